@@ -1,0 +1,46 @@
+"""Differentiable control in continuous time.
+
+Write `dx/dt = f(t, x, u, w)` as a module, let Diffrax integrate it, close the loop with
+a controller, and differentiate, `vmap` or `jit` the whole.
+"""
+
+from . import (
+    controllers as controllers,
+    costs as costs,
+    disturbances as disturbances,
+    dynamics as dynamics,
+    environments as environments,
+    math as math,
+    references as references,
+    systems as systems,
+)
+from ._controller import (
+    AbstractController as AbstractController,
+    AbstractLearner as AbstractLearner,
+)
+from ._fields import (
+    bounded as bounded,
+    parameter as parameter,
+    positive as positive,
+    weight as weight,
+)
+from ._paths import replace as replace
+from ._results import RESULTS as RESULTS
+from .costs import AbstractCost as AbstractCost
+from .disturbances import AbstractDisturbance as AbstractDisturbance
+from .dynamics import (
+    AbstractDynamics as AbstractDynamics,
+    c2d as c2d,
+    Discretized as Discretized,
+    LinearDynamics as LinearDynamics,
+    linearize as linearize,
+    open_loop as open_loop,
+)
+from .environments import (
+    Environment as Environment,
+    make as make,
+    randomise as randomise,
+    register as register,
+)
+from .simulation import rollout as rollout, Trajectory as Trajectory
+from .systems import AbstractSystem as AbstractSystem, system as system

@@ -1,0 +1,134 @@
+"""What a controller is; the protocols alone."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, PyTree
+
+from ._fields import check_parameters
+from ._typing import PRNGKey, RealScalar
+
+
+class AbstractController(eqx.Module):
+    """A feedback law with a state of its own.
+
+    [`delucax.rollout`][] makes the calls, in this order at each step: `__call__` acts on
+    the observation; the environment saturates and steps; `applied` tells the controller
+    the control that was really applied, and its cost. Trained weights are fields; what
+    is learned or remembered along the way lives in the state, a pytree of arrays.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        from jaxtyping import Array
+
+        class Damper(dlx.AbstractController):
+            gain: Array = dlx.weight(1.0)
+
+            def __call__(self, t, y, state):
+                return -self.gain * y[1:], state
+
+        import jax
+        dlx.rollout(dlx.make("pendulum"), Damper(), key=jax.random.key(0)).total_cost
+        ```
+    """
+
+    def __check_init__(self):
+        check_parameters(self)
+
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
+        """The state at the start of an episode; none by default.
+
+        **Arguments:** `key`: a random key, for controllers that draw.
+
+        **Returns:** a pytree of arrays.
+        """
+        del key
+        return None
+
+    @abc.abstractmethod
+    def __call__(
+        self, t: RealScalar, y: Array, state: PyTree
+    ) -> tuple[Array, PyTree]:
+        """The control for an observation.
+
+        **Arguments:**
+
+        - `t`: time, a scalar.
+        - `y`: observation, a vector.
+        - `state`: the controller's state.
+
+        **Returns:** `(u, state)`, `u` a vector of the control's size.
+        """
+
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
+        """Told what was really applied, after saturation; ignored by default.
+
+        **Arguments:**
+
+        - `u`: the control that was applied.
+        - `cost`: the stage cost that it was charged.
+        - `state`: the controller's state.
+
+        **Returns:** the new state.
+        """
+        del u, cost
+        return state
+
+
+class AbstractLearner(AbstractController):
+    """A controller that learns online by what it would have been charged.
+
+    `loss` and `fresh` are all that a wrapper such as an adaptive meta-controller needs.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        class ScaledGuess(dlx.AbstractLearner):
+            def init(self, *, key=None):
+                return jnp.zeros(())
+
+            def __call__(self, t, y, state):
+                return -state * y[:1], state
+
+            def loss(self, t, state):
+                return state**2
+
+            def fresh(self, state, key):
+                return jnp.zeros(())
+
+        ScaledGuess().loss(0.0, jnp.ones(()))
+        ```
+    """
+
+    @abc.abstractmethod
+    def loss(self, t: RealScalar, state: PyTree) -> Array:
+        """The counterfactual loss of the policy held in `state`.
+
+        **Arguments:** `t`: time. `state`: the learner's state.
+
+        **Returns:** a scalar.
+        """
+
+    @abc.abstractmethod
+    def fresh(self, state: PyTree, key: PRNGKey | None) -> PyTree:
+        """A state that shares what `state` has observed, but has learned nothing.
+
+        **Arguments:** `state`: the learner's state. `key`: a random key, or `None`.
+
+        **Returns:** the new state.
+        """
+
+
+def wrong_observation(controller: Any, expected: int, y: Array) -> ValueError:
+    """The error for an observation that a controller was not made for."""
+    return ValueError(
+        f"{type(controller).__name__}: expects an observation of size {expected}, got "
+        f"size {y.shape[0] if y.ndim else 0}. If it was made for the encoded "
+        "observation, give it features=env.encode."
+    )

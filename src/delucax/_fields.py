@@ -1,0 +1,257 @@
+"""What a field of a module is: a constant of the physics, or a trainable weight."""
+
+import abc
+import dataclasses
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+
+_ROLE = "delucax_role"
+_CONSTRAINT = "delucax_constraint"
+
+
+class AbstractConstraint(eqx.Module):
+    """A set of legal values, and a smooth map onto it from all real numbers.
+
+    Training moves the unconstrained value and the model sees the legal one, so that no
+    step of any optimiser can leave the set.
+    """
+
+    @abc.abstractmethod
+    def constrain(self, z: Array) -> Array:
+        """The legal value of an unconstrained `z`."""
+
+    @abc.abstractmethod
+    def unconstrain(self, value: Array) -> Array:
+        """The `z` with `constrain(z) == value`."""
+
+    @abc.abstractmethod
+    def holds(self, value: Array) -> Array:
+        """Whether each entry of `value` is legal."""
+
+
+class _Positive(AbstractConstraint):
+    def constrain(self, z):
+        return jnp.exp(z)
+
+    def unconstrain(self, value):
+        return jnp.log(value)
+
+    def holds(self, value):
+        return value > 0
+
+    def __repr__(self):
+        return "positive"
+
+
+positive = _Positive()
+"""The constraint `value > 0`: training moves the logarithm, so a step is relative.
+
+!!! example
+
+    ```python
+    import delucax as dlx
+
+    length = dlx.parameter(1.0, constraint=dlx.positive)
+    ```
+"""
+
+
+class bounded(AbstractConstraint):
+    """The constraint `low < value < high`; training moves the logit.
+
+    **Arguments:**
+
+    - `low`: the lower end, a number.
+    - `high`: the upper end, a number above `low`.
+
+    **Raises:** `ValueError` if `low >= high`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        damping = dlx.parameter(0.1, constraint=dlx.bounded(0.0, 1.0))
+        ```
+    """
+
+    low: float
+    high: float
+
+    def __init__(self, low: float, high: float):
+        if not low < high:
+            raise ValueError(f"bounded: low must be below high, got {low} and {high}.")
+        self.low = float(low)
+        self.high = float(high)
+
+    def constrain(self, z):
+        return self.low + (self.high - self.low) * jax.nn.sigmoid(z)
+
+    def unconstrain(self, value):
+        unit = (value - self.low) / (self.high - self.low)
+        return jnp.log(unit) - jnp.log1p(-unit)
+
+    def holds(self, value):
+        return (value > self.low) & (value < self.high)
+
+    def __repr__(self):
+        return f"bounded({self.low}, {self.high})"
+
+
+def as_float_array(value: Any) -> Any:
+    """A number as a weakly typed float array; anything else as it is.
+
+    A weak type follows the precision of what it meets, so one module serves float32
+    and float64 alike. Integers become floats; arrays of numbers keep their precision.
+    """
+    if value is None or isinstance(value, jax.Array) and eqx.is_inexact_array(value):
+        return value
+    if isinstance(value, bool | int | float | np.number) or (
+        isinstance(value, np.ndarray) and value.ndim == 0
+    ):
+        return jnp.asarray(float(value))
+    if isinstance(value, np.ndarray | list | tuple | jax.Array):
+        array = jnp.asarray(value)
+        return array if eqx.is_inexact_array(array) else array.astype(float)
+    return value
+
+
+def parameter(
+    default: Any = dataclasses.MISSING, *, constraint: AbstractConstraint | None = None
+) -> Any:
+    """A field that holds a constant of the physics.
+
+    A number given for it becomes a (weakly typed) floating-point array leaf, so that it
+    can be differentiated, batched under `jax.vmap`, and changed without compiling
+    again. A bare `float` field would be static under `eqx.filter_jit`: every value
+    would compile anew and its gradient would be `None`.
+
+    **Arguments:**
+
+    - `default`: the default value, a number or an array. No default by default.
+    - `constraint`: the legal values, [`delucax.positive`][] or [`delucax.bounded`][].
+        Checked when a module is made, and kept by `delucax.training.fit`.
+
+    **Returns:** a dataclass field.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        from jaxtyping import Array
+
+        class Oscillator(dlx.AbstractSystem):
+            state_names = ("x", "v")
+            control_names = ("force",)
+            stiffness: Array = dlx.parameter(1.0, constraint=dlx.positive)
+
+            def vector_field(self, t, x, u, w):
+                return jnp.stack([x[1], u[0] - self.stiffness * x[0]])
+        ```
+    """
+    return _field("parameter", default, constraint)
+
+
+def weight(
+    default: Any = dataclasses.MISSING, *, constraint: AbstractConstraint | None = None
+) -> Any:
+    """A field that holds trainable weights: an array, a number, or a whole network.
+
+    These are the only fields that `delucax.training.fit` moves unless told otherwise.
+
+    **Arguments:**
+
+    - `default`: the default value. No default by default.
+    - `constraint`: the legal values, as in [`delucax.parameter`][].
+
+    **Returns:** a dataclass field.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        from jaxtyping import Array
+
+        class Proportional(dlx.AbstractController):
+            gain: Array = dlx.weight(1.0)
+
+            def __call__(self, t, y, state):
+                return -self.gain * y[:1], state
+        ```
+    """
+    return _field("weight", default, constraint)
+
+
+def _field(role: str, default: Any, constraint: AbstractConstraint | None) -> Any:
+    return eqx.field(
+        default=default,
+        converter=as_float_array,
+        metadata={_ROLE: role, _CONSTRAINT: constraint},
+    )
+
+
+def converter_of(module: eqx.Module, name: str) -> Callable[[Any], Any]:
+    """How field `name` of `module` converts what it is given."""
+    field = _fields(module).get(name)
+    return (lambda x: x) if field is None else field.metadata.get("converter", _same)
+
+
+def _same(x):
+    return x
+
+
+def _fields(module: Any) -> dict[str, dataclasses.Field]:
+    return {f.name: f for f in dataclasses.fields(module)}
+
+
+def marked_leaves(
+    tree: Any,
+) -> Iterator[tuple[tuple, Any, str | None, AbstractConstraint | None]]:
+    """`(path, leaf, role, constraint)` of every leaf; the innermost mark holds."""
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        node, role, constraint = tree, None, None
+        for key in path:
+            if isinstance(key, jax.tree_util.GetAttrKey) and eqx.is_array(node):
+                break
+            if isinstance(key, jax.tree_util.GetAttrKey):
+                if isinstance(node, eqx.Module):
+                    metadata = _fields(node)[key.name].metadata
+                    role = metadata.get(_ROLE, role)
+                    constraint = metadata.get(_CONSTRAINT, constraint)
+                node = getattr(node, key.name)
+            elif isinstance(key, jax.tree_util.SequenceKey):
+                node = node[key.idx]
+            elif isinstance(key, jax.tree_util.DictKey):
+                node = node[key.key]
+            else:
+                break
+        yield path, leaf, role, constraint
+
+
+def check_parameters(module: eqx.Module) -> None:
+    """Raise unless every `parameter()` and `weight()` of `module` is legal.
+
+    Traced values cannot be looked at and are let through.
+    """
+    for field in dataclasses.fields(module):
+        if _ROLE not in field.metadata:
+            continue
+        value = getattr(module, field.name, None)
+        constraint = field.metadata[_CONSTRAINT]
+        for leaf in jax.tree.leaves(value):
+            if isinstance(leaf, jax.core.Tracer) or not eqx.is_inexact_array(leaf):
+                continue
+            leaf = np.asarray(leaf)
+            name = f"{type(module).__name__}: {field.name}"
+            if not np.all(np.isfinite(leaf)):
+                raise ValueError(f"{name} must be finite, got {leaf}.")
+            if constraint is not None and not np.all(constraint.holds(leaf)):
+                raise ValueError(f"{name} must be {constraint}, got {leaf}.")

@@ -1,0 +1,21 @@
+"""Array aliases shared by every signature."""
+
+from typing import TypeAlias
+
+from jaxtyping import Array, Bool, Float, Key, Num, Shaped, UInt32
+
+RealScalar: TypeAlias = Num[Array, ""] | int | float
+"""A real number: a Python number or a rank-0 array."""
+Vector: TypeAlias = Float[Array, "_"]
+"""A rank-1 floating-point array."""
+Matrix: TypeAlias = Float[Array, "_ _"]
+"""A rank-2 floating-point array."""
+State: TypeAlias = Float[Array, "states"]  # noqa: F821
+Control: TypeAlias = Float[Array, "controls"]  # noqa: F821
+Disturbance: TypeAlias = Float[Array, "disturbances"]  # noqa: F821
+Observation: TypeAlias = Float[Array, "observations"]  # noqa: F821
+Scalar: TypeAlias = Float[Array, ""]
+BoolScalar: TypeAlias = Bool[Array, ""]
+PRNGKey: TypeAlias = Key[Array, "..."] | UInt32[Array, "... 2"]
+"""A key from `jax.random.key` (or the older `jax.random.PRNGKey`)."""
+AnyArray: TypeAlias = Shaped[Array, "..."]

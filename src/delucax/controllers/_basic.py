@@ -1,0 +1,147 @@
+"""The simplest controllers."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array
+
+from .._check import as_matrix, check_count
+from .._controller import AbstractController, wrong_observation
+from .._fields import as_float_array, parameter, weight
+from ..math import matvec
+
+
+class Zero(AbstractController):
+    """`u = 0`: the floor that every method must beat.
+
+    **Arguments:** `control_size`: the number of controls.
+
+    **Raises:** `ValueError` if it is below 1.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        zero = dlx.controllers.Zero(1)
+        dlx.rollout(dlx.make("pendulum"), zero, key=jax.random.key(0)).total_cost
+        ```
+    """
+
+    control_size: int = eqx.field(static=True)
+
+    def __init__(self, control_size: int):
+        self.control_size = check_count(control_size, "control_size", "Zero")
+
+    def __call__(self, t, y, state):
+        return jnp.zeros(self.control_size, y.dtype), state
+
+
+class Constant(AbstractController):
+    """`u = value`.
+
+    **Arguments:** `value`: a vector, one entry a control.
+
+    **Raises:** `ValueError` if `value` is not a finite vector.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        push = dlx.controllers.Constant(jnp.array([0.5]))
+        dlx.rollout(dlx.make("pendulum"), push, key=jax.random.key(0)).total_cost
+        ```
+    """
+
+    value: Array = weight()
+
+    def __init__(self, value: Any):
+        value = as_float_array(value)
+        if not eqx.is_array(value) or value.ndim != 1:
+            raise ValueError(f"Constant: value must be a vector, got {value!r}.")
+        self.value = value
+
+    def __call__(self, t, y, state):
+        return self.value.astype(y.dtype), state
+
+
+class Random(AbstractController):
+    """Independent normal controls, `u ~ N(mean, std^2)`, for exploration.
+
+    **Arguments:**
+
+    - `std`: standard deviation, a vector with one entry a control.
+    - `mean`: a number or vector, 0 by default.
+
+    **Raises:** `ValueError` if `std` is not a vector; or, when it is run, if there is no
+    key.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        explore = dlx.controllers.Random(jnp.array([1.0]))
+        dlx.rollout(dlx.make("pendulum"), explore, key=jax.random.key(0)).total_cost
+        ```
+    """
+
+    std: Array = parameter()
+    mean: Array = parameter()
+
+    def __init__(self, std: Any, mean: Any = 0.0):
+        self.std, self.mean = as_float_array(std), as_float_array(mean)
+        if not eqx.is_array(self.std) or self.std.ndim != 1:
+            raise ValueError(
+                "Random: std must be a vector with an entry for each control, got "
+                f"{std!r}."
+            )
+
+    def init(self, *, key=None):
+        if key is None:
+            raise ValueError("Random: key must be a key such as jax.random.key(0).")
+        return key
+
+    def __call__(self, t, y, state):
+        state, now = jr.split(state)
+        u = self.mean + self.std * jr.normal(now, self.std.shape, y.dtype)
+        return u.astype(y.dtype), state
+
+
+class Linear(AbstractController):
+    """Linear feedback, `u = -K y`.
+
+    **Arguments:** `K`: the gain, shape `(m, p)`; trainable.
+
+    **Raises:** `ValueError` if `K` is not a finite matrix, or does not fit the
+    observation.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        feedback = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
+        dlx.rollout(dlx.make("pendulum"), feedback, key=jax.random.key(0)).total_cost
+        ```
+    """
+
+    K: Array = weight()
+
+    def __init__(self, K: Any):
+        self.K = as_matrix(K, "K", "Linear")
+
+    def __call__(self, t, y, state):
+        if y.shape != self.K.shape[1:]:
+            raise wrong_observation(self, self.K.shape[1], y)
+        return -matvec(self.K, y).astype(y.dtype), state

@@ -1,0 +1,6 @@
+"""Stage and final costs, each minus a reward."""
+
+from ._base import AbstractCost as AbstractCost
+from ._compose import Function as Function, Rate as Rate
+from ._pendulum import PendulumCost as PendulumCost
+from ._quadratic import Quadratic as Quadratic, Tracking as Tracking

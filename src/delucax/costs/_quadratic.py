@@ -1,0 +1,198 @@
+"""Quadratic costs about a point and about a reference."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._check import as_matrix, is_concrete
+from .._fields import as_float_array, parameter
+from .._typing import Matrix, RealScalar
+from ..math import quadratic_form
+from ._base import AbstractCost
+
+
+class Quadratic(AbstractCost):
+    """`(x - x*)' Q (x - x*) + (u - u*)' R (u - u*)`, and `(x - x*)' Qf (x - x*)`.
+
+    **Arguments:**
+
+    - `Q`: state weight, shape `(n, n)`, symmetric.
+    - `R`: control weight, shape `(m, m)`, symmetric.
+    - `final`: final weight Qf, shape `(n, n)`, symmetric; none by default.
+    - `state_target`: x*, shape `(n,)`; zero by default.
+    - `control_target`: u*, shape `(m,)`; zero by default.
+    - `difference`: `(x, x*) -> deviation`, such as `system.difference`, which wraps
+        angles; subtraction by default.
+
+    **Raises:** `ValueError` if a weight is not square, symmetric and finite, or if a
+    target does not fit.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        cost = dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1), final=10 * jnp.eye(2))
+        cost(0.0, jnp.ones(2), jnp.zeros(1))
+        ```
+    """
+
+    Q: Matrix = parameter()
+    R: Matrix = parameter()
+    Qf: Matrix | None = parameter()
+    state_target: Array | None = parameter()
+    control_target: Array | None = parameter()
+    difference: Callable[[Array, Array], Array] | None
+
+    def __init__(
+        self,
+        Q: Any,
+        R: Any,
+        final: Any = None,
+        state_target: Any = None,
+        control_target: Any = None,
+        *,
+        difference: Callable[[Array, Array], Array] | None = None,
+    ):
+        where = "Quadratic"
+        self.Q = symmetric(Q, "Q", where)
+        self.R = symmetric(R, "R", where)
+        self.Qf = None if final is None else symmetric(final, "final", where)
+        if self.Qf is not None and self.Qf.shape != self.Q.shape:
+            raise ValueError(
+                f"{where}: final must have the shape of Q, {self.Q.shape}, got "
+                f"{self.Qf.shape}."
+            )
+        self.state_target = _target(state_target, self.Q, "state_target")
+        self.control_target = _target(control_target, self.R, "control_target")
+        self.difference = difference
+
+    def _state(self, x: Array) -> Array:
+        if x.shape != self.Q.shape[:1]:
+            raise ValueError(
+                f"Quadratic: Q has shape {self.Q.shape} but the state has shape "
+                f"{x.shape}."
+            )
+        if self.difference is not None:
+            target = jnp.zeros_like(x) if self.state_target is None else self.state_target
+            return self.difference(x, target)
+        return x if self.state_target is None else x - self.state_target
+
+    def __call__(self, t, x, u):
+        if u.shape != self.R.shape[:1]:
+            raise ValueError(
+                f"Quadratic: R has shape {self.R.shape} but the control has shape "
+                f"{u.shape}."
+            )
+        du = u if self.control_target is None else u - self.control_target
+        return quadratic_form(self.Q, self._state(x)) + quadratic_form(self.R, du)
+
+    def final(self, t, x):
+        if self.Qf is None:
+            return jnp.zeros((), x.dtype)
+        return quadratic_form(self.Qf, self._state(x))
+
+
+class Tracking(AbstractCost):
+    """`e' Q e + u' R u` with `e = h(x) - r(t)`, and `e' Qf e` at the end.
+
+    **Arguments:**
+
+    - `Q`: error weight, shape `(p, p)`, symmetric.
+    - `R`: control weight, shape `(m, m)`, symmetric.
+    - `reference`: any function of time to a vector of size p, such as those in
+        `delucax.references`.
+    - `final`: final weight Qf, shape `(p, p)`; none by default.
+    - `output`: h, from the state to the vector that follows the reference; the state
+        itself by default.
+
+    **Raises:** `ValueError` if a weight is not square, symmetric and finite.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        circle = lambda t: jnp.stack([jnp.cos(t), jnp.sin(t)])
+        cost = dlx.costs.Tracking(jnp.eye(2), jnp.eye(1), circle)
+        cost(0.0, jnp.ones(2), jnp.zeros(1))
+        ```
+    """
+
+    Q: Matrix = parameter()
+    R: Matrix = parameter()
+    reference: Callable[[RealScalar], Array]
+    Qf: Matrix | None = parameter()
+    output: Callable[[Array], Array] | None
+
+    def __init__(
+        self,
+        Q: Any,
+        R: Any,
+        reference: Callable[[RealScalar], Array],
+        final: Any = None,
+        output: Callable[[Array], Array] | None = None,
+    ):
+        where = "Tracking"
+        self.Q = symmetric(Q, "Q", where)
+        self.R = symmetric(R, "R", where)
+        if not callable(reference):
+            raise ValueError(
+                f"{where}: reference must be a function of time, got {reference!r}."
+            )
+        self.reference = reference
+        self.Qf = None if final is None else symmetric(final, "final", where)
+        self.output = output
+
+    def _error(self, t: RealScalar, x: Array) -> Array:
+        y = x if self.output is None else self.output(x)
+        r = self.reference(t)
+        if jnp.shape(r) != y.shape or y.shape != self.Q.shape[:1]:
+            raise ValueError(
+                f"Tracking: Q has shape {self.Q.shape}, the output {y.shape} and the "
+                f"reference {jnp.shape(r)}; these must fit."
+            )
+        return y - r
+
+    def __call__(self, t, x, u):
+        return quadratic_form(self.Q, self._error(t, x)) + quadratic_form(self.R, u)
+
+    def final(self, t, x):
+        if self.Qf is None:
+            return jnp.zeros((), x.dtype)
+        return quadratic_form(self.Qf, self._error(t, x))
+
+
+def symmetric(value: Any, name: str, where: str) -> Array:
+    """`value` as a symmetric matrix of finite entries, or an error.
+
+    An asymmetry of the size of rounding is averaged away.
+    """
+    matrix = as_matrix(value, name, where)
+    if matrix.shape[0] != matrix.shape[1]:
+        raise ValueError(f"{where}: {name} must be square, got shape {matrix.shape}.")
+    if is_concrete(matrix):
+        array = np.asarray(matrix)
+        scale = np.max(np.abs(array), initial=0.0)
+        slack = 100 * np.finfo(array.dtype).eps * scale
+        if np.max(np.abs(array - array.T), initial=0.0) > slack:
+            raise ValueError(f"{where}: {name} must be symmetric, got {array}.")
+    return (matrix + matrix.T) / 2
+
+
+def _target(value: Any, weight: Array, name: str) -> Array | None:
+    if value is None:
+        return None
+    array = as_float_array(value)
+    if not eqx.is_array(array) or array.shape != weight.shape[:1]:
+        raise ValueError(
+            f"Quadratic: {name} must have shape {weight.shape[:1]}, got "
+            f"{jnp.shape(array)}."
+        )
+    return array

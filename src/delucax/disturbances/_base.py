@@ -1,0 +1,88 @@
+"""Sequences of disturbances, drawn for a whole horizon at once."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._fields import as_float_array, check_parameters
+from .._typing import PRNGKey
+
+
+class AbstractDisturbance(eqx.Module):
+    """A sequence `w[0], ..., w[T - 1]`, drawn at once for the whole horizon.
+
+    Add two with `+`; confine one to a part of the time with
+    [`delucax.disturbances.Window`][].
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        noise = dlx.disturbances.Gaussian(0.1, size=2)
+        push = dlx.disturbances.Shock(jnp.array([0.0, 1.0]), start=2.0, duration=0.5)
+        w = (noise + push).sequence(jax.random.key(0), 0.05 * jnp.arange(100))
+        ```
+    """
+
+    size: eqx.AbstractVar[int]
+    """The number of entries of `w` at each step."""
+
+    def __check_init__(self):
+        check_parameters(self)
+
+    @abc.abstractmethod
+    def sequence(self, key: PRNGKey | None, times: Array) -> Array:
+        """The disturbances at `times`.
+
+        **Arguments:**
+
+        - `key`: a random key; those that draw nothing take `None` too.
+        - `times`: the start of each step, shape `(T,)`.
+
+        **Returns:** shape `(T, size)`.
+        """
+
+    def __add__(self, other: "AbstractDisturbance") -> "AbstractDisturbance":
+        from ._compose import Sum
+
+        if not isinstance(other, AbstractDisturbance):
+            return NotImplemented
+        return Sum(self, other)
+
+
+def common_size(where: str, size: int | None, **values: Any) -> tuple[int, dict]:
+    """The size that arrays share, and the arrays; numbers fit any size."""
+    arrays = {name: as_float_array(value) for name, value in values.items()}
+    for name, array in arrays.items():
+        if not eqx.is_inexact_array(array) or array.ndim > 1:
+            got = array.shape if eqx.is_array(array) else repr(array)
+            raise ValueError(
+                f"{where}: {name} must be a number or a vector with an entry for each "
+                f"disturbance, got {got}."
+            )
+        if array.ndim == 1:
+            if size is not None and array.shape[0] != size:
+                raise ValueError(
+                    f"{where}: {name} has {array.shape[0]} entries where {size} are "
+                    "expected."
+                )
+            size = array.shape[0]
+    if size is None:
+        raise ValueError(
+            f"{where}: size must be given when every other argument is a number, such "
+            f"as {where}(..., size=2)."
+        )
+    if size < 1:
+        raise ValueError(f"{where}: size must be at least 1, got {size}.")
+    return size, arrays
+
+
+def spread(values: Array, steps: int, size: int) -> Array:
+    """`values` as shape `(steps, size)`."""
+    return jnp.broadcast_to(values, (steps, size))

@@ -1,0 +1,112 @@
+"""Disturbances made of others."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array
+
+from .._fields import parameter
+from ._base import AbstractDisturbance
+from ._deterministic import Constant
+
+
+class Sum(AbstractDisturbance):
+    """The sum of several disturbances, each drawn with a key of its own.
+
+    **Arguments:** `*terms`: disturbances of one size.
+
+    **Raises:** `ValueError` if there are none, or if sizes differ.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        both = dlx.disturbances.Sum(
+            dlx.disturbances.Gaussian(0.1, size=2), dlx.disturbances.Constant(0.5, size=2)
+        )
+        ```
+    """
+
+    terms: tuple[AbstractDisturbance, ...]
+
+    def __init__(self, *terms: AbstractDisturbance):
+        sizes = [term.size for term in terms]
+        if len(set(sizes)) != 1:
+            raise ValueError(f"Sum: terms must be of one size, got sizes {sizes}.")
+        self.terms = terms
+
+    @property
+    def size(self) -> int:
+        """The size that the terms share."""
+        return self.terms[0].size
+
+    def sequence(self, key, times):
+        n = len(self.terms)
+        keys = [None] * n if key is None else list(jr.split(key, n))
+        drawn = [w.sequence(k, times) for w, k in zip(self.terms, keys, strict=True)]
+        return sum(drawn[1:], drawn[0])
+
+
+class Window(AbstractDisturbance):
+    """A disturbance inside a time window, `start <= t < stop`, and zero outside.
+
+    **Arguments:**
+
+    - `disturbance`: the one inside.
+    - `start`, `stop`: the ends of the window, in units of time.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        gust = dlx.disturbances.Window(
+            dlx.disturbances.Sinusoid(0.2, frequency=1.0, size=2), start=3.0, stop=6.0
+        )
+        gust.sequence(None, 0.5 * jnp.arange(20))
+        ```
+    """
+
+    disturbance: AbstractDisturbance
+    start: Array = parameter()
+    stop: Array = parameter()
+
+    @property
+    def size(self) -> int:
+        """That of the disturbance inside."""
+        return self.disturbance.size
+
+    def sequence(self, key, times):
+        w = self.disturbance.sequence(key, times)
+        inside = (times >= self.start) & (times < self.stop)
+        return jnp.where(inside[:, None], w, jnp.zeros((), w.dtype))
+
+
+def Shock(
+    value: Any, start: Any, duration: Any, *, size: int | None = None
+) -> AbstractDisturbance:
+    """A constant push for a while: a `Window` of a `Constant`.
+
+    **Arguments:**
+
+    - `value`: a number, or a vector of `size` entries.
+    - `start`, `duration`: in units of time.
+    - `size`: entries a step; follows from `value` if that is a vector.
+
+    **Returns:** the disturbance.
+
+    **Raises:** `ValueError` if the size is unknown or does not fit.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        push = dlx.disturbances.Shock(jnp.array([0.0, 0.5]), start=5.0, duration=0.5)
+        ```
+    """
+    return Window(Constant(value, size=size), start, start + duration)

@@ -1,0 +1,210 @@
+"""Disturbances that are known functions of time."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._check import as_matrix
+from .._fields import parameter, positive
+from ..math import sin
+from ._base import AbstractDisturbance, common_size, spread
+
+
+class Zero(AbstractDisturbance):
+    """No disturbance.
+
+    **Arguments:** `size`: entries a step.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.disturbances.Zero(2).sequence(None, jnp.arange(3.0))
+        ```
+    """
+
+    size: int = eqx.field(static=True)
+
+    def __init__(self, size: int):
+        self.size, _ = common_size("Zero", size)
+
+    def sequence(self, key, times):
+        return jnp.zeros((times.shape[0], self.size), times.dtype)
+
+
+class Constant(AbstractDisturbance):
+    """`w[k] = value`.
+
+    **Arguments:**
+
+    - `value`: a number, or a vector of `size` entries.
+    - `size`: entries a step; follows from `value` if that is a vector.
+
+    **Raises:** `ValueError` if the size is unknown or does not fit.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.disturbances.Constant(0.5, size=2).sequence(None, jnp.arange(3.0))
+        ```
+    """
+
+    value: Array = parameter()
+    size: int = eqx.field(static=True)
+
+    def __init__(self, value: Any, *, size: int | None = None):
+        self.size, arrays = common_size("Constant", size, value=value)
+        self.value = arrays["value"]
+
+    def sequence(self, key, times):
+        return spread(self.value, times.shape[0], self.size).astype(times.dtype)
+
+
+class Sinusoid(AbstractDisturbance):
+    """`w[k] = amplitude sin(2 pi frequency t_k + phase) + offset`.
+
+    **Arguments:** each a number or a vector of `size` entries.
+
+    - `amplitude`.
+    - `frequency`: in hertz if time is in seconds.
+    - `phase`: in radians, 0 by default.
+    - `offset`: 0 by default.
+    - `size`: entries a step; follows from the others if one is a vector.
+
+    **Raises:** `ValueError` if the size is unknown or does not fit.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        wind = dlx.disturbances.Sinusoid(jnp.array([0.0, 0.2]), frequency=0.5)
+        wind.sequence(None, 0.1 * jnp.arange(5))
+        ```
+    """
+
+    amplitude: Array = parameter()
+    frequency: Array = parameter()
+    phase: Array = parameter()
+    offset: Array = parameter()
+    size: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        amplitude: Any,
+        frequency: Any,
+        phase: Any = 0.0,
+        offset: Any = 0.0,
+        *,
+        size: int | None = None,
+    ):
+        self.size, arrays = common_size(
+            "Sinusoid",
+            size,
+            amplitude=amplitude,
+            frequency=frequency,
+            phase=phase,
+            offset=offset,
+        )
+        for name, array in arrays.items():
+            setattr(self, name, array)
+
+    def sequence(self, key, times):
+        angle = 2 * np.pi * self.frequency * times[:, None] + self.phase
+        w = self.amplitude * sin(angle) + self.offset
+        return spread(w, times.shape[0], self.size).astype(times.dtype)
+
+
+class Square(AbstractDisturbance):
+    """`w[k] = amplitude` in the first part of each period and `-amplitude` in the rest.
+
+    **Arguments:** each a number or a vector of `size` entries.
+
+    - `amplitude`.
+    - `period`: in units of time, positive.
+    - `duty`: the part of a period at `+amplitude`, 0.5 by default.
+    - `size`: entries a step; follows from the others if one is a vector.
+
+    The gradient with respect to `period` and `duty` is zero almost everywhere.
+
+    **Raises:** `ValueError` if the size is unknown or does not fit, or the period is not
+    positive.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.disturbances.Square(0.3, period=2.0, size=1).sequence(None, jnp.arange(4.0))
+        ```
+    """
+
+    amplitude: Array = parameter()
+    period: Array = parameter(constraint=positive)
+    duty: Array = parameter()
+    size: int = eqx.field(static=True)
+
+    def __init__(
+        self, amplitude: Any, period: Any, duty: Any = 0.5, *, size: int | None = None
+    ):
+        self.size, arrays = common_size(
+            "Square", size, amplitude=amplitude, period=period, duty=duty
+        )
+        for name, array in arrays.items():
+            setattr(self, name, array)
+
+    def sequence(self, key, times):
+        cycles = times[:, None] / self.period
+        first = cycles - jnp.floor(cycles) < self.duty
+        w = jnp.where(first, self.amplitude, -self.amplitude)
+        return spread(w, times.shape[0], self.size).astype(times.dtype)
+
+
+class FromArray(AbstractDisturbance):
+    """A recorded or hand-made sequence: `w[k] = values[k]`.
+
+    **Arguments:** `values`: shape `(steps, size)`, at least as many steps as the
+    horizon it is used for.
+
+    **Raises:** `ValueError` if `values` is not a matrix of finite numbers, or has too few
+    steps for the horizon.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        recorded = dlx.disturbances.FromArray(jnp.ones((100, 2)))
+        recorded.sequence(None, 0.05 * jnp.arange(50))
+        ```
+    """
+
+    values: Array = parameter()
+
+    def __init__(self, values: Any):
+        self.values = as_matrix(values, "values", "FromArray")
+
+    @property
+    def size(self) -> int:
+        """The number of columns of `values`."""
+        return self.values.shape[1]
+
+    def sequence(self, key, times):
+        steps = times.shape[0]
+        if self.values.shape[0] < steps:
+            raise ValueError(
+                f"FromArray: values has {self.values.shape[0]} steps, fewer than the "
+                f"horizon of {steps}."
+            )
+        return self.values[:steps].astype(times.dtype)

@@ -1,0 +1,175 @@
+"""Random disturbances."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array
+
+from .._check import check_count, check_positive
+from .._fields import parameter
+from ._base import AbstractDisturbance, common_size
+
+
+class Gaussian(AbstractDisturbance):
+    """Independent normal noise, `w[k] ~ N(mean, std^2)`.
+
+    **Arguments:** each a number or a vector of `size` entries.
+
+    - `std`: standard deviation.
+    - `mean`: 0 by default.
+    - `size`: entries a step; follows from the others if one is a vector.
+
+    **Raises:** `ValueError` if the size is unknown or does not fit.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        noise = dlx.disturbances.Gaussian(0.1, size=2)
+        noise.sequence(jax.random.key(0), 0.05 * jnp.arange(10))
+        ```
+    """
+
+    std: Array = parameter()
+    mean: Array = parameter()
+    size: int = eqx.field(static=True)
+
+    def __init__(self, std: Any, mean: Any = 0.0, *, size: int | None = None):
+        self.size, arrays = common_size("Gaussian", size, std=std, mean=mean)
+        self.std, self.mean = arrays["std"], arrays["mean"]
+
+    def sequence(self, key, times):
+        w = jr.normal(_need(key, "Gaussian"), (times.shape[0], self.size), times.dtype)
+        return (self.std * w + self.mean).astype(times.dtype)
+
+
+class Uniform(AbstractDisturbance):
+    """Independent uniform noise, `w[k] ~ U(low, high)`.
+
+    **Arguments:** each a number or a vector of `size` entries.
+
+    - `low`, `high`: the ends.
+    - `size`: entries a step; follows from the others if one is a vector.
+
+    **Raises:** `ValueError` if the size is unknown or does not fit.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        noise = dlx.disturbances.Uniform(-0.1, 0.1, size=2)
+        noise.sequence(jax.random.key(0), 0.05 * jnp.arange(10))
+        ```
+    """
+
+    low: Array = parameter()
+    high: Array = parameter()
+    size: int = eqx.field(static=True)
+
+    def __init__(self, low: Any, high: Any, *, size: int | None = None):
+        self.size, arrays = common_size("Uniform", size, low=low, high=high)
+        self.low, self.high = arrays["low"], arrays["high"]
+
+    def sequence(self, key, times):
+        w = jr.uniform(_need(key, "Uniform"), (times.shape[0], self.size), times.dtype)
+        return (self.low + (self.high - self.low) * w).astype(times.dtype)
+
+
+class RandomWalk(AbstractDisturbance):
+    """A Gaussian random walk kept inside a bound:
+    `w[k + 1] = clip(w[k] + std e[k], -bound, bound)`, `e[k] ~ N(0, 1)`, `w[-1] = 0`.
+
+    **Arguments:** each a number or a vector of `size` entries.
+
+    - `std`: standard deviation of a step, 0.3 by default.
+    - `bound`: 1 by default.
+    - `size`: entries a step; follows from the others if one is a vector.
+
+    **Raises:** `ValueError` if the size is unknown or does not fit.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        walk = dlx.disturbances.RandomWalk(size=2)
+        walk.sequence(jax.random.key(0), 0.05 * jnp.arange(10))
+        ```
+    """
+
+    std: Array = parameter()
+    bound: Array = parameter()
+    size: int = eqx.field(static=True)
+
+    def __init__(self, std: Any = 0.3, bound: Any = 1.0, *, size: int | None = None):
+        self.size, arrays = common_size("RandomWalk", size, std=std, bound=bound)
+        self.std, self.bound = arrays["std"], arrays["bound"]
+
+    def sequence(self, key, times):
+        shape = (times.shape[0], self.size)
+        e = jr.normal(_need(key, "RandomWalk"), shape, times.dtype)
+        std, bound = self.std.astype(e.dtype), self.bound.astype(e.dtype)
+
+        def step(w, e):
+            w = jnp.clip(w + std * e, -bound, bound)
+            return w, w
+
+        return lax.scan(step, jnp.zeros(self.size, e.dtype), e)[1]
+
+
+class Brownian(AbstractDisturbance):
+    """Brownian increments for a system with a diffusion, `w[k] ~ N(0, dt / substeps)`.
+
+    An environment whose system has a diffusion uses it by default.
+
+    **Arguments:**
+
+    - `size`: Brownian motions.
+    - `dt`: the control interval.
+    - `substeps`: solver steps an interval, 1 by default; the increments of all of them
+        follow one another in `w`.
+
+    **Raises:** `ValueError` if `dt` is not positive or `substeps` is below 1.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        increments = dlx.disturbances.Brownian(1, dt=0.05)
+        increments.sequence(jax.random.key(0), 0.05 * jnp.arange(10))
+        ```
+    """
+
+    dt: Array = parameter()
+    size: int = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+
+    def __init__(self, size: int, dt: Any, substeps: int = 1):
+        check_positive(dt, "dt", "Brownian")
+        self.dt = dt
+        self.substeps = check_count(substeps, "substeps", "Brownian")
+        self.size = check_count(size, "size", "Brownian") * self.substeps
+
+    def sequence(self, key, times):
+        e = jr.normal(_need(key, "Brownian"), (times.shape[0], self.size), times.dtype)
+        return (jnp.sqrt(self.dt / self.substeps) * e).astype(times.dtype)
+
+
+def _need(key, where: str):
+    if key is None:
+        raise ValueError(f"{where}: key must be a key such as jax.random.key(0).")
+    return key

@@ -1,0 +1,8 @@
+"""Discrete maps `x_next = F(t, x, u, w)`: discretised, linear and linearised systems."""
+
+from ._base import AbstractDynamics as AbstractDynamics
+from ._discretized import Discretized as Discretized
+from ._linear import LinearDynamics as LinearDynamics
+from ._linearize import c2d as c2d, linearize as linearize
+from ._open_loop import open_loop as open_loop
+from ._runge_kutta import RK4 as RK4

@@ -1,0 +1,140 @@
+"""The discrete-time map that environments, planners and learners step."""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._results import RESULTS, Result
+from .._typing import RealScalar
+from ..systems._base import validate_io
+
+
+class AbstractDynamics(eqx.Module):
+    """Dynamics in discrete time, `x_next = F(t, x, u, w)` over a step of `dt`.
+
+    Subclasses give `dt`, the names of states and controls, and `advance`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        dynamics(0.0, jnp.array([0.1, 0.0]), jnp.zeros(1))
+        ```
+    """
+
+    dt: eqx.AbstractVar[Array]
+    state_names: eqx.AbstractVar[tuple[str, ...]]
+    control_names: eqx.AbstractVar[tuple[str, ...]]
+
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """Units of the states, for plots and tables."""
+        return ()
+
+    @property
+    def control_units(self) -> tuple[str, ...]:
+        """Units of the controls, for plots and tables."""
+        return ()
+
+    @property
+    def state_size(self) -> int:
+        """The number of states."""
+        return len(self.state_names)
+
+    @property
+    def control_size(self) -> int:
+        """The number of controls."""
+        return len(self.control_names)
+
+    @property
+    def disturbance_size(self) -> int:
+        """The size of `w`; that of the state by default."""
+        return self.state_size
+
+    @property
+    def is_stochastic(self) -> bool:
+        """Whether `w` holds Brownian increments, so that no noise is the exception."""
+        return False
+
+    @abc.abstractmethod
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
+        """One step, with what became of it.
+
+        **Arguments:**
+
+        - `t`: time at the start of the step.
+        - `x`: state, shape `(state_size,)`.
+        - `u`: control, shape `(control_size,)`, held over the step.
+        - `w`: disturbance, shape `(disturbance_size,)`; `None` for zero.
+
+        **Returns:** `(x_next, result)`, the latter one of `delucax.RESULTS`.
+        """
+
+    def __call__(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None = None
+    ) -> Array:
+        """The next state.
+
+        **Arguments:** as `advance`; shapes are checked.
+
+        **Returns:** `x_next`, shape `(state_size,)`.
+
+        **Raises:** `ValueError` on a wrong shape, and an error at run time if the
+        solver fails.
+        """
+        x, u, w = validate_io(self, x, u, w)
+        x_next, result = self.advance(t, x, u, w)
+        if result is RESULTS.successful:
+            return x_next
+        return result.error_if(x_next, result != RESULTS.successful)
+
+    def observe(self, t: RealScalar, x: Array) -> Array:
+        """What the plant's sensor reads; the state by default.
+
+        **Arguments:** `t`: time. `x`: state.
+
+        **Returns:** the observation, rank 1.
+        """
+        del t
+        return x
+
+    def difference(self, x: Array, x_ref: Array) -> Array:
+        """The deviation of `x` from `x_ref`; angles wrap where the system says so.
+
+        **Arguments:** `x`: state. `x_ref`: the state to measure from.
+
+        **Returns:** the deviation, a vector.
+        """
+        return x - x_ref
+
+    def equilibrium(self) -> tuple[Array, Array]:
+        """A state and a control at which the dynamics rest.
+
+        **Returns:** `(x, u)`.
+
+        **Raises:** `ValueError` if none is named.
+        """
+        raise ValueError(
+            f"{type(self).__name__} names no equilibrium: give the state and control "
+            "yourself."
+        )
+
+    @property
+    def observation_size(self) -> int:
+        """The size of what `observe` returns."""
+        shape = eqx.filter_eval_shape(
+            self.observe, jnp.zeros(()), jnp.zeros(self.state_size)
+        ).shape
+        if len(shape) != 1:
+            raise ValueError(
+                f"{type(self).__name__}: observe must return a vector, got an array of "
+                f"shape {shape}."
+            )
+        return shape[0]

@@ -1,0 +1,415 @@
+"""A continuous system integrated over one control interval."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array
+
+from .._check import check_count, check_positive
+from .._fields import parameter
+from .._results import first_of, or_none, promote, RESULTS
+from ..systems import AbstractSystem
+from ..systems._base import zeros_if_none
+from ._base import AbstractDynamics
+from ._runge_kutta import (
+    RK4,
+    join_state,
+    runge_kutta_step,
+    split_state,
+    tableau_of,
+)
+
+
+_SDE_SOLVERS = (
+    diffrax.Euler,
+    diffrax.EulerHeun,
+    diffrax.ItoMilstein,
+    diffrax.StratonovichMilstein,
+    diffrax.Heun,
+    diffrax.Midpoint,
+    diffrax.Ralston,
+)
+
+
+class Discretized(AbstractDynamics):
+    r"""The exact-at-the-switch, zero-order-hold discretisation of a system.
+
+    `x_next = x + integral over [t, t + dt] of f(s, x(s), u, w) ds`, the control (and a
+    disturbance that enters the field) held over the interval; then the system's
+    `project`; then, where the system names no disturbances, `+ w`.
+
+    With a fixed step (the default) `dt` is cut into `substeps` equal steps of `solver`:
+    explicit Runge-Kutta methods are written out stage by stage, diagonally implicit
+    ones take Diffrax `solver.step`s. With a `stepsize_controller` each interval is one
+    `diffrax.diffeqsolve`, whose gradient is taken as `adjoint` says.
+
+    If the system has a `diffusion`, then `w` holds the Brownian increments of the
+    substeps one after the other, each with variance `dt / substeps`, and the solver is
+    one of Euler (Euler-Maruyama, Itô), ItoMilstein, EulerHeun, Heun, Midpoint, Ralston
+    or StratonovichMilstein (all Stratonovich).
+
+    **Arguments:**
+
+    - `system`: the continuous-time system.
+    - `dt`: the control interval, a positive number (an array leaf: changing it does not
+        compile again).
+    - `solver`: a Diffrax solver; [`delucax.dynamics.RK4`][] by default, and
+        `diffrax.Euler` for a system with a diffusion.
+    - `substeps`: solver steps an interval, 1 by default; fixed-step only.
+    - `stepsize_controller`: such as `diffrax.PIDController(rtol=1e-6, atol=1e-8)`;
+        `None` for fixed steps.
+    - `adjoint`: any `diffrax.AbstractAdjoint`; `diffrax.RecursiveCheckpointAdjoint()`
+        by default. Needs a `stepsize_controller`: fixed steps are differentiated as
+        they are written.
+    - `max_steps`: the most adaptive steps in an interval, 256 by default.
+
+    **Raises:** `ValueError` if `dt` is not positive, if `solver` does not fit the
+    system or the kind of step, or if `adjoint` or `max_steps` is given without a
+    `stepsize_controller`.
+
+    Source: Hairer, Nørsett and Wanner, 1993; Kidger, 2021 (Diffrax).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import diffrax
+        import jax.numpy as jnp
+
+        pendulum = dlx.systems.Pendulum()
+        fixed = dlx.Discretized(pendulum, dt=0.05, solver=diffrax.Tsit5(), substeps=2)
+        adaptive = dlx.Discretized(
+            pendulum,
+            dt=0.05,
+            solver=diffrax.Tsit5(),
+            stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-8),
+        )
+        adaptive(0.0, jnp.array([0.1, 0.0]), jnp.zeros(1))
+        ```
+    """
+
+    system: AbstractSystem
+    dt: Array = parameter()
+    solver: diffrax.AbstractSolver
+    substeps: int = eqx.field(static=True)
+    stepsize_controller: diffrax.AbstractStepSizeController | None
+    adjoint: diffrax.AbstractAdjoint | None
+    max_steps: int | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        system: AbstractSystem,
+        dt: Any,
+        solver: diffrax.AbstractSolver | None = None,
+        substeps: int = 1,
+        stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+        adjoint: diffrax.AbstractAdjoint | None = None,
+        max_steps: int | None = None,
+    ):
+        where = "Discretized"
+        if not isinstance(system, AbstractSystem):
+            raise ValueError(
+                f"{where}: system must be an AbstractSystem (wrap a function with "
+                f"`delucax.system`), got {type(system).__name__}."
+            )
+        check_positive(dt, "dt", where)
+        self.system = system
+        self.dt = dt
+        self.substeps = check_count(substeps, "substeps", where)
+        noisy = _has_diffusion(system)
+        if solver is None:
+            solver = diffrax.Euler() if noisy else RK4()
+        if not isinstance(solver, diffrax.AbstractSolver):
+            raise ValueError(
+                f"{where}: solver must be a Diffrax solver such as diffrax.Tsit5() "
+                f"(an instance, not the class), got {solver!r}."
+            )
+        name = type(solver).__name__
+        if stepsize_controller is None:
+            if adjoint is not None:
+                raise ValueError(
+                    f"{where}: adjoint is given without stepsize_controller. Fixed "
+                    "steps are differentiated as they are written; give "
+                    "stepsize_controller=diffrax.PIDController(rtol=..., atol=...), or "
+                    "choose what `rollout` stores with its checkpoint= argument."
+                )
+            if max_steps is not None:
+                raise ValueError(
+                    f"{where}: max_steps needs stepsize_controller; with fixed steps "
+                    "give substeps."
+                )
+            if noisy and not isinstance(solver, _SDE_SOLVERS):
+                fitting = ", ".join(s.__name__ for s in _SDE_SOLVERS)
+                raise ValueError(
+                    f"{where}: solver {name} does not fit a system with a diffusion; "
+                    f"use one of {fitting}."
+                )
+            if not noisy:
+                if isinstance(solver, diffrax.AbstractImplicitSolver):
+                    _check_implicit(solver, where)
+                elif tableau_of(solver) is None:
+                    raise ValueError(
+                        f"{where}: solver {name} does not fit fixed steps of "
+                        "dx/dt = f(t, x, u, w); use an explicit Runge-Kutta method "
+                        "(diffrax.Euler, Heun, Midpoint, Ralston, Bosh3, Tsit5, "
+                        "Dopri5, Dopri8, delucax.dynamics.RK4) or a diagonally "
+                        "implicit one (diffrax.ImplicitEuler, Kvaerno3, Kvaerno4, "
+                        "Kvaerno5)."
+                    )
+        else:
+            tableau = tableau_of(solver)
+            if type(solver) is diffrax.Euler or (
+                tableau is not None and not tableau.b_error.any()
+            ):
+                raise ValueError(
+                    f"{where}: solver {name} estimates no error, so a "
+                    "stepsize_controller cannot steer it; use diffrax.Tsit5(), or wrap "
+                    f"it: diffrax.HalfSolver({name}())."
+                )
+            if noisy:
+                raise ValueError(
+                    f"{where}: stepsize_controller does not fit a system with a "
+                    "diffusion, whose Brownian increments are drawn for fixed steps."
+                )
+            if substeps != 1:
+                raise ValueError(
+                    f"{where}: substeps must be 1 with a stepsize_controller, which "
+                    f"chooses the steps, got {substeps}."
+                )
+            if isinstance(solver, diffrax.AbstractImplicitSolver):
+                _check_implicit(solver, where)
+            if adjoint is None:
+                adjoint = diffrax.RecursiveCheckpointAdjoint()
+            max_steps = check_count(
+                256 if max_steps is None else max_steps, "max_steps", where
+            )
+        self.solver = solver
+        self.stepsize_controller = stepsize_controller
+        self.adjoint = adjoint
+        self.max_steps = max_steps
+
+    def __check_init__(self):
+        check_positive(self.dt, "dt", "Discretized")
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Those of the system."""
+        return self.system.state_names
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        """Those of the system."""
+        return self.system.control_names
+
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """Those of the system."""
+        return self.system.state_units
+
+    @property
+    def control_units(self) -> tuple[str, ...]:
+        """Those of the system."""
+        return self.system.control_units
+
+    @property
+    def disturbance_size(self) -> int:
+        """That of the system; times the substeps where `w` is Brownian increments."""
+        size = self.system.disturbance_size
+        return size * self.substeps if self.is_stochastic else size
+
+    @property
+    def is_stochastic(self) -> bool:
+        """Whether the system has a diffusion."""
+        return _has_diffusion(self.system)
+
+    def observe(self, t, x):
+        return self.system.observe(t, x)
+
+    def difference(self, x, x_ref):
+        return self.system.difference(x, x_ref)
+
+    def equilibrium(self):
+        return self.system.equilibrium()
+
+    def advance(self, t, x, u, w):
+        system = self.system
+        if self.is_stochastic:
+            held, added = None, None
+        elif system.disturbance_names:
+            held, added = zeros_if_none(w, system.disturbance_size, x), None
+        else:
+            held, added = None, w
+
+        def field(t, y, args):
+            u, held = args
+            dx = system.vector_field(t, y, u, held)
+            if dx.shape != y.shape:
+                raise ValueError(
+                    f"{type(system).__name__}: vector_field must return shape "
+                    f"{y.shape}, as the state has, got {dx.shape}."
+                )
+            return dx
+
+        args = (u, held)
+        if self.is_stochastic:
+            x_next, result = self._noisy(field, t, x, args, w)
+        elif self.stepsize_controller is not None:
+            x_next, result = self._adaptive(field, t, x, args)
+        else:
+            x_next, result = self._fixed(field, t, x, args)
+        x_next = system.project(x_next)
+        if added is not None:
+            x_next = x_next + added
+        return x_next.astype(x.dtype), result
+
+    def _fixed(self, field, t, x, args):
+        tableau = tableau_of(self.solver)
+        h = self.dt / self.substeps
+        if tableau is not None:
+
+            def step(t, x, _):
+                rhs = lambda t, y: field(t, y, args)  # noqa: E731
+                return runge_kutta_step(tableau, rhs, t, x, h), RESULTS.successful
+        else:
+            solver = _for_one_step(self.solver, x.dtype)
+            term = diffrax.ODETerm(field)
+
+            def step(t, x, _):
+                return _solver_step(solver, term, t, x, h, args)
+
+        return self._substep(step, t, x, None)
+
+    def _noisy(self, field, t, x, args, w):
+        increments = zeros_if_none(w, self.disturbance_size, x)
+        increments = increments.reshape(self.substeps, -1)
+        h = self.dt / self.substeps
+        g, (u, _) = self.system.diffusion, args
+        if type(self.solver) is diffrax.Euler:
+
+            def step(t, x, dB):
+                noise = _apply(g(t, x, u), dB)
+                return x + h * field(t, x, args) + noise, RESULTS.successful
+        else:
+
+            def step(t, x, dB):
+                noise = _BrownianTerm(g, u, dB)
+                term = diffrax.MultiTerm(diffrax.ODETerm(field), noise)
+                return _solver_step(self.solver, term, t, x, h, args)
+
+        return self._substep(step, t, x, increments)
+
+    def _substep(self, step, t, x, inputs):
+        """`substeps` steps one after the other, the state carried by its components."""
+        if self.substeps == 1:
+            return step(t, x, None if inputs is None else inputs[0])
+        h = self.dt / self.substeps
+
+        def body(parts, index_and_input):
+            i, given = index_and_input
+            x_next, result = step(t + i * h, join_state(parts, x.shape[0]), given)
+            return split_state(x_next.astype(x.dtype)), or_none(result)
+
+        xs = (jnp.arange(self.substeps), inputs)
+        parts, results = lax.scan(body, split_state(x), xs)
+        return join_state(parts, x.shape[0]), first_of(results)
+
+    def _adaptive(self, field, t, x, args):
+        t0 = jnp.asarray(t, x.dtype)
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(field),
+            self.solver,
+            t0,
+            t0 + self.dt,
+            dt0=None,
+            y0=x,
+            args=args,
+            stepsize_controller=self.stepsize_controller,
+            adjoint=self.adjoint,
+            max_steps=self.max_steps,
+            throw=False,
+        )
+        return solution.ys[0], promote(solution.result)
+
+
+def _has_diffusion(system: AbstractSystem) -> bool:
+    if type(system).diffusion is AbstractSystem.diffusion:
+        return False
+    t, x, u = jnp.zeros(()), jnp.zeros(system.state_size), jnp.zeros(system.control_size)
+    return eqx.filter_eval_shape(system.diffusion, t, x, u) is not None
+
+
+def _apply(g: Array, dB: Array) -> Array:
+    return g * dB if g.ndim == 1 else g @ dB
+
+
+class _BrownianTerm(diffrax.AbstractTerm):
+    """`g dB` with the increment of this step given."""
+
+    diffusion: Any
+    control: Array
+    increment: Array
+
+    def vf(self, t, y, args):
+        del args
+        return self.diffusion(t, y, self.control)
+
+    def contr(self, t0, t1, **kwargs):
+        del t0, t1, kwargs
+        return self.increment
+
+    def prod(self, vf, control):
+        return _apply(vf, control)
+
+
+def _check_implicit(solver: diffrax.AbstractSolver, where: str) -> None:
+    if solver.term_structure is not diffrax.AbstractTerm:
+        raise ValueError(
+            f"{where}: solver {type(solver).__name__} needs a split into stiff and "
+            "non-stiff parts; use diffrax.ImplicitEuler, Kvaerno3, Kvaerno4 or "
+            "Kvaerno5."
+        )
+
+
+def _for_one_step(solver: Any, dtype: Any) -> Any:
+    """An implicit solver that works outside `diffeqsolve`: differentiable both ways,
+    and with explicit tolerances where it would take them from a step-size controller.
+    """
+    if getattr(solver, "scan_kind", "bounded") is None:
+        solver = eqx.tree_at(
+            lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None
+        )
+    double = dtype == jnp.float64
+    values = {
+        "rtol": 1e-10 if double else 1e-5,
+        "atol": 1e-12 if double else 1e-6,
+        "norm": optx.rms_norm,
+    }
+    finder = solver.root_finder
+    names = [
+        name
+        for name in values
+        if "stepsize" in repr(getattr(finder, name, None)).replace("_", "")
+    ]
+    if not names:
+        return solver
+    return eqx.tree_at(
+        lambda s: [getattr(s.root_finder, name) for name in names],
+        solver,
+        [values[name] for name in names],
+        is_leaf=lambda leaf: leaf is getattr(finder, names[0]),
+    )
+
+
+def _solver_step(solver, term, t, x, h, args):
+    """One Diffrax step that starts afresh, as it must after a switch of the control."""
+    t0 = jnp.asarray(t, x.dtype)
+    t1 = t0 + h
+    state = solver.init(term, t0, t1, x, args)
+    x_next, _, _, _, result = solver.step(
+        term, t0, t1, x, args, state, made_jump=jnp.array(True)
+    )
+    return x_next, promote(result)

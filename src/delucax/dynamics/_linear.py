@@ -1,0 +1,188 @@
+"""Linear dynamics in discrete time, about their operating point."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._check import as_matrix, as_vector, check_positive
+from .._fields import as_float_array, parameter
+from .._names import indexed_names
+from .._results import RESULTS
+from ..math import matvec
+from ..systems._linear import check_matrices
+from ._base import AbstractDynamics
+
+
+class LinearDynamics(AbstractDynamics):
+    """Affine dynamics about an operating point,
+
+    `x_next = x_ref_next + A (x - x_ref) + B (u - u_ref) + E w`, `y = C x`,
+
+    with `x_ref_next` given as the argument `x_next`. Time-invariant, or time-varying:
+    then `A` and `B` (and whichever of the rest) have a leading time axis, indexed by
+    `round(t / dt)`; beyond its end the next state is NaN, which a rollout reports.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`, or `(T, n, n)`.
+    - `B`: shape `(n, m)`, or `(T, n, m)`.
+    - `C`: shape `(p, n)`; the identity by default. Time-invariant.
+    - `E`: shape `(n, k)`, or `(T, n, k)`; the identity by default.
+    - `dt`: the step, 1 by default.
+    - `x_ref`, `u_ref`: the operating point, shapes `(n,)` and `(m,)` or with a leading
+        time axis; zero by default.
+    - `x_next`: where the operating point goes, shape `(n,)` or `(T, n)`; by default
+        `x_ref`, an equilibrium.
+    - `state_names`, `control_names`: `("x0", ...)` and `("u0", ...)` by default.
+
+    **Raises:** `ValueError` if shapes do not fit, entries are not finite, or `dt` is not
+    positive.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+        B = jnp.array([[0.0], [1.0]])
+        dynamics = dlx.LinearDynamics(A, B)
+        dynamics(0.0, jnp.ones(2), jnp.zeros(1))
+        ```
+    """
+
+    A: Float[Array, "*T n n"] = parameter()
+    B: Float[Array, "*T n m"] = parameter()
+    C: Float[Array, "p n"] | None = parameter()
+    E: Float[Array, "*T n k"] | None = parameter()
+    dt: Array = parameter()
+    x_ref: Float[Array, "*T n"] = parameter()
+    u_ref: Float[Array, "*T m"] = parameter()
+    x_next: Float[Array, "*T n"] = parameter()
+    state_names: tuple[str, ...] = eqx.field(static=True)
+    control_names: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        A: Any,
+        B: Any,
+        C: Any = None,
+        E: Any = None,
+        dt: Any = 1.0,
+        x_ref: Any = None,
+        u_ref: Any = None,
+        x_next: Any = None,
+        *,
+        state_names: tuple[str, ...] | None = None,
+        control_names: tuple[str, ...] | None = None,
+    ):
+        where = "LinearDynamics"
+        A, B, E = as_float_array(A), as_float_array(B), as_float_array(E)
+        steps = None
+        if eqx.is_array(A) and A.ndim == 3:
+            steps = A.shape[0]
+            A = as_matrix(A, "A", where, ndim=3)
+            B = _in_time(as_matrix(B, "B", where, ndim=jnp.ndim(B)), steps, 2, "B")
+            if E is not None:
+                E = _in_time(as_matrix(E, "E", where, ndim=jnp.ndim(E)), steps, 2, "E")
+            if steps == 0:
+                raise ValueError(f"{where}: A must have at least one time step.")
+            E0 = None if E is None else E[0]
+            _, _, C, _ = check_matrices(A[0], B[0], C, E0, where)
+        else:
+            A, B, C, E = check_matrices(A, B, C, E, where)
+        n, m = B.shape[-2:]
+        self.A, self.B, self.C, self.E = A, B, C, E
+        check_positive(dt, "dt", where)
+        self.dt = dt
+        self.x_ref = _point(x_ref, n, steps, "x_ref", jnp.zeros(n, A.dtype))
+        self.u_ref = _point(u_ref, m, steps, "u_ref", jnp.zeros(m, A.dtype))
+        self.x_next = _point(x_next, n, steps, "x_next", self.x_ref)
+        self.state_names = _checked(state_names, "x", n, "state_names")
+        self.control_names = _checked(control_names, "u", m, "control_names")
+
+    @property
+    def is_time_varying(self) -> bool:
+        """Whether the matrices have a leading time axis."""
+        return self.A.ndim == 3
+
+    @property
+    def disturbance_size(self) -> int:
+        """The number of columns of `E`; the size of the state by default."""
+        return self.state_size if self.E is None else self.E.shape[-1]
+
+    def at(self, t: Any) -> "LinearDynamics":
+        """The time-invariant dynamics that hold at time `t`.
+
+        **Arguments:** `t`: time, a scalar.
+
+        **Returns:** `LinearDynamics` whose matrices have no time axis.
+        """
+        if not self.is_time_varying:
+            return self
+        k = jnp.round(t / self.dt).astype(int)
+        here = lambda array: array.at[k].get(mode="fill", fill_value=jnp.nan)  # noqa: E731
+        pick = lambda s: [s.A, s.B, s.E, s.x_ref, s.u_ref, s.x_next]  # noqa: E731
+        return eqx.tree_at(
+            pick,
+            self,
+            [None if a is None else here(a) for a in pick(self)],
+            is_leaf=lambda leaf: leaf is None,
+        )
+
+    def advance(self, t, x, u, w):
+        here = self.at(t)
+        x_next = here.x_next + matvec(here.A, x - here.x_ref)
+        x_next = x_next + matvec(here.B, u - here.u_ref)
+        if w is not None:
+            x_next = x_next + (w if here.E is None else matvec(here.E, w))
+        return x_next.astype(x.dtype), RESULTS.successful
+
+    def observe(self, t, x):
+        return x if self.C is None else matvec(self.C, x)
+
+    def equilibrium(self):
+        here = self.at(0.0)
+        return here.x_ref, here.u_ref
+
+
+def _in_time(array: Array, steps: int, ndim: int, name: str) -> Array:
+    """`array` with a leading time axis of `steps`, broadcast if it has none."""
+    if array.ndim == ndim:
+        return jnp.broadcast_to(array, (steps, *array.shape))
+    if array.ndim != ndim + 1 or array.shape[0] != steps:
+        raise ValueError(
+            f"LinearDynamics: {name} must have {ndim} axes, or a leading time axis of "
+            f"{steps} as A has, got shape {array.shape}."
+        )
+    return array
+
+
+def _point(value: Any, size: int, steps: int | None, name: str, default: Array):
+    if value is None:
+        array = default
+    else:
+        array = as_float_array(value)
+        if not (steps is not None and jnp.ndim(array) == 2):
+            array = as_vector(array, size, name, "LinearDynamics")
+    if steps is None:
+        return array
+    array = _in_time(array, steps, 1, name)
+    if array.shape[-1] != size:
+        raise ValueError(
+            f"LinearDynamics: {name} must have {size} entries a step, got shape "
+            f"{array.shape}."
+        )
+    return array
+
+
+def _checked(names, letter: str, size: int, argument: str) -> tuple[str, ...]:
+    if names is None:
+        return indexed_names(letter, size)
+    if len(names) != size:
+        raise ValueError(
+            f"LinearDynamics: {argument} must have {size} names, got {names!r}."
+        )
+    return tuple(names)

@@ -1,0 +1,100 @@
+"""States under given controls."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import as_vector
+from .._fields import as_float_array
+from .._results import first_failure, first_of, or_none, RESULTS
+from .._typing import RealScalar
+from ._base import AbstractDynamics
+from ._runge_kutta import join_state, split_state, stack_steps
+
+
+def open_loop(
+    dynamics: AbstractDynamics,
+    x0: Any,
+    controls: Any,
+    w: Any = None,
+    t0: RealScalar = 0.0,
+) -> Array:
+    """The states that given controls lead to, for planning and identification.
+
+    `x_{k+1} = F(t0 + k dt, x_k, u_k, w_k)`.
+
+    **Arguments:**
+
+    - `dynamics`: the discrete-time dynamics.
+    - `x0`: the first state, shape `(n,)`.
+    - `controls`: shape `(T, m)`.
+    - `w`: disturbances, shape `(T, k)`; zero by default.
+    - `t0`: the time of the first state, 0 by default.
+
+    **Returns:** the states, shape `(T + 1, n)`. Compiled at its door; differentiable
+    with respect to every array.
+
+    **Raises:** `ValueError` on a wrong shape, and an error at run time if the solver
+    fails or a state becomes NaN or infinite.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        states = dlx.open_loop(dynamics, jnp.zeros(2), 0.1 * jnp.ones((20, 1)))
+        ```
+    """
+    where = "open_loop"
+    if not isinstance(dynamics, AbstractDynamics):
+        raise ValueError(
+            f"{where}: dynamics must be an AbstractDynamics, got "
+            f"{type(dynamics).__name__}."
+        )
+    x0 = as_vector(x0, dynamics.state_size, "x0", where)
+    controls = _sequence(controls, dynamics.control_size, "controls", where)
+    if w is not None:
+        w = _sequence(w, dynamics.disturbance_size, "w", where)
+        if w.shape[0] != controls.shape[0]:
+            raise ValueError(
+                f"{where}: w must have as many steps as controls "
+                f"({controls.shape[0]}), got shape {w.shape}."
+            )
+    return _open_loop(dynamics, x0, controls, w, as_float_array(t0))
+
+
+@eqx.filter_jit
+def _open_loop(dynamics, x0, controls, w, t0):
+    size = x0.shape[0]
+
+    @jax.checkpoint
+    def body(parts, inputs):
+        k, u, w = inputs
+        t = t0 + k * dynamics.dt
+        x_next, result = dynamics.advance(t, join_state(parts, size), u, w)
+        parts = split_state(x_next.astype(x0.dtype))
+        return parts, (parts, or_none(result))
+
+    steps = jnp.arange(controls.shape[0])
+    _, (parts, results) = lax.scan(body, split_state(x0), (steps, controls, w))
+    states = jnp.concatenate([x0[None], stack_steps(parts, size)])
+    finite = jnp.all(jnp.isfinite(states[-1]))
+    end = RESULTS.where(finite, RESULTS.successful, RESULTS.diverged)
+    result = first_failure(first_of(results), end)
+    return result.error_if(states, result != RESULTS.successful)
+
+
+def _sequence(value: Any, size: int, name: str, where: str) -> Array:
+    array = as_float_array(value)
+    if not eqx.is_inexact_array(array) or array.ndim != 2 or array.shape[1] != size:
+        got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+        raise ValueError(f"{where}: {name} must have shape (steps, {size}), got {got}.")
+    if array.shape[0] == 0:
+        raise ValueError(f"{where}: {name} must have at least one step.")
+    return array

@@ -1,0 +1,15 @@
+"""Environments, and the named tasks."""
+
+from ._environment import (
+    Environment as Environment,
+    Step as Step,
+    UniformState as UniformState,
+    randomise as randomise,
+)
+from ._lds import lds as lds
+from ._pendulum import (
+    GymPendulum as GymPendulum,
+    pendulum as pendulum,
+    pendulum_features as pendulum_features,
+)
+from ._registry import make as make, register as register, registered as registered

@@ -1,0 +1,373 @@
+"""The closed world that a controller acts in."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array
+
+from .._check import as_vector, check_count, check_key, is_concrete
+from .._fields import as_float_array, parameter
+from .._paths import get_path, replace
+from .._results import Result
+from .._typing import PRNGKey, RealScalar
+from ..costs import AbstractCost
+from ..disturbances import AbstractDisturbance, Brownian, Zero
+from ..dynamics import AbstractDynamics
+
+
+class Step(NamedTuple):
+    """What one step of an environment returns.
+
+    - `state`: the next state.
+    - `control`: the control that was applied, after the bounds.
+    - `cost`: the stage cost at the current state and the applied control.
+    - `terminated`: whether the next state ends the episode.
+    - `result`: what became of the step, one of `delucax.RESULTS`.
+    """
+
+    state: Array
+    control: Array
+    cost: Array
+    terminated: Array
+    result: Result
+
+
+class UniformState(eqx.Module):
+    """A first state drawn uniformly from a box.
+
+    **Arguments:** `low`, `high`: vectors, the corners of the box.
+
+    **Raises:** `ValueError` if the corners differ in size or `low` is above `high`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        start = dlx.environments.UniformState(-jnp.ones(2), jnp.ones(2))
+        start(jax.random.key(0))
+        ```
+    """
+
+    low: Array = parameter()
+    high: Array = parameter()
+
+    def __check_init__(self):
+        _check_bounds(self.low, self.high, jnp.shape(self.low), "UniformState: low")
+
+    def __call__(self, key: PRNGKey) -> Array:
+        """A state drawn with `key`."""
+        unit = jr.uniform(key, self.low.shape, self.low.dtype)
+        return self.low + (self.high - self.low) * unit
+
+
+class Environment(eqx.Module):
+    """Dynamics, a cost, and what else makes a task of them.
+
+    `jax.jit(env.step)` raises "unhashable", as it does for a method of any module that
+    holds arrays: use `eqx.filter_jit(env.step)`, or pass the environment as an
+    argument, `jax.jit(Environment.step)(env, ...)`. `vmap` and `scan` work as they are.
+
+    **Arguments:**
+
+    - `dynamics`: the discrete-time dynamics.
+    - `cost`: the stage and final cost; minus the reward.
+    - `disturbance`: the disturbances; by default none, or the Brownian increments of
+        dynamics that have a diffusion.
+    - `sensor_noise`: disturbances added to what is observed; none by default.
+    - `initial_state`: a vector, or a function of a key to one; zero by default.
+    - `control_bounds`: `(low, high)`, each a number or a vector; controls are clipped to
+        them. None by default.
+    - `horizon`: steps an episode, 200 by default.
+    - `terminated`: `(t, x) -> bool`; never by default.
+    - `actions`: the table behind integer actions, shape `(actions, m)`; none by default.
+    - `encode`: what a network or a Gymnasium user sees of an observation (cosine and
+        sine of an angle, for example): a function of a vector to a vector; the identity
+        by default. Controllers are given the observation itself.
+
+    **Raises:** `ValueError` if sizes do not fit each other or bounds cross.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        cost = dlx.costs.Quadratic(jnp.eye(2), 0.1 * jnp.eye(1))
+        env = dlx.Environment(dynamics, cost, control_bounds=(-2.0, 2.0))
+        step = env.step(0.0, jnp.array([0.1, 0.0]), jnp.zeros(1), None)
+        ```
+    """
+
+    dynamics: AbstractDynamics
+    cost: AbstractCost
+    disturbance: AbstractDisturbance
+    sensor_noise: AbstractDisturbance | None
+    initial_state: Array | Callable[[PRNGKey], Array] = parameter()
+    control_bounds: tuple[Array, Array] | None
+    horizon: int = eqx.field(static=True)
+    terminated: Callable[[RealScalar, Array], Array] | None
+    actions: Array | None = parameter()
+    encode: Callable[[Array], Array]
+
+    def __init__(
+        self,
+        dynamics: AbstractDynamics,
+        cost: AbstractCost,
+        disturbance: AbstractDisturbance | None = None,
+        sensor_noise: AbstractDisturbance | None = None,
+        initial_state: Any = None,
+        control_bounds: tuple[Any, Any] | None = None,
+        horizon: int = 200,
+        terminated: Callable[[RealScalar, Array], Array] | None = None,
+        actions: Any = None,
+        encode: Callable[[Array], Array] | None = None,
+    ):
+        where = "Environment"
+        if not isinstance(dynamics, AbstractDynamics):
+            raise ValueError(
+                f"{where}: dynamics must be an AbstractDynamics (discretise a system "
+                f"with `delucax.Discretized`), got {type(dynamics).__name__}."
+            )
+        if not isinstance(cost, AbstractCost):
+            raise ValueError(
+                f"{where}: cost must be an AbstractCost (wrap a function with "
+                f"`delucax.costs.Function`), got {type(cost).__name__}."
+            )
+        n, m = dynamics.state_size, dynamics.control_size
+        k = dynamics.disturbance_size
+        if disturbance is None:
+            if dynamics.is_stochastic:
+                substeps = getattr(dynamics, "substeps", 1)
+                disturbance = Brownian(k // substeps, dynamics.dt, substeps)
+            else:
+                disturbance = Zero(k)
+        for name, given, size in (
+            ("disturbance", disturbance, k),
+            ("sensor_noise", sensor_noise, None),
+        ):
+            if given is None:
+                continue
+            if not isinstance(given, AbstractDisturbance):
+                raise ValueError(
+                    f"{where}: {name} must be an AbstractDisturbance, got "
+                    f"{type(given).__name__}."
+                )
+            size = dynamics.observation_size if size is None else size
+            if given.size != size:
+                raise ValueError(
+                    f"{where}: {name} has size {given.size} where {size} is expected."
+                )
+        if initial_state is None:
+            initial_state = jnp.zeros(n)
+        if not callable(initial_state):
+            initial_state = as_vector(initial_state, n, "initial_state", where)
+        if control_bounds is not None:
+            if not isinstance(control_bounds, tuple | list) or len(control_bounds) != 2:
+                raise ValueError(
+                    f"{where}: control_bounds must be a pair (low, high), got "
+                    f"{control_bounds!r}."
+                )
+            low, high = (as_float_array(b) for b in control_bounds)
+            _check_bounds(low, high, (m,), f"{where}: control_bounds")
+            control_bounds = (low, high)
+        if actions is not None:
+            actions = as_float_array(actions)
+            if actions.ndim != 2 or actions.shape[1] != m:
+                raise ValueError(
+                    f"{where}: actions must have shape (actions, {m}), got "
+                    f"{actions.shape}."
+                )
+        self.dynamics = dynamics
+        self.cost = cost
+        self.disturbance = disturbance
+        self.sensor_noise = sensor_noise
+        self.initial_state = initial_state
+        self.control_bounds = control_bounds
+        self.horizon = check_count(horizon, "horizon", where)
+        self.terminated = terminated
+        self.actions = actions
+        self.encode = _identity if encode is None else encode
+
+    @property
+    def dt(self) -> Array:
+        """The control interval."""
+        return self.dynamics.dt
+
+    @property
+    def state_size(self) -> int:
+        """The number of states."""
+        return self.dynamics.state_size
+
+    @property
+    def control_size(self) -> int:
+        """The number of controls."""
+        return self.dynamics.control_size
+
+    @property
+    def disturbance_size(self) -> int:
+        """The size of `w`."""
+        return self.dynamics.disturbance_size
+
+    @property
+    def observation_size(self) -> int:
+        """The size of what a controller is given."""
+        return self.dynamics.observation_size
+
+    @property
+    def feature_size(self) -> int:
+        """The size of what `encode` returns."""
+        y = jnp.zeros(self.observation_size)
+        return eqx.filter_eval_shape(self.encode, y).shape[0]
+
+    def reset(self, key: PRNGKey) -> Array:
+        """A first state.
+
+        **Arguments:** `key`: a random key.
+
+        **Returns:** the state, shape `(state_size,)`.
+        """
+        if callable(self.initial_state):
+            return as_vector(
+                self.initial_state(key), self.state_size, "initial_state", "Environment"
+            )
+        return self.initial_state
+
+    def saturate(self, u: Array) -> Array:
+        """The control that is applied when `u` is asked for.
+
+        **Arguments:** `u`: a control, shape `(m,)`; or an integer action, a scalar,
+            where there is a table of `actions`.
+
+        **Returns:** shape `(m,)`.
+        """
+        if self.actions is not None and jnp.issubdtype(jnp.result_type(u), jnp.integer):
+            if jnp.ndim(u) != 0:
+                raise ValueError(
+                    "Environment: u must be one integer action (a scalar) or a control "
+                    f"of shape ({self.control_size},), got shape {jnp.shape(u)}."
+                )
+            u = self.actions[u]
+        if self.control_bounds is None:
+            return u
+        low, high = self.control_bounds
+        return jnp.clip(u, low, high).astype(u.dtype)
+
+    def step(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None = None
+    ) -> Step:
+        """One step: clip the control, charge the stage cost, advance the state.
+
+        **Arguments:**
+
+        - `t`: time, a scalar.
+        - `x`: state, shape `(state_size,)`.
+        - `u`: control, shape `(control_size,)`; or an integer where there is a table of
+            `actions`.
+        - `w`: disturbance, shape `(disturbance_size,)`; `None` for zero.
+
+        **Returns:** a [`delucax.environments.Step`][].
+
+        **Raises:** `ValueError` on a wrong shape.
+        """
+        x = as_vector(x, self.state_size, "x (the state)", "Environment.step")
+        u = self.saturate(as_float_array(u) if self.actions is None else jnp.asarray(u))
+        u = as_vector(u, self.control_size, "u (the control)", "Environment.step")
+        if w is not None:
+            size = self.disturbance_size
+            w = as_vector(w, size, "w (the disturbance)", "Environment.step")
+        cost = jnp.asarray(self.cost(t, x, u))
+        if cost.shape != ():
+            raise ValueError(
+                f"{type(self.cost).__name__}: the stage cost must be a scalar, got an "
+                f"array of shape {cost.shape}."
+            )
+        x_next, result = self.dynamics.advance(t, x, u, w)
+        if self.terminated is None:
+            terminated = jnp.zeros((), bool)
+        else:
+            terminated = jnp.asarray(self.terminated(t + self.dt, x_next))
+        return Step(x_next, u, cost, terminated, result)
+
+
+def _identity(x):
+    return x
+
+
+def _check_bounds(low: Array, high: Array, shape: tuple[int, ...], what: str) -> None:
+    for end in (low, high):
+        if not eqx.is_array(end) or end.shape not in ((), shape):
+            raise ValueError(
+                f"{what} and high must be numbers or have shape {shape}, got "
+                f"{jnp.shape(end)}."
+            )
+    if is_concrete(low) and is_concrete(high):
+        if not np.all(np.asarray(low) <= np.asarray(high)):
+            raise ValueError(f"{what} must have low <= high, got {low} and {high}.")
+
+
+def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
+    """A copy with the named parameters drawn at random: domain randomisation.
+
+    Under `jax.vmap` over keys it makes a batch of plants that compiles once.
+
+    **Arguments:**
+
+    - `tree`: an environment, or anything that [`delucax.replace`][] takes.
+    - `key`: a random key.
+    - `ranges`: from a path to `(low, high)`, drawn uniformly, or to a function of a key
+        to a value.
+
+    **Returns:** the copy.
+
+    **Raises:** `ValueError` if a path is not there, or a range is not a pair or function.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("pendulum")
+        ranges = {"dynamics.system.length": (0.8, 1.2)}
+
+        def cost(key):
+            plant = dlx.randomise(env, key, ranges)
+            zero = dlx.controllers.Zero(1)
+            return dlx.rollout(plant, zero, key=key).total_cost
+
+        jax.vmap(cost)(jax.random.split(jax.random.key(0), 8))
+        ```
+    """
+    check_key(key, "randomise")
+    changes = {}
+    for (path, given), one in zip(
+        ranges.items(), jr.split(key, len(ranges)), strict=True
+    ):
+        old = get_path(tree, path)
+        if callable(given):
+            changes[path] = given(one)
+        elif isinstance(given, tuple | list) and len(given) == 2:
+            low, high = (as_float_array(end) for end in given)
+            if is_concrete(low) and is_concrete(high) and not np.all(low <= high):
+                raise ValueError(
+                    f"randomise: the range of {path!r} must have low <= high, got "
+                    f"{given}."
+                )
+            shape = jnp.broadcast_shapes(jnp.shape(old), low.shape, high.shape)
+            unit = jr.uniform(one, shape, jnp.result_type(old, low, high))
+            changes[path] = low + (high - low) * unit
+        else:
+            raise ValueError(
+                f"randomise: the range of {path!r} must be a pair (low, high) or a "
+                f"function of a key, got {given!r}."
+            )
+    return replace(tree, changes)
+

@@ -1,0 +1,163 @@
+"""Swing up and hold a pendulum: Gym's Pendulum-v1."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._check import check_positive
+from .._fields import parameter, positive
+from .._results import RESULTS
+from ..costs import PendulumCost
+from ..dynamics import AbstractDynamics, Discretized
+from ..math import cos, sin
+from ..systems import Pendulum
+from ._environment import Environment, UniformState
+
+
+class GymPendulum(AbstractDynamics):
+    """Gym's arithmetic for the pendulum, which clips between its half-steps:
+
+    `velocity_next = clip(velocity + acceleration dt, -max_speed, max_speed)`,
+    `angle_next = angle + velocity_next dt`; then `w` is added.
+
+    Not smooth where the speed meets its limit: the gradient through the velocity is 0
+    beyond it. The angle is not wrapped.
+
+    **Arguments:**
+
+    - `system`: the pendulum.
+    - `dt`: the step, 0.05 by default.
+    - `max_speed`: 8 by default.
+
+    **Raises:** `ValueError` if `dt` or `max_speed` is not positive.
+
+    Source: Gymnasium (Towers et al., 2023), `Pendulum-v1`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dynamics = dlx.environments.GymPendulum(dlx.systems.Pendulum())
+        dynamics(0.0, jnp.array([0.1, 0.0]), jnp.zeros(1))
+        ```
+    """
+
+    system: Pendulum
+    dt: Array = parameter(0.05, constraint=positive)
+    max_speed: Array = parameter(8.0, constraint=positive)
+
+    state_names = Pendulum.state_names
+    control_names = Pendulum.control_names
+    state_units = Pendulum.state_units
+    control_units = Pendulum.control_units
+
+    def __check_init__(self):
+        check_positive(self.dt, "dt", "GymPendulum")
+        check_positive(self.max_speed, "max_speed", "GymPendulum")
+
+    def advance(self, t, x, u, w):
+        angle, velocity = x[0], x[1]
+        acceleration = self.system.acceleration(angle, velocity, u[0])
+        velocity = velocity + acceleration * self.dt
+        velocity = jnp.clip(velocity, -self.max_speed, self.max_speed)
+        angle = angle + velocity * self.dt
+        x_next = jnp.stack([angle, velocity])
+        if w is not None:
+            x_next = x_next + w
+        return x_next.astype(x.dtype), RESULTS.successful
+
+    def difference(self, x, x_ref):
+        return self.system.difference(x, x_ref)
+
+    def equilibrium(self):
+        return self.system.equilibrium()
+
+
+def pendulum_features(x: Array) -> Array:
+    """Cosine and sine of the angle, and the velocity: what Gymnasium users see.
+
+    **Arguments:** `x`: (angle, velocity).
+
+    **Returns:** (cos(angle), sin(angle), velocity).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.environments.pendulum_features(jnp.array([0.1, 0.0]))
+        ```
+    """
+    return jnp.stack([cos(x[0]), sin(x[0]), x[1]])
+
+
+def pendulum(
+    mass: Any = 1.0,
+    length: Any = 1.0,
+    gravity: Any = 10.0,
+    damping: Any = 0.0,
+    *,
+    dt: Any = 0.05,
+    horizon: int = 200,
+    max_torque: Any = 2.0,
+    max_speed: Any = 8.0,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **environment: Any,
+) -> Environment:
+    """Swing up a pendulum and hold it upright with a torque too weak to lift it at once.
+
+    State (angle, velocity) with angle 0 upright; control (torque). Starts with the angle
+    uniform over the circle and the velocity in +-1. Cost
+    `wrap(angle)^2 + 0.1 velocity^2 + 0.001 torque^2` a step. Never terminates.
+
+    **Arguments:**
+
+    - `mass`, `length`, `gravity`, `damping`: of [`delucax.systems.Pendulum`][].
+    - `dt`: the control interval, 0.05 by default.
+    - `horizon`: steps an episode, 200 by default.
+    - `max_torque`: 2 by default.
+    - `max_speed`: the speed limit of Gym's arithmetic, 8 by default.
+    - `solver`: a Diffrax solver in place of Gym's arithmetic (there is no speed limit
+        then).
+    - `substeps`: solver steps an interval, with `solver`.
+    - `**environment`: other arguments of [`delucax.Environment`][], such as
+        `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, or `substeps` without `solver`.
+
+    Source: Gymnasium (Towers et al., 2023), `Pendulum-v1`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.environments.pendulum(length=1.2, dt=0.02)
+        ```
+    """
+    system = Pendulum(mass, length, gravity, damping)
+    if solver is None:
+        if substeps != 1:
+            raise ValueError("pendulum: substeps needs a solver, such as RK4().")
+        dynamics = GymPendulum(system, dt, max_speed)
+    else:
+        dynamics = Discretized(system, dt, solver, substeps)
+    corner = np.array([np.pi, 1.0], np.float32)
+    arguments = dict(
+        dynamics=dynamics,
+        cost=PendulumCost(),
+        initial_state=UniformState(jnp.asarray(-corner), jnp.asarray(corner)),
+        control_bounds=(-max_torque, max_torque),
+        horizon=horizon,
+        encode=pendulum_features,
+    )
+    return Environment(**(arguments | environment))

@@ -1,0 +1,91 @@
+"""Tasks by name."""
+
+import difflib
+import importlib
+from typing import Any
+
+from ._environment import Environment
+
+
+_REGISTRY: dict[str, str] = {
+    "pendulum": "delucax.environments:pendulum",
+    "classic/pendulum": "delucax.environments:pendulum",
+    "lds": "delucax.environments:lds",
+}
+
+
+def make(name: str, **kwargs: Any) -> Environment:
+    """The task of that name.
+
+    **Arguments:**
+
+    - `name`: such as `"pendulum"`; the paper's names (`"classic/pendulum"`) work too.
+    - `**kwargs`: passed to the function that makes the task.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on an unknown name, with the close ones.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("pendulum", length=1.2)
+        ```
+    """
+    if name not in _REGISTRY:
+        names = sorted(_REGISTRY)
+        close = difflib.get_close_matches(str(name), names, n=3, cutoff=0.4) or names
+        raise ValueError(
+            f"make: no task is called {name!r}; did you mean "
+            f"{' or '.join(repr(n) for n in close)}? All names: {', '.join(names)}."
+        )
+    module, _, function = _REGISTRY[name].partition(":")
+    return getattr(importlib.import_module(module), function)(**kwargs)
+
+
+def register(name: str, entry_point: str) -> None:
+    """Add a task that [`delucax.make`][] finds.
+
+    **Arguments:**
+
+    - `name`: what to call it.
+    - `entry_point`: `"module:function"`, imported when the task is first made; the
+        function returns an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` if the entry point is not of that form, or if the name is
+    taken by another.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dlx.register("my_pendulum", "delucax.environments:pendulum")
+        env = dlx.make("my_pendulum")
+        ```
+    """
+    module, _, function = str(entry_point).partition(":")
+    if not module or not function.isidentifier():
+        raise ValueError(
+            "register: entry_point must be 'module:function', such as "
+            f"'my_package.tasks:rocket', got {entry_point!r}."
+        )
+    if _REGISTRY.get(name, entry_point) != entry_point:
+        raise ValueError(f"register: {name!r} is already {_REGISTRY[name]!r}.")
+    _REGISTRY[name] = entry_point
+
+
+def registered() -> tuple[str, ...]:
+    """The names that [`delucax.make`][] knows.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dlx.environments.registered()
+        ```
+    """
+    return tuple(sorted(_REGISTRY))

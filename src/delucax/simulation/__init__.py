@@ -1,0 +1,4 @@
+"""Closed loops, step by step and over a whole horizon."""
+
+from ._rollout import rollout as rollout
+from ._trajectory import Trajectory as Trajectory

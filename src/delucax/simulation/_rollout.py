@@ -1,0 +1,329 @@
+"""The closed loop."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+
+from .._check import as_vector, check_count, check_key, is_concrete
+from .._controller import AbstractController
+from .._fields import as_float_array
+from .._results import first_failure, first_of, or_none, RESULTS
+from .._typing import PRNGKey
+from ..disturbances import Zero
+from ..dynamics._runge_kutta import join_state, split_state, stack_steps
+from ..environments import Environment
+from ._trajectory import Trajectory
+
+
+Checkpoint = Literal["step", "sqrt"] | None
+KEEP = (
+    "states",
+    "observations",
+    "controls",
+    "disturbances",
+    "costs",
+    "terminated",
+)
+
+
+def rollout(
+    environment: Environment,
+    controller: AbstractController,
+    *,
+    key: PRNGKey,
+    horizon: int | None = None,
+    x0: Any = None,
+    w: Any = None,
+    keep: Sequence[str] = KEEP,
+    checkpoint: Checkpoint = "step",
+    gradient_decay: Any = 1.0,
+    throw: bool = True,
+) -> Trajectory:
+    """Run a controller in an environment: the one closed loop of the library.
+
+    At each step k, with `t_k = k dt`: the controller acts on the observation `y_k`; the
+    environment clips the control, charges `c(t_k, x_k, u_k)` and steps; the controller
+    is told the control that was applied and its cost. The final cost is charged once,
+    at `x_T` or on entering a terminated state, after which the state is held at no cost.
+
+    It is compiled at its door, as `diffrax.diffeqsolve` is: a second call with other
+    numbers, another key or start does not compile again. A batch is `jax.vmap` of it.
+    It is differentiable with respect to every array leaf of its arguments.
+
+    **Arguments:**
+
+    - `environment`: the environment.
+    - `controller`: the controller.
+    - `key`: a random key, for the start, the disturbances, the sensor noise and the
+        controller.
+    - `horizon`: steps; the environment's own by default.
+    - `x0`: the first state, shape `(n,)`; drawn by the environment by default.
+    - `w`: disturbances, shape `(horizon, k)`; drawn by the environment by default.
+    - `keep`: what the trajectory stores, of `"states"`, `"observations"`, `"controls"`,
+        `"disturbances"`, `"costs"` and `"terminated"`; all by default.
+    - `checkpoint`: what the gradient stores. `"step"` (default): the state at each step,
+        and the step is computed again; `"sqrt"`: the state at each of about the square
+        root of T steps, for long horizons; `None`: all that is needed, nothing computed
+        again.
+    - `gradient_decay`: the gradient passing back through the state is multiplied by it
+        at each step. 1, the true gradient, by default; 0.9 damps the exploding
+        gradients of a long unstable horizon.
+    - `throw`: raise if a step fails or the states become NaN or infinite (default); if
+        false, look at `trajectory.result`.
+
+    **Returns:** a [`delucax.Trajectory`][].
+
+    **Raises:** `ValueError` on an argument of the wrong kind or shape; an error at run
+    time as `throw` says.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        controller = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
+        trajectory = dlx.rollout(env, controller, key=jax.random.key(0))
+        keys = jax.random.split(jax.random.key(1), 100)
+        batch = jax.vmap(lambda k: dlx.rollout(env, controller, key=k))(keys)
+        ```
+    """
+    where = "rollout"
+    if not isinstance(environment, Environment):
+        raise ValueError(
+            f"{where}: environment must be an Environment, got "
+            f"{type(environment).__name__}."
+        )
+    if not isinstance(controller, AbstractController):
+        raise ValueError(
+            f"{where}: controller must be an AbstractController, got "
+            f"{type(controller).__name__}."
+        )
+    check_key(key, where)
+    horizon = environment.horizon if horizon is None else horizon
+    horizon = check_count(horizon, "horizon", where)
+    if x0 is not None:
+        x0 = as_vector(x0, environment.state_size, "x0", where)
+        if is_concrete(x0) and not np.all(np.isfinite(x0)):
+            raise ValueError(f"{where}: x0 must be finite, got {x0}.")
+    if w is not None:
+        w = as_float_array(w)
+        shape = (horizon, environment.disturbance_size)
+        if jnp.shape(w) != shape:
+            raise ValueError(
+                f"{where}: w must have shape (horizon, disturbances) = {shape}, got "
+                f"{jnp.shape(w)}."
+            )
+    keep = (keep,) if isinstance(keep, str) else tuple(keep)
+    if not set(keep) <= set(KEEP):
+        raise ValueError(
+            f"{where}: keep must be some of {', '.join(KEEP)}; got {keep!r}."
+        )
+    if checkpoint not in ("step", "sqrt", None):
+        raise ValueError(
+            f"{where}: checkpoint must be 'step', 'sqrt' or None, got {checkpoint!r}."
+        )
+    if isinstance(gradient_decay, int | float) and gradient_decay == 1:
+        decay = None
+    else:
+        decay = as_float_array(gradient_decay)
+    trajectory = _rollout(
+        environment,
+        controller,
+        key,
+        x0,
+        w,
+        decay,
+        horizon,
+        tuple(name for name in KEEP if name in keep),
+        checkpoint,
+    )
+    return _checked(trajectory) if throw else trajectory
+
+
+def _checked(trajectory: Trajectory) -> Trajectory:
+    """Raise if the trajectory failed: now if it can be seen, else at run time."""
+    failed = trajectory.result != RESULTS.successful
+    if not is_concrete(failed):
+        return trajectory.result.error_if(trajectory, failed)
+    if failed:
+        message = f"rollout: {RESULTS[trajectory.result]}"
+        if trajectory.states is not None:
+            bad = ~np.all(np.isfinite(trajectory.states), axis=-1)
+            if bad.any():
+                k = int(np.argmax(bad))
+                message += (
+                    f" The state after step {k} (t = {float(trajectory.times[k]):g}) "
+                    "is the first that is not finite."
+                )
+        raise RuntimeError(message + " Pass throw=False to look at the trajectory.")
+    return trajectory
+
+
+@eqx.filter_jit
+def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
+    dynamics = env.dynamics
+    start_key, w_key, noise_key, controller_key = jr.split(key, 4)
+    if x0 is None:
+        x0 = env.reset(start_key)
+    size, dtype, dt = x0.shape[0], x0.dtype, env.dt
+    times = (jnp.arange(horizon + 1) * dt).astype(dtype)
+    if w is None and not isinstance(env.disturbance, Zero):
+        w = _drawn(env.disturbance, w_key, times[:-1], env.disturbance_size)
+    noise = None
+    if env.sensor_noise is not None:
+        noise = _drawn(env.sensor_noise, noise_key, times[:-1], env.observation_size)
+    ends = env.terminated is not None
+    plain_sight = True  # whether the observation is the state itself, found by tracing
+
+    first = controller.init(key=controller_key)
+    first, static = eqx.partition(first, eqx.is_array)
+
+    def body(carry, inputs):
+        nonlocal plain_sight
+        parts, memory, ended, total = carry
+        k, w, noise = inputs
+        t = (k * dt).astype(dtype)
+        x = join_state(parts, size)
+        if decay is not None:
+            x = lax.stop_gradient(x) + decay * (x - lax.stop_gradient(x))
+        y = dynamics.observe(t, x)
+        plain_sight = noise is None and y is x
+        y = y if noise is None else (y + noise).astype(dtype)
+        u, after = controller(t, y, eqx.combine(memory, static))
+        _check_control(controller, u, env)
+        step = env.step(t, x, u, w)
+        cost, x_next, result = step.cost.astype(dtype), step.state, step.result
+        after = controller.applied(step.control, cost, after)
+        after = eqx.filter(after, eqx.is_array)
+        if ends:
+            done, length = ended
+            cost = jnp.where(done, 0, cost)
+            x_next = jnp.where(done, x, x_next)
+            after = jax.tree.map(lambda a, b: jnp.where(done, a, b), memory, after)
+            if result is not RESULTS.successful:
+                result = RESULTS.where(done, RESULTS.successful, result)
+            ended = (done | step.terminated, length + ~done)
+        parts = split_state(x_next.astype(dtype))
+        kept = {
+            "states": parts,
+            "observations": None if plain_sight and "states" in keep else y,
+            "controls": step.control,
+            "costs": cost,
+            "terminated": ended[0] if ends else None,
+        }
+        kept = {name: value for name, value in kept.items() if name in keep}
+        total = None if total is None else total + cost
+        return (parts, after, ended, total), (kept, or_none(result))
+
+    carry = (
+        split_state(x0),
+        first,
+        (jnp.zeros((), bool), jnp.zeros((), int)) if ends else None,
+        None if "costs" in keep else jnp.zeros((), dtype),
+    )
+    inputs = (jnp.arange(horizon), w, noise)
+    carry, (kept, results) = _scan(body, carry, inputs, horizon, checkpoint)
+    parts, _, ended, total = carry
+    final_state = join_state(parts, size)
+
+    states = observations = None
+    if "states" in kept:
+        states = jnp.concatenate([x0[None], stack_steps(kept["states"], size)])
+    if "observations" in keep:
+        observations = kept["observations"]
+        if observations is None:
+            observations = states[:-1]
+    terminated = kept.get("terminated")
+    if "terminated" in keep and not ends:
+        terminated = jnp.zeros(horizon, bool)
+    disturbances = None
+    if "disturbances" in keep:
+        zeros = jnp.zeros((horizon, env.disturbance_size), dtype)
+        disturbances = zeros if w is None else w
+    length = ended[1] if ends else jnp.asarray(horizon)
+    end = (length * dt).astype(dtype)
+    final_cost = jnp.asarray(env.cost.final(end, final_state), dtype)
+    if final_cost.shape != ():
+        raise ValueError(
+            f"{type(env.cost).__name__}: the final cost must be a scalar, got an array "
+            f"of shape {final_cost.shape}."
+        )
+    costs = kept.get("costs")
+    total_cost = (jnp.sum(costs) if total is None else total) + final_cost
+    finite = jnp.all(jnp.isfinite(final_state)) & jnp.isfinite(total_cost)
+    diverged = RESULTS.where(finite, RESULTS.successful, RESULTS.diverged)
+    return Trajectory(
+        times=times,
+        states=states if "states" in keep else None,
+        observations=observations,
+        controls=kept.get("controls"),
+        disturbances=disturbances,
+        costs=costs,
+        terminated=terminated,
+        final_state=final_state,
+        final_cost=final_cost,
+        total_cost=total_cost,
+        length=length,
+        result=first_failure(first_of(results), diverged),
+        state_names=dynamics.state_names,
+        control_names=dynamics.control_names,
+        state_units=dynamics.state_units,
+        control_units=dynamics.control_units,
+    )
+
+
+def _scan(body, carry, inputs, horizon, checkpoint):
+    """`lax.scan` over the horizon, with what the gradient stores chosen."""
+    if checkpoint == "step":
+        body = jax.checkpoint(body)
+    if checkpoint != "sqrt":
+        return lax.scan(body, carry, inputs)
+    block = max(1, math.isqrt(horizon))
+    blocks, rest = divmod(horizon, block)
+    inner = jax.checkpoint(body)
+    whole = jax.checkpoint(lambda carry, xs: lax.scan(inner, carry, xs))
+    cut = blocks * block
+    shaped = jax.tree.map(
+        lambda a: a[:cut].reshape(blocks, block, *a.shape[1:]), inputs
+    )
+    carry, kept = lax.scan(whole, carry, shaped)
+    kept = jax.tree.map(lambda a: a.reshape(cut, *a.shape[2:]), kept)
+    if rest:
+        tail = jax.tree.map(lambda a: a[cut:], inputs)
+        carry, last = lax.scan(inner, carry, tail)
+        kept = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), kept, last)
+    return carry, kept
+
+
+def _drawn(disturbance, key, times, size):
+    """The sequence that a disturbance draws, with its shape checked."""
+    w = disturbance.sequence(key, times)
+    shape = (times.shape[0], size)
+    if jnp.shape(w) != shape:
+        raise ValueError(
+            f"{type(disturbance).__name__}: sequence must return shape {shape}, got "
+            f"{jnp.shape(w)}."
+        )
+    return w
+
+
+def _check_control(controller, u, env) -> None:
+    """Raise, with names, unless the controller returned a control of the right size."""
+    integer = env.actions is not None and jnp.issubdtype(
+        jnp.result_type(u), jnp.integer
+    )
+    if not integer and jnp.shape(u) != (env.control_size,):
+        raise ValueError(
+            f"{type(controller).__name__}: returned a control of shape {jnp.shape(u)}, "
+            f"but the environment takes shape ({env.control_size},)."
+        )

@@ -1,0 +1,211 @@
+"""What a closed loop leaves behind."""
+
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._results import RESULTS, Result
+
+
+if TYPE_CHECKING:
+    import pandas
+
+
+class Trajectory(eqx.Module):
+    """The record of a closed loop: `T` steps from `T + 1` states.
+
+    What was not asked for with `keep=` is `None`. Under `jax.vmap` every array has a
+    leading batch axis.
+
+    **Attributes:**
+
+    - `times`: shape `(T + 1,)`.
+    - `states`: shape `(T + 1, n)`.
+    - `observations`: what the controller was given, shape `(T, p)`.
+    - `controls`: what was applied, after the bounds, shape `(T, m)`.
+    - `disturbances`: shape `(T, k)`.
+    - `costs`: stage costs, shape `(T,)`; 0 after termination.
+    - `terminated`: whether step k ended the episode, or found it ended, shape `(T,)`.
+    - `final_state`: shape `(n,)`.
+    - `final_cost`: a scalar, charged once.
+    - `total_cost`: the sum of the stage costs and the final cost.
+    - `length`: steps until termination, T if there was none.
+    - `result`: the first failure, or success; one of `delucax.RESULTS`.
+    - `state_names`, `control_names`, `state_units`, `control_units`: tuples of strings.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("pendulum")
+        zero = dlx.controllers.Zero(1)
+        trajectory = dlx.rollout(env, zero, key=jax.random.key(0), horizon=100)
+        trajectory.total_cost, trajectory.states.shape, trajectory[:10].costs
+        ```
+    """
+
+    times: Array
+    states: Array | None
+    observations: Array | None
+    controls: Array | None
+    disturbances: Array | None
+    costs: Array | None
+    terminated: Array | None
+    final_state: Array
+    final_cost: Array
+    total_cost: Array
+    length: Array
+    result: Result
+    state_names: tuple[str, ...] = eqx.field(static=True)
+    control_names: tuple[str, ...] = eqx.field(static=True)
+    state_units: tuple[str, ...] = eqx.field(static=True)
+    control_units: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """The leading axes that `jax.vmap` put there; `()` for one trajectory."""
+        return self.times.shape[:-1]
+
+    @property
+    def steps(self) -> int:
+        """The number of steps T."""
+        return self.times.shape[-1] - 1
+
+    def __getitem__(self, index: Any) -> "Trajectory":
+        """Members of a batch, or a stretch of time of one trajectory.
+
+        Of a batch, `trajectory[i]` and `trajectory[2:5]` pick members. Of one
+        trajectory, `trajectory[start:stop]` are the steps from `start` up to `stop`,
+        with the states at both ends; `total_cost` is then theirs, and includes the
+        final cost only if the last step is among them.
+
+        **Raises:** `ValueError` if one trajectory is indexed by anything but a slice
+        of step 1.
+        """
+        if self.batch_shape:
+            return jax.tree.map(lambda leaf: leaf[index], self)
+        if not isinstance(index, slice) or index.step not in (None, 1):
+            raise ValueError(
+                "Trajectory: one trajectory takes a slice such as trajectory[10:20]; "
+                f"got {index!r}."
+            )
+        start, stop, _ = index.indices(self.steps)
+        stop = max(stop, start)
+        if self.states is None or self.costs is None:
+            raise ValueError(
+                "Trajectory: states and costs must be kept to slice in time; got "
+                "keep= without them."
+            )
+
+        def ends(leaf):
+            return None if leaf is None else leaf[start : stop + 1]
+
+        def steps(leaf):
+            return None if leaf is None else leaf[start:stop]
+
+        costs = steps(self.costs)
+        is_end = stop == self.steps
+        final_cost = self.final_cost if is_end else jnp.zeros_like(self.final_cost)
+        return Trajectory(
+            times=ends(self.times),
+            states=ends(self.states),
+            observations=steps(self.observations),
+            controls=steps(self.controls),
+            disturbances=steps(self.disturbances),
+            costs=costs,
+            terminated=steps(self.terminated),
+            final_state=self.states[stop],
+            final_cost=final_cost,
+            total_cost=jnp.sum(costs) + final_cost,
+            length=jnp.clip(self.length - start, 0, stop - start),
+            result=self.result,
+            state_names=self.state_names,
+            control_names=self.control_names,
+            state_units=self.state_units,
+            control_units=self.control_units,
+        )
+
+    def to_pandas(self) -> "pandas.DataFrame":
+        """A tidy table, one row a time: `time`, states, controls, `cost`.
+
+        A batch has its index in the columns `batch` (`batch0`, `batch1`, ... if it has
+        several axes). The last row of each trajectory has no control or cost.
+
+        **Returns:** a `pandas.DataFrame`.
+
+        **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
+        """
+        import pandas as pd
+
+        columns: dict[str, np.ndarray] = {}
+        shape = self.times.shape
+        axes = self.batch_shape
+        for i in range(len(axes)):
+            name = "batch" if len(axes) == 1 else f"batch{i}"
+            index = np.arange(axes[i]).reshape((-1,) + (1,) * (len(shape) - i - 1))
+            columns[name] = np.broadcast_to(index, shape)
+        columns["time"] = np.asarray(self.times)
+
+        def put(names, array, pad):
+            if array is None:
+                return
+            array = np.asarray(array)
+            if pad:
+                width = [(0, 0)] * array.ndim
+                width[len(axes)] = (0, 1)
+                array = np.pad(array, width, constant_values=np.nan)
+            for i, name in enumerate(names):
+                columns[name] = array[..., i]
+
+        put(self.state_names, self.states, pad=False)
+        put(self.control_names, self.controls, pad=True)
+        if self.disturbances is not None:
+            size = self.disturbances.shape[-1]
+            put([f"w{i}" for i in range(size)], self.disturbances, pad=True)
+        if self.costs is not None:
+            put(["cost"], self.costs[..., None], pad=True)
+        return pd.DataFrame({k: np.ravel(v) for k, v in columns.items()})
+
+    def summary(self) -> "pandas.DataFrame":
+        """One row for a trajectory, one a member for a batch: cost, length, outcome.
+
+        Columns: `total_cost`, `final_cost`, `mean_cost` (a step), `length`,
+        `terminated`, `result`.
+
+        **Returns:** a `pandas.DataFrame`.
+
+        **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
+        """
+        import pandas as pd
+
+        total = np.ravel(self.total_cost)
+        length = np.ravel(self.length)
+        final = np.ravel(self.final_cost)
+        ok = np.ravel(np.asarray(self.result == RESULTS.successful))
+        ok = np.broadcast_to(ok, total.shape)
+        codes = np.broadcast_to(np.ravel(jax.tree.leaves(self.result)[0]), total.shape)
+        words = [
+            "successful" if fine else _message(code)
+            for fine, code in zip(ok, codes, strict=True)
+        ]
+        return pd.DataFrame(
+            {
+                "total_cost": total,
+                "final_cost": final,
+                "mean_cost": (total - final) / np.maximum(length, 1),
+                "length": length,
+                "terminated": length < self.steps,
+                "result": words,
+            }
+        )
+
+
+def _message(code: Any) -> str:
+    item = jax.tree.unflatten(jax.tree.structure(RESULTS.successful), [np.asarray(code)])
+    return RESULTS[item]

@@ -1,0 +1,98 @@
+"""A system from a plain function."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+from jaxtyping import Array
+
+from .._names import indexed_names
+from ._base import AbstractSystem
+
+
+class FunctionSystem(AbstractSystem):
+    """A system whose vector field is a function; made by [`delucax.system`][].
+
+    **Arguments:**
+
+    - `function`: `(t, x, u, w) -> dx/dt`; may itself be an `eqx.Module`, whose arrays
+        are then leaves of the system.
+    - `state_names`, `control_names`, `disturbance_names`: tuples of strings.
+    """
+
+    function: Callable[..., Array]
+    state_names: tuple[str, ...] = eqx.field(static=True)
+    control_names: tuple[str, ...] = eqx.field(static=True)
+    _disturbance_names: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        function: Callable[..., Array],
+        state_names: tuple[str, ...],
+        control_names: tuple[str, ...],
+        disturbance_names: tuple[str, ...] = (),
+    ):
+        self.function = function
+        self.state_names = state_names
+        self.control_names = control_names
+        self._disturbance_names = disturbance_names
+
+    @property
+    def disturbance_names(self) -> tuple[str, ...]:
+        """Names of the disturbances."""
+        return self._disturbance_names
+
+    def vector_field(self, t, x, u, w):
+        return self.function(t, x, u, w)
+
+
+def _names(given: int | Sequence[str], letter: str, argument: str) -> tuple[str, ...]:
+    if isinstance(given, int) and not isinstance(given, bool) and given >= 0:
+        return indexed_names(letter, given)
+    if isinstance(given, tuple | list) and all(isinstance(n, str) for n in given):
+        return tuple(given)
+    raise ValueError(
+        f"system: {argument} must be a whole number or a tuple of names, got {given!r}."
+    )
+
+
+def system(
+    f: Callable[..., Array],
+    *,
+    states: int | Sequence[str],
+    controls: int | Sequence[str],
+    disturbances: int | Sequence[str] = (),
+) -> FunctionSystem:
+    """A system from a function `f(t, x, u, w) -> dx/dt`.
+
+    **Arguments:**
+
+    - `f`: the vector field. A function's own constants are fixed; pass an `eqx.Module`
+        with a `__call__` to have them as differentiable leaves.
+    - `states`, `controls`: their names, or how many there are.
+    - `disturbances`: names or number of those that enter `f`; none by default, in which
+        case `w` is added to the next state.
+
+    **Returns:** a [`delucax.systems.FunctionSystem`][].
+
+    **Raises:** `ValueError` if names are neither a number nor strings.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        def double_integrator(t, x, u, w):
+            return jnp.stack([x[1], u[0]])
+
+        car = dlx.system(double_integrator, states=("position", "speed"), controls=1)
+        ```
+    """
+    if not callable(f):
+        raise ValueError(f"system: f must be a function of (t, x, u, w), got {f!r}.")
+    return FunctionSystem(
+        f,
+        _names(states, "x", "states"),
+        _names(controls, "u", "controls"),
+        _names(disturbances, "w", "disturbances"),
+    )
