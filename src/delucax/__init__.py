@@ -12,6 +12,7 @@ from . import (
     environments as environments,
     math as math,
     references as references,
+    riccati as riccati,
     systems as systems,
 )
 from ._controller import (

@@ -50,6 +50,23 @@ def as_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
     return array
 
 
+def symmetric_matrix(value: Any, name: str, where: str) -> Array:
+    """`value` as a symmetric matrix of finite entries, or an error.
+
+    An asymmetry of the size of rounding is averaged away.
+    """
+    matrix = as_matrix(value, name, where)
+    if matrix.shape[0] != matrix.shape[1]:
+        raise ValueError(f"{where}: {name} must be square, got shape {matrix.shape}.")
+    if is_concrete(matrix):
+        array = np.asarray(matrix)
+        scale = np.max(np.abs(array), initial=0.0)
+        slack = 100 * np.finfo(array.dtype).eps * scale
+        if np.max(np.abs(array - array.T), initial=0.0) > slack:
+            raise ValueError(f"{where}: {name} must be symmetric, got {array}.")
+    return (matrix + matrix.T) / 2
+
+
 def check_finite(array: Any, name: str, where: str) -> None:
     """Raise if a concrete `array` holds NaN or infinity."""
     if eqx.is_inexact_array(array) and is_concrete(array):

@@ -5,10 +5,9 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
-from .._check import as_matrix, is_concrete
+from .._check import symmetric_matrix
 from .._fields import as_float_array, parameter
 from .._typing import Matrix, RealScalar
 from ..math import quadratic_form
@@ -60,9 +59,9 @@ class Quadratic(AbstractCost):
         difference: Callable[[Array, Array], Array] | None = None,
     ):
         where = "Quadratic"
-        self.Q = symmetric(Q, "Q", where)
-        self.R = symmetric(R, "R", where)
-        self.Qf = None if final is None else symmetric(final, "final", where)
+        self.Q = symmetric_matrix(Q, "Q", where)
+        self.R = symmetric_matrix(R, "R", where)
+        self.Qf = None if final is None else symmetric_matrix(final, "final", where)
         if self.Qf is not None and self.Qf.shape != self.Q.shape:
             raise ValueError(
                 f"{where}: final must have the shape of Q, {self.Q.shape}, got "
@@ -140,14 +139,14 @@ class Tracking(AbstractCost):
         output: Callable[[Array], Array] | None = None,
     ):
         where = "Tracking"
-        self.Q = symmetric(Q, "Q", where)
-        self.R = symmetric(R, "R", where)
+        self.Q = symmetric_matrix(Q, "Q", where)
+        self.R = symmetric_matrix(R, "R", where)
         if not callable(reference):
             raise ValueError(
                 f"{where}: reference must be a function of time, got {reference!r}."
             )
         self.reference = reference
-        self.Qf = None if final is None else symmetric(final, "final", where)
+        self.Qf = None if final is None else symmetric_matrix(final, "final", where)
         self.output = output
 
     def _error(self, t: RealScalar, x: Array) -> Array:
@@ -167,23 +166,6 @@ class Tracking(AbstractCost):
         if self.Qf is None:
             return jnp.zeros((), x.dtype)
         return quadratic_form(self.Qf, self._error(t, x))
-
-
-def symmetric(value: Any, name: str, where: str) -> Array:
-    """`value` as a symmetric matrix of finite entries, or an error.
-
-    An asymmetry of the size of rounding is averaged away.
-    """
-    matrix = as_matrix(value, name, where)
-    if matrix.shape[0] != matrix.shape[1]:
-        raise ValueError(f"{where}: {name} must be square, got shape {matrix.shape}.")
-    if is_concrete(matrix):
-        array = np.asarray(matrix)
-        scale = np.max(np.abs(array), initial=0.0)
-        slack = 100 * np.finfo(array.dtype).eps * scale
-        if np.max(np.abs(array - array.T), initial=0.0) > slack:
-            raise ValueError(f"{where}: {name} must be symmetric, got {array}.")
-    return (matrix + matrix.T) / 2
 
 
 def _target(value: Any, weight: Array, name: str) -> Array | None:

@@ -83,7 +83,7 @@ def _open_loop(dynamics, x0, controls, w, t0):
 
     steps = jnp.arange(controls.shape[0])
     _, (parts, results) = lax.scan(body, split_state(x0), (steps, controls, w))
-    states = jnp.concatenate([x0[None], stack_steps(parts, size)])
+    states = stack_steps(parts, size, split_state(x0))
     finite = jnp.all(jnp.isfinite(states[-1]))
     end = RESULTS.where(finite, RESULTS.successful, RESULTS.diverged)
     result = first_failure(first_of(results), end)

@@ -121,8 +121,19 @@ def join_state(parts: tuple[Array, ...], size: int) -> Array:
     return join(parts, size <= COMPONENTS_UP_TO)
 
 
-def stack_steps(parts: tuple[Array, ...], size: int) -> Array:
-    """States over time, shape `(T, size)`, from the components of each step."""
+def stack_steps(
+    parts: tuple[Array, ...], size: int, first: tuple[Array, ...] = ()
+) -> Array:
+    """Vectors over time, shape `(T, size)`, from the components of each step.
+
+    `first` is put before them, component by component: under `vmap` the transposition
+    that follows is then several times faster than that of a concatenated array.
+    """
+    if first:
+        parts = tuple(
+            jnp.concatenate([a[None].astype(b.dtype), b])
+            for a, b in zip(first, parts, strict=True)
+        )
     return jnp.stack(parts, axis=1) if size <= COMPONENTS_UP_TO else parts[0]
 
 

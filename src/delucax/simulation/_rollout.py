@@ -216,8 +216,8 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
         parts = split_state(x_next.astype(dtype))
         kept = {
             "states": parts,
-            "observations": None if plain_sight and "states" in keep else y,
-            "controls": step.control,
+            "observations": None if plain_sight and "states" in keep else split_state(y),
+            "controls": split_state(step.control),
             "costs": cost,
             "terminated": ended[0] if ends else None,
         }
@@ -236,20 +236,10 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
     parts, _, ended, total = carry
     final_state = join_state(parts, size)
 
-    states = observations = None
-    if "states" in kept:
-        states = jnp.concatenate([x0[None], stack_steps(kept["states"], size)])
-    if "observations" in keep:
-        observations = kept["observations"]
-        if observations is None:
-            observations = states[:-1]
-    terminated = kept.get("terminated")
-    if "terminated" in keep and not ends:
-        terminated = jnp.zeros(horizon, bool)
-    disturbances = None
-    if "disturbances" in keep:
-        zeros = jnp.zeros((horizon, env.disturbance_size), dtype)
-        disturbances = zeros if w is None else w
+    def over_time(name, size, first=()):
+        found = kept.get(name)
+        return None if found is None else stack_steps(found, size, first)
+
     length = ended[1] if ends else jnp.asarray(horizon)
     end = (length * dt).astype(dtype)
     final_cost = jnp.asarray(env.cost.final(end, final_state), dtype)
@@ -263,18 +253,22 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
     finite = jnp.all(jnp.isfinite(final_state)) & jnp.isfinite(total_cost)
     diverged = RESULTS.where(finite, RESULTS.successful, RESULTS.diverged)
     return Trajectory(
-        times=times,
-        states=states if "states" in keep else None,
-        observations=observations,
-        controls=kept.get("controls"),
-        disturbances=disturbances,
+        states=over_time("states", size, split_state(x0)),
+        controls=over_time("controls", env.control_size),
         costs=costs,
-        terminated=terminated,
         final_state=final_state,
         final_cost=final_cost,
         total_cost=total_cost,
         length=length,
         result=first_failure(first_of(results), diverged),
+        dt=dt,
+        steps=horizon,
+        keep=keep,
+        recorded_times=None,
+        recorded_observations=over_time("observations", env.observation_size),
+        recorded_disturbances=w if "disturbances" in keep else None,
+        recorded_terminated=kept.get("terminated"),
+        disturbance_size=env.disturbance_size,
         state_names=dynamics.state_names,
         control_names=dynamics.control_names,
         state_units=dynamics.state_units,

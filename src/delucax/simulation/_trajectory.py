@@ -1,5 +1,6 @@
 """What a closed loop leaves behind."""
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -35,6 +36,7 @@ class Trajectory(eqx.Module):
     - `total_cost`: the sum of the stage costs and the final cost.
     - `length`: steps until termination, T if there was none.
     - `result`: the first failure, or success; one of `delucax.RESULTS`.
+    - `steps`: T, an int. `dt`: the control interval.
     - `state_names`, `control_names`, `state_units`, `control_units`: tuples of strings.
 
     !!! example
@@ -50,18 +52,24 @@ class Trajectory(eqx.Module):
         ```
     """
 
-    times: Array
     states: Array | None
-    observations: Array | None
     controls: Array | None
-    disturbances: Array | None
     costs: Array | None
-    terminated: Array | None
     final_state: Array
     final_cost: Array
     total_cost: Array
     length: Array
     result: Result
+    dt: Array
+    # What follows from the rest is not stored but made on demand: writing it out would
+    # cost a batch more than the simulation does.
+    recorded_times: Array | None
+    recorded_observations: Array | None
+    recorded_disturbances: Array | None
+    recorded_terminated: Array | None
+    steps: int = eqx.field(static=True)
+    keep: tuple[str, ...] = eqx.field(static=True)
+    disturbance_size: int = eqx.field(static=True)
     state_names: tuple[str, ...] = eqx.field(static=True)
     control_names: tuple[str, ...] = eqx.field(static=True)
     state_units: tuple[str, ...] = eqx.field(static=True)
@@ -70,12 +78,37 @@ class Trajectory(eqx.Module):
     @property
     def batch_shape(self) -> tuple[int, ...]:
         """The leading axes that `jax.vmap` put there; `()` for one trajectory."""
-        return self.times.shape[:-1]
+        return self.total_cost.shape
 
     @property
-    def steps(self) -> int:
-        """The number of steps T."""
-        return self.times.shape[-1] - 1
+    def times(self) -> Array:
+        """`t_k = k dt`, shape `(T + 1,)`."""
+        if self.recorded_times is not None:
+            return self.recorded_times
+        times = jnp.arange(self.steps + 1) * self.dt[..., None]
+        return times.astype(self.final_state.dtype)
+
+    @property
+    def observations(self) -> Array | None:
+        """What the controller was given, shape `(T, p)`."""
+        if self.recorded_observations is None and "observations" in self.keep:
+            return None if self.states is None else self.states[..., :-1, :]
+        return self.recorded_observations
+
+    @property
+    def disturbances(self) -> Array | None:
+        """The disturbances that acted, shape `(T, k)`."""
+        if self.recorded_disturbances is None and "disturbances" in self.keep:
+            shape = (*self.batch_shape, self.steps, self.disturbance_size)
+            return jnp.zeros(shape, self.final_state.dtype)
+        return self.recorded_disturbances
+
+    @property
+    def terminated(self) -> Array | None:
+        """Whether step k ended the episode, or found it ended, shape `(T,)`."""
+        if self.recorded_terminated is None and "terminated" in self.keep:
+            return jnp.zeros((*self.batch_shape, self.steps), bool)
+        return self.recorded_terminated
 
     def __getitem__(self, index: Any) -> "Trajectory":
         """Members of a batch, or a stretch of time of one trajectory.
@@ -109,26 +142,23 @@ class Trajectory(eqx.Module):
         def steps(leaf):
             return None if leaf is None else leaf[start:stop]
 
-        costs = steps(self.costs)
+        costs = self.costs[start:stop]
         is_end = stop == self.steps
         final_cost = self.final_cost if is_end else jnp.zeros_like(self.final_cost)
-        return Trajectory(
-            times=ends(self.times),
+        return dataclasses.replace(
+            self,
             states=ends(self.states),
-            observations=steps(self.observations),
             controls=steps(self.controls),
-            disturbances=steps(self.disturbances),
             costs=costs,
-            terminated=steps(self.terminated),
             final_state=self.states[stop],
             final_cost=final_cost,
             total_cost=jnp.sum(costs) + final_cost,
             length=jnp.clip(self.length - start, 0, stop - start),
-            result=self.result,
-            state_names=self.state_names,
-            control_names=self.control_names,
-            state_units=self.state_units,
-            control_units=self.control_units,
+            recorded_times=ends(self.times),
+            recorded_observations=steps(self.recorded_observations),
+            recorded_disturbances=steps(self.recorded_disturbances),
+            recorded_terminated=steps(self.recorded_terminated),
+            steps=stop - start,
         )
 
     def to_pandas(self) -> "pandas.DataFrame":
@@ -144,13 +174,13 @@ class Trajectory(eqx.Module):
         import pandas as pd
 
         columns: dict[str, np.ndarray] = {}
-        shape = self.times.shape
         axes = self.batch_shape
+        shape = (*axes, self.steps + 1)
         for i in range(len(axes)):
             name = "batch" if len(axes) == 1 else f"batch{i}"
             index = np.arange(axes[i]).reshape((-1,) + (1,) * (len(shape) - i - 1))
             columns[name] = np.broadcast_to(index, shape)
-        columns["time"] = np.asarray(self.times)
+        columns["time"] = np.broadcast_to(self.times, shape)
 
         def put(names, array, pad):
             if array is None:

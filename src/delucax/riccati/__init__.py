@@ -1,0 +1,3 @@
+"""Matrix equations of control, by solves and products alone."""
+
+from ._dare import dare as dare, RiccatiSolution as RiccatiSolution
