@@ -4,6 +4,9 @@ Write `dx/dt = f(t, x, u, w)` as a module, let Diffrax integrate it, close the l
 a controller, and differentiate, `vmap` or `jit` the whole.
 """
 
+from importlib import import_module as _import_module
+from typing import Any, TYPE_CHECKING
+
 from . import (
     controllers as controllers,
     costs as costs,
@@ -14,6 +17,7 @@ from . import (
     references as references,
     riccati as riccati,
     systems as systems,
+    training as training,
 )
 from ._controller import (
     AbstractController as AbstractController,
@@ -43,5 +47,28 @@ from .environments import (
     randomise as randomise,
     register as register,
 )
-from .simulation import rollout as rollout, Trajectory as Trajectory
+from .simulation import (
+    rollout as rollout,
+    simulate as simulate,
+    Trajectory as Trajectory,
+)
 from .systems import AbstractSystem as AbstractSystem, system as system
+
+
+if TYPE_CHECKING:
+    from . import plotting as plotting
+    from .plotting import animate as animate, plot as plot
+
+_LAZY = ("animate", "plot", "plotting")
+
+
+def __getattr__(name: str) -> Any:
+    """What needs Matplotlib, which is optional, imported when it is first asked for."""
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    plotting = _import_module(".plotting", __name__)
+    return plotting if name == "plotting" else getattr(plotting, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY} - {"Any", "TYPE_CHECKING"})

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 from jaxtyping import PyTree
 
-from ._fields import converter_of
+from ._fields import as_float_array, converter_of
 
 
 _T = TypeVar("_T")
@@ -80,9 +80,11 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
     for path, value in changes.items():
         parent_path, _, name = path.rpartition(".")
         parent = get_path(tree, parent_path) if parent_path else tree
-        _child(parent, name, path)
+        old = _child(parent, name, path)
         if isinstance(parent, eqx.Module):
             value = converter_of(parent, name)(value)
+        elif eqx.is_inexact_array(old):
+            value = as_float_array(value)
         tree = eqx.tree_at(
             lambda tree, path=path: get_path(tree, path),
             tree,

@@ -4,5 +4,6 @@ from ._basic import (
     Constant as Constant,
     Linear as Linear,
     Random as Random,
+    Sequence as Sequence,
     Zero as Zero,
 )

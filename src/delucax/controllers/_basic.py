@@ -145,3 +145,40 @@ class Linear(AbstractController):
         if y.shape != self.K.shape[1:]:
             raise wrong_observation(self, self.K.shape[1], y)
         return -matvec(self.K, y).astype(y.dtype), state
+
+
+class Sequence(AbstractController):
+    """Given controls, one after the other: open loop.
+
+    `u_k = values[k]`; the last is held after the end.
+
+    **Arguments:** `values`: shape `(steps, m)`; trainable.
+
+    **Raises:** `ValueError` if `values` is not a matrix of finite numbers with at least
+    one row.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        replay = dlx.controllers.Sequence(0.5 * jnp.ones((20, 1)))
+        dlx.rollout(dlx.make("pendulum"), replay, key=jax.random.key(0)).total_cost
+        ```
+    """
+
+    values: Array = weight()
+
+    def __init__(self, values: Any):
+        self.values = as_matrix(values, "values", "Sequence")
+        if self.values.shape[0] == 0:
+            raise ValueError("Sequence: values must have at least one row, got none.")
+
+    def init(self, *, key=None):
+        return jnp.zeros((), jnp.int32)
+
+    def __call__(self, t, y, state):
+        u = self.values[jnp.minimum(state, self.values.shape[0] - 1)]
+        return u.astype(y.dtype), state + 1

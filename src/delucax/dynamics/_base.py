@@ -4,7 +4,7 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from .._results import RESULTS, Result
 from .._typing import RealScalar
@@ -78,7 +78,7 @@ class AbstractDynamics(eqx.Module):
         """
 
     def __call__(
-        self, t: RealScalar, x: Array, u: Array, w: Array | None = None
+        self, t: RealScalar, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None
     ) -> Array:
         """The next state.
 

@@ -6,7 +6,6 @@ import diffrax
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array
 
 from .._check import check_count, check_positive
@@ -21,6 +20,13 @@ from ._runge_kutta import (
     runge_kutta_step,
     split_state,
     tableau_of,
+)
+from ._solvers import (
+    check_adaptive,
+    check_fixed_step,
+    check_solver,
+    for_one_step,
+    loud,
 )
 
 
@@ -120,15 +126,10 @@ class Discretized(AbstractDynamics):
         self.system = system
         self.dt = dt
         self.substeps = check_count(substeps, "substeps", where)
-        noisy = _has_diffusion(system)
+        noisy = has_diffusion(system)
         if solver is None:
             solver = diffrax.Euler() if noisy else RK4()
-        if not isinstance(solver, diffrax.AbstractSolver):
-            raise ValueError(
-                f"{where}: solver must be a Diffrax solver such as diffrax.Tsit5() "
-                f"(an instance, not the class), got {solver!r}."
-            )
-        name = type(solver).__name__
+        check_solver(solver, where)
         if stepsize_controller is None:
             if adjoint is not None:
                 raise ValueError(
@@ -145,31 +146,13 @@ class Discretized(AbstractDynamics):
             if noisy and not isinstance(solver, _SDE_SOLVERS):
                 fitting = ", ".join(s.__name__ for s in _SDE_SOLVERS)
                 raise ValueError(
-                    f"{where}: solver {name} does not fit a system with a diffusion; "
-                    f"use one of {fitting}."
+                    f"{where}: solver {type(solver).__name__} does not fit a system "
+                    f"with a diffusion; use one of {fitting}."
                 )
             if not noisy:
-                if isinstance(solver, diffrax.AbstractImplicitSolver):
-                    _check_implicit(solver, where)
-                elif tableau_of(solver) is None:
-                    raise ValueError(
-                        f"{where}: solver {name} does not fit fixed steps of "
-                        "dx/dt = f(t, x, u, w); use an explicit Runge-Kutta method "
-                        "(diffrax.Euler, Heun, Midpoint, Ralston, Bosh3, Tsit5, "
-                        "Dopri5, Dopri8, delucax.dynamics.RK4) or a diagonally "
-                        "implicit one (diffrax.ImplicitEuler, Kvaerno3, Kvaerno4, "
-                        "Kvaerno5)."
-                    )
+                check_fixed_step(solver, where)
         else:
-            tableau = tableau_of(solver)
-            if type(solver) is diffrax.Euler or (
-                tableau is not None and not tableau.b_error.any()
-            ):
-                raise ValueError(
-                    f"{where}: solver {name} estimates no error, so a "
-                    "stepsize_controller cannot steer it; use diffrax.Tsit5(), or wrap "
-                    f"it: diffrax.HalfSolver({name}())."
-                )
+            check_adaptive(solver, where)
             if noisy:
                 raise ValueError(
                     f"{where}: stepsize_controller does not fit a system with a "
@@ -180,8 +163,6 @@ class Discretized(AbstractDynamics):
                     f"{where}: substeps must be 1 with a stepsize_controller, which "
                     f"chooses the steps, got {substeps}."
                 )
-            if isinstance(solver, diffrax.AbstractImplicitSolver):
-                _check_implicit(solver, where)
             if adjoint is None:
                 adjoint = diffrax.RecursiveCheckpointAdjoint()
             max_steps = check_count(
@@ -224,7 +205,7 @@ class Discretized(AbstractDynamics):
     @property
     def is_stochastic(self) -> bool:
         """Whether the system has a diffusion."""
-        return _has_diffusion(self.system)
+        return has_diffusion(self.system)
 
     def observe(self, t, x):
         return self.system.observe(t, x)
@@ -246,13 +227,7 @@ class Discretized(AbstractDynamics):
 
         def field(t, y, args):
             u, held = args
-            dx = system.vector_field(t, y, u, held)
-            if dx.shape != y.shape:
-                raise ValueError(
-                    f"{type(system).__name__}: vector_field must return shape "
-                    f"{y.shape}, as the state has, got {dx.shape}."
-                )
-            return dx
+            return evaluate_field(system, t, y, u, held)
 
         args = (u, held)
         if self.is_stochastic:
@@ -275,7 +250,7 @@ class Discretized(AbstractDynamics):
                 rhs = lambda t, y: field(t, y, args)  # noqa: E731
                 return runge_kutta_step(tableau, rhs, t, x, h), RESULTS.successful
         else:
-            solver = _for_one_step(self.solver, x.dtype)
+            solver = for_one_step(self.solver, x.dtype)
             term = diffrax.ODETerm(field)
 
             def step(t, x, _):
@@ -328,14 +303,15 @@ class Discretized(AbstractDynamics):
             y0=x,
             args=args,
             stepsize_controller=self.stepsize_controller,
-            adjoint=self.adjoint,
+            adjoint=loud(self.adjoint),
             max_steps=self.max_steps,
             throw=False,
         )
         return solution.ys[0], promote(solution.result)
 
 
-def _has_diffusion(system: AbstractSystem) -> bool:
+def has_diffusion(system: AbstractSystem) -> bool:
+    """Whether `system` has noise inside."""
     if type(system).diffusion is AbstractSystem.diffusion:
         return False
     t, x, u = jnp.zeros(()), jnp.zeros(system.state_size), jnp.zeros(system.control_size)
@@ -365,43 +341,15 @@ class _BrownianTerm(diffrax.AbstractTerm):
         return _apply(vf, control)
 
 
-def _check_implicit(solver: diffrax.AbstractSolver, where: str) -> None:
-    if solver.term_structure is not diffrax.AbstractTerm:
+def evaluate_field(system: AbstractSystem, t: Any, x: Array, u: Array, w: Any) -> Array:
+    """The vector field of `system`, with its shape checked."""
+    dx = system.vector_field(t, x, u, w)
+    if dx.shape != x.shape:
         raise ValueError(
-            f"{where}: solver {type(solver).__name__} needs a split into stiff and "
-            "non-stiff parts; use diffrax.ImplicitEuler, Kvaerno3, Kvaerno4 or "
-            "Kvaerno5."
+            f"{type(system).__name__}: vector_field must return shape {x.shape}, as "
+            f"the state has, got {dx.shape}."
         )
-
-
-def _for_one_step(solver: Any, dtype: Any) -> Any:
-    """An implicit solver that works outside `diffeqsolve`: differentiable both ways,
-    and with explicit tolerances where it would take them from a step-size controller.
-    """
-    if getattr(solver, "scan_kind", "bounded") is None:
-        solver = eqx.tree_at(
-            lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None
-        )
-    double = dtype == jnp.float64
-    values = {
-        "rtol": 1e-10 if double else 1e-5,
-        "atol": 1e-12 if double else 1e-6,
-        "norm": optx.rms_norm,
-    }
-    finder = solver.root_finder
-    names = [
-        name
-        for name in values
-        if "stepsize" in repr(getattr(finder, name, None)).replace("_", "")
-    ]
-    if not names:
-        return solver
-    return eqx.tree_at(
-        lambda s: [getattr(s.root_finder, name) for name in names],
-        solver,
-        [values[name] for name in names],
-        is_leaf=lambda leaf: leaf is getattr(finder, names[0]),
-    )
+    return dx
 
 
 def _solver_step(solver, term, t, x, h, args):

@@ -68,10 +68,12 @@ def tableau_of(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau | None:
     """The tableau of an explicit Runge-Kutta solver; `None` for any other."""
     if type(solver) is diffrax.Euler:
         return _EULER
+    # A wrapped solver passes for the one inside, but has no tableau of its own.
+    tableau = getattr(solver, "tableau", None)
     if isinstance(solver, diffrax.AbstractERK) and isinstance(
-        solver.tableau, diffrax.ButcherTableau
+        tableau, diffrax.ButcherTableau
     ):
-        return solver.tableau
+        return tableau
     return None
 
 

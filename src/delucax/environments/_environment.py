@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from .._check import as_vector, check_count, check_key, is_concrete
 from .._fields import as_float_array, parameter
@@ -240,7 +240,7 @@ class Environment(eqx.Module):
             )
         return self.initial_state
 
-    def saturate(self, u: Array) -> Array:
+    def saturate(self, u: ArrayLike) -> Array:
         """The control that is applied when `u` is asked for.
 
         **Arguments:** `u`: a control, shape `(m,)`; or an integer action, a scalar,
@@ -248,6 +248,7 @@ class Environment(eqx.Module):
 
         **Returns:** shape `(m,)`.
         """
+        u = jnp.asarray(u)
         if self.actions is not None and jnp.issubdtype(jnp.result_type(u), jnp.integer):
             if jnp.ndim(u) != 0:
                 raise ValueError(
@@ -261,7 +262,7 @@ class Environment(eqx.Module):
         return jnp.clip(u, low, high).astype(u.dtype)
 
     def step(
-        self, t: RealScalar, x: Array, u: Array, w: Array | None = None
+        self, t: RealScalar, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None
     ) -> Step:
         """One step: clip the control, charge the stage cost, advance the state.
 

@@ -2,10 +2,10 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 
-def wrap(angle: Array) -> Array:
+def wrap(angle: ArrayLike) -> Array:
     r"""The angle between -pi and pi that points the same way:
     `angle - 2 pi round(angle / (2 pi))`.
 
@@ -27,4 +27,5 @@ def wrap(angle: Array) -> Array:
         dlx.math.wrap(jnp.array(7.0))
         ```
     """
+    angle = jnp.asarray(angle)
     return angle - (2 * np.pi) * jnp.round(angle * (1 / (2 * np.pi)))

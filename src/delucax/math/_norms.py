@@ -1,10 +1,10 @@
 """Norms whose gradient is finite at zero."""
 
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 
-def safe_norm(x: Array, axis: int | None = -1, keepdims: bool = False) -> Array:
+def safe_norm(x: ArrayLike, axis: int | None = -1, keepdims: bool = False) -> Array:
     """The Euclidean norm with gradient 0 (not NaN) at 0.
 
     **Arguments:**
@@ -25,6 +25,7 @@ def safe_norm(x: Array, axis: int | None = -1, keepdims: bool = False) -> Array:
         jax.grad(dlx.math.safe_norm)(jnp.zeros(3))
         ```
     """
+    x = jnp.asarray(x)
     squared = jnp.sum(x * x, axis=axis, keepdims=keepdims)
     at_zero = squared == 0
     return jnp.where(at_zero, 0.0, jnp.sqrt(jnp.where(at_zero, 1.0, squared)))

@@ -11,7 +11,7 @@ Cody and Waite, "Software Manual for the Elementary Functions", 1980.
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 
 # pi in four parts, each with so few bits that its product with a whole number up to
@@ -65,7 +65,7 @@ _sin32.defjvp(lambda p, t: (_sin32(*p), _cos32(*p) * t[0]))
 _cos32.defjvp(lambda p, t: (_cos32(*p), -_sin32(*p) * t[0]))
 
 
-def sin(x: Array) -> Array:
+def sin(x: ArrayLike) -> Array:
     """The sine, vectorised on CPU in float32.
 
     **Arguments:**
@@ -91,7 +91,7 @@ def sin(x: Array) -> Array:
     return _sin32(x) if x.dtype == jnp.float32 else jnp.sin(x)
 
 
-def cos(x: Array) -> Array:
+def cos(x: ArrayLike) -> Array:
     """The cosine, vectorised on CPU in float32.
 
     **Arguments:**

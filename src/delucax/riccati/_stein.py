@@ -1,6 +1,8 @@
 """The Stein equation, and what else repeated squaring tells of a matrix."""
 
-import equinox as eqx
+import functools
+from collections.abc import Callable
+
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -13,6 +15,21 @@ from ..math import safe_norm
 MAX_DOUBLINGS = 60
 """Beyond it the spectral radius cannot be told from 1: 2**60 > 1 / eps in float64."""
 _SQUARINGS = 32
+
+
+def full_precision(function: Callable) -> Callable:
+    """`function` with products in the precision of their arguments.
+
+    Accelerators round the arguments of a float32 product to fewer bits by default, and
+    repeated squaring amplifies that.
+    """
+
+    @functools.wraps(function)
+    def wrapped(*arguments):
+        with jax.default_matmul_precision("highest"):
+            return function(*arguments)
+
+    return wrapped
 
 
 def solve(

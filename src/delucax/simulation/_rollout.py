@@ -19,7 +19,7 @@ from .._typing import PRNGKey
 from ..disturbances import Zero
 from ..dynamics._runge_kutta import join_state, split_state, stack_steps
 from ..environments import Environment
-from ._trajectory import Trajectory
+from ._trajectory import checked, Trajectory
 
 
 Checkpoint = Literal["step", "sqrt"] | None
@@ -147,26 +147,7 @@ def rollout(
         tuple(name for name in KEEP if name in keep),
         checkpoint,
     )
-    return _checked(trajectory) if throw else trajectory
-
-
-def _checked(trajectory: Trajectory) -> Trajectory:
-    """Raise if the trajectory failed: now if it can be seen, else at run time."""
-    failed = trajectory.result != RESULTS.successful
-    if not is_concrete(failed):
-        return trajectory.result.error_if(trajectory, failed)
-    if failed:
-        message = f"rollout: {RESULTS[trajectory.result]}"
-        if trajectory.states is not None:
-            bad = ~np.all(np.isfinite(trajectory.states), axis=-1)
-            if bad.any():
-                k = int(np.argmax(bad))
-                message += (
-                    f" The state after step {k} (t = {float(trajectory.times[k]):g}) "
-                    "is the first that is not finite."
-                )
-        raise RuntimeError(message + " Pass throw=False to look at the trajectory.")
-    return trajectory
+    return checked(trajectory, where) if throw else trajectory
 
 
 @eqx.filter_jit

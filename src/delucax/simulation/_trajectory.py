@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._check import is_concrete
 from .._results import RESULTS, Result
 
 
@@ -234,6 +235,25 @@ class Trajectory(eqx.Module):
                 "result": words,
             }
         )
+
+
+def checked(trajectory: Trajectory, where: str) -> Trajectory:
+    """Raise if the trajectory failed: now if it can be seen, else at run time."""
+    failed = trajectory.result != RESULTS.successful
+    if not is_concrete(failed):
+        return trajectory.result.error_if(trajectory, failed)
+    if failed:
+        message = f"{where}: {RESULTS[trajectory.result]}"
+        if trajectory.states is not None:
+            bad = ~np.all(np.isfinite(trajectory.states), axis=-1)
+            if bad.any():
+                k = int(np.argmax(bad))
+                message += (
+                    f" The state after step {k} (t = {float(trajectory.times[k]):g}) "
+                    "is the first that is not finite."
+                )
+        raise RuntimeError(message + " Pass throw=False to look at the trajectory.")
+    return trajectory
 
 
 def _message(code: Any) -> str:

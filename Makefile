@@ -1,0 +1,118 @@
+# Every target runs in a virtual environment, made on first use with the newest Python that
+# scripts/python.sh finds. Nothing is needed beforehand but make and Python 3.11 or newer.
+#
+#   make demo ARGS="--help"            arguments for the command
+#   make test PYTEST_ARGS="-k riccati" arguments for pytest
+#   make test PYTHON=python3.12        another interpreter (before .venv exists)
+
+SHELL := /bin/sh
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+
+VENV ?= .venv
+ARGS ?=
+PYTEST_ARGS ?=
+
+bin := $(VENV)/bin
+pip := $(bin)/python -m pip --disable-pip-version-check -qq
+
+# The tests run one process a core, so that each process keeps to one thread.
+one_thread := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
+	XLA_FLAGS="--xla_cpu_multi_thread_eigen=false $$XLA_FLAGS"
+pytest := $(one_thread) $(bin)/python -m pytest -n logical --maxprocesses=8
+
+##@ Use
+
+.PHONY: help
+help: ## list the targets
+	@awk 'BEGIN { FS = ":.*## " } \
+		/^##@ / { printf "\n%s\n", substr($$0, 5) } \
+		/^[a-z0-9-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+.PHONY: demo
+demo: $(VENV)/.demo ## the library at work; what it draws lands in demo/
+	$(bin)/python -u -m delucax demo $(ARGS)
+
+.PHONY: bench
+bench: $(VENV)/.bench ## speed against other libraries
+	$(bin)/python -u -m benchmarks $(ARGS)
+
+##@ Check
+
+.PHONY: test
+test: test-float32 test-float64 notebooks ## all tests in both precisions, then the notebooks
+
+.PHONY: test-float32
+test-float32: $(VENV)/.tests ## the tests in single precision
+	JAX_ENABLE_X64=0 $(pytest) $(PYTEST_ARGS)
+
+.PHONY: test-float64
+test-float64: $(VENV)/.tests ## the tests in double precision
+	JAX_ENABLE_X64=1 $(pytest) $(PYTEST_ARGS)
+
+.PHONY: notebooks
+notebooks: $(VENV)/.tests ## run every notebook from top to bottom
+	CI=1 MPLBACKEND=agg $(pytest) -o addopts= -W default \
+		--nbmake --nbmake-timeout=600 notebooks
+
+.PHONY: lint
+lint: $(VENV)/.dev ## style, formatting and the import rules between the floors
+	$(bin)/ruff check
+	$(bin)/ruff format --check
+	$(bin)/lint-imports --no-cache --no-logo
+
+.PHONY: format
+format: $(VENV)/.dev ## apply style and formatting
+	$(bin)/ruff check --fix
+	$(bin)/ruff format
+
+.PHONY: types
+types: $(VENV)/.dev ## static types
+	$(bin)/pyright
+
+.PHONY: docs
+docs: $(VENV)/.docs ## build the site into site/; a warning is an error
+	$(bin)/properdocs build --strict --config-file mkdocs.yml
+
+.PHONY: serve
+serve: $(VENV)/.docs ## show the site on this machine while editing it
+	$(bin)/properdocs serve --config-file mkdocs.yml
+
+##@ Set up
+
+.PHONY: dev
+dev: $(VENV)/.dev ## everything a contributor needs, and the commit hooks
+	if [ -e .git ]; then $(bin)/prek install; fi
+
+.PHONY: clean
+clean: ## remove what the other targets wrote, but not the environment
+	rm -rf build demo dist site .cache .hypothesis .pytest_cache .ruff_cache
+	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -exec rm -rf {} +
+
+.PHONY: distclean
+distclean: clean ## remove the environment too
+	rm -rf $(VENV)
+
+# A stamp is renewed when pyproject.toml changes; with nothing to do a target starts at
+# once. The group `dev` holds `tests` and `docs`, so that its stamp renews theirs.
+
+$(VENV)/.pip:
+	@if $(bin)/python -m pip --version >/dev/null 2>&1; then :; else \
+		python="$(PYTHON)"; \
+		if [ -z "$$python" ]; then python=$$(sh scripts/python.sh) || exit 1; fi; \
+		echo "making $(VENV) with $$("$$python" --version)"; \
+		"$$python" -m venv --clear $(VENV); \
+	fi
+	@$(pip) install --upgrade 'pip>=25.1'
+	@touch $@
+
+$(VENV)/.demo: $(VENV)/.pip pyproject.toml
+	@echo "installing delucax into $(VENV)"
+	@$(pip) install --editable '.[all]'
+	@touch $@
+
+$(VENV)/.tests $(VENV)/.docs $(VENV)/.dev $(VENV)/.bench: $(VENV)/.pip pyproject.toml
+	@echo "installing delucax and its $(@F:.%=%) group into $(VENV)"
+	@$(pip) install --editable '.[all]' --group $(@F:.%=%)
+	@touch $@ $(if $(filter %/.dev,$@),$(VENV)/.tests $(VENV)/.docs)

@@ -1,0 +1,1 @@
+"""Speed against peers: everything timed in one run, so that ratios are fair."""

@@ -1,0 +1,50 @@
+"""What the numbers were measured on: the header of a results file."""
+
+import os
+import platform
+from datetime import datetime, UTC
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+
+PACKAGES = ("delucax", "jax", "jaxlib", "equinox", "diffrax", "numpy", "gymnasium")
+
+
+def limit_cores(count: int) -> None:
+    """Keep this process, and those it starts, on `count` cores.
+
+    Call it before JAX starts its threads. Does nothing where the system has no such
+    call (macOS, Windows).
+    """
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
+
+
+def describe() -> dict[str, Any]:
+    """Processor, cores, device, versions, load and date; no host name."""
+    import cpuinfo
+    import jax
+
+    usable = (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count()
+    )
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "cpu": cpuinfo.get_cpu_info().get("brand_raw", platform.processor()),
+        "cores": os.cpu_count(),
+        "cores_used": usable,
+        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "system": f"{platform.system()} {platform.machine()}",
+        "device": jax.devices()[0].device_kind,
+        "python": platform.python_version(),
+        "versions": {name: _version(name) for name in PACKAGES},
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

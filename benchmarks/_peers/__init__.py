@@ -1,0 +1,1 @@
+"""The other contenders. Each module answers `contender(case)` and `simulate(case)`."""

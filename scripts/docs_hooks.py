@@ -1,0 +1,75 @@
+"""What the build of the site needs beyond its plugins, named as a hook in `mkdocs.yml`.
+
+Arithmatex marks the equations of pages, docstrings and notebooks; latex2mathml turns
+each into MathML here, which browsers show by themselves. The site therefore needs
+neither JavaScript for its mathematics nor a network, and the sources stay plain `$...$`
+and `$$...$$`. An equation that cannot be converted is a warning, hence an error in a
+strict build.
+"""
+
+import html
+import logging
+import re
+import unicodedata
+from typing import Any
+
+from latex2mathml.converter import convert
+
+
+_log = logging.getLogger("mkdocs.plugins.docs_hooks")
+
+_EQUATION = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
+
+# A class without an `__init__` of its own shows that of `object`.
+_NO_INIT = re.compile(r"<p>Initialize self\.\s+See help\(type\(self\)\)[^<]*</p>")
+
+# mkdocs-jupyter offers MathJax from the network to every page; nothing is left for it.
+_MATHJAX = re.compile(r"<script data-mkdocs-jupyter-mathjax=.*?</script>", re.DOTALL)
+
+# What latex2mathml knows by another name, or sets better under it.
+_SPELLINGS = [
+    (re.compile(r"\\(begin|end)\{(align|aligned|gather|split)\}"), r"\\\1{align*}"),
+    (re.compile(r"\\operatorname\*?\{arg(?:\\[,;: ]|\s|~)*(min|max)\}"), r"\\arg\1"),
+    (re.compile(r"\\operatorname\*"), r"\\operatorname"),
+    (re.compile(r"\\mathrm\{([A-Za-z])\}"), r"{\\mathrm \1}"),
+]
+
+# It takes some relations and brackets for letters.
+_LETTER = re.compile(r"<mi>(&#x[0-9A-F]+;)</mi>")
+
+
+def to_mathml(latex: str, display: bool) -> str:
+    """The MathML of an equation, raising `ValueError` where some of it is unknown."""
+    for pattern, replacement in _SPELLINGS:
+        latex = pattern.sub(replacement, latex)
+    mathml = convert(latex, display="block" if display else "inline")
+    unknown = re.search(r"\\[A-Za-z]+", mathml)
+    if unknown is not None:
+        raise ValueError(f"unknown command {unknown.group()}")
+    return _LETTER.sub(_symbol, mathml)
+
+
+def _symbol(match: re.Match[str]) -> str:
+    kind = unicodedata.category(html.unescape(match.group(1)))
+    return f"<mo>{match.group(1)}</mo>" if kind[0] in "PS" else match.group()
+
+
+def on_page_content(html_text: str, /, *, page: Any, **_: Any) -> str:
+    """Replace every marked equation of a page, and drop what says nothing."""
+
+    def render(match: re.Match[str]) -> str:
+        source = html.unescape(match.group(2)).strip()
+        latex = re.sub(r"^\\[(\[]|\\[)\]]$", "", source).strip()
+        try:
+            return to_mathml(latex, display=match.group(1) == "div")
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+            _log.warning("%s: no MathML for %s (%s)", page.file.src_uri, latex, reason)
+            return match.group()
+
+    return _EQUATION.sub(render, _NO_INIT.sub("", html_text))
+
+
+def on_post_page(output: str, /, **_: Any) -> str:
+    """Remove the loader of MathJax."""
+    return _MATHJAX.sub("", output)

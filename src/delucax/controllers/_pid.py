@@ -1,0 +1,371 @@
+"""Proportional-integral-derivative control."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._check import as_bounds, as_matrix, is_concrete
+from .._controller import AbstractController, wrong_observation
+from .._fields import as_float_array, check_parameters, parameter, positive, weight
+from ..math import matvec
+
+
+class _Select(eqx.Module):
+    """Entries of an observation."""
+
+    indices: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, y):
+        if max(self.indices) >= y.shape[0]:
+            raise ValueError(
+                f"PID: output selects component {max(self.indices)}, but the "
+                f"observation has size {y.shape[0]}."
+            )
+        return jnp.stack([y[i] for i in self.indices])
+
+
+class _Project(eqx.Module):
+    """A linear map of an observation."""
+
+    C: Array = parameter()
+
+    def __check_init__(self):
+        check_parameters(self)
+
+    def __call__(self, y):
+        if y.shape != self.C.shape[1:]:
+            raise wrong_observation(self, self.C.shape[1], y)
+        return matvec(self.C, y)
+
+
+class _Memory(NamedTuple):
+    integral: Array
+    slope: Array
+    previous: Array
+    started: Array
+    asked: Array
+
+
+class PID(AbstractController):
+    """Proportional, integral and derivative action, one loop a control.
+
+    With the error `e = r(t) - h(y)`, over a step of `dt`:
+
+    `v = kp e + I + kd D`, `u = clip(v, low, high)`,
+    `I_next = I + dt (ki e + (u_applied - v) / T_a)`,
+    `D = (T_d D_before + z - z_before) / (T_d + dt)`,
+
+    `D` being the derivative of `z = -h(y)` (so that a jump of the reference makes no
+    kick), or of `e`, through a first-order lag; it starts at 0. The integral is a true
+    one. Its second term, back-calculation, keeps it from winding up: `u_applied` is the
+    control that was really applied, so the environment's bounds count as the
+    controller's own do. Where `ki` is 0 there is no integral.
+
+    **Arguments:**
+
+    - `kp`, `ki`, `kd`: the gains, each a number or a vector with an entry for each
+        loop; 0 by default but for `kp`. Trainable. Units: of the control over those of
+        the error, its integral and its derivative.
+    - `dt`: the control interval, that of the environment.
+    - `reference`: r, a function of time, a vector or a number; 0 by default.
+    - `output`: h, what the loops follow: an index into the observation, a tuple of
+        indices, a matrix, or a function of the observation; all of it by default.
+    - `bounds`: `(low, high)`, each a number or a vector; none by default.
+    - `derivative_time_constant`: T_d of the lag, `dt` by default; 0 for none.
+    - `derivative_on`: `"measurement"` (default) or `"error"`.
+    - `anti_windup_time`: T_a, at least `dt`. By default the integral time `kp / ki` of
+        each loop, but not below `dt`.
+
+    **Raises:** `ValueError` if sizes do not fit, or a time is out of its range; when it
+    is run, if there are not as many outputs as loops.
+
+    Source: Åström and Hägglund, 2006.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("pendulum")
+        pid = dlx.controllers.PID(
+            25.0, 5.0, 5.0, dt=env.dt, output=0, bounds=(-2.0, 2.0)
+        )
+        dlx.rollout(env, pid, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
+        ```
+    """
+
+    kp: Array = weight()
+    ki: Array = weight()
+    kd: Array = weight()
+    dt: Array = parameter(constraint=positive)
+    reference: Array | Callable[[Any], Array] | None = parameter()
+    output: Callable[[Array], Array] | None
+    bounds: tuple[Array, Array] | None
+    derivative_time_constant: Array = parameter()
+    derivative_on: Literal["measurement", "error"] = eqx.field(static=True)
+    anti_windup_time: Array | None = parameter(constraint=positive)
+    loops: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        kp: Any,
+        ki: Any = 0.0,
+        kd: Any = 0.0,
+        *,
+        dt: Any,
+        reference: Any = None,
+        output: Any = None,
+        bounds: Any = None,
+        derivative_time_constant: Any = None,
+        derivative_on: Literal["measurement", "error"] = "measurement",
+        anti_windup_time: Any = None,
+    ):
+        where = "PID"
+        if derivative_on not in ("measurement", "error"):
+            raise ValueError(
+                f"{where}: derivative_on must be 'measurement' or 'error', got "
+                f"{derivative_on!r}."
+            )
+        self.kp, self.ki, self.kd, self.dt = kp, ki, kd, dt
+        self.reference = reference
+        self.output = _as_output(output, where)
+        self.bounds = as_bounds(bounds, None, where)
+        if derivative_time_constant is None:
+            derivative_time_constant = dt
+        self.derivative_time_constant = derivative_time_constant
+        self.derivative_on = derivative_on
+        self.anti_windup_time = anti_windup_time
+        vectors = {
+            "kp": kp,
+            "ki": ki,
+            "kd": kd,
+            "reference": None if callable(reference) else reference,
+            "low bounds": None if self.bounds is None else self.bounds[0],
+            "high bounds": None if self.bounds is None else self.bounds[1],
+            "derivative_time_constant": derivative_time_constant,
+            "anti_windup_time": anti_windup_time,
+        }
+        self.loops = _count_loops(vectors, self.output, where)
+
+    def __check_init__(self):
+        lag, windup, dt = self.derivative_time_constant, self.anti_windup_time, self.dt
+        if is_concrete(lag) and np.any(np.asarray(lag) < 0):
+            raise ValueError(
+                f"PID: derivative_time_constant must not be negative, got {lag}."
+            )
+        if windup is not None and is_concrete(windup) and is_concrete(dt):
+            if np.any(np.asarray(windup) < np.asarray(dt)):
+                raise ValueError(
+                    f"PID: anti_windup_time must be at least dt = {dt}, got {windup}."
+                )
+
+    def init(self, *, key=None):
+        zeros = _zeros(self.loops, self.kp, self.ki, self.kd, self.dt)
+        return _Memory(zeros, zeros, zeros, jnp.zeros((), bool), zeros)
+
+    def __call__(self, t, y, state):
+        error, measured = _error(self, t, y)
+        moving = -measured if self.derivative_on == "measurement" else error
+        step = jnp.where(state.started, moving - state.previous, 0)
+        lag = self.derivative_time_constant
+        slope = (lag * state.slope + step) / (lag + self.dt)
+        asked = self.kp * error + state.integral + self.kd * slope
+        integral = state.integral + self.dt * self.ki * error
+        after = _Memory(integral, slope, moving, jnp.ones((), bool), asked)
+        return _clip(asked, self.bounds).astype(y.dtype), _as(after, state)
+
+    def applied(self, u, cost, state):
+        correction = self.dt * self._windup_rate() * (u - state.asked)
+        after = state._replace(integral=state.integral + correction)
+        return _as(after, state)
+
+    def _windup_rate(self):
+        """`1 / T_a`, and 0 where there is no integral to wind up."""
+        fastest = 1 / self.dt
+        if self.anti_windup_time is None:
+            no_kp = self.kp == 0
+            rate = jnp.abs(self.ki / jnp.where(no_kp, 1, self.kp))
+            rate = jnp.where(no_kp, fastest, jnp.minimum(rate, fastest))
+        else:
+            rate = 1 / self.anti_windup_time
+        return jnp.where(self.ki == 0, 0, rate)
+
+
+class _Averages(NamedTuple):
+    error: Array
+    integral: Array
+    derivative: Array
+
+
+class LeakyPID(AbstractController):
+    """The PID of the original Deluca, whose integral is an exponential average.
+
+    With the error `e = r(t) - h(y)` and `a = dt / (dt + T)`:
+
+    `I = I_before + a (e - I_before)`, `D = D_before + a (e - e_before - D_before)`,
+    `u = clip(kp e + ki I + kd D, low, high)`,
+
+    all 0 at the start. The average does not wind up, nor does it remove an offset, and
+    the "derivative" is a difference that is not divided by `dt`; for those see
+    [`delucax.controllers.PID`][].
+
+    **Arguments:**
+
+    - `kp`, `ki`, `kd`: the gains, each a number or a vector with an entry for each
+        loop; 3, 4 and 0 by default. Trainable.
+    - `dt`: the control interval, that of the environment.
+    - `time_constant`: T, 0.5 by default.
+    - `reference`: r, a function of time, a vector or a number; 0 by default.
+    - `output`: h, what the loops follow: an index into the observation, a tuple of
+        indices, a matrix, or a function of the observation; all of it by default.
+    - `bounds`: `(low, high)`, each a number or a vector; none by default.
+
+    **Raises:** `ValueError` if sizes do not fit, or a time is not positive; when it is
+    run, if there are not as many outputs as loops.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("pendulum")
+        pid = dlx.controllers.LeakyPID(20.0, 5.0, 50.0, dt=env.dt, output=0)
+        dlx.rollout(env, pid, key=jax.random.key(0), x0=[0.1, 0.0]).total_cost
+        ```
+    """
+
+    kp: Array = weight()
+    ki: Array = weight()
+    kd: Array = weight()
+    dt: Array = parameter(constraint=positive)
+    time_constant: Array = parameter(constraint=positive)
+    reference: Array | Callable[[Any], Array] | None = parameter()
+    output: Callable[[Array], Array] | None
+    bounds: tuple[Array, Array] | None
+    loops: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        kp: Any = 3.0,
+        ki: Any = 4.0,
+        kd: Any = 0.0,
+        *,
+        dt: Any,
+        time_constant: Any = 0.5,
+        reference: Any = None,
+        output: Any = None,
+        bounds: Any = None,
+    ):
+        where = "LeakyPID"
+        self.kp, self.ki, self.kd, self.dt = kp, ki, kd, dt
+        self.time_constant = time_constant
+        self.reference = reference
+        self.output = _as_output(output, where)
+        self.bounds = as_bounds(bounds, None, where)
+        vectors = {
+            "kp": kp,
+            "ki": ki,
+            "kd": kd,
+            "reference": None if callable(reference) else reference,
+            "low bounds": None if self.bounds is None else self.bounds[0],
+            "high bounds": None if self.bounds is None else self.bounds[1],
+            "time_constant": time_constant,
+        }
+        self.loops = _count_loops(vectors, self.output, where)
+
+    def init(self, *, key=None):
+        zeros = _zeros(self.loops, self.kp, self.ki, self.kd, self.dt)
+        return _Averages(zeros, zeros, zeros)
+
+    def __call__(self, t, y, state):
+        error, _ = _error(self, t, y)
+        share = self.dt / (self.dt + self.time_constant)
+        integral = state.integral + share * (error - state.integral)
+        change = error - state.error
+        derivative = state.derivative + share * (change - state.derivative)
+        u = self.kp * error + self.ki * integral + self.kd * derivative
+        after = _Averages(error, integral, derivative)
+        return _clip(u, self.bounds).astype(y.dtype), _as(after, state)
+
+
+def _as_output(output: Any, where: str) -> Callable[[Array], Array] | None:
+    if output is None or callable(output):
+        return output
+    if isinstance(output, int | np.integer) and not isinstance(output, bool):
+        output = (output,)
+    if isinstance(output, Sequence) and len(output) > 0:
+        whole = all(isinstance(i, int | np.integer) and i >= 0 for i in output)
+        if whole:
+            return _Select(tuple(int(i) for i in output))
+    if jnp.ndim(output) != 2:
+        raise ValueError(
+            f"{where}: output must be an index from 0, a tuple of them, a matrix or a "
+            f"function, got {output!r}."
+        )
+    return _Project(as_matrix(output, "output", where))
+
+
+def _count_loops(vectors: dict[str, Any], output: Any, where: str) -> int:
+    """The size that all the vectors have; 1 where all are numbers."""
+    sizes = {}
+    for name, value in vectors.items():
+        if value is None:
+            continue
+        array = as_float_array(value)
+        if not eqx.is_inexact_array(array) or array.ndim > 1:
+            raise ValueError(
+                f"{where}: {name} must be a number or a vector, got {value!r}."
+            )
+        if array.ndim == 1:
+            sizes[name] = array.shape[0]
+    if isinstance(output, _Select):
+        sizes["output"] = len(output.indices)
+    elif isinstance(output, _Project):
+        sizes["output"] = output.C.shape[0]
+    if len(set(sizes.values())) > 1 or 0 in sizes.values():
+        got = ", ".join(f"{name} of size {size}" for name, size in sizes.items())
+        raise ValueError(f"{where}: there must be one entry a loop; got {got}.")
+    return next(iter(sizes.values()), 1)
+
+
+def _zeros(loops: int, *like: Array) -> Array:
+    return jnp.zeros(loops, jnp.result_type(*like))
+
+
+def _error(pid: Any, t: Any, y: Array) -> tuple[Array, Array]:
+    """`(r(t) - h(y), h(y))`, checked to have an entry for each loop."""
+    name = type(pid).__name__
+    measured = y if pid.output is None else jnp.atleast_1d(pid.output(y))
+    if measured.shape != (pid.loops,):
+        what = "the observation has" if pid.output is None else "output gives"
+        raise ValueError(
+            f"{name}: expects {pid.loops} outputs, one a loop, but {what} shape "
+            f"{measured.shape}; choose what each loop follows, such as output=0."
+        )
+    reference = pid.reference(t) if callable(pid.reference) else pid.reference
+    reference = 0 if reference is None else reference
+    if jnp.shape(reference) not in ((), (pid.loops,)):
+        raise ValueError(
+            f"{name}: reference must have an entry for each of {pid.loops} loops, got "
+            f"shape {jnp.shape(reference)}."
+        )
+    return reference - measured, measured
+
+
+def _clip(u: Array, bounds: tuple[Array, Array] | None) -> Array:
+    return u if bounds is None else jnp.clip(u, *bounds)
+
+
+def _as(after: Any, before: Any) -> Any:
+    """`after` in the types of `before`, as a loop must carry it."""
+    return jax.tree.map(lambda a, b: a.astype(b.dtype), after, before)

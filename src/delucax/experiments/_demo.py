@@ -1,0 +1,235 @@
+"""The main job: from the pendulum's ODE to a trained controller, in one command."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from .. import plotting
+from .._paths import replace
+from .._serialise import save
+from ..controllers import Linear, LQR, Zero
+from ..disturbances import Shock
+from ..dynamics import linearize
+from ..environments import Environment, pendulum
+from ..simulation import rollout, Trajectory
+from ..systems import Pendulum
+from ..training import expected_cost, fit
+from ._swing_up import BATCH, holds_upright, HORIZON, STEPS, train_swing_up
+
+
+EVALUATION_STEPS = 400
+STARTS = 100
+_SHOCK = Shock(np.array([0.0, 0.3], np.float32), start=10.0, duration=0.5)
+
+
+def demo(
+    out: str | Path = "demo",
+    *,
+    seeds: int = 5,
+    steps: int = STEPS,
+    say: Callable[[str], Any] = print,
+) -> Any:
+    """Design, train, compare and show controllers for Gym's pendulum.
+
+    Takes the pendulum's ODE; designs an LQR about the upright; trains the linear policy
+    of the Deluca paper (Section 4) and an MLP by differentiating the rollout; runs them
+    and zero control from the same 100 starts, without and with a shock in the middle;
+    and writes a table, the controller, a figure and an animation.
+
+    **Arguments:**
+
+    - `out`: the folder to write to, `"demo"` by default.
+    - `seeds`: how many MLPs to train, 5 by default; the first is the one shown.
+    - `steps`: optimiser steps for each, 800 by default.
+    - `say`: what to do with a line of text; `print` by default.
+
+    **Returns:** the table, a `pandas.DataFrame`.
+
+    **Raises:** `OSError` if the folder cannot be written; `ValueError` if `seeds` is
+    below 1.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import tempfile
+
+        with tempfile.TemporaryDirectory() as folder:
+            table = dlx.experiments.demo(folder, seeds=1, steps=20)
+        ```
+    """
+    import pandas as pd
+
+    if seeds < 1:
+        raise ValueError(f"demo: seeds must be at least 1, got {seeds}.")
+    out = _writable(Path(out))
+    env = pendulum()
+    controllers: dict[str, Any] = {"zero": Zero(1)}
+
+    say("LQR about the upright, from the linearised ODE")
+    model = linearize(env.dynamics)
+    lqr = LQR(
+        model, jnp.diag(jnp.array([1.0, 0.1])), jnp.eye(1) * 0.001, difference=_difference
+    )
+    controllers["LQR"] = lqr
+    say(f"  K = {np.array2string(np.asarray(lqr.K), precision=3)}")
+
+    say("\nLinear policy u = -K x by gradient descent on the rollout (torque +-10)")
+    linear = _train_linear()
+    controllers["linear policy"] = linear
+    say(f"  K = {np.array2string(np.asarray(linear.K), precision=3)}")
+
+    say(f"\nMLP by gradient descent through the ODE, {seeds} seeds")
+    evaluate = eqx.filter_jit(_evaluate)
+    starts = jax.vmap(env.reset)(jax.random.split(jax.random.key(2**20), STARTS))
+    seconds, held = [], []
+    for seed in range(seeds):
+        begin = time.perf_counter()
+        fitted = train_swing_up(env, key=jax.random.key(seed), steps=steps)
+        seconds.append(time.perf_counter() - begin)
+        policy = fitted.model
+        runs = evaluate(env, policy, starts)
+        held.append(int(jnp.sum(holds_upright(runs))))
+        say(
+            f"  seed {seed}: {seconds[-1]:.1f} s with compilation; swings up and holds "
+            f"from {held[-1]} of {STARTS} starts"
+        )
+        if seed == 0:
+            controllers["MLP"] = policy
+
+    shaken = pendulum(disturbance=_SHOCK)
+    rows, shown = [], {}
+    for world, name in ((env, "none"), (shaken, "at 10 s")):
+        for label, controller in controllers.items():
+            runs = evaluate(world, controller, starts)
+            rows.append(_row(label, name, runs))
+            shown[label, name] = runs
+    table = pd.DataFrame(rows)
+    say(f"\nCost over 20 s from the same {STARTS} starts, torque +-2:\n")
+    say(table.to_string(index=False, float_format=lambda x: f"{x:.1f}"))
+
+    say(f"\nWriting {out}/")
+    table.to_csv(out / "table.csv", index=False)
+    save(out / "mlp.dlx", controllers["MLP"])
+    # The start that hangs lowest makes the best picture of a swing-up.
+    lowest = int(jnp.argmin(jnp.cos(starts[:, 0])))
+    picture = {name: shown[name, "at 10 s"][lowest] for name in controllers}
+    plotting.plot(picture).savefig(out / "trajectories.png", dpi=120)
+    say("  table.csv, mlp.dlx, trajectories.png")
+    swing = shown["MLP", "none"][lowest][:160]
+    plotting.animate(env, swing, path=out / "swing_up.gif", max_frames=80)
+    say("  swing_up.gif")
+
+    trained = BATCH * HORIZON * steps
+    say(
+        f"\nTrained on {trained / 1e6:.1f} million steps, gradients included, in "
+        f"{seconds[0]:.1f} s with compilation"
+        + (f" ({min(seconds):.1f} s without)" if seeds > 1 else "")
+        + f": {trained / min(seconds) / 1e6:.2f} million steps a second."
+    )
+    say(_beside_gymnasium(trained / min(seconds)))
+    say(_derivative())
+    return table
+
+
+def _writable(out: Path) -> Path:
+    """The folder, made and tried before any work is done."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise OSError(f"demo: out must be a folder to write to, got {out}: {error}")
+    return out
+
+
+def _difference(x, x_ref):
+    return Pendulum().difference(x, x_ref)
+
+
+def _train_linear() -> Linear:
+    """The policy optimisation of the paper: one start, hanging; torque +-10."""
+    env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0], np.float32))
+    mean_cost = expected_cost(env, batch=1, horizon=50)
+
+    def loss(controller, key):
+        return mean_cost(controller, key) / 50
+
+    gain = Linear(jnp.zeros((1, 2)))
+    return fit(loss, gain, optax.sgd(0.01), 1000, key=jax.random.key(0)).model
+
+
+def _evaluate(env: Environment, controller: Any, starts: Any) -> Trajectory:
+    def one(x0):
+        key = jax.random.key(0)
+        return rollout(env, controller, key=key, x0=x0, horizon=EVALUATION_STEPS)
+
+    return jax.vmap(one)(starts)
+
+
+def _row(label: str, shock: str, runs: Trajectory) -> dict[str, Any]:
+    cost = np.asarray(runs.total_cost)
+    half = 1.96 * cost.std(ddof=1) / np.sqrt(len(cost))
+    return {
+        "controller": label,
+        "shock": shock,
+        "mean cost": cost.mean(),
+        "+- 95%": half,
+        "median": np.median(cost),
+        "worst": cost.max(),
+        "upright at the end": int(jnp.sum(holds_upright(runs))),
+    }
+
+
+def _beside_gymnasium(steps_per_second: float) -> str:
+    """Gymnasium's own speed, measured here and now if it is installed."""
+    try:
+        import gymnasium
+    except ImportError:
+        return "Gymnasium is not installed, so its speed was not measured."
+    env = gymnasium.make("Pendulum-v1").unwrapped
+    env.reset(seed=0)
+    action = np.zeros(1, np.float32)
+    count = 20_000
+    for _ in range(1000):
+        env.step(action)
+    begin = time.perf_counter()
+    for _ in range(count):
+        env.step(action)
+    rate = count / (time.perf_counter() - begin)
+    return (
+        f"Gymnasium simulates {rate / 1e6:.3f} million steps a second on this machine: "
+        f"training ran {steps_per_second / rate:.0f} times as fast."
+    )
+
+
+def _derivative() -> str:
+    """The cost's derivative with respect to the length, beside a central difference."""
+    with jax.enable_x64(True):
+        env = pendulum(solver=diffrax.Tsit5(), dt=0.02)
+        K = jnp.array([[20.0, 5.0]])
+        x0 = jnp.array([0.1, 0.0])
+
+        @jax.jit
+        def cost(length):
+            longer = replace(env, {"dynamics.system.length": length})
+            key = jax.random.key(0)
+            run = rollout(longer, Linear(K), key=key, x0=x0, horizon=250, throw=False)
+            return run.total_cost
+
+        length, step = jnp.array(1.0), 1e-5
+        exact = float(jax.grad(cost)(length))
+        numeric = float((cost(length + step) - cost(length - step)) / (2 * step))
+    return (
+        "d(cost)/d(length) through the ODE (Tsit5, float64): "
+        f"{exact:.9f}; central difference: {numeric:.9f}."
+    )

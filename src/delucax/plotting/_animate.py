@@ -1,0 +1,164 @@
+"""A trajectory as a moving picture."""
+
+import dataclasses
+import functools
+import math
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from .._check import check_count
+from ..environments import Environment
+from ..simulation import Trajectory
+from ._export import check_path, html_player, reduced, write
+from ._plot import control_bounds
+from ._runs import as_runs, last_seen, Run
+from ._scene import Scene
+
+
+FASTEST, SLOWEST = 30.0, 5.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Animation:
+    """A moving picture, made by [`delucax.animate`][]. A notebook plays it.
+
+    `len(animation)` is the number of frames.
+
+    **Attributes:**
+
+    - `fps`: frames a second.
+    - `indices`: the step of the trajectory that each frame shows.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("pendulum")
+        zero = dlx.controllers.Zero(1)
+        trajectory = dlx.rollout(env, zero, key=jax.random.key(0), horizon=20)
+        animation = dlx.animate(env, trajectory)
+        len(animation), animation.fps
+        ```
+    """
+
+    fps: float
+    indices: tuple[int, ...]
+    _run: Run = dataclasses.field(repr=False)
+    _environment: Environment = dataclasses.field(repr=False)
+    _dpi: float = dataclasses.field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @functools.cached_property
+    def _frames(self) -> list[Image.Image]:
+        scene = Scene(self._run, self._environment, self.indices, self._dpi)
+        return [reduced(scene.frame(k)) for k in self.indices]
+
+    def save(self, path: Any) -> None:
+        """Write the animation to a file.
+
+        **Arguments:** `path`: where to; the ending chooses the form: `.gif`, `.html` (a
+            page that needs nothing else) or `.mp4` (needs ffmpeg).
+
+        **Raises:** `ValueError` if the ending is another, if the folder is not there or
+        cannot be written to, or if there is no ffmpeg for an `.mp4`.
+        """
+        target = check_path(path, "Animation.save")
+        write(target, self._frames, self.fps)
+
+    def _repr_html_(self) -> str:
+        return html_player(self._frames, self.fps)
+
+
+def animate(
+    environment: Environment,
+    trajectory: Trajectory,
+    *,
+    path: Any = None,
+    fps: float | None = None,
+    max_frames: int = 100,
+    dpi: float = 60,
+) -> Animation:
+    """A moving picture of a trajectory: the plant, and its states, controls and costs.
+
+    How the plant looks is found by the type of its system; see
+    [`delucax.plotting.register_drawing`][]. One that has no drawing is shown as a dot
+    in the plane of its first two states. It ends where the episode ends.
+
+    **Arguments:**
+
+    - `environment`: the environment that was run.
+    - `trajectory`: one trajectory with its states and controls.
+    - `path`: a file to save it to at once, ending in `.gif`, `.html` or `.mp4`. None by
+        default.
+    - `fps`: frames a second. By default it plays in real time, but with at least 5
+        frames a second: a longer run plays faster than it was.
+    - `max_frames`: the most frames, 100 by default; they are spread evenly over the
+        steps.
+    - `dpi`: pixels an inch, 60 by default: a picture about 600 pixels wide.
+
+    **Returns:** an [`delucax.plotting.Animation`][], which a notebook plays, and which
+    has `save(path)`.
+
+    **Raises:** `ValueError` if the trajectory is a batch, holds no states or controls,
+    or is not of this environment; if a number is not positive; or if `path` cannot be
+    written.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        linear = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
+        start = jnp.array([0.2, 0.0])
+        trajectory = dlx.rollout(env, linear, key=jax.random.key(0), x0=start)
+        animation = dlx.animate(env, trajectory, max_frames=50)
+        ```
+    """
+    where = "animate"
+    if not isinstance(trajectory, Trajectory):
+        raise ValueError(
+            f"{where}: trajectory must be a Trajectory, got "
+            f"{type(trajectory).__name__}."
+        )
+    if trajectory.batch_shape:
+        raise ValueError(
+            f"{where}: trajectory must be one trajectory, got a batch of shape "
+            f"{trajectory.batch_shape}; pick one, such as trajectory[0]."
+        )
+    run = as_runs(trajectory, None, "trajectory", where)[0]
+    if "controls" not in run.series:
+        raise ValueError(
+            f"{where}: trajectory holds no controls; keep them in the rollout, such as "
+            'keep=("states", "controls", "costs").'
+        )
+    control_bounds(environment, run, where)
+    max_frames = check_count(max_frames, "max_frames", where)
+    for name, value in (("fps", fps), ("dpi", dpi)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ValueError(
+                f"{where}: {name} must be positive and finite, got {value}."
+            )
+    target = None if path is None else check_path(path, where)
+    last = int(last_seen(run)[0])
+    duration = float(run.times[0, last] - run.times[0, 0])
+    frames = min(max_frames, last + 1)
+    if fps is None and duration > 0:
+        # Real time; no more frames than it takes, and no slide show of a long run.
+        frames = min(frames, max(2, round(FASTEST * duration) + 1))
+        fps = min(max((frames - 1) / duration, SLOWEST), FASTEST)
+    indices = np.unique(np.round(np.linspace(0, last, frames)).astype(int))
+    animation = Animation(
+        float(fps or FASTEST), tuple(indices.tolist()), run, environment, float(dpi)
+    )
+    if target is not None:
+        write(target, animation._frames, animation.fps)
+    return animation

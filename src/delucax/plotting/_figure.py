@@ -1,0 +1,99 @@
+"""Figures that show themselves in a notebook, and how everything here looks."""
+
+import io
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
+
+
+# Okabe and Ito (2008): told apart by colour-blind readers too. Its yellow and black are
+# left out: one vanishes on white paper, the other on a dark page.
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+LINE_STYLES = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 1.5, 1, 1.5)))
+NEUTRAL = "0.5"
+
+
+class NotebookFigure(Figure):
+    """A figure that a notebook shows, whether or not it has a plotting backend."""
+
+    def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=2 * self.dpi)
+        data = buffer.getvalue()
+        # Twice the pixels, shown at the nominal size: sharp on a dense screen. The size
+        # is read from the header, since a user's settings may crop what is saved.
+        width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))
+        return data, {"width": width // 2, "height": height // 2}
+
+
+def color_of(index: int) -> str:
+    """The colour of line `index`; they come round again after six."""
+    return PALETTE[index % len(PALETTE)]
+
+
+def line_style_of(index: int) -> Any:
+    """The line style of line `index`: solid until the colours come round again."""
+    return LINE_STYLES[index // len(PALETTE) % len(LINE_STYLES)]
+
+
+def style_axes(
+    ax: Axes, *, size: float, ticks: tuple[int, int] = (8, 4)
+) -> None:
+    """A light grid, two spines, few ticks, and no offset hidden in a corner."""
+    ax.grid(True, color=NEUTRAL, alpha=0.2, linewidth=0.6)
+    ax.set_axisbelow(True)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        ax.spines[side].set_color(NEUTRAL)
+        ax.spines[side].set_linewidth(0.8)
+    ax.tick_params(color=NEUTRAL, width=0.8, length=3, labelsize=size - 0.5)
+    ax.margins(x=0.01)
+    for axis, count in zip((ax.xaxis, ax.yaxis), ticks, strict=True):
+        axis.set_major_locator(MaxNLocator(count, steps=[1, 2, 2.5, 5, 10]))
+        axis.set_major_formatter(ScalarFormatter(useOffset=False))
+
+
+def with_unit(name: str, unit: str) -> str:
+    """`"angle [rad]"`; the name alone where the unit is not known."""
+    return f"{name} [{unit}]" if unit else name
+
+
+def wrapped(text: str, width: int) -> str:
+    """`text` in lines of about `width` characters, broken at spaces, and after `_` in
+    words that are longer than a line. Mathematics between dollar signs is left whole.
+    """
+    if "$" in text:
+        return text
+    pieces = []
+    for word in re.findall(r"[^ ]+ *", text):
+        long = len(word.rstrip()) > width
+        pieces += re.findall(r"[^_]+_*|_+", word) if long else [word]
+    lines = [""]
+    for piece in pieces:
+        if lines[-1] and len(lines[-1] + piece.rstrip()) > width:
+            lines.append("")
+        lines[-1] += piece
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def side_legend(
+    ax: Axes, handles: Sequence[Any], labels: Sequence[str], *, size: float
+) -> None:
+    """A legend beside the panel, where it covers no data."""
+    ax.legend(
+        handles,
+        labels,
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
+        frameon=False,
+        fontsize=size,
+        handlelength=1.4,
+        handletextpad=0.5,
+        labelspacing=0.3,
+        borderaxespad=0.3,
+    )

@@ -1,0 +1,183 @@
+"""The phase portrait of a planar system."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from .._check import as_vector
+from .._fields import as_float_array
+from ..systems import AbstractSystem
+from ._figure import (
+    color_of,
+    line_style_of,
+    NEUTRAL,
+    NotebookFigure,
+    style_axes,
+    with_unit,
+    wrapped,
+)
+from ._runs import as_runs
+
+
+GRID = 60
+SIZE = 10.0
+
+
+def phase_portrait(
+    system: AbstractSystem,
+    *,
+    limits: Any,
+    control: Any = None,
+    trajectories: Any = (),
+) -> Figure:
+    """Draw the flow of a system with two states, and trajectories in it.
+
+    Streamlines follow dx/dt at time 0, thicker where it is faster. A dot marks where a
+    trajectory starts. A state that is an angle (the system's `difference` wraps it)
+    shows its trajectories in every turn that is within the limits.
+
+    **Arguments:**
+
+    - `system`: a system with two states.
+    - `limits`: `((low, high), (low, high))`, of the first and the second state.
+    - `control`: a vector, or a function of the state to one (for a closed loop); zero
+        by default.
+    - `trajectories`: a [`delucax.Trajectory`][] (or a batch of them), a sequence, or a
+        dictionary from labels to them; none by default.
+
+    **Returns:** a `matplotlib.figure.Figure`.
+
+    **Raises:** `ValueError` if the system does not have two states, if limits cross, or
+    if the control or a trajectory does not fit the system.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        figure = dlx.plotting.phase_portrait(
+            dlx.systems.Pendulum(damping=0.5), limits=((-6.0, 6.0), (-8.0, 8.0))
+        )
+        ```
+    """
+    where = "phase_portrait"
+    if not isinstance(system, AbstractSystem):
+        raise ValueError(
+            f"{where}: system must be an AbstractSystem, such as "
+            f"environment.dynamics.system, got {type(system).__name__}."
+        )
+    if system.state_size != 2:
+        raise ValueError(
+            f"{where}: system must have two states, got {system.state_names}."
+        )
+    limits = _limits(limits, where)
+    runs = []
+    if not isinstance(trajectories, tuple | list | dict) or len(trajectories):
+        runs = as_runs(trajectories, None, "trajectories", where)
+        names = runs[0].trajectory.state_names
+        if names != system.state_names:
+            raise ValueError(
+                f"{where}: trajectories have states {names}, but the system has "
+                f"{system.state_names}."
+            )
+    x, v = (np.linspace(low, high, GRID) for low, high in limits)
+    states = jnp.stack(jnp.meshgrid(jnp.asarray(x), jnp.asarray(v)), axis=-1)
+    field = np.asarray(_field(system, control, states.reshape(-1, 2), where))
+    field = field.reshape(GRID, GRID, 2)
+
+    figure = NotebookFigure(figsize=(6.0, 4.8), layout="constrained")
+    ax = figure.add_subplot()
+    style_axes(ax, size=SIZE, ticks=(8, 6))
+    ax.grid(False)
+    # Speed as seen in the picture, so that neither axis outweighs the other.
+    extent = np.array([high - low for low, high in limits])
+    speed = np.linalg.norm(field / extent, axis=-1)
+    top = np.nanmax(np.where(np.isfinite(speed), speed, 0.0), initial=0.0) or 1.0
+    if np.any(speed > 0):
+        ax.streamplot(
+            x,
+            v,
+            field[..., 0],
+            field[..., 1],
+            color=to_rgba(NEUTRAL, 0.6),
+            linewidth=0.5 + 0.9 * np.sqrt(speed / top),
+            density=1.3,
+            arrowsize=0.8,
+            zorder=1,
+        )
+    handles, labels = [], []
+    for i, run in enumerate(runs):
+        style: dict[str, Any] = {"color": color_of(i), "linestyle": line_style_of(i)}
+        members = run.series["states"]
+        alpha = 1.0 if len(members) == 1 else max(0.2, 0.9 - 0.02 * len(members))
+        for path in members:
+            for turn in _turns(system, path, limits):
+                xs, vs = (path + turn).T
+                ax.plot(xs, vs, linewidth=1.8, alpha=alpha, zorder=2, **style)
+                ax.plot(xs[:1], vs[:1], "o", color=style["color"], ms=5, zorder=3)
+        handles.append(Line2D([], [], linewidth=1.8, **style))
+        labels.append(wrapped(run.label, 40))
+    ax.set(xlim=limits[0], ylim=limits[1])
+    units = system.state_units or ("", "")
+    ax.set_xlabel(wrapped(with_unit(system.state_names[0], units[0]), 60), size=SIZE)
+    ax.set_ylabel(wrapped(with_unit(system.state_names[1], units[1]), 45), size=SIZE)
+    if isinstance(trajectories, dict):
+        figure.legend(
+            handles,
+            labels,
+            loc="outside upper center",
+            ncols=max(1, 60 // (6 + max(map(len, labels)))),
+            frameon=False,
+            fontsize=SIZE,
+        )
+    return figure
+
+
+def _limits(limits: Any, where: str) -> tuple[tuple[float, float], ...]:
+    try:
+        array = np.asarray(limits, float)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.shape != (2, 2) or not np.all(np.isfinite(array)):
+        raise ValueError(
+            f"{where}: limits must be ((low, high), (low, high)), got {limits!r}."
+        )
+    if not np.all(array[:, 0] < array[:, 1]):
+        raise ValueError(f"{where}: limits must have low < high, got {limits!r}.")
+    return tuple((float(low), float(high)) for low, high in array)
+
+
+def _field(system: AbstractSystem, control: Any, states: Any, where: str) -> Any:
+    """dx/dt at each row of `states`."""
+    size = system.control_size
+    law: Callable[[Any], Any]
+    if control is None:
+        law = lambda x: jnp.zeros(size, x.dtype)
+    elif callable(control):
+        law = lambda x: as_vector(control(x), size, "what control returns", where)
+    else:
+        constant = as_vector(as_float_array(control), size, "control", where)
+        law = lambda x: constant
+    w = jnp.zeros(system.disturbance_size) if system.disturbance_names else None
+    return jax.vmap(lambda x: system.vector_field(0.0, x, law(x), w))(states)
+
+
+def _turns(system: AbstractSystem, path: np.ndarray, limits: Any) -> list[np.ndarray]:
+    """The shifts by whole turns of its angles that bring `path` into the limits."""
+    turns = [np.zeros(2)]
+    for i, (low, high) in enumerate(limits):
+        full = 2 * np.pi * np.eye(2)[i]
+        zero = jnp.zeros(2)
+        away = np.asarray(system.difference(zero + full, zero))
+        if np.max(np.abs(away)) > 1e-3 or not np.any(np.isfinite(path[:, i])):
+            continue
+        first = np.ceil((low - np.nanmax(path[:, i])) / (2 * np.pi))
+        last = np.floor((high - np.nanmin(path[:, i])) / (2 * np.pi))
+        turns = [t + k * full for t in turns for k in np.arange(first, last + 1)]
+    return turns

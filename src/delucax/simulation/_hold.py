@@ -1,0 +1,227 @@
+"""Zero-order hold inside one solve, exact at the switch."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._controller import AbstractController
+from ..dynamics._discretized import evaluate_field
+from ..systems import AbstractSystem
+
+
+class Inputs(eqx.Module):
+    """The `args` of the solve: all that a gradient may be taken with respect to.
+
+    Which control holds is said by `index`, an integer, rather than by the control
+    itself, so that the adjoint equations reach `controls`.
+    """
+
+    system: AbstractSystem
+    source: Any  # a controller, or a function of time; None for an array
+    memory: Any  # the controller's first state
+    controls: Array | None
+    disturbances: Array | None
+    index: Array
+    u: Array | None  # what a held controller asked for at the last switch
+
+    def control(self, t: Array, x: Array) -> Array:
+        if self.u is not None:
+            return self.u
+        if self.controls is not None:
+            return self.controls[self.index]
+        if isinstance(self.source, AbstractController):
+            u, _ = self.source(t, self.system.observe(t, x), self.memory)
+        else:
+            u = self.source(t)
+        check_control(u, self.source, self.system)
+        return u
+
+    def disturbance(self, x: Array) -> Array | None:
+        if self.disturbances is not None:
+            return self.disturbances[self.index]
+        if self.system.disturbance_names:
+            return jnp.zeros(self.system.disturbance_size, x.dtype)
+        return None
+
+    def act(self, t: Array, x: Array, memory: Any) -> tuple[Array, Any]:
+        """A held controller's answer at a switch, and its state after it."""
+        arrays, static = memory, eqx.filter(self.memory, eqx.is_array, inverse=True)
+        y = self.system.observe(t, x)
+        u, after = self.source(t, y, eqx.combine(arrays, static))
+        check_control(u, self.source, self.system)
+        u = u.astype(x.dtype)
+        after = self.source.applied(u, jnp.zeros((), x.dtype), after)
+        return u, eqx.filter(after, eqx.is_array)
+
+
+def field(t, x, args):
+    u = args.control(t, x)
+    return evaluate_field(args.system, t, x, u, args.disturbance(x)).astype(x.dtype)
+
+
+def check_control(u: Any, source: Any, system: AbstractSystem) -> None:
+    """Raise, with names, unless `u` is a control of the right size."""
+    if jnp.shape(u) != (system.control_size,):
+        raise ValueError(
+            f"{getattr(source, '__name__', type(source).__name__)}: returned a control "
+            f"of shape {jnp.shape(u)}, but the system takes shape "
+            f"({system.control_size},)."
+        )
+
+
+class Recorded(NamedTuple):
+    """A saved state with the held control of the step that it comes from."""
+
+    state: Array
+    control: Array
+
+
+def recorded(t: Array, x: Any, args: Inputs) -> Recorded:
+    """What is saved of a solve with a held controller."""
+    del t
+    return x if isinstance(x, Recorded) else Recorded(x, args.u)
+
+
+class _Ends(diffrax.AbstractLocalInterpolation):
+    """The interpolation of a step, with the solver's own state at its end."""
+
+    t0: Array
+    t1: Array
+    inside: diffrax.AbstractLocalInterpolation
+    end: Any
+    held: Array | None
+
+    def evaluate(self, t0, t1=None, left=True):
+        if t1 is not None:
+            return self.evaluate(t1, left=left) - self.evaluate(t0, left=left)
+        x = jnp.where(t0 == self.t1, self.end, self.inside.evaluate(t0, left=left))
+        return x if self.held is None else Recorded(x, self.held)
+
+
+class Hold(diffrax.AbstractWrappedSolver):
+    """A solver of which each step uses the control of the interval that it lies in.
+
+    The times of a step's stages do not tell the interval: its last stage is at the
+    switch itself, and rounding puts others beyond it. So the interval is found once a
+    step, from the step's two ends, and handed to the vector field as an index. What a
+    solver keeps from its last step (the slope at its end) is dropped at a switch. Steps
+    must not cross one, which is the step-size controller's part.
+
+    With `sampled`, a controller is asked at the start of each interval for the control
+    to hold; the control and the controller's memory are carried in the solver's state,
+    so that a rejected step takes them back.
+    """
+
+    solver: diffrax.AbstractSolver
+    switches: Array
+    sampled: bool = eqx.field(static=True)
+
+    @property
+    def term_structure(self):
+        return self.solver.term_structure
+
+    @property
+    def term_compatible_contr_kwargs(self):
+        return self.solver.term_compatible_contr_kwargs
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        inside = self.solver.interpolation_cls
+
+        def ends(*, t0, t1, inner, end, held):
+            return _Ends(t0, t1, inside(t0=t0, t1=t1, **inner), end, held)
+
+        return ends
+
+    # Diffrax looks for these on what passes for a Runge-Kutta or implicit solver.
+
+    @property
+    def root_finder(self):
+        return self.solver.root_finder  # pyright: ignore
+
+    @property
+    def root_find_max_steps(self):
+        return self.solver.root_find_max_steps  # pyright: ignore
+
+    @property
+    def scan_kind(self):
+        return self.solver.scan_kind  # pyright: ignore
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def strong_order(self, terms):
+        return self.solver.strong_order(terms)
+
+    def error_order(self, terms):
+        return self.solver.error_order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        args = _at(args, self._interval(terms, t0, t1))
+        inner = self.solver.init(terms, t0, t1, y0, args)
+        held = (args.u, eqx.filter(args.memory, eqx.is_array)) if self.sampled else None
+        return inner, jnp.full((), -1, jnp.int32), held
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        inner, last, held = solver_state
+        index = self._interval(terms, t0, t1)
+        switched = index != last
+        args = _at(args, index)
+        if self.sampled:
+
+            def act(held):
+                _, memory = held
+                return args.act(self.switches[index], y0, memory)
+
+            held = lax.cond(switched, act, lambda held: held, held)
+            args = eqx.tree_at(lambda a: a.u, args, held[0])
+        y1, error, dense_info, inner, result = self.solver.step(
+            terms, t0, t1, y0, args, inner, made_jump | switched
+        )
+        record = held[0] if self.sampled else None
+        dense_info = dict(inner=dense_info, end=y1, held=record)
+        return y1, error, dense_info, (inner, index, held), result
+
+    def func(self, terms, t0, y0, args):
+        ahead = jnp.nextafter(t0, jnp.full_like(t0, jnp.inf))
+        return self.solver.func(
+            terms, t0, y0, _at(args, self._interval(terms, t0, ahead))
+        )
+
+    def _interval(self, terms, t0, t1):
+        """The interval that the step from `t0` to `t1` lies in.
+
+        A backward solve counts its time down in negative numbers. A step that begins
+        one rounding before a switch belongs to what comes after it.
+        """
+        forwards = terms.direction == 1
+        low = jnp.where(forwards, t0, -t1)
+        high = jnp.where(forwards, t1, -t0)
+        index = _interval_from(self.switches, low)
+        switch = self.switches[index + 1]
+        later = (high - switch > switch - low).astype(index.dtype)
+        return jnp.minimum(index + later, self.switches.shape[0] - 2)
+
+
+def _at(args: Inputs, index: Array) -> Inputs:
+    return eqx.tree_at(lambda a: a.index, args, index)
+
+
+def _interval_from(switches: Array, t: Array) -> Array:
+    """k with `switches[k] <= t < switches[k + 1]`, of equal intervals."""
+    count = switches.shape[0] - 1
+    share = (t - switches[0]) / (switches[-1] - switches[0])
+    k = jnp.clip(jnp.floor(share * count).astype(jnp.int32), 0, count - 1)
+    # Rounding can put the quotient on the wrong side of a switch, never beyond it.
+    k = k + (t >= switches[k + 1]).astype(k.dtype) - (t < switches[k]).astype(k.dtype)
+    return jnp.clip(k, 0, count - 1)
+
+
+def interval_before(switches: Array, t: Array) -> Array:
+    """k with `switches[k] < t <= switches[k + 1]`."""
+    k = _interval_from(switches, t)
+    return jnp.maximum(k - (t == switches[k]).astype(k.dtype), 0)

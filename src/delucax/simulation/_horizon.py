@@ -1,0 +1,145 @@
+"""What a solve over a whole horizon asks of its arguments."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import numpy as np
+
+from .._check import check_positive, is_concrete
+from .._controller import AbstractController
+from .._fields import as_float_array
+from ..dynamics._discretized import has_diffusion
+from ..dynamics._solvers import check_adaptive, check_solver
+from ..systems import AbstractSystem
+
+
+def check_system(system: Any, where: str) -> None:
+    """Raise unless one solve can integrate `system`."""
+    if not isinstance(system, AbstractSystem):
+        raise ValueError(
+            f"{where}: system must be an AbstractSystem (of an environment, its "
+            f"`dynamics.system`), got {type(system).__name__}."
+        )
+    name = type(system).__name__
+    if type(system).project is not AbstractSystem.project:
+        raise ValueError(
+            f"{where}: system {name} projects its state after each interval, which one "
+            "solve cannot do; use `delucax.open_loop` or `delucax.rollout` with "
+            "delucax.Discretized(system, dt)."
+        )
+    if has_diffusion(system):
+        raise ValueError(
+            f"{where}: system {name} has a diffusion; use `delucax.open_loop` or "
+            "`delucax.rollout` with delucax.Discretized(system, dt), which takes its "
+            "Brownian increments."
+        )
+
+
+def as_time(value: Any, name: str, where: str) -> Any:
+    time = as_float_array(value)
+    if not eqx.is_inexact_array(time) or time.shape != ():
+        raise ValueError(f"{where}: {name} must be a number, got {value!r}.")
+    if is_concrete(time) and not np.isfinite(time):
+        raise ValueError(f"{where}: {name} must be finite, got {value!r}.")
+    return time
+
+
+def as_sequence(value: Any, size: int, name: str, where: str) -> Any:
+    array = as_float_array(value)
+    if not eqx.is_inexact_array(array) or array.ndim != 2 or array.shape[1] != size:
+        got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+        raise ValueError(f"{where}: {name} must have shape (T, {size}), got {got}.")
+    if array.shape[0] == 0:
+        raise ValueError(f"{where}: {name} must have at least one interval.")
+    return array
+
+
+def count_intervals(
+    t0: Any, t1: Any, dt: Any, source: Any, w: Any, where: str
+) -> int | None:
+    """The number of intervals that the arguments agree on; `None` if none says."""
+    counts = {}
+    if not callable(source):
+        counts["controller_or_controls"] = source.shape[0]
+    if w is not None:
+        counts["w"] = w.shape[0]
+    if dt is not None:
+        known = is_concrete(t0) and is_concrete(t1) and is_concrete(dt)
+        if not known and not counts:
+            raise ValueError(
+                f"{where}: dt, t0 and t1 must be known numbers, not traced ones, as "
+                "they say how many intervals there are; give an array of controls, or "
+                "use `delucax.rollout`."
+            )
+        if known:
+            check_positive(dt, "dt", where)
+            ratio = (float(t1) - float(t0)) / float(dt)
+            # Single precision rounds the quotient by a few parts in 1e7.
+            if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
+                raise ValueError(
+                    f"{where}: t1 - t0 must be a whole multiple of dt, got t0 = {t0}, "
+                    f"t1 = {t1}, dt = {dt}."
+                )
+            counts["dt"] = round(ratio)
+    if len(set(counts.values())) > 1:
+        said = ", ".join(f"{name} says {count}" for name, count in counts.items())
+        raise ValueError(f"{where}: the numbers of intervals differ: {said}.")
+    return next(iter(counts.values()), None)
+
+
+def as_save_times(ts: Any, t0: Any, t1: Any, where: str) -> Any:
+    ts = as_float_array(ts)
+    if not eqx.is_inexact_array(ts) or ts.ndim != 1 or ts.shape[0] < 2:
+        raise ValueError(
+            f"{where}: ts must be a vector of at least two times, got {ts!r}."
+        )
+    if is_concrete(ts) and is_concrete(t0) and is_concrete(t1):
+        values = np.asarray(ts)
+        inside = np.all((values >= np.asarray(t0)) & (values <= np.asarray(t1)))
+        if not inside or not np.all(np.diff(values) > 0):
+            raise ValueError(
+                f"{where}: ts must increase and lie between t0 = {t0} and t1 = {t1}, "
+                f"got {ts}."
+            )
+    return ts
+
+
+def check_adjoint(
+    adjoint: Any, adaptive: bool, hold: str | None, source: Any, where: str
+) -> None:
+    """Raise unless `adjoint` fits the solve."""
+    if not isinstance(adjoint, diffrax.AbstractAdjoint):
+        raise ValueError(
+            f"{where}: adjoint must be a Diffrax adjoint such as "
+            f"diffrax.RecursiveCheckpointAdjoint(), got {adjoint!r}."
+        )
+    if isinstance(adjoint, diffrax.ImplicitAdjoint):
+        raise ValueError(
+            f"{where}: adjoint ImplicitAdjoint is for solves that end in a steady "
+            "state; use diffrax.RecursiveCheckpointAdjoint()."
+        )
+    if not isinstance(adjoint, diffrax.BacksolveAdjoint):
+        return
+    if not adaptive:
+        raise ValueError(
+            f"{where}: adjoint BacksolveAdjoint needs a stepsize_controller, such as "
+            "diffrax.PIDController(rtol=1e-6, atol=1e-8)."
+        )
+    if hold == "zero" and isinstance(source, AbstractController):
+        raise ValueError(
+            f"{where}: adjoint BacksolveAdjoint does not fit a held controller: its "
+            "samples and memory cannot be run backwards. Use "
+            "diffrax.RecursiveCheckpointAdjoint(), hold=None, or an array of controls."
+        )
+    if "solver" in adjoint.kwargs:
+        check_solver(adjoint.kwargs["solver"], f"{where}: BacksolveAdjoint")
+        check_adaptive(adjoint.kwargs["solver"], f"{where}: BacksolveAdjoint")
+    backwards = adjoint.kwargs.get("stepsize_controller")
+    if backwards is not None and not isinstance(
+        backwards, diffrax.AbstractAdaptiveStepSizeController
+    ):
+        raise ValueError(
+            f"{where}: BacksolveAdjoint: stepsize_controller must be adaptive, got "
+            f"{type(backwards).__name__}."
+        )

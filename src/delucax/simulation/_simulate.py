@@ -1,0 +1,385 @@
+"""The whole horizon in one solve."""
+
+from typing import Any, Literal
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._check import as_vector, check_count, is_concrete
+from .._controller import AbstractController
+from .._results import first_failure, promote, RESULTS
+from .._typing import PRNGKey
+from ..dynamics._solvers import (
+    check_adaptive,
+    check_fixed_step,
+    check_solver,
+    for_one_step,
+    loud,
+)
+from ..systems import AbstractSystem
+from ._hold import (
+    check_control,
+    field,
+    Hold,
+    Inputs,
+    interval_before,
+    Recorded,
+    recorded,
+)
+from ._horizon import (
+    as_save_times,
+    as_sequence,
+    as_time,
+    check_adjoint,
+    check_system,
+    count_intervals,
+)
+from ._trajectory import checked, Trajectory
+
+
+def simulate(
+    system: AbstractSystem,
+    controller_or_controls: Any,
+    t0: Any,
+    t1: Any,
+    x0: Any,
+    *,
+    hold: Literal["zero"] | None = "zero",
+    dt: Any = None,
+    w: Any = None,
+    solver: diffrax.AbstractSolver | None = None,
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    substeps: int = 1,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    max_steps: int | None = None,
+    ts: Any = None,
+    key: PRNGKey | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    throw: bool = True,
+) -> Trajectory:
+    r"""Integrate a controlled system over the whole horizon in one solve.
+
+    `dx/dt = f(t, x, u, w)` from `t0` to `t1` by a single `diffrax.diffeqsolve`, so that
+    `adjoint` governs the gradient of the whole horizon. The horizon is cut into T equal
+    intervals. With `hold="zero"` the control of interval k is held over it, and the
+    solve is exact at the switch: no step crosses one, and every stage of a step uses
+    the control of the interval that the step lies in. A step that starts at a switch
+    uses nothing from before it.
+
+    There is no cost here: `costs` is `None`, and the trajectory's `final_cost` and
+    `total_cost` are zero. It is compiled at its door, as [`delucax.rollout`][] is.
+
+    **Arguments:**
+
+    - `system`: the continuous-time system.
+    - `controller_or_controls`: an array of controls, shape `(T, m)`; a function of time
+        to a control; or a controller. A controller that is held samples the sensor at
+        each switch, and is told by `applied` of its own control and a cost of zero.
+    - `t0`, `t1`: start and end of the horizon, numbers with `t1 > t0`.
+    - `x0`: the state at `t0`, shape `(n,)`.
+    - `hold`: `"zero"` (default), the control is held over each interval; `None`, it is
+        a function of time, or continuous feedback `u = pi(t, observe(t, x))` of a
+        controller without a state of its own.
+    - `dt`: the interval, a number of which `t1 - t0` is a whole multiple. By default
+        `(t1 - t0) / T` where `controller_or_controls` or `w` is an array; needed
+        otherwise.
+    - `w`: disturbances that enter the vector field, shape `(T, k)`, held over the
+        intervals whatever `hold` is; zero by default.
+    - `solver`: a Diffrax solver; `diffrax.Tsit5()` by default.
+    - `stepsize_controller`: such as `diffrax.PIDController(rtol=1e-6, atol=1e-8)`;
+        `None` (default) for fixed steps.
+    - `substeps`: fixed steps an interval, 1 by default.
+    - `adjoint`: any of `diffrax.RecursiveCheckpointAdjoint()` (default),
+        `diffrax.DirectAdjoint()`, `diffrax.ForwardMode()`, or
+        `diffrax.BacksolveAdjoint()`, which needs a `stepsize_controller` and takes no
+        held controller, whose memory cannot be run backwards.
+    - `max_steps`: the most adaptive steps over the horizon; by default 4096, or 64 an
+        interval if that is more.
+    - `ts`: the times to save at, increasing and between `t0` and `t1`; by default the
+        T + 1 ends of the intervals, where the saved states are the solver's own, not
+        interpolated.
+    - `key`: a random key for the controller's `init`; none by default.
+    - `progress_meter`: such as `diffrax.TqdmProgressMeter()`; none by default.
+    - `throw`: raise if the solve fails or the state becomes NaN or infinite (default);
+        if false, look at `trajectory.result`.
+
+    **Returns:** a [`delucax.Trajectory`][] whose `times` are those saved at. Its
+    `controls` and `disturbances` are those in force just before each time but the first
+    (with `hold=None`, the control just after each time but the last), `observations`
+    are what the sensor reads at each time but the last.
+
+    **Raises:** `ValueError` on an argument of the wrong kind or shape, on a solver or
+    adjoint that does not fit, and on systems that one solve cannot integrate: those
+    that `project` their state after each interval, that have a `diffusion`, or, with
+    `w`, that name no disturbances; discretise these with [`delucax.Discretized`][]. An
+    error at run time as `throw` says.
+
+    Source: Kidger, 2021 (Diffrax).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import diffrax
+        import jax
+        import jax.numpy as jnp
+
+        pendulum = dlx.systems.Pendulum()
+        x0 = jnp.array([0.1, 0.0])
+
+        def cost(controls):
+            trajectory = dlx.simulate(
+                pendulum,
+                controls,
+                0.0,
+                1.0,
+                x0,
+                stepsize_controller=diffrax.PIDController(rtol=1e-5, atol=1e-6),
+                adjoint=diffrax.BacksolveAdjoint(),
+            )
+            return jnp.sum(trajectory.final_state**2)
+
+        jax.grad(cost)(jnp.zeros((20, 1)))
+
+        feedback = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
+        sampled = dlx.simulate(pendulum, feedback, 0.0, 1.0, x0, dt=0.05)
+        continuous = dlx.simulate(pendulum, feedback, 0.0, 1.0, x0, hold=None, dt=0.05)
+        ```
+    """
+    where = "simulate"
+    check_system(system, where)
+    if hold not in ("zero", None):
+        raise ValueError(f"{where}: hold must be 'zero' or None, got {hold!r}.")
+    x0 = as_vector(x0, system.state_size, "x0", where)
+    if is_concrete(x0) and not np.all(np.isfinite(x0)):
+        raise ValueError(f"{where}: x0 must be finite, got {x0}.")
+    t0, t1 = as_time(t0, "t0", where), as_time(t1, "t1", where)
+    if is_concrete(t0) and is_concrete(t1) and not t1 > t0:
+        raise ValueError(f"{where}: t1 must be above t0, got t0 = {t0}, t1 = {t1}.")
+    source = controller_or_controls
+    if not callable(source):
+        source = as_sequence(
+            source, system.control_size, "controller_or_controls", where
+        )
+        if hold is None:
+            raise ValueError(
+                f"{where}: hold=None needs a controller or a function of time; an "
+                "array of controls is held, hold='zero'."
+            )
+    if w is not None:
+        if not system.disturbance_names:
+            raise ValueError(
+                f"{where}: w cannot be given, as {type(system).__name__} names no "
+                "disturbances: w would be added to the state after each interval, "
+                "which one solve cannot do. Use `delucax.open_loop` or "
+                "`delucax.rollout` with delucax.Discretized(system, dt)."
+            )
+        w = as_sequence(w, system.disturbance_size, "w", where)
+    substeps = check_count(substeps, "substeps", where)
+    adaptive = stepsize_controller is not None
+    steps = count_intervals(t0, t1, dt, source, w, where)
+    if steps is None and (hold == "zero" or not adaptive or ts is None):
+        raise ValueError(
+            f"{where}: dt must be given, as there is no array of controls to take the "
+            "interval from (it may be left out with hold=None if both "
+            "stepsize_controller and ts are given)."
+        )
+    if ts is not None:
+        ts = as_save_times(ts, t0, t1, where)
+    solver = diffrax.Tsit5() if solver is None else solver
+    check_solver(solver, where)
+    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+    check_adjoint(adjoint, adaptive, hold, source, where)
+    if adaptive:
+        if not isinstance(
+            stepsize_controller, diffrax.AbstractAdaptiveStepSizeController
+        ):
+            raise ValueError(
+                f"{where}: stepsize_controller must be adaptive, such as "
+                "diffrax.PIDController(rtol=1e-6, atol=1e-8); for fixed steps leave it "
+                f"out and give substeps. Got {type(stepsize_controller).__name__}."
+            )
+        if substeps != 1:
+            raise ValueError(
+                f"{where}: substeps must be 1 with a stepsize_controller, which "
+                f"chooses the steps, got {substeps}."
+            )
+        check_adaptive(solver, where)
+        most = max(4096, 64 * (steps or 0)) if max_steps is None else max_steps
+        max_steps = check_count(most, "max_steps", where)
+    else:
+        if max_steps is not None:
+            raise ValueError(
+                f"{where}: max_steps needs stepsize_controller; with fixed steps give "
+                "substeps."
+            )
+        check_fixed_step(solver, where)
+        max_steps = steps * substeps
+    if progress_meter is None:
+        progress_meter = diffrax.NoProgressMeter()
+    trajectory = _simulate(
+        system,
+        source,
+        w,
+        x0,
+        t0,
+        t1,
+        ts,
+        key,
+        solver,
+        stepsize_controller,
+        adjoint,
+        progress_meter,
+        steps,
+        substeps,
+        max_steps,
+        hold,
+    )
+    return checked(trajectory, where) if throw else trajectory
+
+
+@eqx.filter_jit
+def _simulate(
+    system,
+    source,
+    w,
+    x0,
+    t0,
+    t1,
+    ts,
+    key,
+    solver,
+    stepsize_controller,
+    adjoint,
+    progress_meter,
+    steps,
+    substeps,
+    max_steps,
+    hold,
+):
+    dtype = x0.dtype
+    t0, t1 = t0.astype(dtype), t1.astype(dtype)
+    grid = switches = None
+    if steps is not None:
+        grid = t0 + (t1 - t0) * (jnp.arange(steps * substeps + 1) / (steps * substeps))
+        grid = grid.astype(dtype).at[-1].set(t1)
+        switches = grid[::substeps]
+    times = switches if ts is None else ts.astype(dtype)
+
+    sampled = hold == "zero" and isinstance(source, AbstractController)
+    controls = memory = u = None
+    if isinstance(source, AbstractController):
+        memory = source.init(key=key)
+        if hold is None and jax.tree.leaves(memory):
+            raise ValueError(
+                f"simulate: hold=None needs a controller without a state of its own, "
+                f"got {type(source).__name__}, whose state is only defined from one "
+                "sample to the next; use hold='zero' with dt."
+            )
+        # The solve's loop keeps the types that it starts with: no weak ones.
+        memory = jax.tree.map(
+            lambda a: jnp.asarray(a, a.dtype) if eqx.is_array(a) else a, memory
+        )
+    elif not callable(source):
+        controls = source
+    elif hold == "zero":
+        controls = jax.vmap(source)(switches[:-1])
+        check_control(controls[0], source, system)
+    if controls is not None:
+        controls, source = controls.astype(dtype), None
+    index = jnp.zeros((), jnp.int32)
+    args = Inputs(system, source, memory, controls, w, index, u)
+    if sampled:
+        u, _ = args.act(t0, x0, eqx.filter(memory, eqx.is_array))
+        args = eqx.tree_at(lambda a: a.u, args, u, is_leaf=lambda leaf: leaf is None)
+
+    held = hold == "zero" or w is not None
+
+    def fitted(solver):
+        return Hold(solver, switches, sampled) if held else solver
+
+    def clipped(controller):
+        if not held or steps == 1:
+            return controller
+        return diffrax.ClipStepSizeController(controller, step_ts=switches[1:-1])
+
+    if stepsize_controller is None:
+        stepsize_controller = diffrax.StepTo(grid)
+        if isinstance(solver, diffrax.AbstractImplicitSolver):
+            solver = for_one_step(solver, dtype)
+    else:
+        stepsize_controller = clipped(stepsize_controller)
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        backwards = dict(adjoint.kwargs)
+        for name, fit in (("solver", fitted), ("stepsize_controller", clipped)):
+            if name in backwards:
+                backwards[name] = fit(backwards[name])
+        adjoint = diffrax.BacksolveAdjoint(**backwards)
+    saved = dict(t0=True, ts=times[1:]) if ts is None else dict(t1=True, ts=times)
+    if sampled:
+        saved["fn"] = recorded
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        fitted(solver),
+        t0,
+        t1,
+        dt0=None,
+        y0=x0,
+        args=args,
+        saveat=diffrax.SaveAt(**saved),
+        stepsize_controller=stepsize_controller,
+        adjoint=loud(adjoint),
+        max_steps=max_steps,
+        progress_meter=progress_meter,
+        throw=False,
+    )
+    states, applied = solution.ys, None
+    if isinstance(states, Recorded):
+        states, applied = states.state, states.control
+    final_state = states[-1]
+    count = times.shape[0]
+    states = states[:count]
+
+    def before(held):
+        """Of a held sequence, what is in force just before each time but the first."""
+        if held is None or ts is None:
+            return held
+        return held[jax.vmap(lambda t: interval_before(switches, t))(times[1:])]
+
+    if applied is not None:
+        controls = applied[1:count]
+    elif controls is not None:
+        controls = before(controls)
+    else:
+        controls = jax.vmap(args.control)(times[:-1], states[:-1])
+    finite = jnp.all(jnp.isfinite(final_state))
+    diverged = RESULTS.where(finite, RESULTS.successful, RESULTS.diverged)
+    sensor = None
+    if type(system).observe is not AbstractSystem.observe:
+        sensor = jax.vmap(system.observe)(times[:-1], states[:-1])
+    spacing = (t1 - t0) / steps if ts is None else (times[-1] - times[0]) / (count - 1)
+    return Trajectory(
+        states=states,
+        controls=controls,
+        costs=None,
+        final_state=final_state,
+        final_cost=jnp.zeros((), dtype),
+        total_cost=jnp.zeros((), dtype),
+        length=jnp.asarray(count - 1),
+        result=first_failure(promote(solution.result), diverged),
+        dt=spacing,
+        recorded_times=times,
+        recorded_observations=sensor,
+        recorded_disturbances=before(w),
+        recorded_terminated=None,
+        steps=count - 1,
+        keep=("states", "observations", "controls", "disturbances"),
+        disturbance_size=system.disturbance_size,
+        state_names=system.state_names,
+        control_names=system.control_names,
+        state_units=system.state_units,
+        control_units=system.control_units,
+    )

@@ -1,0 +1,8 @@
+"""Gradient estimators, and the loop that trains on them."""
+
+from ._analytic import analytic as analytic
+from ._costs import expected_cost as expected_cost, scored_cost as scored_cost
+from ._evolution import EvolutionStrategies as EvolutionStrategies
+from ._fit import fit as fit, Fitted as Fitted
+from ._history import History as History
+from ._likelihood import LikelihoodRatio as LikelihoodRatio

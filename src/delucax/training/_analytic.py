@@ -1,0 +1,59 @@
+"""The gradient by differentiating through the loss."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import PyTree
+
+from .._typing import PRNGKey
+from ._loss import cost_and_metrics
+from ._trainable import weights_of
+
+
+def analytic(
+    loss: Callable[..., Any], model: PyTree, key: PRNGKey
+) -> tuple[Any, PyTree]:
+    """The gradient by automatic differentiation through the loss.
+
+    `g = d loss(theta, key) / d theta`, exact for the key that is drawn; its mean over
+    keys is the gradient of the expected loss wherever the two may be exchanged.
+
+    Like every estimator it is called as `estimator(loss, model, key)` and differentiates
+    with respect to the leaves of the model marked `weight()`; or, where none is marked,
+    to every floating-point array. [`delucax.training.fit`][] hands it the trainable
+    (unconstrained) values alone.
+
+    **Arguments:**
+
+    - `loss`: `loss(model, key)` to a scalar, or to a scalar and a dictionary of metrics.
+    - `model`: a pytree with weights.
+    - `key`: a random key, passed to the loss.
+
+    **Returns:** `(value, gradient)`: what the loss returned, and a pytree like the model
+    with `None` in the place of what is not a weight.
+
+    **Raises:** `ValueError` if the loss is not a floating-point scalar.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        loss = dlx.training.expected_cost(env, batch=8, horizon=50)
+        controller = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
+        value, gradient = dlx.training.analytic(loss, controller, jax.random.key(0))
+        gradient.K
+        ```
+    """
+    weights, rest = weights_of(model)
+
+    def of(weights):
+        value = loss(eqx.combine(weights, rest), key)
+        return cost_and_metrics(value, "analytic")[0], value
+
+    (_, value), gradient = eqx.filter_value_and_grad(of, has_aux=True)(weights)
+    return value, gradient

@@ -1,0 +1,130 @@
+"""The gradient of a smoothed loss, from its values alone."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array, PyTree
+
+from .._check import check_count
+from .._fields import as_float_array, check_parameters, parameter, positive
+from .._typing import PRNGKey
+from ._loss import cost_and_metrics
+from ._trainable import weights_of
+
+
+class EvolutionStrategies(eqx.Module):
+    r"""The gradient of the loss smoothed by Gaussian noise on the weights.
+
+    Antithetic, over `n = samples / 2` directions `e_i ~ N(0, I)`, each with its own key:
+
+    `g = 1 / (2 n sigma) sum_i (loss(theta + sigma e_i) - loss(theta - sigma e_i)) e_i`,
+
+    or one-sided, over `n = samples` directions and one key:
+
+    `g = 1 / (n sigma) sum_i (loss(theta + sigma e_i) - loss(theta)) e_i`.
+
+    Both are unbiased for the gradient of `E[loss(theta + sigma e)]`, which is that of
+    the expected loss itself where the loss is quadratic, and differs by order
+    `sigma^2` elsewhere. Only values are taken, all at once under `jax.vmap`: the loss
+    need not be differentiable. Called as every estimator is, see
+    [`delucax.training.analytic`][].
+
+    **Arguments:**
+
+    - `sigma`: the standard deviation of the noise, positive; in the unconstrained
+        values of what has a constraint when used by [`delucax.training.fit`][].
+    - `samples`: the number of perturbed losses in one estimate; even if antithetic.
+    - `antithetic`: whether each direction is tried both ways (default), which cancels
+        the loss itself and every even term.
+
+    **Returns:** from a call, `(value, gradient)`: what the loss returned for the
+    unperturbed weights, and a pytree like the model with `None` in the place of what is
+    not a weight.
+
+    **Raises:** `ValueError` if `sigma` is not positive, or if `samples` is below 1, or
+    odd and antithetic.
+
+    Source: Salimans, Ho, Chen, Sidor and Sutskever, 2017; Nesterov and Spokoiny, 2017
+    (one-sided).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        loss = dlx.training.expected_cost(env, batch=1, horizon=50)
+        controller = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
+        estimator = dlx.training.EvolutionStrategies(sigma=0.1, samples=16)
+        value, gradient = estimator(loss, controller, jax.random.key(0))
+        ```
+    """
+
+    sigma: Array = parameter(constraint=positive)
+    samples: int = eqx.field(static=True)
+    antithetic: bool = eqx.field(static=True)
+
+    def __init__(self, sigma: Any, samples: int, antithetic: bool = True):
+        where = "EvolutionStrategies"
+        self.sigma = as_float_array(sigma)
+        self.samples = check_count(samples, "samples", where)
+        if antithetic and samples % 2:
+            raise ValueError(
+                f"{where}: samples must be even when antithetic, got {samples}."
+            )
+        self.antithetic = bool(antithetic)
+
+    def __check_init__(self):
+        check_parameters(self)
+
+    def __call__(self, loss, model, key: PRNGKey) -> tuple[Any, PyTree]:
+        weights, rest = weights_of(model)
+        n = self.samples // 2 if self.antithetic else self.samples
+        loss_key, noise_key, pair_key = jr.split(key, 3)
+        noise = _normal(noise_key, weights, n)
+        ones = jnp.ones(n)
+        # The unperturbed weights ride in front, so that the loss is traced once.
+        if self.antithetic:
+            signs = jnp.concatenate([jnp.zeros(1), ones, -ones])
+            pairs = jr.split(pair_key, n)
+            keys = jnp.concatenate([loss_key[None], pairs, pairs])
+            lanes = jnp.concatenate([jnp.zeros(1, int), jnp.arange(n), jnp.arange(n)])
+        else:
+            signs = jnp.concatenate([jnp.zeros(1), ones])
+            keys = None
+            lanes = jnp.concatenate([jnp.zeros(1, int), jnp.arange(n)])
+
+        def value_at(sign, lane, own_key):
+            scale = self.sigma * sign
+            moved = jax.tree.map(
+                lambda w, e: (w + scale * e[lane]).astype(w.dtype), weights, noise
+            )
+            one_key = loss_key if own_key is None else own_key
+            value = loss(eqx.combine(moved, rest), one_key)
+            return cost_and_metrics(value, "EvolutionStrategies")
+
+        costs, metrics = jax.vmap(value_at)(signs, lanes, keys)
+        if self.antithetic:
+            slopes = (costs[1 : n + 1] - costs[n + 1 :]) / (2 * n * self.sigma)
+        else:
+            slopes = (costs[1:] - costs[0]) / (n * self.sigma)
+        gradient = jax.tree.map(
+            lambda w, e: jnp.tensordot(slopes, e, 1).astype(w.dtype), weights, noise
+        )
+        first = {name: metric[0] for name, metric in metrics.items()}
+        return (costs[0], first) if first else costs[0], gradient
+
+
+def _normal(key: PRNGKey, weights: PyTree, n: int) -> PyTree:
+    """`n` standard normal draws for each leaf, along a new leading axis."""
+    leaves, structure = jax.tree.flatten(weights)
+    draws = [
+        jr.normal(one, (n, *leaf.shape), leaf.dtype)
+        for one, leaf in zip(jr.split(key, len(leaves)), leaves, strict=True)
+    ]
+    return jax.tree.unflatten(structure, draws)

@@ -1,0 +1,333 @@
+"""The training loop."""
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optax
+from jaxtyping import PyTree
+from tqdm.auto import tqdm
+
+from .._check import check_count, check_key, is_concrete
+from .._results import RESULTS, Result
+from .._typing import PRNGKey
+from . import _checkpoint
+from ._analytic import analytic
+from ._history import History, history_of
+from ._loop import FAULTS, run_block
+from ._trainable import strong, take_apart
+
+
+_WHERE = "fit"
+
+
+class Fitted(eqx.Module):
+    """What training leaves behind.
+
+    **Attributes:**
+
+    - `model`: the trained model. If training diverged, the model as it was before the
+        step that failed.
+    - `history`: the record, a [`delucax.training.History`][].
+    - `result`: success, or `RESULTS.diverged`; one of `delucax.RESULTS`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+        import optax
+
+        fitted = dlx.training.fit(
+            lambda model, key: jnp.sum((model.K - 2.0) ** 2),
+            dlx.controllers.Linear(jnp.zeros((1, 2))),
+            optax.adam(0.1),
+            steps=100,
+            key=jax.random.key(0),
+        )
+        fitted.model.K, fitted.history.loss[-1], fitted.result
+        ```
+    """
+
+    model: PyTree
+    history: History
+    result: Result
+
+
+def fit(
+    loss: Callable[..., Any],
+    model: PyTree,
+    optimiser: optax.GradientTransformation,
+    steps: int,
+    *,
+    key: PRNGKey,
+    data: PyTree = None,
+    batch_size: int | None = None,
+    trainable: Any = None,
+    gradient: Callable[..., Any] = analytic,
+    block: int = 100,
+    progress: bool = True,
+    callbacks: Sequence[Callable[[int, dict[str, float]], Any]] = (),
+    checkpoint: str | os.PathLike | None = None,
+    checkpoint_every: int | None = None,
+    throw: bool = True,
+) -> Fitted:
+    """Train a model: one loop for policies, identification and learned simulators.
+
+    At step k, with `key_k = fold_in(key, k)`: take the loss and its gradient with
+    respect to the trainable values, update them with the optimiser. What has a
+    constraint is moved in its unconstrained value, `z = unconstrain(value)`, and the
+    model sees `constrain(z)`, so that no step leaves the legal set.
+
+    The steps run in compiled blocks, as one loop on the device. The result does not
+    depend on the size of the block, and a run that was cut off and resumed from its
+    checkpoint ends with the same bits as one that was not. A second call with the same
+    loss function, optimiser object and kind of model does not compile again; an
+    optimiser is a pair of functions, so each new one does. Not for use under `jit` or
+    `vmap`: train an ensemble by `vmap` inside the loss.
+
+    **Arguments:**
+
+    - `loss`: `loss(model, key)`, or `loss(model, batch, key)` where there is `data`; to
+        a scalar, or to a scalar and a dictionary of scalar metrics. If it is a module
+        (as that of [`delucax.training.expected_cost`][] is), a change of its arrays
+        does not compile again.
+    - `model`: any pytree: a controller, an environment, a network, or several.
+    - `optimiser`: an Optax optimiser, such as `optax.adam(1e-3)`. It sees a dictionary
+        from the path of each trainable leaf to its unconstrained value.
+    - `steps`: the number of steps, at least 1.
+    - `key`: a random key.
+    - `data`: a pytree of arrays with a common leading axis; none by default.
+    - `batch_size`: rows in a batch, drawn without replacement; each pass over the data
+        has a new order, and leaves out the rows that do not fill a batch. All rows at
+        every step by default.
+    - `trainable`: what moves. The fields marked [`delucax.weight`][] by default; else a
+        path such as `"dynamics.system.length"`, several paths, a dictionary from path to
+        a constraint ([`delucax.positive`][], [`delucax.bounded`][], or `None` for
+        that of the field), a function of a leaf such as `equinox.is_inexact_array`, or
+        booleans in the structure of the model.
+    - `gradient`: the estimator, [`delucax.training.analytic`][] by default; or
+        [`delucax.training.EvolutionStrategies`][],
+        [`delucax.training.LikelihoodRatio`][], or any function
+        `gradient(loss, values, key)` to `(value, gradient)`.
+    - `block`: steps in one compiled call, 100 by default. The bar moves, callbacks are
+        called and checkpoints are written after each.
+    - `progress`: whether to show a bar with the loss; true by default.
+    - `callbacks`: functions `(step, metrics)` called after each block, with the number
+        of steps done and a dictionary of the last step's numbers; none by default. The
+        way to TensorBoard and the like.
+    - `checkpoint`: the path of a file to write the run to; none by default. If it is
+        there, the run goes on from it.
+    - `checkpoint_every`: steps between checkpoints, rounded up to whole blocks; 10
+        blocks by default. The end of the run is always written.
+    - `throw`: raise if the loss, its gradient or an update is NaN or infinite
+        (default); if false, stop there and look at `fitted.result`.
+
+    **Returns:** a [`delucax.training.Fitted`][].
+
+    **Raises:** `ValueError` on an argument of the wrong kind or shape, if nothing is
+    trainable, or if the checkpoint is of another run; `RuntimeError` as `throw` says.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+        import optax
+
+        def loss(system, batch, key):
+            states, slopes = batch
+            zero = jnp.zeros(1)
+            field = lambda x: system.vector_field(0.0, x, zero, None)
+            return jnp.mean((jax.vmap(field)(states) - slopes) ** 2)
+
+        true = dlx.systems.Pendulum(length=1.5)
+        states = jax.random.normal(jax.random.key(0), (256, 2))
+        field = lambda x: true.vector_field(0.0, x, jnp.zeros(1), None)
+        fitted = dlx.training.fit(
+            loss,
+            dlx.systems.Pendulum(),
+            optax.adam(0.05),
+            steps=200,
+            key=jax.random.key(1),
+            data=(states, jax.vmap(field)(states)),
+            batch_size=32,
+            trainable={"length": dlx.positive},
+        )
+        fitted.model.length
+        ```
+    """
+    if not callable(loss):
+        raise ValueError(f"{_WHERE}: loss must be a function, got {loss!r}.")
+    if not isinstance(optimiser, optax.GradientTransformation):
+        raise ValueError(
+            f"{_WHERE}: optimiser must be an Optax optimiser such as optax.adam(1e-3), "
+            f"got {optimiser!r}."
+        )
+    steps = check_count(steps, "steps", _WHERE)
+    block = min(check_count(block, "block", _WHERE), steps)
+    check_key(key, _WHERE)
+    data, data_size, batch_size = _checked_data(data, batch_size)
+    _check_callbacks(callbacks)
+    if not callable(gradient):
+        raise ValueError(
+            f"{_WHERE}: gradient must be an estimator such as "
+            f"delucax.training.analytic, got {gradient!r}."
+        )
+    model = _as_jax(model)
+    if not all(is_concrete(leaf) for leaf in jax.tree.leaves((model, key, data))):
+        raise ValueError(
+            f"{_WHERE}: model, key and data must hold values; fit cannot be called "
+            "under jax.jit, jax.vmap or jax.grad. Train an ensemble by jax.vmap inside "
+            "the loss."
+        )
+    assembly, values = take_apart(model, trainable, _WHERE)
+    state, static = eqx.partition(optimiser.init(values), eqx.is_array)
+    state = jax.tree.map(strong, state)
+    history: dict[str, list[np.ndarray]] = {}
+    done, seconds, last_write = 0, 0.0, 0
+
+    if checkpoint is None:
+        if checkpoint_every is not None:
+            raise ValueError(f"{_WHERE}: checkpoint_every needs checkpoint, a path.")
+        file = run = None
+        every = steps
+    else:
+        every = 10 * block if checkpoint_every is None else checkpoint_every
+        every = check_count(every, "checkpoint_every", _WHERE)
+        file = _checkpoint.prepare(checkpoint, _WHERE)
+        run = dict(
+            steps=steps,
+            key=np.asarray(jr.key_data(key)).tolist(),
+            batch_size=batch_size,
+            data_size=data_size,
+            trainable={
+                path: f"{v.dtype}{list(v.shape)} {assembly.constraints.get(path, '')}"
+                for path, v in values.items()
+            },
+            optimiser=_checkpoint.describe(state),
+            start=_checkpoint.fingerprint(model),
+        )
+        if file.exists():
+            there, progress_there = _checkpoint.read_header(file, _WHERE)
+            _checkpoint.check_same_run(file, there, run, _WHERE)
+            done, seconds = progress_there["step"], progress_there["seconds"]
+            rows = {
+                name: np.zeros(done, dtype)
+                for name, dtype in progress_there["history"].items()
+            }
+            values, state, rows = _checkpoint.read(file, (values, state, rows), _WHERE)
+            history = {name: [column] for name, column in rows.items()}
+            last_write = done
+
+    order = None
+    if batch_size is not None:
+        order = (jnp.zeros(data_size, jnp.int32), jnp.asarray(-1, jnp.int32))
+    fault = 0
+    began = time.perf_counter() - seconds
+    with tqdm(total=steps, initial=done, disable=not progress, desc="fit") as bar:
+        while done < steps and not fault:
+            stop = min(done + block, steps)
+            values, state, order, rows, count, fault = run_block(
+                (loss, gradient, optimiser, static, assembly),
+                (values, state, order),
+                (key, data),
+                np.asarray([done, stop], np.int32),
+                block,
+                batch_size,
+            )
+            rows, count, fault = jax.device_get((rows, count, fault))
+            count, fault = int(count), int(fault)
+            seconds = time.perf_counter() - began
+            rows = {name: column[:count] for name, column in rows.items()}
+            rows["step"] = np.arange(done, done + count)
+            rows["seconds"] = np.full(count, seconds)
+            if history and history.keys() != rows.keys():
+                raise ValueError(
+                    f"{_WHERE}: checkpoint '{file}' is of another run: its columns are "
+                    f"{', '.join(sorted(history))} there and {', '.join(sorted(rows))} "
+                    "here. Name another file, or delete this one."
+                )
+            for name, column in rows.items():
+                history.setdefault(name, []).append(column)
+            done += count
+            last = {name: float(column[-1]) for name, column in rows.items()}
+            bar.update(count)
+            bar.set_postfix(loss=f"{last['loss']:.4g}", refresh=False)
+            if file is not None and not fault:
+                if done == steps or done - last_write >= every:
+                    joined = _joined(history)
+                    state_of = dict(
+                        step=done,
+                        seconds=seconds,
+                        history={name: str(c.dtype) for name, c in joined.items()},
+                    )
+                    _checkpoint.write(file, run, state_of, (values, state, joined))
+                    last_write = done
+            for callback in callbacks:
+                callback(done, last)
+
+    if fault and throw:
+        raise RuntimeError(
+            f"{_WHERE}: the {FAULTS[fault]} is not finite at step {done - 1} (loss {last['loss']:g}, "
+            f"gradient norm {last['gradient_norm']:g}). Pass throw=False to get the "
+            "model as it was before that step."
+        )
+    return Fitted(
+        model=assembly(values),
+        history=history_of(_joined(history)),
+        result=RESULTS.diverged if fault else RESULTS.successful,
+    )
+
+
+def _checked_data(data, batch_size):
+    """`(data as JAX arrays, number of rows, batch size)`."""
+    if data is None:
+        if batch_size is not None:
+            raise ValueError(f"{_WHERE}: batch_size needs data.")
+        return None, None, None
+    data = _as_jax(data)
+    shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(data)]
+    sizes = {shape[0] if shape else None for shape in shapes}
+    arrays = all(eqx.is_array(leaf) for leaf in jax.tree.leaves(data))
+    if not arrays or len(sizes) != 1 or sizes & {None, 0}:
+        raise ValueError(
+            f"{_WHERE}: data must be arrays with a common leading axis, got shapes "
+            f"{shapes}."
+        )
+    (size,) = sizes
+    if batch_size is not None:
+        batch_size = check_count(batch_size, "batch_size", _WHERE)
+        if batch_size > size:
+            raise ValueError(
+                f"{_WHERE}: batch_size must be at most the {size} rows of data, got "
+                f"{batch_size}."
+            )
+    return data, size, batch_size
+
+
+def _check_callbacks(callbacks) -> None:
+    if not isinstance(callbacks, tuple | list) or not all(map(callable, callbacks)):
+        raise ValueError(
+            f"{_WHERE}: callbacks must be a sequence of functions of (step, metrics), "
+            f"got {callbacks!r}."
+        )
+
+
+def _as_jax(tree):
+    """NumPy arrays as JAX ones: they would be static under `jit`."""
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, tree
+    )
+
+
+def _joined(history: dict[str, list[Any]]) -> dict[str, np.ndarray]:
+    return {name: np.concatenate(columns) for name, columns in history.items()}

@@ -1,0 +1,210 @@
+"""Which leaves of a model move, and how the rest and their limits are kept."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from .._check import check_finite
+from .._fields import AbstractConstraint, marked_leaves
+from .._paths import get_path, path_string
+
+
+class Assembly(eqx.Module):
+    """A model with holes where its trainable leaves go.
+
+    Calling it with the unconstrained values fills the holes with legal ones.
+    """
+
+    leaves: list[Any]
+    structure: Any = eqx.field(static=True)
+    holes: tuple[tuple[int, str, bool], ...] = eqx.field(static=True)
+    constraints: dict[str, AbstractConstraint]
+
+    def __call__(self, values: dict[str, Array]) -> Any:
+        leaves = list(self.leaves)
+        for index, path, is_weak in self.holes:
+            value = values[path]
+            if path in self.constraints:
+                value = self.constraints[path].constrain(value)
+            leaves[index] = _weak(value) if is_weak else value
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+def take_apart(
+    model: PyTree, trainable: Any, where: str
+) -> tuple[Assembly, dict[str, Array]]:
+    """`model` as its unconstrained trainable values, by path, and all the rest."""
+    entries = [
+        (path_string(path), leaf, role, constraint)
+        for path, leaf, role, constraint in marked_leaves(model)
+    ]
+    given: Mapping[str, AbstractConstraint | None] = {}
+    if trainable is None:
+        chosen = [role == "weight" and is_float(leaf) for _, leaf, role, _ in entries]
+    elif (paths := _as_paths(trainable, where)) is not None:
+        given = paths
+        chosen = _chosen_by_path(model, entries, paths, where)
+    else:
+        chosen = _chosen_by_filter(model, entries, trainable, where)
+    if not any(chosen):
+        floats = [path for path, leaf, _, _ in entries if is_float(leaf)]
+        could = f"trainable= could name {_listed(floats)}" if floats else (
+            "it has no floating-point array"
+        )
+        said = "no field is marked weight()" if trainable is None else (
+            f"trainable={trainable!r} picks no leaf"
+        )
+        raise ValueError(
+            f"{where}: nothing in {type(model).__name__} is trainable: {said}; {could}."
+        )
+    leaves, holes, constraints, values = [], [], {}, {}
+    for index, ((path, leaf, _, constraint), moves) in enumerate(
+        zip(entries, chosen, strict=True)
+    ):
+        leaves.append(None if moves else leaf)
+        if not moves:
+            continue
+        name = path or "the model"
+        check_finite(leaf, name, where)
+        for prefix, other in given.items():
+            if other is not None and _is_under(path, prefix):
+                constraint = other
+        value = strong(leaf)
+        if constraint is not None:
+            if not np.all(constraint.holds(np.asarray(leaf))):
+                raise ValueError(f"{where}: {name} must be {constraint}, got {leaf}.")
+            constraints[path] = constraint
+            value = constraint.unconstrain(value)
+        values[path] = value
+        holes.append((index, path, leaf.weak_type))
+    structure = jax.tree.structure(model)
+    return Assembly(leaves, structure, tuple(holes), constraints), values
+
+
+def weights_of(model: PyTree) -> tuple[PyTree, PyTree]:
+    """`model` as its weights and the rest, each with `None` where the other has a leaf.
+
+    The weights are the leaves marked `weight()`; or, where none is marked, every
+    floating-point array.
+    """
+    entries = list(marked_leaves(model))
+    marked = [role == "weight" and is_float(leaf) for _, leaf, role, _ in entries]
+    if not any(marked):
+        marked = [is_float(leaf) for _, leaf, _, _ in entries]
+    spec = jax.tree.unflatten(jax.tree.structure(model), marked)
+    return eqx.partition(model, spec)
+
+
+def is_float(leaf: Any) -> bool:
+    """Whether `leaf` is a JAX array of real floating-point numbers."""
+    return eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating)
+
+
+def strong(leaf: Any) -> Any:
+    """An array without its weak type; anything else as it is.
+
+    An optimiser turns weak types strong after its first step, which would compile the
+    loop again.
+    """
+    return lax.convert_element_type(leaf, leaf.dtype) if is_float(leaf) else leaf
+
+
+def _weak(value: Array) -> Array:
+    """`value` with a weak type, so that the model sees the kind of leaf that it had."""
+    like = jnp.asarray(0.0)
+    if value.dtype != like.dtype:
+        return value
+    # `full_like` is the one public operation that gives a traced number a weak type.
+    if value.ndim == 0:
+        return lax.full_like(like, value)
+    return jax.vmap(lambda v: lax.full_like(like, v))(value.ravel()).reshape(value.shape)
+
+
+def _as_paths(
+    trainable: Any, where: str
+) -> Mapping[str, AbstractConstraint | None] | None:
+    """From path to constraint, or `None` if `trainable` does not name paths."""
+    if isinstance(trainable, str):
+        return {trainable: None}
+    if isinstance(trainable, Mapping):
+        if not all(isinstance(path, str) for path in trainable):
+            return None
+        if all(
+            c is None or isinstance(c, AbstractConstraint) for c in trainable.values()
+        ):
+            return trainable
+        if any(isinstance(c, AbstractConstraint) for c in trainable.values()):
+            raise ValueError(
+                f"{where}: trainable must map each path to delucax.positive, "
+                f"delucax.bounded(low, high) or None, got {dict(trainable)!r}."
+            )
+    if isinstance(trainable, tuple | list | set | frozenset):
+        if all(isinstance(path, str) for path in trainable):
+            return dict.fromkeys(trainable)
+    return None
+
+
+def _is_under(path: str, prefix: str) -> bool:
+    return path == prefix or path.startswith(prefix + ".")
+
+
+def _chosen_by_path(model, entries, paths, where) -> list[bool]:
+    for prefix in paths:
+        try:
+            node = get_path(model, prefix)
+        except ValueError as error:
+            raise ValueError(f"{where}: trainable: {error}") from None
+        if not any(
+            _is_under(path, prefix) and is_float(leaf) for path, leaf, _, _ in entries
+        ):
+            got = f"dtype {node.dtype}" if eqx.is_array(node) else repr(node)
+            raise ValueError(
+                f"{where}: trainable: {prefix!r} must be a floating-point array, or "
+                f"hold some, got {got}. A number becomes one where its field is "
+                "declared with delucax.parameter() or delucax.weight()."
+            )
+    return [
+        is_float(leaf) and any(_is_under(path, prefix) for prefix in paths)
+        for path, leaf, _, _ in entries
+    ]
+
+
+def _chosen_by_filter(model, entries, trainable, where) -> list[bool]:
+    if callable(trainable) and not isinstance(trainable, eqx.Module):
+        chosen = [trainable(leaf) for _, leaf, _, _ in entries]
+    else:
+        try:
+            spread = jax.tree.map(
+                lambda mask, part: jax.tree.map(lambda _: mask, part), trainable, model
+            )
+        except (ValueError, TypeError):
+            spread = None
+        chosen = jax.tree.leaves(spread)
+        if len(chosen) != len(entries):
+            raise ValueError(
+                f"{where}: trainable must be a path, paths, a function of a leaf, or "
+                f"booleans in the structure of the model, got {trainable!r}."
+            )
+    for (path, leaf, _, _), moves in zip(entries, chosen, strict=True):
+        if not isinstance(moves, bool | np.bool_):
+            raise ValueError(
+                f"{where}: trainable must say True or False of each leaf, got "
+                f"{moves!r} for {path!r}."
+            )
+        if moves and not is_float(leaf):
+            raise ValueError(
+                f"{where}: trainable picks {path!r}, which is not a floating-point "
+                f"array: {leaf!r}."
+            )
+    return [bool(moves) for moves in chosen]
+
+
+def _listed(paths: list[str], most: int = 8) -> str:
+    named = ", ".join(repr(path) for path in paths[:most])
+    return named if len(paths) <= most else f"{named} and {len(paths) - most} more"

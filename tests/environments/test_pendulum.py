@@ -1,0 +1,116 @@
+"""Our pendulum against Gymnasium's."""
+
+import delucax as dlx
+import diffrax
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x64, tolerance
+
+
+@pytest.fixture
+def gym():
+    return gymnasium.make("Pendulum-v1").unwrapped
+
+
+@needs_x64
+def test_one_step_agrees_on_many_states(gym):
+    env = dlx.make("pendulum")
+    rng = np.random.default_rng(0)
+    n = 100_000
+    states = np.stack([rng.uniform(-10, 10, n), rng.uniform(-8, 8, n)], axis=1)
+    actions = rng.uniform(-3, 3, (n, 1))
+    step = jax.jit(jax.vmap(lambda x, u: env.step(0.0, x, u)))(states, actions)
+    features = jax.vmap(env.encode)(step.state)
+    found = np.empty((n, 2))
+    rewards = np.empty(n)
+    seen = np.empty((n, 3), np.float32)
+    gym.reset(seed=0)
+    for i in range(n):
+        gym.state = states[i]
+        seen[i], rewards[i], terminated, truncated, _ = gym.step(actions[i])
+        assert not terminated and not truncated
+        found[i] = gym.state
+    assert np.max(np.abs(found - step.state)) <= 1e-12
+    assert np.max(np.abs(rewards + step.cost)) <= 1e-12
+    np.testing.assert_array_equal(seen, np.asarray(features).astype(np.float32))
+
+
+@needs_x64
+def test_whole_episodes_agree(gym):
+    env = dlx.make("pendulum")
+    rng = np.random.default_rng(1)
+    for seed in range(20):
+        gym.reset(seed=seed)
+        x0 = gym.state.copy()
+        actions = rng.uniform(-2, 2, (200, 1))
+        states, total = [x0], 0.0
+        for u in actions:
+            _, reward, *_ = gym.step(u)
+            states.append(gym.state.copy())
+            total -= reward
+        replay = dlx.controllers.Sequence(actions)
+        run = dlx.rollout(env, replay, key=jax.random.key(0), x0=x0)
+        assert np.max(np.abs(np.array(states) - run.states)) <= 1e-6
+        assert abs(total - run.total_cost) <= 1e-6 * abs(total)
+
+
+def test_start_is_gyms(key):
+    env = dlx.make("classic/pendulum")
+    x0 = jax.vmap(env.reset)(jax.random.split(key, 2000))
+    assert np.all(np.abs(x0) <= np.array([np.pi + 1e-6, 1.0]))
+    assert_close(x0.std(axis=0), np.array([np.pi, 1.0]) / np.sqrt(3), rtol=0.05)
+
+
+def test_bounds_and_cost(key):
+    env = dlx.make("pendulum")
+    push = dlx.controllers.Constant(jnp.array([5.0]))
+    run = dlx.rollout(env, push, key=key, horizon=3, x0=jnp.array([0.5, 0.0]))
+    assert np.all(run.controls == 2.0)
+    assert_close(run.costs[0], 0.25 + 0.001 * 4, rtol=1e-6)
+
+
+def test_arguments_reach_the_physics():
+    env = dlx.environments.pendulum(
+        2.0, 1.5, 9.81, 0.1, dt=0.02, horizon=7, max_torque=3.0, max_speed=4.0
+    )
+    system = env.dynamics.system
+    found = [system.mass, system.length, system.gravity, system.damping]
+    assert_close(found, [2.0, 1.5, 9.81, 0.1], rtol=1e-6)
+    assert env.horizon == 7
+    assert_close(env.dt, 0.02, rtol=1e-6)
+    assert_close(env.control_bounds[1], 3.0)
+    fast = env.step(0.0, jnp.array([np.pi / 2, 3.99]), jnp.array([3.0]))
+    assert fast.state[1] == 4.0
+
+
+def test_a_solver_swaps_the_arithmetic():
+    env = dlx.make("pendulum", solver=diffrax.Tsit5(), substeps=4)
+    system = env.dynamics.system
+    x0 = jnp.array([1.0, 0.5])
+    zero = dlx.controllers.Zero(1)
+    run = dlx.rollout(env, zero, key=jax.random.key(0), x0=x0, horizon=100)
+    energy = 0.5 * run.states[:, 1] ** 2 / 3 + 5.0 * jnp.cos(run.states[:, 0])
+    assert_close(energy, energy[0] * jnp.ones(101), rtol=tolerance(1e-5, 1e-7))
+    assert isinstance(system, dlx.systems.Pendulum)
+    with pytest.raises(ValueError, match="substeps"):
+        dlx.make("pendulum", substeps=2)
+
+
+@pytest.mark.parametrize(
+    "arguments, match",
+    [
+        ({"length": 0.0}, "length must be positive"),
+        ({"mass": -1.0}, "mass must be positive"),
+        ({"gravity": float("nan")}, "gravity must be finite"),
+        ({"dt": 0.0}, "dt must be positive"),
+        ({"max_speed": -1.0}, "max_speed must be positive"),
+        ({"max_torque": -1.0}, "low <= high"),
+        ({"horizon": 0}, "horizon must be a whole number of at least 1"),
+    ],
+)
+def test_bad_arguments(arguments, match):
+    with pytest.raises(ValueError, match=match):
+        dlx.make("pendulum", **arguments)

@@ -1,0 +1,69 @@
+"""What several test files share."""
+
+import contextlib
+
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import pytest
+
+
+needs_x64 = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="float64 only")
+needs_x32 = pytest.mark.skipif(bool(jax.config.jax_enable_x64), reason="float32 only")
+
+
+def dtype():
+    """The precision of this run."""
+    return jnp.zeros(()).dtype
+
+
+def tolerance(single, double):
+    return double if jax.config.jax_enable_x64 else single
+
+
+def assert_close(a, b, *, rtol=0.0, atol=0.0):
+    np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=rtol, atol=atol)
+
+
+def central_difference(f, x, step=1e-6):
+    """The gradient of a scalar `f` at an array `x`, by central differences."""
+    x = np.asarray(x, np.float64)
+    gradient = np.zeros_like(x)
+    for i in np.ndindex(x.shape):
+        h = step * max(1.0, abs(x[i]))
+        up, down = x.copy(), x.copy()
+        up[i] += h
+        down[i] -= h
+        gradient[i] = (float(f(jnp.asarray(up))) - float(f(jnp.asarray(down)))) / (
+            2 * h
+        )
+    return gradient
+
+
+@contextlib.contextmanager
+def as_a_user():
+    """Without the type checks that only the tests switch on, so that our own errors
+    are the ones that are seen."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        yield
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@contextlib.contextmanager
+def user_error(kind=ValueError, match=None):
+    """A user meets this error."""
+    with as_a_user(), pytest.raises(kind, match=match):
+        yield
+
+
+class CountCalls:
+    """Counts how often it is traced, when it is called inside a compiled function."""
+
+    def __init__(self):
+        self.count = 0
+
+    def __call__(self):
+        self.count += 1

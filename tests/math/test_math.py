@@ -1,0 +1,74 @@
+import delucax as dlx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x32, needs_x64
+from jax.test_util import check_grads
+
+
+@needs_x32
+@pytest.mark.parametrize("name", ["sin", "cos"])
+def test_error_up_to_ten_thousand(name):
+    x = np.linspace(-1e4, 1e4, 400_001).astype(np.float32)
+    found = np.asarray(getattr(dlx.math, name)(x), np.float64)
+    exact = getattr(np, name)(x.astype(np.float64))
+    assert np.max(np.abs(found - exact)) <= 1.5e-7
+
+
+@needs_x64
+@pytest.mark.parametrize("name", ["sin", "cos"])
+def test_double_precision_is_exact(name):
+    x = np.linspace(-100, 100, 10_001)
+    assert_close(getattr(dlx.math, name)(x), getattr(np, name)(x), atol=1e-15)
+
+
+@pytest.mark.parametrize("f", [dlx.math.sin, dlx.math.cos])
+@needs_x64
+def test_trig_gradients(f):
+    check_grads(f, (jnp.linspace(-3.0, 3.0, 7),), order=2, atol=1e-5, rtol=1e-5)
+
+
+@needs_x32
+@pytest.mark.parametrize("f, g", [(dlx.math.sin, jnp.sin), (dlx.math.cos, jnp.cos)])
+def test_trig_second_derivative(f, g):
+    x = jnp.linspace(-3.0, 3.0, 7)
+    second = jax.vmap(jax.grad(jax.grad(f)))(x)
+    assert_close(second, jax.vmap(jax.grad(jax.grad(g)))(x), atol=3e-7)
+
+
+def test_trig_is_nan_at_infinity():
+    assert np.isnan(dlx.math.sin(jnp.array(jnp.inf)))
+    assert np.isnan(dlx.math.cos(jnp.array(-jnp.inf)))
+
+
+def test_wrap():
+    x = jnp.linspace(-20.0, 20.0, 1001)
+    wrapped = dlx.math.wrap(x)
+    assert np.all(np.abs(wrapped) <= np.pi + 1e-5)
+    assert_close(jnp.cos(wrapped), jnp.cos(x), atol=1e-5)
+    assert_close(jnp.sin(wrapped), jnp.sin(x), atol=1e-5)
+    assert jax.grad(dlx.math.wrap)(jnp.array(4.0)) == 1.0
+
+
+def test_safe_norm():
+    assert np.all(jax.grad(dlx.math.safe_norm)(jnp.zeros(3)) == 0)
+    x = jnp.array([3.0, 4.0])
+    assert_close(dlx.math.safe_norm(x), 5.0, rtol=1e-6)
+    assert_close(jax.grad(dlx.math.safe_norm)(x), x / 5, rtol=1e-6)
+    assert dlx.math.safe_norm(jnp.ones((2, 3)), keepdims=True).shape == (2, 1)
+
+
+@pytest.mark.parametrize("m, n", [(1, 1), (1, 3), (4, 8), (5, 9)])
+def test_small_products(m, n, key):
+    a, b, c = jax.random.split(key, 3)
+    M = jax.random.normal(a, (m, n))
+    x = jax.random.normal(b, (n,))
+    S = jax.random.normal(c, (n, n))
+    assert_close(dlx.math.matvec(M, x), M @ x, rtol=1e-5, atol=1e-5)
+    assert_close(dlx.math.quadratic_form(S, x), x @ S @ x, rtol=1e-4, atol=1e-5)
+
+
+def test_matvec_names_the_shapes():
+    with pytest.raises(ValueError, match=r"\(2, 3\).*\(2,\)"):
+        dlx.math.matvec(jnp.ones((2, 3)), jnp.ones(2))
