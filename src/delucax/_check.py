@@ -67,21 +67,18 @@ def symmetric_matrix(value: Any, name: str, where: str) -> Array:
     return (matrix + matrix.T) / 2
 
 
-def as_bounds(value: Any, size: int | None, where: str) -> tuple[Array, Array] | None:
-    """`value` as `(low, high)`, each a number or a vector of `size`, or an error."""
+def as_bounds(value: Any, where: str) -> tuple[Array, Array] | None:
+    """`value` as `(low, high)`, each a number or a vector, or an error."""
     if value is None:
         return None
     if not isinstance(value, tuple | list) or len(value) != 2:
         raise ValueError(f"{where}: bounds must be a pair (low, high), got {value!r}.")
     low, high = (as_float_array(end) for end in value)
-    for end in (low, high):
-        shape = jnp.shape(end) if eqx.is_inexact_array(end) else None
-        fits = shape == () or size is not None and shape == (size,)
-        if not fits and not (size is None and shape is not None and len(shape) == 1):
-            expected = "vectors" if size is None else f"have shape ({size},)"
-            raise ValueError(
-                f"{where}: bounds must be numbers or {expected}, got {value!r}."
-            )
+    fit = all(eqx.is_inexact_array(end) and end.ndim <= 1 for end in (low, high))
+    if not fit or low.ndim == high.ndim == 1 and low.shape != high.shape:
+        raise ValueError(
+            f"{where}: bounds must be numbers or vectors of one size, got {value!r}."
+        )
     if is_concrete(low) and is_concrete(high):
         if not np.all(np.asarray(low) <= np.asarray(high)):
             raise ValueError(

@@ -198,6 +198,40 @@ def _field(role: str, default: Any, constraint: AbstractConstraint | None) -> An
     )
 
 
+class StaticFunction(eqx.Module):
+    """A plain function as a module without leaves.
+
+    A function among the leaves of a module makes `jax.jit` refuse the module as an
+    argument; inside this it is part of the structure.
+    """
+
+    function: Callable = eqx.field(static=True)
+
+    def __call__(self, *args, **kwargs):
+        return self.function(*args, **kwargs)
+
+    def __repr__(self):
+        return repr(self.function)
+
+
+def as_module(value: Any) -> Any:
+    """A plain function as a `StaticFunction`; modules, arrays and `None` as they are."""
+    if callable(value) and not jax.tree.leaves(eqx.filter(value, eqx.is_array)):
+        if isinstance(value, eqx.Module) or not _is_leaf(value):
+            return value
+        return StaticFunction(value)
+    return value
+
+
+def _is_leaf(value: Any) -> bool:
+    return jax.tree.leaves(value) == [value]
+
+
+def function_field(default: Any = dataclasses.MISSING) -> Any:
+    """A field that holds a function: plain, or a module with a `__call__`."""
+    return eqx.field(default=default, converter=as_module)
+
+
 def converter_of(module: eqx.Module, name: str) -> Callable[[Any], Any]:
     """How field `name` of `module` converts what it is given."""
     field = _fields(module).get(name)

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_bounds, as_matrix, is_concrete
+from .._check import as_bounds, check_finite, is_concrete
 from .._controller import AbstractController, wrong_observation
-from .._fields import as_float_array, check_parameters, parameter, positive, weight
+from .._fields import as_float_array, parameter, positive, weight
 from ..math import matvec
 
 
@@ -21,11 +21,6 @@ class _Select(eqx.Module):
     indices: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, y):
-        if max(self.indices) >= y.shape[0]:
-            raise ValueError(
-                f"PID: output selects component {max(self.indices)}, but the "
-                f"observation has size {y.shape[0]}."
-            )
         return jnp.stack([y[i] for i in self.indices])
 
 
@@ -34,12 +29,7 @@ class _Project(eqx.Module):
 
     C: Array = parameter()
 
-    def __check_init__(self):
-        check_parameters(self)
-
     def __call__(self, y):
-        if y.shape != self.C.shape[1:]:
-            raise wrong_observation(self, self.C.shape[1], y)
         return matvec(self.C, y)
 
 
@@ -135,23 +125,14 @@ class PID(AbstractController):
         self.kp, self.ki, self.kd, self.dt = kp, ki, kd, dt
         self.reference = reference
         self.output = _as_output(output, where)
-        self.bounds = as_bounds(bounds, None, where)
+        self.bounds = as_bounds(bounds, where)
         if derivative_time_constant is None:
             derivative_time_constant = dt
         self.derivative_time_constant = derivative_time_constant
         self.derivative_on = derivative_on
         self.anti_windup_time = anti_windup_time
-        vectors = {
-            "kp": kp,
-            "ki": ki,
-            "kd": kd,
-            "reference": None if callable(reference) else reference,
-            "low bounds": None if self.bounds is None else self.bounds[0],
-            "high bounds": None if self.bounds is None else self.bounds[1],
-            "derivative_time_constant": derivative_time_constant,
-            "anti_windup_time": anti_windup_time,
-        }
-        self.loops = _count_loops(vectors, self.output, where)
+        times = ("derivative_time_constant", "anti_windup_time")
+        self.loops = _count_loops(self, times)
 
     def __check_init__(self):
         lag, windup, dt = self.derivative_time_constant, self.anti_windup_time, self.dt
@@ -271,17 +252,8 @@ class LeakyPID(AbstractController):
         self.time_constant = time_constant
         self.reference = reference
         self.output = _as_output(output, where)
-        self.bounds = as_bounds(bounds, None, where)
-        vectors = {
-            "kp": kp,
-            "ki": ki,
-            "kd": kd,
-            "reference": None if callable(reference) else reference,
-            "low bounds": None if self.bounds is None else self.bounds[0],
-            "high bounds": None if self.bounds is None else self.bounds[1],
-            "time_constant": time_constant,
-        }
-        self.loops = _count_loops(vectors, self.output, where)
+        self.bounds = as_bounds(bounds, where)
+        self.loops = _count_loops(self, ("time_constant",))
 
     def init(self, *, key=None):
         zeros = _zeros(self.loops, self.kp, self.ki, self.kd, self.dt)
@@ -307,16 +279,24 @@ def _as_output(output: Any, where: str) -> Callable[[Array], Array] | None:
         whole = all(isinstance(i, int | np.integer) and i >= 0 for i in output)
         if whole:
             return _Select(tuple(int(i) for i in output))
-    if jnp.ndim(output) != 2:
+    array = as_float_array(output)
+    if not eqx.is_inexact_array(array) or array.ndim != 2:
         raise ValueError(
             f"{where}: output must be an index from 0, a tuple of them, a matrix or a "
             f"function, got {output!r}."
         )
-    return _Project(as_matrix(output, "output", where))
+    check_finite(array, "output", where)
+    return _Project(array)
 
 
-def _count_loops(vectors: dict[str, Any], output: Any, where: str) -> int:
+def _count_loops(pid: Any, times: tuple[str, ...]) -> int:
     """The size that all the vectors have; 1 where all are numbers."""
+    where = type(pid).__name__
+    low, high = (None, None) if pid.bounds is None else pid.bounds
+    vectors = {"low bounds": low, "high bounds": high}
+    vectors |= {name: getattr(pid, name) for name in ("kp", "ki", "kd", *times)}
+    if not callable(pid.reference):
+        vectors["reference"] = pid.reference
     sizes = {}
     for name, value in vectors.items():
         if value is None:
@@ -328,10 +308,10 @@ def _count_loops(vectors: dict[str, Any], output: Any, where: str) -> int:
             )
         if array.ndim == 1:
             sizes[name] = array.shape[0]
-    if isinstance(output, _Select):
-        sizes["output"] = len(output.indices)
-    elif isinstance(output, _Project):
-        sizes["output"] = output.C.shape[0]
+    if isinstance(pid.output, _Select):
+        sizes["output"] = len(pid.output.indices)
+    elif isinstance(pid.output, _Project):
+        sizes["output"] = pid.output.C.shape[0]
     if len(set(sizes.values())) > 1 or 0 in sizes.values():
         got = ", ".join(f"{name} of size {size}" for name, size in sizes.items())
         raise ValueError(f"{where}: there must be one entry a loop; got {got}.")
@@ -345,6 +325,13 @@ def _zeros(loops: int, *like: Array) -> Array:
 def _error(pid: Any, t: Any, y: Array) -> tuple[Array, Array]:
     """`(r(t) - h(y), h(y))`, checked to have an entry for each loop."""
     name = type(pid).__name__
+    if isinstance(pid.output, _Select) and max(pid.output.indices) >= y.shape[0]:
+        raise ValueError(
+            f"{name}: output selects component {max(pid.output.indices)}, but the "
+            f"observation has size {y.shape[0]}."
+        )
+    if isinstance(pid.output, _Project) and y.shape != pid.output.C.shape[1:]:
+        raise wrong_observation(pid, pid.output.C.shape[1], y)
     measured = y if pid.output is None else jnp.atleast_1d(pid.output(y))
     if measured.shape != (pid.loops,):
         what = "the observation has" if pid.output is None else "output gives"

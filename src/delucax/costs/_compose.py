@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_positive
-from .._fields import parameter
+from .._fields import function_field, parameter
 from .._typing import RealScalar
 from ._base import AbstractCost
 
@@ -31,8 +31,8 @@ class Function(AbstractCost):
         ```
     """
 
-    stage: Callable[[RealScalar, Array, Array], Array]
-    final_cost: Callable[[RealScalar, Array], Array] | None = None
+    stage: Callable[[RealScalar, Array, Array], Array] = function_field()
+    final_cost: Callable[[RealScalar, Array], Array] | None = function_field(None)
 
     def __call__(self, t, x, u):
         return self.stage(t, x, u)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import symmetric_matrix
-from .._fields import as_float_array, parameter
+from .._fields import as_float_array, function_field, parameter
 from .._typing import Matrix, RealScalar
 from ..math import quadratic_form
 from ._base import AbstractCost
@@ -46,7 +46,7 @@ class Quadratic(AbstractCost):
     Qf: Matrix | None = parameter()
     state_target: Array | None = parameter()
     control_target: Array | None = parameter()
-    difference: Callable[[Array, Array], Array] | None
+    difference: Callable[[Array, Array], Array] | None = function_field()
 
     def __init__(
         self,
@@ -126,9 +126,9 @@ class Tracking(AbstractCost):
 
     Q: Matrix = parameter()
     R: Matrix = parameter()
-    reference: Callable[[RealScalar], Array]
+    reference: Callable[[RealScalar], Array] = function_field()
     Qf: Matrix | None = parameter()
-    output: Callable[[Array], Array] | None
+    output: Callable[[Array], Array] | None = function_field()
 
     def __init__(
         self,

@@ -1,11 +1,14 @@
 """Which Diffrax solvers fit, and how they are made to."""
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+import lineax as lx
 import optimistix as optx
+from jaxtyping import PyTree, Scalar
 
 from ._runge_kutta import tableau_of
 
@@ -62,28 +65,75 @@ def _check_implicit(solver: diffrax.AbstractSolver, where: str) -> None:
         )
 
 
+class _Chord(optx.AbstractRootFinder):
+    """Diffrax's chord method, which iterates until it has converged.
+
+    Diffrax's own gives up after two iterations, for a step-size controller to take a
+    shorter step. Fixed steps have none, so this one goes on while it contracts.
+    """
+
+    rtol: float
+    atol: float
+    linear_solver: lx.AbstractLinearSolver
+    norm: Callable[[PyTree], Scalar] = optx.rms_norm
+
+    @property
+    def _chord(self):
+        return diffrax.VeryChord(
+            self.rtol, self.atol, self.norm, linear_solver=self.linear_solver
+        )
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        return self._chord.init(fn, y, args, options, f_struct, aux_struct, tags)
+
+    def step(self, fn, y, args, options, state, tags):
+        return self._chord.step(fn, y, args, options, state, tags)
+
+    def terminate(self, fn, y, args, options, state, tags):
+        del fn, y, args, options, tags
+        size = state.diffsize  # of the last change, in units of the tolerance
+        rate = size / state.diffsize_prev
+        left = size * rate / (1 - rate)  # what is left to go, if it goes on like this
+        enough = state.step >= 2
+        # Close to the root rounding takes over, and the rate says nothing.
+        converged = enough & ((size < 0.1) | (rate < 1) & (left < 0.01))
+        lost = ~jnp.isfinite(size) | (rate > 2)
+        diverged = enough & ~converged & lost
+        result = optx.RESULTS.where(
+            diverged, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+        )
+        failed = state.result != optx.RESULTS.successful
+        result = optx.RESULTS.where(failed, state.result, result)
+        return failed | converged | diverged, result
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        return self._chord.postprocess(fn, y, aux, args, options, state, tags, result)
+
+
 def for_one_step(solver: Any, dtype: Any) -> Any:
     """An implicit solver that works outside `diffeqsolve`: differentiable both ways,
-    and with explicit tolerances where it would take them from a step-size controller.
+    and with a root finder of its own where it would take a step-size controller's
+    tolerances.
     """
     if getattr(solver, "scan_kind", "bounded") is None:
         solver = eqx.tree_at(
             lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None
         )
-    double = dtype == jnp.float64
-    values = {
-        "rtol": 1e-10 if double else 1e-5,
-        "atol": 1e-12 if double else 1e-6,
-        "norm": optx.rms_norm,
-    }
     finder = solver.root_finder
+    # Diffrax's mark for a tolerance that is yet to come has no public name.
     names = [
         name
-        for name in values
+        for name in ("rtol", "atol", "norm")
         if "stepsize" in repr(getattr(finder, name, None)).replace("_", "")
     ]
     if not names:
         return solver
+    double = dtype == jnp.float64
+    rtol, atol = (1e-10, 1e-12) if double else (1e-5, 1e-6)
+    if isinstance(finder, diffrax.VeryChord | optx.Chord):
+        finder = _Chord(rtol, atol, finder.linear_solver)
+        return eqx.tree_at(lambda s: s.root_finder, solver, finder)
+    values = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
     return eqx.tree_at(
         lambda s: [getattr(s.root_finder, name) for name in names],
         solver,

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from .._check import as_vector, check_count, check_key, is_concrete
-from .._fields import as_float_array, parameter
+from .._fields import as_float_array, function_field, parameter
 from .._paths import get_path, replace
 from .._results import Result
 from .._typing import PRNGKey, RealScalar
@@ -110,12 +110,12 @@ class Environment(eqx.Module):
     cost: AbstractCost
     disturbance: AbstractDisturbance
     sensor_noise: AbstractDisturbance | None
-    initial_state: Array | Callable[[PRNGKey], Array] = parameter()
+    initial_state: Array | Callable[[PRNGKey], Array] = function_field()
     control_bounds: tuple[Array, Array] | None
     horizon: int = eqx.field(static=True)
-    terminated: Callable[[RealScalar, Array], Array] | None
+    terminated: Callable[[RealScalar, Array], Array] | None = function_field()
     actions: Array | None = parameter()
-    encode: Callable[[Array], Array]
+    encode: Callable[[Array], Array] = function_field()
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
-from .._check import check_count, check_key
+from .._check import check_count, check_key, is_concrete
 from .._typing import PRNGKey
 from ..costs import Quadratic
 from ..dynamics import LinearDynamics
@@ -70,9 +70,10 @@ def lds(
         check_key(key, "lds")
         n = check_count(states, "states", "lds")
         m = check_count(controls, "controls", "lds")
-        if not np.all(np.isfinite(spectral_radius)) or np.any(spectral_radius < 0):
+        known = is_concrete(spectral_radius)
+        if known and not 0 <= spectral_radius < np.inf:
             raise ValueError(
-                f"lds: spectral_radius must not be negative, got {spectral_radius}."
+                f"lds: spectral_radius must be finite and not negative, got {spectral_radius}."
             )
         a, b, c = jr.split(key, 3)
         A = jr.normal(a, (n, n))

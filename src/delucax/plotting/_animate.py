@@ -11,7 +11,7 @@ from PIL import Image
 from .._check import check_count
 from ..environments import Environment
 from ..simulation import Trajectory
-from ._export import check_path, html_player, reduced, write
+from ._export import check_path, compressed, html_player, write
 from ._plot import control_bounds
 from ._runs import as_runs, last_seen, Run
 from ._scene import Scene
@@ -57,7 +57,7 @@ class Animation:
     @functools.cached_property
     def _frames(self) -> list[Image.Image]:
         scene = Scene(self._run, self._environment, self.indices, self._dpi)
-        return [reduced(scene.frame(k)) for k in self.indices]
+        return compressed(scene.frame(k) for k in self.indices)
 
     def save(self, path: Any) -> None:
         """Write the animation to a file.

@@ -8,7 +8,7 @@ import os
 import pathlib
 import shutil
 import subprocess
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import matplotlib
@@ -17,6 +17,7 @@ from PIL import Image
 
 
 ENDINGS = (".gif", ".html", ".mp4")
+CLEAR = 63  # the palette's index that stands for "as in the first frame"
 
 
 def check_path(path: Any, where: str) -> pathlib.Path:
@@ -47,11 +48,41 @@ def _ffmpeg() -> str:
     return matplotlib.rcParams["animation.ffmpeg_path"]
 
 
-def reduced(frame: np.ndarray) -> Image.Image:
-    """A frame, shape `(height, width, 3)`, in at most 64 colours of its own."""
-    # Of Pillow's methods the one that keeps both thin grey lines and pure white.
-    image = Image.fromarray(frame)
-    return image.quantize(64, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+def compressed(frames: Iterable[np.ndarray]) -> list[Image.Image]:
+    """Frames of shape `(height, width, 3)` in few colours: the first whole, the others
+    transparent where they are as the first, so that a page of them is small."""
+    images: list[Image.Image] = []
+    for frame in frames:
+        if not images:
+            first = frame
+            images.append(_quantised(frame, 255))
+            continue
+        changed = np.any(frame != first, axis=-1)
+        indices = np.full(frame.shape[:2], CLEAR, np.uint8)
+        image = Image.fromarray(indices)
+        if changed.any():
+            colours = _quantised(frame[changed][None], CLEAR)
+            indices[changed] = np.asarray(colours)[0]
+            image = Image.fromarray(indices)
+            image.putpalette(colours.getpalette() or [])
+        else:
+            image.putpalette([0, 0, 0])
+        image.info["transparency"] = CLEAR
+        images.append(image)
+    return images
+
+
+def _quantised(pixels: np.ndarray, colours: int) -> Image.Image:
+    # Of Pillow's methods the one that keeps both thin pale lines and pure white.
+    method = Image.Quantize.MAXCOVERAGE
+    return Image.fromarray(pixels).quantize(colours, method, dither=Image.Dither.NONE)
+
+
+def expanded(images: Sequence[Image.Image]) -> Iterator[Image.Image]:
+    """The whole frames, in full colour, that were compressed."""
+    first = images[0].convert("RGBA")
+    for image in images:
+        yield Image.alpha_composite(first, image.convert("RGBA")).convert("RGB")
 
 
 def write(path: pathlib.Path, frames: Sequence[Image.Image], fps: float) -> None:
@@ -72,11 +103,11 @@ def write(path: pathlib.Path, frames: Sequence[Image.Image], fps: float) -> None
 
 def _write_gif(path, frames, fps):
     # One palette for all frames, from a mosaic of them: nothing flickers.
-    mosaic = np.concatenate([np.asarray(f.convert("RGB"))[::3, ::3] for f in frames])
+    whole = list(expanded(frames))
+    mosaic = np.concatenate([np.asarray(image)[::3, ::3] for image in whole])
     palette = Image.fromarray(mosaic).quantize(255, Image.Quantize.MAXCOVERAGE)
     images = [
-        f.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE)
-        for f in frames
+        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in whole
     ]
     # The format counts in hundredths of a second; browsers take less than 2 for 10.
     duration = max(20, 10 * round(100 / fps))
@@ -97,7 +128,7 @@ def _write_mp4(path, frames, fps):
     # The pixel format that every player knows needs even sizes.
     even = "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white"
     command += ["-i", "-", "-vf", even, "-pix_fmt", "yuv420p", str(path)]
-    data = b"".join(f.convert("RGB").tobytes() for f in frames)
+    data = b"".join(image.tobytes() for image in expanded(frames))
     done = subprocess.run(command, input=data, capture_output=True)
     if done.returncode:
         words = done.stderr.decode(errors="replace").strip()
@@ -106,8 +137,10 @@ def _write_mp4(path, frames, fps):
 
 _PLAYER = """\
 <div class="delucax-animation" id="%(id)s" style="max-width:%(width)dpx">
+<div style="position:relative">
 <img alt="animation" src="data:image/png;base64,%(first)s"
- style="width:100%%;display:block">
+ style="width:100%%;display:block;margin:0">
+<img alt="" hidden style="width:100%%;position:absolute;left:0;top:0;margin:0"></div>
 <div style="display:flex;align-items:center;gap:8px">
 <button type="button" style="width:4.5em">Pause</button>
 <input type="range" min="0" max="%(last)d" value="0" step="1" aria-label="frame"
@@ -117,16 +150,17 @@ _PLAYER = """\
   const frames = [%(frames)s];
   for (const root of document.querySelectorAll("#%(id)s:not([data-ready])")) {
     root.dataset.ready = "1";
-    const [picture, button, slider] =
-      ["img", "button", "input"].map((name) => root.querySelector(name));
+    const [change, button, slider] =
+      ["img[hidden]", "button", "input"].map((name) => root.querySelector(name));
     let timer = null;
     const show = (i) => {
       slider.value = i;
-      picture.src = "data:image/png;base64," + frames[i];
+      change.hidden = i === 0;
+      if (i > 0) change.src = "data:image/png;base64," + frames[i - 1];
     };
     const next = () => {
       if (!root.isConnected) clearInterval(timer);
-      else show((Number(slider.value) + 1) %% frames.length);
+      else show((Number(slider.value) + 1) %% (frames.length + 1));
     };
     const play = (on) => {
       clearInterval(timer);
@@ -146,9 +180,9 @@ _PLAYER = """\
 
 
 def html_player(frames: Iterable[Image.Image], fps: float) -> str:
-    """A player with a button and a slider that needs nothing from the network.
+    """A player with a button and a slider, of compressed frames.
 
-    Matplotlib's own loads its icons from another site.
+    It needs nothing from the network; Matplotlib's own has its icons from another site.
     """
     width, encoded = 0, []
     for image in frames:
@@ -163,6 +197,6 @@ def html_player(frames: Iterable[Image.Image], fps: float) -> str:
         "width": width,
         "first": encoded[0],
         "last": len(encoded) - 1,
-        "frames": ",".join(f'"{e}"' for e in encoded),
+        "frames": ",".join(f'"{e}"' for e in encoded[1:]),
         "interval": 1000 / fps,
     }

@@ -40,9 +40,7 @@ def line_style_of(index: int) -> Any:
     return LINE_STYLES[index // len(PALETTE) % len(LINE_STYLES)]
 
 
-def style_axes(
-    ax: Axes, *, size: float, ticks: tuple[int, int] = (8, 4)
-) -> None:
+def style_axes(ax: Axes, *, size: float, ticks: tuple[int, int] = (8, 4)) -> None:
     """A light grid, two spines, few ticks, and no offset hidden in a corner."""
     ax.grid(True, color=NEUTRAL, alpha=0.2, linewidth=0.6)
     ax.set_axisbelow(True)

@@ -34,13 +34,13 @@ class Scene:
             drawing = PHASE
         panels = panels_of(run, None, grouped=True, where="animate")
         step = np.diff(run.times[0]).max(initial=0.0) or 1.0
-        self.decimals = int(np.clip(np.ceil(-np.log10(step)), 0, 3))
+        self.decimals = int(np.clip(np.ceil(-np.log10(step) - 1e-3), 0, 3))
 
         size = (6.0 if drawing is None else 10.0, max(4.6, 1.2 * len(panels) + 0.8))
-        self.canvas = FigureCanvasAgg(self.figure)
         room = 0.35 / size[1]  # at the top, for the texts
         layout = ConstrainedLayoutEngine(rect=(0, 0, 1, 1 - room))
         self.figure = Figure(size, dpi, layout=layout)
+        self.canvas = FigureCanvasAgg(self.figure)
         self.texts = [
             self.figure.text(
                 x / size[0], 1 - 0.1 / size[1], "", va="top", fontsize=SIZE + 1

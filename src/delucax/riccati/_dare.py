@@ -32,6 +32,9 @@ class RiccatiSolution(eqx.Module):
     - `iterations`: doublings taken.
     - `result`: success, or why not; one of `delucax.RESULTS`.
 
+    `X`, `K` and `closed_loop` are differentiable. `residual` and `spectral_radius` are
+    measurements and have no gradient.
+
     !!! example
 
         ```python
@@ -169,12 +172,14 @@ def _solution(A, B, Q, R, S, E):
     if E is not None:
         quadratic, K = _terms(A, B, R, S, X)
     weight = X if E is None else E.T @ X @ E
-    transported = A.T @ X @ A
-    size = sum(jnp.linalg.norm(M) for M in (transported, weight, quadratic, Q))
-    error = jnp.linalg.norm(transported - weight - quadratic + Q)
-    residual = error / jnp.where(size == 0, 1, size)
+    moved = A.T @ X @ A
+    size = sum(jnp.linalg.norm(M) for M in (moved, weight, quadratic, Q))
+    error = jnp.linalg.norm(moved - weight - quadratic + Q)
+    residual = lax.stop_gradient(error / jnp.where(size == 0, 1, size))
     closed_loop = plain_A - plain_B @ K
-    radius = spectral_radius(closed_loop)
+    # The bound follows the radius but its derivative does not where eigenvalues are
+    # complex: their phase is in it, N times as fast as it is small.
+    radius = lax.stop_gradient(spectral_radius(closed_loop))
     eps = jnp.finfo(A.dtype).eps
     stable = radius < 1 - A.shape[0] * eps
     solved = residual < 1000 * A.shape[0] * eps

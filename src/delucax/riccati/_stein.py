@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float
 
-from ..math import safe_norm
-
 
 MAX_DOUBLINGS = 60
 """Beyond it the spectral radius cannot be told from 1: 2**60 > 1 / eps in float64."""
@@ -87,7 +85,7 @@ def spectral_radius(A: Float[Array, "n n"]) -> Float[Array, ""]:
 
     def square(carry, weight):
         power, log_bound, is_zero = carry
-        size = safe_norm(power, axis=None)
+        size = jnp.linalg.norm(power)
         is_zero = is_zero | (size == 0)
         size = jnp.where(is_zero, 1, size)
         scaled = power / size

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 from jaxtyping import Array
 
+from .._fields import function_field
 from .._names import indexed_names
 from ._base import AbstractSystem
 
@@ -19,7 +20,7 @@ class FunctionSystem(AbstractSystem):
     - `state_names`, `control_names`, `disturbance_names`: tuples of strings.
     """
 
-    function: Callable[..., Array]
+    function: Callable[..., Array] = function_field()
     state_names: tuple[str, ...] = eqx.field(static=True)
     control_names: tuple[str, ...] = eqx.field(static=True)
     _disturbance_names: tuple[str, ...] = eqx.field(static=True)

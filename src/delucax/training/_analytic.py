@@ -19,19 +19,20 @@ def analytic(
     `g = d loss(theta, key) / d theta`, exact for the key that is drawn; its mean over
     keys is the gradient of the expected loss wherever the two may be exchanged.
 
-    Like every estimator it is called as `estimator(loss, model, key)` and differentiates
+    Like every estimator it is called as `estimator(loss, model, key)`. The gradient is
     with respect to the leaves of the model marked `weight()`; or, where none is marked,
     to every floating-point array. [`delucax.training.fit`][] hands it the trainable
     (unconstrained) values alone.
 
     **Arguments:**
 
-    - `loss`: `loss(model, key)` to a scalar, or to a scalar and a dictionary of metrics.
+    - `loss`: `loss(model, key)` to a scalar, or to a scalar and a dictionary of scalar
+        metrics.
     - `model`: a pytree with weights.
     - `key`: a random key, passed to the loss.
 
-    **Returns:** `(value, gradient)`: what the loss returned, and a pytree like the model
-    with `None` in the place of what is not a weight.
+    **Returns:** `(value, gradient)`: what the loss returned, and a pytree like the
+    model with `None` in the place of what is not a weight.
 
     **Raises:** `ValueError` if the loss is not a floating-point scalar.
 

@@ -4,7 +4,7 @@ import json
 import os
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,8 +12,61 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
+from ._trainable import is_float
 
-_FORMAT = "delucax.training.fit"
+
+_FORMAT = "delucax.training.fit 1"
+
+
+class Checkpoint(NamedTuple):
+    """Where a run is kept, and what tells it from others."""
+
+    path: Path
+    run: dict[str, Any]
+
+    def resume(
+        self, arrays: Any, where: str
+    ) -> tuple[Any, dict[str, np.ndarray], float] | None:
+        """`(arrays, history, seconds)` as they were written; `None` if none were.
+
+        `arrays` are those at the start of the run, for their structure.
+        """
+        if not self.path.exists():
+            return None
+        header = _header(self.path, where)
+        _check_same_run(self.path, header["run"], self.run, where)
+        rows = {
+            name: np.zeros(header["step"], dtype)
+            for name, dtype in header["history"].items()
+        }
+        try:
+            with open(self.path, "rb") as file:
+                file.readline()
+                like = (_without_keys(arrays), rows)
+                plain, rows = eqx.tree_deserialise_leaves(file, like)
+        except Exception as error:
+            raise ValueError(
+                f"{where}: checkpoint '{self.path}' must be whole, but could not be "
+                f"read: {error}"
+            ) from None
+        return _with_keys(plain, arrays), rows, header["seconds"]
+
+    def write(self, arrays: Any, rows: dict[str, np.ndarray], seconds: float) -> None:
+        """Write the run beside the old file, and put it in its place at once."""
+        header = {
+            "format": _FORMAT,
+            "run": self.run,
+            "step": len(rows["step"]),
+            "seconds": seconds,
+            "history": {name: str(column.dtype) for name, column in rows.items()},
+        }
+        beside = self.path.with_name(self.path.name + ".tmp")
+        with open(beside, "wb") as file:
+            file.write(json.dumps(header).encode() + b"\n")
+            eqx.tree_serialise_leaves(file, (_without_keys(arrays), rows))
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, self.path)
 
 
 def prepare(path: Any, where: str) -> Path:
@@ -36,63 +89,6 @@ def prepare(path: Any, where: str) -> Path:
     return path
 
 
-def write(path: Path, run: dict[str, Any], progress: dict[str, Any], tree: Any) -> None:
-    """Write a checkpoint beside the old one, and put it in its place at once."""
-    header = {"format": _FORMAT, "version": 1, "run": run, "progress": progress}
-    beside = path.with_name(path.name + ".tmp")
-    with open(beside, "wb") as file:
-        file.write(json.dumps(header).encode() + b"\n")
-        eqx.tree_serialise_leaves(file, _without_keys(tree))
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(beside, path)
-
-
-def read_header(path: Path, where: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """`(run, progress)` of a checkpoint."""
-    try:
-        with open(path, "rb") as file:
-            header = json.loads(file.readline())
-        if header["format"] != _FORMAT or header["version"] != 1:
-            raise ValueError
-        return header["run"], header["progress"]
-    except (ValueError, KeyError, TypeError):
-        raise ValueError(
-            f"{where}: checkpoint '{path}' must be a file that fit has written, or not "
-            "be there."
-        ) from None
-
-
-def read(path: Path, like: Any, where: str) -> Any:
-    """The arrays of a checkpoint, in the structure of `like`."""
-    try:
-        with open(path, "rb") as file:
-            file.readline()
-            plain = eqx.tree_deserialise_leaves(file, _without_keys(like))
-    except Exception as error:
-        raise ValueError(
-            f"{where}: checkpoint '{path}' must be whole, but reading it failed: {error}"
-        ) from None
-    return jax.tree.map(
-        lambda leaf, old: jr.wrap_key_data(leaf, impl=jr.key_impl(old))
-        if _is_key(old)
-        else leaf,
-        plain,
-        like,
-    )
-
-
-def _is_key(leaf: Any) -> bool:
-    return eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _without_keys(tree: Any) -> Any:
-    """Typed random keys cannot be written; their data can."""
-    return jax.tree.map(
-        lambda leaf: jr.key_data(leaf) if _is_key(leaf) else leaf, tree
-    )
-
-
 def describe(tree: Any) -> dict[str, str]:
     """The kind of each array of a tree, by its place."""
     return {
@@ -109,18 +105,30 @@ def fingerprint(tree: Any) -> dict[str, list[float]]:
     """
     marks = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
-        if eqx.is_inexact_array(leaf):
-            values = np.abs(np.asarray(leaf, np.complex128)).ravel()
-            signed = np.asarray(leaf, np.complex128).real.ravel()
+        if is_float(leaf):
+            # Bounds may be infinite, and JSON has no word for that.
+            values = np.nan_to_num(np.asarray(leaf, float).ravel())
             pattern = np.cos(np.arange(values.size))
-            marks[jax.tree_util.keystr(path)] = [
-                float(signed @ pattern),
-                float(np.linalg.norm(values)),
-            ]
+            size = float(np.linalg.norm(values))
+            marks[jax.tree_util.keystr(path)] = [float(values @ pattern), size]
     return marks
 
 
-def check_same_run(
+def _header(path: Path, where: str) -> dict[str, Any]:
+    try:
+        with open(path, "rb") as file:
+            header = json.loads(file.readline())
+        if header["format"] == _FORMAT:
+            return header
+    except (ValueError, KeyError, TypeError):
+        pass
+    raise ValueError(
+        f"{where}: checkpoint '{path}' must be a file that fit has written, or not be "
+        "there."
+    )
+
+
+def _check_same_run(
     path: Path, there: dict[str, Any], here: dict[str, Any], where: str
 ) -> None:
     """Raise unless a checkpoint is of the run that asks for it."""
@@ -141,10 +149,29 @@ def check_same_run(
                 differ(f"{what} {place}", old.get(place), new.get(place))
     for place in sorted(there["start"].keys() | here["start"].keys()):
         old, new = there["start"].get(place), here["start"].get(place)
-        if old is None or new is None or not _close(old, new):
-            differ(f"the first value (projection, norm) of model{place}", old, new)
+        if old is None or new is None or not _are_close(old, new):
+            what = f"(projection, norm) of model{place} at the start"
+            differ(what, old, new)
 
 
-def _close(old: list[float], new: list[float]) -> bool:
-    scale = max(old[1], new[1])
-    return bool(np.all(np.abs(np.subtract(old, new)) <= 1e-3 * scale))
+def _are_close(old: list[float], new: list[float]) -> bool:
+    return bool(np.all(np.abs(np.subtract(old, new)) <= 1e-3 * max(old[1], new[1])))
+
+
+def _is_key(leaf: Any) -> bool:
+    return eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _without_keys(tree: Any) -> Any:
+    """Typed random keys cannot be written; their data can."""
+    return jax.tree.map(lambda leaf: jr.key_data(leaf) if _is_key(leaf) else leaf, tree)
+
+
+def _with_keys(plain: Any, like: Any) -> Any:
+    return jax.tree.map(
+        lambda leaf, old: (
+            jr.wrap_key_data(leaf, impl=jr.key_impl(old)) if _is_key(old) else leaf
+        ),
+        plain,
+        like,
+    )

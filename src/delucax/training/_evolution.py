@@ -18,7 +18,7 @@ from ._trainable import weights_of
 class EvolutionStrategies(eqx.Module):
     r"""The gradient of the loss smoothed by Gaussian noise on the weights.
 
-    Antithetic, over `n = samples / 2` directions `e_i ~ N(0, I)`, each with its own key:
+    Antithetic, over `n = samples / 2` directions `e_i ~ N(0, I)`, a key for each:
 
     `g = 1 / (2 n sigma) sum_i (loss(theta + sigma e_i) - loss(theta - sigma e_i)) e_i`,
 

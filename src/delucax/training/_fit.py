@@ -15,10 +15,10 @@ from jaxtyping import PyTree
 from tqdm.auto import tqdm
 
 from .._check import check_count, check_key, is_concrete
-from .._results import RESULTS, Result
+from .._results import Result, RESULTS
 from .._typing import PRNGKey
-from . import _checkpoint
 from ._analytic import analytic
+from ._checkpoint import Checkpoint, describe, fingerprint, prepare
 from ._history import History, history_of
 from ._loop import FAULTS, run_block
 from ._trainable import strong, take_apart
@@ -109,8 +109,8 @@ def fit(
         has a new order, and leaves out the rows that do not fill a batch. All rows at
         every step by default.
     - `trainable`: what moves. The fields marked [`delucax.weight`][] by default; else a
-        path such as `"dynamics.system.length"`, several paths, a dictionary from path to
-        a constraint ([`delucax.positive`][], [`delucax.bounded`][], or `None` for
+        path such as `"dynamics.system.length"`, several paths, a dictionary from path
+        to a constraint ([`delucax.positive`][], [`delucax.bounded`][], or `None` for
         that of the field), a function of a leaf such as `equinox.is_inexact_array`, or
         booleans in the structure of the model.
     - `gradient`: the estimator, [`delucax.training.analytic`][] by default; or
@@ -192,55 +192,34 @@ def fit(
     assembly, values = take_apart(model, trainable, _WHERE)
     state, static = eqx.partition(optimiser.init(values), eqx.is_array)
     state = jax.tree.map(strong, state)
-    history: dict[str, list[np.ndarray]] = {}
-    done, seconds, last_write = 0, 0.0, 0
-
-    if checkpoint is None:
-        if checkpoint_every is not None:
-            raise ValueError(f"{_WHERE}: checkpoint_every needs checkpoint, a path.")
-        file = run = None
-        every = steps
-    else:
-        every = 10 * block if checkpoint_every is None else checkpoint_every
-        every = check_count(every, "checkpoint_every", _WHERE)
-        file = _checkpoint.prepare(checkpoint, _WHERE)
-        run = dict(
-            steps=steps,
-            key=np.asarray(jr.key_data(key)).tolist(),
-            batch_size=batch_size,
-            data_size=data_size,
-            trainable={
-                path: f"{v.dtype}{list(v.shape)} {assembly.constraints.get(path, '')}"
-                for path, v in values.items()
-            },
-            optimiser=_checkpoint.describe(state),
-            start=_checkpoint.fingerprint(model),
-        )
-        if file.exists():
-            there, progress_there = _checkpoint.read_header(file, _WHERE)
-            _checkpoint.check_same_run(file, there, run, _WHERE)
-            done, seconds = progress_there["step"], progress_there["seconds"]
-            rows = {
-                name: np.zeros(done, dtype)
-                for name, dtype in progress_there["history"].items()
-            }
-            values, state, rows = _checkpoint.read(file, (values, state, rows), _WHERE)
-            history = {name: [column] for name, column in rows.items()}
-            last_write = done
+    history: dict[str, np.ndarray] = {}
+    seconds = 0.0
+    saved = None
+    if checkpoint is not None:
+        run = _description(model, assembly, values, state, key, steps)
+        run |= dict(batch_size=batch_size, data_size=data_size)
+        saved = Checkpoint(prepare(checkpoint, _WHERE), run)
+        found = saved.resume((values, state), _WHERE)
+        if found is not None:
+            (values, state), history, seconds = found
+    elif checkpoint_every is not None:
+        raise ValueError(f"{_WHERE}: checkpoint_every needs checkpoint, a path.")
+    every = 10 * block if checkpoint_every is None else checkpoint_every
+    every = check_count(every, "checkpoint_every", _WHERE)
 
     order = None
     if batch_size is not None:
         order = (jnp.zeros(data_size, jnp.int32), jnp.asarray(-1, jnp.int32))
-    fault = 0
+    done = written = len(history.get("step", ()))
+    fault, last, blocks = 0, {}, [history] if history else []
     began = time.perf_counter() - seconds
     with tqdm(total=steps, initial=done, disable=not progress, desc="fit") as bar:
         while done < steps and not fault:
-            stop = min(done + block, steps)
             values, state, order, rows, count, fault = run_block(
                 (loss, gradient, optimiser, static, assembly),
                 (values, state, order),
                 (key, data),
-                np.asarray([done, stop], np.int32),
+                np.asarray([done, min(done + block, steps)], np.int32),
                 block,
                 batch_size,
             )
@@ -250,40 +229,34 @@ def fit(
             rows = {name: column[:count] for name, column in rows.items()}
             rows["step"] = np.arange(done, done + count)
             rows["seconds"] = np.full(count, seconds)
-            if history and history.keys() != rows.keys():
+            if blocks and blocks[0].keys() != rows.keys():
                 raise ValueError(
-                    f"{_WHERE}: checkpoint '{file}' is of another run: its columns are "
-                    f"{', '.join(sorted(history))} there and {', '.join(sorted(rows))} "
-                    "here. Name another file, or delete this one."
+                    f"{_WHERE}: checkpoint '{checkpoint}' is of another run: its "
+                    f"history has {', '.join(sorted(blocks[0]))}, and the loss makes "
+                    f"{', '.join(sorted(rows))}. Name another file, or delete this one."
                 )
-            for name, column in rows.items():
-                history.setdefault(name, []).append(column)
+            blocks.append(rows)
             done += count
             last = {name: float(column[-1]) for name, column in rows.items()}
             bar.update(count)
             bar.set_postfix(loss=f"{last['loss']:.4g}", refresh=False)
-            if file is not None and not fault:
-                if done == steps or done - last_write >= every:
-                    joined = _joined(history)
-                    state_of = dict(
-                        step=done,
-                        seconds=seconds,
-                        history={name: str(c.dtype) for name, c in joined.items()},
-                    )
-                    _checkpoint.write(file, run, state_of, (values, state, joined))
-                    last_write = done
+            is_due = done == steps or done - written >= every
+            if saved is not None and is_due and not fault:
+                blocks = [_joined(blocks)]
+                saved.write((values, state), blocks[0], seconds)
+                written = done
             for callback in callbacks:
                 callback(done, last)
 
     if fault and throw:
         raise RuntimeError(
-            f"{_WHERE}: the {FAULTS[fault]} is not finite at step {done - 1} (loss {last['loss']:g}, "
-            f"gradient norm {last['gradient_norm']:g}). Pass throw=False to get the "
-            "model as it was before that step."
+            f"{_WHERE}: the {FAULTS[fault]} is not finite at step {done - 1} (loss "
+            f"{last['loss']:g}, gradient norm {last['gradient_norm']:g}). Pass "
+            "throw=False to get the model as it was before that step."
         )
     return Fitted(
         model=assembly(values),
-        history=history_of(_joined(history)),
+        history=history_of(_joined(blocks)),
         result=RESULTS.diverged if fault else RESULTS.successful,
     )
 
@@ -329,5 +302,19 @@ def _as_jax(tree):
     )
 
 
-def _joined(history: dict[str, list[Any]]) -> dict[str, np.ndarray]:
-    return {name: np.concatenate(columns) for name, columns in history.items()}
+def _joined(blocks: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return {name: np.concatenate([rows[name] for rows in blocks]) for name in blocks[0]}
+
+
+def _description(model, assembly, values, state, key, steps) -> dict[str, Any]:
+    """What tells this run from another, in words that JSON has."""
+    return dict(
+        steps=steps,
+        key=np.asarray(jr.key_data(key)).tolist(),
+        trainable={
+            path: f"{v.dtype}{list(v.shape)} {assembly.constraints.get(path, '')}"
+            for path, v in values.items()
+        },
+        optimiser=describe(state),
+        start=fingerprint(model),
+    )

@@ -42,8 +42,8 @@ class LikelihoodRatio(eqx.Module):
     the draws, and a pytree like the model with `None` in the place of what is not a
     weight.
 
-    **Raises:** `ValueError` if `samples` is below 1, or below 2 with a baseline; when it
-    is called, if the loss returns no `"log_prob"`.
+    **Raises:** `ValueError` if `samples` is below 1, or below 2 with a baseline; when
+    it is called, if the loss returns no `"log_prob"`.
 
     Source: Williams, 1992; Kool, van Hoof and Welling, 2019 (the baseline).
 
@@ -95,9 +95,7 @@ class LikelihoodRatio(eqx.Module):
             excess = costs
             if self.baseline:
                 # The mean of the others differs from that of all by this factor.
-                excess = (costs - jnp.mean(costs)) * (
-                    self.samples / (self.samples - 1)
-                )
+                excess = (costs - jnp.mean(costs)) * (self.samples / (self.samples - 1))
             means = {name: jnp.mean(metric) for name, metric in metrics.items()}
             value = (jnp.mean(costs), lax.stop_gradient(means))
             return jnp.mean(excess * metrics["log_prob"]), value

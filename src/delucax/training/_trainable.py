@@ -54,14 +54,12 @@ def take_apart(
         chosen = _chosen_by_filter(model, entries, trainable, where)
     if not any(chosen):
         floats = [path for path, leaf, _, _ in entries if is_float(leaf)]
-        could = f"trainable= could name {_listed(floats)}" if floats else (
-            "it has no floating-point array"
-        )
-        said = "no field is marked weight()" if trainable is None else (
-            f"trainable={trainable!r} picks no leaf"
-        )
+        said = "no field is marked weight()"
+        if trainable is not None:
+            said = f"trainable={trainable!r} picks no leaf"
         raise ValueError(
-            f"{where}: nothing in {type(model).__name__} is trainable: {said}; {could}."
+            f"{where}: nothing in {type(model).__name__} is trainable: {said}. The "
+            f"floating-point arrays that could be are {_listed(floats)}."
         )
     leaves, holes, constraints, values = [], [], {}, {}
     for index, ((path, leaf, _, constraint), moves) in enumerate(
@@ -123,7 +121,8 @@ def _weak(value: Array) -> Array:
     # `full_like` is the one public operation that gives a traced number a weak type.
     if value.ndim == 0:
         return lax.full_like(like, value)
-    return jax.vmap(lambda v: lax.full_like(like, v))(value.ravel()).reshape(value.shape)
+    flat = jax.vmap(lambda v: lax.full_like(like, v))(value.ravel())
+    return flat.reshape(value.shape)
 
 
 def _as_paths(
@@ -206,5 +205,5 @@ def _chosen_by_filter(model, entries, trainable, where) -> list[bool]:
 
 
 def _listed(paths: list[str], most: int = 8) -> str:
-    named = ", ".join(repr(path) for path in paths[:most])
+    named = ", ".join(repr(path) for path in paths[:most]) or "none"
     return named if len(paths) <= most else f"{named} and {len(paths) - most} more"

@@ -1,0 +1,189 @@
+"""Neural-network policies."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._check import as_bounds, check_count, check_key, is_concrete
+from .._controller import AbstractController, wrong_observation
+from .._fields import weight
+from .._typing import PRNGKey
+from ..environments import Environment
+from ._gaussian import Gaussian
+
+
+class MLP(AbstractController):
+    """A fully connected network of the observation,
+
+    `u = network(features(y))`, and with bounds
+    `u = (high + low) / 2 + (high - low) / 2 * tanh(network(features(y)))`.
+
+    **Arguments:**
+
+    - `in_size`: the size of the features.
+    - `out_size`: the number of controls.
+    - `width`: units in a hidden layer, 64 by default.
+    - `depth`: hidden layers, 2 by default; 0 for a linear map.
+    - `features`: what the network is given of an observation, a function such as
+        `env.encode`; the observation itself by default.
+    - `bounds`: `(low, high)`, each a finite number or vector, that the control is
+        squashed into; none by default.
+    - `activation`: of the hidden layers, `jnp.tanh` by default.
+    - `key`: a random key, for the first weights.
+
+    **Attributes:** `network`, an `eqx.nn.MLP`, trainable.
+
+    **Raises:** `ValueError` if a size is below 1, bounds are not finite or there is no
+    key; when it is run, if the features have another size.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("pendulum")
+        policy = dlx.controllers.MLP(
+            env.feature_size,
+            env.control_size,
+            width=32,
+            depth=1,
+            features=env.encode,
+            bounds=env.control_bounds,
+            key=jax.random.key(0),
+        )
+        dlx.rollout(env, policy, key=jax.random.key(1)).total_cost
+        ```
+    """
+
+    network: eqx.nn.MLP = weight()
+    features: Callable[[Array], Array] | None
+    bounds: tuple[Array, Array] | None
+
+    def __init__(
+        self,
+        in_size: int,
+        out_size: int,
+        width: int = 64,
+        depth: int = 2,
+        *,
+        features: Callable[[Array], Array] | None = None,
+        bounds: Any = None,
+        activation: Callable[[Array], Array] = jnp.tanh,
+        key: PRNGKey,
+    ):
+        where = "MLP"
+        check_key(key, where)
+        out_size = check_count(out_size, "out_size", where)
+        if isinstance(depth, bool) or not isinstance(depth, int) or depth < 0:
+            raise ValueError(
+                f"{where}: depth must be a whole number of at least 0, got {depth!r}."
+            )
+        self.network = eqx.nn.MLP(
+            check_count(in_size, "in_size", where),
+            out_size,
+            check_count(width, "width", where),
+            depth,
+            activation,
+            key=key,
+        )
+        self.features = features
+        self.bounds = as_bounds(bounds, where)
+        for end in self.bounds or ():
+            if end.shape not in ((), (out_size,)):
+                raise ValueError(
+                    f"{where}: bounds must be numbers or have shape ({out_size},), got "
+                    f"shape {end.shape}."
+                )
+            if is_concrete(end) and not np.all(np.isfinite(end)):
+                raise ValueError(
+                    f"{where}: bounds must be finite to squash into, got {end}."
+                )
+
+    def __call__(self, t, y, state):
+        z = y if self.features is None else self.features(y)
+        if z.shape != (self.network.in_size,):
+            raise wrong_observation(self, self.network.in_size, z)
+        u = self.network(z)
+        if self.bounds is not None:
+            low, high = self.bounds
+            u = (high + low) / 2 + (high - low) / 2 * jnp.tanh(u)
+        return u.astype(y.dtype), state
+
+
+def Deep(
+    environment: Environment,
+    width: int = 64,
+    depth: int = 2,
+    *,
+    head: Literal["deterministic", "gaussian"] = "deterministic",
+    key: PRNGKey,
+) -> AbstractController:
+    """A fully connected network made to fit an environment.
+
+    It is given `environment.encode(y)`, and squashes into `environment.control_bounds`
+    where those are finite.
+
+    **Arguments:**
+
+    - `environment`: the environment.
+    - `width`: units in a hidden layer, 64 by default.
+    - `depth`: hidden layers, 2 by default.
+    - `head`: `"deterministic"` (default); or `"gaussian"`, whose standard deviation
+        starts at a quarter of the range of each control, or at 1 without bounds.
+    - `key`: a random key, for the first weights.
+
+    **Returns:** a [`delucax.controllers.MLP`][], or a
+    [`delucax.controllers.Gaussian`][] around one.
+
+    **Raises:** `ValueError` if `environment` is not an environment, `head` is unknown,
+    a size is below 1 or there is no key.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("pendulum")
+        policy = dlx.controllers.Deep(env, width=32, key=jax.random.key(0))
+        dlx.rollout(env, policy, key=jax.random.key(1)).total_cost
+        ```
+    """
+    where = "Deep"
+    if not isinstance(environment, Environment):
+        raise ValueError(
+            f"{where}: environment must be an Environment, got "
+            f"{type(environment).__name__}."
+        )
+    if head not in ("deterministic", "gaussian"):
+        raise ValueError(
+            f"{where}: head must be 'deterministic' or 'gaussian', got {head!r}."
+        )
+    bounds = environment.control_bounds
+    if bounds is not None:
+        if not all(np.all(np.isfinite(end)) for end in bounds if is_concrete(end)):
+            bounds = None
+    size = environment.control_size
+    network = MLP(
+        environment.feature_size,
+        size,
+        width,
+        depth,
+        features=environment.encode,
+        bounds=bounds,
+        key=key,
+    )
+    if head == "deterministic":
+        return network
+    std = jnp.ones(size)
+    if bounds is not None:
+        std = jnp.broadcast_to((bounds[1] - bounds[0]) / 4, (size,))
+    return Gaussian(network, jnp.log(std), bounds=environment.control_bounds)

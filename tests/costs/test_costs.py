@@ -1,0 +1,86 @@
+import delucax as dlx
+import jax
+import jax.numpy as jnp
+import pytest
+from helpers import assert_close, user_error
+
+
+Q = jnp.array([[2.0, 0.5], [0.5, 1.0]])
+R = jnp.array([[0.1]])
+
+
+def test_quadratic():
+    x, u = jnp.array([1.0, -2.0]), jnp.array([3.0])
+    cost = dlx.costs.Quadratic(Q, R, final=2 * Q)
+    assert_close(cost(0.0, x, u), x @ Q @ x + u @ R @ u, rtol=1e-6)
+    assert_close(cost.final(0.0, x), 2 * x @ Q @ x, rtol=1e-6)
+    target = dlx.costs.Quadratic(Q, R, state_target=x, control_target=u)
+    assert target(0.0, x, u) == 0 and target.final(0.0, x) == 0
+
+
+def test_quadratic_wraps_angles():
+    difference = dlx.systems.Pendulum().difference
+    target = jnp.array([3.0, 0.0])
+    cost = dlx.costs.Quadratic(Q, R, state_target=target, difference=difference)
+    x = target + jnp.array([2 * jnp.pi, 0.0])
+    assert_close(cost(0.0, x, jnp.zeros(1)), 0.0, atol=1e-9)
+
+
+def test_tracking():
+    reference = dlx.references.FigureEight(period=4.0)
+    cost = dlx.costs.Tracking(Q, R, reference, final=Q)
+    assert_close(cost(0.7, reference(0.7), jnp.ones(1)), 0.1, rtol=1e-5)
+    assert_close(cost.final(1.0, reference(1.0)), 0.0, atol=1e-9)
+    first = dlx.costs.Tracking(
+        jnp.eye(1), R, lambda t: t * jnp.ones(1), output=lambda x: x[:1]
+    )
+    assert_close(first(2.0, jnp.array([3.0, 9.0]), jnp.zeros(1)), 1.0)
+
+
+def test_rate_keeps_the_problem_when_dt_changes():
+    inner = dlx.costs.Quadratic(Q, R, final=Q)
+    x, u = jnp.ones(2), jnp.ones(1)
+    cost = dlx.costs.Rate(inner, 0.05)
+    assert_close(cost(0.0, x, u), 0.05 * inner(0.0, x, u), rtol=1e-6)
+    assert_close(cost.final(0.0, x), inner.final(0.0, x))
+
+
+def test_function():
+    cost = dlx.costs.Function(lambda t, x, u: t * x[0], lambda t, x: x[1])
+    assert cost(2.0, jnp.array([3.0, 4.0]), jnp.zeros(1)) == 6
+    assert cost.final(2.0, jnp.array([3.0, 4.0])) == 4
+    assert dlx.costs.Function(lambda t, x, u: x[0]).final(0.0, jnp.ones(2)) == 0
+
+
+def test_weights_are_differentiable():
+    def value(q):
+        return dlx.costs.Quadratic(q * jnp.eye(2), R)(0.0, jnp.ones(2), jnp.ones(1))
+
+    assert_close(jax.jit(jax.grad(value))(3.0), 2.0)
+
+
+@pytest.mark.parametrize(
+    "make, match",
+    [
+        (lambda: dlx.costs.Quadratic(jnp.ones((2, 3)), R), "Q must be square"),
+        (lambda: dlx.costs.Quadratic(jnp.array([[1.0, 1], [0, 1]]), R), "symmetric"),
+        (lambda: dlx.costs.Quadratic(jnp.ones(2), R), "Q must be a matrix"),
+        (lambda: dlx.costs.Quadratic(Q * jnp.nan, R), "Q must be finite"),
+        (lambda: dlx.costs.Quadratic(Q, R, final=jnp.eye(3)), "final must have"),
+        (lambda: dlx.costs.Quadratic(Q, R, state_target=jnp.ones(3)), "state_target"),
+        (lambda: dlx.costs.Quadratic(Q, R)(0.0, jnp.ones(3), jnp.ones(1)), "state has"),
+        (lambda: dlx.costs.Quadratic(Q, R)(0.0, jnp.ones(2), jnp.ones(2)), "control"),
+        (lambda: dlx.costs.Tracking(Q, R, jnp.ones(2)), "reference must be a function"),
+        (
+            lambda: dlx.costs.Tracking(Q, R, lambda t: jnp.ones(3))(
+                0.0, jnp.ones(2), jnp.ones(1)
+            ),
+            "must fit",
+        ),
+        (lambda: dlx.costs.Rate(dlx.costs.PendulumCost(), 0.0), "dt must be positive"),
+        (lambda: dlx.costs.PendulumCost(float("nan")), "velocity_weight must be finite"),
+    ],
+)
+def test_bad_arguments(make, match):
+    with user_error(match=match):
+        make()

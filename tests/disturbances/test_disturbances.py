@@ -1,0 +1,102 @@
+import delucax as dlx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, user_error
+
+
+d = dlx.disturbances
+TIMES = 0.1 * jnp.arange(2000)
+ALL = {
+    "zero": d.Zero(2),
+    "constant": d.Constant(0.5, size=2),
+    "sinusoid": d.Sinusoid(jnp.array([0.1, 0.2]), frequency=0.5, phase=0.3, offset=0.1),
+    "square": d.Square(0.3, period=jnp.array([2.0, 3.0])),
+    "array": d.FromArray(jnp.ones((2000, 2))),
+    "gaussian": d.Gaussian(jnp.array([0.1, 0.2]), mean=0.05),
+    "uniform": d.Uniform(-0.1, jnp.array([0.1, 0.3])),
+    "walk": d.RandomWalk(size=2),
+    "brownian": d.Brownian(1, dt=0.1, substeps=2),
+    "sum": d.Gaussian(0.1, size=2) + d.Constant(1.0, size=2),
+    "window": d.Window(d.Gaussian(0.1, size=2), 1.0, 2.0),
+    "shock": d.Shock(jnp.array([0.0, 1.0]), start=5.0, duration=0.5),
+}
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_contract(name, key):
+    disturbance = ALL[name]
+    w = disturbance.sequence(key, TIMES)
+    assert w.shape == (2000, disturbance.size) == (2000, 2)
+    assert w.dtype == TIMES.dtype
+    again = eqx.filter_jit(lambda d, k, t: d.sequence(k, t))(disturbance, key, TIMES)
+    assert_close(again, w, atol=1e-4)
+    keys = jax.random.split(key, 3)
+    batch = jax.vmap(lambda k: disturbance.sequence(k, TIMES))(keys)
+    assert_close(batch[1], disturbance.sequence(keys[1], TIMES), atol=1e-4)
+
+
+def test_every_public_disturbance_is_listed():
+    kinds = {type(x) for x in ALL.values()}
+    public = {
+        v
+        for v in vars(d).values()
+        if isinstance(v, type)
+        and issubclass(v, dlx.AbstractDisturbance)
+        and v is not dlx.AbstractDisturbance
+    }
+    assert public <= kinds
+
+
+def test_deterministic_values():
+    t = jnp.array([0.0, 0.25, 0.5, 1.0])
+    sine = d.Sinusoid(2.0, frequency=1.0, size=1).sequence(None, t)
+    assert_close(sine[:, 0], [0, 2, 0, 0], atol=1e-6)
+    square = d.Square(3.0, period=1.0, duty=0.4, size=1).sequence(None, t)
+    assert_close(square[:, 0], [3, 3, -3, 3])
+    shock = d.Shock(2.0, start=0.25, duration=0.5, size=1).sequence(None, t)
+    assert_close(shock[:, 0], [0, 2, 2, 0])
+    recorded = d.FromArray(jnp.arange(6.0).reshape(6, 1)).sequence(None, t)
+    assert_close(recorded[:, 0], [0, 1, 2, 3])
+
+
+def test_moments(key):
+    normal = ALL["gaussian"].sequence(key, TIMES)
+    assert_close(normal.mean(axis=0), [0.05, 0.05], atol=0.015)
+    assert_close(normal.std(axis=0), [0.1, 0.2], rtol=0.05)
+    uniform = ALL["uniform"].sequence(key, TIMES)
+    assert np.all((uniform >= -0.1) & (uniform <= jnp.array([0.1, 0.3]) + 1e-6))
+    assert_close(uniform.mean(axis=0), [0.0, 0.1], atol=0.01)
+    increments = ALL["brownian"].sequence(key, TIMES)
+    assert_close(increments.std(axis=0), np.sqrt(0.05) * np.ones(2), rtol=0.05)
+    walk = ALL["walk"].sequence(key, TIMES)
+    assert np.all(np.abs(walk) <= 1) and np.max(np.abs(np.diff(walk, axis=0))) < 1.5
+
+
+def test_sum_draws_each_with_its_own_key(key):
+    one = d.Gaussian(1.0, size=1)
+    both = (one + one).sequence(key, TIMES)
+    assert_close(both.std(), np.sqrt(2), rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    "make, match",
+    [
+        (lambda: d.Gaussian(0.1), "size must be given"),
+        (lambda: d.Gaussian(jnp.ones(2), jnp.ones(3)), "mean has 3 entries where 2"),
+        (lambda: d.Constant(jnp.ones((2, 2))), "value must be a number or a vector"),
+        (lambda: d.Constant(jnp.array([jnp.nan])), "value must be finite"),
+        (lambda: d.Square(1.0, period=0.0, size=1), "period must be positive"),
+        (lambda: d.FromArray(jnp.ones(3)), "values must be a matrix"),
+        (lambda: d.FromArray(jnp.ones((3, 1))).sequence(None, TIMES), "3 steps, fewer"),
+        (lambda: d.Gaussian(1.0, size=1).sequence(None, TIMES), "key must be"),
+        (lambda: d.Sum(d.Zero(1), d.Zero(2)), "one size"),
+        (lambda: d.Brownian(1, dt=-1.0), "dt must be positive"),
+        (lambda: d.Zero(0), "size must be at least 1"),
+    ],
+)
+def test_bad_arguments(make, match):
+    with user_error(match=match):
+        make()

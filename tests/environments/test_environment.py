@@ -1,0 +1,173 @@
+import delucax as dlx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, CountCalls, user_error
+
+
+DYNAMICS = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+COST = dlx.costs.PendulumCost()
+
+
+@pytest.mark.parametrize("name", dlx.environments.registered())
+def test_every_task(name, key):
+    arguments = {"key": key} if name == "lds" else {}
+    env = dlx.make(name, **arguments)
+    x0 = env.reset(key)
+    step = eqx.filter_jit(env.step)(0.0, x0, jnp.zeros(env.control_size))
+    assert step.state.shape == x0.shape == (env.state_size,)
+    assert step.cost.shape == () and step.result == dlx.RESULTS.successful
+    assert env.encode(jnp.zeros(env.observation_size)).shape == (env.feature_size,)
+    same = jax.jit(dlx.Environment.step)(env, 0.0, x0, jnp.zeros(env.control_size))
+    assert_close(same.state, step.state, rtol=1e-6)
+
+
+def test_unknown_name_lists_the_close_ones():
+    with user_error(match="did you mean.*'pendulum'"):
+        dlx.make("pendulm")
+
+
+def test_register():
+    dlx.register("tests/pendulum", "delucax.environments:pendulum")
+    assert_close(dlx.make("tests/pendulum", length=2.0).dynamics.system.length, 2.0)
+    with user_error(match="entry_point must be 'module:function'"):
+        dlx.register("tests/other", "delucax.environments.pendulum")
+    with user_error(match="is already"):
+        dlx.register("tests/pendulum", "delucax.environments:lds")
+
+
+def test_replace():
+    env = dlx.make("pendulum")
+    changed = dlx.replace(
+        env, {"dynamics.system.length": 1.2, "control_bounds.1": 1, "dynamics.dt": 0.1}
+    )
+    assert_close(changed.dynamics.system.length, 1.2, rtol=1e-6)
+    assert jax.tree.structure(changed) == jax.tree.structure(env)
+    for new, old in zip(jax.tree.leaves(changed), jax.tree.leaves(env), strict=True):
+        assert new.dtype == old.dtype and new.weak_type == old.weak_type
+    with user_error(match="GymPendulum has no 'sytem'.*did you mean.*system"):
+        dlx.replace(env, {"dynamics.sytem.length": 1.0})
+    with user_error(match="length must be positive"):
+        dlx.replace(env, {"dynamics.system.length": -1.0})
+    with user_error(match="it is a leaf"):
+        dlx.replace(env, {"dynamics.dt.size": 1.0})
+
+
+def test_randomise_is_domain_randomisation_without_compiling(key):
+    env = dlx.make("pendulum")
+    ranges = {
+        "dynamics.system.length": (0.8, 1.2),
+        "dynamics.system.mass": lambda k: jnp.exp(0.1 * jax.random.normal(k)),
+    }
+    traced = CountCalls()
+
+    class Traced(dlx.AbstractController):
+        def __call__(self, t, y, state):
+            traced()
+            return jnp.zeros(1, y.dtype), state
+
+    def cost(k):
+        plant = dlx.randomise(env, k, ranges)
+        run = dlx.rollout(plant, Traced(), key=k, horizon=5)
+        return plant.dynamics.system.length, plant.dynamics.system.mass, run.total_cost
+
+    keys = jax.random.split(key, 50)
+    lengths, masses, costs = jax.vmap(cost)(keys)
+    first = traced.count
+    assert np.all((lengths >= 0.8) & (lengths <= 1.2)) and len(np.unique(costs)) == 50
+    assert_close(jnp.log(masses).std(), 0.1, rtol=0.3)
+    one = cost(keys[3])
+    assert_close(one[2], costs[3], rtol=1e-4)
+    jax.vmap(cost)(keys[:7])
+    assert first == 1 and traced.count <= 3
+    with user_error(match="must be a pair"):
+        dlx.randomise(env, key, {"dynamics.dt": 1.0})
+    with user_error(match="low <= high"):
+        dlx.randomise(env, key, {"dynamics.dt": (2.0, 1.0)})
+    with user_error(match=r"jax\.random\.key\(0\)"):
+        dlx.randomise(env, 3, {"dynamics.dt": (1.0, 2.0)})
+
+
+def test_lds(key):
+    env = dlx.make("lds", key=key, states=5, controls=2, observations=3)
+    eigenvalues = np.linalg.eigvals(env.dynamics.A)
+    assert_close(np.max(np.abs(eigenvalues)), 0.9, rtol=1e-4)
+    assert env.dynamics.B.shape == (5, 2) and env.observation_size == 3
+    radii = jnp.array([0.5, 0.99])
+    batch = jax.vmap(
+        lambda k, r: dlx.make("lds", key=k, states=3, spectral_radius=r).dynamics.A
+    )(jax.random.split(key), radii)
+    found = np.max(np.abs(np.linalg.eigvals(np.asarray(batch))), axis=1)
+    assert_close(found, radii, rtol=1e-4)
+    with user_error(match="key"):
+        dlx.make("lds")
+    with user_error(match="B must be given"):
+        dlx.make("lds", A=jnp.eye(2))
+
+
+def test_default_noise_of_a_diffusion():
+    class Brownian(dlx.AbstractSystem):
+        state_names = ("x",)
+        control_names = ("u",)
+
+        def vector_field(self, t, x, u, w):
+            return u - x
+
+        def diffusion(self, t, x, u):
+            return jnp.ones(1)
+
+    dynamics = dlx.Discretized(Brownian(), dt=0.1, substeps=4)
+    env = dlx.Environment(dynamics, dlx.costs.Function(lambda t, x, u: x[0] ** 2))
+    assert env.disturbance.size == dynamics.disturbance_size == 4
+    run = dlx.rollout(env, dlx.controllers.Zero(1), key=jax.random.key(0))
+    assert np.std(run.states) > 0.1
+
+
+@pytest.mark.parametrize(
+    "arguments, match",
+    [
+        ({"dynamics": dlx.systems.Pendulum()}, "dynamics must be an AbstractDynamics"),
+        ({"cost": lambda t, x, u: 0.0}, "cost must be an AbstractCost"),
+        ({"disturbance": dlx.disturbances.Zero(3)}, "disturbance has size 3 where 2"),
+        ({"sensor_noise": dlx.disturbances.Zero(1)}, "sensor_noise has size 1 where 2"),
+        ({"disturbance": 0.1}, "disturbance must be an AbstractDisturbance"),
+        ({"initial_state": jnp.zeros(3)}, r"initial_state must have shape \(2,\)"),
+        ({"control_bounds": (1.0, -1.0)}, "low <= high"),
+        ({"control_bounds": 2.0}, "must be a pair"),
+        ({"control_bounds": (jnp.zeros(2), jnp.ones(2))}, "control_bounds and high"),
+        ({"horizon": 0}, "horizon must be a whole number of at least 1"),
+        ({"actions": jnp.ones((2, 2))}, "actions must have shape"),
+    ],
+)
+def test_bad_arguments(arguments, match):
+    with user_error(match=match):
+        dlx.Environment(**({"dynamics": DYNAMICS, "cost": COST} | arguments))
+
+
+@pytest.mark.parametrize(
+    "x, u, w, match",
+    [
+        (jnp.zeros(3), jnp.zeros(1), None, r"x \(the state\) must have shape \(2,\)"),
+        (jnp.zeros(2), jnp.zeros(2), None, r"u \(the control\) must have shape \(1,\)"),
+        (jnp.zeros(2), jnp.zeros(1), jnp.zeros(3), r"w \(the disturbance\)"),
+    ],
+)
+def test_bad_shapes_of_a_step(x, u, w, match):
+    env = dlx.Environment(DYNAMICS, COST)
+    with user_error(match=match):
+        env.step(0.0, x, u, w)
+    with user_error(match=match):
+        env.dynamics(0.0, x, u, w)
+
+
+def test_a_cost_that_is_no_scalar():
+    env = dlx.Environment(DYNAMICS, dlx.costs.Function(lambda t, x, u: x))
+    with user_error(match=r"stage cost must be a scalar, got an array of shape \(2,\)"):
+        env.step(0.0, jnp.zeros(2), jnp.zeros(1))
+
+
+def test_uniform_state():
+    with user_error(match="low <= high"):
+        dlx.environments.UniformState(jnp.ones(2), jnp.zeros(2))

@@ -1,0 +1,196 @@
+import delucax as dlx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from helpers import assert_close, needs_x64, tolerance, user_error
+from jax.test_util import check_grads
+
+
+A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+B = jnp.array([[0.0], [1.0]])
+Q, R = jnp.eye(2), jnp.eye(1)
+
+
+def random_problem(seed, n, m):
+    rng = np.random.default_rng(seed)
+    A, B = 1.2 * rng.normal(size=(n, n)) / np.sqrt(n), rng.normal(size=(n, m))
+    E = np.eye(n) + 0.3 * rng.normal(size=(n, n)) / np.sqrt(n)
+    root = rng.normal(size=(n + m, n + m))
+    weight = root @ root.T / n
+    return A, B, weight[:n, :n], weight[n:, n:], weight[:n, n:], E
+
+
+def equation(A, B, Q, R, S, E, X):
+    cross = A.T @ X @ B + S
+    gain = np.linalg.solve(R + B.T @ X @ B, cross.T)
+    terms = A.T @ X @ A, E.T @ X @ E, cross @ gain, Q
+    left = terms[0] - terms[1] - terms[2] + terms[3]
+    return np.linalg.norm(left) / sum(map(np.linalg.norm, terms)), gain
+
+
+def test_double_integrator():
+    solution = dlx.riccati.dare(A, B, Q, R)
+    assert_close(solution.K, [[0.42208244, 1.24392885]], rtol=tolerance(1e-5, 1e-8))
+    X = [[2.94712, 2.36921], [2.36921, 4.61313]]
+    assert_close(solution.X, X, rtol=1e-5)
+    assert_close(jnp.trace(solution.X), 7.56026, rtol=1e-6)
+    assert_close(solution.closed_loop, A - B @ solution.K)
+    radius = np.max(np.abs(np.linalg.eigvals(solution.closed_loop)))
+    assert_close(solution.spectral_radius, radius, rtol=tolerance(1e-5, 1e-8))
+    assert solution.result == dlx.RESULTS.successful
+    assert solution.residual < tolerance(1e-6, 1e-15)
+    assert solution.iterations < 10
+
+
+@needs_x64
+@pytest.mark.parametrize("n, m", [(1, 1), (4, 2)])
+def test_matches_scipy(n, m):
+    for seed in range(10):
+        A, B, Q, R, S, _ = random_problem(seed, n, m)
+        X = scipy.linalg.solve_discrete_are(A, B, Q, R, s=S)
+        solution = dlx.riccati.dare(A, B, Q, R, S)
+        assert np.linalg.norm(solution.X - X) < 1e-9 * np.linalg.norm(X)
+        residual, gain = equation(A, B, Q, R, S, np.eye(n), np.asarray(solution.X))
+        assert residual < 1e-13 and solution.residual < 1e-13
+        assert_close(solution.K, gain, rtol=1e-9, atol=1e-9)
+
+
+@needs_x64
+def test_descriptor_form():
+    for seed in range(10):
+        A, B, Q, R, S, E = random_problem(seed, 4, 2)
+        # SciPy gives up on some of these: it is given the plain problem.
+        plain = np.linalg.solve(E, A), np.linalg.solve(E, B)
+        Y = scipy.linalg.solve_discrete_are(*plain, Q, R, s=S)
+        solution = dlx.riccati.dare(A, B, Q, R, S, E)
+        assert np.linalg.norm(E.T @ solution.X @ E - Y) < 1e-9 * np.linalg.norm(Y)
+        residual, gain = equation(A, B, Q, R, S, E, np.asarray(solution.X))
+        assert residual < 1e-13 and solution.residual < 1e-13
+        assert_close(solution.K, gain, rtol=1e-9, atol=1e-9)
+        loop = np.linalg.solve(E, A - B @ gain)
+        assert_close(solution.closed_loop, loop, atol=1e-9)
+        # A bound, so from above but for rounding, and a close one.
+        radius = np.max(np.abs(np.linalg.eigvals(loop)))
+        assert -1e-12 < float(solution.spectral_radius) - radius < 1e-8
+    solution = dlx.riccati.dare(A, B, Q, R, S, np.diag([1.0, 1, 1, 0]), throw=False)
+    assert solution.result != dlx.RESULTS.successful
+
+
+def test_single_precision():
+    problem = random_problem(0, 4, 2)
+    exact, _ = equation(*problem, np.zeros((4, 4)))
+    assert exact > 0.1
+    single = [jnp.asarray(M, jnp.float32) for M in problem]
+    solution = dlx.riccati.dare(*single)
+    assert solution.X.dtype == solution.K.dtype == jnp.float32
+    X = np.asarray(solution.X, np.float64)
+    residual, _ = equation(*problem, X)
+    assert residual < 1e-5
+
+
+@pytest.mark.parametrize(
+    "A, B, Q",
+    [
+        ([[1.2, 0.0], [0.0, 0.5]], [[0.0], [1.0]], np.eye(2)),  # not stabilisable
+        ([[1.0, 0.0], [0.0, 0.5]], [[0.0], [1.0]], np.eye(2)),  # just not
+        ([[1.0, 1.0], [0.0, 1.0]], [[0.0], [1.0]], np.zeros((2, 2))),  # unseen
+    ],
+)
+def test_no_stabilising_solution(A, B, Q):
+    solution = dlx.riccati.dare(A, B, Q, np.eye(1), throw=False)
+    assert solution.result != dlx.RESULTS.successful
+    if np.any(Q):
+        assert solution.result == dlx.RESULTS.not_stabilising
+        assert solution.spectral_radius >= 1
+    with pytest.raises(RuntimeError, match="dare: .*throw=False"):
+        dlx.riccati.dare(A, B, Q, np.eye(1))
+    with pytest.raises(eqx.EquinoxRuntimeError):
+        eqx.filter_jit(dlx.riccati.dare)(jnp.asarray(A), jnp.asarray(B), Q, np.eye(1))
+
+
+def test_least_energy():
+    # With Q = 0 the cost sees no state, yet unstable modes must be moved: they are
+    # mirrored at the unit circle, where plain doubling would rest at X = 0.
+    unstable = jnp.array([[2.0, 1.0], [0.0, 1.5]])
+    solution = dlx.riccati.dare(unstable, B, jnp.zeros((2, 2)), R)
+    moved = np.sort(np.abs(np.linalg.eigvals(solution.closed_loop)))
+    assert_close(moved, [1 / 2, 1 / 1.5], rtol=tolerance(1e-4, 1e-9))
+
+
+def test_free_control():
+    # R = 0: one-step dead-beat control of what B reaches.
+    solution = dlx.riccati.dare(2 * jnp.eye(2), jnp.eye(2), Q, jnp.zeros((2, 2)))
+    assert_close(solution.K, 2 * np.eye(2), atol=tolerance(1e-5, 1e-12))
+    assert_close(solution.X, np.eye(2), atol=tolerance(1e-5, 1e-12))
+    assert solution.spectral_radius < 1e-5
+
+
+def test_one_bad_member_harms_no_other():
+    As = jnp.stack([A, 0.5 * A, 0.9 * A])
+    spoilt = As.at[1].set(jnp.diag(jnp.array([1.3, 0.2])))
+
+    @jax.jit
+    @jax.value_and_grad
+    def total_of_two(As):
+        batch = jax.vmap(lambda A: dlx.riccati.dare(A, B, Q, R, throw=False))(As)
+        return jnp.sum(jnp.trace(batch.X[::2], axis1=1, axis2=2))
+
+    solve = jax.jit(jax.vmap(lambda A: dlx.riccati.dare(A, B, Q, R, throw=False)))
+    good, bad = solve(As), solve(spoilt)
+    assert np.all(good.result == dlx.RESULTS.successful)
+    np.testing.assert_array_equal(
+        bad.result == dlx.RESULTS.successful, [True, False, True]
+    )
+    assert_close(bad.X[::2], good.X[::2])
+    value, gradient = total_of_two(As)
+    value_beside, gradient_beside = total_of_two(spoilt)
+    assert_close(value_beside, value)
+    assert_close(gradient_beside[::2], gradient[::2])
+    assert_close(gradient_beside[1], np.zeros((2, 2)))
+
+
+@needs_x64
+def test_gradients_of_every_argument():
+    A, B, Q, R, S, E = (jnp.asarray(M) for M in random_problem(3, 2, 1))
+
+    @jax.jit
+    def f(A, B, Q, R, S, E):
+        symmetric = (Q + Q.T) / 2, (R + R.T) / 2
+        solution = dlx.riccati.dare(0.5 * A, B, *symmetric, S, E, throw=False)
+        return jnp.sum(jnp.sin(solution.X)) + jnp.sum(solution.K**2)
+
+    check_grads(f, (A, B, Q, R, S, E), order=2, modes=("fwd", "rev"), rtol=1e-5)
+
+
+@needs_x64
+def test_dead_beat_loop_has_a_gradient():
+    nilpotent = jnp.array([[0.0, 1.0], [0.0, 0.0]])
+    solve = lambda A: dlx.riccati.dare(A, jnp.zeros((2, 1)), Q, R)
+    assert solve(nilpotent).spectral_radius == 0
+    gradient = jax.grad(lambda A: jnp.sum(solve(A).X))(nilpotent)
+    # X is the sum of (A^k)' A^k, and A^2 = 0: so dX = dA' A + A' dA.
+    assert_close(gradient, [[2.0, 2.0], [0.0, 0.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "change, match",
+    [
+        ({"A": np.ones((2, 3))}, r"A must be square, got shape \(2, 3\)"),
+        ({"A": np.ones(2)}, r"A must be a matrix, got shape \(2,\)"),
+        ({"A": np.array([[np.nan, 0], [0, 1]])}, "A must be finite"),
+        ({"A": np.eye(2) * 1j}, "must be real, got complex"),
+        ({"B": np.ones((3, 1))}, r"as many rows as A \(2\), got shape \(3, 1\)"),
+        ({"Q": np.eye(3)}, r"Q must have shape \(2, 2\).*got \(3, 3\)"),
+        ({"Q": np.array([[1.0, 1.0], [0.0, 1.0]])}, "Q must be symmetric"),
+        ({"R": np.ones((1, 2))}, r"R must be square, got shape \(1, 2\)"),
+        ({"R": np.eye(2)}, r"R must have shape \(1, 1\).*got \(2, 2\)"),
+        ({"S": np.ones((1, 2))}, r"S must have shape \(2, 1\).*got \(1, 2\)"),
+        ({"E": np.eye(3)}, r"E must have shape \(2, 2\).*got \(3, 3\)"),
+    ],
+)
+def test_wrong_arguments(change, match):
+    with user_error(match=match):
+        dlx.riccati.dare(**({"A": A, "B": B, "Q": Q, "R": R} | change))
