@@ -5,7 +5,7 @@ a controller, and differentiate, `vmap` or `jit` the whole.
 """
 
 from importlib import import_module as _import_module
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from . import (
     controllers as controllers,
@@ -58,11 +58,12 @@ from .systems import AbstractSystem as AbstractSystem, system as system
 if TYPE_CHECKING:
     from . import plotting as plotting
     from .plotting import animate as animate, plot as plot
+del TYPE_CHECKING
 
 _LAZY = ("animate", "plot", "plotting")
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str):
     """What needs Matplotlib, which is optional, imported when it is first asked for."""
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -71,4 +72,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY} - {"Any", "TYPE_CHECKING"})
+    return sorted({*globals(), *_LAZY})

@@ -38,7 +38,7 @@ class AbstractConstraint(eqx.Module):
 
 class _Positive(AbstractConstraint):
     def constrain(self, z):
-        return jnp.exp(z)
+        return _inside(jnp.exp(z), 0.0, np.inf)
 
     def unconstrain(self, value):
         return jnp.log(value)
@@ -48,6 +48,20 @@ class _Positive(AbstractConstraint):
 
     def __repr__(self):
         return "positive"
+
+
+def _inside(value: Array, low: float, high: float) -> Array:
+    """`value` off the ends of an open interval, which rounding may put it on."""
+    dtype = jnp.result_type(value)
+    tiny = float(jnp.finfo(dtype).tiny)
+    least, most = (
+        float(np.nextafter(np.asarray(end, dtype), np.asarray(other, dtype)))
+        for end, other in ((low, high), (high, low))
+    )
+    # Numbers below `tiny` are flushed to zero.
+    least = tiny if low == 0 else least
+    most = -tiny if high == 0 else most
+    return jnp.clip(value, least, most)
 
 
 positive = _Positive()
@@ -85,18 +99,18 @@ class bounded(AbstractConstraint):
     low: float
     high: float
 
-    def __init__(self, low: float, high: float):
+    def __init__(self, low: float | int, high: float | int):
         if not low < high:
             raise ValueError(f"bounded: low must be below high, got {low} and {high}.")
         self.low = float(low)
         self.high = float(high)
 
     def constrain(self, z):
-        return self.low + (self.high - self.low) * jax.nn.sigmoid(z)
+        value = self.low + (self.high - self.low) * jax.nn.sigmoid(z)
+        return _inside(value, self.low, self.high)
 
     def unconstrain(self, value):
-        unit = (value - self.low) / (self.high - self.low)
-        return jnp.log(unit) - jnp.log1p(-unit)
+        return jnp.log(value - self.low) - jnp.log(self.high - value)
 
     def holds(self, value):
         return (value > self.low) & (value < self.high)

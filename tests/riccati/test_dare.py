@@ -152,17 +152,31 @@ def test_one_bad_member_harms_no_other():
     assert_close(gradient_beside[1], np.zeros((2, 2)))
 
 
+def facts(A, B, Q, R, S, E=None):
+    symmetric = (Q + Q.T) / 2, (R + R.T) / 2
+    solution = dlx.riccati.dare(A, B, *symmetric, S, E, throw=False)
+    return jnp.sum(jnp.sin(solution.X)) + jnp.sum(jnp.sin(solution.K))
+
+
+SMOOTH = (
+    jnp.array([[0.8, 0.3], [-0.2, 1.1]]),
+    jnp.array([[0.2], [1.0]]),
+    Q,
+    R,
+    jnp.array([[0.1], [-0.1]]),
+)
+
+
 @needs_x64
 def test_gradients_of_every_argument():
-    A, B, Q, R, S, E = (jnp.asarray(M) for M in random_problem(3, 2, 1))
+    f = jax.jit(facts)
+    check_grads(f, SMOOTH, order=2, modes=("fwd", "rev"), rtol=1e-6, eps=1e-5)
 
-    @jax.jit
-    def f(A, B, Q, R, S, E):
-        symmetric = (Q + Q.T) / 2, (R + R.T) / 2
-        solution = dlx.riccati.dare(0.5 * A, B, *symmetric, S, E, throw=False)
-        return jnp.sum(jnp.sin(solution.X)) + jnp.sum(solution.K**2)
 
-    check_grads(f, (A, B, Q, R, S, E), order=2, modes=("fwd", "rev"), rtol=1e-5)
+@needs_x64
+def test_gradients_in_descriptor_form():
+    arguments = (*SMOOTH, jnp.array([[1.1, 0.1], [0.0, 0.9]]))
+    check_grads(jax.jit(facts), arguments, order=1, modes=("rev",), rtol=1e-6, eps=1e-5)
 
 
 @needs_x64

@@ -8,6 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._components import by_components
 from .._check import check_count, check_positive
 from .._fields import parameter
 from .._results import first_of, or_none, promote, RESULTS
@@ -283,6 +284,7 @@ class Discretized(AbstractDynamics):
             return step(t, x, None if inputs is None else inputs[0])
         h = self.dt / self.substeps
 
+        @by_components
         def body(parts, index_and_input):
             i, given = index_and_input
             x_next, result = step(t + i * h, join_state(parts, x.shape[0]), given)

@@ -8,6 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._components import by_components
 from .._check import as_vector
 from .._fields import as_float_array
 from .._results import first_failure, first_of, or_none, RESULTS
@@ -74,16 +75,16 @@ def _open_loop(dynamics, x0, controls, w, t0):
     size = x0.shape[0]
 
     @jax.checkpoint
+    @by_components
     def body(parts, inputs):
         k, u, w = inputs
         t = t0 + k * dynamics.dt
         x_next, result = dynamics.advance(t, join_state(parts, size), u, w)
-        parts = split_state(x_next.astype(x0.dtype))
-        return parts, (parts, or_none(result))
+        return split_state(x_next.astype(x0.dtype)), (parts, or_none(result))
 
     steps = jnp.arange(controls.shape[0])
-    _, (parts, results) = lax.scan(body, split_state(x0), (steps, controls, w))
-    states = stack_steps(parts, size, split_state(x0))
+    last, (parts, results) = lax.scan(body, split_state(x0), (steps, controls, w))
+    states = stack_steps(parts, size, last)
     finite = jnp.all(jnp.isfinite(states[-1]))
     end = RESULTS.where(finite, RESULTS.successful, RESULTS.diverged)
     result = first_failure(first_of(results), end)

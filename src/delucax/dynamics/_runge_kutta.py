@@ -124,17 +124,19 @@ def join_state(parts: tuple[Array, ...], size: int) -> Array:
 
 
 def stack_steps(
-    parts: tuple[Array, ...], size: int, first: tuple[Array, ...] = ()
+    parts: tuple[Array, ...], size: int, last: tuple[Array, ...] = ()
 ) -> Array:
     """Vectors over time, shape `(T, size)`, from the components of each step.
 
-    `first` is put before them, component by component: under `vmap` the transposition
-    that follows is then several times faster than that of a concatenated array.
+    `last` is put behind them, component by component: under `vmap` the transposition
+    that follows is then several times faster than that of a concatenated array. (And a
+    loop that keeps the state before each step, not the one after it, does not tempt XLA
+    to compute the step twice, once to carry it and once to keep it.)
     """
-    if first:
+    if last:
         parts = tuple(
-            jnp.concatenate([a[None].astype(b.dtype), b])
-            for a, b in zip(first, parts, strict=True)
+            jnp.concatenate([a, b[None].astype(a.dtype)])
+            for a, b in zip(parts, last, strict=True)
         )
     return jnp.stack(parts, axis=1) if size <= COMPONENTS_UP_TO else parts[0]
 

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from typing import Any
+import os
 
 import numpy as np
 from PIL import Image
@@ -13,14 +13,14 @@ from ..environments import Environment
 from ..simulation import Trajectory
 from ._export import check_path, compressed, html_player, write
 from ._plot import control_bounds
-from ._runs import as_runs, last_seen, Run
+from ._runs import as_runs, last_seen
 from ._scene import Scene
 
 
 FASTEST, SLOWEST = 30.0, 5.0
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Animation:
     """A moving picture, made by [`delucax.animate`][]. A notebook plays it.
 
@@ -28,8 +28,10 @@ class Animation:
 
     **Attributes:**
 
-    - `fps`: frames a second.
+    - `environment`, `trajectory`: what it shows.
     - `indices`: the step of the trajectory that each frame shows.
+    - `fps`: frames a second.
+    - `dpi`: pixels an inch.
 
     !!! example
 
@@ -45,21 +47,25 @@ class Animation:
         ```
     """
 
-    fps: float
+    environment: Environment
+    trajectory: Trajectory
     indices: tuple[int, ...]
-    _run: Run = dataclasses.field(repr=False)
-    _environment: Environment = dataclasses.field(repr=False)
-    _dpi: float = dataclasses.field(repr=False)
+    fps: float
+    dpi: float
+
+    def __repr__(self) -> str:
+        return f"Animation({len(self)} frames, {self.fps:.3g} a second)"
 
     def __len__(self) -> int:
         return len(self.indices)
 
     @functools.cached_property
     def _frames(self) -> list[Image.Image]:
-        scene = Scene(self._run, self._environment, self.indices, self._dpi)
+        run = as_runs(self.trajectory, None, "trajectory", "Animation")[0]
+        scene = Scene(run, self.environment, self.indices, self.dpi)
         return compressed(scene.frame(k) for k in self.indices)
 
-    def save(self, path: Any) -> None:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """Write the animation to a file.
 
         **Arguments:** `path`: where to; the ending chooses the form: `.gif`, `.html` (a
@@ -79,10 +85,10 @@ def animate(
     environment: Environment,
     trajectory: Trajectory,
     *,
-    path: Any = None,
-    fps: float | None = None,
+    path: str | os.PathLike[str] | None = None,
+    fps: float | int | None = None,
     max_frames: int = 100,
-    dpi: float = 60,
+    dpi: float | int = 60,
 ) -> Animation:
     """A moving picture of a trajectory: the plant, and its states, controls and costs.
 
@@ -134,6 +140,8 @@ def animate(
             f"{where}: trajectory must be one trajectory, got a batch of shape "
             f"{trajectory.batch_shape}; pick one, such as trajectory[0]."
         )
+    if not trajectory.steps:
+        raise ValueError(f"{where}: trajectory must have at least one step, got none.")
     run = as_runs(trajectory, None, "trajectory", where)[0]
     if "controls" not in run.series:
         raise ValueError(
@@ -143,9 +151,12 @@ def animate(
     control_bounds(environment, run, where)
     max_frames = check_count(max_frames, "max_frames", where)
     for name, value in (("fps", fps), ("dpi", dpi)):
-        if value is not None and not (math.isfinite(value) and value > 0):
+        if value is None and name == "fps":
+            continue
+        number = isinstance(value, int | float | np.number)
+        if not (number and math.isfinite(value) and value > 0):
             raise ValueError(
-                f"{where}: {name} must be positive and finite, got {value}."
+                f"{where}: {name} must be positive and finite, got {value!r}."
             )
     target = None if path is None else check_path(path, where)
     last = int(last_seen(run)[0])
@@ -157,7 +168,11 @@ def animate(
         fps = min(max((frames - 1) / duration, SLOWEST), FASTEST)
     indices = np.unique(np.round(np.linspace(0, last, frames)).astype(int))
     animation = Animation(
-        float(fps or FASTEST), tuple(indices.tolist()), run, environment, float(dpi)
+        environment,
+        trajectory,
+        tuple(indices.tolist()),
+        float(FASTEST if fps is None else fps),
+        float(dpi),
     )
     if target is not None:
         write(target, animation._frames, animation.fps)

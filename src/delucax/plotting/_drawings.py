@@ -1,6 +1,7 @@
 """How a plant looks: draw functions, found by the type of the system."""
 
 import inspect
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -26,7 +27,9 @@ _DRAWINGS: dict[type, Drawing] = {}
 
 
 def register_drawing(
-    system_class: Any, draw: Callable[..., Any], setup: Callable[..., Any] | None = None
+    system_class: type[AbstractSystem] | type[AbstractDynamics],
+    draw: Callable[..., Any],
+    setup: Callable[..., Any] | None = None,
 ) -> None:
     """Tell [`delucax.animate`][] how a kind of plant looks.
 
@@ -113,7 +116,7 @@ def setup_phase(
     states = np.where(np.isfinite(states), states, np.nan)
     ax.set_axis_on()
     ax.set_aspect("auto")
-    style_axes(ax, size=11, ticks=(6, 6))
+    style_axes(ax, size=11.0, ticks=(6, 6))
     ax.margins(0.06)
     ax.plot(states[:, 0], states[:, 1], color=color_of(0), linewidth=1.5, alpha=0.35)
     ax.set_xlabel(wrapped(with_unit(dynamics.state_names[0], units[0]), 40), size=11)
@@ -148,7 +151,8 @@ def draw_pendulum(
 ) -> None:
     """A rod of length 1 with a bob, hinged at the origin, angle 0 upright and growing
     anticlockwise; the torque is an arc of up to 240 degrees about the hinge."""
-    tip = np.array([-np.sin(x[0]), np.cos(x[0])])
+    angle = float(x[0])
+    tip = np.array([-np.sin(angle), np.cos(angle)])
     ax.plot(
         [0, tip[0]],
         [0, tip[1]],
@@ -160,7 +164,7 @@ def draw_pendulum(
     ax.add_artist(Circle((tip[0], tip[1]), 0.11, color=color_of(0), zorder=2))
     share = float(np.clip(u[0] / largest_torque, -1, 1))
     if abs(share) > 0.01:
-        arrow = arc_arrow(0.36, x[0] + np.pi / 2, np.deg2rad(240) * share)
+        arrow = arc_arrow(0.36, angle + np.pi / 2, math.radians(240) * share)
         ax.add_artist(Polygon(arrow, color=color_of(1), lw=0, zorder=3))
     ax.add_artist(Circle((0, 0), 0.055, facecolor="white", edgecolor=NEUTRAL, zorder=4))
 

@@ -15,6 +15,8 @@ import matplotlib
 import numpy as np
 from PIL import Image
 
+from ._figure import quantised
+
 
 ENDINGS = (".gif", ".html", ".mp4")
 CLEAR = 63  # the palette's index that stands for "as in the first frame"
@@ -52,16 +54,17 @@ def compressed(frames: Iterable[np.ndarray]) -> list[Image.Image]:
     """Frames of shape `(height, width, 3)` in few colours: the first whole, the others
     transparent where they are as the first, so that a page of them is small."""
     images: list[Image.Image] = []
+    first: np.ndarray | None = None
     for frame in frames:
-        if not images:
+        if first is None:
             first = frame
-            images.append(_quantised(frame, 255))
+            images.append(quantised(Image.fromarray(frame), 255))
             continue
         changed = np.any(frame != first, axis=-1)
         indices = np.full(frame.shape[:2], CLEAR, np.uint8)
         image = Image.fromarray(indices)
         if changed.any():
-            colours = _quantised(frame[changed][None], CLEAR)
+            colours = quantised(Image.fromarray(frame[changed][None]), CLEAR)
             indices[changed] = np.asarray(colours)[0]
             image = Image.fromarray(indices)
             image.putpalette(colours.getpalette() or [])
@@ -70,12 +73,6 @@ def compressed(frames: Iterable[np.ndarray]) -> list[Image.Image]:
         image.info["transparency"] = CLEAR
         images.append(image)
     return images
-
-
-def _quantised(pixels: np.ndarray, colours: int) -> Image.Image:
-    # Of Pillow's methods the one that keeps both thin pale lines and pure white.
-    method = Image.Quantize.MAXCOVERAGE
-    return Image.fromarray(pixels).quantize(colours, method, dither=Image.Dither.NONE)
 
 
 def expanded(images: Sequence[Image.Image]) -> Iterator[Image.Image]:
@@ -105,7 +102,7 @@ def _write_gif(path, frames, fps):
     # One palette for all frames, from a mosaic of them: nothing flickers.
     whole = list(expanded(frames))
     mosaic = np.concatenate([np.asarray(image)[::3, ::3] for image in whole])
-    palette = Image.fromarray(mosaic).quantize(255, Image.Quantize.MAXCOVERAGE)
+    palette = quantised(Image.fromarray(mosaic), 255)
     images = [
         image.quantize(palette=palette, dither=Image.Dither.NONE) for image in whole
     ]
@@ -135,6 +132,7 @@ def _write_mp4(path, frames, fps):
         raise RuntimeError(f"ffmpeg could not write {str(path)!r}: {words[-500:]}")
 
 
+# The script waits a moment: some notebooks run it before the rest is on the page.
 _PLAYER = """\
 <div class="delucax-animation" id="%(id)s" style="max-width:%(width)dpx">
 <div style="position:relative">
@@ -146,7 +144,7 @@ _PLAYER = """\
 <input type="range" min="0" max="%(last)d" value="0" step="1" aria-label="frame"
  style="flex:1"></div></div>
 <script>
-(() => {
+setTimeout(() => {
   const frames = [%(frames)s];
   for (const root of document.querySelectorAll("#%(id)s:not([data-ready])")) {
     root.dataset.ready = "1";
@@ -155,8 +153,8 @@ _PLAYER = """\
     let timer = null;
     const show = (i) => {
       slider.value = i;
-      change.hidden = i === 0;
       if (i > 0) change.src = "data:image/png;base64," + frames[i - 1];
+      change.hidden = i === 0;
     };
     const next = () => {
       if (!root.isConnected) clearInterval(timer);
@@ -174,7 +172,7 @@ _PLAYER = """\
     });
     play(true);
   }
-})();
+}, 0);
 </script>
 """
 

@@ -22,7 +22,7 @@ from ._figure import (
     with_unit,
     wrapped,
 )
-from ._runs import as_runs
+from ._runs import as_runs, Trajectories
 
 
 GRID = 60
@@ -34,7 +34,7 @@ def phase_portrait(
     *,
     limits: Any,
     control: Any = None,
-    trajectories: Any = (),
+    trajectories: Trajectories = (),
 ) -> Figure:
     """Draw the flow of a system with two states, and trajectories in it.
 

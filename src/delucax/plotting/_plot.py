@@ -21,7 +21,16 @@ from ._figure import (
     with_unit,
     wrapped,
 )
-from ._runs import as_runs, HELD, last_seen, Panel, panels_of, Run, time_label
+from ._runs import (
+    as_runs,
+    HELD,
+    last_seen,
+    Panel,
+    panels_of,
+    Run,
+    time_label,
+    Trajectories,
+)
 
 
 FEW = 8
@@ -31,11 +40,11 @@ SIZE = 9.0
 
 
 def plot(
-    trajectory: Any,
+    trajectory: Trajectories,
     *,
-    labels: Any = None,
+    labels: str | Sequence[str] | None = None,
     environment: Environment | None = None,
-    show: Sequence[str] | None = None,
+    show: str | Sequence[str] | None = None,
 ) -> Figure:
     """Draw states, controls and costs against time, in stacked panels.
 
@@ -52,7 +61,8 @@ def plot(
 
     - `trajectory`: a [`delucax.Trajectory`][], a batch of them, or several to compare:
         a dictionary from labels to trajectories, or a sequence.
-    - `labels`: strings, one a trajectory, where a sequence is given.
+    - `labels`: strings, one a trajectory, where a sequence is given; or the title of
+        one trajectory. None by default.
     - `environment`: the environment that was run; its control bounds are then drawn as
         dashed lines. None by default.
     - `show`: what to draw, and in which order: `"states"`, `"controls"`, `"costs"`,
@@ -287,8 +297,6 @@ def _head(figure: Figure, runs: Sequence[Run], *, with_costs: bool) -> None:
             handles.append(Line2D([], [], linewidth=1.6, **style))
             cost = f" ({_total(run)})" if with_costs else ""
             labels.append(wrapped(run.label, 40) + cost)
-        elif run.label:
-            figure.suptitle(wrapped(run.label, 80), fontsize=SIZE + 1)
     for name, marker in (("failed", "x"), ("terminated", "o")):
         masks = [
             run.failed if name == "failed" else run.terminated & ~run.failed
@@ -306,7 +314,9 @@ def _head(figure: Figure, runs: Sequence[Run], *, with_costs: bool) -> None:
             labels.append(f"failed: {RESULTS[runs[0].trajectory.result]}")
         else:
             labels.append(name)
+    title = wrapped(runs[0].label, 80) if len(runs) == 1 else ""
     if not handles:
+        figure.suptitle(title, fontsize=SIZE + 1)
         return
     # Lengths in characters, of which eleven fit an inch, and six more for the handle.
     lengths = [6 + max(map(len, label.split("\n"))) for label in labels]
@@ -318,6 +328,8 @@ def _head(figure: Figure, runs: Sequence[Run], *, with_costs: bool) -> None:
         loc="outside upper center",
         ncols=max(1, columns),
         frameon=False,
+        title=title or None,
+        title_fontsize=SIZE + 1,
         fontsize=SIZE,
         handlelength=1.8,
         columnspacing=1.6,

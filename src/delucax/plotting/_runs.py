@@ -1,8 +1,9 @@
 """What there is to draw in a trajectory: plain NumPy arrays, and panels for them."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -12,6 +13,7 @@ from .._results import RESULTS
 from ..simulation import Trajectory
 
 
+Trajectories: TypeAlias = Trajectory | Mapping[Any, Trajectory] | Sequence[Trajectory]
 KINDS = ("states", "controls", "costs", "observations", "disturbances")
 HELD = ("controls", "disturbances")
 MOST_LINES = 6
@@ -111,13 +113,14 @@ def _run(label: str, trajectory: Trajectory, what: str, where: str) -> Run:
             "jax.jit and jax.vmap."
         )
     lead = len(trajectory.batch_shape)
-    steps = trajectory.steps
+    steps, members = trajectory.steps, math.prod(trajectory.batch_shape)
 
     def flat(array: Any) -> np.ndarray:
         array = np.asarray(array)
-        return array.reshape((-1,) + array.shape[lead:])
+        return array.reshape((members,) + array.shape[lead:])
 
-    times = flat(trajectory.times)
+    shape = (*trajectory.batch_shape, steps + 1)
+    times = flat(np.broadcast_to(trajectory.times, shape))
     ends = flat(trajectory.length).astype(int)
     terminated = ends < steps
     if trajectory.terminated is not None and steps:

@@ -24,11 +24,11 @@ class Scene:
     """Draws the frames of an animation, one step of a trajectory each."""
 
     def __init__(
-        self, run: Run, environment: Environment, indices: Sequence[int], dpi: float
+        self, run: Run, environment: Environment, indices: Sequence[int], dpi: float | int
     ):
         self.run = run
-        self.states = np.asarray(run.trajectory.states)
-        self.controls = np.asarray(run.trajectory.controls)
+        self.states = np.asarray(run.trajectory.states, float)
+        self.controls = np.asarray(run.trajectory.controls, float)
         drawing = drawing_for(environment)
         if drawing is None and self.states.shape[1] > 1:
             drawing = PHASE

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
+from .._components import by_components
 from .._check import as_vector, check_count, check_key, is_concrete
 from .._controller import AbstractController
 from .._fields import as_float_array
@@ -194,7 +195,7 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
             if result is not RESULTS.successful:
                 result = RESULTS.where(done, RESULTS.successful, result)
             ended = (done | step.terminated, length + ~done)
-        parts = split_state(x_next.astype(dtype))
+        after_parts = split_state(x_next.astype(dtype))
         kept = {
             "states": parts,
             "observations": None if plain_sight and "states" in keep else split_state(y),
@@ -204,7 +205,7 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
         }
         kept = {name: value for name, value in kept.items() if name in keep}
         total = None if total is None else total + cost
-        return (parts, after, ended, total), (kept, or_none(result))
+        return (after_parts, after, ended, total), (kept, or_none(result))
 
     carry = (
         split_state(x0),
@@ -217,9 +218,9 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
     parts, _, ended, total = carry
     final_state = join_state(parts, size)
 
-    def over_time(name, size, first=()):
+    def over_time(name, size, last=()):
         found = kept.get(name)
-        return None if found is None else stack_steps(found, size, first)
+        return None if found is None else stack_steps(found, size, last)
 
     length = ended[1] if ends else jnp.asarray(horizon)
     end = (length * dt).astype(dtype)
@@ -234,7 +235,7 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
     finite = jnp.all(jnp.isfinite(final_state)) & jnp.isfinite(total_cost)
     diverged = RESULTS.where(finite, RESULTS.successful, RESULTS.diverged)
     return Trajectory(
-        states=over_time("states", size, split_state(x0)),
+        states=over_time("states", size, parts),
         controls=over_time("controls", env.control_size),
         costs=costs,
         final_state=final_state,
@@ -259,6 +260,7 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
 
 def _scan(body, carry, inputs, horizon, checkpoint):
     """`lax.scan` over the horizon, with what the gradient stores chosen."""
+    body = by_components(body)
     if checkpoint == "step":
         body = jax.checkpoint(body)
     if checkpoint != "sqrt":

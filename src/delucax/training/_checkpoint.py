@@ -107,7 +107,7 @@ def fingerprint(tree: Any) -> dict[str, list[float]]:
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         if is_float(leaf):
             # Bounds may be infinite, and JSON has no word for that.
-            values = np.nan_to_num(np.asarray(leaf, float).ravel())
+            values = np.nan_to_num(np.asarray(leaf, float).ravel(), posinf=1, neginf=-1)
             pattern = np.cos(np.arange(values.size))
             size = float(np.linalg.norm(values))
             marks[jax.tree_util.keystr(path)] = [float(values @ pattern), size]

@@ -20,7 +20,7 @@ from .._typing import PRNGKey
 from ._analytic import analytic
 from ._checkpoint import Checkpoint, describe, fingerprint, prepare
 from ._history import History, history_of
-from ._loop import FAULTS, run_block
+from ._loop import CAPACITY, FAULTS, run_block
 from ._trainable import strong, take_apart
 
 
@@ -117,8 +117,8 @@ def fit(
         [`delucax.training.EvolutionStrategies`][],
         [`delucax.training.LikelihoodRatio`][], or any function
         `gradient(loss, values, key)` to `(value, gradient)`.
-    - `block`: steps in one compiled call, 100 by default. The bar moves, callbacks are
-        called and checkpoints are written after each.
+    - `block`: steps in one call to the device, at most 1000; 100 by default. The bar
+        moves, callbacks are called and checkpoints are written after each.
     - `progress`: whether to show a bar with the loss; true by default.
     - `callbacks`: functions `(step, metrics)` called after each block, with the number
         of steps done and a dictionary of the last step's numbers; none by default. The
@@ -173,7 +173,9 @@ def fit(
             f"got {optimiser!r}."
         )
     steps = check_count(steps, "steps", _WHERE)
-    block = min(check_count(block, "block", _WHERE), steps)
+    block = check_count(block, "block", _WHERE)
+    if block > CAPACITY:
+        raise ValueError(f"{_WHERE}: block must be at most {CAPACITY}, got {block}.")
     check_key(key, _WHERE)
     data, data_size, batch_size = _checked_data(data, batch_size)
     _check_callbacks(callbacks)
@@ -220,7 +222,6 @@ def fit(
                 (values, state, order),
                 (key, data),
                 np.asarray([done, min(done + block, steps)], np.int32),
-                block,
                 batch_size,
             )
             rows, count, fault = jax.device_get((rows, count, fault))

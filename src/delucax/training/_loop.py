@@ -15,13 +15,16 @@ from ._trainable import strong
 _WHERE = "fit"
 # Folded into the key for the order of the data; no step counts as far.
 _ORDER = 2**32 - 1
+CAPACITY = 1000
+"""The most steps in a block. It is the size of the buffers whatever the block, so that
+the compiled program, and with it every last bit, is the same for all."""
 FAULTS = ("nothing", "loss", "gradient", "update")
 """What is not finite, by the number that a block returns."""
 
 
 @eqx.filter_jit
-def run_block(functions, carry, inputs, span, block, batch_size):
-    """The steps from `span[0]` up to `span[1]`, at most `block` of them."""
+def run_block(functions, carry, inputs, span, batch_size):
+    """The steps from `span[0]` up to `span[1]`, at most `CAPACITY` of them."""
     loss, gradient, optimiser, static, assembly = functions
     key, data = inputs
     optimiser = optax.with_extra_args_support(optimiser)
@@ -82,7 +85,7 @@ def run_block(functions, carry, inputs, span, block, batch_size):
     # Traced once, here: the loop needs to know what a row is before it begins.
     step = eqx.filter_closure_convert(step, values, state, order, first)
     row = step.out_struct[3]
-    rows = {n: jnp.zeros((block, *s.shape), s.dtype) for n, s in row.items()}
+    rows = {n: jnp.zeros((CAPACITY, *s.shape), s.dtype) for n, s in row.items()}
 
     def going(carry):
         _, _, _, _, count, fault = carry
