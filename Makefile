@@ -109,7 +109,7 @@ $(VENV)/.pip:
 
 $(VENV)/.demo: $(VENV)/.pip pyproject.toml
 	@echo "installing delucax into $(VENV)"
-	@$(pip) install --editable '.[all]'
+	@$(pip) install --editable '.[demo]'
 	@touch $@
 
 $(VENV)/.tests $(VENV)/.docs $(VENV)/.dev $(VENV)/.bench: $(VENV)/.pip pyproject.toml

@@ -31,6 +31,7 @@ from ._fields import (
 )
 from ._paths import replace as replace
 from ._results import RESULTS as RESULTS
+from ._serialise import load as load, save as save
 from .costs import AbstractCost as AbstractCost
 from .disturbances import AbstractDisturbance as AbstractDisturbance
 from .dynamics import (

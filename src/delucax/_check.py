@@ -96,7 +96,10 @@ def check_finite(array: Any, name: str, where: str) -> None:
 
 def check_positive(value: Any, name: str, where: str) -> None:
     """Raise unless a concrete number is finite and above zero."""
-    if is_concrete(value) and not (np.all(np.isfinite(value)) and np.all(value > 0)):
+    if not is_concrete(value):
+        return
+    array = np.asarray(value)
+    if not (np.all(np.isfinite(array)) and np.all(array > 0)):
         raise ValueError(f"{where}: {name} must be positive and finite, got {value}.")
 
 

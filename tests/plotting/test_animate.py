@@ -232,7 +232,7 @@ def test_pendulum_knows_its_largest_torque(env, trajectory):
 
 
 def test_other_plants_are_a_dot_in_a_plane_or_traces_alone(key):
-    lds = dlx.make("lds", key=key, states=3, horizon=4)
+    lds = dlx.make("lds", A=0.9 * jnp.eye(3), B=jnp.ones((3, 1)), horizon=4)
     run = dlx.rollout(lds, dlx.controllers.Zero(1), key=key, x0=jnp.ones(3))
     assert drawing_for(lds) is None
     scene = Scene(as_runs(run, None, "", "")[0], lds, range(5), 40)
@@ -339,7 +339,7 @@ def test_bad_paths_are_refused_before_anything_is_drawn(
 
 
 def test_errors_name_the_argument(env, trajectory, key):
-    lds = dlx.make("lds", key=key, horizon=5)
+    lds = dlx.make("lds", A=jnp.eye(2), B=jnp.ones((2, 1)), horizon=5)
     zero = dlx.controllers.Zero(1)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), trajectory)
     blind = dlx.rollout(env, zero, key=key, keep=("controls",))

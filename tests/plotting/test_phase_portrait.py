@@ -102,7 +102,7 @@ def test_errors_name_the_argument(swing, key):
     portrait = dlx.plotting.phase_portrait
     system = dlx.systems.Pendulum()
     three = dlx.system(lambda t, x, u, w: x, states=3, controls=1)
-    lds = dlx.make("lds", key=key, horizon=5)
+    lds = dlx.make("lds", A=jnp.eye(2), B=jnp.ones((2, 1)), horizon=5)
     run = dlx.rollout(lds, dlx.controllers.Zero(1), key=key, x0=jnp.ones(2))
     for arguments, match in (
         ((three, LIMITS), "system must have two states, got"),

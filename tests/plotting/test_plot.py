@@ -156,7 +156,7 @@ def test_states_that_share_a_unit_share_a_panel(key):
 
 
 def test_states_without_units_are_spread_over_panels(key):
-    env = dlx.make("lds", key=key, states=12, controls=1, horizon=5)
+    env = dlx.make("lds", A=jnp.eye(12), B=jnp.ones((12, 1)), horizon=5)
     run = dlx.rollout(env, dlx.controllers.Zero(1), key=key, x0=jnp.ones(12))
     figure = dlx.plot(run)
     assert [len(data_lines(ax)) for ax in figure.axes] == [6, 6, 1, 1]
@@ -333,7 +333,7 @@ def test_settings_are_left_alone_and_nothing_warns(trajectory, batch):
 
 
 def test_errors_name_the_argument(env, linear, trajectory, key):
-    lds = dlx.make("lds", key=key, horizon=5)
+    lds = dlx.make("lds", A=jnp.eye(2), B=jnp.ones((2, 1)), horizon=5)
     other = dlx.rollout(lds, dlx.controllers.Zero(1), key=key, x0=jnp.ones(2))
     blind = dlx.rollout(env, linear, key=key, keep=("controls", "costs"))
     poor = dlx.rollout(env, linear, key=key, keep=("states",))

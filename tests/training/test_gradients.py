@@ -114,8 +114,8 @@ def assert_mean(samples, exact, power=0.2):
 
 # The numbers of draws are the same throughout, so that each estimator compiles once.
 ANALYTIC = (analytic, 4000)
-SCORED = (LikelihoodRatio(32), 2000)
-NO_BASELINE = (LikelihoodRatio(32, baseline=False), 2000)
+SCORED = (LikelihoodRatio(32), 4000)
+NO_BASELINE = (LikelihoodRatio(32, baseline=False), 16000)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_saturated_controls_are_scored_as_drawn():
     _, scored = estimates(SCORED[0], loss, Recalling(), SCORED[1])
     error = np.hypot(*(g.std(0) / np.sqrt(len(g)) for g in (pathwise, scored)))
     assert np.all(np.abs(scored.mean(0) - pathwise.mean(0)) < 4 * error)
-    assert np.all(error < 0.1 * np.abs(pathwise.mean(0)).max())
+    assert np.all(error < 0.15 * np.abs(pathwise.mean(0)).max())
 
 
 def test_a_score_stops_where_the_episode_does():

@@ -99,8 +99,8 @@ def demo(
         runs = evaluate(env, policy, starts)
         held.append(int(jnp.sum(holds_upright(runs))))
         say(
-            f"  seed {seed}: {seconds[-1]:.1f} s with compilation; swings up and holds "
-            f"from {held[-1]} of {STARTS} starts"
+            f"  seed {seed}: {seconds[-1]:.1f} s{', compilation included' * (not seed)};"
+            f" swings up and holds from {held[-1]} of {STARTS} starts"
         )
         if seed == 0:
             controllers["MLP"] = policy

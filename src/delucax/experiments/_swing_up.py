@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 
 from .._paths import replace
 from .._typing import PRNGKey
-from ..controllers import MLP
+from ..controllers import Deep
 from ..environments import Environment, pendulum
 from ..math import wrap
 from ..simulation import Trajectory
@@ -56,15 +56,7 @@ def train_swing_up(
     """
     environment = pendulum() if environment is None else environment
     init_key, fit_key = jax.random.split(key)
-    policy = MLP(
-        environment.feature_size,
-        environment.control_size,
-        width=32,
-        depth=1,
-        features=environment.encode,
-        scale=environment.control_bounds[1],
-        key=init_key,
-    )
+    policy = Deep(environment, width=32, depth=1, key=init_key)
     return fit(
         expected_cost(
             _spread(environment),

@@ -125,7 +125,8 @@ def _run(label: str, trajectory: Trajectory, what: str, where: str) -> Run:
     terminated = ends < steps
     if trajectory.terminated is not None and steps:
         terminated = terminated | flat(trajectory.terminated)[:, -1]
-    failed = flat(np.asarray(trajectory.result != RESULTS.successful))
+    failed = np.asarray(trajectory.result != RESULTS.successful)
+    failed = flat(np.broadcast_to(failed, trajectory.batch_shape))
     series = {}
     for kind in KINDS:
         array = getattr(trajectory, kind)
@@ -139,7 +140,7 @@ def _run(label: str, trajectory: Trajectory, what: str, where: str) -> Run:
         times=times,
         series=series,
         ends=ends,
-        failed=np.broadcast_to(failed, ends.shape),
+        failed=failed,
         terminated=terminated,
         total_costs=flat(trajectory.total_cost),
         batched=lead > 0,

@@ -24,7 +24,11 @@ class Scene:
     """Draws the frames of an animation, one step of a trajectory each."""
 
     def __init__(
-        self, run: Run, environment: Environment, indices: Sequence[int], dpi: float | int
+        self,
+        run: Run,
+        environment: Environment,
+        indices: Sequence[int],
+        dpi: float | int,
     ):
         self.run = run
         self.states = np.asarray(run.trajectory.states, float)

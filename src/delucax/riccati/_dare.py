@@ -280,11 +280,10 @@ def _polish(A, B, Q, R, S, X):
 def _riccati_jvp(primals, tangents):
     X, iterations = _riccati(*primals)
 
-    def error(*arguments):
-        return _equation(*arguments, X)[0]
+    def equation(*arguments):
+        return _equation(*arguments, X)
 
-    _, error_tangent = jax.jvp(error, primals, tangents)
-    _, closed_loop = _equation(*primals, X)
+    _, error_tangent, closed_loop = jax.jvp(equation, primals, tangents, has_aux=True)
     X_tangent = stein(closed_loop, error_tangent)
     return (X, iterations), (X_tangent, _no_tangent(iterations))
 

@@ -97,7 +97,7 @@ class _Ends(diffrax.AbstractLocalInterpolation):
 
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
-            return self.evaluate(t1, left=left) - self.evaluate(t0, left=left)
+            return self.inside.evaluate(t0, t1, left=left)
         x = jnp.where(t0 == self.t1, self.end, self.inside.evaluate(t0, left=left))
         return x if self.held is None else Recorded(x, self.held)
 

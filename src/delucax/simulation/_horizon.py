@@ -4,6 +4,7 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import numpy as np
 
 from .._check import check_positive, is_concrete
@@ -37,15 +38,26 @@ def check_system(system: Any, where: str) -> None:
 
 
 def as_time(value: Any, name: str, where: str) -> Any:
-    time = as_float_array(value)
-    if not eqx.is_inexact_array(time) or time.shape != ():
+    """`value` as a scalar: a Python number if it is known, so that it stays known
+    while other things are being traced.
+    """
+    if isinstance(value, jax.core.Tracer):
+        array = as_float_array(value)
+        if array.shape != ():
+            raise ValueError(
+                f"{where}: {name} must be a number, got shape {array.shape}."
+            )
+        return array
+    number = np.asarray(value)
+    if number.shape != () or number.dtype.kind not in "iuf":
         raise ValueError(f"{where}: {name} must be a number, got {value!r}.")
-    if is_concrete(time) and not np.isfinite(time):
+    if not np.isfinite(number):
         raise ValueError(f"{where}: {name} must be finite, got {value!r}.")
-    return time
+    return float(number)
 
 
 def as_sequence(value: Any, size: int, name: str, where: str) -> Any:
+    """`value` as an array of shape `(T, size)`, or an error."""
     array = as_float_array(value)
     if not eqx.is_inexact_array(array) or array.ndim != 2 or array.shape[1] != size:
         got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
@@ -74,7 +86,7 @@ def count_intervals(
             )
         if known:
             check_positive(dt, "dt", where)
-            ratio = (float(t1) - float(t0)) / float(dt)
+            ratio = (t1 - t0) / dt
             # Single precision rounds the quotient by a few parts in 1e7.
             if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
                 raise ValueError(
@@ -89,6 +101,7 @@ def count_intervals(
 
 
 def as_save_times(ts: Any, t0: Any, t1: Any, where: str) -> Any:
+    """`ts` as an array of increasing times from `t0` to `t1`, or an error."""
     ts = as_float_array(ts)
     if not eqx.is_inexact_array(ts) or ts.ndim != 1 or ts.shape[0] < 2:
         raise ValueError(
@@ -96,7 +109,8 @@ def as_save_times(ts: Any, t0: Any, t1: Any, where: str) -> Any:
         )
     if is_concrete(ts) and is_concrete(t0) and is_concrete(t1):
         values = np.asarray(ts)
-        inside = np.all((values >= np.asarray(t0)) & (values <= np.asarray(t1)))
+        t0, t1 = values.dtype.type(t0), values.dtype.type(t1)
+        inside = np.all((values >= t0) & (values <= t1))
         if not inside or not np.all(np.diff(values) > 0):
             raise ValueError(
                 f"{where}: ts must increase and lie between t0 = {t0} and t1 = {t1}, "

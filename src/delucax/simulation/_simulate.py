@@ -157,6 +157,7 @@ def simulate(
     if is_concrete(x0) and not np.all(np.isfinite(x0)):
         raise ValueError(f"{where}: x0 must be finite, got {x0}.")
     t0, t1 = as_time(t0, "t0", where), as_time(t1, "t1", where)
+    dt = None if dt is None else as_time(dt, "dt", where)
     if is_concrete(t0) and is_concrete(t1) and not t1 > t0:
         raise ValueError(f"{where}: t1 must be above t0, got t0 = {t0}, t1 = {t1}.")
     source = controller_or_controls
@@ -225,8 +226,8 @@ def simulate(
         source,
         w,
         x0,
-        t0,
-        t1,
+        jnp.asarray(t0, x0.dtype),
+        jnp.asarray(t1, x0.dtype),
         ts,
         key,
         solver,
@@ -261,7 +262,6 @@ def _simulate(
     hold,
 ):
     dtype = x0.dtype
-    t0, t1 = t0.astype(dtype), t1.astype(dtype)
     grid = switches = None
     if steps is not None:
         grid = t0 + (t1 - t0) * (jnp.arange(steps * substeps + 1) / (steps * substeps))

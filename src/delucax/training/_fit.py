@@ -212,18 +212,23 @@ def fit(
     order = None
     if batch_size is not None:
         order = (jnp.zeros(data_size, jnp.int32), jnp.asarray(-1, jnp.int32))
+    functions = (loss, gradient, optimiser, static, assembly)
+
+    def launch(carry, first):
+        span = np.asarray([first, min(first + block, steps)], np.int32)
+        return run_block(functions, carry, (key, data), span, batch_size)
+
     done = written = len(history.get("step", ()))
-    fault, last, blocks = 0, {}, [history] if history else []
+    carry = (values, state, order, jnp.zeros((), jnp.int32))
+    fault, last, blocks, ahead = 0, {}, [history] if history else [], None
     began = time.perf_counter() - seconds
     with tqdm(total=steps, initial=done, disable=not progress, desc="fit") as bar:
         while done < steps and not fault:
-            values, state, order, rows, count, fault = run_block(
-                (loss, gradient, optimiser, static, assembly),
-                (values, state, order),
-                (key, data),
-                np.asarray([done, min(done + block, steps)], np.int32),
-                batch_size,
-            )
+            carry, rows, count = ahead or launch(carry, done)
+            # The device takes the next block while this one is looked at. If this one
+            # failed, the next takes no step.
+            ahead = launch(carry, done + block) if done + block < steps else None
+            values, state, _, fault = carry
             rows, count, fault = jax.device_get((rows, count, fault))
             count, fault = int(count), int(fault)
             seconds = time.perf_counter() - began

@@ -1,0 +1,109 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, user_error
+
+import delucax as dlx
+
+
+MLP, Deep = dlx.controllers.MLP, dlx.controllers.Deep
+
+
+def test_arithmetic(key):
+    policy = MLP(3, 2, width=5, depth=1, key=key)
+    y = jnp.array([0.3, -1.0, 2.0])
+    hidden, out = policy.network.layers
+    expected = out.weight @ jnp.tanh(hidden.weight @ y + hidden.bias) + out.bias
+    assert_close(policy(0.0, y, None)[0], expected, rtol=1e-6)
+    relu = MLP(3, 2, width=5, depth=1, activation=jax.nn.relu, key=key)
+    expected = out.weight @ jax.nn.relu(hidden.weight @ y + hidden.bias) + out.bias
+    assert_close(relu(0.0, y, None)[0], expected, rtol=1e-6)
+    assert len(MLP(3, 2, depth=0, key=key).network.layers) == 1
+
+
+def test_squashed_into_bounds(key):
+    low, high = jnp.array([0.0, -3.0]), jnp.array([100.0, -1.0])
+    policy = MLP(1, 2, width=4, depth=1, bounds=(low, high), key=key)
+    act = lambda scale: policy(0.0, jnp.full(1, scale), None)[0]
+    for y in (-1e6, -1.0, 0.5, 1e6):
+        assert np.all((act(y) >= low) & (act(y) <= high))
+    centred = jax.tree.map(
+        lambda leaf: 0 * leaf, eqx.filter(policy.network, eqx.is_array)
+    )
+    policy = eqx.tree_at(
+        lambda p: p.network,
+        policy,
+        eqx.combine(centred, eqx.filter(policy.network, eqx.is_array, inverse=True)),
+    )
+    assert_close(act(1.0), [50.0, -2.0])
+
+
+def test_deep_fits_the_environment(key):
+    env = dlx.make("pendulum")
+    policy = Deep(env, width=8, depth=3, key=key)
+    assert isinstance(policy, MLP)
+    sizes = [layer.weight.shape for layer in policy.network.layers]
+    assert sizes == [(8, 3), (8, 8), (8, 8), (1, 8)]
+    y = jnp.array([2.0, -1.0])
+    turned = y + jnp.array([2 * np.pi, 0.0])
+    assert_close(policy(0.0, turned, None)[0], policy(0.0, y, None)[0], atol=1e-4)
+    run = dlx.rollout(env, policy, key=key, horizon=5)
+    assert np.all(np.abs(run.controls) < 2)
+
+
+def test_deep_heads(key):
+    env = dlx.make("pendulum")
+    policy = Deep(env, width=8, head="gaussian", key=key)
+    assert isinstance(policy, dlx.controllers.Gaussian)
+    assert_close(jnp.exp(policy.log_std), [1.0], rtol=1e-6)  # a quarter of -2 to 2
+    assert policy.base.bounds is not None and policy.bounds is not None
+    open_ended = dlx.make("lds", A=jnp.eye(2), B=jnp.ones((2, 1)))
+    policy = Deep(open_ended, width=8, head="gaussian", key=key)
+    assert policy.bounds is None and policy.base.bounds is None
+    assert_close(policy.log_std, [0.0])
+    half = dlx.make(
+        "lds", A=jnp.eye(2), B=jnp.ones((2, 1)), control_bounds=(0.0, jnp.inf)
+    )
+    policy = Deep(half, width=8, head="gaussian", key=key)
+    assert policy.base.bounds is None
+    run = dlx.rollout(half, policy, key=key, horizon=5)
+    assert run.controls.min() >= 0
+    assert np.isfinite(policy.total_log_prob(run))
+
+
+def test_deep_learns(key):
+    env = dlx.make("lds", A=jnp.array([[1.0, 0.3], [0.0, 1.0]]), B=jnp.eye(2)[:, 1:])
+    env = dlx.replace(env, {"initial_state": jnp.array([1.0, 0.0])})
+    loss = dlx.training.expected_cost(env, batch=1, horizon=20)
+    import optax
+
+    policy = Deep(env, width=8, depth=1, key=key)
+    fitted = dlx.training.fit(loss, policy, optax.adam(0.02), steps=60, key=key)
+    assert loss(fitted.model, key) < 0.6 * loss(policy, key)
+
+
+def test_wrong_arguments(key):
+    with user_error(match="in_size must be a whole number of at least 1"):
+        MLP(0, 1, key=key)
+    with user_error(match="depth must be a whole number of at least 0, got -1"):
+        MLP(1, 1, depth=-1, key=key)
+    with user_error(match="key must be one random key"):
+        MLP(1, 1, key=3)
+    with user_error(match="bounds must be finite to squash into"):
+        MLP(1, 1, bounds=(0.0, np.inf), key=key)
+    with user_error(match=r"bounds must be numbers or have shape \(1,\).*\(2,\)"):
+        MLP(1, 1, bounds=(0.0, jnp.ones(2)), key=key)
+    with user_error(match="MLP: .*size 3, got size 2.*features=env.encode"):
+        MLP(3, 1, key=key)(0.0, jnp.zeros(2), None)
+    with user_error(match="environment must be an Environment, got GymPendulum"):
+        Deep(dlx.make("pendulum").dynamics, key=key)
+    with user_error(match="head must be .* got 'softmax'"):
+        Deep(dlx.make("pendulum"), head="softmax", key=key)
+
+
+@pytest.mark.parametrize("depth", [True, 1.0])
+def test_depth_is_a_whole_number(key, depth):
+    with user_error(match="depth must be a whole number"):
+        MLP(1, 1, depth=depth, key=key)
