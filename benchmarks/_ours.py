@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
-import delucax as dlx
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+import delucax as dlx
 from benchmarks._problem import Case, DT, GAIN, MAX_SPEED, MAX_TORQUE
 from benchmarks._timing import compiled, Contender
 
@@ -18,7 +18,8 @@ NAME = "delucax"
 
 
 class UserPendulum(dlx.AbstractDynamics):
-    """Gymnasium's pendulum as a user would write it, with nothing but `delucax.math`."""
+    """Gymnasium's pendulum as a user would write it, with nothing but
+    `delucax.math`."""
 
     state_names = ("angle", "velocity")
     control_names = ("torque",)

@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import delucax as dlx
 import diffrax
 import equinox as eqx
 import jax
@@ -19,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+import delucax as dlx
 from benchmarks import _ours
 from benchmarks._machine import describe, limit_cores
 from benchmarks._peers import c, gymnasium_peer, gymnax_peer, raw
@@ -47,9 +47,7 @@ def entries(case: Case) -> list[Contender | Missing]:
         found.append(_ours.contender(case, name="delucax, stored", checkpoint=None))
         # What a gradient is measured against: the cost alone, forward.
         forward = Case("trajectory", case.steps, case.lanes, case.method)
-        found.append(
-            raw.contender(forward, sin=dlx.math.sin, name=f"{RAW}, forward")
-        )
+        found.append(raw.contender(forward, sin=dlx.math.sin, name=f"{RAW}, forward"))
     if case.method == "gym" and case.workload in ("trajectory", "cost"):
         user = _ours.environment(case, dynamics=_ours.UserPendulum())
         found.append(_ours.contender(case, name="delucax, user's pendulum", env=user))
@@ -64,9 +62,7 @@ def entries(case: Case) -> list[Contender | Missing]:
 def noise_entries(lanes: int | None, steps: int) -> list[Contender]:
     """The price of noise: Gaussian `w`, and Euler-Maruyama beside Euler."""
     case = Case("trajectory", steps, lanes)
-    gaussian = dlx.make(
-        "pendulum", disturbance=dlx.disturbances.Gaussian(0.01, size=2)
-    )
+    gaussian = dlx.make("pendulum", disturbance=dlx.disturbances.Gaussian(0.01, size=2))
     cost = dlx.costs.PendulumCost()
     system = _ours.NoisyPendulum()
     stochastic = dlx.Discretized(system, 0.05, diffrax.Euler())

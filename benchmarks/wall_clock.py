@@ -13,7 +13,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import delucax as dlx
 import equinox as eqx
 import gymnasium
 import jax
@@ -21,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+import delucax as dlx
 from benchmarks._machine import describe, limit_cores
 
 

@@ -3,7 +3,6 @@ import os
 import subprocess
 import sys
 
-import delucax as dlx
 import diffrax
 import equinox as eqx
 import jax
@@ -12,6 +11,8 @@ import numpy as np
 import optax
 import pytest
 from helpers import user_error
+
+import delucax as dlx
 
 
 KEY = jax.random.key(0)

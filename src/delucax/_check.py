@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 from ._fields import as_float_array
@@ -13,7 +14,7 @@ from ._fields import as_float_array
 
 def is_concrete(x: Any) -> bool:
     """Whether the value of `x` can be looked at now (it is not being traced)."""
-    return not isinstance(x, jax.core.Tracer)
+    return not isinstance(x, Tracer)
 
 
 def check_key(key: Any, where: str) -> None:

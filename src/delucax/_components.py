@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jax.extend.core import Literal
 
 
@@ -19,10 +20,10 @@ LARGEST = 16
 """Vectors with more entries are left whole, to keep programs short."""
 
 _ELEMENTWISE = frozenset(
-    "abs add and atan2 ceil clamp convert_element_type cos copy cosh div eq erf exp exp2"
-    " expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne"
-    " neg not or pow rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub"
-    " tan tanh xor".split()
+    "abs add and atan2 ceil clamp convert_element_type cos copy cosh div eq erf exp"
+    " exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul"
+    " ne neg not or pow rem round rsqrt select_n sign sin sinh sqrt square"
+    " stop_gradient sub tan tanh xor".split()
 )
 
 
@@ -78,14 +79,16 @@ def _apply(equation: Any, values: list[Any]) -> Sequence[Any]:
     if name in ("jit", "pjit"):
         inner = params["jaxpr"]
         return _replay(inner.jaxpr, inner.consts, values)
-    shape = getattr(equation.outvars[0].aval, "shape", None) if equation.outvars else None
+    shape: Any = None
+    if equation.outvars:
+        shape = getattr(equation.outvars[0].aval, "shape", None)
     if name in ("broadcast_in_dim", "reshape") and len(values) == 1 and shape == (1,):
-        if jnp.shape(_whole(values[0])) == ():
+        if not isinstance(values[0], _Components) and jnp.shape(values[0]) == ():
             return [_Components([values[0]])]
     if name == "concatenate" and shape is not None and len(shape) == 1:
         if shape[0] <= LARGEST and all(isinstance(v, _Components) for v in values):
             return [_Components([e for v in values for e in v.entries])]
-    if name == "stack" and len(shape) == 1 and shape[0] <= LARGEST:
+    if name == "stack" and shape == (len(values),) and len(values) <= LARGEST:
         return [_Components(values)]
     if name == "unstack" and isinstance(values[0], _Components):
         return values[0].entries
@@ -108,11 +111,15 @@ def _of_components(primitive, params, shape, values):
         (start,), (stop,) = params["start_indices"], params["limit_indices"]
         step = 1 if params["strides"] is None else params["strides"][0]
         return _Components(first.entries[start:stop:step])
-    if name in ("squeeze", "reshape") and shape == () and isinstance(first, _Components):
+    if (
+        name in ("squeeze", "reshape")
+        and shape == ()
+        and isinstance(first, _Components)
+    ):
         return first.entries[0]
     if name == "dynamic_slice" and isinstance(first, _Components):
         start, (size,) = values[1], params["slice_sizes"]
-        if isinstance(start, int) or not isinstance(start, jax.core.Tracer):
+        if isinstance(start, int) or not isinstance(start, Tracer):
             start = min(max(int(start), 0), len(first.entries) - size)
             return _Components(first.entries[start : start + size])
         return None

@@ -13,10 +13,11 @@ from ._typing import PRNGKey, RealScalar
 class AbstractController(eqx.Module):
     """A feedback law with a state of its own.
 
-    [`delucax.rollout`][] makes the calls, in this order at each step: `__call__` acts on
-    the observation; the environment saturates and steps; `applied` tells the controller
-    the control that was really applied, and its cost. Trained weights are fields; what
-    is learned or remembered along the way lives in the state, a pytree of arrays.
+    [`delucax.rollout`][] makes the calls, in this order at each step: `__call__` acts
+    on the observation; the environment saturates and steps; `applied` tells the
+    controller the control that was really applied, and its cost. Trained weights are
+    fields; what is learned or remembered along the way lives in the state, a pytree of
+    arrays.
 
     !!! example
 
@@ -49,9 +50,7 @@ class AbstractController(eqx.Module):
         return None
 
     @abc.abstractmethod
-    def __call__(
-        self, t: RealScalar, y: Array, state: PyTree
-    ) -> tuple[Array, PyTree]:
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         """The control for an observation.
 
         **Arguments:**

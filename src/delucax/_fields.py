@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 
@@ -229,7 +230,7 @@ class StaticFunction(eqx.Module):
 
 
 def as_module(value: Any) -> Any:
-    """A plain function as a `StaticFunction`; modules, arrays and `None` as they are."""
+    """A plain function as a `StaticFunction`; anything else as it is."""
     if callable(value) and not jax.tree.leaves(eqx.filter(value, eqx.is_array)):
         if isinstance(value, eqx.Module) or not _is_leaf(value):
             return value
@@ -295,7 +296,7 @@ def check_parameters(module: eqx.Module) -> None:
         value = getattr(module, field.name, None)
         constraint = field.metadata[_CONSTRAINT]
         for leaf in jax.tree.leaves(value):
-            if isinstance(leaf, jax.core.Tracer) or not eqx.is_inexact_array(leaf):
+            if isinstance(leaf, Tracer) or not eqx.is_inexact_array(leaf):
                 continue
             leaf = np.asarray(leaf)
             name = f"{type(module).__name__}: {field.name}"

@@ -1,8 +1,11 @@
 """Outcomes of a solve, in one enumeration with Diffrax's and Lineax's own."""
 
+from typing import Any, TYPE_CHECKING, TypeAlias
+
 import diffrax
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
@@ -21,7 +24,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     not_converged = "The iteration did not converge within its step limit."
 
 
-Result = type(RESULTS.successful)
+if TYPE_CHECKING:
+    Result: TypeAlias = Any
+else:
+    Result = type(RESULTS.successful)
 """An item of `RESULTS`; the type of every `result` field."""
 
 
@@ -30,6 +36,11 @@ def promote(result: Result) -> Result:
     if isinstance(result, RESULTS):
         return result
     return RESULTS.promote(result)
+
+
+def choose(condition: Array, first: Any, second: Any) -> Result:
+    """`first` where the condition holds, else `second`."""
+    return RESULTS.where(condition, first, second)
 
 
 def first_failure(first: Result, second: Result) -> Result:
@@ -41,7 +52,7 @@ def first_failure(first: Result, second: Result) -> Result:
         return second
     if second is RESULTS.successful:
         return first
-    return RESULTS.where(first != RESULTS.successful, first, second)
+    return choose(first != RESULTS.successful, first, second)
 
 
 def first_of(results: Result | None) -> Result:

@@ -5,37 +5,31 @@ a line of JSON that describes the structure; and the bytes of the arrays.
 """
 
 import dataclasses
+import functools
 import hashlib
-import importlib
-import inspect
+import importlib.metadata
 import json
+import math
 import os
-import sys
-import tempfile
+import secrets
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.random as jr
 import numpy as np
+
+from ._qualified import name_of, thing_of
+from ._results import Result
 
 
 _MAGIC = "delucax-file"
 _VERSION = 1
-_TRUSTED = (
-    "delucax",
-    "diffrax",
-    "equinox",
-    "jax",
-    "jaxlib",
-    "lineax",
-    "optax",
-    "optimistix",
-    "__main__",
-)
+_PARTIALS = {"partial": functools.partial, "Partial": jax.tree_util.Partial}
 
 
 def save(path: str | os.PathLike, obj: Any) -> None:
@@ -63,41 +57,49 @@ def save(path: str | os.PathLike, obj: Any) -> None:
         controller = dlx.load("controller.dlx")
         ```
     """
-    arrays: list[np.ndarray] = []
-    tree = _encode(obj, "obj", arrays)
-    header = json.dumps({"tree": tree, "arrays": [_describe(a) for a in arrays]})
-    body = header.encode() + b"\n" + b"".join(a.tobytes() for a in arrays)
-    digest = hashlib.sha256(body).hexdigest()
-    first = f"{_MAGIC} {_VERSION} {digest}\n".encode()
     path = Path(path)
+    writer = _Writer()
+    header = {"library": _library(), "tree": writer.describe(obj, "obj")}
+    header["arrays"] = [
+        {"dtype": array.dtype.name, "shape": list(array.shape)}
+        for array in writer.arrays
+    ]
+    text = json.dumps(header, allow_nan=False, separators=(",", ":"))
+    body = b"".join([text.encode(), b"\n", *(a.tobytes() for a in writer.arrays)])
+    first = f"{_MAGIC} {_VERSION} {hashlib.sha256(body).hexdigest()}\n"
+    if path.is_dir():
+        raise ValueError(f"save: path must be that of a file, got the folder '{path}'.")
+    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        with open(beside, "xb") as file:
+            file.write(first.encode())
+            file.write(body)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
     except OSError as error:
-        raise OSError(f"save: path {path} cannot be written: {error}") from error
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(first + body)
-        os.replace(name, path)
-    except OSError as error:
-        os.unlink(name)
-        raise OSError(f"save: path {path} cannot be written: {error}") from error
+        beside.unlink(missing_ok=True)
+        raise type(error)(f"save: '{path}' cannot be written: {error}") from error
 
 
 def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
     """Read what [`delucax.save`][] wrote.
 
     Nothing in the file is run: classes and functions are looked up by name, and only in
-    packages that are trusted.
+    packages that are trusted. What was loaded calls the functions that the file names,
+    so use only files from those whom you trust.
 
     **Arguments:**
 
     - `path`: the file to read.
-    - `trust`: packages, besides this one, JAX and its kin, and what you defined
-        yourself in the running notebook or script, whose classes and functions the file
-        may name; none by default.
+    - `trust`: packages or modules whose classes and functions the file may name,
+        besides delucax, Diffrax, Equinox, Lineax, Optax and Optimistix, the public
+        functions of JAX and NumPy, and what you defined yourself in the running
+        notebook or script; none by default.
 
     **Returns:** the object, of the same structure: a function compiled for the one that
-    was saved does not compile again.
+    was saved does not compile again. Arrays in double precision are narrowed, with a
+    warning, where JAX is in single precision.
 
     **Raises:** `ValueError` if the file is damaged, foreign or of a newer version, or
     names what is not trusted, not there, or no longer has the same fields; `OSError` if
@@ -113,205 +115,314 @@ def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
         ```
     """
     path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"load: path must be that of a file, got the folder '{path}'.")
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise OSError(f"load: path {path} cannot be read: {error}") from error
+        raise type(error)(f"load: '{path}' cannot be read: {error}") from error
     first, _, body = content.partition(b"\n")
     words = first.decode(errors="replace").split()
-    if len(words) != 3 or words[0] != _MAGIC or not words[1].isdigit():
-        raise ValueError(f"load: path {path} is not a file that delucax.save wrote.")
+    if len(words) != 3 or words[0] != _MAGIC or not words[1].isdecimal():
+        raise ValueError(
+            f"load: '{path}' is not a file that delucax.save wrote, or its beginning "
+            "is damaged."
+        )
     if int(words[1]) > _VERSION:
         raise ValueError(
-            f"load: path {path} has format {words[1]}, newer than the {_VERSION} that "
+            f"load: '{path}' has format {words[1]}, newer than the {_VERSION} that "
             "this version of delucax reads; update delucax."
         )
     if hashlib.sha256(body).hexdigest() != words[2]:
-        raise ValueError(f"load: path {path} is damaged: its checksum does not match.")
-    header, _, payload = body.partition(b"\n")
-    description = json.loads(header)
-    arrays, offset = [], 0
-    for about in description["arrays"]:
-        dtype, shape = jnp.dtype(about["dtype"]), tuple(about["shape"])
-        size = dtype.itemsize * int(np.prod(shape, dtype=int))
-        piece = np.frombuffer(payload[offset : offset + size], dtype).reshape(shape)
-        arrays.append(piece)
-        offset += size
-    names = _Names((*_TRUSTED, *([trust] if isinstance(trust, str) else trust)), path)
-    return _decode(description["tree"], arrays, names)
-
-
-def _describe(array: np.ndarray) -> dict[str, Any]:
-    return {"dtype": array.dtype.name, "shape": list(array.shape)}
-
-
-def _encode(node: Any, path: str, arrays: list[np.ndarray]) -> Any:
-    """`node` as JSON; its arrays are put behind `arrays`."""
-    if node is None or type(node) in (bool, int, float, str):
-        return node
-    if isinstance(node, jax.core.Tracer):
-        raise ValueError(f"save: {path} is being traced; save outside of jit and grad.")
-    if isinstance(node, jax.Array):
-        if jnp.issubdtype(node.dtype, jax.dtypes.prng_key):
-            arrays.append(np.asarray(jax.random.key_data(node)))
-            return {"key": len(arrays) - 1, "impl": str(jax.random.key_impl(node))}
-        arrays.append(np.ascontiguousarray(node).reshape(node.shape))
-        return {"array": len(arrays) - 1, "weak": bool(node.weak_type)}
-    if isinstance(node, np.ndarray | np.generic):
-        if node.dtype.hasobject:
-            raise ValueError(f"save: {path} is an array of Python objects.")
-        arrays.append(np.ascontiguousarray(node).reshape(np.shape(node)))
-        kind = "numpy" if isinstance(node, np.ndarray) else "number"
-        return {kind: len(arrays) - 1}
-    if isinstance(node, np.dtype):
-        return {"dtype": node.name}
-
-    def inside(child, step):
-        return _encode(child, f"{path}{step}", arrays)
-
-    if inspect.ismethod(node) or type(node).__name__ == "BoundMethod":
-        owner, name = node.__self__, node.__func__.__name__
-        if getattr(owner, name, None) == node:
-            return {"method": name, "of": inside(owner, "")}
-    if isinstance(node, eqx.Module):
-        fields = {
-            field.name: inside(getattr(node, field.name), f".{field.name}")
-            for field in dataclasses.fields(node)
-            if field.name in vars(node) or hasattr(node, field.name)
-        }
-        return {"module": _name_of(type(node), path), "fields": fields}
-    if isinstance(node, jax.tree_util.Partial):
-        parts = [node.func, node.args, node.keywords]
-        return {"partial": [inside(part, "") for part in parts]}
-    if isinstance(node, tuple) and hasattr(node, "_fields"):
-        items = [inside(child, f".{name}") for name, child in node._asdict().items()]
-        return {"namedtuple": _name_of(type(node), path), "items": items}
-    if type(node) in (tuple, list):
-        items = [inside(child, f"[{i}]") for i, child in enumerate(node)]
-        return {type(node).__name__: items}
-    if type(node) is dict:
-        items = [
-            [inside(k, f" key {k!r}"), inside(v, f"[{k!r}]")] for k, v in node.items()
-        ]
-        return {"dict": items}
-    return {"name": _name_of(node, path)}
-
-
-def _name_of(thing: Any, path: str) -> str:
-    """`module:name` of a class or function, or of a constant of a module."""
-    module = getattr(thing, "__module__", None)
-    names = [getattr(thing, "__qualname__", None), getattr(thing, "__name__", None)]
-    for name in names:
-        if module and name and _look_up(module, name) is thing:
-            return f"{module}:{name}"
-    # JAX's functions say where they are used from, not where they are defined; and
-    # some constants of a module are instances of a class.
-    home = type(thing).__module__
-    for place in (module, home, "jax.numpy", "jax.nn"):
-        for name, value in list(vars(sys.modules.get(place, object)).items()):
-            if value is thing:
-                return f"{place}:{name}"
-    raise ValueError(
-        f"save: {path} is {thing!r}, which has no name to find it by. Use a function "
-        "defined at the top of a module in place of a lambda, or a module with a "
-        "`__call__`."
-    )
-
-
-def _look_up(module: str, name: str) -> Any:
-    value: Any = sys.modules.get(module)
-    for part in name.split("."):
-        value = getattr(value, part, None)
-    return value
-
-
-class _Names:
-    """Finds classes and functions by name, in trusted packages alone."""
-
-    def __init__(self, trusted: tuple[str, ...], path: Path):
-        self.trusted = trusted
-        self.path = path
-
-    def __call__(self, name: str) -> Any:
-        module, _, attribute = name.partition(":")
-        package = module.partition(".")[0]
-        if package not in self.trusted:
-            raise ValueError(
-                f"load: path {self.path} names {name}, of a package that is not "
-                f"trusted; if you trust it, load(..., trust=({package!r},))."
-            )
-        if module not in sys.modules:
-            try:
-                importlib.import_module(module)
-            except ImportError as error:
-                raise ValueError(
-                    f"load: path {self.path} needs the module {module}: {error}."
-                ) from error
-        found = _look_up(module, attribute)
-        if found is None:
-            where = "define it first" if module == "__main__" else "it is not there"
-            raise ValueError(
-                f"load: path {self.path} needs {attribute} of {module}: {where}."
-            )
-        return found
-
-
-def _decode(node: Any, arrays: list[np.ndarray], names: Callable[[str], Any]) -> Any:
-    if not isinstance(node, dict):
-        return node
-    if "array" in node:
-        return _array(arrays[node["array"]], node["weak"])
-    if "key" in node:
-        data = jnp.asarray(arrays[node["key"]])
-        return jax.random.wrap_key_data(data, impl=node["impl"])
-    if "numpy" in node:
-        return arrays[node["numpy"]].copy()
-    if "number" in node:
-        return arrays[node["number"]][()]
-    if "dtype" in node:
-        return jnp.dtype(node["dtype"])
-    if "name" in node:
-        return names(node["name"])
-    inside = lambda child: _decode(child, arrays, names)
-    if "module" in node:
-        cls = names(node["module"])
-        if not (isinstance(cls, type) and issubclass(cls, eqx.Module)):
-            raise ValueError(f"load: {node['module']} is not a module class.")
-        known = {field.name for field in dataclasses.fields(cls)}
-        if not set(node["fields"]) <= known:
-            raise ValueError(
-                f"load: {node['module']} has changed since the file was written: it "
-                f"has fields {sorted(known)}, the file {sorted(node['fields'])}."
-            )
-        module = object.__new__(cls)
-        for name, child in node["fields"].items():
-            object.__setattr__(module, name, inside(child))
-        return module
-    if "method" in node:
-        return getattr(inside(node["of"]), node["method"])
-    if "partial" in node:
-        function, args, keywords = map(inside, node["partial"])
-        return jax.tree_util.Partial(function, *args, **keywords)
-    if "namedtuple" in node:
-        return names(node["namedtuple"])(*map(inside, node["items"]))
-    if "tuple" in node:
-        return tuple(map(inside, node["tuple"]))
-    if "list" in node:
-        return list(map(inside, node["list"]))
-    return {inside(key): inside(value) for key, value in node["dict"]}
-
-
-def _array(array: np.ndarray, weak: bool) -> jax.Array:
-    if weak and array.shape == ():
-        return jnp.asarray(array[()].item())
-    if array.dtype == np.float64 and not jax.config.read("jax_enable_x64") and not weak:
+        raise ValueError(f"load: '{path}' is damaged: its checksum does not match.")
+    text, _, payload = body.partition(b"\n")
+    try:
+        header = json.loads(text)
+        arrays = _split(payload, header["arrays"])
+        trust = (trust,) if isinstance(trust, str) else tuple(trust)
+        reader = _Reader(arrays, trust)
+        obj = reader.build(header["tree"])
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
+        raise ValueError(f"load: '{path}' cannot be used: {error}") from error
+    if reader.narrowed:
         warnings.warn(
-            "load: an array was saved in float64 and is read in float32; set "
-            "jax_enable_x64 to keep its precision.",
-            stacklevel=4,
+            f"load: '{path}' holds arrays in double precision, which are read in "
+            "single precision; set jax_enable_x64 to keep them.",
+            stacklevel=2,
         )
-        array = array.astype(np.float32)
-    if weak:
-        # A weak type is kept by what is written into a weakly typed array.
-        return jnp.broadcast_to(jnp.asarray(0.0), array.shape).at[...].set(array)
-    return jnp.asarray(array)
+    return obj
+
+
+def _library() -> str:
+    try:
+        return importlib.metadata.version("delucax")
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def _split(payload: bytes, descriptions: list[dict[str, Any]]) -> list[np.ndarray]:
+    arrays, offset = [], 0
+    for description in descriptions:
+        dtype, shape = jnp.dtype(description["dtype"]), tuple(description["shape"])
+        end = offset + dtype.itemsize * math.prod(shape)
+        piece = np.frombuffer(payload[offset:end], dtype)
+        arrays.append(piece.reshape(shape).copy())
+        offset = end
+    return arrays
+
+
+class _Writer:
+    """Describes a tree in JSON, and collects its arrays."""
+
+    def __init__(self):
+        self.arrays: list[np.ndarray] = []
+
+    def describe(self, node: Any, path: str) -> Any:
+        if node is None or type(node) in (bool, int, str):
+            return node
+        if type(node) is float:
+            return node if math.isfinite(node) else {"float": repr(node)}
+        if type(node) is complex:
+            return {"complex": repr(node)}
+        if isinstance(node, jax.core.Tracer):
+            raise ValueError(
+                f"save: {path} is being traced; save outside of jit, grad and vmap."
+            )
+        if isinstance(node, jax.Array):
+            if jnp.issubdtype(node.dtype, jax.dtypes.prng_key):
+                impl = str(jr.key_impl(node))
+                return {"key": self.put(jr.key_data(node), path), "impl": impl}
+            kind = "weak" if node.weak_type else "array"
+            return {kind: self.put(node, path)}
+        if isinstance(node, np.ndarray | np.generic):
+            kind = "numpy" if isinstance(node, np.ndarray) else "scalar"
+            return {kind: self.put(node, path)}
+        if isinstance(node, np.dtype):
+            return {"dtype": node.name}
+        if isinstance(node, Result):
+            return self.result(node, path)
+        if isinstance(node, eqx.Module):
+            return self.module(node, path)
+        if type(node) in _PARTIALS.values():
+            return {
+                "partial": type(node).__name__,
+                "function": self.describe(node.func, path),
+                "args": self.describe(node.args, f"{path}.args"),
+                "keywords": self.describe(node.keywords, f"{path}.keywords"),
+            }
+        if isinstance(node, tuple) and hasattr(node, "_fields"):
+            names = type(node)._fields  # pyright: ignore[reportAttributeAccessIssue]
+            fields = {
+                name: self.describe(child, f"{path}.{name}")
+                for name, child in zip(names, node, strict=True)
+            }
+            return {"namedtuple": self.name(type(node), path), "fields": fields}
+        if type(node) in (tuple, list):
+            items = [self.describe(c, f"{path}.{i}") for i, c in enumerate(node)]
+            return {type(node).__name__: items}
+        if type(node) is frozenset:
+            items = sorted(node, key=repr)
+            return {"frozenset": [self.describe(c, f"{path}.{c!r}") for c in items]}
+        if type(node) is dict:
+            items = [
+                [self.describe(k, f"{path}.{k}"), self.describe(v, f"{path}.{k}")]
+                for k, v in node.items()
+            ]
+            return {"dict": items}
+        return {"name": self.name(node, path)}
+
+    def put(self, array: Any, path: str) -> int:
+        array = np.asarray(array)
+        if array.dtype.kind in "OMmSUT" or array.dtype.names is not None:
+            raise ValueError(
+                f"save: {path} must be an array of numbers, got dtype {array.dtype}."
+            )
+        self.arrays.append(array.astype(array.dtype.newbyteorder("="), copy=False))
+        return len(self.arrays) - 1
+
+    def name(self, thing: Any, path: str) -> str:
+        name = name_of(thing)
+        if name is not None:
+            return name
+        if isinstance(thing, type):
+            remedy = "Define the class at the top level of a module."
+        elif callable(thing):
+            remedy = (
+                "In place of a lambda, or a function made inside another, use one that "
+                "is defined at the top level of a module, or an eqx.Module with a "
+                "`__call__`."
+            )
+        else:
+            remedy = "Hold numbers, strings, arrays, modules, or functions by name."
+        raise ValueError(
+            f"save: {path} is {thing!r}, which has no name to find it by. {remedy}"
+        )
+
+    def result(self, node: Any, path: str) -> dict[str, Any]:
+        """An outcome, by the names of its items: their numbers differ by version."""
+        items = node._enumeration._name_to_item
+        names = {int(item._value): name for name, item in items.items()}
+        used = np.unique(np.asarray(node._value)).tolist()
+        return {
+            "result": self.name(node._enumeration, path),
+            "value": self.describe(node._value, path),
+            "items": {str(number): names[number] for number in used},
+        }
+
+    def module(self, node: eqx.Module, path: str) -> dict[str, Any]:
+        held = vars(node)
+        if "__func__" in held:
+            name = node.__func__.__name__  # pyright: ignore[reportAttributeAccessIssue]
+            owner = node.__self__  # pyright: ignore[reportAttributeAccessIssue]
+            again = getattr(owner, name, None)
+            if getattr(again, "__func__", None) is not held["__func__"]:
+                raise ValueError(
+                    f"save: {path} is the method {name!r} of {type(owner).__name__}, "
+                    "which does not have it under that name."
+                )
+            return {"method": name, "of": self.describe(owner, f"{path}.__self__")}
+        names = [field.name for field in dataclasses.fields(node)]
+        if not set(held) <= set(names):
+            return {"name": self.name(node, path)}
+        fields = {
+            name: self.describe(held[name], f"{path}.{name}")
+            for name in names
+            if name in held
+        }
+        described = {"module": self.name(type(node), path), "fields": fields}
+        if len(fields) < len(names):
+            described["unset"] = [name for name in names if name not in held]
+        return described
+
+
+class _Reader:
+    """Builds the tree that was described."""
+
+    def __init__(self, arrays: list[np.ndarray], trust: tuple[str, ...]):
+        self.arrays = arrays
+        self.trust = trust
+        self.narrowed = False
+
+    def build(self, node: Any) -> Any:
+        if not isinstance(node, dict):
+            return node
+        kind, content = next(iter(node.items()))
+        return getattr(self, f"build_{kind}")(content, node)
+
+    def build_float(self, content, node):
+        return float(content)
+
+    def build_complex(self, content, node):
+        return complex(content)
+
+    def build_array(self, content, node):
+        return jnp.asarray(self.fitted(self.arrays[content]))
+
+    def build_weak(self, content, node):
+        # A weak type has the precision that is current, and is kept by what is written
+        # into a weakly typed array.
+        array = self.arrays[content]
+        zero = jnp.asarray(array.dtype.type(0).item())
+        return jnp.broadcast_to(zero, array.shape).at[...].set(array)
+
+    def build_key(self, content, node):
+        data = jnp.asarray(self.arrays[content])
+        return jr.wrap_key_data(data, impl=node["impl"])
+
+    def build_numpy(self, content, node):
+        return self.arrays[content]
+
+    def build_scalar(self, content, node):
+        return self.arrays[content][()]
+
+    def build_dtype(self, content, node):
+        return jnp.dtype(content)
+
+    def build_name(self, content, node):
+        return thing_of(content, self.trust)
+
+    def build_result(self, content, node):
+        enumeration = thing_of(content, self.trust)
+        value = self.build(node["value"])
+        numbers = np.asarray(value)
+        fitted = np.zeros_like(numbers)
+        for number, name in node["items"].items():
+            item = enumeration._name_to_item.get(name)
+            if item is None:
+                raise ValueError(f"it needs the item {name!r}, unknown to {content!r}.")
+            fitted = np.where(numbers == int(number), int(item._value), fitted)
+        fitted = fitted.astype(numbers.dtype)
+        if isinstance(value, jax.Array):
+            fitted = jnp.asarray(fitted)
+        return _rebuilt(Result, {"_value": fitted, "_enumeration": enumeration})
+
+    def build_module(self, content, node):
+        cls = thing_of(content, self.trust)
+        if not (isinstance(cls, type) and issubclass(cls, eqx.Module)):
+            raise ValueError(f"it needs a module class, and {content!r} is not one.")
+        known = {field.name for field in dataclasses.fields(cls)}
+        there = {*node["fields"], *node.get("unset", ())}
+        if there != known:
+            raise ValueError(
+                f"{content!r} has changed since it was written: its fields are "
+                f"{sorted(known)}, those of the file {sorted(there)}."
+            )
+        return _rebuilt(cls, {k: self.build(v) for k, v in node["fields"].items()})
+
+    def build_method(self, content, node):
+        method = getattr(self.build(node["of"]), content, None)
+        if not hasattr(method, "__func__"):
+            raise ValueError(f"it needs the method {content!r}, which is not there.")
+        return method
+
+    def build_partial(self, content, node):
+        args, keywords = self.build(node["args"]), self.build(node["keywords"])
+        function = self.build(node["function"])
+        return _PARTIALS[content](function, *args, **keywords)
+
+    def build_namedtuple(self, content, node):
+        cls = thing_of(content, self.trust)
+        names = getattr(cls, "_fields", None)
+        if not (isinstance(cls, type) and issubclass(cls, tuple)) or names is None:
+            raise ValueError(f"it needs a named tuple, and {content!r} is not one.")
+        if list(names) != list(node["fields"]):
+            raise ValueError(
+                f"{content!r} has changed since it was written: its fields are "
+                f"{list(names)}, those of the file {list(node['fields'])}."
+            )
+        return tuple.__new__(cls, [self.build(v) for v in node["fields"].values()])
+
+    def build_tuple(self, content, node):
+        return tuple(self.build(child) for child in content)
+
+    def build_list(self, content, node):
+        return [self.build(child) for child in content]
+
+    def build_frozenset(self, content, node):
+        return frozenset(self.build(child) for child in content)
+
+    def build_dict(self, content, node):
+        return {self.build(key): self.build(value) for key, value in content}
+
+    def fitted(self, array: np.ndarray) -> np.ndarray:
+        """`array` in the precision that JAX has switched on."""
+        dtype = jax.dtypes.canonicalize_dtype(array.dtype)
+        if dtype == array.dtype:
+            return array
+        narrow = array.astype(dtype)
+        if array.dtype.kind in "iu":
+            if not np.array_equal(narrow, array):
+                raise ValueError(
+                    "it holds whole numbers that need 64 bits; set jax_enable_x64."
+                )
+        else:
+            self.narrowed = True
+        return narrow
+
+
+def _rebuilt(cls: type, fields: dict[str, Any]) -> Any:
+    """An instance without a call of its `__init__`, as Equinox unflattens one."""
+    module = object.__new__(cls)
+    for name, value in fields.items():
+        object.__setattr__(module, name, value)
+    return module

@@ -4,9 +4,10 @@ from typing import TypeAlias
 
 from jaxtyping import Array, Bool, Float, Key, Num, Shaped, UInt32
 
+
 RealScalar: TypeAlias = Num[Array, ""] | int | float
 """A real number: a Python number or a rank-0 array."""
-Vector: TypeAlias = Float[Array, "_"]
+Vector: TypeAlias = Float[Array, "_"]  # noqa: F821
 """A rank-1 floating-point array."""
 Matrix: TypeAlias = Float[Array, "_ _"]
 """A rank-2 floating-point array."""

@@ -8,8 +8,9 @@ import re
 import textwrap
 from pathlib import Path
 
-import delucax as dlx
 import pytest
+
+import delucax as dlx
 
 
 def _packages():
@@ -122,6 +123,6 @@ def test_example_runs(name, value, tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", [name for name, _ in MEMBERS])
 def test_name_is_on_the_site(name):
     pages = "\n".join(page.read_text() for page in sorted(DOCS.glob("*.md")))
-    assert re.search(rf"^ *(:::|##+) +`?{re.escape(name)}`?\s*$", pages, re.MULTILINE), (
-        f"{name} is on no page of docs/api"
-    )
+    assert re.search(
+        rf"^ *(:::|##+) +`?{re.escape(name)}`?\s*$", pages, re.MULTILINE
+    ), f"{name} is on no page of docs/api"

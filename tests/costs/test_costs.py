@@ -1,8 +1,9 @@
-import delucax as dlx
 import jax
 import jax.numpy as jnp
 import pytest
 from helpers import assert_close, user_error
+
+import delucax as dlx
 
 
 Q = jnp.array([[2.0, 0.5], [0.5, 1.0]])
@@ -78,7 +79,10 @@ def test_weights_are_differentiable():
             "must fit",
         ),
         (lambda: dlx.costs.Rate(dlx.costs.PendulumCost(), 0.0), "dt must be positive"),
-        (lambda: dlx.costs.PendulumCost(float("nan")), "velocity_weight must be finite"),
+        (
+            lambda: dlx.costs.PendulumCost(float("nan")),
+            "velocity_weight must be finite",
+        ),
     ],
 )
 def test_bad_arguments(make, match):

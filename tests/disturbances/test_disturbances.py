@@ -1,10 +1,11 @@
-import delucax as dlx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import assert_close, user_error
+
+import delucax as dlx
 
 
 d = dlx.disturbances

@@ -1,10 +1,11 @@
-import delucax as dlx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import assert_close, CountCalls, user_error
+
+import delucax as dlx
 
 
 DYNAMICS = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)

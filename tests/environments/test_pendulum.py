@@ -1,6 +1,5 @@
 """Our pendulum against Gymnasium's."""
 
-import delucax as dlx
 import diffrax
 import gymnasium
 import jax
@@ -8,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import assert_close, needs_x64, tolerance
+
+import delucax as dlx
 
 
 @pytest.fixture

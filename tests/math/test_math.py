@@ -1,10 +1,11 @@
-import delucax as dlx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import assert_close, needs_x32, needs_x64
 from jax.test_util import check_grads
+
+import delucax as dlx
 
 
 @needs_x32

@@ -94,7 +94,9 @@ def test_gif_holds_every_frame_at_its_pace(animation, tmp_path):
     assert frames[0].shape[1] == 600
     for before, after in zip(frames, frames[1:], strict=False):
         assert np.mean(np.any(before != after, axis=-1)) > 1e-3
-    white = np.all(frames[0] > 250, axis=-1).mean()
+    for frame, rendered in zip(frames, expanded(animation._frames), strict=True):
+        assert np.abs(frame - np.asarray(rendered)).max() <= 24
+    white = np.all(frames[0] == 255, axis=-1).mean()
     assert 0.5 < white < 0.99
 
 

@@ -1,7 +1,8 @@
-import delucax as dlx
 import jax
 import jax.numpy as jnp
 from helpers import assert_close, user_error
+
+import delucax as dlx
 
 
 def test_signals():

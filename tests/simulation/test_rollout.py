@@ -1,4 +1,3 @@
-import delucax as dlx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,6 +11,8 @@ from helpers import (
     tolerance,
     user_error,
 )
+
+import delucax as dlx
 
 
 FEEDBACK = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
@@ -131,7 +132,8 @@ def test_gradient_is_that_of_central_differences(key):
 
     def cost(leaves):
         plant = dlx.replace(
-            env, {"dynamics.system.length": leaves[0], "cost.velocity_weight": leaves[1]}
+            env,
+            {"dynamics.system.length": leaves[0], "cost.velocity_weight": leaves[1]},
         )
         K = jnp.stack([leaves[2], leaves[3]])[None]
         feedback = dlx.controllers.Linear(K)

@@ -1,10 +1,11 @@
-import delucax as dlx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import assert_close, dtype, user_error
+
+import delucax as dlx
 
 
 class Spring(dlx.AbstractSystem):
@@ -57,7 +58,11 @@ def test_names_are_needed():
 
 def test_sizes_and_defaults():
     spring = Spring()
-    assert (spring.state_size, spring.control_size, spring.disturbance_size) == (2, 1, 2)
+    assert (spring.state_size, spring.control_size, spring.disturbance_size) == (
+        2,
+        1,
+        2,
+    )
     x = jnp.array([1.0, 2.0])
     assert spring.observe(0.0, x) is x and spring.project(x) is x
     assert_close(spring.difference(x, x), [0, 0])

@@ -79,8 +79,8 @@ class Random(AbstractController):
     - `std`: standard deviation, a vector with one entry a control.
     - `mean`: a number or vector, 0 by default.
 
-    **Raises:** `ValueError` if `std` is not a vector; or, when it is run, if there is no
-    key.
+    **Raises:** `ValueError` if `std` is not a vector; or, when it is run, if there is
+    no key.
 
     !!! example
 

@@ -131,9 +131,12 @@ class Gaussian(AbstractController):
         each = -0.5 * z**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi)
         if self.bounds is not None:
             low, high = self.bounds
-            # Far away, not infinite: an infinite tail has no gradient, even unused.
-            below = jnp.where(jnp.isinf(low), -1, (low - mean) / std)
-            above = jnp.where(jnp.isinf(high), -1, (mean - high) / std)
+            # Finite stand-ins for what is not reached: an infinity has no gradient,
+            # even where it is not chosen.
+            near_low = jnp.where(jnp.isinf(low), 0, low)
+            near_high = jnp.where(jnp.isinf(high), 0, high)
+            below = (near_low - mean) / std
+            above = (mean - near_high) / std
             each = jnp.where(u >= high, log_ndtr(above), each)
             each = jnp.where(u <= low, log_ndtr(below), each)
         return jnp.sum(each).astype(mean.dtype)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .._check import is_concrete
 from .._controller import AbstractController, wrong_observation
-from .._fields import parameter, weight
+from .._fields import function_field, parameter, weight
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..riccati import dare
@@ -65,7 +65,7 @@ class LQR(AbstractController):
     P: Float[Array, "n n"] = parameter()
     x_ref: Float[Array, " n"] = parameter()
     u_ref: Float[Array, " m"] = parameter()
-    difference: Callable[[Array, Array], Array] | None
+    difference: Callable[[Array, Array], Array] | None = function_field()
 
     def __init__(
         self,

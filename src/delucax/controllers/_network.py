@@ -4,13 +4,14 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from .._check import as_bounds, check_count, check_key, is_concrete
 from .._controller import AbstractController, wrong_observation
-from .._fields import weight
+from .._fields import as_module, function_field, weight
 from .._typing import PRNGKey
 from ..environments import Environment
 from ._gaussian import Gaussian
@@ -61,7 +62,7 @@ class MLP(AbstractController):
     """
 
     network: eqx.nn.MLP = weight()
-    features: Callable[[Array], Array] | None
+    features: Callable[[Array], Array] | None = function_field()
     bounds: tuple[Array, Array] | None
 
     def __init__(
@@ -88,7 +89,8 @@ class MLP(AbstractController):
             out_size,
             check_count(width, "width", where),
             depth,
-            activation,
+            as_module(activation),
+            as_module(jax.nn.identity),
             key=key,
         )
         self.features = features

@@ -11,7 +11,14 @@ from jaxtyping import Array
 
 from .._check import as_bounds, check_finite, is_concrete
 from .._controller import AbstractController, wrong_observation
-from .._fields import as_float_array, parameter, positive, weight
+from .._fields import (
+    as_float_array,
+    as_module,
+    function_field,
+    parameter,
+    positive,
+    weight,
+)
 from ..math import matvec
 
 
@@ -95,7 +102,7 @@ class PID(AbstractController):
     kd: Array = weight()
     dt: Array = parameter(constraint=positive)
     reference: Array | Callable[[Any], Array] | None = parameter()
-    output: Callable[[Array], Array] | None
+    output: Callable[[Array], Array] | None = function_field()
     bounds: tuple[Array, Array] | None
     derivative_time_constant: Array = parameter()
     derivative_on: Literal["measurement", "error"] = eqx.field(static=True)
@@ -123,7 +130,7 @@ class PID(AbstractController):
                 f"{derivative_on!r}."
             )
         self.kp, self.ki, self.kd, self.dt = kp, ki, kd, dt
-        self.reference = reference
+        self.reference = as_module(reference)
         self.output = _as_output(output, where)
         self.bounds = as_bounds(bounds, where)
         if derivative_time_constant is None:
@@ -231,7 +238,7 @@ class LeakyPID(AbstractController):
     dt: Array = parameter(constraint=positive)
     time_constant: Array = parameter(constraint=positive)
     reference: Array | Callable[[Any], Array] | None = parameter()
-    output: Callable[[Array], Array] | None
+    output: Callable[[Array], Array] | None = function_field()
     bounds: tuple[Array, Array] | None
     loops: int = eqx.field(static=True)
 
@@ -250,7 +257,7 @@ class LeakyPID(AbstractController):
         where = "LeakyPID"
         self.kp, self.ki, self.kd, self.dt = kp, ki, kd, dt
         self.time_constant = time_constant
-        self.reference = reference
+        self.reference = as_module(reference)
         self.output = _as_output(output, where)
         self.bounds = as_bounds(bounds, where)
         self.loops = _count_loops(self, ("time_constant",))

@@ -78,7 +78,9 @@ class Quadratic(AbstractCost):
                 f"{x.shape}."
             )
         if self.difference is not None:
-            target = jnp.zeros_like(x) if self.state_target is None else self.state_target
+            target = (
+                jnp.zeros_like(x) if self.state_target is None else self.state_target
+            )
             return self.difference(x, target)
         return x if self.state_target is None else x - self.state_target
 

@@ -1,7 +1,7 @@
 """Sequences of disturbances, drawn for a whole horizon at once."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,8 +30,10 @@ class AbstractDisturbance(eqx.Module):
         ```
     """
 
-    size: eqx.AbstractVar[int]
-    """The number of entries of `w` at each step."""
+    if TYPE_CHECKING:  # a static checker would ask for abstract fields as arguments
+        size: ClassVar[Any]
+    else:
+        size: eqx.AbstractVar[int]
 
     def __check_init__(self):
         check_parameters(self)

@@ -24,7 +24,8 @@ class Sum(AbstractDisturbance):
         import delucax as dlx
 
         both = dlx.disturbances.Sum(
-            dlx.disturbances.Gaussian(0.1, size=2), dlx.disturbances.Constant(0.5, size=2)
+            dlx.disturbances.Gaussian(0.1, size=2),
+            dlx.disturbances.Constant(0.5, size=2),
         )
         ```
     """

@@ -136,8 +136,8 @@ class Square(AbstractDisturbance):
 
     The gradient with respect to `period` and `duty` is zero almost everywhere.
 
-    **Raises:** `ValueError` if the size is unknown or does not fit, or the period is not
-    positive.
+    **Raises:** `ValueError` if the size is unknown or does not fit, or the period is
+    not positive.
 
     !!! example
 
@@ -176,8 +176,8 @@ class FromArray(AbstractDisturbance):
     **Arguments:** `values`: shape `(steps, size)`, at least as many steps as the
     horizon it is used for.
 
-    **Raises:** `ValueError` if `values` is not a matrix of finite numbers, or has too few
-    steps for the horizon.
+    **Raises:** `ValueError` if `values` is not a matrix of finite numbers, or has too
+    few steps for the horizon.
 
     !!! example
 

@@ -1,4 +1,5 @@
-"""Discrete maps `x_next = F(t, x, u, w)`: discretised, linear and linearised systems."""
+"""Discrete maps `x_next = F(t, x, u, w)`: discretised, linear and linearised
+systems."""
 
 from ._base import AbstractDynamics as AbstractDynamics
 from ._discretized import Discretized as Discretized

@@ -1,12 +1,13 @@
 """The discrete-time map that environments, planners and learners step."""
 
 import abc
+from typing import Any, ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from .._results import RESULTS, Result
+from .._results import Result, RESULTS
 from .._typing import RealScalar
 from ..systems._base import validate_io
 
@@ -27,19 +28,16 @@ class AbstractDynamics(eqx.Module):
         ```
     """
 
-    dt: eqx.AbstractVar[Array]
-    state_names: eqx.AbstractVar[tuple[str, ...]]
-    control_names: eqx.AbstractVar[tuple[str, ...]]
-
-    @property
-    def state_units(self) -> tuple[str, ...]:
-        """Units of the states, for plots and tables."""
-        return ()
-
-    @property
-    def control_units(self) -> tuple[str, ...]:
-        """Units of the controls, for plots and tables."""
-        return ()
+    if TYPE_CHECKING:  # a static checker would ask for abstract fields as arguments
+        dt: ClassVar[Any]
+        state_names: ClassVar[Any]
+        control_names: ClassVar[Any]
+    else:
+        dt: eqx.AbstractVar[Array]
+        state_names: eqx.AbstractVar[tuple[str, ...]]
+        control_names: eqx.AbstractVar[tuple[str, ...]]
+    state_units: ClassVar[Any] = ()
+    control_units: ClassVar[Any] = ()
 
     @property
     def state_size(self) -> int:
@@ -89,8 +87,7 @@ class AbstractDynamics(eqx.Module):
         **Raises:** `ValueError` on a wrong shape, and an error at run time if the
         solver fails.
         """
-        x, u, w = validate_io(self, x, u, w)
-        x_next, result = self.advance(t, x, u, w)
+        x_next, result = self.advance(t, *validate_io(self, x, u, w))
         if result is RESULTS.successful:
             return x_next
         return result.error_if(x_next, result != RESULTS.successful)

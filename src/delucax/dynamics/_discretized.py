@@ -8,16 +8,16 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._components import by_components
 from .._check import check_count, check_positive
+from .._components import by_components
 from .._fields import parameter
 from .._results import first_of, or_none, promote, RESULTS
 from ..systems import AbstractSystem
 from ..systems._base import zeros_if_none
 from ._base import AbstractDynamics
 from ._runge_kutta import (
-    RK4,
     join_state,
+    RK4,
     runge_kutta_step,
     split_state,
     tableau_of,
@@ -244,18 +244,14 @@ class Discretized(AbstractDynamics):
 
     def _fixed(self, field, t, x, args):
         tableau = tableau_of(self.solver)
+        solver = for_one_step(self.solver, x.dtype) if tableau is None else None
         h = self.dt / self.substeps
-        if tableau is not None:
 
-            def step(t, x, _):
-                rhs = lambda t, y: field(t, y, args)  # noqa: E731
-                return runge_kutta_step(tableau, rhs, t, x, h), RESULTS.successful
-        else:
-            solver = for_one_step(self.solver, x.dtype)
-            term = diffrax.ODETerm(field)
-
-            def step(t, x, _):
-                return _solver_step(solver, term, t, x, h, args)
+        def step(t, x, _):
+            if tableau is None:
+                return _solver_step(solver, diffrax.ODETerm(field), t, x, h, args)
+            rhs = lambda t, y: field(t, y, args)
+            return runge_kutta_step(tableau, rhs, t, x, h), RESULTS.successful
 
         return self._substep(step, t, x, None)
 
@@ -263,18 +259,15 @@ class Discretized(AbstractDynamics):
         increments = zeros_if_none(w, self.disturbance_size, x)
         increments = increments.reshape(self.substeps, -1)
         h = self.dt / self.substeps
-        g, (u, _) = self.system.diffusion, args
-        if type(self.solver) is diffrax.Euler:
+        g: Any = self.system.diffusion
+        u = args[0]
 
-            def step(t, x, dB):
+        def step(t, x, dB):
+            if type(self.solver) is diffrax.Euler:
                 noise = _apply(g(t, x, u), dB)
                 return x + h * field(t, x, args) + noise, RESULTS.successful
-        else:
-
-            def step(t, x, dB):
-                noise = _BrownianTerm(g, u, dB)
-                term = diffrax.MultiTerm(diffrax.ODETerm(field), noise)
-                return _solver_step(self.solver, term, t, x, h, args)
+            term = diffrax.MultiTerm(diffrax.ODETerm(field), _BrownianTerm(g, u, dB))
+            return _solver_step(self.solver, term, t, x, h, args)
 
         return self._substep(step, t, x, increments)
 
@@ -295,6 +288,7 @@ class Discretized(AbstractDynamics):
         return join_state(parts, x.shape[0]), first_of(results)
 
     def _adaptive(self, field, t, x, args):
+        assert self.stepsize_controller is not None and self.adjoint is not None
         t0 = jnp.asarray(t, x.dtype)
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(field),
@@ -309,6 +303,7 @@ class Discretized(AbstractDynamics):
             max_steps=self.max_steps,
             throw=False,
         )
+        assert solution.ys is not None
         return solution.ys[0], promote(solution.result)
 
 
@@ -316,7 +311,11 @@ def has_diffusion(system: AbstractSystem) -> bool:
     """Whether `system` has noise inside."""
     if type(system).diffusion is AbstractSystem.diffusion:
         return False
-    t, x, u = jnp.zeros(()), jnp.zeros(system.state_size), jnp.zeros(system.control_size)
+    t, x, u = (
+        jnp.zeros(()),
+        jnp.zeros(system.state_size),
+        jnp.zeros(system.control_size),
+    )
     return eqx.filter_eval_shape(system.diffusion, t, x, u) is not None
 
 

@@ -37,8 +37,8 @@ class LinearDynamics(AbstractDynamics):
         `x_ref`, an equilibrium.
     - `state_names`, `control_names`: `("x0", ...)` and `("u0", ...)` by default.
 
-    **Raises:** `ValueError` if shapes do not fit, entries are not finite, or `dt` is not
-    positive.
+    **Raises:** `ValueError` if shapes do not fit, entries are not finite, or `dt` is
+    not positive.
 
     !!! example
 

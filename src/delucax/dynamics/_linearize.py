@@ -18,19 +18,15 @@ from ._linear import LinearDynamics
 
 @overload
 def linearize(
-    model: AbstractSystem,
-    t: RealScalar = 0.0,
-    x: Any = None,
-    u: Any = None,
+    model: AbstractSystem, t: RealScalar = ..., x: Any = ..., u: Any = ...
 ) -> LinearSystem: ...
 @overload
 def linearize(
-    model: AbstractDynamics,
-    t: RealScalar = 0.0,
-    x: Any = None,
-    u: Any = None,
+    model: AbstractDynamics, t: RealScalar = ..., x: Any = ..., u: Any = ...
 ) -> LinearDynamics: ...
-def linearize(model, t=0.0, x=None, u=None):
+def linearize(
+    model: Any, t: RealScalar = 0.0, x: Any = None, u: Any = None
+) -> LinearSystem | LinearDynamics:
     """The first-order model about an operating point, by automatic differentiation.
 
     The operating point is kept, so that a regulator designed on the result acts on
@@ -84,8 +80,10 @@ def linearize(model, t=0.0, x=None, u=None):
             E = _jacobian(f, 3)(t, x, u, w)
         return LinearSystem(A, B, C, E, x_ref=x, u_ref=u, dx_ref=f(t, x, u, held))
 
+    dynamics: Any = model
+
     def step(x, u, w):
-        return model(t, x, u, w)
+        return dynamics(t, x, u, w)
 
     w = zeros_if_none(None, model.disturbance_size, x)
     A, B, E = _jacobian(step, (0, 1, 2))(x, u, w)
@@ -181,7 +179,7 @@ def _solve(matrix: Array, right: Array) -> Array:
     return jax.vmap(solve, in_axes=1, out_axes=1)(right)
 
 
-def _jacobian(f, argnums=0):
+def _jacobian(f: Any, argnums: Any = 0) -> Any:
     """Forward mode; reverse where a solver inside has only that."""
 
     def jacobian(*args):

@@ -8,10 +8,10 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._components import by_components
 from .._check import as_vector
+from .._components import by_components
 from .._fields import as_float_array
-from .._results import first_failure, first_of, or_none, RESULTS
+from .._results import choose, first_failure, first_of, or_none, RESULTS
 from .._typing import RealScalar
 from ._base import AbstractDynamics
 from ._runge_kutta import join_state, split_state, stack_steps
@@ -86,7 +86,7 @@ def _open_loop(dynamics, x0, controls, w, t0):
     last, (parts, results) = lax.scan(body, split_state(x0), (steps, controls, w))
     states = stack_steps(parts, size, last)
     finite = jnp.all(jnp.isfinite(states[-1]))
-    end = RESULTS.where(finite, RESULTS.successful, RESULTS.diverged)
+    end = choose(finite, RESULTS.successful, RESULTS.diverged)
     result = first_failure(first_of(results), end)
     return result.error_if(states, result != RESULTS.successful)
 

@@ -2,9 +2,9 @@
 
 from ._environment import (
     Environment as Environment,
+    randomise as randomise,
     Step as Step,
     UniformState as UniformState,
-    randomise as randomise,
 )
 from ._lds import lds as lds
 from ._pendulum import (

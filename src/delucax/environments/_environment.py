@@ -82,11 +82,12 @@ class Environment(eqx.Module):
         dynamics that have a diffusion.
     - `sensor_noise`: disturbances added to what is observed; none by default.
     - `initial_state`: a vector, or a function of a key to one; zero by default.
-    - `control_bounds`: `(low, high)`, each a number or a vector; controls are clipped to
-        them. None by default.
+    - `control_bounds`: `(low, high)`, each a number or a vector; controls are clipped
+        to them. None by default.
     - `horizon`: steps an episode, 200 by default.
     - `terminated`: `(t, x) -> bool`; never by default.
-    - `actions`: the table behind integer actions, shape `(actions, m)`; none by default.
+    - `actions`: the table behind integer actions, shape `(actions, m)`; none by
+        default.
     - `encode`: what a network or a Gymnasium user sees of an observation (cosine and
         sine of an angle, for example): a function of a vector to a vector; the identity
         by default. Controllers are given the observation itself.
@@ -189,7 +190,7 @@ class Environment(eqx.Module):
         self.cost = cost
         self.disturbance = disturbance
         self.sensor_noise = sensor_noise
-        self.initial_state = initial_state
+        self.initial_state = initial_state  # pyright: ignore[reportAttributeAccessIssue]
         self.control_bounds = control_bounds
         self.horizon = check_count(horizon, "horizon", where)
         self.terminated = terminated
@@ -328,7 +329,8 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
 
     **Returns:** the copy.
 
-    **Raises:** `ValueError` if a path is not there, or a range is not a pair or function.
+    **Raises:** `ValueError` if a path is not there, or a range is not a pair or
+    function.
 
     !!! example
 
@@ -362,7 +364,7 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
                     f"randomise: the range of {path!r} must have low <= high, got "
                     f"{given}."
                 )
-            shape = jnp.broadcast_shapes(jnp.shape(old), low.shape, high.shape)
+            shape: Any = jnp.broadcast_shapes(jnp.shape(old), low.shape, high.shape)
             unit = jr.uniform(one, shape, jnp.result_type(old, low, high))
             changes[path] = low + (high - low) * unit
         else:
@@ -371,4 +373,3 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
                 f"function of a key, got {given!r}."
             )
     return replace(tree, changes)
-

@@ -31,9 +31,9 @@ def lds(
 
     **Arguments:**
 
-    - `A`, `B`, `C`: the matrices; `C` is the identity by default. If neither `A` nor `B`
-        is given, all are drawn with `key`: entries standard normal, `A` scaled to the
-        spectral radius.
+    - `A`, `B`, `C`: the matrices; `C` is the identity by default. If neither `A` nor
+        `B` is given, all are drawn with `key`: entries standard normal, `A` scaled to
+        the spectral radius.
     - `key`: a random key, for random matrices.
     - `states`, `controls`: sizes of random matrices, 2 and 1 by default.
     - `observations`: rows of a random `C`; the identity by default.
@@ -44,8 +44,8 @@ def lds(
 
     **Returns:** an [`delucax.Environment`][], with `dt = 1`.
 
-    **Raises:** `ValueError` if one of `A` and `B` is missing, if there is no key to draw
-    them with, or if shapes do not fit.
+    **Raises:** `ValueError` if one of `A` and `B` is missing, if there is no key to
+    draw them with, or if shapes do not fit.
 
     !!! example
 
@@ -73,7 +73,8 @@ def lds(
         known = is_concrete(spectral_radius)
         if known and not 0 <= spectral_radius < np.inf:
             raise ValueError(
-                f"lds: spectral_radius must be finite and not negative, got {spectral_radius}."
+                "lds: spectral_radius must be finite and not negative, got "
+                f"{spectral_radius}."
             )
         a, b, c = jr.split(key, 3)
         A = jr.normal(a, (n, n))
@@ -84,7 +85,7 @@ def lds(
             C = jr.normal(c, (p, n))
     dynamics = LinearDynamics(A, B, C)
     n, m = dynamics.state_size, dynamics.control_size
-    arguments = dict(
+    arguments: dict[str, Any] = dict(
         dynamics=dynamics,
         cost=Quadratic(jnp.eye(n), jnp.eye(m)),
         horizon=horizon,

@@ -1,6 +1,6 @@
 """Swing up and hold a pendulum: Gym's Pendulum-v1."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import jax.numpy as jnp
@@ -51,8 +51,8 @@ class GymPendulum(AbstractDynamics):
     dt: Array = parameter(0.05, constraint=positive)
     max_speed: Array = parameter(8.0, constraint=positive)
 
-    state_names = Pendulum.state_names
-    control_names = Pendulum.control_names
+    state_names: ClassVar = Pendulum.state_names
+    control_names: ClassVar = Pendulum.control_names
     state_units = Pendulum.state_units
     control_units = Pendulum.control_units
 
@@ -111,10 +111,11 @@ def pendulum(
     substeps: int = 1,
     **environment: Any,
 ) -> Environment:
-    """Swing up a pendulum and hold it upright with a torque too weak to lift it at once.
+    """Swing up a pendulum and hold it upright with a torque too weak to lift it at
+    once.
 
-    State (angle, velocity) with angle 0 upright; control (torque). Starts with the angle
-    uniform over the circle and the velocity in +-1. Cost
+    State (angle, velocity) with angle 0 upright; control (torque). Starts with the
+    angle uniform over the circle and the velocity in +-1. Cost
     `wrap(angle)^2 + 0.1 velocity^2 + 0.001 torque^2` a step. Never terminates.
 
     **Arguments:**
@@ -148,11 +149,11 @@ def pendulum(
     if solver is None:
         if substeps != 1:
             raise ValueError("pendulum: substeps needs a solver, such as RK4().")
-        dynamics = GymPendulum(system, dt, max_speed)
+        dynamics = GymPendulum(system=system, dt=dt, max_speed=max_speed)
     else:
         dynamics = Discretized(system, dt, solver, substeps)
     corner = np.array([np.pi, 1.0], np.float32)
-    arguments = dict(
+    arguments: dict[str, Any] = dict(
         dynamics=dynamics,
         cost=PendulumCost(),
         initial_state=UniformState(jnp.asarray(-corner), jnp.asarray(corner)),

@@ -20,7 +20,6 @@ from ..disturbances import Shock
 from ..dynamics import linearize
 from ..environments import Environment, pendulum
 from ..simulation import rollout, Trajectory
-from ..systems import Pendulum
 from ..training import expected_cost, fit
 from ._swing_up import BATCH, holds_upright, HORIZON, STEPS, train_swing_up
 
@@ -77,7 +76,10 @@ def demo(
     say("LQR about the upright, from the linearised ODE")
     model = linearize(env.dynamics)
     lqr = LQR(
-        model, jnp.diag(jnp.array([1.0, 0.1])), jnp.eye(1) * 0.001, difference=_difference
+        model,
+        jnp.diag(jnp.array([1.0, 0.1])),
+        jnp.eye(1) * 0.001,
+        difference=env.dynamics.difference,
     )
     controllers["LQR"] = lqr
     say(f"  K = {np.array2string(np.asarray(lqr.K), precision=3)}")
@@ -98,9 +100,10 @@ def demo(
         policy = fitted.model
         runs = evaluate(env, policy, starts)
         held.append(int(jnp.sum(holds_upright(runs))))
+        first = "" if seed else ", compilation included"
         say(
-            f"  seed {seed}: {seconds[-1]:.1f} s{', compilation included' * (not seed)};"
-            f" swings up and holds from {held[-1]} of {STARTS} starts"
+            f"  seed {seed}: {seconds[-1]:.1f} s{first}; swings up and holds from "
+            f"{held[-1]} of {STARTS} starts"
         )
         if seed == 0:
             controllers["MLP"] = policy
@@ -148,12 +151,9 @@ def _writable(out: Path) -> Path:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise OSError(f"demo: out must be a folder to write to, got {out}: {error}")
+        message = f"demo: out must be a folder to write to, got {out}: {error}"
+        raise OSError(message) from error
     return out
-
-
-def _difference(x, x_ref):
-    return Pendulum().difference(x, x_ref)
 
 
 def _train_linear() -> Linear:

@@ -31,10 +31,10 @@ def train_swing_up(
 ) -> Fitted:
     """Train an MLP that swings the pendulum up and holds it, through the ODE.
 
-    The gradient of a long swing explodes through the unstable upright, and plain descent
-    then falls into spinning; so the gradient is damped by 0.92 each step back in time.
-    One network of width 32, 128 fresh starts a step, horizon 100, Adam with cosine
-    decay from 0.01.
+    The gradient of a long swing explodes through the unstable upright, and plain
+    descent then falls into spinning; so the gradient is damped by 0.92 each step back
+    in time. One network of width 32, 128 fresh starts a step, horizon 100, Adam with
+    cosine decay from 0.01.
 
     **Arguments:**
 

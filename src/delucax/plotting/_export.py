@@ -99,13 +99,33 @@ def write(path: pathlib.Path, frames: Sequence[Image.Image], fps: float) -> None
 
 
 def _write_gif(path, frames, fps):
-    # One palette for all frames, from a mosaic of them: nothing flickers.
-    whole = list(expanded(frames))
-    mosaic = np.concatenate([np.asarray(image)[::3, ::3] for image in whole])
-    palette = quantised(Image.fromarray(mosaic), 255)
-    images = [
-        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in whole
-    ]
+    # One palette for all frames, so that nothing flickers. What was compressed has few
+    # colours, and each is looked up for itself: Pillow's own look-up is coarse enough
+    # to tint white paper.
+    indices = [np.asarray(image) for image in frames]
+    tables = [np.reshape(image.getpalette(), (-1, 3)) for image in frames]
+    used = [tables[0][np.unique(indices[0])]]
+    for table, index in zip(tables[1:], indices[1:], strict=True):
+        used.append(table[np.unique(index[index != CLEAR])])
+    colours = np.unique(np.concatenate(used), axis=0).astype(np.uint8)
+    main = quantised(Image.fromarray(colours[None]), 255).getpalette()
+    paper = tables[0][np.bincount(indices[0].ravel()).argmax()]
+    palette = np.concatenate([np.reshape(main, (-1, 3))[:255], paper[None]])
+
+    def look_up(table):
+        distance = np.sum((table[:, None] - palette) ** 2, axis=-1)
+        return np.argmin(distance, axis=-1).astype(np.uint8)
+
+    first = look_up(tables[0])[indices[0]]
+    images = []
+    for k, (table, index) in enumerate(zip(tables, indices, strict=True)):
+        whole = first
+        if k:
+            shown = look_up(table)[np.minimum(index, len(table) - 1)]
+            whole = np.where(index == CLEAR, first, shown)
+        image = Image.fromarray(whole)
+        image.putpalette(palette.ravel().tolist())
+        images.append(image)
     # The format counts in hundredths of a second; browsers take less than 2 for 10.
     duration = max(20, 10 * round(100 / fps))
     images[0].save(

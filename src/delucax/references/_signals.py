@@ -52,8 +52,8 @@ class Sequence(eqx.Module):
     - `values`: shape `(steps, p)`.
     - `dt`: the time between values.
 
-    **Raises:** `ValueError` if `values` is not a matrix of finite numbers, or `dt` is not
-    positive.
+    **Raises:** `ValueError` if `values` is not a matrix of finite numbers, or `dt` is
+    not positive.
 
     !!! example
 
@@ -112,6 +112,4 @@ class FigureEight(eqx.Module):
     def __call__(self, t: Any) -> Array:
         """The signal at time `t`."""
         s = 2 * np.pi * t / self.period
-        return self.centre + jnp.stack(
-            [self.width * sin(s), self.height * sin(2 * s)]
-        )
+        return self.centre + jnp.stack([self.width * sin(s), self.height * sin(2 * s)])

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_matrix, is_concrete, symmetric_matrix
-from .._results import Result, RESULTS
+from .._results import choose, Result, RESULTS
 from ._stein import full_precision, MAX_DOUBLINGS, solve, spectral_radius, stein
 
 
@@ -183,8 +183,8 @@ def _solution(A, B, Q, R, S, E):
     eps = jnp.finfo(A.dtype).eps
     stable = radius < 1 - A.shape[0] * eps
     solved = residual < 1000 * A.shape[0] * eps
-    result = RESULTS.where(solved, RESULTS.successful, RESULTS.not_converged)
-    result = RESULTS.where(stable, result, RESULTS.not_stabilising)
+    result = choose(solved, RESULTS.successful, RESULTS.not_converged)
+    result = choose(stable, result, RESULTS.not_stabilising)
     return RiccatiSolution(X, K, residual, closed_loop, radius, iterations, result)
 
 

@@ -4,8 +4,8 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax
 import numpy as np
+from jax.core import Tracer
 
 from .._check import check_positive, is_concrete
 from .._controller import AbstractController
@@ -41,7 +41,7 @@ def as_time(value: Any, name: str, where: str) -> Any:
     """`value` as a scalar: a Python number if it is known, so that it stays known
     while other things are being traced.
     """
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         array = as_float_array(value)
         if array.shape != ():
             raise ValueError(

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
-from .._components import by_components
 from .._check import as_vector, check_count, check_key, is_concrete
+from .._components import by_components
 from .._controller import AbstractController
 from .._fields import as_float_array
-from .._results import first_failure, first_of, or_none, RESULTS
+from .._results import choose, first_failure, first_of, or_none, RESULTS
 from .._typing import PRNGKey
 from ..disturbances import Zero
 from ..dynamics._runge_kutta import join_state, split_state, stack_steps
@@ -52,7 +52,8 @@ def rollout(
     At each step k, with `t_k = k dt`: the controller acts on the observation `y_k`; the
     environment clips the control, charges `c(t_k, x_k, u_k)` and steps; the controller
     is told the control that was applied and its cost. The final cost is charged once,
-    at `x_T` or on entering a terminated state, after which the state is held at no cost.
+    at `x_T` or on entering a terminated state, after which the state is held at no
+    cost.
 
     It is compiled at its door, as `diffrax.diffeqsolve` is: a second call with other
     numbers, another key or start does not compile again. A batch is `jax.vmap` of it.
@@ -69,10 +70,10 @@ def rollout(
     - `w`: disturbances, shape `(horizon, k)`; drawn by the environment by default.
     - `keep`: what the trajectory stores, of `"states"`, `"observations"`, `"controls"`,
         `"disturbances"`, `"costs"` and `"terminated"`; all by default.
-    - `checkpoint`: what the gradient stores. `"step"` (default): the state at each step,
-        and the step is computed again; `"sqrt"`: the state at each of about the square
-        root of T steps, for long horizons; `None`: all that is needed, nothing computed
-        again.
+    - `checkpoint`: what the gradient stores. `"step"` (default): the state at each
+        step, and the step is computed again; `"sqrt"`: the state at each of about the
+        square root of T steps, for long horizons; `None`: all that is needed, nothing
+        computed again.
     - `gradient_decay`: the gradient passing back through the state is multiplied by it
         at each step. 1, the true gradient, by default; 0.9 damps the exploding
         gradients of a long unstable horizon.
@@ -193,12 +194,14 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
             x_next = jnp.where(done, x, x_next)
             after = jax.tree.map(lambda a, b: jnp.where(done, a, b), memory, after)
             if result is not RESULTS.successful:
-                result = RESULTS.where(done, RESULTS.successful, result)
+                result = choose(done, RESULTS.successful, result)
             ended = (done | step.terminated, length + ~done)
         after_parts = split_state(x_next.astype(dtype))
         kept = {
             "states": parts,
-            "observations": None if plain_sight and "states" in keep else split_state(y),
+            "observations": None
+            if plain_sight and "states" in keep
+            else split_state(y),
             "controls": split_state(step.control),
             "costs": cost,
             "terminated": ended[0] if ends else None,
@@ -218,11 +221,11 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
     parts, _, ended, total = carry
     final_state = join_state(parts, size)
 
-    def over_time(name, size, last=()):
+    def over_time(name: str, size: int, last: Any = ()) -> Any:
         found = kept.get(name)
         return None if found is None else stack_steps(found, size, last)
 
-    length = ended[1] if ends else jnp.asarray(horizon)
+    length = jnp.asarray(horizon) if ended is None else ended[1]
     end = (length * dt).astype(dtype)
     final_cost = jnp.asarray(env.cost.final(end, final_state), dtype)
     if final_cost.shape != ():
@@ -233,7 +236,7 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
     costs = kept.get("costs")
     total_cost = (jnp.sum(costs) if total is None else total) + final_cost
     finite = jnp.all(jnp.isfinite(final_state)) & jnp.isfinite(total_cost)
-    diverged = RESULTS.where(finite, RESULTS.successful, RESULTS.diverged)
+    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
     return Trajectory(
         states=over_time("states", size, parts),
         controls=over_time("controls", env.control_size),

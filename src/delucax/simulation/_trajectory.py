@@ -1,7 +1,7 @@
 """What a closed loop leaves behind."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import is_concrete
-from .._results import RESULTS, Result
+from .._results import Result, RESULTS
 
 
 if TYPE_CHECKING:
@@ -257,5 +257,7 @@ def checked(trajectory: Trajectory, where: str) -> Trajectory:
 
 
 def _message(code: Any) -> str:
-    item = jax.tree.unflatten(jax.tree.structure(RESULTS.successful), [np.asarray(code)])
+    item = jax.tree.unflatten(
+        jax.tree.structure(RESULTS.successful), [np.asarray(code)]
+    )
     return RESULTS[item]

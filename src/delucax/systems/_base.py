@@ -1,7 +1,7 @@
 """The continuous-time system: a vector field and its names."""
 
 import abc
-from typing import Any
+from typing import Any, ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -52,23 +52,15 @@ class AbstractSystem(eqx.Module):
         ```
     """
 
-    state_names: eqx.AbstractVar[tuple[str, ...]]
-    control_names: eqx.AbstractVar[tuple[str, ...]]
-
-    @property
-    def disturbance_names(self) -> tuple[str, ...]:
-        """Names of the disturbances that enter the vector field."""
-        return ()
-
-    @property
-    def state_units(self) -> tuple[str, ...]:
-        """Units of the states, for plots and tables."""
-        return ()
-
-    @property
-    def control_units(self) -> tuple[str, ...]:
-        """Units of the controls, for plots and tables."""
-        return ()
+    if TYPE_CHECKING:  # a static checker would ask for abstract fields as arguments
+        state_names: ClassVar[Any]
+        control_names: ClassVar[Any]
+    else:
+        state_names: eqx.AbstractVar[tuple[str, ...]]
+        control_names: eqx.AbstractVar[tuple[str, ...]]
+    disturbance_names: ClassVar[Any] = ()
+    state_units: ClassVar[Any] = ()
+    control_units: ClassVar[Any] = ()
 
     def __check_init__(self):
         for name in ("state_names", "control_names", "disturbance_names"):
@@ -98,9 +90,7 @@ class AbstractSystem(eqx.Module):
         return len(self.disturbance_names) or self.state_size
 
     @abc.abstractmethod
-    def vector_field(
-        self, t: RealScalar, x: Array, u: Array, w: Array | None
-    ) -> Array:
+    def vector_field(self, t: RealScalar, x: Array, u: Array, w: Array | None) -> Array:
         """The time derivative of the state.
 
         **Arguments:**

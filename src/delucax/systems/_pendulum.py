@@ -1,5 +1,7 @@
 """The torque-driven pendulum of Gym's Pendulum-v1."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -44,10 +46,10 @@ class Pendulum(AbstractSystem):
     gravity: Array = parameter(10.0)
     damping: Array = parameter(0.0)
 
-    state_names = ("angle", "velocity")
-    control_names = ("torque",)
-    state_units = ("rad", "rad/s")
-    control_units = ("N m",)
+    state_names: ClassVar = ("angle", "velocity")
+    control_names: ClassVar = ("torque",)
+    state_units: ClassVar = ("rad", "rad/s")
+    control_units: ClassVar = ("N m",)
 
     def acceleration(self, angle: Array, velocity: Array, torque: Array) -> Array:
         """The angular acceleration.

@@ -88,10 +88,10 @@ def fit(
 
     The steps run in compiled blocks, as one loop on the device. The result does not
     depend on the size of the block, and a run that was cut off and resumed from its
-    checkpoint ends with the same bits as one that was not. A second call with the same
-    loss function, optimiser object and kind of model does not compile again; an
-    optimiser is a pair of functions, so each new one does. Not for use under `jit` or
-    `vmap`: train an ensemble by `vmap` inside the loss.
+    checkpoint, on the same kind of machine, ends with the same bits. A second call with
+    the same loss function, optimiser object and kind of model does not compile again;
+    an optimiser is a pair of functions, so each new one does. Not for use under `jit`
+    or `vmap`: train an ensemble by `vmap` inside the loss.
 
     **Arguments:**
 
@@ -213,23 +213,15 @@ def fit(
     if batch_size is not None:
         order = (jnp.zeros(data_size, jnp.int32), jnp.asarray(-1, jnp.int32))
     functions = (loss, gradient, optimiser, static, assembly)
-
-    def launch(carry, first):
-        span = np.asarray([first, min(first + block, steps)], np.int32)
-        return run_block(functions, carry, (key, data), span, batch_size)
-
+    carry = (values, state, order)
     done = written = len(history.get("step", ()))
-    carry = (values, state, order, jnp.zeros((), jnp.int32))
-    fault, last, blocks, ahead = 0, {}, [history] if history else [], None
+    fault, last, blocks = 0, {}, [history] if history else []
     began = time.perf_counter() - seconds
     with tqdm(total=steps, initial=done, disable=not progress, desc="fit") as bar:
         while done < steps and not fault:
-            carry, rows, count = ahead or launch(carry, done)
-            # The device takes the next block while this one is looked at. If this one
-            # failed, the next takes no step.
-            ahead = launch(carry, done + block) if done + block < steps else None
-            values, state, _, fault = carry
-            rows, count, fault = jax.device_get((rows, count, fault))
+            span = np.asarray([done, min(done + block, steps)], np.int32)
+            carry, outcome = run_block(functions, carry, (key, data), span, batch_size)
+            rows, count, fault = jax.device_get(outcome)
             count, fault = int(count), int(fault)
             seconds = time.perf_counter() - began
             rows = {name: column[:count] for name, column in rows.items()}
@@ -249,7 +241,7 @@ def fit(
             is_due = done == steps or done - written >= every
             if saved is not None and is_due and not fault:
                 blocks = [_joined(blocks)]
-                saved.write((values, state), blocks[0], seconds)
+                saved.write(carry[:2], blocks[0], seconds)
                 written = done
             for callback in callbacks:
                 callback(done, last)
@@ -261,7 +253,7 @@ def fit(
             "throw=False to get the model as it was before that step."
         )
     return Fitted(
-        model=assembly(values),
+        model=assembly(carry[0]),
         history=history_of(_joined(blocks)),
         result=RESULTS.diverged if fault else RESULTS.successful,
     )

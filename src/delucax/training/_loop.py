@@ -24,10 +24,7 @@ FAULTS = ("nothing", "loss", "gradient", "update")
 
 @eqx.filter_jit
 def run_block(functions, carry, inputs, span, batch_size):
-    """The steps from `span[0]` up to `span[1]`, at most `CAPACITY` of them.
-
-    None is taken after one that failed, be it in this block or in the one before.
-    """
+    """The steps from `span[0]` up to `span[1]`, at most `CAPACITY` of them."""
     loss, gradient, optimiser, static, assembly = functions
     key, data = inputs
     optimiser = optax.with_extra_args_support(optimiser)
@@ -83,7 +80,7 @@ def run_block(functions, carry, inputs, span, batch_size):
         row = {"loss": strong(cost), "gradient_norm": norm, **metrics}
         return values, state, order, row, fault
 
-    values, state, order, fault = carry
+    values, state, order = carry
     first, stop = span[0], span[1]
     # Traced once, here: the loop needs to know what a row is before it begins.
     step = eqx.filter_closure_convert(step, values, state, order, first)
@@ -104,9 +101,9 @@ def run_block(functions, carry, inputs, span, batch_size):
         return values, state, order, rows, count + 1, fault
 
     zero = jnp.zeros((), jnp.int32)
-    start = (values, state, order, rows, zero, fault)
-    values, state, order, rows, count, fault = lax.while_loop(going, body, start)
-    return (values, state, order, fault), rows, count
+    start = (values, state, order, rows, zero, zero)
+    values, state, order, *outcome = lax.while_loop(going, body, start)
+    return (values, state, order), outcome
 
 
 def _drawn_rows(key, order, k, batch_size):

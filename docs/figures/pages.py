@@ -1,0 +1,34 @@
+"""The pictures of the pages, drawn by the code that the pages show.
+
+`python docs/figures/pages.py` runs the Python blocks of `index.md` and
+`first_system.md`, page by page, and copies what they draw to `docs/assets/`, in a
+minute or two.
+"""
+
+import os
+import re
+import shutil
+import tempfile
+from pathlib import Path
+
+
+DOCS = Path(__file__).parents[1]
+PICTURES = {"index.md": ["van_der_pol.png"], "first_system.md": ["first_system.png"]}
+
+
+def run(page, folder):
+    """Run the blocks of a page in `folder`, in one namespace."""
+    fenced = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+    os.chdir(folder)
+    namespace = {"__name__": "page"}
+    for block in fenced.findall(page.read_text()):
+        exec(compile(block, str(page), "exec"), namespace)
+
+
+if __name__ == "__main__":
+    for name, pictures in PICTURES.items():
+        with tempfile.TemporaryDirectory() as folder:
+            run(DOCS / name, folder)
+            for picture in pictures:
+                shutil.copy(Path(folder) / picture, DOCS / "assets" / picture)
+            os.chdir(DOCS)

@@ -1,0 +1,115 @@
+"""Functions and classes by name, `"module:qualified.name"`, and back."""
+
+import importlib
+import sys
+import types
+from typing import Any
+
+import numpy as np
+
+
+_TRUSTED = ("delucax", "diffrax", "equinox", "lineax", "optax", "optimistix")
+
+# Of JAX and NumPy only what is meant for arrays: both hold helpers that read files or
+# run strings.
+_JAX = (
+    "jax.nn",
+    "jax.numpy",
+    "jax.lax",
+    "jax",
+    "jax.nn.initializers",
+    "jax.numpy.fft",
+    "jax.numpy.linalg",
+    "jax.random",
+    "jax.scipy.linalg",
+    "jax.scipy.special",
+    "jax.tree_util",
+)
+_NUMPY_TYPES = (np.ufunc, type)
+
+
+def name_of(thing: Any) -> str | None:
+    """The name that leads to `thing` and nothing else; `None` if there is none.
+
+    A public name is preferred to the module that a thing is defined in, which a later
+    version of its library may move.
+    """
+    module = getattr(thing, "__module__", None)
+    name = getattr(thing, "__qualname__", None) or getattr(thing, "__name__", None)
+    if not isinstance(module, str) or not isinstance(name, str):
+        module, name = type(thing).__module__, ""
+    places = _places(module)
+    for place in places:
+        if name and _look_up(place, name) is thing:
+            return f"{place}:{name}"
+    # A constant of a module, or a lambda that a module gives a name. In a notebook or
+    # script, names come to mean other things.
+    for place in places if module != "__main__" else ():
+        for name, value in list(vars(sys.modules.get(place, types)).items()):
+            if value is thing:
+                return f"{place}:{name}"
+    return None
+
+
+def thing_of(name: str, trust: tuple[str, ...]) -> Any:
+    """What `name` leads to.
+
+    **Raises:** `ValueError` if its module is not trusted, or if there is no such thing.
+    """
+    module, _, path = name.partition(":")
+    package = module.partition(".")[0]
+    named = any(module == t or module.startswith(t + ".") for t in trust)
+    if not named and package not in (*_TRUSTED, "jax", "numpy", "__main__"):
+        raise ValueError(
+            f"it needs {name!r}, and {package!r} is not a package that is trusted; if "
+            f"you trust it, give trust=({package!r},)."
+        )
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise ValueError(
+            f"it needs {name!r}, which cannot be imported: {error}."
+        ) from None
+    thing = _look_up(module, path)
+    if thing is None:
+        hint = " Define it before you load." if package == "__main__" else ""
+        raise ValueError(
+            f"it needs {name!r}, which is not there: it may have been renamed or moved "
+            f"since.{hint}"
+        )
+    origin = getattr(thing, "__module__", None) or type(thing).__module__
+    allowed = (*_TRUSTED, *trust, package) if package in _TRUSTED else (*trust, package)
+    if package == "jax":
+        fits = module in _JAX and origin.partition(".")[0] in ("jax", "jaxlib")
+    elif package == "numpy":
+        fits = module == "numpy" and isinstance(thing, _NUMPY_TYPES)
+    else:
+        fits = any(origin == t or origin.startswith(t + ".") for t in allowed)
+    if not fits and not named:
+        raise ValueError(
+            f"it needs {name!r}, which is not among what is trusted; if you trust it, "
+            f"give trust=({module!r},)."
+        )
+    return thing
+
+
+def _places(module: str) -> tuple[str, ...]:
+    """Where to look for what says that it is of `module`, the best place first."""
+    if module.partition(".")[0] in ("jax", "jaxlib"):
+        return (*_JAX, module)
+    public = module.partition("._")[0]
+    return (public, module) if public != module else (module,)
+
+
+def _look_up(module: str, path: str) -> Any:
+    """The thing at `path` in a module that is imported; `None` if it is not there.
+
+    A path goes on from a class, never from a module that another one imports, nor from
+    the inside of a function.
+    """
+    thing = sys.modules.get(module)
+    for i, part in enumerate(path.split(".")):
+        if i > 0 and not isinstance(thing, type):
+            return None
+        thing = getattr(thing, part, None)
+    return None if isinstance(thing, types.ModuleType) else thing
