@@ -1,165 +1,521 @@
+import functools
+import hashlib
 import json
 import os
-import subprocess
 import sys
+import types
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.random as jr
+import lineax as lx
 import numpy as np
 import optax
 import pytest
-from helpers import user_error
+from helpers import assert_close, needs_x32, needs_x64, user_error
+from jaxtyping import Array
 
 import delucax as dlx
 
 
-KEY = jax.random.key(0)
+KEY = jr.key(0)
 PENDULUM = dlx.systems.Pendulum(length=1.2)
+ENV = dlx.make("pendulum")
 
 
-class Mine(eqx.Module):
-    gain: jax.Array
-    how: object
-    name: str = eqx.field(static=True)
+class Damper(dlx.AbstractController):
+    """A user's own class, of a module that is not trusted by itself."""
+
+    gain: Array = dlx.weight(1.0)
+
+    def __call__(self, t, y, state):
+        return -self.gain * y[1:], state
 
 
-def objects():
-    env = dlx.make("pendulum", disturbance=dlx.disturbances.Gaussian(0.1, size=2))
-    policy = dlx.controllers.Deep(env, width=4, key=KEY)
-    controller = diffrax.PIDController(rtol=1e-4, atol=1e-5)
-    adaptive = dlx.Discretized(
-        PENDULUM, 0.05, diffrax.Kvaerno5(), stepsize_controller=controller
-    )
-    run = dlx.rollout(env, policy, key=KEY, horizon=5)
-    return {
-        "env": env,
-        "policy": policy,
-        "gaussian": dlx.controllers.Deep(env, head="gaussian", key=KEY),
-        "adaptive": adaptive,
-        "fixed": dlx.Discretized(PENDULUM, 0.05, diffrax.Tsit5(), substeps=3),
-        "linear": dlx.linearize(dlx.Discretized(PENDULUM, 0.05)),
-        "wraps": dlx.costs.Quadratic(
-            jnp.eye(2), jnp.eye(1), difference=PENDULUM.difference
-        ),
-        "trajectory": run,
-        "batch": jax.vmap(dlx.systems.Pendulum)(jnp.ones(3)),
-        "optimiser": optax.adam(1e-3).init({"w": jnp.ones(3)}),
-        "key": {"typed": KEY, "old": jax.random.PRNGKey(3)},
-        "plain": (1, 2.5, None, True, "é", [np.arange(3), np.float32(2)], {"a": 1}),
-        "functions": Mine(jnp.ones(2), jax.nn.relu, "x"),
-        "ufunc": Mine(jnp.ones(2, jnp.bfloat16), jnp.tanh, "y"),
-        "results": dlx.RESULTS.diverged,
-    }
+class Static(eqx.Module):
+    """With a static field that holds all that one may."""
+
+    table: dict = eqx.field(static=True)
 
 
-OBJECTS = objects()
+def double(x):
+    return 2 * x
 
 
-@pytest.mark.parametrize("name", OBJECTS)
-def test_round_trip(name, tmp_path):
-    obj = OBJECTS[name]
-    path = tmp_path / "it.dlx"
-    dlx.save(path, obj)
-    trust = (__name__.partition(".")[0],)
-    found = dlx.load(path, trust=trust)
-    assert jax.tree.structure(found) == jax.tree.structure(obj)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(obj), strict=True):
-        if isinstance(b, jax.Array):
-            assert a.aval == b.aval
-            if jnp.issubdtype(b.dtype, jax.dtypes.prng_key):
-                a, b = jax.random.key_data(a), jax.random.key_data(b)
-        np.testing.assert_array_equal(a, b)
-    assert list(tmp_path.iterdir()) == [path]
+halve = lambda x: x / 2
 
 
-def test_does_not_compile_again(tmp_path):
-    env = OBJECTS["env"]
-    dlx.save(tmp_path / "env", env)
-    again = dlx.load(tmp_path / "env")
-    count = []
+@eqx.filter_jit
+def compiled(x):
+    return x + 1
+
+
+def rollout(key, controller=None):
+    controller = dlx.controllers.Zero(1) if controller is None else controller
+    return dlx.rollout(ENV, controller, key=key, horizon=5)
+
+
+def batch_of_plants():
+    draw = lambda key: dlx.randomise(ENV, key, {"dynamics.system.length": (0.8, 1.2)})
+    return jax.vmap(draw)(jr.split(KEY, 4))
+
+
+def sequential():
+    a, b = jr.split(KEY)
+    layers = [eqx.nn.Linear(2, 3, key=a), eqx.nn.Lambda(jnp.sin)]
+    return eqx.nn.Sequential([*layers, eqx.nn.Linear(3, 1, key=b)])
+
+
+THINGS = {
+    "environment": lambda: ENV,
+    "batch of environments": batch_of_plants,
+    "trajectory": lambda: rollout(KEY),
+    "batch of trajectories": lambda: jax.vmap(rollout)(jr.split(KEY, 3)),
+    "simulated trajectory": lambda: dlx.simulate(
+        PENDULUM, jnp.zeros((3, 1)), 0.0, 0.15, jnp.ones(2)
+    ),
+    "fixed-step implicit": lambda: dlx.Discretized(PENDULUM, 0.05, diffrax.Kvaerno3()),
+    "adaptive": lambda: dlx.Discretized(
+        PENDULUM,
+        0.05,
+        diffrax.Tsit5(),
+        stepsize_controller=diffrax.PIDController(rtol=1e-3, atol=1e-6),
+        adjoint=diffrax.BacksolveAdjoint(solver=diffrax.Dopri5()),
+    ),
+    "linear dynamics": lambda: dlx.linearize(dlx.Discretized(PENDULUM, 0.05)),
+    "system of a function": lambda: dlx.system(dlx.math.wrap, states=1, controls=1),
+    "cost with a bound method": lambda: dlx.costs.Quadratic(
+        jnp.eye(2), jnp.eye(1), difference=PENDULUM.difference
+    ),
+    "sum of disturbances": lambda: (
+        dlx.disturbances.Gaussian(0.1, size=2) + dlx.disturbances.Constant(jnp.ones(2))
+    ),
+    "policy": lambda: dlx.controllers.MLP(2, 1, key=KEY),
+    "network": lambda: eqx.nn.MLP(2, 1, 8, 2, key=KEY),
+    "network of other activations": lambda: eqx.nn.MLP(
+        2, 1, 8, 2, activation=jnp.tanh, final_activation=jax.nn.sigmoid, key=KEY
+    ),
+    "sequential": sequential,
+    "recurrent cell": lambda: eqx.nn.GRUCell(2, 3, key=KEY),
+    "optimiser state": lambda: optax.adam(1e-3).init({"a": jnp.ones(2)}),
+    "result": lambda: dlx.RESULTS.not_converged,
+    "results of a batch": lambda: jax.vmap(
+        lambda k: dlx.RESULTS.where(k > 1, dlx.RESULTS.successful, dlx.RESULTS.diverged)
+    )(jnp.arange(3)),
+    "result of Diffrax": lambda: diffrax.RESULTS.max_steps_reached,
+    "constraints": lambda: (dlx.positive, dlx.bounded(0.0, 2.0)),
+    "keys": lambda: (KEY, jr.split(KEY, 3), jr.key(1, impl="rbg"), jr.PRNGKey(2)),
+    "bound method": lambda: PENDULUM.acceleration,
+    "partial": lambda: jax.tree_util.Partial(jnp.sin, jnp.ones(2)),
+    "partial of Equinox": lambda: eqx.Partial(dlx.math.sin, jnp.ones(2)),
+    "functions": lambda: [
+        jnp.add,
+        jax.nn.relu,
+        jax.nn.swish,
+        jnp.linalg.norm,
+        np.tanh,
+        jnp.float32,
+        dlx.environments.pendulum_features,
+    ],
+    "sentinels": lambda: (frozenset([lx.symmetric_tag]), diffrax.Kvaerno5()),
+    "numbers": lambda: (1, -0.0, 1e-320, 2**70, True, None, "é\n", 1 - 2j, [1.5, ()]),
+    "not numbers": lambda: (float("inf"), -float("inf")),
+    "weak types": lambda: (
+        jnp.asarray(1.5),
+        jnp.asarray(3),
+        jnp.broadcast_to(jnp.asarray(2.5), (2, 3)),
+    ),
+    "arrays": lambda: {
+        "half": jnp.ones(3, jnp.bfloat16),
+        "empty": jnp.zeros((0, 3)),
+        "bool": jnp.array([True, False]),
+        "small": np.arange(3, dtype=np.int8),
+        "scalar": np.float32(1.5),
+        "fortran": np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+        "complex": jnp.array([1 + 2j]),
+        "nan": np.array([np.nan, np.inf]),
+    },
+    "dtype": lambda: np.dtype("float32"),
+}
+
+
+def assert_same_leaf(a, b):
+    assert type(a) is type(b)
+    if isinstance(a, jax.Array) and jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+        assert a.dtype == b.dtype
+        a, b = jr.key_data(a), jr.key_data(b)
+    if isinstance(a, jax.Array):
+        assert a.weak_type == b.weak_type
+    if isinstance(a, jax.Array | np.ndarray | np.generic):
+        assert a.dtype == b.dtype and a.shape == b.shape
+        assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
+    elif isinstance(a, float):
+        assert repr(a) == repr(b)
+    else:
+        assert a == b
+
+
+@pytest.mark.parametrize("name", THINGS)
+def test_round_trip_is_exact(name, tmp_path):
+    thing = THINGS[name]()
+    dlx.save(tmp_path / "thing.dlx", thing)
+    again = dlx.load(tmp_path / "thing.dlx")
+    assert jax.tree.structure(again) == jax.tree.structure(thing)
+    leaves = zip(jax.tree.leaves(thing), jax.tree.leaves(again), strict=True)
+    for a, b in leaves:
+        assert_same_leaf(a, b)
+
+
+def test_functools_partial(tmp_path):
+    dlx.save(tmp_path / "f", functools.partial(jnp.add, jnp.ones(2)))
+    again = dlx.load(tmp_path / "f")
+    assert type(again) is functools.partial
+    assert_close(again(1.0), 2 * np.ones(2))
+
+
+def test_what_was_loaded_does_not_compile_again(tmp_path):
+    traced = []
 
     @eqx.filter_jit
-    def f(env):
-        count.append(1)
-        return env.dynamics.dt * 2
+    def step(env, x):
+        traced.append(None)
+        return env.step(0.0, x, jnp.zeros(1)).state
 
-    f(env)
-    f(again)
-    assert len(count) == 1
-
-
-def test_what_has_no_name_is_an_error_when_it_is_saved(tmp_path):
-    cost = dlx.costs.Function(lambda t, x, u: x[0])
-    env = dlx.Environment(dlx.Discretized(PENDULUM, 0.05), cost)
-    with user_error(match=r"obj\.cost\.stage\.function is <function .*no name"):
-        dlx.save(tmp_path / "bad", env)
-    assert not list(tmp_path.iterdir())
-    with user_error(match="being traced"):
-        jax.jit(lambda x: dlx.save(tmp_path / "bad", x))(1.0)
+    policy = dlx.controllers.MLP(2, 1, key=KEY)
+    act = eqx.filter_jit(lambda policy, y: traced.append(None) or policy(0.0, y, None))
+    dlx.save(tmp_path / "pair", (ENV, policy))
+    env, loaded = dlx.load(tmp_path / "pair")
+    x = jnp.ones(2)
+    assert_close(step(env, x), step(ENV, x))
+    assert_close(act(loaded, x)[0], act(policy, x)[0])
+    assert len(traced) == 2
 
 
-def test_damaged_and_foreign_files(tmp_path):
-    path = tmp_path / "it.dlx"
-    dlx.save(path, OBJECTS["policy"])
-    whole = path.read_bytes()
-    for damaged in (whole[:-5], whole[:200], whole[:300] + b"?" + whole[301:]):
-        path.write_bytes(damaged)
-        with user_error(match="it.dlx is damaged"):
-            dlx.load(path)
-    for foreign in (b"", b"PK\x03\x04zip", json.dumps({"a": 1}).encode()):
-        path.write_bytes(foreign)
-        with user_error(match="is not a file that delucax.save wrote"):
-            dlx.load(path)
-    path.write_bytes(whole.replace(b"delucax-file 1 ", b"delucax-file 9 ", 1))
-    with user_error(match="format 9, newer than"):
+def test_a_loaded_environment_still_takes_other_parameters(tmp_path):
+    dlx.save(tmp_path / "env", ENV)
+    longer = dlx.replace(dlx.load(tmp_path / "env"), {"dynamics.system.length": 1.5})
+    assert_close(longer.dynamics.system.length, 1.5)
+    with user_error(match="length must be positive"):
+        dlx.replace(longer, {"dynamics.system.length": -1.0})
+
+
+def test_static_fields(tmp_path):
+    static = Static({"a": (1, "b", None), "f": [double, jnp.tanh, Damper]})
+    dlx.save(tmp_path / "static", static)
+    again = dlx.load(tmp_path / "static", trust=(__name__,))
+    assert again.table == static.table
+    assert jax.tree.structure(again) == jax.tree.structure(static)
+
+
+def test_compiled_functions(tmp_path):
+    """What `eqx.filter_jit` makes of a function is found by its name."""
+    dlx.save(tmp_path / "f", compiled)
+    assert dlx.load(tmp_path / "f", trust=__name__) is compiled
+
+
+def test_public_names_are_preferred(tmp_path):
+    dlx.save(tmp_path / "f", (PENDULUM, jax.nn.relu, diffrax.Tsit5()))
+    text = (tmp_path / "f").read_bytes().decode(errors="replace")
+    for name in ("delucax.systems:Pendulum", "jax.nn:relu", "diffrax:Tsit5"):
+        assert f'"{name}"' in text
+
+
+# What cannot be written, and where it is.
+
+
+def local_class():
+    class Local(eqx.Module):
+        pass
+
+    return Local()
+
+
+def renamed_method():
+    class Other(Damper):
+        pass
+
+    return Other().applied
+
+
+@pytest.mark.parametrize(
+    "thing, place, remedy",
+    [
+        (lambda: lambda x: x, "obj", "top level"),
+        (lambda: {"a": [eqx.nn.Lambda(lambda x: x)]}, "obj.a.0.fn", "eqx.Module"),
+        (lambda: optax.sgd(0.1), "obj.init", "top level"),
+        (lambda: (1, local_class()), "obj.1", "Define the class"),
+        (renamed_method, "obj.__self__", "Define the class"),
+        (lambda: {1, 2}, "obj", "Hold numbers"),
+        (lambda: [np.array([None])], "obj.0", "array of numbers"),
+        (lambda: np.array(["a"]), "obj", "array of numbers"),
+    ],
+)
+def test_what_has_no_name_fails_at_the_save(thing, place, remedy, tmp_path):
+    with user_error(match=rf"save: {place} .*{remedy}"):
+        dlx.save(tmp_path / "f", thing())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_that_means_another_thing_is_not_written(tmp_path, monkeypatch):
+    old = double
+    monkeypatch.setattr(sys.modules[__name__], "double", abs)
+    with user_error(match="no name to find it by"):
+        dlx.save(tmp_path / "f", old)
+
+
+def test_a_lambda_with_a_name_of_its_own(tmp_path):
+    dlx.save(tmp_path / "f", halve)
+    assert dlx.load(tmp_path / "f", trust=__name__) is halve
+
+
+def test_traced_values_are_refused(tmp_path):
+    def f(x):
+        dlx.save(tmp_path / "f", {"x": x})
+        return x
+
+    with user_error(match="obj.x is being traced"):
+        jax.jit(f)(jnp.ones(2))
+
+
+# Trust.
+
+
+def test_own_classes_need_trust(tmp_path):
+    dlx.save(tmp_path / "f", Damper(2.0))
+    package = __name__.partition(".")[0]
+    with user_error(match=rf"not a package that is trusted.*trust=\('{package}',\)"):
+        dlx.load(tmp_path / "f")
+    for trust in (__name__, (package,), ["other", __name__]):
+        assert_close(dlx.load(tmp_path / "f", trust=trust).gain, 2.0)
+    with user_error(match="not a package that is trusted"):
+        dlx.load(tmp_path / "f", trust=package[:-1])
+
+
+def test_what_the_script_defines_is_found(tmp_path, monkeypatch):
+    main = sys.modules["__main__"]
+    for thing in (double, Damper):
+        monkeypatch.setattr(thing, "__module__", "__main__")
+    monkeypatch.setattr(main, "double", double, raising=False)
+    monkeypatch.setattr(main, "Damper", Damper, raising=False)
+    dlx.save(tmp_path / "f", (double, Damper(3.0)))
+    function, damper = dlx.load(tmp_path / "f")
+    assert function is double and type(damper) is Damper
+    monkeypatch.delattr(main, "double")
+    with user_error(match="'__main__:double', which is not there.*Define it before"):
+        dlx.load(tmp_path / "f")
+
+
+def forge(path, tree, arrays=()):
+    """A file with a right checksum and any content."""
+    body = json.dumps({"library": "0", "tree": tree, "arrays": list(arrays)}) + "\n"
+    digest = hashlib.sha256(body.encode()).hexdigest()
+    path.write_text(f"delucax-file 1 {digest}\n{body}")
+    return path
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "os:system",
+        "builtins:eval",
+        "subprocess:run",
+        "numpy:load",
+        "numpy:os.system",
+        "numpy.testing:runstring",
+        "jax:os.system",
+        "jax.tools.jax_to_ir:main",
+        "delucax._serialise:os.replace",
+        "delucax._serialise:Path",
+        "__main__:sys.exit",
+        "equinox._module._prebuilt:Any",
+        "delucax.dynamics:Discretized.__init__.__globals__",
+    ],
+)
+def test_a_file_cannot_reach_beyond_what_is_trusted(name, tmp_path):
+    with user_error(match="cannot be used: it needs"):
+        dlx.load(forge(tmp_path / "f", {"name": name}))
+
+
+def test_a_package_that_is_not_trusted_is_not_imported(tmp_path, monkeypatch):
+    (tmp_path / "never_imported.py").write_text("raise RuntimeError('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    path = forge(tmp_path / "f", {"name": "never_imported:f"})
+    with user_error(match="not a package that is trusted"):
         dlx.load(path)
-    with user_error(OSError, match="missing.dlx cannot be read"):
-        dlx.load(tmp_path / "missing.dlx")
-    with user_error(OSError, match="cannot be read"):
+    with user_error(RuntimeError, match="^imported$"):
+        dlx.load(path, trust="never_imported")
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        {"module": "delucax:rollout", "fields": {}},
+        {"module": "equinox:Module", "fields": {"a": 1}},
+        {"namedtuple": "delucax:Trajectory", "fields": {}},
+        {"namedtuple": "delucax.environments:Step", "fields": {"state": 1}},
+        {"array": 7},
+        {"unheard_of": 1},
+        {"method": "nothing", "of": {"module": "delucax.costs:PendulumCost"}},
+        {"result": "delucax:RESULTS", "value": 0, "items": {"0": "no_such_item"}},
+    ],
+)
+def test_a_forged_structure_is_refused(tree, tmp_path):
+    with user_error(match="cannot be used"):
+        dlx.load(forge(tmp_path / "f", tree))
+
+
+# Versions.
+
+
+def test_a_class_that_has_changed(tmp_path, monkeypatch):
+    module = types.ModuleType("changing_module")
+    monkeypatch.setitem(sys.modules, "changing_module", module)
+
+    def define(**fields):
+        space = {"__module__": "changing_module", "__annotations__": fields}
+        module.Thing = type(eqx.Module)("Thing", (eqx.Module,), space)
+
+    define(a=float, b=float)
+    dlx.save(tmp_path / "f", module.Thing(1.0, 2.0))
+    trust = "changing_module"
+    assert dlx.load(tmp_path / "f", trust=trust).b == 2.0
+    for fields in ({"a": float}, {"a": float, "b": float, "c": float}):
+        define(**fields)
+        with user_error(match=r"'changing_module:Thing' has changed .*\['a', 'b'\]"):
+            dlx.load(tmp_path / "f", trust=trust)
+    del module.Thing
+    with user_error(match="may have been renamed or moved"):
+        dlx.load(tmp_path / "f", trust=trust)
+
+
+def test_results_are_kept_by_name(tmp_path):
+    """Their numbers change as Diffrax, Lineax and Optimistix add items."""
+    dlx.save(tmp_path / "f", dlx.RESULTS.diverged)
+    number = int(dlx.RESULTS.diverged._value)
+    content = (tmp_path / "f").read_bytes()
+    body = content.partition(b"\n")[2].replace(f'"{number}"'.encode(), b'"77"')
+    header, _, payload = body.partition(b"\n")
+    old = np.array(number, np.int32).tobytes()
+    assert payload == old
+    body = header + b"\n" + np.array(77, np.int32).tobytes()
+    digest = hashlib.sha256(body).hexdigest().encode()
+    (tmp_path / "f").write_bytes(b"delucax-file 1 " + digest + b"\n" + body)
+    assert dlx.load(tmp_path / "f") == dlx.RESULTS.diverged
+
+
+def test_a_newer_version(tmp_path):
+    dlx.save(tmp_path / "f", 1)
+    content = (
+        (tmp_path / "f").read_bytes().replace(b"delucax-file 1", b"delucax-file 2")
+    )
+    (tmp_path / "f").write_bytes(content)
+    with user_error(match=rf"{tmp_path}.* has format 2, newer than the 1 .*update"):
+        dlx.load(tmp_path / "f")
+
+
+# Damage.
+
+
+def test_every_flipped_byte_is_noticed(tmp_path):
+    dlx.save(tmp_path / "f", {"x": jnp.arange(3.0)})
+    content = (tmp_path / "f").read_bytes()
+    for i in range(len(content)):
+        flipped = bytearray(content)
+        flipped[i] ^= 1
+        (tmp_path / "f").write_bytes(flipped)
+        with user_error(match="damaged|not a file that|newer than"):
+            dlx.load(tmp_path / "f")
+
+
+@pytest.mark.parametrize("content", [b"", b"\n", b"\x89PNG\r\n", b"delucax-file 1"])
+def test_foreign_files(content, tmp_path):
+    (tmp_path / "f").write_bytes(content)
+    with user_error(match=f"'{tmp_path / 'f'}' is not a file that delucax.save wrote"):
+        dlx.load(tmp_path / "f")
+
+
+def test_truncated_files(tmp_path):
+    dlx.save(tmp_path / "f", jnp.ones(100))
+    content = (tmp_path / "f").read_bytes()
+    for size in range(0, len(content), 37):
+        (tmp_path / "f").write_bytes(content[:size])
+        with user_error(match="damaged|not a file that"):
+            dlx.load(tmp_path / "f")
+
+
+def test_paths(tmp_path):
+    with user_error(FileNotFoundError, match=str(tmp_path / "missing")):
+        dlx.load(tmp_path / "missing")
+    with user_error(match=f"must be that of a file, got the folder '{tmp_path}'"):
         dlx.load(tmp_path)
-    with user_error(OSError, match="cannot be written"):
-        dlx.save(tmp_path / "no" / "folder.dlx", 1)
-    with user_error(OSError, match="cannot be written"):
+    with user_error(match=f"must be that of a file, got the folder '{tmp_path}'"):
         dlx.save(tmp_path, 1)
+    with user_error(FileNotFoundError, match="no_folder.*cannot be written"):
+        dlx.save(tmp_path / "no_folder" / "f", 1)
+    dlx.save(str(tmp_path / "text"), 1)
+    assert dlx.load(str(tmp_path / "text")) == 1
 
 
-def test_untrusted_names_are_refused(tmp_path):
-    path = tmp_path / "it.dlx"
-    dlx.save(path, {"run": os.path.join})
-    with user_error(match="posixpath:join, of a package that is not trusted"):
-        dlx.load(path)
+@pytest.mark.skipif(os.getuid() == 0, reason="the superuser writes everywhere")
+def test_a_folder_that_cannot_be_written_to(tmp_path):
+    folder = tmp_path / "read_only"
+    folder.mkdir(mode=0o500)
+    with user_error(PermissionError, match="read_only"):
+        dlx.save(folder / "f", 1)
 
 
-def test_a_changed_class_is_an_error(tmp_path, monkeypatch):
-    path = tmp_path / "it.dlx"
-    dlx.save(path, PENDULUM)
+def test_the_old_file_survives_a_failed_write(tmp_path, monkeypatch):
+    dlx.save(tmp_path / "f", 1)
 
-    class Pendulum(eqx.Module):
-        mass: jax.Array
+    def full(handle):
+        raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(sys.modules[type(PENDULUM).__module__], "Pendulum", Pendulum)
-    with user_error(match="has changed since the file was written"):
-        dlx.load(path)
+    monkeypatch.setattr(os, "fsync", full)
+    with user_error(OSError, match="cannot be written: .*No space left"):
+        dlx.save(tmp_path / "f", 2)
+    assert dlx.load(tmp_path / "f") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["f"]
 
 
-def test_a_user_defined_system_of_a_script(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(
-        "import delucax as dlx, jax, sys\n"
-        "class Mine(dlx.AbstractSystem):\n"
-        "    state_names = ('x',)\n"
-        "    control_names = ('u',)\n"
-        "    a: jax.Array = dlx.parameter(2.0)\n"
-        "    def vector_field(self, t, x, u, w):\n"
-        "        return -self.a * x + u\n"
-        "dlx.save('it.dlx', dlx.Discretized(Mine(3.0), 0.1))\n"
-        "print(float(dlx.load('it.dlx').system.a))\n"
-    )
-    out = subprocess.run(
-        [sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True
-    )
-    assert out.stdout == "3.0\n", out.stderr
-    with user_error(match="needs Mine of __main__: define it first"):
-        dlx.load(tmp_path / "it.dlx")
+def test_the_file_is_readable_as_any_other(tmp_path):
+    (tmp_path / "other").touch()
+    dlx.save(tmp_path / "f", 1)
+    modes = {(tmp_path / name).stat().st_mode for name in ("f", "other")}
+    assert len(modes) == 1
+
+
+# Precision.
+
+
+@needs_x64
+def test_single_precision_stays_single(tmp_path):
+    dlx.save(tmp_path / "f", jnp.ones(2, jnp.float32))
+    assert dlx.load(tmp_path / "f").dtype == jnp.float32
+
+
+@needs_x32
+def test_double_precision_is_narrowed_with_a_warning(tmp_path):
+    about = [{"dtype": "float64", "shape": []}, {"dtype": "int64", "shape": []}]
+
+    def write(tree, number=3):
+        text = json.dumps({"tree": tree, "arrays": about}).encode() + b"\n"
+        body = text + np.float64(0.1).tobytes() + np.int64(number).tobytes()
+        digest = hashlib.sha256(body).hexdigest().encode()
+        (tmp_path / "f").write_bytes(b"delucax-file 1 " + digest + b"\n" + body)
+
+    write({"array": 0})
+    with pytest.warns(UserWarning, match="double precision.*jax_enable_x64"):
+        x = dlx.load(tmp_path / "f")
+    assert x.dtype == jnp.float32 and x == np.float32(0.1)
+    write({"weak": 0})  # follows the precision of what it meets, so says nothing
+    x = dlx.load(tmp_path / "f")
+    assert x.weak_type and x.dtype == jnp.float32
+    write({"array": 1})
+    assert dlx.load(tmp_path / "f") == 3
+    write({"array": 1}, 2**40)
+    with user_error(match="whole numbers that need 64 bits"):
+        dlx.load(tmp_path / "f")
+    write({"numpy": 0})
+    assert dlx.load(tmp_path / "f").dtype == np.float64

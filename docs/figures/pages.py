@@ -1,15 +1,16 @@
 """The pictures of the pages, drawn by the code that the pages show.
 
 `python docs/figures/pages.py` runs the Python blocks of `index.md` and
-`first_system.md`, page by page, and copies what they draw to `docs/assets/`, in a
-minute or two.
+`first_system.md`, page by page, and puts what they draw, in fewer colours, into
+`docs/assets/`, in a minute or two.
 """
 
 import os
 import re
-import shutil
 import tempfile
 from pathlib import Path
+
+from PIL import Image
 
 
 DOCS = Path(__file__).parents[1]
@@ -30,5 +31,7 @@ if __name__ == "__main__":
         with tempfile.TemporaryDirectory() as folder:
             run(DOCS / name, folder)
             for picture in pictures:
-                shutil.copy(Path(folder) / picture, DOCS / "assets" / picture)
+                drawn = Image.open(Path(folder) / picture).convert("RGB")
+                small = drawn.quantize(128, dither=Image.Dither.NONE)
+                small.save(DOCS / "assets" / picture, optimize=True)
             os.chdir(DOCS)

@@ -122,8 +122,9 @@ def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
     except OSError as error:
         raise type(error)(f"load: '{path}' cannot be read: {error}") from error
     first, _, body = content.partition(b"\n")
-    words = first.decode(errors="replace").split()
-    if len(words) != 3 or words[0] != _MAGIC or not words[1].isdecimal():
+    words = first.decode(errors="replace").split(" ")
+    is_ours = len(words) == 3 and words[0] == _MAGIC and words[1].isdecimal()
+    if not is_ours or int(words[1]) < 1:
         raise ValueError(
             f"load: '{path}' is not a file that delucax.save wrote, or its beginning "
             "is damaged."
@@ -282,17 +283,10 @@ class _Writer:
                 )
             return {"method": name, "of": self.describe(owner, f"{path}.__self__")}
         names = [field.name for field in dataclasses.fields(node)]
-        if not set(held) <= set(names):
+        if set(held) != set(names):  # what Equinox made of a function
             return {"name": self.name(node, path)}
-        fields = {
-            name: self.describe(held[name], f"{path}.{name}")
-            for name in names
-            if name in held
-        }
-        described = {"module": self.name(type(node), path), "fields": fields}
-        if len(fields) < len(names):
-            described["unset"] = [name for name in names if name not in held]
-        return described
+        fields = {name: self.describe(held[name], f"{path}.{name}") for name in names}
+        return {"module": self.name(type(node), path), "fields": fields}
 
 
 class _Reader:
@@ -361,7 +355,7 @@ class _Reader:
         if not (isinstance(cls, type) and issubclass(cls, eqx.Module)):
             raise ValueError(f"it needs a module class, and {content!r} is not one.")
         known = {field.name for field in dataclasses.fields(cls)}
-        there = {*node["fields"], *node.get("unset", ())}
+        there = set(node["fields"])
         if there != known:
             raise ValueError(
                 f"{content!r} has changed since it was written: its fields are "

@@ -15,6 +15,7 @@ from .._fields import as_float_array
 from .._results import RESULTS
 from ..environments import Environment
 from ..simulation import rollout, Trajectory
+from ..simulation._rollout import Checkpoint
 
 
 class _ExpectedCost(eqx.Module):
@@ -24,7 +25,7 @@ class _ExpectedCost(eqx.Module):
     gradient_decay: Array | None
     batch: int = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
-    checkpoint: str | None = eqx.field(static=True)
+    checkpoint: Checkpoint = eqx.field(static=True)
 
     def __call__(self, controller, key):
         def total(key):
@@ -52,7 +53,7 @@ def expected_cost(
     *,
     batch: int,
     horizon: int | None = None,
-    checkpoint: str | None = "step",
+    checkpoint: Checkpoint = "step",
     gradient_decay: Any = 1.0,
 ) -> Any:
     """The loss of a controller: its mean total cost over fresh starts.

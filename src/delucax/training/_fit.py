@@ -274,7 +274,7 @@ def _checked_data(data, batch_size):
             f"{_WHERE}: data must be arrays with a common leading axis, got shapes "
             f"{shapes}."
         )
-    (size,) = sizes
+    size = shapes[0][0]
     if batch_size is not None:
         batch_size = check_count(batch_size, "batch_size", _WHERE)
         if batch_size > size:

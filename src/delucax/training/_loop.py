@@ -84,7 +84,7 @@ def run_block(functions, carry, inputs, span, batch_size):
     first, stop = span[0], span[1]
     # Traced once, here: the loop needs to know what a row is before it begins.
     step = eqx.filter_closure_convert(step, values, state, order, first)
-    row = step.out_struct[3]
+    row = step.out_struct[3]  # pyright: ignore[reportFunctionMemberAccess]
     rows = {n: jnp.zeros((CAPACITY, *s.shape), s.dtype) for n, s in row.items()}
 
     def going(carry):

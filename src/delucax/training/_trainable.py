@@ -75,7 +75,7 @@ def take_apart(
                 constraint = other
         value = strong(leaf)
         if constraint is not None:
-            if not np.all(constraint.holds(np.asarray(leaf))):
+            if not np.all(constraint.holds(leaf)):
                 raise ValueError(f"{where}: {name} must be {constraint}, got {leaf}.")
             constraints[path] = constraint
             value = constraint.unconstrain(value)

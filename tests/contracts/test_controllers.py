@@ -1,0 +1,232 @@
+"""What every controller must do. A new one is covered by being listed here."""
+
+import inspect
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x64, tolerance, user_error
+from jax.flatten_util import ravel_pytree
+
+import delucax as dlx
+
+
+c = dlx.controllers
+DT = 0.1
+A = jnp.array([[1.0, DT], [0.3 * DT, 0.98]])
+B = jnp.array([[0.0], [DT]])
+FEEDBACK = jnp.array([[1.0, 1.5]])
+
+
+class Case(NamedTuple):
+    """`make(size)` is the controller with its numbers near `size` times some others."""
+
+    make: Any
+    reads_all: bool = True  # whether an observation of the wrong size is an error
+
+
+def lqr(size):
+    return c.LQR(dlx.LinearDynamics(A, B, dt=DT), size * jnp.eye(2), jnp.eye(1))
+
+
+def mlp(size, in_size=2, features=None):
+    key = jax.random.key(int(10 * size))
+    options = dict(features=features, bounds=(-2.0 * size, 2.0), key=key)
+    return c.MLP(in_size, 1, width=4, depth=2, **options)
+
+
+def features(y):
+    return jnp.stack([y[0], y[1], y[0] * y[1]])
+
+
+CASES = {
+    "Zero": Case(lambda size: c.Zero(1), reads_all=False),
+    "Constant": Case(lambda size: c.Constant([size]), reads_all=False),
+    "Random": Case(lambda size: c.Random([size], 0.1), reads_all=False),
+    "Sequence": Case(lambda size: c.Sequence(size * jnp.ones((4, 1))), False),
+    "Linear": Case(lambda size: c.Linear(size * FEEDBACK)),
+    "LQR": Case(lqr),
+    "PID": Case(lambda size: c.PID(size, 2 * size, 0.3, dt=DT, output=[[1.0, 0.1]])),
+    "PID on an index": Case(
+        lambda size: c.PID([size], 2.0, 0.3, dt=DT, output=0, reference=0.1 * size),
+        reads_all=False,
+    ),
+    "LeakyPID": Case(lambda size: c.LeakyPID(size, dt=DT, output=[[1.0, 0.1]])),
+    "MLP": Case(mlp),
+    "MLP of features": Case(lambda size: mlp(size, 3, features), reads_all=False),
+    "Gaussian": Case(lambda size: c.Gaussian(c.Linear(size * FEEDBACK), [-1.0])),
+    "Gaussian of PID": Case(
+        lambda size: c.Gaussian(
+            c.PID(size, 2.0, dt=DT, output=[[1.0, 0.1]]), -1.0, bounds=(-9.0, 9.0)
+        )
+    ),
+}
+every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+PARTICULAR = {name: case for name, case in CASES.items() if case.reads_all}
+
+
+def environment(dtype=None):
+    """Smooth, unstable without control, and disturbed."""
+    dtype = jnp.zeros(()).dtype if dtype is None else dtype
+    dynamics = dlx.LinearDynamics(A.astype(dtype), B.astype(dtype), dt=DT)
+    eye = jnp.eye(2, dtype=dtype)
+    return dlx.Environment(
+        dynamics,
+        dlx.costs.Quadratic(eye, 0.1 * eye[:1, :1], final=eye),
+        disturbance=dlx.disturbances.Gaussian(0.05, size=2),
+        initial_state=jnp.array([0.5, -0.3], dtype),
+        control_bounds=(-20.0, 20.0),
+        horizon=8,
+    )
+
+
+def test_every_controller_is_listed():
+    members = {
+        name
+        for name, member in vars(c).items()
+        if inspect.isclass(member) and issubclass(member, dlx.AbstractController)
+    }
+    listed = {type(case.make(1.0)).__name__ for case in CASES.values()}
+    assert members - listed == set()
+    assert members >= {"Zero", "LQR", "PID", "MLP", "Gaussian"}
+
+
+@every
+def test_jit(case, key):
+    """It goes into plain `jax.jit`, and other numbers in it do not compile again."""
+    env, traced = environment(), 0
+
+    @jax.jit
+    def run(controller, key):
+        nonlocal traced
+        traced += 1
+        return dlx.rollout(env, controller, key=key).total_cost
+
+    first = run(case.make(1.0), key)
+    second = run(case.make(1.1), jax.random.key(5))
+    assert np.isfinite(first) and np.isfinite(second) and first != second
+    assert traced == 1
+
+
+@every
+def test_vmap(case, key):
+    """A batch over controllers and keys is what the loop over them gives."""
+    env = environment()
+    run = lambda controller, key: dlx.rollout(env, controller, key=key).controls
+    pair, keys = [case.make(1.0), case.make(1.1)], jax.random.split(key, 2)
+    batch = jax.vmap(run)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *pair), keys)
+    close = dict(rtol=tolerance(1e-4, 1e-11), atol=tolerance(1e-5, 1e-12))
+    for controls, controller, key in zip(batch, pair, keys, strict=True):
+        assert_close(controls, run(controller, key), **close)
+
+
+class Known(dlx.AbstractController):
+    """A controller whose key is known beforehand."""
+
+    base: dlx.AbstractController
+    key: Any
+
+    def init(self, *, key=None):
+        return self.base.init(key=self.key)
+
+    def __call__(self, t, y, state):
+        return self.base(t, y, state)
+
+    def applied(self, u, cost, state):
+        return self.base.applied(u, cost, state)
+
+
+@every
+def test_scan(case, key):
+    """Calling it by hand, its state carried by `lax.scan`, is what a rollout does."""
+    env, controller = environment(), case.make(1.0)
+    w = 0.05 * jax.random.normal(key, (8, 2))
+    known = jax.random.key(7)
+    run = dlx.rollout(env, Known(controller, known), key=key, w=w)
+    state = controller.init(key=known)
+    assert all(eqx.is_array(leaf) for leaf in jax.tree.leaves(state))
+
+    def step(carry, inputs):
+        x, state = carry
+        k, w = inputs
+        t = k * DT
+        u, state = controller(t, env.dynamics.observe(t, x), state)
+        step = env.step(t, x, u, w)
+        state = controller.applied(step.control, step.cost, state)
+        return (step.state, state), step.control
+
+    _, controls = lax.scan(step, (env.reset(key), state), (jnp.arange(8), w))
+    assert controls.shape == (8, 1)
+    close = dict(rtol=tolerance(1e-4, 1e-11), atol=tolerance(1e-5, 1e-12))
+    assert_close(controls, run.controls, **close)
+
+
+@every
+def test_grad(case, key):
+    """Every number that it holds has a finite gradient, and the right one."""
+    env = environment()
+    arrays, static = eqx.partition(case.make(1.0), eqx.is_inexact_array)
+    flat, unravel = ravel_pytree(arrays)
+
+    @jax.jit
+    @jax.value_and_grad
+    def cost(flat):
+        controller = eqx.combine(unravel(flat), static)
+        return dlx.rollout(env, controller, key=key).total_cost
+
+    _, gradient = cost(flat)
+    assert np.all(np.isfinite(gradient))
+    if not jax.config.jax_enable_x64:
+        return
+    # One direction a leaf, so that none hides behind a larger one.
+    rng, start, h = np.random.default_rng(0), 0, 1e-6
+    for path, leaf in jax.tree_util.tree_leaves_with_path(arrays):
+        way = np.zeros(flat.shape)
+        way[start : start + leaf.size] = rng.choice([-1.0, 1.0], size=leaf.size)
+        start += leaf.size
+        exact = float(gradient @ way)
+        numeric = float(cost(flat + h * way)[0] - cost(flat - h * way)[0]) / (2 * h)
+        assert abs(exact - numeric) < 1e-5 * max(1.0, abs(exact)), path
+
+
+@every
+@pytest.mark.parametrize(
+    "dtype", [jnp.float32, pytest.param(jnp.float64, marks=needs_x64)]
+)
+def test_precision(case, key, dtype):
+    """Controls have the precision of the observation."""
+    env, controller = environment(dtype), case.make(1.0)
+    state = controller.init(key=key)
+    u, after = controller(0.1, jnp.array([0.3, -0.2], dtype), state)
+    assert u.dtype == dtype and u.shape == (1,)
+    after = controller.applied(u, jnp.zeros((), dtype), after)
+    same = lambda a, b: a.shape == b.shape and a.dtype == b.dtype
+    assert jax.tree.all(jax.tree.map(same, state, after))
+    run = dlx.rollout(env, controller, key=key)
+    assert run.controls.dtype == run.total_cost.dtype == dtype
+    assert run.result == dlx.RESULTS.successful
+
+
+@pytest.mark.parametrize("case", PARTICULAR.values(), ids=PARTICULAR)
+def test_wrong_observation(case, key):
+    """An observation of another size is an error that names both sizes."""
+    controller = case.make(1.0)
+    state = controller.init(key=key)
+    with user_error(match="observation of size 2, got size 5.*features=env.encode"):
+        controller(0.0, jnp.zeros(5), state)
+
+
+@every
+def test_saved_and_loaded(case, key, tmp_path):
+    """What is loaded acts as what was saved did, and compiles no more."""
+    env, controller = environment(), case.make(1.0)
+    dlx.save(tmp_path / "controller.dlx", controller)
+    loaded = dlx.load(tmp_path / "controller.dlx", trust=[__name__])
+    assert type(loaded) is type(controller)
+    assert jax.tree.structure(loaded) == jax.tree.structure(controller)
+    run = lambda controller: dlx.rollout(env, controller, key=key).controls
+    np.testing.assert_array_equal(run(loaded), run(controller))

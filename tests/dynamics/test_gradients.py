@@ -1,0 +1,108 @@
+"""Every way to differentiate a closed loop against central differences."""
+
+import delucax as dlx
+import diffrax
+import jax
+import jax.numpy as jnp
+import pytest
+from helpers import assert_close, central_difference, needs_x64
+
+
+pytestmark = needs_x64
+CONTROLLER = diffrax.PIDController(rtol=1e-9, atol=1e-11)
+
+
+class Noisy(dlx.AbstractSystem):
+    state_names = ("angle", "velocity")
+    control_names = ("torque",)
+    disturbance_names = ("noise",)
+    length: jax.Array = dlx.parameter(1.0)
+
+    def vector_field(self, t, x, u, w):
+        return jnp.stack([x[1], 15 / self.length * jnp.sin(x[0]) + 3 * u[0]])
+
+    def diffusion(self, t, x, u):
+        return jnp.stack([0.0 * x[0], 0.3 * jnp.cos(x[0])])[:, None]
+
+
+class Scalar(dlx.AbstractSystem):
+    state_names = ("x",)
+    control_names = ("u",)
+    length: jax.Array = dlx.parameter(1.0)
+
+    def vector_field(self, t, x, u, w):
+        return u - jnp.sin(x) / self.length
+
+    def diffusion(self, t, x, u):
+        return 0.2 * (1 + x**2)
+
+
+def _pendulum(solver, **kwargs):
+    return dlx.Discretized(dlx.systems.Pendulum(), 0.05, solver, **kwargs)
+
+
+def _adaptive(solver, adjoint):
+    return _pendulum(solver, stepsize_controller=CONTROLLER, adjoint=adjoint)
+
+
+CASES = {
+    "Euler": lambda: _pendulum(diffrax.Euler()),
+    "RK4": lambda: _pendulum(dlx.dynamics.RK4()),
+    "Tsit5, substeps": lambda: _pendulum(diffrax.Tsit5(), substeps=3),
+    "ImplicitEuler": lambda: _pendulum(diffrax.ImplicitEuler()),
+    "Kvaerno3": lambda: _pendulum(diffrax.Kvaerno3()),
+    "adaptive, checkpointed": lambda: _adaptive(
+        diffrax.Tsit5(), diffrax.RecursiveCheckpointAdjoint()
+    ),
+    "adaptive, direct": lambda: _adaptive(diffrax.Tsit5(), diffrax.DirectAdjoint()),
+    "Euler-Maruyama": lambda: dlx.Discretized(Noisy(), 0.05, substeps=2),
+    "Heun, Stratonovich": lambda: dlx.Discretized(Noisy(), 0.05, diffrax.Heun()),
+    "Milstein": lambda: dlx.Discretized(Scalar(), 0.05, diffrax.ItoMilstein()),
+}
+
+
+def _cost(dynamics, checkpoint="step"):
+    n = dynamics.state_size
+    cost = dlx.costs.Quadratic(jnp.eye(n), 0.1 * jnp.eye(1), final=jnp.eye(n))
+    env = dlx.Environment(dynamics, cost, horizon=12)
+
+    def total(leaves):
+        plant = dlx.replace(env, {"dynamics.system.length": leaves[0]})
+        controller = dlx.controllers.Linear(leaves[None, 1 : 1 + n])
+        return dlx.rollout(
+            plant,
+            controller,
+            key=jax.random.key(0),
+            x0=leaves[1 + n : 1 + 2 * n],
+            checkpoint=checkpoint,
+        ).total_cost
+
+    at = jnp.array([1.1, 8.0, 2.0, 0.3, -0.2])
+    return total, at if n == 2 else at[jnp.array([0, 1, 3])]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_reverse_mode_is_central_differences(name):
+    total, at = _cost(CASES[name]())
+    found = jax.grad(total)(at)
+    expected = central_difference(total, at, step=1e-5)
+    scale = jnp.max(jnp.abs(expected))
+    assert_close(found / scale, expected / scale, atol=1e-6)
+
+
+@pytest.mark.parametrize("checkpoint", ["sqrt", None])
+def test_checkpoints(checkpoint):
+    total, at = _cost(CASES["RK4"](), checkpoint)
+    found = jax.grad(total)(at)
+    assert_close(found, central_difference(total, at, step=1e-5), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["RK4", "Kvaerno3", "Euler-Maruyama"])
+def test_forward_mode_and_second_order(name):
+    total, at = _cost(CASES[name]())
+    assert_close(jax.jacfwd(total)(at), jax.grad(total)(at), rtol=1e-8)
+    if name == "RK4":
+        hessian = jax.hessian(total)(at)
+        one = lambda x: jax.grad(total)(x)[1]
+        expected = central_difference(one, at, step=1e-5)
+        assert_close(hessian[1], expected, rtol=1e-5, atol=1e-6)

@@ -1,0 +1,555 @@
+from types import SimpleNamespace
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+from helpers import assert_close, dtype, needs_x64, tolerance, user_error
+from jaxtyping import Array
+
+import delucax as dlx
+from delucax.simulation._hold import Hold, interval_before
+
+
+PENDULUM = dlx.systems.Pendulum(damping=0.1)
+FEEDBACK = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
+HANGING = jnp.array([3.0, 0.5])
+UPRIGHT = jnp.array([0.1, 0.0])
+LOOSE = diffrax.PIDController(rtol=1e-4, atol=1e-6)
+TIGHT = diffrax.PIDController(rtol=1e-10, atol=1e-10)
+ADAPTIVE = diffrax.PIDController(rtol=tolerance(1e-5, 1e-10), atol=1e-10)
+INTEGRATOR = dlx.system(lambda t, x, u, w: u, states=1, controls=1)
+SWITCHED = dlx.systems.LinearSystem(-jnp.eye(1), jnp.eye(1), E=jnp.eye(1))
+
+
+def switching(steps, seed=0, size=1):
+    controls = np.random.default_rng(seed).uniform(-2, 2, (steps, size))
+    return jnp.asarray(controls, dtype())
+
+
+class Projected(dlx.AbstractSystem):
+    state_names = ("x",)
+    control_names = ("u",)
+
+    def vector_field(self, t, x, u, w):
+        return u
+
+    def project(self, x):
+        return jnp.clip(x, -1, 1)
+
+
+class Noisy(dlx.AbstractSystem):
+    state_names = ("x",)
+    control_names = ("u",)
+
+    def vector_field(self, t, x, u, w):
+        return u
+
+    def diffusion(self, t, x, u):
+        return jnp.ones(1)
+
+
+class Sensed(dlx.AbstractSystem):
+    """Sees the position alone, and sees it late in the day as double."""
+
+    state_names = ("x", "v")
+    control_names = ("u",)
+
+    def vector_field(self, t, x, u, w):
+        return jnp.stack([x[1], u[0]])
+
+    def observe(self, t, x):
+        return (1 + t) * x[:1]
+
+
+class Told(dlx.AbstractController):
+    """Acts with the sum of what it was told that it applied, and one more."""
+
+    rate: Array = dlx.weight(0.5)
+
+    def init(self, *, key=None):
+        return jnp.asarray(0.0), jnp.asarray(0), "not an array"
+
+    def __call__(self, t, y, state):
+        total, count, note = state
+        return self.rate * (1 - total - y[:1]), (total, count + 1, note)
+
+    def applied(self, u, cost, state):
+        total, count, note = state
+        return total + 0.1 * u[0] + cost, count, note
+
+
+# Exact at the switch.
+
+
+@pytest.mark.parametrize("t0, t1, steps", [(0.0, 10.0, 200), (100.0, 101.7, 97)])
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"solver": diffrax.Heun(), "substeps": 3},
+        {"stepsize_controller": LOOSE},
+        {"stepsize_controller": diffrax.PIDController(1e-4, 1e-6, dtmax=0.006)},
+    ],
+    ids=["fixed", "adaptive", "short steps"],
+)
+def test_switches_are_exact(t0, t1, steps, how):
+    """The integral of a held control is known, and one wrong stage would show."""
+    controls = switching(steps)
+    run = dlx.simulate(INTEGRATOR, controls, t0, t1, jnp.zeros(1), **how)
+    sums = np.cumsum(np.asarray(controls, float)[:, 0])
+    expected = np.concatenate([[0], sums]) * (t1 - t0) / steps
+    ulp = np.finfo(dtype()).eps * t1
+    assert_close(run.states[:, 0], expected, atol=20 * ulp)
+    assert_close(run.controls, controls)
+
+
+@pytest.mark.parametrize("count", [1, 7, 200, 997])
+@pytest.mark.parametrize("t0, t1", [(0.0, 10.0), (100.0, 101.7), (-0.3, 0.1)])
+def test_interval_of_a_step(count, t0, t1):
+    grid = np.linspace(t0, t1, count + 1).astype(dtype())
+    switches = jnp.asarray(grid)
+    hold = Hold(diffrax.Tsit5(), switches, False)
+    interval = jax.jit(
+        jax.vmap(
+            lambda a, b, forwards: hold._interval(
+                SimpleNamespace(direction=forwards), a, b
+            ),
+            in_axes=(0, 0, None),
+        )
+    )
+    below, above = (np.nextafter(grid, end, dtype=grid.dtype) for end in (-9, 999))
+    here = np.arange(count)
+    for low, high in [
+        (grid[:-1], grid[1:]),
+        (grid[:-1], above[:-1]),
+        (below[1:], grid[1:]),
+        (above[:-1], below[1:]),
+        # Diffrax may begin one rounding before a switch and go on from there.
+        (below[:-1], grid[1:]),
+    ]:
+        assert_close(interval(low, high, 1), here)
+        assert_close(interval(-high, -low, -1), here)
+    assert_close(interval(-above[1:], -grid[:-1], -1), here)
+    before = jax.vmap(lambda t: interval_before(switches, t))
+    assert_close(before(grid[1:]), here)
+    assert_close(before(above[:-1]), here)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        diffrax.Euler(),
+        diffrax.Heun(),
+        dlx.dynamics.RK4(),
+        diffrax.Tsit5(),
+        diffrax.Dopri5(),
+        diffrax.Kvaerno3(),
+    ],
+    ids=lambda solver: type(solver).__name__,
+)
+def test_fixed_steps_are_those_of_discretized(solver):
+    controls = switching(40)
+    run = dlx.simulate(PENDULUM, controls, 0.0, 2.0, HANGING, solver=solver, substeps=2)
+    dynamics = dlx.Discretized(PENDULUM, 0.05, solver, substeps=2)
+    expected = dlx.open_loop(dynamics, HANGING, controls)
+    # Single precision rounds the times of the switches too, by 1e-7 of 2 seconds.
+    assert_close(run.states, expected, atol=tolerance(2e-5, 1e-13))
+    assert run.states.dtype == dtype()
+
+
+def test_adaptive_steps_agree_with_scipy():
+    controls = switching(20)
+    run = dlx.simulate(
+        PENDULUM, controls, 0.5, 1.5, HANGING, stepsize_controller=ADAPTIVE
+    )
+    x = np.asarray(HANGING, float)
+    for k in range(20):
+        u = float(controls[k, 0])
+
+        def field(t, x, u=u):
+            return [x[1], 15 * np.sin(x[0]) + 3 * u - 0.1 * x[1]]
+
+        step = scipy.integrate.solve_ivp(
+            field, (0, 0.05), x, method="DOP853", rtol=1e-13, atol=1e-13
+        )
+        x = step.y[:, -1]
+        assert_close(run.states[k + 1], x, atol=tolerance(3e-5, 3e-9))
+    assert_close(run.times, np.linspace(0.5, 1.5, 21), atol=tolerance(1e-6, 1e-14))
+
+
+def test_held_disturbances():
+    controls, w = switching(10), switching(10, seed=1)
+    run = dlx.simulate(SWITCHED, controls, 0.0, 1.0, jnp.ones(1), w=w)
+    dynamics = dlx.Discretized(SWITCHED, 0.1, diffrax.Tsit5())
+    expected = dlx.open_loop(dynamics, jnp.ones(1), controls, w)
+    assert_close(run.states, expected, atol=tolerance(2e-6, 1e-13))
+    assert_close(run.disturbances, w)
+    # They are held under a control that is not, and say how long the intervals are.
+    zero = dlx.controllers.Zero(1)
+    run = dlx.simulate(SWITCHED, zero, 0.0, 1.0, jnp.ones(1), w=w, hold=None)
+    expected = dlx.open_loop(dynamics, jnp.ones(1), jnp.zeros((10, 1)), w)
+    assert_close(run.states, expected, atol=tolerance(2e-6, 1e-13))
+
+
+# Feedback.
+
+
+@pytest.mark.parametrize("how", [{"substeps": 2}, {"stepsize_controller": ADAPTIVE}])
+@pytest.mark.parametrize("controller", [FEEDBACK, Told()], ids=["linear", "memory"])
+def test_sampled_feedback_is_that_of_a_rollout(controller, how, key):
+    run = dlx.simulate(PENDULUM, controller, 0.0, 1.0, UPRIGHT, dt=0.05, **how)
+    dynamics = dlx.Discretized(PENDULUM, 0.05, diffrax.Tsit5(), substeps=8)
+    env = dlx.Environment(dynamics, dlx.costs.Function(lambda t, x, u: 0.0))
+    expected = dlx.rollout(env, controller, key=key, x0=UPRIGHT, horizon=20)
+    for name in ("states", "controls", "observations"):
+        a, b = getattr(run, name), getattr(expected, name)
+        assert_close(a, b, atol=tolerance(2e-5, 3e-7))
+
+
+def test_continuous_feedback_agrees_with_scipy():
+    run = dlx.simulate(
+        Sensed(),
+        dlx.controllers.Linear(jnp.array([[4.0]])),
+        0.0,
+        1.0,
+        jnp.array([1.0, 0.0]),
+        hold=None,
+        dt=0.1,
+        solver=diffrax.Dopri8(),
+    )
+    exact = scipy.integrate.solve_ivp(
+        lambda t, x: [x[1], -4 * (1 + t) * x[0]],
+        (0, 1),
+        [1.0, 0.0],
+        t_eval=np.linspace(0, 1, 11),
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-13,
+    )
+    assert_close(run.states, exact.y.T, atol=tolerance(1e-5, 1e-10))
+    seen = (1 + exact.t[:-1]) * exact.y[0, :-1]
+    assert_close(run.observations[:, 0], seen, atol=tolerance(1e-5, 1e-10))
+    assert_close(run.controls[:, 0], -4 * seen, atol=tolerance(5e-5, 1e-9))
+
+
+def test_a_function_of_time():
+    signal = lambda t: jnp.stack([jnp.cos(t)])
+    exact = np.sin(np.linspace(0, 1, 11))
+    run = dlx.simulate(INTEGRATOR, signal, 0.0, 1.0, jnp.zeros(1), hold=None, dt=0.1)
+    assert_close(run.states[:, 0], exact, atol=tolerance(1e-6, 1e-10))
+    assert_close(run.controls[:, 0], np.cos(0.1 * np.arange(10)), atol=1e-6)
+    held = dlx.simulate(INTEGRATOR, signal, 0.0, 1.0, jnp.zeros(1), dt=0.1)
+    sums = np.cumsum(np.cos(0.1 * np.arange(10))) * 0.1
+    assert_close(held.states[1:, 0], sums, atol=1e-6)
+    assert_close(held.controls[:, 0], np.cos(0.1 * np.arange(10)), atol=1e-6)
+
+
+def test_a_controller_that_draws(key):
+    noise = dlx.controllers.Random(jnp.ones(1))
+    run = dlx.simulate(INTEGRATOR, noise, 0.0, 1.0, jnp.zeros(1), dt=0.1, key=key)
+    assert len(np.unique(run.controls)) == 10
+    sums = np.cumsum(np.asarray(run.controls)[:, 0]) * 0.1
+    assert_close(run.states[1:, 0], sums, atol=1e-5)
+    with user_error(match="Random: key must be a key"):
+        dlx.simulate(INTEGRATOR, noise, 0.0, 1.0, jnp.zeros(1), dt=0.1)
+
+
+# What is saved.
+
+
+def test_save_times():
+    controls = switching(10)
+    ts = np.array([0.05, 0.1, 0.3, 0.35, 1.0])
+    how = {"stepsize_controller": ADAPTIVE}
+    run = dlx.simulate(INTEGRATOR, controls, 0.0, 1.0, jnp.zeros(1), ts=ts, **how)
+    ends = np.concatenate([[0], np.cumsum(np.asarray(controls, float)[:, 0]) * 0.1])
+    exact = np.interp(ts, np.linspace(0, 1, 11), ends)
+    assert_close(run.times, ts, rtol=1e-6)
+    assert_close(run.states[:, 0], exact, atol=tolerance(2e-6, 1e-12))
+    assert_close(run.controls, controls[np.array([0, 2, 3, 9])])
+    assert run.steps == 4 and run.length == 4
+    assert_close(run.final_state, run.states[-1])
+
+
+def test_what_a_trajectory_of_it_holds():
+    run = dlx.simulate(PENDULUM, switching(5), 0.0, 0.25, UPRIGHT)
+    assert run.costs is None and run.terminated is None
+    assert run.final_cost == 0 and run.total_cost == 0
+    assert run.states.shape == (6, 2) and run.controls.shape == (5, 1)
+    assert run.observations.shape == (5, 2) and run.disturbances.shape == (5, 2)
+    assert run.state_names == PENDULUM.state_names and run.batch_shape == ()
+    assert_close(run.dt, 0.05, rtol=1e-6)
+    assert run.result == dlx.RESULTS.successful
+    table = run.to_pandas()
+    assert list(table.columns[:4]) == ["time", "angle", "velocity", "torque"]
+
+
+def test_batches():
+    controls = switching(4)
+    starts = jnp.array([[0.5], [1.0], [4.0]])
+    run = lambda x0: dlx.simulate(
+        SWITCHED, controls, 0.0, 1.0, x0, stepsize_controller=LOOSE
+    )
+    batch = jax.vmap(run)(starts)
+    assert batch.batch_shape == (3,) and batch.states.shape == (3, 5, 1)
+    for k in range(3):
+        assert_close(batch[k].states, run(starts[k]).states, rtol=1e-3)
+
+
+def test_compiles_once():
+    count = 0
+
+    def field(t, x, u, w):
+        nonlocal count
+        count += 1
+        return u - x
+
+    system = dlx.system(field, states=1, controls=1)
+    for k in range(3):
+        dlx.simulate(system, k * jnp.ones((6, 1)), 0.0, 1.0 + k, jnp.ones(1))
+        if k == 0:
+            first = count
+    assert count == first
+
+
+def test_progress_meter(capfd):
+    meter = diffrax.TextProgressMeter()
+    run = dlx.simulate(
+        INTEGRATOR, switching(3), 0.0, 1.0, jnp.zeros(1), progress_meter=meter
+    )
+    jax.block_until_ready(run.states)
+    jax.effects_barrier()
+    assert "100.00%" in capfd.readouterr().out
+
+
+# Gradients.
+
+
+CONTROLS = jnp.asarray(switching(4))
+
+
+def loss(arguments, weights, **how):
+    system, source, x0 = arguments
+    run = dlx.simulate(system, source, 0.0, 0.2, x0, **how)
+    return jnp.sum(weights * run.states) + jnp.sum(run.controls**3)
+
+
+def assert_gradient(arguments, *, rtol=1e-6, forwards=False, **how):
+    """The gradient in some directions is that of central differences."""
+    params, static = eqx.partition(arguments, eqx.is_inexact_array)
+    flat, unravel = jax.flatten_util.ravel_pytree(params)
+    rng = np.random.default_rng(0)
+    weights = jnp.asarray(rng.normal(size=(5, 2)))
+
+    def f(flat):
+        return loss(eqx.combine(unravel(flat), static), weights, **how)
+
+    if forwards:
+        value = jax.jit(f)
+        gradient = jax.jit(jax.jacfwd(f))(flat)
+    else:
+        both = jax.jit(jax.value_and_grad(f))
+        value = lambda flat: both(flat)[0]
+        gradient = both(flat)[1]
+    for _ in range(3):
+        v = jnp.asarray(rng.normal(size=flat.shape))
+        h = 1e-3
+        near = value(flat + h * v) - value(flat - h * v)
+        far = value(flat + 2 * h * v) - value(flat - 2 * h * v)
+        expected = (8 * near - far) / (12 * h)
+        scale = np.linalg.norm(gradient) * np.linalg.norm(v)
+        assert abs(gradient @ v - expected) <= rtol * scale
+
+
+@needs_x64
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"substeps": 2},
+        {"adjoint": diffrax.DirectAdjoint(), "solver": diffrax.Heun()},
+        {"stepsize_controller": TIGHT},
+        {"stepsize_controller": TIGHT, "adjoint": diffrax.BacksolveAdjoint()},
+        {
+            "stepsize_controller": TIGHT,
+            "adjoint": diffrax.BacksolveAdjoint(
+                solver=diffrax.Dopri8(), stepsize_controller=TIGHT
+            ),
+            "ts": np.array([0.0, 0.03, 0.1, 0.16, 0.2]),
+        },
+    ],
+    ids=["fixed", "direct", "adaptive", "backsolve", "backsolve between"],
+)
+def test_gradient_of_open_loop(how):
+    assert_gradient((PENDULUM, CONTROLS, HANGING), **how)
+
+
+@needs_x64
+def test_forward_gradient():
+    assert_gradient(
+        (PENDULUM, CONTROLS, HANGING), forwards=True, adjoint=diffrax.ForwardMode()
+    )
+
+
+@needs_x64
+@pytest.mark.parametrize(
+    "controller, how",
+    [
+        (FEEDBACK, {"stepsize_controller": TIGHT}),
+        (Told(), {"substeps": 2}),
+        (
+            FEEDBACK,
+            {
+                "hold": None,
+                "stepsize_controller": TIGHT,
+                "adjoint": diffrax.BacksolveAdjoint(),
+            },
+        ),
+    ],
+    ids=["sampled", "memory", "continuous"],
+)
+def test_gradient_of_feedback(controller, how):
+    arguments = (PENDULUM, controller, UPRIGHT)
+    assert_gradient(arguments, dt=0.05, **how)
+
+
+@needs_x64
+def test_gradient_with_respect_to_the_end():
+    f = lambda t1: dlx.simulate(INTEGRATOR, CONTROLS, 0.0, t1, jnp.zeros(1)).states[-1]
+    assert_close(jax.grad(lambda t1: f(t1)[0])(0.3), jnp.mean(CONTROLS), rtol=1e-12)
+
+
+def test_a_gradient_that_fails_is_loud():
+    how = dict(stepsize_controller=LOOSE, adjoint=diffrax.BacksolveAdjoint(max_steps=1))
+    f = lambda x0: dlx.simulate(
+        PENDULUM, CONTROLS, 0.0, 2.0, x0, **how
+    ).final_state.sum()
+    with user_error(RuntimeError, match="maximum number of solver steps"):
+        jax.block_until_ready(jax.grad(f)(HANGING))
+
+
+# What goes wrong.
+
+
+@pytest.mark.parametrize(
+    "how, words, at",
+    [
+        ({}, "NaN or infinite", 0.3),
+        ({"stepsize_controller": LOOSE}, "maximum number of solver steps", None),
+    ],
+)
+def test_a_failed_solve_raises(how, words, at):
+    explodes = dlx.system(lambda t, x, u, w: x**2, states=1, controls=1)
+    arguments = (explodes, jnp.zeros((20, 1)), 0.0, 2.0, 5 * jnp.ones(1))
+    with user_error(RuntimeError, match=f"simulate: .*{words}"):
+        dlx.simulate(*arguments, **how)
+    run = dlx.simulate(*arguments, throw=False, **how)
+    assert run.result != dlx.RESULTS.successful
+    assert words in dlx.RESULTS[run.result]
+
+
+PID = diffrax.PIDController(rtol=1e-6, atol=1e-6)
+U, X = jnp.zeros((4, 1)), jnp.zeros(2)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"system": lambda t, x, u, w: x}, "system must be an AbstractSystem"),
+        ({"system": Projected(), "x0": X[:1]}, "Projected projects its state"),
+        ({"system": Noisy(), "x0": X[:1]}, "has a diffusion.*Discretized"),
+        ({"t1": 0.0}, "t1 must be above t0, got t0 = 0.0, t1 = 0.0"),
+        ({"t1": np.inf}, "t1 must be finite"),
+        ({"t0": jnp.zeros(2)}, "t0 must be a number"),
+        ({"x0": jnp.zeros(3)}, r"x0 must have shape \(2,\), got shape \(3,\)"),
+        ({"x0": jnp.full(2, np.nan)}, "x0 must be finite"),
+        ({"controls": jnp.zeros((4, 2))}, r"must have shape \(T, 1\).*\(4, 2\)"),
+        ({"controls": jnp.zeros((0, 1))}, "at least one interval"),
+        ({"controls": None}, r"must have shape \(T, 1\), got None"),
+        ({"hold": "first"}, "hold must be 'zero' or None, got 'first'"),
+        ({"hold": None}, "hold=None needs a controller or a function of time"),
+        ({"w": jnp.zeros((4, 2))}, "w cannot be given, as Pendulum names no"),
+        ({"controls": FEEDBACK}, "dt must be given"),
+        ({"controls": FEEDBACK, "hold": None}, "dt must be given"),
+        ({"controls": FEEDBACK, "dt": 0.3}, "must be a whole multiple of dt"),
+        ({"controls": FEEDBACK, "dt": -0.1}, "dt must be positive"),
+        ({"controls": FEEDBACK, "dt": 2.0}, "must be a whole multiple of dt"),
+        ({"dt": 0.1}, "controller_or_controls says 4, dt says 10"),
+        ({"solver": diffrax.Tsit5}, "solver must be a Diffrax solver"),
+        ({"solver": diffrax.KenCarp3()}, "needs a split"),
+        ({"solver": diffrax.ReversibleHeun()}, "does not fit fixed steps"),
+        (
+            {"solver": dlx.dynamics.RK4(), "stepsize_controller": PID},
+            "RK4 estimates no error",
+        ),
+        (
+            {"solver": diffrax.Euler(), "stepsize_controller": PID},
+            "Euler estimates no error",
+        ),
+        (
+            {"solver": diffrax.LeapfrogMidpoint(), "stepsize_controller": PID},
+            "LeapfrogMidpoint estimates no error",
+        ),
+        (
+            {"stepsize_controller": diffrax.ConstantStepSize()},
+            "must be adaptive.*give substeps. Got ConstantStepSize",
+        ),
+        ({"stepsize_controller": PID, "substeps": 2}, "substeps must be 1"),
+        ({"substeps": 0}, "substeps must be a whole number of at least 1"),
+        ({"max_steps": 10}, "max_steps needs stepsize_controller"),
+        ({"stepsize_controller": PID, "max_steps": 0}, "max_steps must be a whole"),
+        ({"adjoint": "backsolve"}, "adjoint must be a Diffrax adjoint"),
+        ({"adjoint": diffrax.ImplicitAdjoint()}, "steady state"),
+        ({"adjoint": diffrax.BacksolveAdjoint()}, "needs a stepsize_controller"),
+        (
+            {
+                "adjoint": diffrax.BacksolveAdjoint(),
+                "stepsize_controller": PID,
+                "controls": FEEDBACK,
+                "dt": 0.25,
+            },
+            "does not fit a held controller",
+        ),
+        (
+            {
+                "adjoint": diffrax.BacksolveAdjoint(solver=diffrax.Euler()),
+                "stepsize_controller": PID,
+            },
+            "BacksolveAdjoint: solver Euler estimates no error",
+        ),
+        (
+            {
+                "adjoint": diffrax.BacksolveAdjoint(
+                    stepsize_controller=diffrax.ConstantStepSize()
+                ),
+                "stepsize_controller": PID,
+            },
+            "BacksolveAdjoint: stepsize_controller must be adaptive",
+        ),
+        ({"ts": jnp.array([0.5, 2.0])}, "ts must increase and lie between"),
+        ({"ts": jnp.array([0.5, 0.2])}, "ts must increase and lie between"),
+        ({"ts": jnp.array([0.5])}, "at least two times"),
+        ({"controls": Told(), "hold": None, "dt": 0.25}, "without a state of its own"),
+        (
+            {"controls": dlx.controllers.Zero(2), "dt": 0.25},
+            r"Zero: returned a control of shape \(2,\).*\(1,\)",
+        ),
+        (
+            {"controls": lambda t: jnp.zeros(3), "dt": 0.25, "hold": None},
+            r"<lambda>: returned a control of shape \(3,\)",
+        ),
+    ],
+)
+def test_errors(change, words):
+    arguments = dict(system=PENDULUM, controls=U, t0=0.0, t1=1.0, x0=X) | change
+    positional = [arguments.pop(k) for k in ("system", "controls", "t0", "t1", "x0")]
+    with user_error(match=words):
+        dlx.simulate(*positional, **arguments)
+
+
+def test_traced_intervals_are_an_error():
+    f = lambda dt: dlx.simulate(PENDULUM, FEEDBACK, 0.0, 1.0, X, dt=dt).final_state
+    with user_error(match="must be known numbers, not traced ones"):
+        jax.jit(f)(0.1)
