@@ -3,9 +3,10 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from delucax._components import by_components
 from helpers import assert_close, tolerance
 from jax.test_util import check_grads
+
+from delucax._components import by_components
 
 
 @jax.jit

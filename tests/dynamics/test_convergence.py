@@ -1,6 +1,5 @@
 """Observed orders: deterministic under switching controls, and strong ones."""
 
-import delucax as dlx
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -8,6 +7,8 @@ import numpy as np
 import pytest
 from helpers import assert_close, needs_x64
 from scipy.integrate import solve_ivp
+
+import delucax as dlx
 
 
 pytestmark = needs_x64

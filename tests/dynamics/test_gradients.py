@@ -1,11 +1,12 @@
 """Every way to differentiate a closed loop against central differences."""
 
-import delucax as dlx
 import diffrax
 import jax
 import jax.numpy as jnp
 import pytest
 from helpers import assert_close, central_difference, needs_x64
+
+import delucax as dlx
 
 
 pytestmark = needs_x64

@@ -1,4 +1,3 @@
-import delucax as dlx
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -6,6 +5,8 @@ import numpy as np
 import pytest
 from helpers import assert_close, central_difference, needs_x64, tolerance, user_error
 from scipy.signal import cont2discrete
+
+import delucax as dlx
 
 
 A = jnp.array([[1.0, 0.1], [-0.2, 0.9]])
@@ -91,7 +92,9 @@ def test_linearize_keeps_the_operating_point():
 @pytest.mark.parametrize("ours, scipys", [("zoh", "zoh"), ("tustin", "bilinear")])
 def test_c2d_is_scipys(ours, scipys):
     rng = np.random.default_rng(0)
-    continuous = dlx.systems.LinearSystem(rng.normal(size=(4, 4)), rng.normal(size=(4, 2)))
+    continuous = dlx.systems.LinearSystem(
+        rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
+    )
     model = dlx.c2d(continuous, 0.1, ours)
     Ad, Bd, *_ = cont2discrete(
         (continuous.A, continuous.B, np.eye(4), np.zeros((4, 2))), 0.1, scipys

@@ -85,7 +85,6 @@ class Told(dlx.AbstractController):
 # Exact at the switch.
 
 
-@pytest.mark.parametrize("t0, t1, steps", [(0.0, 10.0, 200), (100.0, 101.7, 97)])
 @pytest.mark.parametrize(
     "how",
     [
@@ -95,15 +94,16 @@ class Told(dlx.AbstractController):
     ],
     ids=["fixed", "adaptive", "short steps"],
 )
-def test_switches_are_exact(t0, t1, steps, how):
+def test_switches_are_exact(how):
     """The integral of a held control is known, and one wrong stage would show."""
-    controls = switching(steps)
-    run = dlx.simulate(INTEGRATOR, controls, t0, t1, jnp.zeros(1), **how)
+    controls = switching(97)
     sums = np.cumsum(np.asarray(controls, float)[:, 0])
-    expected = np.concatenate([[0], sums]) * (t1 - t0) / steps
-    ulp = np.finfo(dtype()).eps * t1
-    assert_close(run.states[:, 0], expected, atol=20 * ulp)
-    assert_close(run.controls, controls)
+    for t0, t1 in [(0.0, 3.1), (100.0, 101.7)]:
+        run = dlx.simulate(INTEGRATOR, controls, t0, t1, jnp.zeros(1), **how)
+        expected = np.concatenate([[0], sums]) * (t1 - t0) / 97
+        ulp = np.finfo(dtype()).eps * t1
+        assert_close(run.states[:, 0], expected, atol=20 * ulp)
+        assert_close(run.controls, controls)
 
 
 @pytest.mark.parametrize("count", [1, 7, 200, 997])
@@ -120,7 +120,9 @@ def test_interval_of_a_step(count, t0, t1):
             in_axes=(0, 0, None),
         )
     )
-    below, above = (np.nextafter(grid, end, dtype=grid.dtype) for end in (-9, 999))
+    tiny = np.finfo(grid.dtype).tiny  # below it XLA flushes to zero
+    below = np.where(grid == 0, -tiny, np.nextafter(grid, grid.dtype.type(-9)))
+    above = np.where(grid == 0, tiny, np.nextafter(grid, grid.dtype.type(999)))
     here = np.arange(count)
     for low, high in [
         (grid[:-1], grid[1:]),
@@ -197,8 +199,11 @@ def test_held_disturbances():
 # Feedback.
 
 
-@pytest.mark.parametrize("how", [{"substeps": 2}, {"stepsize_controller": ADAPTIVE}])
-@pytest.mark.parametrize("controller", [FEEDBACK, Told()], ids=["linear", "memory"])
+@pytest.mark.parametrize(
+    "controller, how",
+    [(FEEDBACK, {"stepsize_controller": ADAPTIVE}), (Told(), {"substeps": 2})],
+    ids=["linear", "memory"],
+)
 def test_sampled_feedback_is_that_of_a_rollout(controller, how, key):
     run = dlx.simulate(PENDULUM, controller, 0.0, 1.0, UPRIGHT, dt=0.05, **how)
     dynamics = dlx.Discretized(PENDULUM, 0.05, diffrax.Tsit5(), substeps=8)
@@ -288,15 +293,17 @@ def test_what_a_trajectory_of_it_holds():
 
 
 def test_batches():
-    controls = switching(4)
+    controls, decay = switching(4), np.exp(-0.25)
     starts = jnp.array([[0.5], [1.0], [4.0]])
     run = lambda x0: dlx.simulate(
-        SWITCHED, controls, 0.0, 1.0, x0, stepsize_controller=LOOSE
+        SWITCHED, controls, 0.0, 1.0, x0, stepsize_controller=ADAPTIVE
     )
     batch = jax.vmap(run)(starts)
-    assert batch.batch_shape == (3,) and batch.states.shape == (3, 5, 1)
-    for k in range(3):
-        assert_close(batch[k].states, run(starts[k]).states, rtol=1e-3)
+    assert batch.batch_shape == (3,) and batch.times.shape == (3, 5)
+    x = np.asarray(starts, float)
+    for k in range(4):
+        x = decay * x + (1 - decay) * float(controls[k, 0])
+        assert_close(batch.states[:, k + 1], x, atol=tolerance(1e-4, 1e-8))
 
 
 def test_compiles_once():
@@ -371,7 +378,6 @@ def assert_gradient(arguments, *, rtol=1e-6, forwards=False, **how):
         {"substeps": 2},
         {"adjoint": diffrax.DirectAdjoint(), "solver": diffrax.Heun()},
         {"stepsize_controller": TIGHT},
-        {"stepsize_controller": TIGHT, "adjoint": diffrax.BacksolveAdjoint()},
         {
             "stepsize_controller": TIGHT,
             "adjoint": diffrax.BacksolveAdjoint(
@@ -380,7 +386,7 @@ def assert_gradient(arguments, *, rtol=1e-6, forwards=False, **how):
             "ts": np.array([0.0, 0.03, 0.1, 0.16, 0.2]),
         },
     ],
-    ids=["fixed", "direct", "adaptive", "backsolve", "backsolve between"],
+    ids=["fixed", "direct", "adaptive", "backsolve"],
 )
 def test_gradient_of_open_loop(how):
     assert_gradient((PENDULUM, CONTROLS, HANGING), **how)
@@ -397,8 +403,7 @@ def test_forward_gradient():
 @pytest.mark.parametrize(
     "controller, how",
     [
-        (FEEDBACK, {"stepsize_controller": TIGHT}),
-        (Told(), {"substeps": 2}),
+        (Told(), {"stepsize_controller": TIGHT}),
         (
             FEEDBACK,
             {
@@ -408,7 +413,7 @@ def test_forward_gradient():
             },
         ),
     ],
-    ids=["sampled", "memory", "continuous"],
+    ids=["sampled", "continuous"],
 )
 def test_gradient_of_feedback(controller, how):
     arguments = (PENDULUM, controller, UPRIGHT)
@@ -417,17 +422,21 @@ def test_gradient_of_feedback(controller, how):
 
 @needs_x64
 def test_gradient_with_respect_to_the_end():
-    f = lambda t1: dlx.simulate(INTEGRATOR, CONTROLS, 0.0, t1, jnp.zeros(1)).states[-1]
-    assert_close(jax.grad(lambda t1: f(t1)[0])(0.3), jnp.mean(CONTROLS), rtol=1e-12)
+    def f(t1):
+        how = {"solver": diffrax.Euler()}
+        run = dlx.simulate(INTEGRATOR, CONTROLS, 0.0, t1, jnp.zeros(1), **how)
+        return run.final_state[0]
+
+    assert_close(jax.grad(f)(0.3), jnp.mean(CONTROLS), rtol=1e-12)
 
 
 def test_a_gradient_that_fails_is_loud():
     how = dict(stepsize_controller=LOOSE, adjoint=diffrax.BacksolveAdjoint(max_steps=1))
     f = lambda x0: dlx.simulate(
-        PENDULUM, CONTROLS, 0.0, 2.0, x0, **how
+        SWITCHED, CONTROLS, 0.0, 20.0, x0, **how
     ).final_state.sum()
     with user_error(RuntimeError, match="maximum number of solver steps"):
-        jax.block_until_ready(jax.grad(f)(HANGING))
+        jax.block_until_ready(jax.grad(f)(jnp.ones(1)))
 
 
 # What goes wrong.

@@ -131,7 +131,7 @@ def for_one_step(solver: Any, dtype: Any) -> Any:
     double = dtype == jnp.float64
     rtol, atol = (1e-10, 1e-12) if double else (1e-5, 1e-6)
     if isinstance(finder, diffrax.VeryChord | optx.Chord):
-        finder = _Chord(rtol, atol, finder.linear_solver)
+        finder = _Chord(rtol=rtol, atol=atol, linear_solver=finder.linear_solver)
         return eqx.tree_at(lambda s: s.root_finder, solver, finder)
     values = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
     return eqx.tree_at(

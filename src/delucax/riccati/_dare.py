@@ -281,7 +281,7 @@ def _riccati_jvp(primals, tangents):
     X, iterations = _riccati(*primals)
 
     def equation(*arguments):
-        return _equation(*arguments, X)
+        return _equation(*arguments, X)  # pyright: ignore[reportCallIssue]
 
     _, error_tangent, closed_loop = jax.jvp(equation, primals, tangents, has_aux=True)
     X_tangent = stein(closed_loop, error_tangent)

@@ -80,7 +80,7 @@ class Recorded(NamedTuple):
     control: Array
 
 
-def recorded(t: Array, x: Any, args: Inputs) -> Recorded:
+def recorded(t: Any, x: Any, args: Any) -> Recorded:
     """What is saved of a solve with a held controller."""
     del t
     return x if isinstance(x, Recorded) else Recorded(x, args.u)
@@ -187,10 +187,14 @@ class Hold(diffrax.AbstractWrappedSolver):
         return y1, error, dense_info, (inner, index, held), result
 
     def func(self, terms, t0, y0, args):
-        ahead = jnp.nextafter(t0, jnp.full_like(t0, jnp.inf))
-        return self.solver.func(
-            terms, t0, y0, _at(args, self._interval(terms, t0, ahead))
+        forwards = terms.direction == 1
+        t = jnp.where(forwards, t0, -t0)
+        ahead = jnp.where(
+            forwards,
+            _interval_from(self.switches, t),
+            interval_before(self.switches, t),
         )
+        return self.solver.func(terms, t0, y0, _at(args, ahead))
 
     def _interval(self, terms, t0, t1):
         """The interval that the step from `t0` to `t1` lies in.

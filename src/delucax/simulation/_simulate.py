@@ -10,7 +10,7 @@ import numpy as np
 
 from .._check import as_vector, check_count, is_concrete
 from .._controller import AbstractController
-from .._results import first_failure, promote, RESULTS
+from .._results import choose, first_failure, promote, RESULTS
 from .._typing import PRNGKey
 from ..dynamics._solvers import (
     check_adaptive,
@@ -218,7 +218,7 @@ def simulate(
                 "substeps."
             )
         check_fixed_step(solver, where)
-        max_steps = steps * substeps
+        max_steps = (steps or 1) * substeps
     if progress_meter is None:
         progress_meter = diffrax.NoProgressMeter()
     trajectory = _simulate(
@@ -262,15 +262,18 @@ def _simulate(
     hold,
 ):
     dtype = x0.dtype
-    grid = switches = None
+    grid: Any = None
+    switches: Any = None
     if steps is not None:
         grid = t0 + (t1 - t0) * (jnp.arange(steps * substeps + 1) / (steps * substeps))
         grid = grid.astype(dtype).at[-1].set(t1)
         switches = grid[::substeps]
-    times = switches if ts is None else ts.astype(dtype)
+    times: Any = switches if ts is None else ts.astype(dtype)
 
     sampled = hold == "zero" and isinstance(source, AbstractController)
-    controls = memory = u = None
+    controls: Any = None
+    memory: Any = None
+    u: Any = None
     if isinstance(source, AbstractController):
         memory = source.init(key=key)
         if hold is None and jax.tree.leaves(memory):
@@ -318,7 +321,9 @@ def _simulate(
             if name in backwards:
                 backwards[name] = fit(backwards[name])
         adjoint = diffrax.BacksolveAdjoint(**backwards)
-    saved = dict(t0=True, ts=times[1:]) if ts is None else dict(t1=True, ts=times)
+    saved: dict[str, Any] = (
+        dict(t0=True, ts=times[1:]) if ts is None else dict(t1=True, ts=times)
+    )
     if sampled:
         saved["fn"] = recorded
     solution = diffrax.diffeqsolve(
@@ -336,7 +341,8 @@ def _simulate(
         progress_meter=progress_meter,
         throw=False,
     )
-    states, applied = solution.ys, None
+    states: Any = solution.ys
+    applied: Any = None
     if isinstance(states, Recorded):
         states, applied = states.state, states.control
     final_state = states[-1]
@@ -356,7 +362,7 @@ def _simulate(
     else:
         controls = jax.vmap(args.control)(times[:-1], states[:-1])
     finite = jnp.all(jnp.isfinite(final_state))
-    diverged = RESULTS.where(finite, RESULTS.successful, RESULTS.diverged)
+    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
     sensor = None
     if type(system).observe is not AbstractSystem.observe:
         sensor = jax.vmap(system.observe)(times[:-1], states[:-1])
