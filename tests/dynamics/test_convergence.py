@@ -104,9 +104,8 @@ def test_strong_order(solver, stratonovich, order):
         w = fine.reshape(paths, n, finest // n).sum(axis=2)
         dynamics = dlx.Discretized(Geometric(drift, b), 1 / n, solver)
         zero = jnp.zeros((n, 1))
-        end = jax.vmap(
-            lambda w: dlx.open_loop(dynamics, jnp.ones(1), zero, w[:, None])[-1, 0]
-        )(w)
+        run = jax.vmap(dlx.open_loop, in_axes=(None, None, None, 0))
+        end = run(dynamics, jnp.ones(1), zero, w[..., None])[:, -1, 0]
         errors.append(jnp.sqrt(jnp.mean((end - exact) ** 2)))
     slope = -np.polyfit(np.log(sizes), np.log(np.array(errors)), 1)[0]
     assert abs(slope - order) <= 0.1, (slope, errors)

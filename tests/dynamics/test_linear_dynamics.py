@@ -60,10 +60,11 @@ def test_linearize_is_central_differences():
         dynamics = dlx.Discretized(system, 0.05, solver)
         model = dlx.linearize(dynamics, 0.0, x, u)
         for i in range(2):
-            f = lambda x, i=i: dynamics(0.0, x, u, w)[i]
-            assert_close(model.A[i], central_difference(f, x), atol=1e-8)
-            f = lambda u, i=i: dynamics(0.0, x, u, w)[i]
-            assert_close(model.B[i], central_difference(f, u), atol=1e-8)
+            f = lambda x, u, i=i, d=dynamics: d(0.0, x, u, w)[i]
+            by_x = central_difference(lambda x, f=f: f(x, u), x)
+            by_u = central_difference(lambda u, f=f: f(x, u), u)
+            assert_close(model.A[i], by_x, atol=1e-8)
+            assert_close(model.B[i], by_u, atol=1e-8)
         assert_close(model.E, jnp.eye(2))
         assert_close(model(0.0, x, u), dynamics(0.0, x, u), rtol=1e-14)
         assert model.state_names == ("angle", "velocity")

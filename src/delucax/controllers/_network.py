@@ -109,7 +109,7 @@ class MLP(AbstractController):
     def __call__(self, t, y, state):
         z = y if self.features is None else self.features(y)
         if z.shape != (self.network.in_size,):
-            raise wrong_observation(self, self.network.in_size, z)
+            raise wrong_observation(self, int(self.network.in_size), z)
         u = self.network(z)
         if self.bounds is not None:
             low, high = self.bounds

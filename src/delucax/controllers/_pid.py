@@ -277,7 +277,7 @@ class LeakyPID(AbstractController):
         return _clip(u, self.bounds).astype(y.dtype), _as(after, state)
 
 
-def _as_output(output: Any, where: str) -> Callable[[Array], Array] | None:
+def _as_output(output: Any, where: str) -> Any:
     if output is None or callable(output):
         return output
     if isinstance(output, int | np.integer) and not isinstance(output, bool):
@@ -346,7 +346,8 @@ def _error(pid: Any, t: Any, y: Array) -> tuple[Array, Array]:
             f"{name}: expects {pid.loops} outputs, one a loop, but {what} shape "
             f"{measured.shape}; choose what each loop follows, such as output=0."
         )
-    reference = pid.reference(t) if callable(pid.reference) else pid.reference
+    given: Any = pid.reference
+    reference = given(t) if callable(given) else given
     reference = 0 if reference is None else reference
     if jnp.shape(reference) not in ((), (pid.loops,)):
         raise ValueError(
