@@ -30,7 +30,7 @@ class AbstractConstraint(eqx.Module):
 
     @abc.abstractmethod
     def unconstrain(self, value: Array) -> Array:
-        """The `z` with `constrain(z) == value`."""
+        """The `z` with `constrain(z)` equal to `value`."""
 
     @abc.abstractmethod
     def holds(self, value: Array) -> Array:

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from jax.core import Tracer
 
 from ._qualified import name_of, thing_of
 from ._results import Result
@@ -185,7 +186,7 @@ class _Writer:
             return node if math.isfinite(node) else {"float": repr(node)}
         if type(node) is complex:
             return {"complex": repr(node)}
-        if isinstance(node, jax.core.Tracer):
+        if isinstance(node, Tracer):
             raise ValueError(
                 f"save: {path} is being traced; save outside of jit, grad and vmap."
             )
@@ -414,7 +415,7 @@ class _Reader:
         return narrow
 
 
-def _rebuilt(cls: type, fields: dict[str, Any]) -> Any:
+def _rebuilt(cls: Any, fields: dict[str, Any]) -> Any:
     """An instance without a call of its `__init__`, as Equinox unflattens one."""
     module = object.__new__(cls)
     for name, value in fields.items():

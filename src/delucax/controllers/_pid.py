@@ -347,7 +347,7 @@ def _error(pid: Any, t: Any, y: Array) -> tuple[Array, Array]:
             f"{measured.shape}; choose what each loop follows, such as output=0."
         )
     given: Any = pid.reference
-    reference = given(t) if callable(given) else given
+    reference: Any = given(t) if callable(given) else given
     reference = 0 if reference is None else reference
     if jnp.shape(reference) not in ((), (pid.loops,)):
         raise ValueError(

@@ -27,6 +27,11 @@ class RK4(diffrax.AbstractERK):
     Has no error estimate, so it takes fixed steps. Uses cubic Hermite interpolation
     where Diffrax asks for dense output.
 
+    **Arguments:**
+
+    - `scan_kind`: how Diffrax loops over the stages where it takes the steps itself, as
+        for every `diffrax.AbstractERK`; leave it out.
+
     Source: Kutta, 1901.
 
     !!! example
@@ -51,7 +56,10 @@ class RK4(diffrax.AbstractERK):
     ] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
     def order(self, terms):
-        """The order of convergence, 4."""
+        """The order of convergence, 4.
+
+        **Arguments:** `terms`: not used.
+        """
         del terms
         return 4
 

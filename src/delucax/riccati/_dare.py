@@ -77,9 +77,9 @@ def dare(
 
     Structure-preserving doubling, started at a multiple of the identity: the Riccati
     recursion from a positive final cost, 2, 4, 8, ... steps back. Then Newton steps on
-    the equation itself. It takes products and solves alone, so it runs on accelerators
-    and under `jax.vmap`, where a member that fails harms no other. It is differentiable
-    to any order, in either mode, by the implicit function theorem.
+    the equation itself. It takes products and solves alone, no eigenvalues, which suits
+    accelerators and `jax.vmap`; in a batch, a member that fails harms no other. It is
+    differentiable to any order, in either mode, by the implicit function theorem.
 
     **Arguments:**
 

@@ -37,7 +37,11 @@ class Trajectory(eqx.Module):
     - `total_cost`: the sum of the stage costs and the final cost.
     - `length`: steps until termination, T if there was none.
     - `result`: the first failure, or success; one of `delucax.RESULTS`.
-    - `steps`: T, an int. `dt`: the control interval.
+    - `steps`: T, an int. `dt`: the control interval. `disturbance_size`: k.
+    - `keep`: the names of what was kept.
+    - `recorded_times`, `recorded_observations`, `recorded_disturbances`,
+        `recorded_terminated`: the arrays behind `times`, `observations`,
+        `disturbances` and `terminated` where they do not follow from the rest.
     - `state_names`, `control_names`, `state_units`, `control_units`: tuples of strings.
 
     !!! example

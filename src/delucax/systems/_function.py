@@ -18,6 +18,14 @@ class FunctionSystem(AbstractSystem):
     - `function`: `(t, x, u, w) -> dx/dt`; may itself be an `eqx.Module`, whose arrays
         are then leaves of the system.
     - `state_names`, `control_names`, `disturbance_names`: tuples of strings.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        decay = dlx.system(lambda t, x, u, w: u - x, states=1, controls=1)
+        ```
     """
 
     function: Callable[..., Array] = function_field()
