@@ -454,6 +454,9 @@ def test_paths(tmp_path):
         dlx.save(tmp_path, 1)
     with user_error(FileNotFoundError, match="no_folder.*cannot be written"):
         dlx.save(tmp_path / "no_folder" / "f", 1)
+    (tmp_path / "file").touch()
+    with user_error(NotADirectoryError, match="file.*cannot be written"):
+        dlx.save(tmp_path / "file" / "f", 1)
     dlx.save(str(tmp_path / "text"), 1)
     assert dlx.load(str(tmp_path / "text")) == 1
 

@@ -104,7 +104,7 @@ def test_switches_are_exact(how):
         assert_close(run.controls, controls)
 
 
-@pytest.mark.parametrize("count", [1, 7, 200, 997])
+@pytest.mark.parametrize("count", [1, 200])
 @pytest.mark.parametrize("t0, t1", [(0.0, 10.0), (100.0, 101.7), (-0.3, 0.1)])
 def test_interval_of_a_step(count, t0, t1):
     grid = np.linspace(t0, t1, count + 1).astype(dtype())

@@ -226,11 +226,12 @@ class Discretized(AbstractDynamics):
         else:
             held, added = None, w
 
+        # An adjoint sees what is in `args`, not what a function closes over.
         def field(t, y, args):
-            u, held = args
+            system, u, held = args
             return evaluate_field(system, t, y, u, held)
 
-        args = (u, held)
+        args = (system, u, held)
         if self.is_stochastic:
             x_next, result = self._noisy(field, t, x, args, w)
         elif self.stepsize_controller is not None:
@@ -260,7 +261,7 @@ class Discretized(AbstractDynamics):
         increments = increments.reshape(self.substeps, -1)
         h = self.dt / self.substeps
         g: Any = self.system.diffusion
-        u = args[0]
+        u = args[1]
 
         def step(t, x, dB):
             if type(self.solver) is diffrax.Euler:

@@ -62,14 +62,15 @@ def compressed(frames: Iterable[np.ndarray]) -> list[Image.Image]:
             continue
         changed = np.any(frame != first, axis=-1)
         indices = np.full(frame.shape[:2], CLEAR, np.uint8)
-        image = Image.fromarray(indices)
+        palette: list[int] = []
         if changed.any():
             colours = quantised(Image.fromarray(frame[changed][None]), CLEAR)
             indices[changed] = np.asarray(colours)[0]
-            image = Image.fromarray(indices)
-            image.putpalette(colours.getpalette() or [])
-        else:
-            image.putpalette([0, 0, 0])
+            palette = colours.getpalette() or []
+        image = Image.fromarray(indices)
+        # Filled up to the clear colour: a PNG knows only of those in its palette.
+        entries = 3 * (CLEAR + 1)
+        image.putpalette((palette + [0] * entries)[:entries])
         image.info["transparency"] = CLEAR
         images.append(image)
     return images
