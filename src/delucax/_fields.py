@@ -38,6 +38,17 @@ class AbstractConstraint(eqx.Module):
 
 
 class _Positive(AbstractConstraint):
+    """The constraint `value > 0`: training moves the logarithm, so a step is relative.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        length = dlx.parameter(1.0, constraint=dlx.positive)
+        ```
+    """
+
     def constrain(self, z):
         return _inside(jnp.exp(z), 0.0, np.inf)
 
@@ -66,16 +77,7 @@ def _inside(value: Array, low: float, high: float) -> Array:
 
 
 positive = _Positive()
-"""The constraint `value > 0`: training moves the logarithm, so a step is relative.
-
-!!! example
-
-    ```python
-    import delucax as dlx
-
-    length = dlx.parameter(1.0, constraint=dlx.positive)
-    ```
-"""
+"""The one there is need of."""
 
 
 class bounded(AbstractConstraint):

@@ -4,6 +4,7 @@ The file is three parts: a line with the format, its version and a SHA-256 of th
 a line of JSON that describes the structure; and the bytes of the arrays.
 """
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -79,7 +80,8 @@ def save(path: str | os.PathLike, obj: Any) -> None:
             os.fsync(file.fileno())
         os.replace(beside, path)
     except OSError as error:
-        beside.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            beside.unlink()
         raise type(error)(f"save: '{path}' cannot be written: {error}") from error
 
 

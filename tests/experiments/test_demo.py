@@ -6,18 +6,21 @@ from helpers import needs_x32, user_error
 from PIL import Image
 
 import delucax as dlx
+from delucax import experiments
 from delucax.__main__ import main
 
 
 def test_the_demo_writes_what_it_says(tmp_path):
     lines = []
     out = tmp_path / "new" / "demo"
-    table = dlx.experiments.demo(out, seeds=1, steps=20, say=lines.append)
+    table = experiments.demo(out, seeds=1, steps=20, say=lines.append)
     written = pd.read_csv(out / "table.csv")
     assert list(written["controller"]) == ["zero", "LQR", "linear policy", "MLP"] * 2
     assert len(table) == 8
-    assert Image.open(out / "trajectories.png").size[0] > 500
-    assert Image.open(out / "swing_up.gif").n_frames > 20
+    with Image.open(out / "trajectories.png") as picture:
+        assert picture.size[0] > 500
+    with Image.open(out / "swing_up.gif") as swing:
+        assert swing.n_frames > 20
     policy = dlx.load(out / "mlp.dlx")
     u, _ = policy(0.0, jnp.array([0.1, 0.0]), policy.init())
     assert u.shape == (1,) and abs(u[0]) <= 2
@@ -32,22 +35,22 @@ def test_the_demo_writes_what_it_says(tmp_path):
 def test_an_unwritable_folder_is_an_error_before_any_work(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     with user_error(OSError, match="out must be a folder to write to"):
-        dlx.experiments.demo(tmp_path / "file", say=lambda line: pytest.fail(line))
+        experiments.demo(tmp_path / "file", say=lambda line: pytest.fail(line))
     assert main(["demo", "--out", str(tmp_path / "file")]) == 2
     assert "error: demo: out must be" in capsys.readouterr().err
     with user_error(match="seeds must be at least 1"):
-        dlx.experiments.demo(tmp_path, seeds=0)
+        experiments.demo(tmp_path, seeds=0)
 
 
 @needs_x32
 def test_swings_up_from_unseen_starts():
     env = dlx.make("pendulum")
-    fitted = dlx.experiments.train_swing_up(key=jax.random.key(0), progress=False)
+    fitted = experiments.train_swing_up(key=jax.random.key(0), progress=False)
     keys = jax.random.split(jax.random.key(2**20), 100)
     runs = jax.vmap(
         lambda k: dlx.rollout(env, fitted.model, key=k, horizon=400, keep="states")
     )(keys)
-    assert jnp.sum(dlx.experiments.holds_upright(runs)) >= 95
+    assert jnp.sum(experiments.holds_upright(runs)) >= 95
 
 
 def test_holds_upright_looks_at_the_end_alone():
@@ -56,8 +59,8 @@ def test_holds_upright_looks_at_the_end_alone():
     key = jax.random.key(0)
     upright = dlx.rollout(env, zero, key=key, x0=jnp.zeros(2), horizon=200)
     hanging = dlx.rollout(env, zero, key=key, x0=jnp.array([3.0, 0.0]), horizon=200)
-    assert dlx.experiments.holds_upright(upright)
-    assert not dlx.experiments.holds_upright(hanging)
+    assert experiments.holds_upright(upright)
+    assert not experiments.holds_upright(hanging)
     bare = dlx.rollout(env, zero, key=key, keep=())
     with user_error(match="states kept"):
-        dlx.experiments.holds_upright(bare)
+        experiments.holds_upright(bare)

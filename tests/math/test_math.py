@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers import assert_close, needs_x32, needs_x64
 from jax.test_util import check_grads
+from scipy.stats import kstest
 
 import delucax as dlx
 
@@ -73,3 +74,27 @@ def test_small_products(m, n, key):
 def test_matvec_names_the_shapes():
     with pytest.raises(ValueError, match=r"\(2, 3\).*\(2,\)"):
         dlx.math.matvec(jnp.ones((2, 3)), jnp.ones(2))
+
+
+@needs_x32
+@pytest.mark.parametrize("shape", [(200_001,), (1000, 3, 50)])
+def test_normal_noise_is_normal(shape, key):
+    from delucax.math._normal import normal
+
+    x = np.asarray(normal(key, shape, jnp.float32)).ravel()
+    assert x.shape == (np.prod(shape),) and np.all(np.isfinite(x))
+    statistic = kstest(x, "norm").statistic
+    assert statistic < 1.95 / np.sqrt(x.size)  # 0.1% level
+    assert abs(np.mean(x[:-1] * x[1:])) < 4 / np.sqrt(x.size)
+    half = x.size // 2  # the two halves come of the same uniform numbers
+    assert abs(np.mean(x[:half] ** 2 * x[-half:] ** 2) - 1) < 10 / np.sqrt(half)
+
+
+@needs_x32
+def test_normal_noise_of_any_kind_of_key():
+    from delucax.math._normal import normal
+
+    old = normal(jax.random.PRNGKey(3), (5,), jnp.float32)
+    assert_close(normal(jax.random.key(3), (5,), jnp.float32), old)
+    other = normal(jax.random.key(3, impl="rbg"), (1000,), jnp.float32)
+    assert kstest(np.asarray(other), "norm").pvalue > 1e-3

@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from .._check import check_count, check_positive
 from .._fields import parameter
+from ..math._normal import normal
 from ._base import AbstractDisturbance, common_size
 
 
@@ -45,7 +46,7 @@ class Gaussian(AbstractDisturbance):
         self.std, self.mean = arrays["std"], arrays["mean"]
 
     def sequence(self, key, times):
-        w = jr.normal(_need(key, "Gaussian"), (times.shape[0], self.size), times.dtype)
+        w = normal(_need(key, "Gaussian"), (times.shape[0], self.size), times.dtype)
         return (self.std * w + self.mean).astype(times.dtype)
 
 
@@ -118,7 +119,7 @@ class RandomWalk(AbstractDisturbance):
 
     def sequence(self, key, times):
         shape = (times.shape[0], self.size)
-        e = jr.normal(_need(key, "RandomWalk"), shape, times.dtype)
+        e = normal(_need(key, "RandomWalk"), shape, times.dtype)
         std, bound = self.std.astype(e.dtype), self.bound.astype(e.dtype)
 
         def step(w, e):
@@ -165,7 +166,7 @@ class Brownian(AbstractDisturbance):
         self.size = check_count(size, "size", "Brownian") * self.substeps
 
     def sequence(self, key, times):
-        e = jr.normal(_need(key, "Brownian"), (times.shape[0], self.size), times.dtype)
+        e = normal(_need(key, "Brownian"), (times.shape[0], self.size), times.dtype)
         return (jnp.sqrt(self.dt / self.substeps) * e).astype(times.dtype)
 
 

@@ -26,7 +26,7 @@ from ._solvers import (
     check_adaptive,
     check_fixed_step,
     check_solver,
-    for_one_step,
+    for_fixed_steps,
     loud,
 )
 
@@ -71,7 +71,8 @@ class Discretized(AbstractDynamics):
         `None` for fixed steps.
     - `adjoint`: any `diffrax.AbstractAdjoint`; `diffrax.RecursiveCheckpointAdjoint()`
         by default. Needs a `stepsize_controller`: fixed steps are differentiated as
-        they are written.
+        they are written. `diffrax.BacksolveAdjoint()` has no gradient with respect to
+        `dt`, and raises if one is asked for.
     - `max_steps`: the most adaptive steps in an interval, 256 by default.
 
     **Raises:** `ValueError` if `dt` is not positive, if `solver` does not fit the
@@ -226,37 +227,32 @@ class Discretized(AbstractDynamics):
         else:
             held, added = None, w
 
-        # An adjoint sees what is in `args`, not what a function closes over.
-        def field(t, y, args):
-            system, u, held = args
-            return evaluate_field(system, t, y, u, held)
-
         args = (system, u, held)
         if self.is_stochastic:
-            x_next, result = self._noisy(field, t, x, args, w)
+            x_next, result = self._noisy(t, x, args, w)
         elif self.stepsize_controller is not None:
-            x_next, result = self._adaptive(field, t, x, args)
+            x_next, result = self._adaptive(t, x, args)
         else:
-            x_next, result = self._fixed(field, t, x, args)
+            x_next, result = self._fixed(t, x, args)
         x_next = system.project(x_next)
         if added is not None:
             x_next = x_next + added
         return x_next.astype(x.dtype), result
 
-    def _fixed(self, field, t, x, args):
+    def _fixed(self, t, x, args):
         tableau = tableau_of(self.solver)
-        solver = for_one_step(self.solver, x.dtype) if tableau is None else None
+        solver = for_fixed_steps(self.solver) if tableau is None else None
         h = self.dt / self.substeps
 
         def step(t, x, _):
             if tableau is None:
-                return _solver_step(solver, diffrax.ODETerm(field), t, x, h, args)
-            rhs = lambda t, y: field(t, y, args)
+                return _solver_step(solver, diffrax.ODETerm(_field), t, x, h, args)
+            rhs = lambda t, y: _field(t, y, args)
             return runge_kutta_step(tableau, rhs, t, x, h), RESULTS.successful
 
         return self._substep(step, t, x, None)
 
-    def _noisy(self, field, t, x, args, w):
+    def _noisy(self, t, x, args, w):
         increments = zeros_if_none(w, self.disturbance_size, x)
         increments = increments.reshape(self.substeps, -1)
         h = self.dt / self.substeps
@@ -266,8 +262,8 @@ class Discretized(AbstractDynamics):
         def step(t, x, dB):
             if type(self.solver) is diffrax.Euler:
                 noise = _apply(g(t, x, u), dB)
-                return x + h * field(t, x, args) + noise, RESULTS.successful
-            term = diffrax.MultiTerm(diffrax.ODETerm(field), _BrownianTerm(g, u, dB))
+                return x + h * _field(t, x, args) + noise, RESULTS.successful
+            term = diffrax.MultiTerm(diffrax.ODETerm(_field), _BrownianTerm(g, u, dB))
             return _solver_step(self.solver, term, t, x, h, args)
 
         return self._substep(step, t, x, increments)
@@ -288,11 +284,11 @@ class Discretized(AbstractDynamics):
         parts, results = lax.scan(body, split_state(x), xs)
         return join_state(parts, x.shape[0]), first_of(results)
 
-    def _adaptive(self, field, t, x, args):
+    def _adaptive(self, t, x, args):
         assert self.stepsize_controller is not None and self.adjoint is not None
         t0 = jnp.asarray(t, x.dtype)
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(field),
+            diffrax.ODETerm(_field),
             self.solver,
             t0,
             t0 + self.dt,
@@ -341,6 +337,14 @@ class _BrownianTerm(diffrax.AbstractTerm):
 
     def prod(self, vf, control):
         return _apply(vf, control)
+
+
+def _field(t, x, args):
+    """The vector field. An adjoint sees what is in `args`, not what a function closes
+    over.
+    """
+    system, u, held = args
+    return evaluate_field(system, t, x, u, held)
 
 
 def evaluate_field(system: AbstractSystem, t: Any, x: Array, u: Array, w: Any) -> Array:

@@ -5,6 +5,7 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax.lax as lax
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
@@ -65,6 +66,53 @@ def _check_implicit(solver: diffrax.AbstractSolver, where: str) -> None:
         )
 
 
+class AbstractTransparentSolver(diffrax.AbstractWrappedSolver):
+    """A solver around another, which Diffrax sees through."""
+
+    solver: eqx.AbstractVar[diffrax.AbstractSolver]
+
+    @property
+    def term_structure(self):
+        return self.solver.term_structure
+
+    @property
+    def term_compatible_contr_kwargs(self):
+        return self.solver.term_compatible_contr_kwargs
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.solver.interpolation_cls
+
+    # Diffrax looks for these on what passes for an implicit or Runge-Kutta solver.
+
+    @property
+    def root_finder(self):
+        return self.solver.root_finder  # pyright: ignore
+
+    @property
+    def root_find_max_steps(self):
+        return self.solver.root_find_max_steps  # pyright: ignore
+
+    @property
+    def scan_kind(self):
+        return self.solver.scan_kind  # pyright: ignore
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def strong_order(self, terms):
+        return self.solver.strong_order(terms)
+
+    def error_order(self, terms):
+        return self.solver.error_order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def func(self, terms, t0, y0, args):
+        return self.solver.func(terms, t0, y0, args)
+
+
 class _Chord(optx.AbstractRootFinder):
     """Diffrax's chord method, which iterates until it has converged.
 
@@ -72,8 +120,8 @@ class _Chord(optx.AbstractRootFinder):
     shorter step. Fixed steps have none, so this one goes on while it contracts.
     """
 
-    rtol: float
-    atol: float
+    rtol: Any
+    atol: Any
     linear_solver: lx.AbstractLinearSolver
     norm: Callable[[PyTree], Scalar] = optx.rms_norm
 
@@ -110,36 +158,68 @@ class _Chord(optx.AbstractRootFinder):
         return self._chord.postprocess(fn, y, aux, args, options, state, tags, result)
 
 
-def for_one_step(solver: Any, dtype: Any) -> Any:
-    """An implicit solver that works outside `diffeqsolve`: differentiable both ways,
-    and with a root finder of its own where it would take a step-size controller's
-    tolerances.
+class _FixedStep(AbstractTransparentSolver):
+    """An implicit solver that needs no step-size controller for its tolerances.
+
+    What is solved for is a slope, or its product with the step. Where the field is
+    stiff rounding of the state alone makes slopes rough, so the tolerance is that of
+    the state: relative to it, whatever the slope.
+    """
+
+    solver: diffrax.AbstractSolver
+
+    @property
+    def root_finder(self):
+        return self._with_tolerances(1.0).root_finder
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        rtol, atol = _tolerances(y0.dtype)
+        scale = lax.stop_gradient(atol + rtol * jnp.abs(y0))
+        tableau = getattr(self.solver, "tableau", None)
+        if tableau is not None and tableau.fsal:  # then Diffrax solves for the slope
+            scale = scale / lax.stop_gradient(t1 - t0)
+        solver = self._with_tolerances(scale, rtol)
+        return solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+
+    def _with_tolerances(self, atol: Any, rtol: float = 1e-3) -> Any:
+        finder = self.solver.root_finder  # pyright: ignore
+        if isinstance(finder, diffrax.VeryChord | optx.Chord):
+            finder = _Chord(rtol=rtol, atol=atol, linear_solver=finder.linear_solver)
+        else:
+            values = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
+            names = _unset(finder)
+            finder = eqx.tree_at(
+                lambda f: [getattr(f, name) for name in names],
+                finder,
+                [values[name] for name in names],
+                is_leaf=lambda leaf: leaf is getattr(finder, names[0]),
+            )
+        return eqx.tree_at(lambda s: s.root_finder, self.solver, finder)
+
+
+def _tolerances(dtype: Any) -> tuple[float, float]:
+    return (1e-10, 1e-12) if dtype == jnp.float64 else (1e-5, 1e-6)
+
+
+def _unset(finder: Any) -> list[str]:
+    """The tolerances that a root finder leaves to a step-size controller."""
+    # Diffrax's mark for them has no public name.
+    return [
+        name
+        for name in ("rtol", "atol", "norm")
+        if "stepsize" in repr(getattr(finder, name, None)).replace("_", "")
+    ]
+
+
+def for_fixed_steps(solver: Any) -> Any:
+    """An implicit solver that works without a step-size controller and outside of
+    `diffeqsolve`, and can be differentiated both ways there.
     """
     if getattr(solver, "scan_kind", "bounded") is None:
         solver = eqx.tree_at(
             lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None
         )
-    finder = solver.root_finder
-    # Diffrax's mark for a tolerance that is yet to come has no public name.
-    names = [
-        name
-        for name in ("rtol", "atol", "norm")
-        if "stepsize" in repr(getattr(finder, name, None)).replace("_", "")
-    ]
-    if not names:
-        return solver
-    double = dtype == jnp.float64
-    rtol, atol = (1e-10, 1e-12) if double else (1e-5, 1e-6)
-    if isinstance(finder, diffrax.VeryChord | optx.Chord):
-        finder = _Chord(rtol=rtol, atol=atol, linear_solver=finder.linear_solver)
-        return eqx.tree_at(lambda s: s.root_finder, solver, finder)
-    values = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
-    return eqx.tree_at(
-        lambda s: [getattr(s.root_finder, name) for name in names],
-        solver,
-        [values[name] for name in names],
-        is_leaf=lambda leaf: leaf is getattr(finder, names[0]),
-    )
+    return _FixedStep(solver) if _unset(solver.root_finder) else solver
 
 
 def loud(adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractAdjoint:

@@ -58,11 +58,11 @@ def demo(
     !!! example
 
         ```python
-        import delucax as dlx
         import tempfile
+        from delucax import experiments
 
         with tempfile.TemporaryDirectory() as folder:
-            table = dlx.experiments.demo(folder, seeds=1, steps=20)
+            table = experiments.demo(folder, seeds=1, steps=20)
         ```
     """
     import pandas as pd

@@ -48,10 +48,10 @@ def train_swing_up(
     !!! example
 
         ```python
-        import delucax as dlx
         import jax
+        from delucax import experiments
 
-        fitted = dlx.experiments.train_swing_up(key=jax.random.key(0), steps=20)
+        fitted = experiments.train_swing_up(key=jax.random.key(0), steps=20)
         ```
     """
     environment = pendulum() if environment is None else environment
@@ -106,11 +106,12 @@ def holds_upright(
         ```python
         import delucax as dlx
         import jax
+        from delucax import experiments
 
         env = dlx.make("pendulum")
         zero = dlx.controllers.Zero(1)
         trajectory = dlx.rollout(env, zero, key=jax.random.key(0))
-        dlx.experiments.holds_upright(trajectory)
+        experiments.holds_upright(trajectory)
         ```
     """
     if trajectory.states is None:

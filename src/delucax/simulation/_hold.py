@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from .._controller import AbstractController
 from ..dynamics._discretized import evaluate_field
+from ..dynamics._solvers import AbstractTransparentSolver
 from ..systems import AbstractSystem
 
 
@@ -102,7 +103,7 @@ class _Ends(diffrax.AbstractLocalInterpolation):
         return x if self.held is None else Recorded(x, self.held)
 
 
-class Hold(diffrax.AbstractWrappedSolver):
+class Hold(AbstractTransparentSolver):
     """A solver of which each step uses the control of the interval that it lies in.
 
     The times of a step's stages do not tell the interval: its last stage is at the
@@ -121,14 +122,6 @@ class Hold(diffrax.AbstractWrappedSolver):
     sampled: bool = eqx.field(static=True)
 
     @property
-    def term_structure(self):
-        return self.solver.term_structure
-
-    @property
-    def term_compatible_contr_kwargs(self):
-        return self.solver.term_compatible_contr_kwargs
-
-    @property
     def interpolation_cls(self):  # pyright: ignore[reportIncompatibleMethodOverride]
         inside = self.solver.interpolation_cls
 
@@ -136,29 +129,6 @@ class Hold(diffrax.AbstractWrappedSolver):
             return _Ends(t0, t1, inside(t0=t0, t1=t1, **inner), end, held)
 
         return ends
-
-    # Diffrax looks for these on what passes for a Runge-Kutta or implicit solver.
-
-    @property
-    def root_finder(self):
-        return self.solver.root_finder  # pyright: ignore
-
-    @property
-    def root_find_max_steps(self):
-        return self.solver.root_find_max_steps  # pyright: ignore
-
-    @property
-    def scan_kind(self):
-        return self.solver.scan_kind  # pyright: ignore
-
-    def order(self, terms):
-        return self.solver.order(terms)
-
-    def strong_order(self, terms):
-        return self.solver.strong_order(terms)
-
-    def error_order(self, terms):
-        return self.solver.error_order(terms)
 
     def init(self, terms, t0, t1, y0, args):
         args = _at(args, self._interval(terms, t0, t1))

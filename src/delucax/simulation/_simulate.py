@@ -16,7 +16,7 @@ from ..dynamics._solvers import (
     check_adaptive,
     check_fixed_step,
     check_solver,
-    for_one_step,
+    for_fixed_steps,
     loud,
 )
 from ..systems import AbstractSystem
@@ -94,8 +94,9 @@ def simulate(
     - `substeps`: fixed steps an interval, 1 by default.
     - `adjoint`: any of `diffrax.RecursiveCheckpointAdjoint()` (default),
         `diffrax.DirectAdjoint()`, `diffrax.ForwardMode()`, or
-        `diffrax.BacksolveAdjoint()`, which needs a `stepsize_controller` and takes no
-        held controller, whose memory cannot be run backwards.
+        `diffrax.BacksolveAdjoint()`, which needs a `stepsize_controller`, takes no
+        held controller, whose memory cannot be run backwards, and raises if a gradient
+        with respect to `t0` or `t1` is asked for.
     - `max_steps`: the most adaptive steps over the horizon; by default 4096, or 64 an
         interval if that is more.
     - `ts`: the times to save at, increasing and between `t0` and `t1`; by default the
@@ -312,7 +313,7 @@ def _simulate(
     if stepsize_controller is None:
         stepsize_controller = diffrax.StepTo(grid)
         if isinstance(solver, diffrax.AbstractImplicitSolver):
-            solver = for_one_step(solver, dtype)
+            solver = for_fixed_steps(solver)
     else:
         stepsize_controller = clipped(stepsize_controller)
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
