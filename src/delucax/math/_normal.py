@@ -7,6 +7,7 @@ package, all of which run in vector registers.
 """
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from .._typing import PRNGKey
 from ._trig import cos, sin
 
 
-def normal(key: PRNGKey, shape: tuple[int, ...], dtype: object) -> Array:
+def normal(key: PRNGKey, shape: tuple[int, ...], dtype: Any) -> Array:
     """Independent standard normal numbers; single precision reaches 5.9 deviations.
 
     In other precisions it is `jax.random.normal`.
