@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import assert_close, tolerance
+from helpers import assert_close, needs_x64, tolerance
 from jax.test_util import check_grads
 
 from delucax._components import by_components
@@ -91,7 +91,7 @@ def test_the_gradient_does_not_pad():
     assert "pad[" not in program(by_components(loss))
 
 
-@pytest.mark.skipif(not jax.config.jax_enable_x64, reason="float64 only")
+@needs_x64
 def test_check_grads():
     x, A, s = _arguments()
     f = by_components(lambda x: _everything(x, A, s)["n"])
