@@ -29,7 +29,7 @@ class UserPendulum(dlx.AbstractDynamics):
     def advance(self, t, x, u, w):
         angle, speed = x
         acceleration = 1.5 * self.gravity * dlx.math.sin(angle) + 3 * u[0]
-        speed = jnp.clip(speed + acceleration * self.dt, -MAX_SPEED, MAX_SPEED)
+        speed = dlx.math.clip(speed + acceleration * self.dt, -MAX_SPEED, MAX_SPEED)
         x_next = jnp.stack([angle + speed * self.dt, speed])
         return x_next if w is None else x_next + w, dlx.RESULTS.successful
 

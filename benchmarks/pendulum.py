@@ -27,13 +27,14 @@ from benchmarks._timing import Contender, Missing, race, Timing
 
 
 RESULTS = Path(__file__).parent / "results"
-RAW = "raw, delucax sine"
+RAW = "raw, delucax.math"
+OURS = raw.Numerics(dlx.math.sin, dlx.math.clip)
 
 
 def entries(case: Case) -> list[Contender | Missing]:
     """Everyone who can take part in a case."""
     found: list[Contender | Missing] = [
-        raw.contender(case, sin=dlx.math.sin, name=RAW),
+        raw.contender(case, numerics=OURS, name=RAW),
         raw.contender(case),
         _ours.contender(case),
     ]
@@ -42,12 +43,12 @@ def entries(case: Case) -> list[Contender | Missing]:
         env = _ours.environment(case, dynamics=diffrax_step)
         found.append(_ours.contender(case, name="delucax, Diffrax step", env=env))
     if case.workload == "gradient":
-        kept = functools.partial(raw.contender, sin=dlx.math.sin, checkpoint=True)
+        kept = functools.partial(raw.contender, numerics=OURS, checkpoint=True)
         found.append(kept(case, name=f"{RAW}, checkpoint"))
         found.append(_ours.contender(case, name="delucax, stored", checkpoint=None))
         # What a gradient is measured against: the cost alone, forward.
         forward = Case("trajectory", case.steps, case.lanes, case.method)
-        found.append(raw.contender(forward, sin=dlx.math.sin, name=f"{RAW}, forward"))
+        found.append(raw.contender(forward, numerics=OURS, name=f"{RAW}, forward"))
     if case.method == "gym" and case.workload in ("trajectory", "cost"):
         user = _ours.environment(case, dynamics=_ours.UserPendulum())
         found.append(_ours.contender(case, name="delucax, user's pendulum", env=user))

@@ -8,7 +8,7 @@ once to carry it and once to keep it.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,13 +30,23 @@ from benchmarks._timing import compiled, Contender
 
 NAME = "raw lax.scan"
 
-Sine = Callable[[jax.Array], jax.Array]
 State = tuple[jax.Array, jax.Array]
 
 
-def acceleration(angle: jax.Array, torque: Any, sin: Sine) -> jax.Array:
+class Numerics(NamedTuple):
+    """The functions that XLA compiles badly on CPU, and so are worth choosing."""
+
+    sin: Callable[[jax.Array], jax.Array] = jnp.sin
+    clip: Callable[[jax.Array, float, float], jax.Array] = jnp.clip
+
+
+PLAIN = Numerics()
+
+
+def acceleration(angle: jax.Array, torque: Any, numerics: Numerics) -> jax.Array:
     """Angular acceleration of the pendulum."""
-    return 3 * GRAVITY / (2 * LENGTH) * sin(angle) + 3.0 / (MASS * LENGTH**2) * torque
+    weight = 3 * GRAVITY / (2 * LENGTH) * numerics.sin(angle)
+    return weight + 3.0 / (MASS * LENGTH**2) * torque
 
 
 def wrap(angle: jax.Array) -> jax.Array:
@@ -50,22 +60,22 @@ def stage_cost(state: State, torque: jax.Array) -> jax.Array:
     return wrap(angle) ** 2 + 0.1 * speed**2 + 0.001 * torque**2
 
 
-def gym_step(state: State, torque: Any, sin: Sine) -> State:
+def gym_step(state: State, torque: Any, numerics: Numerics) -> State:
     """Gymnasium's semi-implicit Euler step with its bound on the speed."""
     angle, speed = state
-    speed = speed + acceleration(angle, torque, sin) * DT
-    speed = jnp.clip(speed, -MAX_SPEED, MAX_SPEED)
+    speed = speed + acceleration(angle, torque, numerics) * DT
+    speed = numerics.clip(speed, -MAX_SPEED, MAX_SPEED)
     return angle + speed * DT, speed
 
 
-def rk4_step(state: State, torque: Any, sin: Sine) -> State:
+def rk4_step(state: State, torque: Any, numerics: Numerics) -> State:
     """One classical Runge-Kutta step of the ODE, the torque held."""
     angle, speed = state
     half = 0.5 * DT
-    v1, a1 = speed, acceleration(angle, torque, sin)
-    v2, a2 = speed + half * a1, acceleration(angle + half * v1, torque, sin)
-    v3, a3 = speed + half * a2, acceleration(angle + half * v2, torque, sin)
-    v4, a4 = speed + DT * a3, acceleration(angle + DT * v3, torque, sin)
+    v1, a1 = speed, acceleration(angle, torque, numerics)
+    v2, a2 = speed + half * a1, acceleration(angle + half * v1, torque, numerics)
+    v3, a3 = speed + half * a2, acceleration(angle + half * v2, torque, numerics)
+    v4, a4 = speed + DT * a3, acceleration(angle + DT * v3, torque, numerics)
     sixth = DT / 6
     return (
         angle + sixth * (v1 + 2 * (v2 + v3) + v4),
@@ -73,7 +83,7 @@ def rk4_step(state: State, torque: Any, sin: Sine) -> State:
     )
 
 
-def tsit5_step(state: State, torque: Any, sin: Sine) -> State:
+def tsit5_step(state: State, torque: Any, numerics: Numerics) -> State:
     """One Tsit5 step by Diffrax's own `Tsit5().step`, the torque held.
 
     The state is an array here, as Diffrax's users write it. The torque jumps at every
@@ -83,7 +93,7 @@ def tsit5_step(state: State, torque: Any, sin: Sine) -> State:
     import diffrax
 
     def field(t: Any, y: jax.Array, args: Any) -> jax.Array:
-        return jnp.stack([y[1], acceleration(y[0], args, sin)])
+        return jnp.stack([y[1], acceleration(y[0], args, numerics)])
 
     y = jnp.stack(state)
     solver_state = (True, jnp.zeros_like(y))
@@ -97,7 +107,7 @@ STEPS = {"gym": gym_step, "rk4": rk4_step, "tsit5": tsit5_step}
 
 
 def program(
-    case: Case, *, sin: Sine = jnp.sin, checkpoint: bool = False
+    case: Case, *, numerics: Numerics = PLAIN, checkpoint: bool = False
 ) -> Callable[[jax.Array, jax.Array, jax.Array], Any]:
     """The function of `(gain, angle, speed)` to compile for a case.
 
@@ -115,8 +125,8 @@ def program(
 
     def controlled(gain: jax.Array, state: State) -> tuple[State, jax.Array, jax.Array]:
         torque = -(gain[0] * state[0] + gain[1] * state[1])
-        torque = jnp.clip(torque, -MAX_TORQUE, MAX_TORQUE)
-        return advance(state, torque, sin), torque, stage_cost(state, torque)
+        torque = numerics.clip(torque, -MAX_TORQUE, MAX_TORQUE)
+        return advance(state, torque, numerics), torque, stage_cost(state, torque)
 
     if checkpoint:
         controlled = jax.checkpoint(controlled)
@@ -140,7 +150,7 @@ def program(
 
     def free(gain: jax.Array, angle: jax.Array, speed: jax.Array) -> State:
         def body(state: State, _: None) -> Any:
-            return advance(state, 0.0, sin), None
+            return advance(state, 0.0, numerics), None
 
         return lax.scan(body, (angle, speed), None, case.steps)[0]
 
@@ -166,12 +176,12 @@ def program(
 def contender(
     case: Case,
     *,
-    sin: Sine = jnp.sin,
+    numerics: Numerics = PLAIN,
     checkpoint: bool = False,
     name: str = NAME,
 ) -> Contender:
     """Compile the case and return it ready to race; the options are `program`'s."""
-    function = program(case, sin=sin, checkpoint=checkpoint)
+    function = program(case, numerics=numerics, checkpoint=checkpoint)
     gain = np.asarray(GAIN, np.float32)
     return compiled(name, case.total_steps, function, gain, *case.starts())
 

@@ -115,3 +115,9 @@ def test_a_solver_swaps_the_arithmetic():
 def test_bad_arguments(arguments, match):
     with pytest.raises(ValueError, match=match):
         dlx.make("pendulum", **arguments)
+
+
+def test_it_runs_in_the_precision_of_the_session():
+    env = dlx.make("pendulum")
+    run = dlx.rollout(env, dlx.controllers.Zero(1), key=jax.random.key(0), horizon=2)
+    assert run.states.dtype == jnp.zeros(()).dtype

@@ -98,3 +98,15 @@ def test_normal_noise_of_any_kind_of_key():
     assert_close(normal(jax.random.key(3), (5,), jnp.float32), old)
     other = normal(jax.random.key(3, impl="rbg"), (1000,), jnp.float32)
     assert kstest(np.asarray(other), "norm").pvalue > 1e-3
+
+
+def test_clip():
+    x = jnp.array([-3.0, -2.0, 0.5, 2.0, 3.0, jnp.nan])
+    assert_close(dlx.math.clip(x, -2.0, 2.0), jnp.clip(x, -2.0, 2.0))
+    assert_close(dlx.math.clip(x, -jnp.inf, 1.0), jnp.clip(x, None, 1.0))
+    assert dlx.math.clip(x, -2, 2).dtype == x.dtype
+    slopes = jax.vmap(jax.grad(dlx.math.clip, (0, 1, 2)), in_axes=(0, None, None))
+    inside, at_low, at_high = slopes(x[:-1], -2.0, 2.0)
+    assert_close(inside, [0.0, 1.0, 1.0, 1.0, 0.0])
+    assert_close(at_low, [1.0, 0.0, 0.0, 0.0, 0.0])
+    assert_close(at_high, [0.0, 0.0, 0.0, 0.0, 1.0])

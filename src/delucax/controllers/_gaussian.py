@@ -13,6 +13,7 @@ from .._check import as_bounds
 from .._controller import AbstractController
 from .._fields import as_float_array, weight
 from .._typing import PRNGKey, RealScalar
+from ..math import clip
 from ..simulation import Trajectory
 
 
@@ -103,7 +104,7 @@ class Gaussian(AbstractController):
         mean, base = self._mean(t, y, state)
         key, now = jr.split(state.key)
         u = mean + jnp.exp(self.log_std) * jr.normal(now, mean.shape, mean.dtype)
-        u = u if self.bounds is None else jnp.clip(u, *self.bounds)
+        u = u if self.bounds is None else clip(u, *self.bounds)
         return u.astype(mean.dtype), _State(base, key)
 
     def applied(self, u, cost, state):

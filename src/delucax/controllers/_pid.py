@@ -19,7 +19,7 @@ from .._fields import (
     positive,
     weight,
 )
-from ..math import matvec
+from ..math import clip, matvec
 
 
 class _Select(eqx.Module):
@@ -358,7 +358,7 @@ def _error(pid: Any, t: Any, y: Array) -> tuple[Array, Array]:
 
 
 def _clip(u: Array, bounds: tuple[Array, Array] | None) -> Array:
-    return u if bounds is None else jnp.clip(u, *bounds)
+    return u if bounds is None else clip(u, *bounds)
 
 
 def _as(after: Any, before: Any) -> Any:

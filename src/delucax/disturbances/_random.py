@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from .._check import check_count, check_positive
 from .._fields import parameter
+from ..math import clip
 from ..math._normal import normal
 from ._base import AbstractDisturbance, common_size
 
@@ -123,7 +124,7 @@ class RandomWalk(AbstractDisturbance):
         std, bound = self.std.astype(e.dtype), self.bound.astype(e.dtype)
 
         def step(w, e):
-            w = jnp.clip(w + std * e, -bound, bound)
+            w = clip(w + std * e, -bound, bound)
             return w, w
 
         return lax.scan(step, jnp.zeros(self.size, e.dtype), e)[1]

@@ -14,11 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._fence import fence
 from .._typing import RealScalar
 
 
 COMPONENTS_UP_TO = 16
 """States larger than this are combined as whole arrays, to keep programs short."""
+STACKED_FIRST_UP_TO = 6
+"""Trajectories of more components are extended before they are stacked."""
 
 
 class RK4(diffrax.AbstractERK):
@@ -103,7 +106,7 @@ def runge_kutta_step(
     for row, node in zip(rows, nodes, strict=True):
         stage = join(_combine(base, row, slopes, h), split)
         slope = field(t + node * h, stage)
-        slopes.append(tuple(slope) if split else (slope,))
+        slopes.append(fence(*slope) if split else (slope,))
     return join(_combine(base, weights, slopes, h), split).astype(x.dtype)
 
 
@@ -136,11 +139,17 @@ def stack_steps(
 ) -> Array:
     """Vectors over time, shape `(T, size)`, from the components of each step.
 
-    `last` is put behind them, component by component: under `vmap` the transposition
-    that follows is then several times faster than that of a concatenated array. (And a
-    loop that keeps the state before each step, not the one after it, does not tempt XLA
-    to compute the step twice, once to carry it and once to keep it.)
+    `last` is put behind them: of a few components when they are one array, of more
+    one by one, which is what a batch on CPU transposes fastest. (And a loop that keeps
+    the state before each step, not the one after it, does not tempt XLA to compute the
+    step twice, once to carry it and once to keep it.)
     """
+    if size <= STACKED_FIRST_UP_TO:
+        # A reshape of one component is free, where a stack would copy it.
+        steps = parts[0][:, None] if size == 1 else jnp.stack(parts, axis=1)
+        if last:
+            steps = jnp.concatenate([steps, jnp.stack(last)[None].astype(steps.dtype)])
+        return steps
     if last:
         parts = tuple(
             jnp.concatenate([a, b[None].astype(a.dtype)])

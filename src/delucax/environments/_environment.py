@@ -17,6 +17,7 @@ from .._typing import PRNGKey, RealScalar
 from ..costs import AbstractCost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics
+from ..math import clip
 
 
 class Step(NamedTuple):
@@ -260,7 +261,7 @@ class Environment(eqx.Module):
         if self.control_bounds is None:
             return u
         low, high = self.control_bounds
-        return jnp.clip(u, low, high).astype(u.dtype)
+        return clip(u, low, high).astype(u.dtype)
 
     def step(
         self, t: RealScalar, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None

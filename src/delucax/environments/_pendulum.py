@@ -12,7 +12,7 @@ from .._fields import parameter, positive
 from .._results import RESULTS
 from ..costs import PendulumCost
 from ..dynamics import AbstractDynamics, Discretized
-from ..math import cos, sin
+from ..math import clip, cos, sin
 from ..systems import Pendulum
 from ._environment import Environment, UniformState
 
@@ -64,7 +64,7 @@ class GymPendulum(AbstractDynamics):
         angle, velocity = x[0], x[1]
         acceleration = self.system.acceleration(angle, velocity, u[0])
         velocity = velocity + acceleration * self.dt
-        velocity = jnp.clip(velocity, -self.max_speed, self.max_speed)
+        velocity = clip(velocity, -self.max_speed, self.max_speed)
         angle = angle + velocity * self.dt
         x_next = jnp.stack([angle, velocity])
         if w is not None:
@@ -152,7 +152,7 @@ def pendulum(
         dynamics = GymPendulum(system=system, dt=dt, max_speed=max_speed)
     else:
         dynamics = Discretized(system, dt, solver, substeps)
-    corner = np.array([np.pi, 1.0], np.float32)
+    corner = np.array([np.pi, 1.0])
     arguments: dict[str, Any] = dict(
         dynamics=dynamics,
         cost=PendulumCost(),

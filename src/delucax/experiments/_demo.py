@@ -26,7 +26,7 @@ from ._swing_up import BATCH, holds_upright, HORIZON, STEPS, train_swing_up
 
 EVALUATION_STEPS = 400
 STARTS = 100
-_SHOCK = Shock(np.array([0.0, 0.3], np.float32), start=10.0, duration=0.5)
+_SHOCK = Shock(np.array([0.0, 0.3]), start=10.0, duration=0.5)
 
 
 def demo(
@@ -158,7 +158,7 @@ def _writable(out: Path) -> Path:
 
 def _train_linear() -> Linear:
     """The policy optimisation of the paper: one start, hanging; torque +-10."""
-    env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0], np.float32))
+    env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
     mean_cost = expected_cost(env, batch=1, horizon=50)
 
     def loss(controller, key):

@@ -74,7 +74,7 @@ def train_swing_up(
 
 def _spread(environment: Environment) -> Environment:
     """Starts over all angles and speeds, so that no part of the swing is new."""
-    corner = jnp.asarray(np.array([np.pi, 8.0], np.float32))
+    corner = jnp.asarray(np.array([np.pi, 8.0]))
     starts = {"initial_state.low": -corner, "initial_state.high": corner}
     return replace(environment, starts)
 
