@@ -54,6 +54,24 @@ def test_missing_matplotlib_says_how_to_get_it():
     """)
 
 
+def test_missing_pandas_says_how_to_get_it():
+    python("""
+        import sys
+        sys.modules["pandas"] = None
+        import delucax as dlx
+        import jax
+
+        env, zero = dlx.make("pendulum"), dlx.controllers.Zero(1)
+        run = dlx.rollout(env, zero, key=jax.random.key(0), horizon=3)
+        try:
+            run.to_pandas()
+        except ImportError as error:
+            assert 'pip install "delucax[tables]"' in str(error), error
+        else:
+            raise AssertionError("a table was made")
+    """)
+
+
 def test_names_are_those_of_the_package():
     assert dlx.plot is dlx.plotting.plot
     assert dlx.animate is dlx.plotting.animate

@@ -13,6 +13,7 @@ import numpy as np
 import optax
 
 from .. import plotting
+from .._extras import extra
 from .._paths import replace
 from .._serialise import save
 from ..controllers import Linear, LQR, Zero
@@ -65,7 +66,7 @@ def demo(
             table = experiments.demo(folder, seeds=1, steps=20)
         ```
     """
-    import pandas as pd
+    pd = extra("pandas", "demo")
 
     if seeds < 1:
         raise ValueError(f"demo: seeds must be at least 1, got {seeds}.")

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import is_concrete
+from .._extras import extra
 from .._results import Result, RESULTS
 
 
@@ -176,7 +177,7 @@ class Trajectory(eqx.Module):
 
         **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
         """
-        import pandas as pd
+        pd = extra("pandas", "tables")
 
         columns: dict[str, np.ndarray] = {}
         axes = self.batch_shape
@@ -217,7 +218,7 @@ class Trajectory(eqx.Module):
 
         **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
         """
-        import pandas as pd
+        pd = extra("pandas", "tables")
 
         total = np.ravel(self.total_cost)
         length = np.ravel(self.length)

@@ -5,6 +5,8 @@ from typing import Any, TYPE_CHECKING
 import equinox as eqx
 import numpy as np
 
+from .._extras import extra
+
 
 if TYPE_CHECKING:
     import pandas
@@ -75,7 +77,7 @@ class History(eqx.Module):
 
         **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
         """
-        import pandas as pd
+        pd = extra("pandas", "tables")
 
         return pd.DataFrame({name: self[name] for name in (*COLUMNS, *self.metrics)})
 
