@@ -4,10 +4,13 @@ Needs the extra: `pip install "delucax[plot]"`. Figures are made without pyplot,
 is kept alive, no backend is chosen and no global setting is changed.
 """
 
-from .._extras import extra
-
-
-extra("matplotlib", "plot")
+try:
+    import matplotlib  # noqa: F401
+except ImportError as error:
+    raise ImportError(
+        "delucax.plotting needs matplotlib, which is an optional extra: "
+        'pip install "delucax[plot]"'
+    ) from error
 
 from ._animate import animate as animate, Animation as Animation
 from ._drawings import register_drawing as register_drawing
