@@ -8,11 +8,13 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 
 from . import (
+    analysis as analysis,
     controllers as controllers,
     costs as costs,
     disturbances as disturbances,
     dynamics as dynamics,
     environments as environments,
+    interop as interop,
     math as math,
     references as references,
     riccati as riccati,
@@ -37,6 +39,7 @@ from .disturbances import AbstractDisturbance as AbstractDisturbance
 from .dynamics import (
     AbstractDynamics as AbstractDynamics,
     c2d as c2d,
+    d2c as d2c,
     Discretized as Discretized,
     LinearDynamics as LinearDynamics,
     linearize as linearize,

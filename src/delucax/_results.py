@@ -17,11 +17,31 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """
 
     diverged = "The states or costs became NaN or infinite."
+    not_stabilisable = (
+        "The pair (A, B) is not stabilisable: no control moves some mode that does not "
+        "decay."
+    )
     not_stabilising = (
-        "No stabilising solution was found: the pair (A, B) may not be stabilisable, "
-        "or an unstable mode may not be seen by the cost."
+        "There is no stabilising solution: the cost may not see an unstable mode, or "
+        "have no minimum."
+    )
+    on_boundary = (
+        "The closed loop is on the boundary of stability, up to rounding: a mode there "
+        "is not seen by the cost, or the cost is the least that has a minimum."
+    )
+    ill_posed = (
+        "The data are not those of a well-posed problem: not finite, a weight that is "
+        "not definite, a singular descriptor matrix, or a singular equation."
+    )
+    not_separated = (
+        "The spectra are not on two sides of a line (of a circle about 0, in discrete "
+        "time), and the equation is too large to be solved as one linear system."
     )
     not_converged = "The iteration did not converge within its step limit."
+    infeasible = (
+        "The problem has no solution: the cost has no unique minimum over the control, "
+        "or gamma is below the least level that any controller attains."
+    )
 
 
 if TYPE_CHECKING:

@@ -33,6 +33,33 @@ def lqr(size):
     return c.LQR(dlx.LinearDynamics(A, B, dt=DT), size * jnp.eye(2), jnp.eye(1))
 
 
+def hinfinity(size, horizon=None):
+    dynamics = dlx.LinearDynamics(A, B, dt=DT)
+    weights = size * jnp.eye(2), jnp.eye(1)
+    return c.HInfinity(dynamics, *weights, gamma=100.0, horizon=horizon)
+
+
+def finite(size):
+    dynamics = dlx.LinearDynamics(A, B, dt=DT)
+    eye, follow = jnp.eye(2), lambda t: jnp.stack([0.1 * t, 0.1 + 0 * t])
+    options = dict(final=size * eye, horizon=12, reference=follow)
+    return c.FiniteHorizonLQR(dynamics, size * eye, jnp.eye(1), **options)
+
+
+def lqi(size):
+    dynamics = dlx.LinearDynamics(A, B, dt=DT)
+    output, target = jnp.eye(1, 2), jnp.array([0.2])
+    return c.LQI(
+        dynamics, size * jnp.eye(3), jnp.eye(1), output=output, reference=target
+    )
+
+
+def ahead(size):
+    dynamics = dlx.LinearDynamics(A, B, dt=DT)
+    signals = dict(reference=[0.1 * size, 0.0], disturbance=[0.0, 0.1], preview=2)
+    return c.LQR(dynamics, size * jnp.eye(2), jnp.eye(1), **signals)
+
+
 def mlp(size, in_size=2, features=None):
     key = jax.random.key(int(10 * size))
     options = dict(features=features, bounds=(-2.0 * size, 2.0), key=key)
@@ -50,6 +77,11 @@ CASES = {
     "Sequence": Case(lambda size: c.Sequence(size * jnp.ones((4, 1))), False),
     "Linear": Case(lambda size: c.Linear(size * FEEDBACK)),
     "LQR": Case(lqr),
+    "LQR that looks ahead": Case(ahead),
+    "FiniteHorizonLQR": Case(finite),
+    "LQI": Case(lqi),
+    "HInfinity": Case(hinfinity),
+    "HInfinity over a horizon": Case(lambda size: hinfinity(size, horizon=8)),
     "PID": Case(lambda size: c.PID(size, 2 * size, 0.3, dt=DT, output=[[1.0, 0.1]])),
     "PID on an index": Case(
         lambda size: c.PID([size], 2.0, 0.3, dt=DT, output=0, reference=0.1 * size),

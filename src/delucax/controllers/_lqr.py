@@ -1,19 +1,26 @@
-"""The linear-quadratic regulator."""
+"""The linear-quadratic regulator over an infinite horizon."""
 
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import is_concrete
-from .._controller import AbstractController, wrong_observation
+from .._controller import AbstractController
 from .._fields import function_field, parameter, weight
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..riccati import dare
+from ..riccati._small import solve
+from ._feed_forward import known_signals, Preview
+from ._operating_point import (
+    check_observed,
+    check_state,
+    check_time_invariant,
+    deviation,
+    equilibrium,
+)
 
 
 class LQR(AbstractController):
@@ -25,6 +32,16 @@ class LQR(AbstractController):
     linear dynamics, `dx` and `du` being the deviations from the operating point. The
     minimum is `dx' P dx`; with unit white noise it is `trace(P)` a step.
 
+    With a `reference` r(t), a `control_reference` u_r(t) or a known `disturbance` w(t),
+    the deviations are those from r and u_r, and a feed-forward is added, the best one
+    if these signals are known `preview` steps ahead and stay as they are from there:
+
+    `u = u_r - K difference(x, r) - (R + B'PB)^-1 B' sum_j (A - B K)'^j P d[k+j]`,
+
+    `d[k]` being the distance from `r[k+1]` to where the dynamics go from `r[k]` under
+    `u_r[k]` and `w[k]`. As control away from u_r is charged, r is reached exactly only
+    if u_r is what holds it; [`delucax.controllers.LQI`][] finds that by itself.
+
     **Arguments:**
 
     - `dynamics`: time-invariant linear dynamics whose operating point is an equilibrium
@@ -32,6 +49,12 @@ class LQR(AbstractController):
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `S`: cross weight, shape `(n, m)`; zero by default.
+    - `reference`: the state to follow, a vector or a function of time; the operating
+        point by default.
+    - `control_reference`: the control from which deviations are charged, a vector or a
+        function of time; that of the operating point by default.
+    - `disturbance`: a disturbance known in advance, a vector or a function of time.
+    - `preview`: for how many steps ahead the signals are looked up, 0 by default.
     - `difference`: `(x, x_ref) -> deviation`, such as the `difference` of the system
         that was linearised, which wraps angles; subtraction by default.
 
@@ -39,10 +62,10 @@ class LQR(AbstractController):
     Riccati equation, shape `(n, n)`; `x_ref` and `u_ref`, the operating point.
 
     **Raises:** `ValueError` if `dynamics` is not linear, is time-varying, does not rest
-    at its operating point or does not observe its state, or if a weight does not fit;
-    an error at run time if there is no stabilising gain.
+    at its operating point or does not observe its state, or if a weight or signal does
+    not fit; an error at run time if there is no stabilising gain.
 
-    Source: Kalman, 1960.
+    Source: Kalman, 1960; Anderson and Moore, 1990 (tracking).
 
     !!! example
 
@@ -66,6 +89,7 @@ class LQR(AbstractController):
     x_ref: Float[Array, " n"] = parameter()
     u_ref: Float[Array, " m"] = parameter()
     difference: Callable[[Array, Array], Array] | None = function_field()
+    feed_forward: Preview | None
 
     def __init__(
         self,
@@ -74,63 +98,43 @@ class LQR(AbstractController):
         R: Any,
         S: Any = None,
         *,
+        reference: Any = None,
+        control_reference: Any = None,
+        disturbance: Any = None,
+        preview: int = 0,
         difference: Callable[[Array, Array], Array] | None = None,
     ):
         where = "LQR"
-        if not isinstance(dynamics, LinearDynamics):
-            raise ValueError(
-                f"{where}: dynamics must be LinearDynamics (`delucax.linearize` makes "
-                "them of any dynamics, `delucax.c2d` of a linear system), got "
-                f"{type(dynamics).__name__}."
-            )
-        if dynamics.is_time_varying:
-            raise ValueError(
-                f"{where}: dynamics must be time-invariant, got matrices at "
-                f"{dynamics.A.shape[0]} times; `dynamics.at(t)` are those at one time."
-            )
-        _check_observed(dynamics)
-        self.x_ref = _equilibrium(dynamics, difference)
+        check_time_invariant(dynamics, where)
+        check_observed(dynamics, where)
+        self.x_ref = equilibrium(dynamics, difference, where)
         self.u_ref = dynamics.u_ref
         self.difference = difference
+        signals = known_signals(
+            dynamics, reference, control_reference, disturbance, difference, where
+        )
+        steps = isinstance(preview, int | np.integer) and not isinstance(preview, bool)
+        if not steps or preview < 0 or (preview and signals is None):
+            raise ValueError(
+                f"{where}: preview must be a number of steps, from 0, at which a "
+                f"reference or disturbance is looked up, got {preview!r}."
+            )
         solution = dare(dynamics.A, dynamics.B, Q, R, S)
         self.K, self.P = solution.K, solution.X
+        if signals is None:
+            self.feed_forward = None
+        else:
+            B, P = dynamics.B, solution.X
+            M = solve(jnp.asarray(R, P.dtype) + B.T @ P @ B, B.T)
+            loop = solution.closed_loop
+            self.feed_forward = Preview(signals, P, M, loop, int(preview))
 
     def __call__(self, t, y, state):
-        if y.shape != self.x_ref.shape:
-            raise wrong_observation(self, self.x_ref.shape[0], y)
-        if self.difference is None:
-            deviation = y - self.x_ref
-        else:
-            deviation = self.difference(y, self.x_ref)
-        return (self.u_ref - matvec(self.K, deviation)).astype(y.dtype), state
-
-
-def _check_observed(dynamics: LinearDynamics) -> None:
-    C = dynamics.C
-    if C is None:
-        return
-    n = dynamics.state_size
-    if C.shape != (n, n) or is_concrete(C) and not np.array_equal(C, np.eye(n)):
-        raise ValueError(
-            "LQR: dynamics must observe their state (C the identity), got a C of shape "
-            f"{C.shape} that does not; LQR acts on the state itself."
-        )
-
-
-def _equilibrium(dynamics: LinearDynamics, difference: Any) -> Array:
-    """The operating point, if the dynamics rest there."""
-    x_ref, x_next = dynamics.x_ref, dynamics.x_next
-    drift = x_next - x_ref if difference is None else difference(x_next, x_ref)
-    drift = jnp.max(jnp.abs(drift))
-    # What is left of an equilibrium that was computed, or is written in few digits.
-    slack = jnp.finfo(x_ref.dtype).eps ** 0.5 * (1 + jnp.max(jnp.abs(x_ref)))
-    moves = ~(drift <= slack)
-    rule = (
-        "LQR: dynamics must rest at their operating point (x_next = x_ref); choose an "
-        "equilibrium as x and u of `delucax.linearize`"
-    )
-    if not is_concrete(moves):
-        return eqx.error_if(x_ref, moves, rule + ".")
-    if moves:
-        raise ValueError(f"{rule}, got x_ref {x_ref} and x_next {x_next}.")
-    return x_ref
+        check_state(self, y, self.x_ref.shape[0])
+        x_ref, u_ref = self.x_ref, self.u_ref
+        if self.feed_forward is not None:
+            signals = self.feed_forward.signals
+            x_ref = signals.state(t)
+            u_ref = signals.control(t) + self.feed_forward(t)
+        u = u_ref - matvec(self.K, deviation(y, x_ref, self.difference))
+        return u.astype(y.dtype), state

@@ -8,10 +8,9 @@ from jaxtyping import Array, Float
 
 from .._check import as_matrix, as_vector, check_positive
 from .._fields import as_float_array, parameter
-from .._names import indexed_names
 from .._results import RESULTS
 from ..math import matvec
-from ..systems._linear import check_matrices
+from ..systems._linear import check_matrices, checked_names
 from ._base import AbstractDynamics
 
 
@@ -100,8 +99,10 @@ class LinearDynamics(AbstractDynamics):
         self.x_ref = _point(x_ref, n, steps, "x_ref", jnp.zeros(n, A.dtype))
         self.u_ref = _point(u_ref, m, steps, "u_ref", jnp.zeros(m, A.dtype))
         self.x_next = _point(x_next, n, steps, "x_next", self.x_ref)
-        self.state_names = _checked(state_names, "x", n, "state_names")
-        self.control_names = _checked(control_names, "u", m, "control_names")
+        self.state_names = checked_names(state_names, "x", n, "state_names", where)
+        self.control_names = checked_names(
+            control_names, "u", m, "control_names", where
+        )
 
     @property
     def is_time_varying(self) -> bool:
@@ -176,13 +177,3 @@ def _point(value: Any, size: int, steps: int | None, name: str, default: Array):
             f"{array.shape}."
         )
     return array
-
-
-def _checked(names, letter: str, size: int, argument: str) -> tuple[str, ...]:
-    if names is None:
-        return indexed_names(letter, size)
-    if len(names) != size:
-        raise ValueError(
-            f"LinearDynamics: {argument} must have {size} names, got {names!r}."
-        )
-    return tuple(names)

@@ -78,7 +78,17 @@ def linearize(
         E = None
         if model.disturbance_names:
             E = _jacobian(f, 3)(t, x, u, w)
-        return LinearSystem(A, B, C, E, x_ref=x, u_ref=u, dx_ref=f(t, x, u, held))
+        return LinearSystem(
+            A,
+            B,
+            C,
+            E,
+            x_ref=x,
+            u_ref=u,
+            dx_ref=f(t, x, u, held),
+            state_names=model.state_names,
+            control_names=model.control_names,
+        )
 
     dynamics: Any = model
 

@@ -1,3 +1,31 @@
 """Matrix equations of control, by solves and products alone."""
 
-from ._dare import dare as dare, RiccatiSolution as RiccatiSolution
+from ._care import care as care
+from ._continuous_horizon import (
+    ContinuousHorizonSolution as ContinuousHorizonSolution,
+    cre as cre,
+)
+from ._dare import dare as dare
+from ._filter import filter_care as filter_care, filter_dare as filter_dare
+from ._finite_horizon import dre as dre, FiniteHorizonSolution as FiniteHorizonSolution
+from ._hinfinity import (
+    ContinuousGameSolution as ContinuousGameSolution,
+    GameSolution as GameSolution,
+    hinf_care as hinf_care,
+    hinf_dare as hinf_dare,
+)
+from ._hinfinity_horizon import (
+    hinf_cre as hinf_cre,
+    hinf_dre as hinf_dre,
+    HorizonGameSolution as HorizonGameSolution,
+)
+from ._linear import (
+    dlyap as dlyap,
+    dsylvester as dsylvester,
+    lyap as lyap,
+    sylvester as sylvester,
+)
+from ._solution import (
+    MatrixSolution as MatrixSolution,
+    RiccatiSolution as RiccatiSolution,
+)

@@ -26,6 +26,7 @@ class LinearSystem(AbstractSystem):
         of the state and is added to the next state by the discrete dynamics.
     - `x_ref`, `u_ref`: the operating point, shapes `(n,)` and `(m,)`; zero by default.
     - `dx_ref`: the vector field there, shape `(n,)`; zero by default.
+    - `state_names`, `control_names`: `("x0", ...)` and `("u0", ...)` by default.
 
     **Raises:** `ValueError` if shapes do not fit or entries are not finite.
 
@@ -51,7 +52,19 @@ class LinearSystem(AbstractSystem):
     state_names: tuple[str, ...] = eqx.field(static=True)
     control_names: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(self, A, B, C=None, E=None, *, x_ref=None, u_ref=None, dx_ref=None):
+    def __init__(
+        self,
+        A,
+        B,
+        C=None,
+        E=None,
+        *,
+        x_ref=None,
+        u_ref=None,
+        dx_ref=None,
+        state_names=None,
+        control_names=None,
+    ):
         where = "LinearSystem"
         self.A, self.B, self.C, self.E = check_matrices(A, B, C, E, where)
         n, m = self.B.shape
@@ -63,8 +76,10 @@ class LinearSystem(AbstractSystem):
             else as_vector(u_ref, m, "u_ref", where)
         )
         self.dx_ref = zeros if dx_ref is None else as_vector(dx_ref, n, "dx_ref", where)
-        self.state_names = indexed_names("x", n)
-        self.control_names = indexed_names("u", m)
+        self.state_names = checked_names(state_names, "x", n, "state_names", where)
+        self.control_names = checked_names(
+            control_names, "u", m, "control_names", where
+        )
 
     @property
     def disturbance_names(self) -> tuple[str, ...]:
@@ -83,6 +98,15 @@ class LinearSystem(AbstractSystem):
 
     def equilibrium(self):
         return self.x_ref, self.u_ref
+
+
+def checked_names(names, letter: str, size: int, argument: str, where: str):
+    """`names` as a tuple of `size`, indexed if there are none, or an error."""
+    if names is None:
+        return indexed_names(letter, size)
+    if isinstance(names, str) or len(names) != size:
+        raise ValueError(f"{where}: {argument} must have {size} names, got {names!r}.")
+    return tuple(names)
 
 
 def check_matrices(A, B, C, E, where: str):

@@ -1,0 +1,27 @@
+"""What linear models tell of themselves: modes, Gramians, norms, margins."""
+
+from ._gramians import (
+    controllability_gramian as controllability_gramian,
+    controllability_matrix as controllability_matrix,
+    observability_gramian as observability_gramian,
+    observability_matrix as observability_matrix,
+)
+from ._margins import (
+    disk_margin as disk_margin,
+    DiskMargin as DiskMargin,
+    Margins as Margins,
+    margins as margins,
+)
+from ._modes import (
+    is_controllable as is_controllable,
+    is_detectable as is_detectable,
+    is_observable as is_observable,
+    is_stabilizable as is_stabilizable,
+    modal_controllability as modal_controllability,
+    modal_observability as modal_observability,
+    ModalTest as ModalTest,
+    poles as poles,
+    zeros as zeros,
+)
+from ._norms import h2_norm as h2_norm, hinf_norm as hinf_norm, PeakGain as PeakGain
+from ._response import dcgain as dcgain, frequency_response as frequency_response

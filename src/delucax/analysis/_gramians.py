@@ -1,0 +1,252 @@
+"""What inputs reach and outputs show, as matrices."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+from jaxtyping import Array, Float
+
+from .._check import check_count, check_positive, is_concrete
+from ..dynamics import LinearDynamics
+from ..riccati._lyapunov import lyapunov
+from ..riccati._small import full_precision
+from ..riccati._stein import stein
+from ..systems import LinearSystem
+from ._plant import is_stable, plant, Plant
+
+
+_DOUBLINGS = 60
+"""Enough for a horizon of 2**60 times what the fastest mode takes."""
+
+
+def controllability_matrix(
+    model: LinearSystem | LinearDynamics, *, inputs: str = "controls"
+) -> Float[Array, "n nm"]:
+    """The Krylov matrix `[B, A B, ..., A^(n-1) B]`.
+
+    Its rank is that of what the inputs reach, but is hard to tell beyond a few states:
+    [`delucax.analysis.is_controllable`][] asks mode by mode instead.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
+        [`delucax.LinearDynamics`][].
+    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
+
+    **Returns:** shape `(n, n m)`.
+
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
+    unknown.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        upright = dlx.linearize(dlx.systems.Pendulum())
+        dlx.analysis.controllability_matrix(upright)
+        ```
+    """
+    given = plant(model, inputs, "controllability_matrix")
+    return _krylov(given.A, given.B)
+
+
+def observability_matrix(
+    model: LinearSystem | LinearDynamics,
+) -> Float[Array, "np n"]:
+    """The Krylov matrix `[C; C A; ...; C A^(n-1)]`.
+
+    **Arguments:** `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
+    [`delucax.LinearDynamics`][].
+
+    **Returns:** shape `(n p, n)`.
+
+    **Raises:** `ValueError` if `model` is not linear or is time-varying.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        upright = dlx.linearize(dlx.systems.Pendulum())
+        dlx.analysis.observability_matrix(upright)
+        ```
+    """
+    given = plant(model, "controls", "observability_matrix")
+    return _krylov(given.A.T, given.C.T).T
+
+
+def controllability_gramian(
+    model: LinearSystem | LinearDynamics,
+    horizon: Any = None,
+    *,
+    inputs: str = "controls",
+    throw: bool = True,
+) -> Float[Array, "n n"]:
+    """The covariance of the state under unit white noise at the inputs,
+
+    the integral of `exp(A t) B B' exp(A' t)`, or in discrete time the sum of
+    `A^k B B' (A')^k`, over all time or over a horizon. `x' W^-1 x` is the least energy
+    of inputs that reach `x` from rest. Differentiable to any order, in either mode.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
+        [`delucax.LinearDynamics`][].
+    - `horizon`: the time in continuous time, a positive number; the number of steps in
+        discrete time, a whole number. All time by default, which needs a stable model.
+    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
+    - `throw`: raise if there is no horizon and the model is not stable (default); if
+        false, return infinity there.
+
+    **Returns:** shape `(n, n)`, symmetric.
+
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, or `horizon`
+    or `inputs` is not as above; an error at run time as `throw` says.
+
+    Source: Van Loan, 1978 (over a horizon).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A, B = jnp.array([[0.5]]), jnp.array([[1.0]])
+        dlx.analysis.controllability_gramian(dlx.LinearDynamics(A, B))  # 4/3
+        ```
+    """
+    where = "controllability_gramian"
+    return _checked_gramian(plant(model, inputs, where), horizon, throw, where)
+
+
+def observability_gramian(
+    model: LinearSystem | LinearDynamics, horizon: Any = None, *, throw: bool = True
+) -> Float[Array, "n n"]:
+    """The energy `x' W x` of the outputs from a state `x`,
+
+    `W` being the integral of `exp(A' t) C' C exp(A t)`, or in discrete time the sum of
+    `(A')^k C' C A^k`, over all time or over a horizon. Differentiable to any order, in
+    either mode.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
+        [`delucax.LinearDynamics`][].
+    - `horizon`: the time in continuous time, a positive number; the number of steps in
+        discrete time, a whole number. All time by default, which needs a stable model.
+    - `throw`: raise if there is no horizon and the model is not stable (default); if
+        false, return infinity there.
+
+    **Returns:** shape `(n, n)`, symmetric.
+
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, or `horizon`
+    is not as above; an error at run time as `throw` says.
+
+    Source: Van Loan, 1978 (over a horizon).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A, B = jnp.array([[-1.0]]), jnp.array([[1.0]])
+        system = dlx.systems.LinearSystem(A, B)
+        dlx.analysis.observability_gramian(system, horizon=2.0)
+        ```
+    """
+    where = "observability_gramian"
+    given = plant(model, "controls", where)
+    dual = Plant(given.A.T, given.C.T, given.B.T, given.D.T, given.dt)
+    return _checked_gramian(dual, horizon, throw, where)
+
+
+def _checked_gramian(plant: Plant, horizon: Any, throw: bool, where: str) -> Array:
+    if horizon is not None and plant.is_discrete:
+        return _gramian_of_steps(plant, check_count(horizon, "horizon", where))
+    if horizon is not None:
+        check_positive(horizon, "horizon", where)
+        return _gramian_of_time(plant, jnp.asarray(horizon, plant.A.dtype))
+    found, stable = _infinite(plant)
+    if not throw:
+        return found
+    message = (
+        f"{where}: the model must be stable for a Gramian over all time. Give a "
+        "horizon, or pass throw=False for infinity."
+    )
+    if not is_concrete(stable):
+        return eqx.error_if(found, ~stable, message)
+    if not stable:
+        raise RuntimeError(message)
+    return found
+
+
+@eqx.filter_jit
+def _krylov(A, B):
+    blocks = [B]
+    for _ in range(A.shape[0] - 1):
+        blocks.append(A @ blocks[-1])
+    return jnp.concatenate(blocks, axis=1)
+
+
+@eqx.filter_jit
+def _infinite(plant: Plant) -> tuple[Array, Array]:
+    stable = is_stable(plant)
+    harmless = -jnp.eye(plant.A.shape[0], dtype=plant.A.dtype) / 2
+    A = jnp.where(stable, plant.A, harmless)
+    found = gramian(A, plant.B, plant.is_discrete)
+    return jnp.where(stable, found, jnp.inf), stable
+
+
+@full_precision
+def gramian(A: Array, B: Array, is_discrete: bool) -> Array:
+    """The controllability Gramian over all time of a stable model."""
+    if is_discrete:
+        return _symmetric(stein(A.T, B @ B.T))
+    return _symmetric(lyapunov(A.T, B @ B.T))
+
+
+def _symmetric(W):
+    return (W + W.T) / 2
+
+
+@eqx.filter_jit
+@full_precision
+def _gramian_of_steps(plant: Plant, steps: int) -> Array:
+    """By doubling: `W_2k = W_k + A^k W_k (A^k)'`, along the bits of `steps`."""
+    A, Q = plant.A, plant.B @ plant.B.T
+    W, power = jnp.zeros_like(Q), jnp.eye(A.shape[0], dtype=A.dtype)
+    for bit in bin(steps)[2:]:
+        W, power = W + power @ W @ power.T, power @ power
+        if bit == "1":
+            W, power = Q + A @ W @ A.T, A @ power
+    return _symmetric(W)
+
+
+@eqx.filter_jit
+@full_precision
+def _gramian_of_time(plant: Plant, horizon: Array) -> Array:
+    """Van Loan's block exponential over a short time, and then doubling."""
+    A, Q = plant.A, plant.B @ plant.B.T
+    n = A.shape[0]
+    fastest = lax.stop_gradient(horizon * jnp.linalg.norm(A))
+    doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(fastest, 1))), 0, _DOUBLINGS)
+    short = horizon * 0.5**doublings
+    block = jnp.block([[-A, Q], [jnp.zeros_like(A), A.T]]) * short
+    exponential = jsl.expm(block)
+    power = exponential[n:, n:].T
+    W = power @ exponential[:n, n:]
+
+    def double(carry, k):
+        W, power = carry
+        more = k < doublings
+        # Zero where it is not used: what overflows there must not reach a derivative.
+        held = jnp.where(more, power, 0)
+        W_next = W + held @ W @ held.T
+        return (W_next, jnp.where(more, held @ held, power)), None
+
+    (W, _), _ = lax.scan(double, (W, power), jnp.arange(_DOUBLINGS))
+    return _symmetric(W)

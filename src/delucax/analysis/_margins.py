@@ -1,0 +1,434 @@
+"""How far a feedback loop is from instability."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._check import is_concrete
+from .._results import first_of, Result
+from ..dynamics import LinearDynamics
+from ..systems import LinearSystem
+from ._norms import peak_gain, thrown
+from ._plant import is_stable, plant, Plant, response, size, solve
+
+
+_HALVINGS = 60
+
+
+class DiskMargin(eqx.Module):
+    """How large a disk of perturbations, gain and phase at once, a loop stands.
+
+    **Attributes:**
+
+    - `margin`: the radius `alpha` of the disk; zero if the closed loop is not stable.
+    - `frequency`: where it is smallest, in radians per unit of time.
+    - `gain_low`, `gain_high`: the real factors between which the loop gain may lie.
+    - `phase`: the phase, in radians, that the loop may be turned either way.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        loop = dlx.systems.LinearSystem(
+            jnp.array([[0.0, 1.0], [0.0, -1.0]]), jnp.array([[0.0], [2.0]]),
+            jnp.array([[1.0, 0.0]]),
+        )
+        dlx.analysis.disk_margin(loop).gain_high
+        ```
+    """
+
+    margin: Float[Array, ""]
+    frequency: Float[Array, ""]
+    gain_low: Float[Array, ""]
+    gain_high: Float[Array, ""]
+    phase: Float[Array, ""]
+    result: Result
+
+
+class Margins(eqx.Module):
+    """The stability margins of a loop with one input and one output.
+
+    **Attributes:**
+
+    - `gain_margin`: the least factor above 1 on the loop gain that brings a pole to the
+        boundary of stability; infinite if none does.
+    - `gain_reduction`: the largest factor below 1 that does; zero if none does.
+    - `phase_margin`: the least turn, either way, that does, in radians; infinite if
+        none does.
+    - `delay_margin`: the least delay that does, in units of time; infinite if none
+        does.
+    - `gain_margin_frequency`, `gain_reduction_frequency`, `phase_margin_frequency`,
+        `delay_margin_frequency`: where, in radians per unit of time; NaN if nowhere.
+    - `disk`, `disk_s`, `disk_t`: the [`delucax.analysis.DiskMargin`][] that balances
+        `S` and `T`, that of the sensitivity `S = 1 / (1 + L)`, and that of
+        `T = L / (1 + L)`.
+    - `is_stable`: whether the closed loop is. If not it has no margins: the factors are
+        1, the others 0, the frequencies NaN.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+
+    All but `is_stable` and `result` are differentiable.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        loop = dlx.systems.LinearSystem(
+            jnp.array([[0.0, 1.0], [0.0, -1.0]]), jnp.array([[0.0], [2.0]]),
+            jnp.array([[1.0, 0.0]]),
+        )
+        found = dlx.analysis.margins(loop)
+        found.phase_margin, found.phase_margin_frequency
+        ```
+    """
+
+    gain_margin: Float[Array, ""]
+    gain_margin_frequency: Float[Array, ""]
+    gain_reduction: Float[Array, ""]
+    gain_reduction_frequency: Float[Array, ""]
+    phase_margin: Float[Array, ""]
+    phase_margin_frequency: Float[Array, ""]
+    delay_margin: Float[Array, ""]
+    delay_margin_frequency: Float[Array, ""]
+    disk: DiskMargin
+    disk_s: DiskMargin
+    disk_t: DiskMargin
+    is_stable: Bool[Array, ""]
+    result: Result
+
+
+def margins(loop: LinearSystem | LinearDynamics, *, throw: bool = True) -> Margins:
+    """The gain, phase, delay and disk margins of a loop with one input and one output.
+
+    The loop `L` is the linear model from `u` to `y`, closed by `u = -y`: for a state
+    feedback `u = -K x`, the plant's `A` and `B` with `C = K`.
+
+    The frequencies at which `L` is real, and those at which it is 1 in size, are
+    eigenvalues of matrices; between these, signs tell the true crossings apart, and
+    each is refined to rounding. First and second derivatives, in either mode, are those
+    of the crossing that decides.
+
+    **Arguments:**
+
+    - `loop`: a [`delucax.systems.LinearSystem`][], or time-invariant
+        [`delucax.LinearDynamics`][], with one control and one output.
+    - `throw`: raise if a search does not end (default); if false, look at `result`.
+
+    **Returns:** [`delucax.analysis.Margins`][].
+
+    **Raises:** `ValueError` if `loop` is not linear, is time-varying, or has more than
+    one control or output; an error at run time as `throw` says.
+
+    Source: Seiler, Packard and Gahinet, 2020 (disk margins).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        upright = dlx.linearize(dlx.make("pendulum").dynamics)
+        K = dlx.riccati.dare(upright.A, upright.B, jnp.eye(2), jnp.eye(1)).K
+        loop = dlx.LinearDynamics(upright.A, upright.B, C=K, dt=upright.dt)
+        dlx.analysis.margins(loop).phase_margin
+        ```
+    """
+    where = "margins"
+    given = plant(loop, "controls", where)
+    if given.D.shape != (1, 1):
+        raise ValueError(
+            f"{where}: loop must have one control and one output, got "
+            f"{given.D.shape[1]} and {given.D.shape[0]}; `disk_margin` takes more."
+        )
+    found = _margins(given)
+    return thrown(found, where) if throw else found
+
+
+def disk_margin(
+    loop: LinearSystem | LinearDynamics,
+    skew: Any = 0.0,
+    *,
+    channel: int | None = None,
+    throw: bool = True,
+) -> DiskMargin:
+    r"""How large a disk of perturbations a loop stands, gain and phase at once,
+
+    `alpha = 1 / max over omega of sigma_max(S + (skew - 1)/2 I)`, `S = (I + L)^-1`:
+    the closed loop stays stable with the loop gain multiplied by any
+    `(2 + (1 - skew) delta) / (2 - (1 + skew) delta)`, `|delta| < alpha`.
+
+    The loop `L` is the linear model from `u` to `y`, closed by `u = -y`. Of several
+    channels, all are perturbed at once by one full matrix `delta`: safe for, and in
+    general more than, separate factors in each channel.
+
+    **Arguments:**
+
+    - `loop`: a [`delucax.systems.LinearSystem`][], or time-invariant
+        [`delucax.LinearDynamics`][], with as many controls as outputs.
+    - `skew`: 0 (default) balances `S` and `T`, 1 takes `S` and -1 takes `T`; a number.
+    - `channel`: perturb this one alone, the others being closed; all by default.
+    - `throw`: raise if the search does not end (default); if false, look at `result`.
+
+    **Returns:** a [`delucax.analysis.DiskMargin`][].
+
+    **Raises:** `ValueError` if `loop` is not linear, is time-varying or is not square,
+    or if there is no such `channel`; an error at run time as `throw` says.
+
+    Source: Seiler, Packard and Gahinet, 2020.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[-1.0, 0.5], [0.0, -2.0]])
+        loop = dlx.systems.LinearSystem(A, jnp.eye(2), 3 * jnp.eye(2))
+        dlx.analysis.disk_margin(loop).margin
+        dlx.analysis.disk_margin(loop, channel=0).margin
+        ```
+    """
+    where = "disk_margin"
+    given = plant(loop, "controls", where)
+    p, m = given.D.shape
+    if p != m:
+        raise ValueError(
+            f"{where}: loop must have as many outputs as controls, got {p} and {m}."
+        )
+    if channel is not None:
+        is_index = isinstance(channel, int) and not isinstance(channel, bool)
+        if not is_index or channel not in range(m):
+            raise ValueError(
+                f"{where}: channel must be a whole number from 0 to {m - 1}, or None "
+                f"for all, got {channel!r}."
+            )
+    found = _disk_margin(given, jnp.asarray(skew, given.A.dtype), channel)
+    return thrown(found, where) if throw else found
+
+
+@eqx.filter_jit
+def _disk_margin(loop: Plant, skew: Array, channel: int | None) -> DiskMargin:
+    A, B, C = loop.A, loop.B, loop.C
+    if channel is not None:
+        others = [i for i in range(B.shape[1]) if i != channel]
+        A = A - B[:, jnp.array(others)] @ C[jnp.array(others)] if others else A
+        B, C = B[:, channel, None], C[channel, None]
+    eye = jnp.eye(B.shape[1], dtype=A.dtype)
+    # S = I - C (s I - (A - B C))^-1 B.
+    peak = peak_gain(Plant(A - B @ C, B, -C, (1 + skew) / 2 * eye, loop.dt))
+    # Each branch that is not taken has a harmless number, so that its derivative has.
+    stable, closed = jnp.isfinite(peak.gain), peak.gain > 0
+    usual = stable & closed
+    alpha = 1 / jnp.where(usual, peak.gain, 1)
+    up, down = 2 - alpha * (1 + skew), 2 + alpha * (1 + skew)
+    low = (2 - alpha * (1 - skew)) / down
+    bounded = up > 0
+    high = (2 + alpha * (1 - skew)) / jnp.where(bounded, up, 1)
+    # With a factor exp(j phase), delta is 2 tan / sqrt(1 + skew^2 tan^2) in size, tan
+    # being that of half the phase.
+    square = 1 - (skew * alpha / 2) ** 2
+    turns = square > 0
+    tangent = alpha / 2 / jnp.sqrt(jnp.where(turns, square, 1))
+    phase = jnp.where(turns, 2 * jnp.arctan(tangent), jnp.pi)
+
+    def chosen(value, without_loop, unstable):
+        value = jnp.where(usual, value, without_loop)
+        return jnp.where(stable, value, unstable)
+
+    return DiskMargin(
+        chosen(alpha, jnp.inf, 0.0),
+        peak.frequency,
+        chosen(low, -jnp.inf, 1.0),
+        chosen(jnp.where(bounded, high, jnp.inf), jnp.inf, 1.0),
+        chosen(phase, jnp.pi, 0.0),
+        peak.result,
+    )
+
+
+@eqx.filter_jit
+def _margins(loop: Plant) -> Margins:
+    closed = loop.A - loop.B @ loop.C
+    stable = is_stable(eqx.tree_at(lambda p: p.A, loop, closed))
+    skews = jnp.array([0, 1, -1], loop.A.dtype)
+    disks = jax.vmap(lambda skew: _disk_margin(loop, skew, None))(skews)
+    still = lax.stop_gradient(loop)
+    omegas, found = _crossings(still)
+    values = jax.vmap(jax.vmap(lambda w: _scalar(still, w)))(omegas)
+
+    # Where the loop is real and negative, and where it is 1 in size.
+    real = jnp.real(values[0])
+    huge = jnp.finfo(real.dtype).eps ** -0.75
+    negative = found[0] & (real < 0) & (real > -huge)
+    factors = -1 / jnp.where(negative, real, -1)
+    turns = jnp.angle(-values[1])
+    lags = jnp.mod(turns, 2 * jnp.pi) / jnp.where(found[1], omegas[1], 1)
+    candidates = jnp.stack(
+        [
+            jnp.where(negative & (factors >= 1), factors, jnp.inf),
+            jnp.where(negative & (factors < 1), 1 / factors, jnp.inf),
+            jnp.where(found[1], jnp.abs(turns), jnp.inf),
+            jnp.where(found[1], lags, jnp.inf),
+        ]
+    )
+    kinds = jnp.array([0, 0, 1, 1])
+    nearest = jnp.argmin(candidates, axis=1)
+    exists = jnp.isfinite(jnp.min(candidates, axis=1))
+    followed = jax.vmap(lambda *each: _follow(loop, *each))(
+        kinds, omegas[kinds, nearest], exists
+    )
+    # Where there is none, a point at which all is finite.
+    followed = jnp.where(exists, followed, 1)
+    L = jax.vmap(lambda w, ok: jnp.where(ok, _scalar(loop, w), 1))(followed, exists)
+    factor = 1 / jax.vmap(size)(L)
+    angle = jnp.arctan2(-jnp.imag(L), -jnp.real(L))
+    lag = jnp.where(angle < 0, angle + 2 * jnp.pi, angle) / followed
+    margins = jnp.stack([factor[0], factor[1], jnp.abs(angle[2]), lag[3]])
+    none, unstable = jnp.array([jnp.inf, 0, jnp.inf, jnp.inf]), jnp.array([1, 1, 0, 0])
+    margins = jnp.where(stable, jnp.where(exists, margins, none), unstable)
+    frequencies = jnp.where(stable & exists, followed, jnp.nan)
+    disk, disk_s, disk_t = (jax.tree.map(lambda a, i=i: a[i], disks) for i in range(3))
+    result = first_of(disks.result)
+    pairs = zip(margins, frequencies, strict=True)
+    flat = (each for pair in pairs for each in pair)
+    return Margins(*flat, disk, disk_s, disk_t, stable, result)
+
+
+def _scalar(loop: Plant, omega: Array) -> Array:
+    return response(loop, omega)[0, 0]
+
+
+def _crossing(kind: Array, L: Array) -> Array:
+    """Zero where `L` is real, or for the second kind where it is 1 in size."""
+    length = size(L)
+    return jnp.where(kind == 0, jnp.imag(L) / length, jnp.log(length))
+
+
+def _follow(loop: Plant, kind: Array, omega: Array, found: Array) -> Array:
+    """`omega` itself, which moves with the loop as the crossing does.
+
+    Two Newton steps from where it is already: their values change nothing but rounding,
+    and their derivatives are those of the crossing to third order.
+    """
+    dt = loop.dt
+    at_nyquist = jnp.asarray(False)
+    if dt is not None:
+        nearly = jnp.pi * (1 - 10 * jnp.finfo(omega.dtype).eps)
+        at_nyquist = omega * lax.stop_gradient(dt) > nearly
+    moves = found & (omega > 0) & ~at_nyquist
+
+    def newton(_, there):
+        g, slope = jax.jvp(
+            lambda w: _crossing(kind, _scalar(loop, w)),
+            (there,),
+            (jnp.ones_like(there),),
+        )
+        return there - jnp.where(moves, g / jnp.where(moves, slope, 1), 0)
+
+    there = lax.fori_loop(0, 2, newton, jnp.where(moves, omega, 1))
+    rest = omega if dt is None else jnp.where(at_nyquist, jnp.pi / dt, omega)
+    return jnp.where(moves, there, rest)
+
+
+def _crossings(loop: Plant) -> tuple[Array, Array]:
+    """Frequencies where the loop is real, and where it is 1 in size.
+
+    **Returns:** two rows of frequencies, and which of them are crossings.
+    """
+    A, B, C = loop.A, loop.B, loop.C
+    eps = jnp.finfo(A.dtype).eps
+    if loop.is_discrete:
+        scale = jnp.ones((), A.dtype)
+        axis = _on_the_axis(loop)
+    else:
+        sizes = jnp.abs(jnp.linalg.eigvals(A - B @ C))
+        scale = jnp.exp(jnp.mean(jnp.log(jnp.where(sizes > 0, sizes, 1))))
+        axis = Plant(A / scale, B / scale, C, loop.D, None)
+
+    def omega(phi):
+        """From an angle in `[0, pi/2]`, which all frequencies become, to a frequency."""
+        return scale * jnp.tan(phi) if loop.dt is None else 2 * phi / loop.dt
+
+    def values(phi):
+        """Both functions that change sign at a crossing, at two rows of angles."""
+        L = jax.vmap(jax.vmap(lambda phi: _scalar(loop, omega(phi))))(phi)
+        return jnp.stack(
+            [jax.vmap(lambda L, k=k: _crossing(k, L))(L[k]) for k in (0, 1)]
+        )
+
+    nodes = jnp.concatenate([_real_frequencies(axis), _unit_frequencies(axis)])
+    nodes = jnp.arctan(jnp.where(jnp.isfinite(nodes), jnp.abs(nodes), 0))
+    ends = jnp.array([0, jnp.pi / 2], A.dtype)
+    nodes = jnp.sort(jnp.concatenate([ends, nodes]))
+    between = (nodes[1:] + nodes[:-1]) / 2
+    between = jnp.stack([between, between])
+    signs = values(between)
+    # What is on the crossing but for rounding tells nothing.
+    tells = jnp.isfinite(signs) & (jnp.abs(signs) > eps**0.5)
+    indices = jnp.arange(signs.shape[1])
+    last = lax.cummax(jnp.where(tells, indices, -1), axis=1)[:, :-1]
+    low, high = jnp.take_along_axis(between, last, axis=1), between[:, 1:]
+    low_sign = jnp.sign(jnp.take_along_axis(signs, last, axis=1))
+    found = tells[:, 1:] & (last >= 0) & (low_sign != jnp.sign(signs[:, 1:]))
+
+    def halve(_, bracket):
+        low, high = bracket
+        middle = (low + high) / 2
+        before = jnp.sign(values(middle)) == low_sign
+        return jnp.where(before, middle, low), jnp.where(before, high, middle)
+
+    low, high = lax.fori_loop(0, _HALVINGS, halve, (low, high))
+    phi = (low + high) / 2
+    # At a pole or a zero on the axis the sign jumps, and nothing is small.
+    found = found & (jnp.abs(values(phi)) < eps**0.25)
+    # At both ends a loop is real, but a strictly proper one at infinity zero.
+    at_ends = jnp.array([[True, loop.is_discrete], [False, False]])
+    phi = jnp.concatenate([phi, jnp.stack([ends, ends])], axis=1)
+    return omega(phi), jnp.concatenate([found, at_ends], axis=1)
+
+
+def _on_the_axis(loop: Plant) -> Plant:
+    """With `z = (1 + s) / (1 - s)` the circle becomes the axis, value for value."""
+    A, B, C, D = loop.A, loop.B, loop.C, loop.D
+    n = A.shape[0]
+    eye = jnp.eye(n, dtype=A.dtype)
+    # A pole at -1, on the circle, would go to infinity; now it goes far.
+    A = A * (1 - 10 * jnp.finfo(A.dtype).eps)
+    both = solve(eye + A, jnp.concatenate([A - eye, B], axis=1))
+    C_axis = 2**0.5 * solve((eye + A).T, C.T).T
+    return Plant(both[:, :n], 2**0.5 * both[:, n:], C_axis, D - C @ both[:, n:], None)
+
+
+def _real_frequencies(loop: Plant) -> Array:
+    """Zeros of `L(s) - L(-s)`: eigenvalues, seen from two points of the real axis."""
+    A, B, C = loop.A, loop.B, loop.C
+    zero = jnp.zeros_like(A)
+    both_A = jnp.block([[A, zero], [zero, -A]])
+    both_B, both_C = jnp.concatenate([B, B]), jnp.concatenate([C, C], axis=1)
+    n = both_A.shape[0]
+    found = []
+    # Neither is likely to be a pole, or a zero itself.
+    for point in (0.7368, 1.3719):
+        right = jnp.concatenate([jnp.eye(n, dtype=A.dtype), both_B], axis=1)
+        solved = solve(point * jnp.eye(n, dtype=A.dtype) - both_A, right)
+        F, FB = solved[:, :n], solved[:, n:]
+        inverse = FB @ (both_C @ F) / (both_C @ FB) - F
+        found.append(jnp.imag(1 / jnp.linalg.eigvals(inverse)))
+    return jnp.concatenate(found)
+
+
+def _unit_frequencies(loop: Plant) -> Array:
+    """Zeros of `1 - L(-s) L(s)`: eigenvalues of a Hamiltonian."""
+    A, B, C, D = loop.A, loop.B, loop.C, loop.D
+    rest = 1 - D[0, 0] ** 2
+    rest = jnp.where(rest == 0, jnp.finfo(A.dtype).eps, rest)
+    F = A + B @ C * D[0, 0] / rest
+    H = jnp.block([[F, B @ B.T / rest], [-C.T @ C / rest, -F.T]])
+    return jnp.imag(jnp.linalg.eigvals(H))

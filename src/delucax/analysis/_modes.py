@@ -1,0 +1,403 @@
+"""Poles, zeros, and which modes the inputs reach and the outputs show."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from .._check import check_positive, is_concrete
+from ..dynamics import LinearDynamics
+from ..systems import LinearSystem
+from ._plant import growth, plant, Plant
+
+
+_SEARCHES = 3
+
+
+class ModalTest(eqx.Module):
+    """How far each mode of a pair of matrices is from being out of reach.
+
+    **Attributes:**
+
+    - `modes`: the eigenvalues of `A`, shape `(n,)`, complex.
+    - `distances`: for each, the smallest singular value of
+        `[(A - mode I) / |A|, B / |B|]` (of `[(A - mode I)' / |A|, C' / |C|]` for
+        observability), shape `(n,)`: zero for a mode out of reach, and otherwise how
+        large a relative change of the matrices would put it there.
+    - `unstable`: which modes are on or outside the boundary of stability.
+    - `tolerance`: distances up to it count as zero.
+
+    The measurements have no gradient.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.1, 0.0], [0.0, 0.5]])
+        dynamics = dlx.LinearDynamics(A, jnp.array([[0.0], [1.0]]))
+        test = dlx.analysis.modal_controllability(dynamics)
+        test.out_of_reach, test.worst  # the mode 1.1
+        ```
+    """
+
+    modes: Complex[Array, " n"]
+    distances: Float[Array, " n"]
+    unstable: Bool[Array, " n"]
+    tolerance: Float[Array, ""]
+
+    @property
+    def out_of_reach(self) -> Bool[Array, " n"]:
+        """Which modes are out of reach."""
+        # A NaN compares false, and is not within reach.
+        return ~(self.distances > self.tolerance)
+
+    @property
+    def worst(self) -> tuple[Complex[Array, ""], Float[Array, ""]]:
+        """The mode that is closest to being out of reach, and its distance."""
+        k = jnp.argmin(self.distances)
+        return self.modes[k], self.distances[k]
+
+    @property
+    def worst_unstable(self) -> tuple[Complex[Array, ""], Float[Array, ""]]:
+        """The same among unstable modes; the distance is infinite if there is none."""
+        distances = jnp.where(self.unstable, self.distances, jnp.inf)
+        k = jnp.argmin(distances)
+        return self.modes[k], distances[k]
+
+
+def modal_controllability(
+    model: LinearSystem | LinearDynamics,
+    *,
+    inputs: str = "controls",
+    tolerance: Any = None,
+) -> ModalTest:
+    """Which modes the inputs reach, by the test of Popov, Belevitch and Hautus,
+
+    `rank [A - lambda I, B] = n` at each eigenvalue `lambda` of `A`.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
+        [`delucax.LinearDynamics`][].
+    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
+    - `tolerance`: relative distances up to it count as zero; `10 n` rounding units by
+        default.
+
+    **Returns:** a [`delucax.analysis.ModalTest`][], which names each mode.
+
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
+    unknown.
+
+    Source: Hautus, 1969; Eising, 1984 (the distance).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        upright = dlx.linearize(dlx.systems.Pendulum())
+        dlx.analysis.modal_controllability(upright).distances
+        ```
+    """
+    where = "modal_controllability"
+    return _modal_test(plant(model, inputs, where), _checked(tolerance, where))
+
+
+def modal_observability(
+    model: LinearSystem | LinearDynamics, *, tolerance: Any = None
+) -> ModalTest:
+    """Which modes the outputs show, by the test of Popov, Belevitch and Hautus,
+
+    `rank [A' - lambda I, C'] = n` at each eigenvalue `lambda` of `A`.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
+        [`delucax.LinearDynamics`][].
+    - `tolerance`: relative distances up to it count as zero; `10 n` rounding units by
+        default.
+
+    **Returns:** a [`delucax.analysis.ModalTest`][], which names each mode.
+
+    **Raises:** `ValueError` if `model` is not linear or is time-varying.
+
+    Source: Hautus, 1969; Eising, 1984 (the distance).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        upright = dlx.linearize(dlx.systems.Pendulum())
+        dlx.analysis.modal_observability(upright).worst
+        ```
+    """
+    where = "modal_observability"
+    tolerance = _checked(tolerance, where)
+    return _modal_test(_dual(plant(model, "controls", where)), tolerance)
+
+
+def is_controllable(
+    model: LinearSystem | LinearDynamics,
+    *,
+    inputs: str = "controls",
+    tolerance: Any = None,
+) -> Bool[Array, ""]:
+    """Whether the inputs reach every mode.
+
+    **Arguments:** `model`, `inputs` and `tolerance`: as in
+    [`delucax.analysis.modal_controllability`][], which says which mode is out of reach.
+
+    **Returns:** a boolean scalar.
+
+    **Raises:** `ValueError`, as there.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        upright = dlx.linearize(dlx.systems.Pendulum())
+        assert dlx.analysis.is_controllable(upright)
+        ```
+    """
+    test = modal_controllability(model, inputs=inputs, tolerance=tolerance)
+    return ~jnp.any(test.out_of_reach)
+
+
+def is_stabilizable(
+    model: LinearSystem | LinearDynamics,
+    *,
+    inputs: str = "controls",
+    tolerance: Any = None,
+) -> Bool[Array, ""]:
+    """Whether the inputs reach every unstable mode.
+
+    **Arguments:** `model`, `inputs` and `tolerance`: as in
+    [`delucax.analysis.modal_controllability`][], which says which mode is out of reach.
+
+    **Returns:** a boolean scalar.
+
+    **Raises:** `ValueError`, as there.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.1, 0.0], [0.0, 0.5]])
+        dynamics = dlx.LinearDynamics(A, jnp.array([[1.0], [0.0]]))
+        assert dlx.analysis.is_stabilizable(dynamics)
+        assert not dlx.analysis.is_controllable(dynamics)
+        ```
+    """
+    test = modal_controllability(model, inputs=inputs, tolerance=tolerance)
+    return ~jnp.any(test.out_of_reach & test.unstable)
+
+
+def is_observable(
+    model: LinearSystem | LinearDynamics, *, tolerance: Any = None
+) -> Bool[Array, ""]:
+    """Whether the outputs show every mode.
+
+    **Arguments:** `model` and `tolerance`: as in
+    [`delucax.analysis.modal_observability`][], which says which mode is not shown.
+
+    **Returns:** a boolean scalar.
+
+    **Raises:** `ValueError`, as there.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        upright = dlx.linearize(dlx.systems.Pendulum())
+        assert dlx.analysis.is_observable(upright)
+        ```
+    """
+    return ~jnp.any(modal_observability(model, tolerance=tolerance).out_of_reach)
+
+
+def is_detectable(
+    model: LinearSystem | LinearDynamics, *, tolerance: Any = None
+) -> Bool[Array, ""]:
+    """Whether the outputs show every unstable mode.
+
+    **Arguments:** `model` and `tolerance`: as in
+    [`delucax.analysis.modal_observability`][], which says which mode is not shown.
+
+    **Returns:** a boolean scalar.
+
+    **Raises:** `ValueError`, as there.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.1, 0.0], [0.0, 0.5]])
+        dynamics = dlx.LinearDynamics(A, jnp.eye(2), C=jnp.array([[1.0, 0.0]]))
+        assert dlx.analysis.is_detectable(dynamics)
+        ```
+    """
+    test = modal_observability(model, tolerance=tolerance)
+    return ~jnp.any(test.out_of_reach & test.unstable)
+
+
+def poles(model: LinearSystem | LinearDynamics) -> Complex[Array, " n"]:
+    """The eigenvalues of `A`.
+
+    They have first derivatives, in either mode, where they are simple. There is no
+    order among them.
+
+    **Arguments:** `model`: a [`delucax.systems.LinearSystem`][], stable if all poles
+    have a negative real part; or time-invariant [`delucax.LinearDynamics`][], stable if
+    all have a modulus below 1.
+
+    **Returns:** shape `(n,)`, complex.
+
+    **Raises:** `ValueError` if `model` is not linear or is time-varying.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        upright = dlx.linearize(dlx.systems.Pendulum())
+        dlx.analysis.poles(upright)  # +3.87 and -3.87 per second
+        ```
+    """
+    return jnp.linalg.eigvals(plant(model, "controls", "poles").A)
+
+
+def zeros(
+    model: LinearSystem | LinearDynamics, *, inputs: str = "controls"
+) -> Complex[Array, " zeros"]:
+    """The invariant zeros: where `[[A - z I, B], [C, 0]]` loses rank.
+
+    Each step takes away what the outputs show at once, and then, of the transposed
+    system, what the inputs reach at once, until the zeros are what is left. How many
+    there are depends on the values, which therefore cannot be traced.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
+        [`delucax.LinearDynamics`][].
+    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
+
+    **Returns:** complex, as many as there are; those that are also poles included.
+
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, if `inputs` is
+    unknown, or under `jax.jit`, `jax.vmap` and `jax.grad`.
+
+    Source: Emami-Naeini and Van Dooren, 1982.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[0.0, 1.0], [-2.0, -3.0]])
+        B = jnp.array([[0.0], [1.0]])
+        system = dlx.systems.LinearSystem(A, B, C=jnp.array([[5.0, 1.0]]))
+        dlx.analysis.zeros(system)  # -5
+        ```
+    """
+    given = plant(model, inputs, "zeros")
+    if not all(is_concrete(M) for M in (given.A, given.B, given.C)):
+        raise ValueError(
+            "zeros: model must be concrete, got one that is being traced (by jax.jit, "
+            "jax.vmap or jax.grad); how many zeros there are depends on its values."
+        )
+    A, B, C, D = (np.asarray(M) for M in (given.A, given.B, given.C, given.D))
+    total = np.linalg.norm(np.block([[A, B], [C, D]]))
+    tolerance = 10 * sum(A.shape) * np.finfo(A.dtype).eps * total
+    A, B, C, D = _hidden_part(A, B, C, D, tolerance)
+    # Of the transposed system: D is then of full row rank, so in the end it is square.
+    A, C, B, D = (M.T for M in _hidden_part(A.T, C.T, B.T, D.T, tolerance))
+    n = A.shape[0]
+    if n == 0 or 0 in D.shape:
+        # With no input or output left the modes that are left are zeros.
+        return jnp.linalg.eigvals(jnp.asarray(A)) if n else jnp.zeros(0, complex)
+    closed = A - B @ np.linalg.solve(D, C)
+    return jnp.linalg.eigvals(jnp.asarray(closed))
+
+
+def _hidden_part(A, B, C, D, tolerance):
+    """What the outputs do not show at once, with the inputs that keep it so."""
+    while True:
+        # Outputs that the inputs do not touch: the rest of the rows of D is zero.
+        left, values, _ = np.linalg.svd(D) if D.size else (np.eye(len(C)), [], None)
+        rank = int(np.sum(np.asarray(values) > tolerance))
+        C, D = left.T @ C, left.T @ D
+        free = C[rank:]
+        # States that those show at once.
+        _, values, right = np.linalg.svd(free) if free.size else ([], [], np.eye(len(A)))
+        seen = int(np.sum(np.asarray(values) > tolerance))
+        if seen == 0:
+            return A, B, C[:rank], D[:rank]
+        shown, hidden = right[:seen].T, right[seen:].T
+        C = np.concatenate([C[:rank] @ hidden, shown.T @ A @ hidden])
+        D = np.concatenate([D[:rank], shown.T @ B])
+        A, B = hidden.T @ A @ hidden, hidden.T @ B
+
+
+def _checked(tolerance: Any, where: str) -> Any:
+    if tolerance is not None:
+        check_positive(tolerance, "tolerance", where)
+    return tolerance
+
+
+def _dual(plant: Plant) -> Plant:
+    return Plant(plant.A.T, plant.C.T, plant.B.T, plant.D.T, plant.dt)
+
+
+@eqx.filter_jit
+def _modal_test(plant: Plant, tolerance: Any) -> ModalTest:
+    plant = lax.stop_gradient(plant)
+    n = plant.A.shape[0]
+    eps = jnp.finfo(plant.A.dtype).eps
+    if tolerance is None:
+        tolerance = 10 * n * eps
+    scale_A, scale_B = (
+        jnp.where(norm > 0, norm, 1)
+        for norm in (jnp.linalg.norm(plant.A), jnp.linalg.norm(plant.B))
+    )
+    A, B = plant.A / scale_A, plant.B / scale_B
+    eigenvalues = jnp.linalg.eigvals(A)
+    # A defective eigenvalue is only known to a root of the rounding.
+    radius = eps ** (1 / 3)
+
+    def distance(mode):
+        """The smallest singular value, and the best `mode` for its vector."""
+        pencil = jnp.concatenate([A - mode * jnp.eye(n, dtype=A.dtype), B], axis=1)
+        left, values, _ = jnp.linalg.svd(pencil, full_matrices=False)
+        vector = left[:, -1]
+        return values[-1], jnp.vdot(vector, A.astype(vector.dtype) @ vector)
+
+    def nearby(eigenvalue):
+        first, better = distance(eigenvalue)
+        mode, least = eigenvalue, first
+        for _ in range(_SEARCHES):
+            step = better - eigenvalue
+            length = jnp.abs(step)
+            step = step * jnp.minimum(1, radius / jnp.where(length > 0, length, 1))
+            mode = eigenvalue + step
+            least, better = distance(mode)
+        found = least <= tolerance
+        return jnp.where(found, mode, eigenvalue), jnp.where(found, least, first)
+
+    modes, distances = jax.vmap(nearby)(eigenvalues)
+    modes = modes * scale_A
+    unstable = growth(plant, modes) >= 0
+    return ModalTest(modes, distances, unstable, jnp.asarray(tolerance, A.dtype))

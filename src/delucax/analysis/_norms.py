@@ -1,0 +1,302 @@
+"""How large the outputs become: the H2 and H-infinity norms."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._check import is_concrete
+from .._results import choose, Result, RESULTS
+from ..dynamics import LinearDynamics
+from ..systems import LinearSystem
+from ._gramians import gramian
+from ._plant import growth, is_stable, largest_gain, Plant, plant, response, solve, size
+
+
+_LEVELS = 30
+_NEWTON_STEPS = 5
+
+
+class PeakGain(eqx.Module):
+    """The largest gain over all frequencies, and where it is.
+
+    **Attributes:**
+
+    - `gain`: the H-infinity norm; infinite if the model is not stable.
+    - `frequency`: where the gain is largest, in radians per unit of time; of the least
+        stable pole if the model is not stable.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+
+    `gain` and `frequency` are differentiable.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[0.0, 1.0], [-1.0, -0.1]])
+        B = jnp.array([[0.0], [1.0]])
+        peak = dlx.analysis.hinf_norm(dlx.systems.LinearSystem(A, B))
+        peak.gain, peak.frequency
+        ```
+    """
+
+    gain: Float[Array, ""]
+    frequency: Float[Array, ""]
+    result: Result
+
+
+def h2_norm(
+    model: LinearSystem | LinearDynamics, *, inputs: str = "controls"
+) -> Float[Array, ""]:
+    """The H2 norm: the root of the outputs' mean square under unit white noise,
+
+    `sqrt(trace(C W C'))`, `W` being the controllability Gramian; the same as the root
+    of the sum, over inputs, of the energy of the outputs after an impulse.
+
+    Infinite if a pole is on or outside the boundary of stability. Differentiable to any
+    order, in either mode.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
+        [`delucax.LinearDynamics`][].
+    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
+
+    **Returns:** a scalar.
+
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
+    unknown.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A, B = jnp.array([[0.5]]), jnp.array([[1.0]])
+        dlx.analysis.h2_norm(dlx.LinearDynamics(A, B))  # sqrt(4/3)
+        ```
+    """
+    return _h2_norm(plant(model, inputs, "h2_norm"))
+
+
+@eqx.filter_jit
+def _h2_norm(plant: Plant) -> Array:
+    stable = is_stable(plant)
+    # Zero for what is not stable, so that its derivatives are finite beside others.
+    A = jnp.where(stable, plant.A, -jnp.eye(plant.A.shape[0], dtype=plant.A.dtype) / 2)
+    W = gramian(A, plant.B, plant.is_discrete)
+    square = jnp.trace(plant.C @ W @ plant.C.T)
+    positive = square > 0
+    norm = jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
+    return jnp.where(stable, norm, jnp.inf)
+
+
+def hinf_norm(
+    model: LinearSystem | LinearDynamics,
+    *,
+    inputs: str = "controls",
+    throw: bool = True,
+) -> PeakGain:
+    r"""The H-infinity norm: the largest gain that any sinusoid meets,
+
+    `max over omega of sigma_max(C (s I - A)^-1 B)`, at `s = j omega`, or in discrete
+    time at `exp(j omega dt)`.
+
+    A level just above the largest gain found so far is crossed at frequencies that are
+    eigenvalues of a Hamiltonian matrix; between two of them the gain is looked at
+    again, until nothing is above the level, and Newton steps find the top. Infinite if
+    a pole is on or outside the boundary of stability.
+
+    It has first and second derivatives, in either mode, where one frequency and one
+    direction alone attain the maximum; elsewhere it has those of the one found.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
+        [`delucax.LinearDynamics`][].
+    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
+    - `throw`: raise if the search does not end (default); if false, look at `result`.
+
+    **Returns:** a [`delucax.analysis.PeakGain`][].
+
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
+    unknown; an error at run time as `throw` says.
+
+    Source: Bruinsma and Steinbuch, 1990; Boyd and Balakrishnan, 1990.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        def peak(damping):
+            A = jnp.array([[0.0, 1.0], [-1.0, -damping]])
+            B = jnp.array([[0.0], [1.0]])
+            system = dlx.systems.LinearSystem(A, B, C=jnp.array([[1.0, 0.0]]))
+            return dlx.analysis.hinf_norm(system).gain
+
+        jax.grad(peak)(0.1)
+        ```
+    """
+    found = peak_gain(plant(model, inputs, "hinf_norm"))
+    return thrown(found, "hinf_norm") if throw else found
+
+
+def thrown(found: Any, where: str) -> Any:
+    """Raise if the search failed: now if it can be seen, else at run time."""
+    failed = found.result != RESULTS.successful
+    if not is_concrete(failed):
+        return found.result.error_if(found, failed)
+    if failed:
+        raise RuntimeError(
+            f"{where}: {RESULTS[found.result]} Pass throw=False to look at what was "
+            "found."
+        )
+    return found
+
+
+@eqx.filter_jit
+def peak_gain(plant: Plant) -> PeakGain:
+    """The largest gain of a model with a feed-through `D`."""
+    n = plant.A.shape[0]
+    poles = jnp.linalg.eigvals(lax.stop_gradient(plant.A))
+    stable = jnp.all(growth(plant, poles) < 0)
+    # Another in the place of what is not stable, so that its derivatives are finite.
+    harmless = jnp.where(stable, plant.A, -jnp.eye(n, dtype=plant.A.dtype) / 2)
+    safe = eqx.tree_at(lambda p: p.A, plant, harmless)
+    start, ended = _search(lax.stop_gradient(safe))
+    gain, frequency = _followed(safe, *_climb(lax.stop_gradient(safe), start))
+    least = poles[jnp.argmax(growth(plant, poles))]
+    if plant.is_discrete:
+        at_pole = jnp.abs(jnp.angle(least)) / lax.stop_gradient(plant.dt)
+    else:
+        at_pole = jnp.abs(jnp.imag(least))
+    result = choose(ended, RESULTS.successful, RESULTS.not_converged)
+    return PeakGain(
+        jnp.where(stable, gain, jnp.inf),
+        jnp.where(stable, frequency, at_pole),
+        result,
+    )
+
+
+def _with_slope(plant: Plant, omega: Array) -> tuple[Array, Array]:
+    one = jnp.ones_like(omega)
+    return jax.jvp(lambda w: largest_gain(response(plant, w)), (omega,), (one,))
+
+
+def _climb(plant: Plant, omega: Array) -> tuple[Array, Array, Array]:
+    """The top by Newton steps for as long as they go up.
+
+    **Returns:** its frequency, the curvature of the gain there, and whether it is a top
+    that moves with the plant; at the ends of the axis it rests.
+    """
+
+    def step(_, carry):
+        best, top, curvature, moves, trial = carry
+        # An infinite frequency is a point like any other that has no slope.
+        finite = jnp.isfinite(trial)
+        at = jnp.where(finite, trial, 1)
+        one = jnp.ones_like(at)
+        (gain, slope), (_, bend) = jax.jvp(lambda w: _with_slope(plant, w), (at,), (one,))
+        usable = finite & (bend < 0) & jnp.isfinite(slope) & jnp.isfinite(bend)
+        bend = jnp.where(usable, bend, -1)
+        up = usable & (gain >= best) & (trial >= 0)
+        top = jnp.where(up, trial, top)
+        trial = jnp.where(up, at - slope / bend, trial)
+        best, curvature = jnp.where(up, gain, best), jnp.where(up, bend, curvature)
+        return best, top, curvature, jnp.where(up, top > 0, moves), trial
+
+    low, unbent = jnp.zeros_like(omega), -jnp.ones_like(omega)
+    start = (low, omega, unbent, jnp.asarray(False), omega)
+    _, top, curvature, moves, _ = lax.fori_loop(0, _NEWTON_STEPS, step, start)
+    return top, curvature, moves
+
+
+def _followed(
+    plant: Plant, omega: Array, curvature: Array, moves: Array
+) -> tuple[Array, Array]:
+    """The gain at the top, and its frequency, which move with the plant as they do."""
+    finite = jnp.isfinite(omega)
+    gain, slope = _with_slope(plant, jnp.where(finite, omega, 1))
+    rise = jnp.where(moves, slope - lax.stop_gradient(slope), 0)
+    # Zero, but not its derivatives: the step that Newton's method would take next.
+    step = -rise / curvature
+    gain = gain + step * slope + step**2 * curvature / 2
+    at_infinity = largest_gain(plant.D)
+    return jnp.where(finite, gain, at_infinity), omega + step
+
+
+def _search(plant: Plant) -> tuple[Array, Array]:
+    """The frequency of the largest gain, and whether the search came to its end."""
+    n = plant.A.shape[0]
+    eye = jnp.eye(n, dtype=plant.A.dtype)
+    A, B, C, D = plant.A, plant.B, plant.C, plant.D
+    if plant.is_discrete:
+        # With z = (1 + s) / (1 - s) the circle becomes the axis, gain for gain.
+        both = solve(eye + A, jnp.concatenate([A - eye, B], axis=1))
+        D = D - C @ both[:, n:]
+        C = 2**0.5 * solve((eye + A).T, C.T).T
+        A, B = both[:, :n], 2**0.5 * both[:, n:]
+    axis = Plant(A, B, C, D, None)
+    gain = lambda w: largest_gain(response(axis, w))
+    eps = jnp.finfo(A.dtype).eps
+    step = eps**0.625
+
+    def best_of(gain_now, omega_now, omegas):
+        gains = jax.vmap(gain)(omegas)
+        gains = jnp.where(jnp.isnan(gains), -1, gains)
+        k = jnp.argmax(gains)
+        better = gains[k] > gain_now
+        return (
+            jnp.where(better, gains[k], gain_now),
+            jnp.where(better, omegas[k], omega_now),
+        )
+
+    poles = jnp.linalg.eigvals(A)
+    at_poles = jnp.concatenate([jnp.abs(poles), jnp.abs(jnp.imag(poles))])
+    starts = jnp.concatenate([jnp.zeros(1, A.dtype), at_poles])
+    infinity = jnp.asarray(jnp.inf, A.dtype)
+    found = best_of(largest_gain(D), infinity, starts)
+
+    def crossings(level):
+        """Frequencies of the eigenvalues of the Hamiltonian at a level.
+
+        All of them: those that are off the axis by more than rounding are no
+        crossings, but to look at the gain there costs little and harms nothing.
+        """
+        m, p = D.shape[1], D.shape[0]
+        R = level**2 * jnp.eye(m, dtype=D.dtype) - D.T @ D
+        S = level**2 * jnp.eye(p, dtype=D.dtype) - D @ D.T
+        solved = solve(R, jnp.concatenate([D.T @ C, B.T], axis=1))
+        F = A + B @ solved[:, :n]
+        upper, lower = level * B @ solved[:, n:], level * C.T @ solve(S, C)
+        H = jnp.block([[F, upper], [-lower, -F.T]])
+        # They come in pairs, s and -s.
+        omegas = jnp.sort(jnp.abs(jnp.imag(jnp.linalg.eigvals(H))))[::2]
+        return jnp.concatenate([jnp.zeros(1, A.dtype), omegas])
+
+    def more(carry):
+        _, _, ended, k = carry
+        return ~ended & (k < _LEVELS)
+
+    def body(carry):
+        gain_now, omega_now, _, k = carry
+        level = (1 + step) * jnp.where(gain_now > 0, gain_now, 1)
+        nodes = crossings(level)
+        between = (nodes[1:] + nodes[:-1]) / 2
+        gain_next, omega_next = best_of(gain_now, omega_now, between)
+        return gain_next, omega_next, ~(gain_next > level), k + 1
+
+    start = (*found, jnp.asarray(False), jnp.asarray(0))
+    _, omega, ended, _ = lax.while_loop(more, body, start)
+    if plant.is_discrete:
+        omega = 2 * jnp.arctan(omega) / plant.dt
+    return omega, ended

@@ -1,0 +1,123 @@
+"""What a linear model makes of sinusoids and of constants."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from .._check import is_concrete
+from .._fields import as_float_array
+from ..dynamics import LinearDynamics
+from ..systems import LinearSystem
+from ._plant import plant, Plant, response, solve
+
+
+def frequency_response(
+    model: LinearSystem | LinearDynamics, omega: Any, *, inputs: str = "controls"
+) -> Complex[Array, "*frequencies p m"]:
+    """The complex gain `C (s I - A)^-1 B` from inputs to outputs,
+
+    at `s = j omega`, or in discrete time at `exp(j omega dt)`.
+
+    Differentiable with respect to the model and to `omega`. At a frequency where a pole
+    is on the boundary of stability it is infinite.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
+        [`delucax.LinearDynamics`][].
+    - `omega`: angular frequencies, in radians per unit of time, any shape.
+    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
+
+    **Returns:** the shape of `omega` and then `(p, m)`, complex.
+
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, if `omega` is
+    not finite, or `inputs` is unknown.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        upright = dlx.linearize(dlx.systems.Pendulum())
+        gains = dlx.analysis.frequency_response(upright, jnp.logspace(-1, 2, 50))
+        decibels = 20 * jnp.log10(jnp.abs(gains[:, 0, 0]))
+        ```
+    """
+    where = "frequency_response"
+    given = plant(model, inputs, where)
+    omega = as_float_array(omega)
+    real = eqx.is_inexact_array(omega) and not jnp.iscomplexobj(omega)
+    if not real or is_concrete(omega) and not bool(jnp.all(jnp.isfinite(omega))):
+        raise ValueError(f"{where}: omega must be real and finite, got {omega}.")
+    return _responses(given, omega)
+
+
+@eqx.filter_jit
+def _responses(plant: Plant, omega: Array) -> Array:
+    omega = omega.astype(plant.A.dtype)
+    found = jax.vmap(lambda w: response(plant, w))(omega.reshape(-1))
+    found = jnp.where(jnp.isfinite(found), found, jnp.inf)
+    return found.reshape(*omega.shape, *found.shape[1:])
+
+
+def dcgain(
+    model: LinearSystem | LinearDynamics,
+    *,
+    inputs: str = "controls",
+    throw: bool = True,
+) -> Float[Array, "p m"]:
+    """What constant inputs make of the outputs in the end,
+
+    `-C A^-1 B`, or in discrete time `C (I - A)^-1 B`.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
+        [`delucax.LinearDynamics`][]. It need not be stable.
+    - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
+    - `throw`: raise if a pole at frequency zero, an integrator, leaves no such gain
+        (default); if false, return infinity there.
+
+    **Returns:** shape `(p, m)`.
+
+    **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
+    unknown; an error at run time as `throw` says.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[0.0, 1.0], [-2.0, -3.0]])
+        B = jnp.array([[0.0], [1.0]])
+        dlx.analysis.dcgain(dlx.systems.LinearSystem(A, B))  # 1/2 and 0
+        ```
+    """
+    gain, has_integrator = _dcgain(plant(model, inputs, "dcgain"))
+    message = (
+        "dcgain: a pole is at frequency zero (an integrator), so that constant inputs "
+        "come to no constant outputs. Pass throw=False for infinity."
+    )
+    if not throw:
+        return gain
+    if not is_concrete(has_integrator):
+        return eqx.error_if(gain, has_integrator, message)
+    if has_integrator:
+        raise RuntimeError(message)
+    return gain
+
+
+@eqx.filter_jit
+def _dcgain(plant: Plant) -> tuple[Array, Array]:
+    n = plant.A.shape[0]
+    eye = jnp.eye(n, dtype=plant.A.dtype)
+    matrix = eye - plant.A if plant.is_discrete else -plant.A
+    values = jnp.linalg.svd(jax.lax.stop_gradient(matrix), compute_uv=False)
+    singular = ~(values[-1] > n * jnp.finfo(values.dtype).eps * values[0])
+    gain = plant.C @ solve(jnp.where(singular, eye, matrix), plant.B) + plant.D
+    return jnp.where(singular, jnp.inf, gain), singular

@@ -1,0 +1,149 @@
+"""The linear-quadratic regulator over a finite horizon."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._check import check_count
+from .._controller import AbstractController
+from .._fields import function_field, parameter, weight
+from ..dynamics import LinearDynamics
+from ..math import matvec
+from ..riccati import dre
+from ._feed_forward import as_signal, KnownSignals
+from ._operating_point import check_linear, check_observed, check_state, deviation
+
+
+class FiniteHorizonLQR(AbstractController):
+    """The linear-quadratic regulator over a finite horizon,
+
+    `u[k] = u_r[k] - K[k] difference(x[k], r[k]) - k[k]`,
+
+    which minimises the sum over `k < T` of `e'Q e + 2 e'S v + v'R v`, and
+    `e' final e` at the end, with `e = difference(x, r)` and `v = u - u_r`. All of the
+    reference and of a known disturbance is taken into account: `k`, the feed-forward,
+    is zero if the dynamics go from each `r[k]` to `r[k+1]` under `u_r[k]`, as along a
+    trajectory that was planned.
+
+    **Arguments:**
+
+    - `dynamics`: linear dynamics that observe their state, time-invariant or
+        time-varying.
+    - `Q`: state weight, shape `(n, n)`, or `(T, n, n)`, symmetric.
+    - `R`: control weight, shape `(m, m)`, or `(T, m, m)`, symmetric.
+    - `S`: cross weight, shape `(n, m)`, or `(T, n, m)`; zero by default.
+    - `final`: final weight, shape `(n, n)`, symmetric; zero by default.
+    - `horizon`: the number of steps `T`; by default those of time-varying `dynamics`.
+    - `reference`: the state to follow, a vector or a function of time; the operating
+        points by default.
+    - `control_reference`: the control from which deviations are charged, a vector or a
+        function of time; that of the operating points by default.
+    - `disturbance`: a disturbance known in advance, a vector or a function of time.
+    - `difference`: `(x, x_ref) -> deviation`; subtraction by default.
+    - `parallel`: solve the recursion in parallel over time, for accelerators.
+
+    **Attributes:** `K`, the gains, trainable, shape `(T, m, n)`; `k`, shape `(T, m)`;
+    `P`, shape `(T+1, n, n)`; `x_ref` and `u_ref`, shapes `(T, n)` and `(T, m)`. From
+    step `T` on the control is NaN, which a rollout reports.
+
+    **Raises:** `ValueError` if `dynamics` is not linear or does not observe its state,
+    there is no horizon, or a weight or signal does not fit; an error at run time if a
+    step has no minimum.
+
+    Source: Kalman, 1960; Anderson and Moore, 1990 (tracking).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+        B = jnp.array([[0.0], [1.0]])
+        regulator = dlx.controllers.FiniteHorizonLQR(
+            dlx.LinearDynamics(A, B), jnp.eye(2), jnp.eye(1), horizon=20
+        )
+        regulator.K[0]
+        ```
+    """
+
+    K: Float[Array, "T m n"] = weight()
+    k: Float[Array, "T m"] = weight()
+    P: Float[Array, "T+1 n n"] = parameter()
+    x_ref: Float[Array, "T n"] = parameter()
+    u_ref: Float[Array, "T m"] = parameter()
+    dt: Array = parameter()
+    difference: Callable[[Array, Array], Array] | None = function_field()
+
+    def __init__(
+        self,
+        dynamics: LinearDynamics,
+        Q: Any,
+        R: Any,
+        S: Any = None,
+        *,
+        final: Any = None,
+        horizon: int | None = None,
+        reference: Any = None,
+        control_reference: Any = None,
+        disturbance: Any = None,
+        difference: Callable[[Array, Array], Array] | None = None,
+        parallel: bool = False,
+    ):
+        where = "FiniteHorizonLQR"
+        check_linear(dynamics, where)
+        check_observed(dynamics, where)
+        steps = dynamics.A.shape[0] if dynamics.is_time_varying else None
+        if horizon is None and steps is None:
+            raise ValueError(
+                f"{where}: horizon must be given, as dynamics are time-invariant."
+            )
+        T = steps if horizon is None else check_count(horizon, "horizon", where)
+        assert T is not None
+        if steps is not None and T > steps:
+            raise ValueError(
+                f"{where}: horizon must be at most {steps}, the steps of dynamics, got "
+                f"{T}."
+            )
+        signals = dict(
+            reference=(reference, dynamics.state_size),
+            control_reference=(control_reference, dynamics.control_size),
+            disturbance=(disturbance, dynamics.disturbance_size),
+        )
+        follow, push, disturb = (
+            as_signal(*given, name, where) for name, given in signals.items()
+        )
+
+        def along(t):
+            here = KnownSignals(dynamics.at(t), follow, push, disturb, difference)
+            return here.state(t), here.control(t), here.moved(t)
+
+        times = jnp.arange(T) * dynamics.dt
+        self.x_ref, self.u_ref, moved = jax.vmap(along)(times)
+        end = T * dynamics.dt
+        if follow is not None:
+            last = follow(end)
+        elif steps == T:
+            last = dynamics.x_next[-1]
+        else:
+            last = dynamics.at(end).x_ref
+        targets = jnp.concatenate([self.x_ref[1:], last[None]])
+        d = jax.vmap(lambda a, b: deviation(a, b, difference))(moved, targets)
+        A, B = dynamics.A, dynamics.B
+        if steps is not None:
+            A, B = A[:T], B[:T]
+        solution = dre(A, B, Q, R, S, final=final, horizon=T, d=d, parallel=parallel)
+        self.K, self.k, self.P = solution.K, solution.k, solution.X
+        self.dt = dynamics.dt
+        self.difference = difference
+
+    def __call__(self, t, y, state):
+        check_state(self, y, self.x_ref.shape[1])
+        step = jnp.round(t / self.dt).astype(int)
+        at = lambda a: a.at[step].get(mode="fill", fill_value=jnp.nan)  # noqa: E731
+        e = deviation(y, at(self.x_ref), self.difference)
+        u = at(self.u_ref) - matvec(at(self.K), e) - at(self.k)
+        return u.astype(y.dtype), state

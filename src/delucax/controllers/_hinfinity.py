@@ -1,0 +1,153 @@
+"""The H-infinity controller."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._check import check_count, is_concrete
+from .._controller import AbstractController
+from .._fields import function_field, parameter, weight
+from ..dynamics import LinearDynamics
+from ..math import matvec
+from ..riccati import hinf_dare, hinf_dre
+from ._operating_point import (
+    check_linear,
+    check_observed,
+    check_state,
+    deviation,
+    equilibrium,
+)
+
+
+class HInfinity(AbstractController):
+    """The H-infinity controller about an operating point,
+
+    `u = u_ref - K difference(x, x_ref)`,
+
+    which keeps the sum of `dx'Q dx + du'R du` below `gamma^2` times the sum of `w'w`,
+    for every disturbance `w` of the linear dynamics from rest, `dx` and `du` being the
+    deviations from the operating point. Over all time, or over a horizon; then the gain
+    varies in time, and `dx' final dx` at the end counts too.
+
+    By default `gamma` is the least that is attainable. A larger one trades some of the
+    worst case for the average.
+
+    **Arguments:**
+
+    - `dynamics`: linear dynamics that rest at their operating point and observe their
+        state; of [`delucax.linearize`][], for example. Their `E` is how the disturbance
+        enters. Time-varying ones have a horizon, and an operating point that each step
+        takes to the next.
+    - `Q`: state weight, shape `(n, n)`, symmetric; over a horizon also `(T, n, n)`.
+    - `R`: control weight, shape `(m, m)`, symmetric; over a horizon also `(T, m, m)`.
+    - `gamma`: the level, a positive number; by default the least that is attainable.
+    - `horizon`: the number of steps `T`; by default that of time-varying `dynamics`,
+        otherwise all time.
+    - `final`: final weight, shape `(n, n)`, symmetric, over a horizon only; zero by
+        default.
+    - `difference`: `(x, x_ref) -> deviation`; subtraction by default.
+
+    **Attributes:** `K`, the gain, trainable, shape `(m, n)`, or `(T, m, n)`; `P`, the
+    solution of the game, shape `(n, n)`, or `(T+1, n, n)`; `L`, the gain of the worst
+    disturbance `w = L dx`, shape `(k, n)`, or `(T, k, n)`; `gamma`, the level; `x_ref`
+    and `u_ref`, the operating point. From step `T` of a horizon on the control is NaN,
+    which a rollout reports.
+
+    **Raises:** `ValueError` if `dynamics` is not linear, does not rest at its operating
+    point or does not observe its state, or if an argument does not fit; an error at run
+    time if no controller attains `gamma`.
+
+    Source: Basar and Bernhard, 1995.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        upright = dlx.linearize(env.dynamics)
+        controller = dlx.controllers.HInfinity(
+            upright, jnp.eye(2), jnp.eye(1), difference=env.dynamics.difference
+        )
+        x0 = jnp.array([0.1, 0.0])
+        dlx.rollout(env, controller, key=jax.random.key(0), x0=x0).total_cost
+        ```
+    """
+
+    K: Float[Array, "*T m n"] = weight()
+    P: Float[Array, "... n n"] = parameter()
+    L: Float[Array, "*T k n"] = parameter()
+    gamma: Float[Array, ""] = parameter()
+    x_ref: Float[Array, "... n"] = parameter()
+    u_ref: Float[Array, "... m"] = parameter()
+    dt: Array | None = parameter()
+    difference: Callable[[Array, Array], Array] | None = function_field()
+
+    def __init__(
+        self,
+        dynamics: LinearDynamics,
+        Q: Any,
+        R: Any,
+        *,
+        gamma: Any = None,
+        horizon: int | None = None,
+        final: Any = None,
+        difference: Callable[[Array, Array], Array] | None = None,
+    ):
+        where = "HInfinity"
+        check_linear(dynamics, where)
+        check_observed(dynamics, where)
+        varies = dynamics.is_time_varying
+        is_finite = varies or horizon is not None
+        if final is not None and not is_finite:
+            raise ValueError(f"{where}: final is given, which needs a horizon.")
+        if varies:
+            self.x_ref = _path(dynamics, difference, where)
+        else:
+            self.x_ref = equilibrium(dynamics, difference, where)
+        self.u_ref = dynamics.u_ref
+        self.difference = difference
+        matrices = dynamics.A, dynamics.B, dynamics.E, Q, R
+        if is_finite:
+            steps = dynamics.A.shape[0] if varies else None
+            T = steps if horizon is None else check_count(horizon, "horizon", where)
+            solution = hinf_dre(*matrices, final=final, horizon=T, gamma=gamma)
+            self.dt = dynamics.dt
+        else:
+            solution = hinf_dare(*matrices, gamma=gamma)
+            self.dt = None
+        self.K, self.P, self.L = solution.K, solution.X, solution.L
+        self.gamma = solution.gamma
+
+    def __call__(self, t, y, state):
+        check_state(self, y, self.x_ref.shape[-1])
+        K, x_ref, u_ref = self.K, self.x_ref, self.u_ref
+        if self.dt is not None:
+            step = jnp.round(t / self.dt).astype(int)
+            at = lambda a: a.at[step].get(mode="fill", fill_value=jnp.nan)  # noqa: E731
+            K = at(K)
+            x_ref = at(x_ref) if x_ref.ndim == 2 else x_ref
+            u_ref = at(u_ref) if u_ref.ndim == 2 else u_ref
+        u = u_ref - matvec(K, deviation(y, x_ref, self.difference))
+        return u.astype(y.dtype), state
+
+
+def _path(dynamics: LinearDynamics, difference: Any, where: str) -> Array:
+    """The operating points, if the dynamics go from each to the next."""
+    x_ref, reached = dynamics.x_ref, dynamics.x_next
+    miss = jax.vmap(lambda a, b: deviation(a, b, difference))(reached[:-1], x_ref[1:])
+    worst = jnp.max(jnp.abs(miss), initial=0.0)
+    slack = jnp.finfo(x_ref.dtype).eps ** 0.5 * (1 + jnp.max(jnp.abs(x_ref)))
+    strays = ~(worst <= slack)
+    rule = f"{where}: dynamics must go from each operating point to the next"
+    if not is_concrete(strays):
+        return eqx.error_if(x_ref, strays, rule + ".")
+    if strays:
+        raise ValueError(f"{rule}, got x_next {reached} and x_ref {x_ref}.")
+    return x_ref

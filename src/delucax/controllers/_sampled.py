@@ -1,0 +1,153 @@
+"""Continuous problems under a control that is held between samples."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+from jaxtyping import Array
+
+from .._check import as_matrix, check_positive, symmetric_matrix
+from ..dynamics import c2d, linearize
+from ..systems import AbstractSystem, LinearSystem
+from ._lqr import LQR
+
+
+_MOST_DOUBLINGS = 20
+
+
+def sampled_weights(
+    system: LinearSystem, Q: Any, R: Any, dt: Any, S: Any = None
+) -> tuple[Array, Array, Array]:
+    """The weights of the sampled problem that charge what the continuous one does,
+
+    `x'Qd x + 2 x'Sd u + u'Rd u`
+    `= integral over [0, dt] of x(t)'Q x(t) + 2 x(t)'S u + u'R u`
+
+    along `dx/dt = A x + B u` from `x`, with `u` held.
+
+    **Arguments:**
+
+    - `system`: the linear system.
+    - `Q`: state weight, shape `(n, n)`, symmetric.
+    - `R`: control weight, shape `(m, m)`, symmetric.
+    - `dt`: the step, a positive number.
+    - `S`: cross weight, shape `(n, m)`; zero by default.
+
+    **Returns:** `(Qd, Rd, Sd)`, shapes `(n, n)`, `(m, m)` and `(n, m)`.
+
+    **Raises:** `ValueError` if `system` is not linear, a weight does not fit, or `dt`
+    is not positive.
+
+    Source: Van Loan, 1978.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        upright = dlx.linearize(dlx.systems.Pendulum())
+        Q, R = jnp.eye(2), jnp.eye(1)
+        Qd, Rd, Sd = dlx.controllers.sampled_weights(upright, Q, R, dt=0.05)
+        ```
+    """
+    where = "sampled_weights"
+    if not isinstance(system, LinearSystem):
+        raise ValueError(
+            f"{where}: system must be a LinearSystem (`delucax.linearize` makes one), "
+            f"got {type(system).__name__}."
+        )
+    check_positive(dt, "dt", where)
+    A, B = system.A, system.B
+    n, m = B.shape
+    Q, R = symmetric_matrix(Q, "Q", where), symmetric_matrix(R, "R", where)
+    S = jnp.zeros((n, m)) if S is None else as_matrix(S, "S", where)
+    for name, M, shape in (("Q", Q, (n, n)), ("R", R, (m, m)), ("S", S, (n, m))):
+        if M.shape != shape:
+            raise ValueError(
+                f"{where}: {name} must have shape {shape} to fit the system, got "
+                f"{M.shape}."
+            )
+    size = n + m
+    field = jnp.zeros((size, size), A.dtype).at[:n, :n].set(A).at[:n, n:].set(B)
+    charge = jnp.block([[Q, S], [S.T, R]]).astype(A.dtype)
+    zero = jnp.zeros_like(field)
+    block = jnp.block([[-field.T, charge], [zero, field]])
+    # Over all of `dt` the exponential of `-A'` would overflow where `A` is stiff, so it
+    # is taken over a part in which little happens, which is then doubled.
+    size_of_step = jax.lax.stop_gradient(jnp.linalg.norm(field) * dt)
+    doublings = jnp.clip(jnp.ceil(jnp.log2(size_of_step)), 0, _MOST_DOUBLINGS)
+    exponential = jsl.expm(block * (dt * 2**-doublings))
+    flow = exponential[size:, size:]
+    total = flow.T @ exponential[:size, size:]
+
+    def double(carry, k):
+        flow, total = carry
+        after = flow @ flow, total + flow.T @ total @ flow
+        more = k < doublings
+        keep = lambda a, b: jnp.where(more, a, b)  # noqa: E731
+        return jax.tree.map(keep, after, carry), None
+
+    steps = jnp.arange(_MOST_DOUBLINGS)
+    (_, total), _ = jax.lax.scan(double, (flow, total), steps)
+    total = (total + total.T) / 2
+    return total[:n, :n], total[n:, n:], total[:n, n:]
+
+
+def lqrd(
+    system: AbstractSystem,
+    Q: Any,
+    R: Any,
+    dt: Any,
+    S: Any = None,
+    *,
+    difference: Callable[[Array, Array], Array] | None = None,
+) -> LQR:
+    """The sampled-data regulator of a continuous problem: of all controls held over
+    each `dt` it minimises the integral over all time of `dx'Q dx + 2 dx'S du + du'R du`.
+
+    Its `P` is that of the continuous cost: the minimum from a deviation `dx` is
+    `dx' P dx`. As `dt` goes to 0 the gain goes to that of [`delucax.riccati.care`][].
+
+    **Arguments:**
+
+    - `system`: a linear system about an equilibrium, or any system, which is linearised
+        about the equilibrium it names.
+    - `Q`: state weight, shape `(n, n)`, symmetric.
+    - `R`: control weight, shape `(m, m)`, symmetric.
+    - `dt`: the step, a positive number.
+    - `S`: cross weight, shape `(n, m)`; zero by default.
+    - `difference`: `(x, x_ref) -> deviation`; that of a system that is not linear by
+        default.
+
+    **Returns:** a [`delucax.controllers.LQR`][].
+
+    **Raises:** `ValueError` if `system` is no system or names no equilibrium, a weight
+    does not fit, or `dt` is not positive; an error at run time if there is no
+    stabilising gain.
+
+    Source: Levis, Schlueter and Athans, 1971; Van Loan, 1978.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        pendulum = dlx.systems.Pendulum()
+        regulator = dlx.controllers.lqrd(pendulum, jnp.eye(2), jnp.eye(1), dt=0.05)
+        regulator.K
+        ```
+    """
+    if not isinstance(system, AbstractSystem):
+        raise ValueError(
+            f"lqrd: system must be an AbstractSystem, got {type(system).__name__}; for "
+            "dynamics in discrete time use `delucax.controllers.LQR`."
+        )
+    linear = system if isinstance(system, LinearSystem) else linearize(system)
+    if difference is None and linear is not system:
+        difference = system.difference
+    Qd, Rd, Sd = sampled_weights(linear, Q, R, dt, S)
+    return LQR(c2d(linear, dt), Qd, Rd, Sd, difference=difference)

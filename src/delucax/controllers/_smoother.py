@@ -1,0 +1,322 @@
+"""Filters and smoothers of a whole record."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import check_finite, is_concrete
+from .._fields import as_float_array
+from .._results import choose, Result, RESULTS
+from ..riccati._small import full_precision
+from ._estimator import Belief
+from ._gaussian_filter import AbstractGaussianFilter
+
+
+class Filtered(eqx.Module):
+    """What a filter made of a record of `T` observations.
+
+    **Attributes:**
+
+    - `predicted`: the belief of each state before it is observed, and at the end that
+        of the state after the last control: a [`delucax.controllers.Belief`][] with a
+        leading axis of `T + 1`.
+    - `updated`: the belief once it is observed, with a leading axis of `T`.
+    - `log_likelihoods`: the log-density of each observation given those before it,
+        shape `(T,)`.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+
+    After a step that fails, all is NaN.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dynamics = dlx.LinearDynamics(0.9 * jnp.eye(1), jnp.ones((1, 1)))
+        kalman = dlx.controllers.KalmanFilter(dynamics, jnp.eye(1), jnp.eye(1))
+        filtered = dlx.controllers.run_filter(kalman, jnp.ones((20, 1)))
+        filtered.updated.mean, filtered.log_likelihood
+        ```
+    """
+
+    predicted: Belief
+    updated: Belief
+    log_likelihoods: Array
+    result: Result
+
+    @property
+    def log_likelihood(self) -> Array:
+        """That of the whole record, a scalar."""
+        return jnp.sum(self.log_likelihoods)
+
+
+class Smoothed(eqx.Module):
+    """What a smoother made of a record of `T` observations.
+
+    **Attributes:**
+
+    - `mean`: of each state, given the whole record, shape `(T, n)`.
+    - `covariance`: likewise, shape `(T, n, n)`.
+    - `filtered`: what the filter made of it, a [`delucax.controllers.Filtered`][].
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dynamics = dlx.LinearDynamics(0.9 * jnp.eye(1), jnp.ones((1, 1)))
+        kalman = dlx.controllers.KalmanFilter(dynamics, jnp.eye(1), jnp.eye(1))
+        smoothed = dlx.controllers.smooth(kalman, jnp.ones((20, 1)))
+        smoothed.mean, smoothed.covariance
+        ```
+    """
+
+    mean: Array
+    covariance: Array
+    filtered: Filtered
+    result: Result
+
+
+def run_filter(
+    estimator: AbstractGaussianFilter,
+    observations: Any,
+    controls: Any = None,
+    *,
+    t0: Any = 0.0,
+    throw: bool = True,
+) -> Filtered:
+    r"""Run a Kalman filter over a record.
+
+    At each step k, with `t_k = t0 + k dt`: the measurement update with `y_k`, then the
+    time update with `u_k`. The log-likelihood of the record,
+
+    `sum over k of log N(y_k - y_k_predicted; 0, C Sigma_k C' + V)`,
+
+    is differentiable with respect to every array leaf of the estimator: noise levels
+    and constants of the physics can be fitted to it.
+
+    **Arguments:**
+
+    - `estimator`: a [`delucax.controllers.KalmanFilter`][],
+        [`delucax.controllers.ExtendedKalmanFilter`][] or
+        [`delucax.controllers.UnscentedKalmanFilter`][].
+    - `observations`: shape `(T, p)`; `trajectory.observations`, for example.
+    - `controls`: those that were applied, shape `(T, m)`; zero by default.
+    - `t0`: the time of the first observation, 0 by default.
+    - `throw`: raise if a belief or the likelihood is not finite (default); if false,
+        look at `result`.
+
+    **Returns:** a [`delucax.controllers.Filtered`][]. Its result is
+    `RESULTS.diverged` where a belief is not finite, and `RESULTS.ill_posed` where only
+    the likelihood is not, as the covariance of an observation is not definite.
+
+    **Raises:** `ValueError` on an argument of the wrong kind or shape, or that is not
+    finite; an error at run time as `throw` says.
+
+    Source: Kalman, 1960; Schweppe, 1965 (the likelihood).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        dynamics = dlx.LinearDynamics(0.9 * jnp.eye(1), jnp.ones((1, 1)))
+        y = jnp.sin(jnp.arange(20.0))[:, None]
+
+        def log_likelihood(noise):
+            V = jnp.exp(noise) * jnp.eye(1)
+            kalman = dlx.controllers.KalmanFilter(dynamics, jnp.eye(1), V)
+            return dlx.controllers.run_filter(kalman, y).log_likelihood
+
+        jax.grad(log_likelihood)(0.0)
+        ```
+    """
+    where = "run_filter"
+    filtered = _filter(
+        estimator, *_record(estimator, observations, controls, t0, where)
+    )
+    return _checked(filtered, where) if throw else filtered
+
+
+def smooth(
+    estimator: AbstractGaussianFilter,
+    observations: Any,
+    controls: Any = None,
+    *,
+    t0: Any = 0.0,
+    throw: bool = True,
+) -> Smoothed:
+    r"""The estimate of each state from the whole record, by the smoother of Rauch, Tung
+    and Striebel.
+
+    Back from the end, with `G_k = P_k A' Sigma_{k+1}^-1`, `P_k` and `Sigma_k` being the
+    covariances of the filter after and before `y_k`:
+
+    `mean_k = m_k + G_k (mean_{k+1} - A m_k - ...)`,
+    `covariance_k = P_k + G_k (covariance_{k+1} - Sigma_{k+1}) G_k'`,
+
+    the latter in a form that stays semidefinite. Of a nonlinear filter, `P_k A'` is the
+    covariance of the state with the next one, as that filter finds it. What does not
+    vary needs no care: a first state that is known, or noise in some states alone.
+
+    **Arguments:**
+
+    - `estimator`: a [`delucax.controllers.KalmanFilter`][],
+        [`delucax.controllers.ExtendedKalmanFilter`][] or
+        [`delucax.controllers.UnscentedKalmanFilter`][].
+    - `observations`: shape `(T, p)`.
+    - `controls`: those that were applied, shape `(T, m)`; zero by default.
+    - `t0`: the time of the first observation, 0 by default.
+    - `throw`: raise if a belief or the likelihood is not finite (default); if false,
+        look at `result`.
+
+    **Returns:** a [`delucax.controllers.Smoothed`][].
+
+    **Raises:** `ValueError` on an argument of the wrong kind or shape, or that is not
+    finite; an error at run time as `throw` says.
+
+    Source: Rauch, Tung and Striebel, 1965; Sarkka, 2008 (unscented).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        zero = dlx.controllers.Zero(1)
+        run = dlx.rollout(env, zero, key=jax.random.key(0), x0=[0.1, 0.0])
+        ekf = dlx.controllers.ExtendedKalmanFilter(
+            env.dynamics, 1e-6 * jnp.eye(2), 1e-2 * jnp.eye(2)
+        )
+        dlx.controllers.smooth(ekf, run.observations, run.controls).mean
+        ```
+    """
+    where = "smooth"
+    smoothed = _smooth(
+        estimator, *_record(estimator, observations, controls, t0, where)
+    )
+    return _checked(smoothed, where) if throw else smoothed
+
+
+def _record(estimator, observations, controls, t0, where):
+    """The observations, controls and times, checked."""
+    if not isinstance(estimator, AbstractGaussianFilter):
+        raise ValueError(
+            f"{where}: estimator must be a KalmanFilter, ExtendedKalmanFilter or "
+            f"UnscentedKalmanFilter, got {type(estimator).__name__}."
+        )
+    p, m = estimator.V.shape[0], estimator.dynamics.control_size
+    y = as_float_array(observations)
+    if not eqx.is_inexact_array(y) or y.ndim != 2 or y.shape[1] != p or not len(y):
+        got = f"shape {y.shape}" if eqx.is_array(y) else repr(observations)
+        raise ValueError(
+            f"{where}: observations must have shape (T, {p}), T at least 1, got {got}."
+        )
+    check_finite(y, "observations", where)
+    shape = (y.shape[0], m)
+    u = jnp.zeros(shape, y.dtype) if controls is None else as_float_array(controls)
+    if not eqx.is_inexact_array(u) or u.shape != shape:
+        got = f"shape {u.shape}" if eqx.is_array(u) else repr(controls)
+        raise ValueError(
+            f"{where}: controls must have shape {shape}, a row for each observation, "
+            f"got {got}."
+        )
+    check_finite(u, "controls", where)
+    t0 = as_float_array(t0)
+    if jnp.shape(t0) != ():
+        raise ValueError(f"{where}: t0 must be a number, got shape {jnp.shape(t0)}.")
+    return y, u, (t0 + jnp.arange(len(y)) * estimator.dynamics.dt).astype(y.dtype)
+
+
+@eqx.filter_jit
+def _filter(estimator, y, u, times) -> Filtered:
+    first = estimator.init()
+
+    def step(carry, inputs):
+        belief, well = carry
+        t, y, u = inputs
+        expected = estimator._compared(t, y, belief)
+        density = estimator._density(belief, *expected)
+        updated = estimator._corrected(belief, *expected)
+        after = estimator.predict(t, u, updated)
+        well &= _is_finite(updated) & _is_finite(after)
+        # From a failure on, steps are taken from the start again, and then masked: so
+        # no NaN of one member of a batch gets into the derivative of the others.
+        after = jax.tree.map(lambda a, b: jnp.where(well, a, b), after, first)
+        return (after, well), (updated, after, density, well)
+
+    start = first, _is_finite(first)
+    _, (updated, after, densities, well) = lax.scan(step, start, (times, y, u))
+    predicted = jax.tree.map(
+        lambda a, b: jnp.concatenate([a[None], _masked(well, b)]), first, after
+    )
+    clear = jnp.all(jnp.isfinite(densities))
+    result = choose(clear, RESULTS.successful, RESULTS.ill_posed)
+    return Filtered(
+        predicted=predicted,
+        updated=jax.tree.map(lambda a: _masked(well, a), updated),
+        log_likelihoods=_masked(well, densities),
+        result=choose(jnp.all(well), result, RESULTS.diverged),
+    )
+
+
+@eqx.filter_jit
+@full_precision
+def _smooth(estimator, y, u, times) -> Smoothed:
+    filtered = _filter(estimator, y, u, times)
+    well = jnp.isfinite(filtered.log_likelihoods)
+    first = estimator.init()
+    updated = jax.tree.map(
+        lambda a, b: jnp.where(well.reshape(-1, *(1,) * b.ndim), a, b),
+        filtered.updated,
+        first,
+    )
+
+    def back(after, inputs):
+        t, u, belief = inputs
+        belief = estimator._smoothed(t, u, belief, after)
+        return belief, belief
+
+    last = jax.tree.map(lambda a: a[-1], updated)
+    inputs = jax.tree.map(lambda a: a[:-1], (times, u, updated))
+    _, smoothed = lax.scan(back, last, inputs, reverse=True)
+    whole = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), smoothed, last)
+    good = filtered.result == RESULTS.successful
+    sound = _is_finite(whole)
+    result = choose(sound | ~good, filtered.result, RESULTS.diverged)
+    whole = jax.tree.map(lambda a: jnp.where(good, a, jnp.nan), whole)
+    return Smoothed(whole.mean, whole.covariance, filtered, result)
+
+
+def _is_finite(belief: Belief) -> Array:
+    return jnp.all(jnp.isfinite(belief.mean)) & jnp.all(jnp.isfinite(belief.covariance))
+
+
+def _masked(well: Array, values: Array) -> Array:
+    return jnp.where(well.reshape(-1, *(1,) * (values.ndim - 1)), values, jnp.nan)
+
+
+def _checked(found, where):
+    """Raise if the run failed: now if it can be seen, else at run time."""
+    failed = found.result != RESULTS.successful
+    if not is_concrete(failed):
+        return found.result.error_if(found, failed)
+    if failed:
+        filtered = found if isinstance(found, Filtered) else found.filtered
+        step = int(jnp.sum(jnp.isfinite(filtered.log_likelihoods)))
+        raise RuntimeError(
+            f"{where}: {RESULTS[found.result]} At observation {step}. Pass throw=False "
+            "to look at the beliefs."
+        )
+    return found

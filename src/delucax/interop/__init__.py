@@ -1,0 +1,3 @@
+"""Conversions to and from other libraries, each an optional extra."""
+
+from ._control import from_control as from_control, to_control as to_control

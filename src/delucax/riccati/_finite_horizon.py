@@ -1,0 +1,199 @@
+"""Linear-quadratic control over a finite horizon in discrete time."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import as_vector, is_concrete
+from .._results import choose, Result, RESULTS
+from ._horizon_arguments import final_weight, in_time, symmetric_stack
+from ._recursion import gain, linear_recursion, sanitised, values
+from ._small import full_precision, solve
+
+
+class FiniteHorizonSolution(eqx.Module):
+    """The optimal control over a finite horizon.
+
+    The least cost from state `x` at step `t` is `x'X[t]x + 2 p[t]'x + s[t]`, and the
+    control that attains it is `u = -K[t] x - k[t]`.
+
+    **Attributes:**
+
+    - `X`: at each step and at the end, shape `(T+1, n, n)`, symmetric.
+    - `K`: the gains, shape `(T, m, n)`.
+    - `p`: the linear part of the cost-to-go, shape `(T+1, n)`; zero if the problem has
+        no linear terms, as are `s` and `k`.
+    - `s`: its constant part, shape `(T+1,)`.
+    - `k`: the feed-forward controls, shape `(T, m)`.
+    - `closed_loop`: the matrices `A - B K`, shape `(T, n, n)`.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+        B = jnp.array([[0.0], [1.0]])
+        solution = dlx.riccati.dre(A, B, jnp.eye(2), jnp.eye(1), horizon=10)
+        solution.K[0], solution.X[0]
+        ```
+    """
+
+    X: Array
+    K: Array
+    p: Array
+    s: Array
+    k: Array
+    closed_loop: Array
+    result: Result
+
+
+def dre(
+    A: Any,
+    B: Any,
+    Q: Any,
+    R: Any,
+    S: Any = None,
+    *,
+    final: Any = None,
+    horizon: Any = None,
+    d: Any = None,
+    q: Any = None,
+    r: Any = None,
+    final_q: Any = None,
+    parallel: bool = False,
+    throw: bool = True,
+) -> FiniteHorizonSolution:
+    r"""The discrete-time Riccati recursion, back from `X_T = final`:
+
+    `X_t = Q + A'X A - (A'X B + S) K_t`, `K_t = (R + B'X B)^-1 (B'X A + S')`
+
+    with `X = X_{t+1}`. The controls `u = -K_t x - k_t` minimise, along
+    `x_next = A x + B u + d`, the sum of `x'Qx + 2 x'Su + u'Ru + 2 q'x + 2 r'u` over
+    steps `t < T`, plus `x_T' final x_T + 2 final_q'x_T`. To track references `x_ref`
+    and `u_ref`, give `q = -Q x_ref`, `r = -R u_ref` and `final_q = -final x_ref_T`.
+
+    Any argument of the stage may vary in time. It is differentiable to any order, in
+    either mode, and the memory of a gradient is that of `X`.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`, or `(T, n, n)`.
+    - `B`: shape `(n, m)`, or `(T, n, m)`.
+    - `Q`: state weight, shape `(n, n)`, or `(T, n, n)`, symmetric.
+    - `R`: control weight, shape `(m, m)`, or `(T, m, m)`, symmetric. May be singular.
+    - `S`: cross weight, shape `(n, m)`, or `(T, n, m)`; zero by default.
+    - `final`: final weight, shape `(n, n)`, symmetric; zero by default.
+    - `horizon`: the number of steps `T`; needed if no argument has a time axis.
+    - `d`: what is added to the next state, shape `(n,)`, or `(T, n)`; zero by default.
+    - `q`: linear cost of the state, shape `(n,)`, or `(T, n)`; zero by default.
+    - `r`: linear cost of the control, shape `(m,)`, or `(T, m)`; zero by default.
+    - `final_q`: linear cost of the final state, shape `(n,)`; zero by default.
+    - `parallel`: if true, in parallel over time, by associative scans of logarithmic
+        depth, which pays on accelerators; in sequence by default.
+    - `throw`: raise if a step has no minimum (default); if false, look at `result`.
+
+    **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. It is NaN at a step
+    where `R + B'XB` is not positive definite, and at all before it, as there is no
+    minimum then.
+
+    **Raises:** `ValueError` on an argument of the wrong shape, that is not finite or
+    not symmetric, or if there is no horizon; an error at run time as `throw` says.
+
+    Source: Bertsekas, 2017; Sarkka and Garcia-Fernandez, 2023 (in parallel).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.0, 0.1], [0.0, 1.0]])
+        B = jnp.array([[0.0], [0.1]])
+        Q, R = jnp.eye(2), jnp.eye(1)
+        ramp = jnp.stack([0.1 * jnp.arange(50), jnp.ones(50)], axis=1)
+        plan = dlx.riccati.dre(A, B, Q, R, q=-ramp @ Q, parallel=True)
+        u0 = -plan.K[0] @ jnp.zeros(2) - plan.k[0]
+        ```
+    """
+    where = "dre"
+    Q, R = symmetric_stack(Q, "Q", where), symmetric_stack(R, "R", where)
+    stage = {
+        "A": (A, ("n", "n")),
+        "B": (B, ("n", "m")),
+        "Q": (Q, ("n", "n")),
+        "R": (R, ("m", "m")),
+        "S": (S, ("n", "m")),
+        "d": (d, ("n",)),
+        "q": (q, ("n",)),
+        "r": (r, ("m",)),
+    }
+    stage, _ = in_time(where, horizon, stage)
+    n = stage["A"].shape[-1]
+    dtype = stage["A"].dtype
+    final = final_weight(final, n, where)
+    final = jnp.zeros((n, n), dtype) if final is None else final.astype(dtype)
+    is_affine = any(v is not None for v in (d, q, r, final_q))
+    if final_q is None:
+        final_q = jnp.zeros(n, dtype)
+    final_q = as_vector(final_q, n, "final_q", where).astype(dtype)
+    solution = _solution(*stage.values(), final, final_q, is_affine, bool(parallel))
+    if not throw:
+        return solution
+    reason = "R + B'XB is not positive definite at step {}."
+    return raised(where, solution, reason)
+
+
+def raised(where: str, solution: Any, reason: str) -> Any:
+    """Raise if a finite-horizon solve failed: now if it can be seen, else at run time.
+
+    `reason` names the step that failed.
+    """
+    failed = solution.result != RESULTS.successful
+    if not is_concrete(failed):
+        return solution.result.error_if(solution, failed)
+    if failed:
+        step = int(jnp.sum(jnp.isnan(solution.X[:, 0, 0]))) - 1
+        raise RuntimeError(
+            f"{where}: {RESULTS[solution.result]} {reason.format(step)} Pass "
+            "throw=False to look at the solution."
+        )
+    return solution
+
+
+@eqx.filter_jit
+@full_precision
+def _solution(A, B, Q, R, S, d, q, r, final, final_q, is_affine, parallel):
+    X = values(A, B, Q, R, S, final, 0, parallel)
+    good = jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
+    A, B, Q, R, S, after = sanitised(good, A, B, Q, R, S, X[1:])
+    K, loop = jax.vmap(gain)(A, B, R, S, after)
+    (T, _, m), n = B.shape, A.shape[-1]
+    if is_affine:
+        p, s, k = _affine(loop, K, B, R, after, d, q, r, final_q, parallel)
+    else:
+        p, s, k = (jnp.zeros(shape, A.dtype) for shape in ((T + 1, n), T + 1, (T, m)))
+    masked = lambda M: jnp.where(good.reshape(-1, *(1,) * (M.ndim - 1)), M, jnp.nan)
+    p, s = p.at[:-1].set(masked(p[:-1])), s.at[:-1].set(masked(s[:-1]))
+    result = choose(jnp.all(good), RESULTS.successful, RESULTS.infeasible)
+    return FiniteHorizonSolution(X, masked(K), p, s, masked(k), masked(loop), result)
+
+
+def _affine(loop, K, B, R, after, d, q, r, final_q, parallel):
+    """The linear and constant parts of the cost-to-go, and the feed-forward."""
+    pushed = jnp.einsum("tij,tj->ti", after, d)
+    added = jnp.einsum("tji,tj->ti", loop, pushed) + q
+    added = added - jnp.einsum("tji,tj->ti", K, r)
+    p = linear_recursion(loop, added, final_q, parallel, lambda loop, p: loop.T @ p)
+    ahead = p[1:] + pushed
+    push = r + jnp.einsum("tji,tj->ti", B, ahead)
+    pivot = R + jnp.swapaxes(B, 1, 2) @ after @ B
+    k = jax.vmap(solve)(pivot, push[..., None])[..., 0]
+    gained = jnp.sum(d * (p[1:] + ahead), axis=1) - jnp.sum(k * push, axis=1)
+    s = jnp.cumsum(gained[::-1])[::-1]
+    return p, jnp.concatenate([s, jnp.zeros(1, s.dtype)]), k

@@ -1,0 +1,323 @@
+"""The H-infinity games over a finite horizon."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._results import choose, Result, RESULTS
+from ._continuous_game import joint_gain
+from ._continuous_horizon import checked_times
+from ._flow import flow_values
+from ._game import players
+from ._hinfinity import checked_game, checked_level, LOOSE, thrown
+from ._horizon_arguments import final_weight, in_time, symmetric_stack
+from ._level import followed, Game, search
+from ._recursion import gain, is_clearly_definite, sanitised, symmetric, values
+from ._small import full_precision, solve
+
+
+class HorizonGameSolution(eqx.Module):
+    """The saddle point of a game over a finite horizon.
+
+    From state `x` at step (or time) `t` the worst cost is `x'X[t]x`, less `gamma^2`
+    times that of the disturbance.
+
+    **Attributes:**
+
+    - `X`: at each step and at the end, shape `(T+1, n, n)`, symmetric; in continuous
+        time at each point of the grid, shape `(N, n, n)`.
+    - `K`: the gains of the control `u = -K[t] x`, shape `(T, m, n)`, or `(N, m, n)`.
+    - `L`: the gains of the worst disturbance `w = L[t] x`, shape `(T, k, n)`, or
+        `(N, k, n)`.
+    - `gamma`: the level that is attained.
+    - `closed_loop`: the matrices `A - B K`, shape `(T, n, n)`, or `(N, n, n)`.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+        B = jnp.array([[0.0], [1.0]])
+        Q, R = jnp.eye(2), jnp.eye(1)
+        solution = dlx.riccati.hinf_dre(A, B, None, Q, R, horizon=20, gamma=4.0)
+        solution.K[0], solution.L[0]
+        ```
+    """
+
+    X: Array
+    K: Array
+    L: Array
+    gamma: Array
+    closed_loop: Array
+    result: Result
+
+
+def hinf_dre(
+    A: Any,
+    B: Any,
+    D: Any,
+    Q: Any,
+    R: Any,
+    *,
+    final: Any = None,
+    horizon: Any = None,
+    gamma: Any = None,
+    tolerance: Any = None,
+    throw: bool = True,
+) -> HorizonGameSolution:
+    r"""The H-infinity game over a finite horizon, back from `X_T = final`:
+
+    `X_t = Q + A' X (I + (B R^-1 B' - gamma^-2 D D') X)^-1 A`, with `X = X_{t+1}`.
+
+    The controls `u = -K_t x` keep the sum of `x'Qx + u'Ru` over steps `t < T`, plus
+    `x_T' final x_T`, below `gamma^2` times that of `w'w`, from rest, for every
+    disturbance `w` along `x_next = A x + B u + D w`. The control does not know `w`, and
+    `gamma^2 I - D'XD` must be positive definite at each step.
+
+    Any argument of the stage may vary in time. Derivatives are those of
+    [`delucax.riccati.hinf_dare`][]: to any order at a given `gamma`; of the least
+    `gamma`, the first, and of all else at that level, held fixed.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`, or `(T, n, n)`.
+    - `B`: shape `(n, m)`, or `(T, n, m)`.
+    - `D`: how the disturbance enters, shape `(n, k)`, or `(T, n, k)`; `None` for the
+        identity.
+    - `Q`: state weight, shape `(n, n)`, or `(T, n, n)`, symmetric.
+    - `R`: control weight, shape `(m, m)`, or `(T, m, m)`, symmetric.
+    - `final`: final weight, shape `(n, n)`, symmetric; zero by default.
+    - `horizon`: the number of steps `T`; needed if no argument has a time axis.
+    - `gamma`: the level, a positive number; by default the least that is attainable.
+    - `tolerance`: how close to the least level, relatively; by default 16 rounding
+        units.
+    - `throw`: raise unless the game is solved (default); if false, look at `result`.
+
+    **Returns:** a [`delucax.riccati.HorizonGameSolution`][]. It is NaN at a step that
+    has no saddle point, as where `gamma` is too low, and at all before it.
+
+    **Raises:** `ValueError` on an argument of the wrong shape, that is not finite or
+    not symmetric, if there is no horizon, or the level is not positive; an error at run
+    time as `throw` says.
+
+    Source: Basar and Bernhard, 1995.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+        B = jnp.array([[0.0], [1.0]])
+        Q, R = jnp.eye(2), jnp.eye(1)
+        dlx.riccati.hinf_dre(A, B, None, Q, R, final=Q, horizon=100).gamma  # 2.9563
+        ```
+    """
+    where = "hinf_dre"
+    A = jnp.asarray(A) if isinstance(A, list | tuple) else A
+    if D is None and eqx.is_array_like(A) and jnp.ndim(A) in (2, 3):
+        D = jnp.eye(jnp.shape(A)[-1], dtype=jnp.result_type(A, jnp.float32))
+    stage = {
+        "A": (A, ("n", "n")),
+        "B": (B, ("n", "m")),
+        "D": (D, ("n", "k")),
+        "Q": (symmetric_stack(Q, "Q", where), ("n", "n")),
+        "R": (symmetric_stack(R, "R", where), ("m", "m")),
+    }
+    stage, _ = in_time(where, horizon, stage)
+    n, dtype = stage["A"].shape[-1], stage["A"].dtype
+    final = final_weight(final, n, where)
+    final = jnp.zeros((n, n), dtype) if final is None else final.astype(dtype)
+    gamma, tolerance = checked_level(where, gamma, tolerance, dtype)
+    solution = _discrete((*stage.values(), final), gamma, tolerance)
+    return thrown(where, solution) if throw else solution
+
+
+def hinf_cre(
+    A: Any,
+    B: Any,
+    D: Any,
+    Q: Any,
+    R: Any,
+    *,
+    times: Any,
+    final: Any = None,
+    gamma: Any = None,
+    tolerance: Any = None,
+    throw: bool = True,
+) -> HorizonGameSolution:
+    r"""The H-infinity game over a finite horizon of continuous time, back from
+    `X(t_1) = final`:
+
+    `-dX/dt = A'X + XA - X (B R^-1 B' - gamma^-2 D D') X + Q`.
+
+    The control `u = -K(t) x`, `K = R^-1 B' X`, keeps the integral of `x'Qx + u'Ru` up
+    to `t_1`, the last of `times`, plus `x(t_1)' final x(t_1)`, below `gamma^2` times
+    that of `w'w`, from rest, for every disturbance `w` along `dx/dt = A x + B u + D w`.
+
+    It is exact but for rounding, as [`delucax.riccati.cre`][] is. Derivatives are those
+    of [`delucax.riccati.hinf_dare`][]: to any order at a given `gamma`; of the least
+    `gamma`, the first, and of all else at that level, held fixed. As `gamma` falls to
+    the least level, `X` grows without bound at the first time: take a few percent more
+    for a controller.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`.
+    - `B`: shape `(n, m)`.
+    - `D`: how the disturbance enters, shape `(n, k)`; `None` for the identity.
+    - `Q`: state weight, shape `(n, n)`, symmetric, positive semidefinite.
+    - `R`: control weight, shape `(m, m)`, symmetric, positive definite.
+    - `times`: where `X` is wanted, increasing, at least two, shape `(N,)`.
+    - `final`: final weight, shape `(n, n)`, symmetric, positive semidefinite; zero by
+        default.
+    - `gamma`: the level, a positive number; by default the least that is attainable.
+    - `tolerance`: how close to the least level, relatively; by default 1e-6, and 1e-3
+        in float32.
+    - `throw`: raise unless the game is solved (default); if false, look at `result`.
+
+    **Returns:** a [`delucax.riccati.HorizonGameSolution`][]. It is NaN at the times
+    from which there is no solution, as where `gamma` is too low.
+
+    **Raises:** `ValueError` on an argument of the wrong shape, that is not finite or
+    not symmetric, times that do not increase, or a level that is not positive; an error
+    at run time as `throw` says.
+
+    Source: Basar and Bernhard, 1995; Davison and Maki, 1973.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
+        B = jnp.array([[0.0], [1.0]])
+        Q, R, times = jnp.eye(2), jnp.eye(1), jnp.linspace(0.0, 5.0, 11)
+        solution = dlx.riccati.hinf_cre(A, B, B, Q, R, times=times, gamma=3.0)
+        ```
+    """
+    where = "hinf_cre"
+    problem = checked_game(where, A, B, D, Q, R)
+    n, dtype = problem[0].shape[0], problem[0].dtype
+    final = final_weight(final, n, where)
+    final = jnp.zeros((n, n), dtype) if final is None else final.astype(dtype)
+    times = checked_times(times, where).astype(dtype)
+    loose = LOOSE[dtype.itemsize]
+    gamma, tolerance = checked_level(where, gamma, tolerance, dtype, loose)
+    solution = _continuous((*problem, final, times), gamma, tolerance)
+    return thrown(where, solution) if throw else solution
+
+
+def _discrete_values(problem, gamma):
+    A, B, D, Q, R, final = problem
+    both, weight = players(B, D, R, gamma)
+    S = jnp.zeros_like(both)
+    return values(A, both, Q, weight, S, final, D.shape[-1], False)
+
+
+def _continuous_values(problem, gamma):
+    A, B, D, Q, R, final, times = problem
+    definite = is_clearly_definite(R)
+    safe = jnp.where(definite, R, jnp.eye(R.shape[0], dtype=R.dtype))
+    G = symmetric(B @ solve(safe, B.T) - D @ D.T / gamma**2)
+    X = flow_values(A, G, Q, final, times, True)
+    return jnp.where(definite, X, jnp.nan)
+
+
+def _game(function):
+    """A recursion as what a search calls: there is no equation left to be solved."""
+
+    def solve(problem, gamma, X0):
+        del X0
+        X = function(problem, gamma)
+        good = jnp.all(jnp.isfinite(X))
+        nothing = jnp.zeros((), X.dtype)
+        return Game(X, nothing, good, jnp.ones((), bool), jnp.asarray(0))
+
+    return solve
+
+
+_discrete_game = _game(_discrete_values)
+_continuous_game = _game(_continuous_values)
+
+
+def _discrete_barrier(problem, gamma):
+    _, _, D, *_ = problem
+    X = _discrete_values(problem, gamma)[1:]
+    eye = jnp.eye(D.shape[-1], dtype=D.dtype)
+    margins = gamma**2 * eye - jnp.swapaxes(D, 1, 2) @ X @ D
+    margins = jax.vmap(lambda M: jnp.trace(solve(M, eye)))(margins)
+    scale = lax.stop_gradient(gamma**2 * jnp.linalg.norm(X))
+    return scale * jnp.sum(margins) + jnp.trace(X[0])
+
+
+def _continuous_barrier(problem, gamma):
+    return jnp.trace(_continuous_values(problem, gamma)[0])
+
+
+def _found(game, barrier, problem, points, gamma, tolerance):
+    """The level, the level to compute with, and the result; `points` is that of `X`."""
+    A = problem[0]
+    nothing = jnp.zeros((points, *A.shape[-2:]), A.dtype)
+    found, level = search(game, problem, nothing, gamma, tolerance)
+    if gamma is None:
+        gamma = followed(barrier, problem, level)
+    else:
+        level = gamma
+    result = choose(found.game.good, RESULTS.successful, RESULTS.infeasible)
+    return gamma, jnp.where(level > 0, level, 1), result
+
+
+@eqx.filter_jit
+@full_precision
+def _discrete(problem, gamma, tolerance):
+    A, B, D, Q, R, _ = problem
+    points = A.shape[0] + 1
+    gamma, level, result = _found(
+        _discrete_game, _discrete_barrier, problem, points, gamma, tolerance
+    )
+    X = _discrete_values(problem, level)
+    good = jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
+    both, weight = players(B, D, R, level)
+    S = jnp.zeros_like(both)
+    A, both, Q, weight, S, after = sanitised(good, A, both, Q, weight, S, X[1:])
+    K, _ = jax.vmap(gain)(A, both, weight, S, after)
+    m = B.shape[-1]
+    loop = A - both[..., :m] @ K[:, :m]
+    masked = lambda M: jnp.where(good[:, None, None], M, jnp.nan)
+    gains = masked(K[:, :m]), masked(-K[:, m:])
+    return HorizonGameSolution(X, *gains, gamma, masked(loop), result)
+
+
+@eqx.filter_jit
+@full_precision
+def _continuous(problem, gamma, tolerance):
+    A, B, D, _, R, _, times = problem
+    gamma, level, result = _found(
+        _continuous_game,
+        _continuous_barrier,
+        problem,
+        times.shape[0],
+        gamma,
+        tolerance,
+    )
+    X = _continuous_values(problem, level)
+    good = jnp.all(jnp.isfinite(X), axis=(1, 2))
+    masked = lambda M: jnp.where(good[:, None, None], M, jnp.nan)
+    known = jnp.where(good[:, None, None], X, 0)
+    safe = jnp.where(jnp.any(good), R, jnp.eye(R.shape[0], dtype=R.dtype))
+    both, weight = players(B, D, safe, level)
+    K, _ = jax.vmap(lambda X: joint_gain(A, both, weight, X))(known)
+    m = B.shape[1]
+    loop = A - B @ K[:, :m]
+    gains = masked(K[:, :m]), masked(-K[:, m:])
+    return HorizonGameSolution(masked(known), *gains, gamma, masked(loop), result)

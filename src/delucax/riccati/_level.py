@@ -1,0 +1,195 @@
+"""A game at its least level, by bisection, and the derivative of the level."""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ._small import full_precision
+
+
+_WIDEST = 1e18
+"""The search gives up this factor away from where it starts."""
+_FACTOR = 4.0
+_MAX_TRIALS = 200
+_AWAY = (1.0, 4.0, 16.0, 64.0)
+_WEIGHTS = (64 / 21, -8 / 3, 2 / 3, -1 / 21)
+"""Of the polynomial through values at the roots of the above, at 0."""
+
+
+class Game(NamedTuple):
+    """A solution of the equation of a game, and what it is worth."""
+
+    X: Array
+    residual: Array
+    holds: Array  # whether all conditions of a solution but the equation are met
+    solved: Array  # whether the equation is
+    iterations: Array
+
+    @property
+    def good(self) -> Array:
+        return self.holds & self.solved
+
+
+class Search(NamedTuple):
+    """Where a search for the least level has come to."""
+
+    low: Array
+    high: Array
+    start: Array
+    calm: Array  # whether there is a solution without a disturbance
+    felt: Array  # whether the disturbance has any effect on the cost
+    base: Array  # the solution without a disturbance
+    game: Game
+    trials: Array
+
+
+Solve = Callable[[tuple, Array, Array], Game]
+"""`(A, B, D, Q, R, *others)`, `gamma` and `X0` to the game's solution. `X0` is a point
+below the solution, from which the iteration rises to it."""
+
+
+def search(
+    solve: Solve,
+    problem: tuple,
+    start: Array,
+    gamma: Array | None = None,
+    tolerance: Array | float = 0.0,
+) -> tuple[Search, Array]:
+    """The game at `gamma`, or at the least level; and the level. No derivatives.
+
+    The first trial is without a disturbance, from `start`. It tells whether there is
+    any level, and about where; and the others start at what it found. The level is the
+    upper, feasible end of a bracket that is narrower than `tolerance`, relatively. It
+    is 0 where no disturbance has any effect.
+    """
+    problem, start, gamma = lax.stop_gradient((problem, start, gamma))
+    A, B, D, *others = problem
+    one = jnp.ones((), A.dtype)
+
+    def more(now):
+        if gamma is not None:
+            return (now.trials == 0) | (now.calm & (now.trials < 2))
+        open_end = jnp.isinf(now.high) | (now.low == 0)
+        wide = now.high > now.low * (1 + tolerance)
+        near = (now.low < _WIDEST * now.start) & (now.high > now.start / _WIDEST)
+        going = jnp.where(open_end, near, wide) & (now.trials < _MAX_TRIALS)
+        return (now.trials == 0) | (now.calm & now.felt & going)
+
+    def body(now):
+        first = now.trials == 0
+        trial = _next(now) if gamma is None else gamma
+        trial = jnp.where(first, one, trial)
+        tried = (A, B, jnp.where(first, 0, D), *others)
+        found = solve(tried, trial, now.base)
+        good = found.good
+        # What a disturbance does to the cost when it is not resisted at all.
+        X = found.X[1:] if D.ndim == 3 else found.X
+        felt = jnp.einsum("...ik,...ij,...jk->", D, X, D)
+        size = jnp.linalg.norm(X) * jnp.sum(D**2)
+        slack = 10 * A.shape[-1] * jnp.finfo(A.dtype).eps * size
+        at_first = Search(
+            low=now.low,
+            high=now.high,
+            start=jnp.sqrt(jnp.maximum(felt, jnp.finfo(A.dtype).tiny)),
+            calm=good,
+            felt=felt > slack,
+            base=found.X,
+            game=found,
+            trials=now.trials,
+        )
+        # Between neighbouring numbers there is nothing left to try.
+        stuck = (trial <= now.low) | (trial >= now.high)
+        better = good & ~stuck
+        keep = better if gamma is None else jnp.ones((), bool)
+        later = now._replace(
+            low=jnp.where(stuck, now.high, jnp.where(good, now.low, trial)),
+            high=jnp.where(better, trial, now.high),
+            game=_where(keep | (now.trials == 1), found, now.game),
+        )
+        return _where(first, at_first, later)._replace(trials=now.trials + 1)
+
+    unknown = jax.eval_shape(solve, problem, one, start)
+    begin = Search(
+        low=0 * one,
+        high=jnp.inf * one,
+        start=one,
+        calm=jnp.zeros((), bool),
+        felt=jnp.zeros((), bool),
+        base=start,
+        game=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), unknown),
+        trials=jnp.asarray(0),
+    )
+    end = lax.while_loop(more, body, begin)
+    if gamma is not None:
+        return end, gamma
+    level = jnp.where(jnp.isfinite(end.high) & end.calm, end.high, one)
+    return end, jnp.where(end.calm & ~end.felt, 0, level)
+
+
+def _next(now: Search) -> Array:
+    """Up by factors until feasible, down until not, and then into the middle."""
+    known = jnp.where(jnp.isinf(now.high), 1, now.high)
+    up = jnp.where(now.low == 0, now.start, _FACTOR * now.low)
+    down = jnp.where(now.low == 0, known / _FACTOR, jnp.sqrt(now.low * known))
+    return jnp.where(jnp.isinf(now.high), up, down)
+
+
+def _where(condition, first, second):
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), first, second)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def followed(barrier: Callable[[tuple, Array], Array], problem: tuple, level: Array):
+    """The least level, differentiated as the problem changes.
+
+    `barrier(problem, gamma)` is any function whose value or slope becomes infinite at
+    the least level: where it is constant, `gamma` moves as the level does.
+    """
+    del barrier, problem
+    return level
+
+
+@followed.defjvp
+@full_precision
+def _followed_jvp(barrier, primals, tangents):
+    problem, level = primals
+    level = once(level)
+    problem = jax.tree.map(once, problem)
+    still = jax.tree.map(jnp.zeros_like, problem)
+    felt = level > 0
+    safe = jnp.where(felt, level, 1)
+
+    def following(away):
+        along = functools.partial(jax.jvp, barrier, (problem, safe * (1 + away)))
+        _, slope = along((still, jnp.ones_like(safe)))
+        _, change = along((tangents[0], jnp.zeros_like(safe)))
+        return -change / jnp.where(slope != 0, slope, 1)
+
+    # Its error is a series in the root of the distance: two eigenvalues may meet on the
+    # boundary. From four distances follows the limit without the first terms.
+    away = jnp.finfo(level.dtype).eps ** (3 / 8) * jnp.asarray(_AWAY, level.dtype)
+    tangent = jax.vmap(following)(away) @ jnp.asarray(_WEIGHTS, level.dtype)
+    return primals[1], jnp.where(felt, tangent, 0)
+
+
+@jax.custom_jvp
+def once(x: Array) -> Array:
+    """`x`, which can not be differentiated again.
+
+    The slope of the barrier is infinite in the limit: its own derivative would be
+    rounding alone.
+    """
+    return x
+
+
+@once.defjvp
+def _once_jvp(primals, tangents):
+    raise NotImplementedError(
+        "The least attainable gamma has first derivatives only. Give gamma as an "
+        "argument for higher ones."
+    )

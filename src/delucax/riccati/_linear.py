@@ -1,0 +1,397 @@
+"""The Lyapunov, Stein and Sylvester equations, for spectra that need not be stable."""
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import as_matrix
+from .._results import choose, Result, RESULTS
+from ._arguments import complex_form, is_complex, real_form, square_matrix
+from ._lyapunov import stable_sylvester
+from ._search import tolerance
+from ._small import full_precision, no_tangent, solve
+from ._solution import checked, MatrixSolution
+from ._spectrum import spectral_abscissa
+from ._stein import smith
+
+
+_DENSE = 256
+"""Up to as many unknowns the equation may be solved as one linear system."""
+_PLAIN, _SHIFTED, _DENSELY, _DONE = range(4)
+
+
+def lyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
+    r"""The continuous-time Lyapunov equation
+
+    `A X + X A' + Q = 0`,
+
+    whose solution is, for a stable `A`, the covariance of `dx/dt = A x` driven by white
+    noise of intensity `Q`.
+
+    Solved by a Cayley transform and doubling if all eigenvalues of `A` are on one side
+    of the imaginary axis. Otherwise a unique solution is still found, in one dense
+    solve, up to `n = 16`; beyond it `result` is `RESULTS.not_separated`.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`. Real, or complex, as `Q`; then `'` is the conjugate
+        transpose.
+    - `Q`: shape `(n, n)`, not necessarily symmetric.
+    - `throw`: raise unless the solution is found (default); if false, look at `result`.
+
+    **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
+    `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
+    `RESULTS.not_separated`, or `RESULTS.ill_posed` where two eigenvalues of `A` sum to
+    zero.
+
+    **Raises:** `ValueError` on a matrix of the wrong shape or that is not finite; an
+    error at run time as `throw` says.
+
+    Source: Smith, 1968.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[0.0, 1.0], [-1.0, -0.5]])
+        covariance = dlx.riccati.lyap(A, jnp.eye(2)).X
+        ```
+    """
+    A, _, Q = _checked("lyap", A, None, Q, "Q")
+    return checked(_solution(False, A, None, -Q), "lyap", throw)
+
+
+def dlyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
+    r"""The discrete-time Lyapunov equation
+
+    `A X A' - X + Q = 0`,
+
+    whose solution is, for a stable `A`, the covariance of `x_next = A x` driven by
+    white noise of covariance `Q`.
+
+    Solved by doubling if all eigenvalues of `A` are on one side of the unit circle.
+    Otherwise a unique solution is still found, in one dense solve, up to `n = 16`;
+    beyond it `result` is `RESULTS.not_separated`.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`. Real, or complex, as `Q`; then `'` is the conjugate
+        transpose.
+    - `Q`: shape `(n, n)`, not necessarily symmetric.
+    - `throw`: raise unless the solution is found (default); if false, look at `result`.
+
+    **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
+    `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
+    `RESULTS.not_separated`, or `RESULTS.ill_posed` where two eigenvalues of `A` have
+    the product one.
+
+    **Raises:** `ValueError` on a matrix of the wrong shape or that is not finite; an
+    error at run time as `throw` says.
+
+    Source: Smith, 1968.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[0.9, 0.1], [0.0, 0.5]])
+        covariance = dlx.riccati.dlyap(A, jnp.eye(2)).X
+        ```
+    """
+    A, _, Q = _checked("dlyap", A, None, Q, "Q")
+    return checked(_solution(True, A, None, Q), "dlyap", throw)
+
+
+def sylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
+    r"""The Sylvester equation
+
+    `A X + X B = C`.
+
+    Solved by a shift, a Cayley transform and doubling if a line `Re(z) = s` has the
+    eigenvalues of `A` on one side and those of `-B` on the other. Otherwise a unique
+    solution is still found, in one dense solve, up to 256 unknowns; beyond it `result`
+    is `RESULTS.not_separated`.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`. Real, or complex, as `B` and `C`.
+    - `B`: shape `(m, m)`.
+    - `C`: shape `(n, m)`.
+    - `throw`: raise unless the solution is found (default); if false, look at `result`.
+
+    **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
+    `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
+    `RESULTS.not_separated`, or `RESULTS.ill_posed` where `A` and `-B` share an
+    eigenvalue.
+
+    **Raises:** `ValueError` on a matrix of the wrong shape or that is not finite; an
+    error at run time as `throw` says.
+
+    Source: Smith, 1968.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A, B = jnp.array([[1.0, 2.0], [0.0, 3.0]]), jnp.array([[4.0]])
+        X = dlx.riccati.sylvester(A, B, jnp.ones((2, 1))).X
+        ```
+    """
+    A, B, C = _checked("sylvester", A, B, C, "C")
+    return checked(_solution(False, A, B, C), "sylvester", throw)
+
+
+def dsylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
+    r"""The Stein equation, which is the Sylvester equation of discrete time,
+
+    `A X B - X + C = 0`.
+
+    Solved by doubling if the spectral radii of `A` and `B` have a product below one; by
+    a Cayley transform if the circle about 0 is crossed outwards by both spectra.
+    Otherwise a unique solution is still found, in one dense solve, up to 256 unknowns;
+    beyond it `result` is `RESULTS.not_separated`.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`. Real, or complex, as `B` and `C`.
+    - `B`: shape `(m, m)`.
+    - `C`: shape `(n, m)`.
+    - `throw`: raise unless the solution is found (default); if false, look at `result`.
+
+    **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
+    `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
+    `RESULTS.not_separated`, or `RESULTS.ill_posed` where an eigenvalue of `A` and one
+    of `B` have the product one.
+
+    **Raises:** `ValueError` on a matrix of the wrong shape or that is not finite; an
+    error at run time as `throw` says.
+
+    Source: Smith, 1968.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A, B = jnp.array([[0.5, 0.2], [0.0, 0.9]]), jnp.array([[0.8]])
+        X = dlx.riccati.dsylvester(A, B, jnp.ones((2, 1))).X
+        ```
+    """
+    A, B, C = _checked("dsylvester", A, B, C, "C")
+    return checked(_solution(True, A, B, C), "dsylvester", throw)
+
+
+def _checked(where, A, B, C, name):
+    """The arguments as matrices of one precision that fit each other."""
+    A, C = square_matrix(A, "A", where), as_matrix(C, name, where)
+    B = None if B is None else square_matrix(B, "B", where)
+    shape = (A.shape[0], A.shape[0] if B is None else B.shape[0])
+    if C.shape != shape:
+        raise ValueError(
+            f"{where}: {name} must have shape {shape}, got shape {C.shape}."
+        )
+    dtype = jnp.result_type(*(M for M in (A, B, C) if M is not None))
+    return tuple(None if M is None else M.astype(dtype) for M in (A, B, C))
+
+
+@functools.partial(eqx.filter_jit)
+def _solution(discrete, A, B, C) -> MatrixSolution:
+    complex_data = is_complex(A, B, C)
+    if complex_data:
+        A, B, C = (real_form(M) for M in (A, B, C))
+    found = _find(discrete, A, B, C)
+    return MatrixSolution(
+        X=complex_form(found.X) if complex_data else found.X,
+        residual=lax.stop_gradient(found.residual),
+        iterations=found.iterations,
+        result=_verdict(found, C.size),
+    )
+
+
+class _Found(NamedTuple):
+    X: Array
+    residual: Array
+    iterations: Array
+    finite: Array  # whether the data are
+
+    @property
+    def solved(self) -> Array:
+        return self.residual <= tolerance(self.X.dtype)
+
+
+def _verdict(found: _Found, unknowns: int) -> Result:
+    failure = RESULTS.ill_posed if unknowns <= _DENSE else RESULTS.not_separated
+    result = choose(found.solved, RESULTS.successful, failure)
+    return choose(found.finite, result, RESULTS.ill_posed)
+
+
+def _left_side(discrete, A, B, X):
+    """`A X + X B`, or `X - A X B`, and its terms."""
+    B = A.T if B is None else B
+    if discrete:
+        moved = A @ X @ B
+        return X - moved, (X, moved)
+    terms = A @ X, X @ B
+    return terms[0] + terms[1], terms
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+@full_precision
+def _find(discrete, A, B, C) -> _Found:
+    """The solution of `A X + X B = C` or `X - A X B = C`; `B` is `A'` by default."""
+    given = [M for M in (A, B, C) if M is not None]
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in given]))
+    last = _DENSELY if C.size <= _DENSE else _SHIFTED
+
+    def attempt(kind):
+        plain, shifted = kind == _PLAIN, kind == _SHIFTED
+        X, iterations = _separated(discrete, A, B, C, plain, shifted)
+        if last == _DENSELY:
+            X = _densely(discrete, A, B, C, X, kind == _DENSELY)
+        left, terms = _left_side(discrete, A, B, X)
+        size = sum(jnp.linalg.norm(M) for M in (*terms, C))
+        error = jnp.linalg.norm(left - C)
+        residual = error / jnp.where(size == 0, 1, size)
+        return X, jnp.where(jnp.isfinite(residual), residual, jnp.inf), iterations
+
+    def more(carry):
+        return carry[0] != _DONE
+
+    def body(carry):
+        kind, before = carry
+        X, residual, iterations = attempt(kind)
+        # The equation is linear: if its residual is small, it is solved.
+        better = (residual < before.residual) | (kind == _PLAIN)
+        found = before._replace(
+            X=jnp.where(better, X, before.X),
+            residual=jnp.where(better, residual, before.residual),
+            iterations=before.iterations + iterations,
+        )
+        over = found.solved | (kind == last)
+        return jnp.where(over, _DONE, kind + 1), found
+
+    nothing = _Found(
+        jnp.full_like(C, jnp.nan),
+        jnp.asarray(jnp.inf, C.dtype),
+        jnp.asarray(0),
+        finite,
+    )
+    start = jnp.where(finite, _PLAIN, _DONE)
+    return lax.while_loop(more, body, (start, nothing))[1]
+
+
+def _separated(discrete, A, B, C, plain, shifted):
+    """The solution if the spectra are separated, as they are or by a shift."""
+    if discrete:
+        # What is not wanted is given a problem that takes one step.
+        X, steps = smith(*_wanted(plain, A, B, C))
+        # Where both spectra are outside the circle, the Cayley transform puts them to
+        # the right of the axis.
+        eye_A, eye_B = jnp.eye(C.shape[0], dtype=C.dtype), jnp.eye(C.shape[1])
+        eye_B = eye_B.astype(C.dtype)
+        other = (A.T if B is None else B) + eye_B
+        A, F = A + eye_A, solve(A + eye_A, A - eye_A)
+        right = solve(A, C)
+        C = -2 * solve(other.T, right.T).T
+        B = None if B is None else solve(other.T, (B - eye_B).T).T
+        A, sign = F, jnp.where(shifted, -1.0, 1.0)
+        Y, more_steps = _one_side(A, B, C, sign, jnp.zeros(()), shifted)
+        return jnp.where(plain, X, Y), steps + more_steps
+    n, m = C.shape
+    mean = jnp.trace(A) / n + (jnp.trace(A) / n if B is None else jnp.trace(B) / m)
+    sign = jnp.where(mean > 0, -1.0, 1.0)
+    if B is None:
+        # There is no other line for an equation that is its own transpose.
+        return _one_side(A, None, C, sign, jnp.zeros(()), plain)
+    shift = _shift(sign * A, sign * B, shifted)
+    return _one_side(A, B, C, sign, sign * shift, plain | shifted)
+
+
+def _shift(A, B, wanted):
+    """Where the line is: between the spectra of `A` and `-B`."""
+    safe_A, safe_B = (jnp.where(wanted, M, 0) for M in (A, B))
+    middle = (spectral_abscissa(safe_A) - spectral_abscissa(safe_B)) / 2
+    return jnp.where(wanted, middle, 0)
+
+
+def _one_side(A, B, C, sign, shift, wanted):
+    """The solution after a shift and a change of sign that make both matrices stable."""
+    sign, shift = sign.astype(C.dtype), shift.astype(C.dtype)
+    A = sign * (A - shift * jnp.eye(A.shape[0], dtype=A.dtype))
+    if B is not None:
+        B = sign * (B + shift * jnp.eye(B.shape[0], dtype=B.dtype))
+    A, B, C = _wanted(wanted, A, B, sign * C, -1)
+    return stable_sylvester(A, B, C)
+
+
+def _wanted(wanted, A, B, C, scale=0):
+    """The problem if it is wanted; else one that is done at once."""
+    A = jnp.where(wanted, A, scale * jnp.eye(A.shape[0], dtype=A.dtype))
+    if B is not None:
+        B = jnp.where(wanted, B, scale * jnp.eye(B.shape[0], dtype=B.dtype))
+    return A, B, jnp.where(wanted, C, 0)
+
+
+def _densely(discrete, A, B, C, X, wanted):
+    """The solution of the equation as one linear system, if that is wanted, else `X`."""
+
+    def body(carry):
+        _, going = carry
+        other = A.T if B is None else B
+        eye_A = jnp.eye(A.shape[0], dtype=A.dtype)
+        eye_B = jnp.eye(other.shape[0], dtype=A.dtype)
+        if discrete:
+            system = jnp.kron(eye_A, eye_B) - jnp.kron(A, other.T)
+        else:
+            system = jnp.kron(A, eye_B) + jnp.kron(eye_A, other.T)
+        return solve(system, C.reshape(-1, 1)).reshape(C.shape), ~going
+
+    return lax.while_loop(lambda carry: carry[1], body, (X, wanted))[0]
+
+
+@_find.defjvp
+@full_precision
+def _find_jvp(discrete, primals, tangents):
+    A, B, _ = primals
+    found = _find(discrete, *primals)
+    ok = found.solved
+    # Guarded at both ends: what is not finite in a failed member stays in it.
+    dA, dB, dC = (
+        None if t is None else jnp.where(ok, t, 0) for t in tangents
+    )
+    X = jnp.where(ok, found.X, 0)
+    safe_A, safe_B = (
+        None if M is None else jnp.where(ok, M, -jnp.eye(M.shape[0], dtype=M.dtype) / 2)
+        for M in (A, B)
+    )
+    B_now = safe_A.T if B is None else safe_B
+    dB = dA.T if B is None else dB
+    if discrete:
+        right = dC + dA @ X @ B_now + safe_A @ X @ dB
+    else:
+        right = dC - dA @ X - X @ dB
+
+    def transposed(M):
+        return None if M is None else M.T
+
+    dX = lax.custom_linear_solve(
+        lambda X: _left_side(discrete, safe_A, safe_B, X)[0],
+        jnp.where(ok, right, 0),
+        solve=lambda _, C: _find(discrete, safe_A, safe_B, C).X,
+        transpose_solve=lambda _, C: _find(
+            discrete, transposed(safe_A), transposed(safe_B), C
+        ).X,
+    )
+    return found, no_tangent(found)._replace(X=jnp.where(ok, dX, 0))

@@ -1,0 +1,140 @@
+"""The spectral radius and abscissa of a matrix, by repeated squaring."""
+
+import math
+
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+_SQUARINGS = 60
+"""Beyond it no more digits of `log |A^N| / N` are to be had in float64."""
+_DIGITS = 1e-8
+"""Of the logarithm of the spectral radius."""
+_LARGE = 16
+"""From here on it pays to look for the few directions that a power has left."""
+_BLOCK = 4
+_TAYLOR_DEGREE = 12
+
+
+def spectral_radius(A: Float[Array, "n n"]) -> Float[Array, ""]:
+    """The spectral radius, from above up to rounding: `|A^N|^(1/N)` for a large `N`.
+
+    The bound holds for every N (Gelfand), and is above the radius by a relative
+    `log(cond) / N`, with `cond` the condition of the eigenvectors. Of a large matrix a
+    few squarings leave only few directions; the rest is done in their span.
+    """
+    logarithm, found, span, _ = _growth(A, A.shape[0] > _LARGE)
+    if A.shape[0] > _LARGE:
+        within, *_ = _growth(span.T @ A @ span, False)
+        logarithm = jnp.where(found, within, logarithm)
+    return jnp.exp(logarithm)
+
+
+def spectral_abscissa(A: Float[Array, "n n"]) -> Float[Array, ""]:
+    """The largest real part of an eigenvalue, up to rounding of the balanced matrix.
+
+    `h^-1 log` of the spectral radius of `exp(h A)`, with `h` small enough for a series.
+    """
+    return abscissa_and_size(A)[0]
+
+
+def abscissa_and_size(
+    A: Float[Array, "n n"],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The spectral abscissa, and the norm of the balanced matrix that it came from."""
+    A = balanced(A)
+    value, found, span, kept = _slowest(A, A.shape[0] > _LARGE)
+    if A.shape[0] > _LARGE:
+        part = span.T @ A @ span
+        # Directions left out come last.
+        size = jnp.linalg.norm(part)
+        part = part - jnp.diag(jnp.where(kept, 0, size))
+        within, *_ = _slowest(balanced(part), False)
+        value = jnp.where(found, within, value)
+    return value, jnp.linalg.norm(A)
+
+
+def _slowest(A, probing):
+    size = jnp.linalg.norm(A)
+    h = 0.25 / jnp.where(size > 0, size, 1)
+    logarithm, *rest = _growth(_exponential(h * A), probing)
+    return logarithm / h, *rest
+
+
+def _exponential(A):
+    """`exp(A)` for `|A| <= 1/4`, where the series is exact to rounding."""
+    powers = [jnp.eye(A.shape[0], dtype=A.dtype), A]
+    while len(powers) < _BLOCK:
+        powers.append(powers[-1] @ A)
+    step = powers[-1] @ A
+    total = jnp.zeros_like(A)
+    for start in reversed(range(0, _TAYLOR_DEGREE, _BLOCK)):
+        terms = (powers[j] / math.factorial(start + j) for j in range(_BLOCK))
+        total = total @ step + sum(terms)
+    return total
+
+
+def _growth(A, probing):
+    """`log |A^N| / N` for a large `N`. If `probing`, also whether an earlier power has
+    few directions left, a basis of them, and which of its columns are used."""
+    n, dtype = A.shape[0], A.dtype
+    eps = float(jnp.finfo(dtype).eps)
+    count = max(n // 4 if n <= 64 else n // 16, min(n, _LARGE))
+    probes = np.random.default_rng(0).normal(size=(n, count)) if probing else 0.0
+    probes = jnp.asarray(probes, dtype)
+
+    def more(carry):
+        *_, logarithm, weight, finished = carry
+        rough = 64 * weight > _DIGITS * jnp.maximum(jnp.abs(logarithm), eps)
+        return ~finished & rough & (weight > 0.5**_SQUARINGS)
+
+    def body(carry):
+        power, span, kept, logarithm, weight, _ = carry
+        size = jnp.linalg.norm(power)
+        finished = ~(size > 0)
+        scaled = power / jnp.where(finished, 1, size)
+        logarithm = logarithm + weight * jnp.log(size)
+        if probing:
+            span, kept, left = _range(scaled, probes)
+            finished = finished | (left < 4 * math.sqrt(n) * eps)
+        return scaled @ scaled, span, kept, logarithm, weight / 2, finished
+
+    zero, one = jnp.zeros((), dtype), jnp.ones((), dtype)
+    start = (A, probes, jnp.zeros(count, bool), zero, one, jnp.asarray(False))
+    _, span, kept, logarithm, _, finished = lax.while_loop(more, body, start)
+    return logarithm, finished & jnp.isfinite(logarithm), span, kept
+
+
+def _range(power, probes):
+    """A basis of the range of `power`, as the probes see it, which of its columns are
+    used, and how much it misses."""
+    basis, triangle = jnp.linalg.qr(power @ probes)
+    weight = jnp.abs(jnp.diagonal(triangle))
+    # What is as small as the rounding of the rest is no direction of the range.
+    kept = weight > math.sqrt(jnp.finfo(power.dtype).eps) * jnp.max(weight)
+    basis = jnp.where(kept, basis, 0)
+    return basis, kept, jnp.linalg.norm(power - basis @ (basis.T @ power))
+
+
+def balanced(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """`D^-1 A D` with `D` diagonal, its rows and columns of like size.
+
+    Powers of two, so that no digit is lost. Source: Osborne, 1960.
+    """
+
+    def sweep(_, scale):
+        scaled = jnp.abs(A) * scale[None, :] / scale[:, None]
+        off = scaled - jnp.diag(jnp.diagonal(scaled))
+        rows, columns = jnp.sum(off, axis=1), jnp.sum(off, axis=0)
+        usable = (rows > 0) & (columns > 0)
+        ratio = jnp.where(usable, rows, 1) / jnp.where(usable, columns, 1)
+        # All at once: half of the step that each would take alone.
+        scale = scale * ratio**0.25
+        return scale / jnp.exp2(jnp.round(jnp.mean(jnp.log2(scale))))
+
+    scale = lax.fori_loop(0, 24, sweep, jnp.ones(A.shape[0], A.dtype))
+    scale = jnp.exp2(jnp.round(jnp.log2(scale)))
+    scale = jnp.where(jnp.isfinite(scale) & (scale > 0), scale, 1)
+    return A * scale[None, :] / scale[:, None]

@@ -1,0 +1,212 @@
+import control
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, central_difference, needs_x64, tolerance, user_error
+
+import delucax as dlx
+from delucax.systems import LinearSystem
+
+
+an = dlx.analysis
+
+
+def random_model(seed, n, m, p, discrete):
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(n, n))
+    values = np.linalg.eigvals(A)
+    if discrete:
+        A = A / np.max(np.abs(values)) * 0.95
+    else:
+        A = A - (np.max(values.real) + 0.1) * np.eye(n)
+    B, C = rng.normal(size=(n, m)), rng.normal(size=(p, n))
+    if discrete:
+        return dlx.LinearDynamics(A, B, C, dt=0.3), control.ss(A, B, C, 0, 0.3)
+    return LinearSystem(A, B, C), control.ss(A, B, C, 0)
+
+
+def swept(model, discrete):
+    """The peak of the gain over a fine sweep, in NumPy."""
+    A, B, C = (np.asarray(M, np.float64) for M in (model.A, model.B, model.C))
+    omegas = np.linspace(0, np.pi / 0.3, 3000)
+    if not discrete:
+        omegas = np.concatenate([[0], np.logspace(-3, 3, 6000)])
+    s = np.exp(1j * omegas * 0.3) if discrete else 1j * omegas
+    eye = np.eye(len(A))
+    gains = C @ np.linalg.solve(s[:, None, None] * eye - A, B.astype(complex))
+    sizes = np.linalg.norm(gains, 2, axis=(1, 2))
+    return np.max(sizes), omegas[np.argmax(sizes)]
+
+
+SHAPES = [(4, 2, 3), (5, 2, 2)]
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_norms_are_controls_and_no_sweep_is_above(shape, discrete):
+    for seed in (0, 1):
+        model, theirs = random_model(seed, *shape, discrete)
+        peak = an.hinf_norm(model)
+        gain, omega = swept(model, discrete)
+        assert peak.result == dlx.RESULTS.successful
+        slack = tolerance(1e-4, 1e-13)
+        assert gain * (1 - slack) <= peak.gain <= gain * (1 + 2e-4)
+        if omega > 0:
+            assert_close(peak.frequency, omega, rtol=2e-2)
+        else:
+            assert_close(peak.frequency, 0, atol=1e-3)
+        there = an.frequency_response(model, peak.frequency)
+        there = np.linalg.norm(np.asarray(there), 2)
+        assert_close(there, peak.gain, rtol=tolerance(1e-4, 1e-13))
+        h2 = control.system_norm(theirs, 2)
+        assert_close(an.h2_norm(model), h2, rtol=tolerance(1e-4, 1e-12))
+        if shape[1] == shape[2]:  # python-control refuses others
+            hinf = control.system_norm(theirs, "inf", tol=1e-11)
+            assert_close(peak.gain, hinf, rtol=tolerance(1e-4, 1e-10))
+
+
+@needs_x64
+@pytest.mark.parametrize("damping", [0.3, 1e-3, 1e-6])
+def test_resonance_is_the_formula(damping):
+    A = jnp.array([[0.0, 1.0], [-1.0, -2 * damping]])
+    oscillator = LinearSystem(A, jnp.array([[0.0], [1.0]]), C=jnp.array([[1.0, 0.0]]))
+    peak = an.hinf_norm(oscillator)
+    gain = 1 / (2 * damping * np.sqrt(1 - damping**2))
+    assert_close(peak.gain, gain, rtol=1e-9)
+    assert_close(peak.frequency, np.sqrt(1 - 2 * damping**2), rtol=1e-9)
+
+
+@needs_x64
+def test_of_two_peaks_the_higher_is_found():
+    # Two resonances far apart, the narrow one higher by one part in a thousand.
+    def resonance(omega, damping, gain):
+        A = np.array([[0, omega], [-omega, -2 * damping * omega]])
+        return A, np.array([[0], [omega * gain * 2 * damping]]), np.array([[1.0, 0]])
+
+    wide, narrow = resonance(1.0, 0.2, 1.0), resonance(300.0, 1e-4, 1.03)
+    A = np.block([[wide[0], np.zeros((2, 2))], [np.zeros((2, 2)), narrow[0]]])
+    model = LinearSystem(
+        A, np.concatenate([wide[1], narrow[1]]), np.concatenate([wide[2], narrow[2]], 1)
+    )
+    peak = an.hinf_norm(model)
+    assert_close(peak.frequency, 300, rtol=1e-3)
+    assert peak.gain > 1.02
+
+
+def spring_chain(theta, discrete):
+    stiffness, damping, gain = theta
+    A = jnp.array(
+        [[0, 1, 0, 0], [-2, -0.3, 1, 0.1], [0, 0, 0, 1], [1, 0.1, -1, -0.2]], float
+    )
+    A = A.at[1, 0].add(-stiffness).at[3, 3].add(-damping)
+    B = jnp.array([[0, 0], [1, 0], [0, 0], [0, 1]], float).at[1, 0].mul(gain)
+    C = jnp.array([[1.0, 0, 0.2, 0], [0.0, 0, 1, 0]])
+    system = LinearSystem(A, B, C)
+    return dlx.c2d(system, 0.4) if discrete else system
+
+
+@needs_x64
+@pytest.mark.parametrize("discrete", [False, True])
+def test_gradients_are_central_differences(discrete):
+    theta = jnp.array([1.0, 0.1, 1.5])
+
+    @jax.jit
+    def measures(theta):
+        model = spring_chain(theta, discrete)
+        peak = an.hinf_norm(model)
+        return jnp.stack([peak.gain, peak.frequency, an.h2_norm(model)])
+
+    forward, reverse = jax.jacfwd(measures)(theta), jax.jacrev(measures)(theta)
+    assert_close(forward, reverse, atol=1e-11)
+    for k in range(3):
+        numeric = central_difference(lambda th, k=k: measures(th)[k], theta)
+        assert_close(forward[k], numeric, rtol=1e-6, atol=1e-7)
+    if not discrete:
+        hessian = jax.jacfwd(jax.jacrev(lambda th: measures(th)[jnp.array([0, 2])]))
+        slopes = jax.jit(jax.jacfwd(measures))
+        curvature = hessian(theta)
+        for i in range(3):
+            h = jnp.zeros(3).at[i].set(1e-5)
+            numeric = (slopes(theta + h) - slopes(theta - h))[jnp.array([0, 2])] / 2e-5
+            assert_close(curvature[:, i], numeric, rtol=1e-5, atol=1e-5)
+
+
+def test_alike_channels_have_finite_gradients():
+    def gain(a):
+        system = LinearSystem(-a * jnp.eye(3), jnp.eye(3))
+        return an.hinf_norm(system).gain
+
+    value, slope = jax.value_and_grad(gain)(jnp.asarray(2.0))
+    assert_close(value, 0.5, rtol=1e-6)
+    assert_close(slope, -0.25, rtol=1e-4)
+
+
+def test_unstable_models_have_infinite_norms_and_harm_no_other():
+    def measures(a):
+        A = jnp.array([[0.0, 1.0], [-4.0, -1.0]]).at[1, 1].set(-a)
+        system = LinearSystem(A, jnp.array([[0.0], [1.0]]), C=jnp.array([[1.0, 0.0]]))
+        peak = an.hinf_norm(system, throw=False)
+        return jnp.stack([peak.gain, an.h2_norm(system), peak.frequency])
+
+    dampings = jnp.array([0.5, 0.0, -0.5])
+    values = jax.vmap(measures)(dampings)
+    slopes = jax.vmap(jax.jacfwd(measures))(dampings)
+    assert_close(values[1:, :2], np.full((2, 2), np.inf))
+    # Where the pole is that is to blame.
+    assert_close(values[1:, 2], [2.0, np.sqrt(4 - 0.0625)], rtol=1e-5)
+    assert np.all(np.isfinite(slopes))
+    assert_close(values[0, :2], measures(dampings[0])[:2], rtol=1e-5)
+
+
+def test_a_gain_of_zero():
+    A, B = -jnp.eye(2), jnp.array([[1.0], [0.0]])
+    silent = LinearSystem(A, B, C=jnp.array([[0.0, 1.0]]))
+    assert an.hinf_norm(silent).gain == 0
+    assert an.h2_norm(silent) == 0
+    slope = jax.grad(lambda A: an.h2_norm(LinearSystem(A, B, silent.C)))(A)
+    assert np.all(np.isfinite(slope))
+
+
+def test_frequency_response_and_dcgain_are_controls():
+    for discrete in (False, True):
+        model, theirs = random_model(3, 4, 2, 3, discrete)
+        omegas = np.linspace(0.1, 8, 6).reshape(2, 3)
+        found = an.frequency_response(model, omegas)
+        assert found.shape == (2, 3, 3, 2)
+        s = np.exp(1j * omegas * 0.3) if discrete else 1j * omegas
+        expected = theirs(s.reshape(-1), squeeze=False)
+        expected = np.moveaxis(expected, -1, 0).reshape(found.shape)
+        assert_close(found, expected, atol=tolerance(1e-4, 1e-12))
+        close = tolerance(1e-4, 1e-12)
+        assert_close(an.dcgain(model), theirs.dcgain(), rtol=close, atol=close)
+
+
+@needs_x64
+def test_frequency_response_is_differentiable_in_the_frequency():
+    model, _ = random_model(4, 3, 1, 1, False)
+    decibels = lambda w: 20 * jnp.log10(jnp.abs(an.frequency_response(model, w)[0, 0]))
+    slope = jax.grad(decibels)(jnp.asarray(1.3))
+    assert_close(slope, central_difference(decibels, jnp.asarray(1.3)), atol=1e-7)
+
+
+def test_integrators_have_no_dcgain():
+    A = jnp.array([[0.0, 1.0], [0.0, -1.0]])
+    B = jnp.array([[0.0], [1.0]])
+    integrator = LinearSystem(A, B)
+    with user_error(RuntimeError, match="dcgain: a pole is at frequency zero"):
+        an.dcgain(integrator)
+    with pytest.raises(Exception, match="a pole is at frequency zero"):
+        jax.block_until_ready(
+            jax.jit(lambda A: an.dcgain(LinearSystem(A, B)))(A),
+        )
+    gain = lambda A: an.dcgain(LinearSystem(A, B), throw=False)[0, 0]
+    As = jnp.stack([A, A.at[1, 0].set(-2.0)])
+    values, slopes = jax.vmap(jax.value_and_grad(gain))(As)
+    assert_close(values, [np.inf, 0.5], rtol=1e-6)
+    assert np.all(np.isfinite(slopes))
+    response = an.frequency_response(integrator, jnp.array([0.0, 1.0]))
+    assert np.all(np.isinf(np.asarray(response[0])))
+    assert np.all(np.isfinite(np.asarray(response[1])))
+    with user_error(match="omega must be real and finite"):
+        an.frequency_response(integrator, jnp.array([jnp.nan]))

@@ -1,0 +1,340 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.linalg
+from helpers import assert_close, needs_x64, tolerance, user_error
+from jax.test_util import check_grads
+
+import delucax as dlx
+
+
+A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+B = jnp.array([[0.0], [1.0]])
+Q, R = jnp.eye(2), jnp.eye(1)
+TIMES = jnp.array([0.0, 0.7, 1.0])
+
+
+def random_stages(seed, T, n, m):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(T, n + m, n + m))
+    weight = root @ np.swapaxes(root, 1, 2) / n
+    stage = dict(
+        A=1.2 * rng.normal(size=(T, n, n)) / np.sqrt(n),
+        B=rng.normal(size=(T, n, m)),
+        Q=weight[:, :n, :n],
+        R=weight[:, n:, n:],
+        S=weight[:, :n, n:],
+    )
+    affine = dict(
+        d=rng.normal(size=(T, n)), q=rng.normal(size=(T, n)), r=rng.normal(size=(T, m))
+    )
+    end = dict(final=np.eye(n), final_q=rng.normal(size=n))
+    return stage | affine | end
+
+
+def best_controls(stages, x0):
+    """The minimum as one dense quadratic program of all controls at once."""
+    A, B, d = stages["A"], stages["B"], stages["d"]
+    T, n, m = B.shape
+    # x_t = free[t] + forced[t] u, with u all controls in a row.
+    free, forced = [x0], [np.zeros((n, T * m))]
+    for t in range(T):
+        free.append(A[t] @ free[-1] + d[t])
+        following = A[t] @ forced[-1]
+        following[:, t * m : (t + 1) * m] += B[t]
+        forced.append(following)
+    H, g, constant = np.zeros((T * m, T * m)), np.zeros(T * m), 0.0
+    for t in range(T + 1):
+        here, x = forced[t], free[t]
+        last = t == T
+        Q, q = (
+            (stages["final"], stages["final_q"])
+            if last
+            else (stages["Q"][t], stages["q"][t])
+        )
+        H += here.T @ Q @ here
+        g += here.T @ (Q @ x + q)
+        constant += x @ Q @ x + 2 * q @ x
+        if not last:
+            pick = np.zeros((m, T * m))
+            pick[:, t * m : (t + 1) * m] = np.eye(m)
+            cross = here.T @ stages["S"][t] @ pick
+            H += pick.T @ stages["R"][t] @ pick + cross + cross.T
+            g += pick.T @ (stages["S"][t].T @ x + stages["r"][t])
+    u = -np.linalg.solve(H, g)
+    return u.reshape(T, m), constant + g @ u
+
+
+@needs_x64
+@pytest.mark.parametrize("parallel", [False, True])
+def test_is_the_minimum_over_all_controls(parallel):
+    stages = random_stages(0, 7, 3, 2)
+    x0 = np.array([1.0, -2.0, 0.5])
+    controls, cost = best_controls(stages, x0)
+    solution = dlx.riccati.dre(**stages, parallel=parallel)
+    assert solution.result == dlx.RESULTS.successful
+    x = x0
+    for t in range(7):
+        u = -solution.K[t] @ x - solution.k[t]
+        assert_close(u, controls[t], atol=1e-10)
+        x = stages["A"][t] @ x + stages["B"][t] @ u + stages["d"][t]
+    to_go = x0 @ solution.X[0] @ x0 + 2 * solution.p[0] @ x0 + solution.s[0]
+    assert_close(to_go, cost, rtol=1e-11)
+    loops = stages["A"] - stages["B"] @ np.asarray(solution.K)
+    assert_close(solution.closed_loop, loops, atol=1e-12)
+
+
+def free_controls(stages):
+    return stages | dict(R=0 * stages["R"], S=0 * stages["S"])
+
+
+@needs_x64
+@pytest.mark.parametrize("T, n, m", [(1, 2, 1), (9, 4, 2), (64, 3, 3), (100, 12, 4)])
+def test_in_parallel_as_in_sequence(T, n, m):
+    problem = random_stages(T, T, n, m)
+    for stages in [problem, free_controls(problem)] if n == m else [problem]:
+        one = dlx.riccati.dre(**stages)
+        other = dlx.riccati.dre(**stages, parallel=True)
+        for name in ("X", "K", "k", "p", "s", "closed_loop"):
+            a, b = np.asarray(getattr(one, name)), np.asarray(getattr(other, name))
+            assert np.max(np.abs(a - b)) < 1e-10 * np.max(np.abs(a)), name
+
+
+def sequential_stages(jaxpr):
+    """The longest chain of equations, one after the other, with loops written out."""
+    depth = {}
+
+    def of(variables):
+        known = (v for v in variables if not hasattr(v, "val"))
+        return max((depth.get(v, 0) for v in known), default=0)
+
+    for equation in jaxpr.eqns:
+        inner, times = 1, 1
+        for value in equation.params.values():
+            for sub in value if isinstance(value, tuple | list) else [value]:
+                sub = getattr(sub, "jaxpr", sub)
+                if hasattr(sub, "eqns"):
+                    inner = max(inner, sequential_stages(sub))
+        if equation.primitive.name == "scan":
+            times = equation.params["length"]
+        assert equation.primitive.name != "while"
+        after = of(equation.invars) + inner * times
+        for variable in equation.outvars:
+            depth[variable] = after
+    return of(jaxpr.outvars)
+
+
+def test_depth_is_logarithmic():
+    def depth(T, parallel):
+        solve = lambda A, d: dlx.riccati.dre(
+            A, B, Q, R, d=d, horizon=T, parallel=parallel, throw=False
+        )
+        solve = lambda A, d, solve=solve: solve(A, d).k
+        return sequential_stages(jax.make_jaxpr(solve)(A, jnp.ones(2)).jaxpr)
+
+    depths = [depth(T, True) for T in (16, 64, 256)]
+    # Twice as many steps add the same each time, and little of it.
+    assert abs((depths[2] - depths[1]) - (depths[1] - depths[0])) < 0.2 * depths[0]
+    assert depths[2] < 2 * depths[0]
+    assert depth(256, False) > 10 * depth(16, False)
+
+
+def test_long_horizon_is_the_stationary_solution():
+    stationary = dlx.riccati.dare(A, B, Q, R)
+    for parallel in (False, True):
+        solution = dlx.riccati.dre(A, B, Q, R, horizon=60, parallel=parallel)
+        assert_close(solution.X[0], stationary.X, rtol=tolerance(1e-4, 1e-12))
+        assert_close(solution.K[0], stationary.K, rtol=tolerance(1e-4, 1e-12))
+        assert_close(solution.X[-1], np.zeros((2, 2)))
+        assert_close(solution.p, np.zeros((61, 2)))
+
+
+def test_tracks_a_reference():
+    # A reference that the dynamics can follow at no cost is followed, given time.
+    ramp = jnp.stack([jnp.arange(41.0), jnp.ones(41)], axis=1)
+    final = 10 * jnp.eye(2)
+    solution = dlx.riccati.dre(
+        A, B, Q, R, q=-ramp[:-1] @ Q, final=final, final_q=-final @ ramp[-1]
+    )
+    x = ramp[0]
+    for t in range(40):
+        assert_close(x, ramp[t], atol=tolerance(1e-3, 1e-10))
+        x = A @ x + B @ (-solution.K[t] @ x - solution.k[t])
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_no_minimum(parallel):
+    # R + B'XB is negative from the third step back on: 1 - 2, and 1 and 1 before it.
+    weights = jnp.stack([jnp.full((1, 1), r) for r in (1.0, 1.0, -2.0, 1.0, 1.0)])
+    scalar = jnp.ones((1, 1))
+    options = dict(final=scalar, parallel=parallel)
+    solve = lambda R, **more: dlx.riccati.dre(
+        scalar, scalar, 0 * scalar, R, **options, **more
+    )
+    solution = solve(weights, throw=False)
+    assert solution.result == dlx.RESULTS.infeasible
+    assert np.all(np.isnan(solution.X[:3])) and np.all(np.isnan(solution.K[:3]))
+    assert_close(solution.X[3:, 0, 0], [1 / 3, 1 / 2, 1.0], rtol=1e-6)
+    assert_close(solution.K[3:, 0, 0], [1 / 3, 1 / 2], rtol=1e-6)
+    with pytest.raises(RuntimeError, match="dre: .*not positive definite at step 2"):
+        solve(weights)
+    with pytest.raises(eqx.EquinoxRuntimeError):
+        eqx.filter_jit(solve)(weights)
+    assert solve(0 * weights, throw=False).result == dlx.RESULTS.successful
+    # With nothing to move the control by, any control is as good.
+    nothing = dlx.riccati.dre(scalar, 0 * scalar, scalar, 0 * weights, throw=False)
+    assert nothing.result == dlx.RESULTS.infeasible
+
+
+@needs_x64
+@pytest.mark.parametrize("parallel", [False, True])
+def test_one_bad_member_harms_no_other(parallel):
+    def total(R):
+        solution = dlx.riccati.dre(
+            A, B, Q, R, final=Q, horizon=4, parallel=parallel, throw=False
+        )
+        good = solution.result == dlx.RESULTS.successful
+        return jnp.where(good, jnp.sum(solution.X[0]) + jnp.sum(solution.K), 0.0), good
+
+    @jax.jit
+    def gradients(Rs):
+        (_, good), gradient = jax.vmap(jax.value_and_grad(total, has_aux=True))(Rs)
+        return good, gradient
+
+    good, gradient = gradients(jnp.asarray([1.0, -1.0, 2.0]).reshape(3, 1, 1))
+    np.testing.assert_array_equal(good, [True, False, True])
+    alone = jax.grad(lambda R: total(R)[0])(jnp.full((1, 1), 2.0))
+    assert_close(gradient[2], alone, rtol=1e-12)
+    assert gradient[1] == 0
+
+
+@needs_x64
+@pytest.mark.parametrize("parallel", [False, True])
+def test_derivatives_of_the_recursion(parallel):
+    stages = {k: jnp.asarray(v) for k, v in random_stages(3, 4, 2, 1).items()}
+
+    def facts(stages):
+        turned = lambda M: (M + jnp.swapaxes(M, -1, -2)) / 2
+        even = {name: turned(stages[name]) for name in ("Q", "R", "final")}
+        solution = dlx.riccati.dre(**(stages | even), parallel=parallel, throw=False)
+        parts = solution.X, solution.K, solution.k, solution.p, solution.s
+        return sum(jnp.sum(jnp.sin(part)) for part in parts)
+
+    check_grads(jax.jit(facts), (stages,), 2, rtol=1e-6, atol=1e-6, eps=1e-5)
+
+
+@needs_x64
+def test_differential_equation():
+    rng = np.random.default_rng(0)
+    n, m = 3, 2
+    root = rng.normal(size=(n + m, n + m))
+    weight = root @ root.T
+    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+    Q, R, S = weight[:n, :n], weight[n:, n:], weight[:n, n:]
+    times = np.array([0.0, 0.1, 0.5, 1.5])
+
+    def field(t, x):
+        X = x.reshape(n, n)
+        cross = X @ B + S
+        rate = A.T @ X + X @ A - cross @ np.linalg.solve(R, cross.T) + Q
+        return -rate.ravel()
+
+    options = dict(method="DOP853", rtol=1e-12, atol=1e-12, t_eval=times[::-1])
+    run = scipy.integrate.solve_ivp(field, (1.5, 0.0), np.eye(n).ravel(), **options)
+    expected = run.y.T[::-1].reshape(-1, n, n)
+    solution = dlx.riccati.cre(A, B, Q, R, S, times=times, final=np.eye(n))
+    assert_close(solution.X, expected, atol=1e-9)
+    gains = np.linalg.solve(R, np.swapaxes(expected @ B + S, 1, 2))
+    assert_close(solution.K, gains, atol=1e-9)
+    assert_close(solution.closed_loop, A - B @ gains, atol=1e-9)
+    # However long the interval, it ends at the stationary solution.
+    X = scipy.linalg.solve_continuous_are(A, B, Q, R, s=S)
+    for T in (1e2, 1e6):
+        long = dlx.riccati.cre(A, B, Q, R, S, times=[-T, 0.0])
+        assert_close(long.X[0], X, rtol=1e-11)
+
+
+@needs_x64
+def test_stiff_differential_equation():
+    # Rates of 1e5 and 1 over a time of 3, where an exponential would overflow.
+    rates = np.array([1e5, 1.0])
+    solution = dlx.riccati.cre(np.diag(rates), Q, Q, Q, times=[0.0, 3.0])
+    assert_close(np.diag(solution.X[0]), rates + np.sqrt(rates**2 + 1), rtol=1e-5)
+    # dX/ds = 2aX - X^2 + 1 in closed form.
+    a = 1.0
+    w = np.hypot(a, 1)
+    exact = np.tanh(3 * w) / (w - a * np.tanh(3 * w))
+    assert_close(solution.X[0, 1, 1], exact, rtol=1e-12)
+
+
+@pytest.mark.parametrize("points", [2, 7])
+def test_escape_in_finite_time(points):
+    # dX/ds = X^2 (-1) - 1 from 0 is -tan s, which is beyond its pole at 2 and at 10.
+    scalar = jnp.ones((1, 1))
+    solve = lambda T, **more: dlx.riccati.cre(
+        0 * scalar, scalar, -scalar, scalar, times=jnp.linspace(0.0, T, points), **more
+    )
+    assert_close(solve(1.5).X[0], [[-np.tan(1.5)]], rtol=tolerance(1e-4, 1e-10))
+    for T in (2.0, 10.0):
+        solution = solve(T, throw=False)
+        assert solution.result == dlx.RESULTS.infeasible
+        assert np.all(np.isnan(solution.X[0])) and np.all(np.isfinite(solution.X[-1]))
+    with pytest.raises(RuntimeError, match="cre: .*no solution over the time"):
+        solve(2.0)
+    bad = dlx.riccati.cre(A, B, Q, -R, times=TIMES, throw=False)
+    assert bad.result == dlx.RESULTS.infeasible
+
+
+@needs_x64
+def test_derivatives_of_the_differential_equation():
+    def facts(A, B, Q, R, S, final):
+        turned = [(M + M.T) / 2 for M in (Q, R, final)]
+        solution = dlx.riccati.cre(
+            A, B, turned[0], turned[1], S, final=turned[2], times=TIMES, throw=False
+        )
+        return jnp.sum(jnp.sin(solution.X)) + jnp.sum(jnp.sin(solution.K))
+
+    S = jnp.array([[0.1], [-0.2]])
+    check_grads(jax.jit(facts), (A, B, Q, R, S, Q), 2, rtol=1e-6, atol=1e-6, eps=1e-5)
+
+
+@pytest.mark.parametrize(
+    "change, match",
+    [
+        ({"A": np.ones((2, 3))}, r"A must have shape \(2, 2\).*got \(2, 3\)"),
+        ({"B": np.ones(2)}, r"B must have shape \(n, m\).*got shape \(2,\)"),
+        ({"Q": np.array([[1.0, 1.0], [0.0, 1.0]])}, "Q must be symmetric"),
+        ({"Q": np.ones((4, 2, 2)) * [[1, 1], [0, 1]]}, "symmetric at each step"),
+        ({"R": np.eye(2)}, r"R must have shape \(1, 1\).*got \(2, 2\)"),
+        ({"d": np.array([np.nan, 0])}, "d must be finite"),
+        ({"final": np.eye(3)}, r"final must have shape \(2, 2\)"),
+        ({"final_q": np.ones(3)}, r"final_q must have shape \(2,\)"),
+        ({"horizon": None}, "horizon must be given"),
+        ({"horizon": 0}, "horizon must be a whole number"),
+        ({"q": np.ones((3, 2))}, r"length of the time axis of q \(3\), got 4"),
+        ({"q": np.ones((4, 2)), "d": np.ones((3, 2))}, "must have one length"),
+    ],
+)
+def test_wrong_arguments_of_the_recursion(change, match):
+    given = {"A": A, "B": B, "Q": Q, "R": R, "horizon": 4}
+    with user_error(match=match):
+        dlx.riccati.dre(**(given | change))
+
+
+@pytest.mark.parametrize(
+    "change, match",
+    [
+        ({"B": np.ones((3, 1))}, r"B must have shape \(2, 1\).*got \(3, 1\)"),
+        ({"S": np.ones((1, 2))}, r"S must have shape \(2, 1\).*got \(1, 2\)"),
+        ({"times": 1.0}, "times must be at least two numbers"),
+        ({"times": [0.0, 0.0]}, "times must increase"),
+        ({"final": np.eye(3)}, r"final must have shape \(2, 2\)"),
+    ],
+)
+def test_wrong_arguments_of_the_differential_equation(change, match):
+    given = {"A": A, "B": B, "Q": Q, "R": R, "times": TIMES}
+    with user_error(match=match):
+        dlx.riccati.cre(**(given | change))
