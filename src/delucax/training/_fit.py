@@ -2,6 +2,7 @@
 
 import os
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,7 +13,6 @@ import jax.random as jr
 import numpy as np
 import optax
 from jaxtyping import PyTree
-from tqdm.auto import tqdm
 
 from .._check import check_count, check_key, is_concrete
 from .._results import Result, RESULTS
@@ -22,6 +22,12 @@ from ._checkpoint import Checkpoint, describe, fingerprint, prepare
 from ._history import History, history_of
 from ._loop import CAPACITY, FAULTS, run_block
 from ._trainable import strong, take_apart
+
+
+with warnings.catch_warnings():
+    # In a notebook without ipywidgets it warns, and draws its bar as text all the same.
+    warnings.simplefilter("ignore")
+    from tqdm.auto import tqdm
 
 
 _WHERE = "fit"
