@@ -7,6 +7,8 @@ Prints a table a case, then the ratios that matter beside their limits, and writ
 import argparse
 import functools
 import json
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -152,6 +154,28 @@ def calls(repeats: int = 200) -> dict[str, float]:
     }
 
 
+LIMITS = {
+    "first eager rollout, linear (s)": 0.5,
+    "eager rollout, T = 200, MLP (ms)": 2.0,
+    "import delucax / import diffrax, optax, lineax": 1.2,
+}
+"""Of single calls and of the import."""
+
+
+def imports(repeats: int = 7) -> float:
+    """How much longer `import delucax` takes than the libraries it stands on."""
+
+    def seconds(statement: str) -> float:
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-c", statement], check=True)
+        return time.perf_counter() - start
+
+    statements = ("import delucax", "import diffrax, optax, lineax")
+    taken = [[seconds(s) for s in statements] for _ in range(repeats + 1)][1:]
+    ours, theirs = np.median(taken, axis=0)
+    return float(ours / theirs)
+
+
 def main() -> None:
     """Run, print and write."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.pendulum")
@@ -222,8 +246,10 @@ def main() -> None:
     print("\nRatios (median over the rounds of one run)")
     print(summary.to_string(index=False, float_format="%.2f"))
     single = calls()
+    single["import delucax / import diffrax, optax, lineax"] = imports()
     print("\nSingle calls")
-    print(pd.Series(single).to_string(float_format="%.3f"))
+    limited = pd.DataFrame({"measured": single, "at most": pd.Series(LIMITS)})
+    print(limited.loc[list(single)].to_string(float_format="%.3f", na_rep=""))
     needed = memory(1_000_000 // few)
     print(f"\nMemory of the gradient, one chain, {1_000_000 // few} steps (MB)")
     print(pd.Series(needed).to_string(float_format="%.2f"))

@@ -1,8 +1,7 @@
 """The pictures of the pages, drawn by the code that the pages show.
 
-`python docs/figures/pages.py` runs the Python blocks of `index.md` and
-`first_system.md`, page by page, and puts what they draw, in fewer colours, into
-`docs/assets/`, in a minute or two.
+`python docs/figures/pages.py` runs the Python blocks of the pages listed below, page by
+page, and puts what they draw, in fewer colours, into `docs/assets/`, in a minute or two.
 """
 
 import os
@@ -14,7 +13,11 @@ from PIL import Image
 
 
 DOCS = Path(__file__).parents[1]
-PICTURES = {"index.md": ["van_der_pol.png"], "first_system.md": ["first_system.png"]}
+PICTURES = {
+    "index.md": ["van_der_pol.png"],
+    "first_system.md": ["first_system.png"],
+    "linear_analysis.md": ["bode.png", "nyquist.png", "root_locus.png"],
+}
 
 
 def run(page, folder):

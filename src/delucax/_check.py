@@ -17,13 +17,13 @@ def is_concrete(x: Any) -> bool:
     return not isinstance(x, Tracer)
 
 
-def check_key(key: Any, where: str) -> None:
-    """Raise unless `key` is one random key."""
+def check_key(key: Any, where: str) -> Any:
+    """`key`, if it is one random key, or an error."""
     if eqx.is_array(key):
         if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ():
-            return
+            return key
         if key.dtype == jnp.uint32 and key.shape == (2,):
-            return
+            return key
         got = f"an array of shape {key.shape} and dtype {key.dtype}"
     else:
         got = repr(key)
@@ -68,22 +68,24 @@ def symmetric_matrix(value: Any, name: str, where: str) -> Array:
     return (matrix + matrix.T) / 2
 
 
-def as_bounds(value: Any, where: str) -> tuple[Array, Array] | None:
+def as_bounds(
+    value: Any, where: str, name: str = "bounds"
+) -> tuple[Array, Array] | None:
     """`value` as `(low, high)`, each a number or a vector, or an error."""
     if value is None:
         return None
     if not isinstance(value, tuple | list) or len(value) != 2:
-        raise ValueError(f"{where}: bounds must be a pair (low, high), got {value!r}.")
+        raise ValueError(f"{where}: {name} must be a pair (low, high), got {value!r}.")
     low, high = (as_float_array(end) for end in value)
     fit = all(eqx.is_inexact_array(end) and end.ndim <= 1 for end in (low, high))
     if not fit or low.ndim == high.ndim == 1 and low.shape != high.shape:
         raise ValueError(
-            f"{where}: bounds must be numbers or vectors of one size, got {value!r}."
+            f"{where}: {name} must be numbers or vectors of one size, got {value!r}."
         )
     if is_concrete(low) and is_concrete(high):
         if not np.all(np.asarray(low) <= np.asarray(high)):
             raise ValueError(
-                f"{where}: bounds must have low <= high, got {low} and {high}."
+                f"{where}: {name} must have low <= high, got {low} and {high}."
             )
     return low, high
 
@@ -96,18 +98,45 @@ def check_finite(array: Any, name: str, where: str) -> None:
 
 
 def check_positive(value: Any, name: str, where: str) -> None:
-    """Raise unless a concrete number is finite and above zero."""
-    if not is_concrete(value):
-        return
-    array = np.asarray(value)
-    if not (np.all(np.isfinite(array)) and np.all(array > 0)):
-        raise ValueError(f"{where}: {name} must be positive and finite, got {value}.")
+    """Raise unless a number is finite and above zero, as far as can be seen."""
+    array, got = as_float_array(value), repr(value)
+    if eqx.is_inexact_array(array):
+        if not is_concrete(array):
+            return
+        got = np.asarray(array)
+        if np.all(np.isfinite(got)) and np.all(got > 0):
+            return
+    raise ValueError(f"{where}: {name} must be positive and finite, got {got}.")
 
 
-def check_count(value: Any, name: str, where: str) -> int:
-    """`value` as an int of at least 1."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+def check_step(dt: Any, where: str) -> None:
+    """Raise unless `dt` is one positive number."""
+    check_positive(dt, "dt", where)
+    if jnp.shape(dt) != ():
+        raise ValueError(f"{where}: dt must be a number, got shape {jnp.shape(dt)}.")
+
+
+def check_range(
+    value: Any, name: str, where: str, low: Any = 0, high: float | int = np.inf
+) -> None:
+    """Raise unless numbers lie between `low` and `high`, as far as can be seen."""
+    array, least, got = as_float_array(value), as_float_array(low), repr(value)
+    if eqx.is_inexact_array(array) and eqx.is_inexact_array(least):
+        if not (is_concrete(array) and is_concrete(least)):
+            return
+        got = np.asarray(array)
+        if np.all((got >= np.asarray(least)) & (got <= high)):
+            return
+    ends = f"at least {low}" if high == np.inf else f"between {low} and {high}"
+    raise ValueError(f"{where}: {name} must be {ends}, got {got}.")
+
+
+def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
+    """`value` as an int of at least `least`."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or value < least:
         raise ValueError(
-            f"{where}: {name} must be a whole number of at least 1, got {value!r}."
+            f"{where}: {name} must be a whole number of at least {least}, got "
+            f"{value!r}."
         )
     return int(value)

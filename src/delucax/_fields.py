@@ -135,7 +135,10 @@ def as_float_array(value: Any) -> Any:
     ):
         return jnp.asarray(float(value))
     if isinstance(value, np.ndarray | list | tuple | jax.Array):
-        array = jnp.asarray(value)
+        try:
+            array = jnp.asarray(value)
+        except (TypeError, ValueError):  # ragged, or not of numbers
+            return value
         return array if eqx.is_inexact_array(array) else array.astype(float)
     return value
 
@@ -255,6 +258,12 @@ def converter_of(module: eqx.Module, name: str) -> Callable[[Any], Any]:
     return (lambda x: x) if field is None else field.metadata.get("converter", _same)
 
 
+def is_static(module: Any, name: str) -> bool:
+    """Whether field `name` of `module` is part of its structure."""
+    field = _fields(module).get(name) if isinstance(module, eqx.Module) else None
+    return field is not None and field.metadata.get("static", False)
+
+
 def _same(x):
     return x
 
@@ -298,10 +307,14 @@ def check_parameters(module: eqx.Module) -> None:
         value = getattr(module, field.name, None)
         constraint = field.metadata[_CONSTRAINT]
         for leaf in jax.tree.leaves(value):
+            name = f"{type(module).__name__}: {field.name}"
+            # Inside a network there may be anything.
+            bare = leaf is value or field.metadata[_ROLE] == "parameter"
+            if bare and not (callable(leaf) or eqx.is_inexact_array(leaf)):
+                raise ValueError(f"{name} must be a number or an array, got {leaf!r}.")
             if isinstance(leaf, Tracer) or not eqx.is_inexact_array(leaf):
                 continue
             leaf = np.asarray(leaf)
-            name = f"{type(module).__name__}: {field.name}"
             if not np.all(np.isfinite(leaf)):
                 raise ValueError(f"{name} must be finite, got {leaf}.")
             if constraint is not None and not np.all(constraint.holds(leaf)):

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 from jaxtyping import PyTree
 
-from ._fields import as_float_array, converter_of
+from ._fields import as_float_array, converter_of, is_static
 
 
 _T = TypeVar("_T")
@@ -81,6 +81,12 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
         parent_path, _, name = path.rpartition(".")
         parent = get_path(tree, parent_path) if parent_path else tree
         old = _child(parent, name, path)
+        if is_static(parent, name):
+            raise ValueError(
+                f"replace: {path!r} is part of the structure of "
+                f"{type(parent).__name__}, not a leaf; build it anew with another "
+                f"{name}."
+            )
         if isinstance(parent, eqx.Module):
             value = converter_of(parent, name)(value)
         elif eqx.is_inexact_array(old):

@@ -17,6 +17,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """
 
     diverged = "The states or costs became NaN or infinite."
+    stage_not_solved = (
+        "The stages of an implicit solver were not solved: take more substeps or a "
+        "smaller dt, or give its root finder other tolerances or more steps."
+    )
     not_stabilisable = (
         "The pair (A, B) is not stabilisable: no control moves some mode that does not "
         "decay."

@@ -88,9 +88,10 @@ def test_gradients_are_central_differences(make, horizon):
         W = an.controllability_gramian(make(A, jnp.asarray(B)), horizon)
         return jnp.sum(weight * W)
 
-    numeric = central_difference(loss, start)
-    assert_close(jax.grad(loss)(start), numeric, rtol=1e-6, atol=1e-7)
-    assert_close(jax.jacfwd(loss)(start), numeric, rtol=1e-6, atol=1e-7)
+    numeric = central_difference(jax.jit(loss), start)
+    assert_close(jax.jit(jax.grad(loss))(start), numeric, rtol=1e-6, atol=1e-7)
+    forward = jax.jit(jax.jacfwd(loss))(start)
+    assert_close(forward, numeric, rtol=1e-6, atol=1e-7)
 
 
 def test_an_unstable_lane_harms_no_other():
@@ -105,9 +106,9 @@ def test_an_unstable_lane_harms_no_other():
     assert_close(slope[0], [[0.5]], rtol=1e-5)
     assert np.all(np.isfinite(slope))
     unstable = LinearSystem(As[1], jnp.ones((1, 1)))
-    with user_error(RuntimeError, match="controllability_gramian: the model must be st"):
+    with user_error(RuntimeError, match="controllability_gramian: the model must"):
         an.controllability_gramian(unstable)
-    with pytest.raises(Exception, match="observability_gramian: the model must be st"):
+    with pytest.raises(Exception, match="observability_gramian: the model must"):
         jax.block_until_ready(
             jax.jit(lambda A: an.observability_gramian(LinearSystem(A, A)))(As[1])
         )

@@ -75,7 +75,7 @@ def test_a_stable_model_has_no_worst_unstable_mode():
 
 
 def test_a_defective_mode_is_found_though_it_is_known_to_half_the_digits():
-    # A chain of two at 0.5 that the input reaches, and one more at 0.5 that it does not.
+    # A chain of two at 0.5 that the input reaches, and one more that it does not.
     A = np.diag([0.5, 0.5, 0.5, -1.0]) + np.diag([1.0, 0, 0], 1)
     B = np.array([[0.0], [1.0], [0.0], [1.0]])
     T = np.linalg.qr(np.random.default_rng(3).normal(size=(4, 4)))[0]
@@ -101,9 +101,9 @@ def test_modal_distance_is_that_of_a_uniform_search():
 def test_modal_tests_under_jit_and_vmap():
     pairs = [hidden([0.5, -1.0], r) for r in ([True, True], [False, True])]
     As, Bs = (jnp.asarray(np.stack(m)) for m in zip(*pairs, strict=True))
-    found = jax.jit(
-        jax.vmap(lambda A, B: an.is_stabilizable(LinearSystem(A, B)))
-    )(As, Bs)
+    found = jax.jit(jax.vmap(lambda A, B: an.is_stabilizable(LinearSystem(A, B))))(
+        As, Bs
+    )
     assert list(np.asarray(found)) == [True, False]
 
 

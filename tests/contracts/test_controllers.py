@@ -60,6 +60,18 @@ def ahead(size):
     return c.LQR(dynamics, size * jnp.eye(2), jnp.eye(1), **signals)
 
 
+def lqg(size, **options):
+    noise = 0.05 * size * jnp.eye(2), 0.1 * jnp.eye(2)
+    dynamics = dlx.LinearDynamics(A, B, dt=DT)
+    return c.LQG(dynamics, size * jnp.eye(2), jnp.eye(1), *noise, **options)
+
+
+def estimated(kind, size):
+    noise = 0.05 * size * jnp.eye(2), 0.1 * jnp.eye(2)
+    filtered = kind(dlx.LinearDynamics(A, B, dt=DT), *noise, covariance=noise[0])
+    return c.OutputFeedback(c.PID(size, 2.0, dt=DT, output=[[1.0, 0.1]]), filtered)
+
+
 def mlp(size, in_size=2, features=None):
     key = jax.random.key(int(10 * size))
     options = dict(features=features, bounds=(-2.0 * size, 2.0), key=key)
@@ -80,6 +92,12 @@ CASES = {
     "LQR that looks ahead": Case(ahead),
     "FiniteHorizonLQR": Case(finite),
     "LQI": Case(lqi),
+    "LQG": Case(lqg),
+    "LQG from the start": Case(lambda size: lqg(size, steady_state=False)),
+    "OutputFeedback": Case(lambda size: estimated(c.ExtendedKalmanFilter, size)),
+    "OutputFeedback of an unscented filter": Case(
+        lambda size: estimated(c.UnscentedKalmanFilter, size)
+    ),
     "HInfinity": Case(hinfinity),
     "HInfinity over a horizon": Case(lambda size: hinfinity(size, horizon=8)),
     "PID": Case(lambda size: c.PID(size, 2 * size, 0.3, dt=DT, output=[[1.0, 0.1]])),

@@ -78,6 +78,16 @@ def test_weights_are_differentiable():
             ),
             "must fit",
         ),
+        (
+            lambda: dlx.costs.Tracking(Q, Q, lambda t: jnp.ones(2))(
+                0.0, jnp.ones(2), jnp.ones(1)
+            ),
+            r"Tracking: R has shape \(2, 2\) but the control has shape \(1,\)",
+        ),
+        (
+            lambda: dlx.costs.Tracking(Q, R, lambda t: jnp.ones(2), final=jnp.eye(3)),
+            "Tracking: final must have the shape of Q",
+        ),
         (lambda: dlx.costs.Rate(dlx.costs.PendulumCost(), 0.0), "dt must be positive"),
         (
             lambda: dlx.costs.PendulumCost(float("nan")),

@@ -82,6 +82,20 @@ def test_sum_draws_each_with_its_own_key(key):
     assert_close(both.std(), np.sqrt(2), rtol=0.05)
 
 
+@pytest.mark.parametrize("name", ["gaussian", "uniform", "walk", "brownian", "sum"])
+def test_a_seed_for_a_key(name):
+    with user_error(match="key must be one random key.*got 0"):
+        ALL[name].sequence(0, TIMES)
+
+
+def test_ends_that_meet_are_legal(key):
+    times = TIMES[:3]
+    for still in (d.Gaussian(0.0, size=1), d.Uniform(0.0, 0.0, size=1)):
+        assert np.all(still.sequence(key, times) == 0)
+    moved = jax.jit(lambda s: d.Gaussian(s, size=1).sequence(key, times))(0.0)
+    assert np.all(moved == 0)
+
+
 @pytest.mark.parametrize(
     "make, match",
     [
@@ -96,6 +110,17 @@ def test_sum_draws_each_with_its_own_key(key):
         (lambda: d.Sum(d.Zero(1), d.Zero(2)), "one size"),
         (lambda: d.Brownian(1, dt=-1.0), "dt must be positive"),
         (lambda: d.Zero(0), "size must be at least 1"),
+        (lambda: d.Gaussian(-0.1, size=1), "std must be at least 0, got -0.1"),
+        (lambda: d.Uniform(1, -1, size=1), "high must be at least 1.0, got -1"),
+        (lambda: d.RandomWalk(-0.1, size=1), "std must be at least 0, got -0.1"),
+        (lambda: d.RandomWalk(bound=-1, size=1), "bound must be at least 0, got -1"),
+        (lambda: d.Square(1.0, 1.0, duty=2, size=1), "duty must be between 0 and 1"),
+        (lambda: d.Shock(1.0, 1.0, duration=-1, size=1), "duration must be at least 0"),
+        (lambda: d.Shock(1.0, 1.0, "long", size=1), "at least 0, got 'long'"),
+        (lambda: d.Window(3.0, 1.0, 2.0), "disturbance must be an .*got 3.0"),
+        (lambda: d.Window(d.Zero(1), 3.0, 2.0), "stop must be at least 3.0, got 2"),
+        (lambda: d.Sum(d.Zero(1), 1.0), "every term must be an .*got 1.0"),
+        (lambda: d.Brownian(1, dt="x"), "dt must be positive and finite, got 'x'"),
     ],
 )
 def test_bad_arguments(make, match):

@@ -137,7 +137,7 @@ def test_default_noise_of_a_diffusion():
         ({"initial_state": jnp.zeros(3)}, r"initial_state must have shape \(2,\)"),
         ({"control_bounds": (1.0, -1.0)}, "low <= high"),
         ({"control_bounds": 2.0}, "must be a pair"),
-        ({"control_bounds": (jnp.zeros(2), jnp.ones(2))}, "control_bounds and high"),
+        ({"control_bounds": (jnp.zeros(2), jnp.ones(2))}, r"or have shape \(1,\)"),
         ({"horizon": 0}, "horizon must be a whole number of at least 1"),
         ({"actions": jnp.ones((2, 2))}, "actions must have shape"),
     ],
@@ -172,3 +172,20 @@ def test_a_cost_that_is_no_scalar():
 def test_uniform_state():
     with user_error(match="low <= high"):
         dlx.environments.UniformState(jnp.ones(2), jnp.zeros(2))
+
+
+def test_replace_checks_and_converts():
+    env = dlx.make("pendulum")
+    wider = dlx.replace(env, {"control_bounds": (-3, 3.0)})
+    assert all(eqx.is_array(end) for end in wider.control_bounds)
+    with user_error(match="control_bounds must have low <= high"):
+        dlx.replace(env, {"control_bounds": (2.0, -2.0)})
+    with user_error(match="cost must be an AbstractCost"):
+        dlx.replace(env, {"cost": 3.0})
+    with user_error(match="disturbance has size 2 where 3 is expected"):
+        dynamics = dlx.LinearDynamics(jnp.eye(3), jnp.ones((3, 1)))
+        dlx.replace(env, {"dynamics": dynamics})
+    with user_error(match="horizon.*structure"):
+        dlx.replace(env, {"horizon": 100})
+    with user_error(match="pendulum: max_speed"):
+        dlx.environments.pendulum(solver=dlx.dynamics.RK4(), max_speed=1.0)

@@ -1,3 +1,5 @@
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -92,24 +94,46 @@ def test_single_precision():
     assert residual < 1e-5
 
 
+ROTATION = np.array([[1.0, 0.3], [-0.4, 1.0]])
+
+
+def rotated(modes, B, seen):
+    """Modes in other coordinates, so that nothing is zero by luck."""
+    back = np.linalg.inv(ROTATION)
+    A = ROTATION @ np.diag(modes) @ back
+    Q = back.T @ np.diag(seen) @ back
+    return A, ROTATION @ np.array(B)[:, None], (Q + Q.T) / 2
+
+
 @pytest.mark.parametrize(
-    "A, B, Q",
+    "A, B, Q, status",
     [
-        ([[1.2, 0.0], [0.0, 0.5]], [[0.0], [1.0]], np.eye(2)),  # not stabilisable
-        ([[1.0, 0.0], [0.0, 0.5]], [[0.0], [1.0]], np.eye(2)),  # just not
-        ([[1.0, 1.0], [0.0, 1.0]], [[0.0], [1.0]], np.zeros((2, 2))),  # unseen
+        (*rotated([1.2, 0.5], [0.0, 1], [1.0, 1]), "not_stabilisable"),
+        ([[1.2, 0], [0, 0.5]], [[0.0], [1]], np.eye(2), "not_stabilisable"),
+        ([[1.0, 0], [0, 0.5]], [[0.0], [1]], np.eye(2), "not_stabilisable"),
+        ([[1.0, 1], [0, 1]], [[0.0], [1]], np.zeros((2, 2)), "on_boundary"),
+        (*rotated([-1.0, 0.5], [1.0, 1], [0.0, 1]), "on_boundary"),
+        ([[0.5, 0], [0, 0.2]], [[0.0], [1]], np.diag([1.0, -9]), "not_stabilising"),
     ],
 )
-def test_no_stabilising_solution(A, B, Q):
-    solution = dlx.riccati.dare(A, B, Q, np.eye(1), throw=False)
-    assert solution.result != dlx.RESULTS.successful
-    if np.any(Q):
-        assert solution.result == dlx.RESULTS.not_stabilising
-        assert solution.spectral_radius >= 1
+def test_no_stabilising_solution(A, B, Q, status):
+    A, B = jnp.asarray(A, float), jnp.asarray(B, float)
+    solution = dlx.riccati.dare(A, B, Q, R, throw=False)
+    assert solution.result == getattr(dlx.RESULTS, status)
     with pytest.raises(RuntimeError, match="dare: .*throw=False"):
-        dlx.riccati.dare(A, B, Q, np.eye(1))
+        dlx.riccati.dare(A, B, Q, R)
     with pytest.raises(eqx.EquinoxRuntimeError):
-        eqx.filter_jit(dlx.riccati.dare)(jnp.asarray(A), jnp.asarray(B), Q, np.eye(1))
+        eqx.filter_jit(dlx.riccati.dare)(A, B, Q, R)
+
+
+def test_ill_posed_where_it_cannot_be_seen():
+    solve = jax.jit(lambda A, R: dlx.riccati.dare(A, B, Q, R, throw=False).result)
+    ill_posed = dlx.RESULTS.ill_posed
+    assert solve(A, R) == dlx.RESULTS.successful
+    assert solve(A.at[0, 0].set(jnp.nan), R) == ill_posed
+    assert solve(A, -R) == ill_posed
+    E = jnp.diag(jnp.array([1.0, 0.0]))
+    assert dlx.riccati.dare(A, B, Q, R, None, E, throw=False).result == ill_posed
 
 
 def test_least_energy():
@@ -134,10 +158,12 @@ def test_one_bad_member_harms_no_other():
     spoilt = As.at[1].set(jnp.diag(jnp.array([1.3, 0.2])))
 
     @jax.jit
-    @jax.value_and_grad
-    def total_of_two(As):
+    @functools.partial(jax.value_and_grad, argnums=(0, 1))
+    def total_of_two(As, Q):
         batch = jax.vmap(lambda A: dlx.riccati.dare(A, B, Q, R, throw=False))(As)
-        return jnp.sum(jnp.trace(batch.X[::2], axis1=1, axis2=2))
+        return jnp.sum(
+            jnp.trace(batch.X[::2] + batch.K.mT[::2] @ batch.K[::2], 0, 1, 2)
+        )
 
     solve = jax.jit(jax.vmap(lambda A: dlx.riccati.dare(A, B, Q, R, throw=False)))
     good, bad = solve(As), solve(spoilt)
@@ -146,11 +172,12 @@ def test_one_bad_member_harms_no_other():
         bad.result == dlx.RESULTS.successful, [True, False, True]
     )
     assert_close(bad.X[::2], good.X[::2])
-    value, gradient = total_of_two(As)
-    value_beside, gradient_beside = total_of_two(spoilt)
+    value, (gradient, shared) = total_of_two(As, Q)
+    value_beside, (gradient_beside, shared_beside) = total_of_two(spoilt, Q)
     assert_close(value_beside, value)
     assert_close(gradient_beside[::2], gradient[::2])
     assert_close(gradient_beside[1], np.zeros((2, 2)))
+    assert_close(shared_beside, shared, rtol=1e-6)
 
 
 def facts(A, B, Q, R, S, E=None):
@@ -166,6 +193,15 @@ SMOOTH = (
     R,
     jnp.array([[0.1], [-0.1]]),
 )
+
+
+def test_complex_data():
+    turn = np.diag(np.exp([0.3j, -0.4j]))
+    plain = dlx.riccati.dare(A, B, Q, R)
+    turned = dlx.riccati.dare(turn @ A @ turn.conj(), turn @ B, Q, R)
+    X = turn @ plain.X @ turn.conj()
+    assert_close(turned.X, X, atol=tolerance(1e-4, 1e-12))
+    assert_close(turned.K, plain.K @ turn.conj(), atol=tolerance(1e-4, 1e-12))
 
 
 @needs_x64
@@ -211,11 +247,11 @@ def test_dead_beat_loop_has_a_gradient():
         ({"A": np.ones((2, 3))}, r"A must be square, got shape \(2, 3\)"),
         ({"A": np.ones(2)}, r"A must be a matrix, got shape \(2,\)"),
         ({"A": np.array([[np.nan, 0], [0, 1]])}, "A must be finite"),
-        ({"A": np.eye(2) * 1j}, "must be real, got complex"),
         ({"B": np.ones((3, 1))}, r"as many rows as A \(2\), got shape \(3, 1\)"),
         ({"Q": np.eye(3)}, r"Q must have shape \(2, 2\).*got \(3, 3\)"),
         ({"Q": np.array([[1.0, 1.0], [0.0, 1.0]])}, "Q must be symmetric"),
         ({"R": np.ones((1, 2))}, r"R must be square, got shape \(1, 2\)"),
+        ({"R": -np.eye(1)}, "R must be positive semidefinite.*eigenvalue is -1"),
         ({"R": np.eye(2)}, r"R must have shape \(1, 1\).*got \(2, 2\)"),
         ({"S": np.ones((1, 2))}, r"S must have shape \(2, 1\).*got \(1, 2\)"),
         ({"E": np.eye(3)}, r"E must have shape \(2, 2\).*got \(3, 3\)"),

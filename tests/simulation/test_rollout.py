@@ -1,3 +1,4 @@
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -345,3 +346,69 @@ def test_random_controller_state_is_kept(key):
         explore.init()
     states = dlx.rollout(env, Counter(), key=key, horizon=5).controls
     assert np.all(states == 10)
+
+
+@needs_x64
+def test_what_follows_the_end_does_not_reach_the_gradient(key):
+    """The root is not real beyond the end, and has no slope at it."""
+    tank = dlx.system(lambda t, x, u, w: -jnp.sqrt(x), states=1, controls=1)
+    env = dlx.Environment(
+        dlx.Discretized(tank, 0.1, diffrax.Euler()),
+        dlx.costs.Quadratic(jnp.eye(1), jnp.eye(1)),
+        terminated=lambda t, x: x[0] <= 0,
+        horizon=40,
+    )
+    zero = dlx.controllers.Zero(1)
+    cost = lambda x0: dlx.rollout(env, zero, key=key, x0=x0).total_cost
+    x0 = jnp.ones(1)
+    assert dlx.rollout(env, zero, key=key, x0=x0).length < 40
+    assert_close(jax.grad(cost)(x0), central_difference(cost, x0), rtol=1e-6)
+
+
+def test_a_system_without_controls(key):
+    decay = dlx.system(lambda t, x, u, w: -x, states=1, controls=0)
+    env = dlx.Environment(
+        dlx.Discretized(decay, 0.1),
+        dlx.costs.Function(lambda t, x, u: x[0] ** 2),
+        initial_state=jnp.ones(1),
+        horizon=10,
+    )
+    run = dlx.rollout(env, dlx.controllers.Zero(0), key=key)
+    assert run.controls.shape == (10, 0)
+    assert_close(run.final_state, [np.exp(-1.0)], rtol=1e-3)
+
+
+def test_a_changed_step_reaches_the_noise(key):
+    """Euler-Maruyama increments follow the step that is taken."""
+
+    class Walk(dlx.AbstractSystem):
+        state_names = ("x",)
+        control_names = ("u",)
+
+        def vector_field(self, t, x, u, w):
+            return jnp.zeros_like(x)
+
+        def diffusion(self, t, x, u):
+            return jnp.ones((1, 1))
+
+    env = dlx.Environment(
+        dlx.Discretized(Walk(), 1.0),
+        dlx.costs.Quadratic(jnp.eye(1), jnp.eye(1)),
+        horizon=1,
+    )
+    short = dlx.replace(env, {"dynamics.dt": 0.01})
+    end = lambda e: dlx.rollout(e, dlx.controllers.Zero(1), key=key).final_state
+    assert_close(end(short), 0.1 * end(env), rtol=1e-5)
+
+
+def test_tables_keep_every_column(key):
+    names = dict(states=("time", "cost", "x"), controls=("x",))
+    plant = dlx.system(lambda t, x, u, w: jnp.concatenate([u, x[:2]]), **names)
+    env = dlx.Environment(
+        dlx.Discretized(plant, 0.1), dlx.costs.Quadratic(jnp.eye(3), jnp.eye(1))
+    )
+    run = dlx.rollout(env, dlx.controllers.Constant([1.0]), key=key, horizon=3)
+    table = run.to_pandas()
+    assert table["time"].to_list() == list(np.asarray(run.times))
+    assert {"state time", "state cost", "x", "control x", "cost"} <= set(table)
+    assert list(table)[-1] == "cost"

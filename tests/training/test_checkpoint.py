@@ -216,3 +216,28 @@ def test_infinite_bounds_do_not_make_another_run(tmp_path):
     with pytest.raises(Cut):
         train(path, callbacks=[cut_at(4)], **options)
     assert_same_run(train(**options), train(path, **options))
+
+
+@pytest.mark.parametrize("what", ["loss", "learning rate", "data"])
+def test_another_loss_rate_or_data_is_another_run(tmp_path, what):
+    model = dlx.controllers.Linear([[20.0, 5.0]])
+    rows = jnp.ones(6)
+
+    def fit(target=1.0, rate=0.1, data=rows):
+        return dlx.training.fit(
+            lambda m, batch, key: jnp.mean(batch) * jnp.sum((m.K - target) ** 2),
+            model,
+            optax.adam(rate),
+            steps=4,
+            key=jax.random.key(0),
+            data=data,
+            checkpoint=tmp_path / "run.ckpt",
+            progress=False,
+        )
+
+    first = fit()
+    assert jnp.all(fit().model.K == first.model.K)
+    other = {"loss": {"target": -9.0}, "learning rate": {"rate": 5.0}}
+    other["data"] = {"data": 2 * rows}
+    with user_error(match="is of another run: the .* of its first steps"):
+        fit(**other[what])

@@ -14,7 +14,7 @@ from ..riccati._lyapunov import lyapunov
 from ..riccati._small import full_precision
 from ..riccati._stein import stein
 from ..systems import LinearSystem
-from ._plant import is_stable, plant, Plant
+from ._plant import is_stable, Plant, plant
 
 
 _DOUBLINGS = 60

@@ -8,12 +8,11 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._check import is_concrete
 from .._results import first_of, Result
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
 from ._norms import peak_gain, thrown
-from ._plant import is_stable, plant, Plant, response, size, solve
+from ._plant import is_stable, Plant, plant, response, size, solve
 
 
 _HALVINGS = 60
@@ -297,21 +296,22 @@ def _margins(loop: Plant) -> Margins:
     disk, disk_s, disk_t = (jax.tree.map(lambda a, i=i: a[i], disks) for i in range(3))
     result = first_of(disks.result)
     pairs = zip(margins, frequencies, strict=True)
-    flat = (each for pair in pairs for each in pair)
-    return Margins(*flat, disk, disk_s, disk_t, stable, result)
+    flat: Any = [each for pair in pairs for each in pair]
+    flat += [disk, disk_s, disk_t, stable, result]
+    return Margins(*flat)
 
 
 def _scalar(loop: Plant, omega: Array) -> Array:
     return response(loop, omega)[0, 0]
 
 
-def _crossing(kind: Array, L: Array) -> Array:
+def _crossing(kind: Any, L: Array) -> Array:
     """Zero where `L` is real, or for the second kind where it is 1 in size."""
     length = size(L)
     return jnp.where(kind == 0, jnp.imag(L) / length, jnp.log(length))
 
 
-def _follow(loop: Plant, kind: Array, omega: Array, found: Array) -> Array:
+def _follow(loop: Plant, kind: Any, omega: Array, found: Array) -> Array:
     """`omega` itself, which moves with the loop as the crossing does.
 
     Two Newton steps from where it is already: their values change nothing but rounding,
@@ -353,7 +353,7 @@ def _crossings(loop: Plant) -> tuple[Array, Array]:
         axis = Plant(A / scale, B / scale, C, loop.D, None)
 
     def omega(phi):
-        """From an angle in `[0, pi/2]`, which all frequencies become, to a frequency."""
+        """The frequency of an angle in `[0, pi/2]`, one for each frequency there is."""
         return scale * jnp.tan(phi) if loop.dt is None else 2 * phi / loop.dt
 
     def values(phi):

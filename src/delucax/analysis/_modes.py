@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from .._check import check_positive, is_concrete
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
-from ._plant import growth, plant, Plant
+from ._plant import growth, Plant, plant
 
 
 _SEARCHES = 3
@@ -342,7 +342,9 @@ def _hidden_part(A, B, C, D, tolerance):
         C, D = left.T @ C, left.T @ D
         free = C[rank:]
         # States that those show at once.
-        _, values, right = np.linalg.svd(free) if free.size else ([], [], np.eye(len(A)))
+        _, values, right = (
+            np.linalg.svd(free) if free.size else ([], [], np.eye(len(A)))
+        )
         seen = int(np.sum(np.asarray(values) > tolerance))
         if seen == 0:
             return A, B, C[:rank], D[:rank]

@@ -13,7 +13,7 @@ from .._results import choose, Result, RESULTS
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
 from ._gramians import gramian
-from ._plant import growth, is_stable, largest_gain, Plant, plant, response, solve, size
+from ._plant import growth, is_stable, largest_gain, Plant, plant, response, solve
 
 
 _LEVELS = 30
@@ -200,23 +200,28 @@ def _climb(plant: Plant, omega: Array) -> tuple[Array, Array, Array]:
     """
 
     def step(_, carry):
-        best, top, curvature, moves, trial = carry
+        best, flattest, top, curvature, moves, trial = carry
         # An infinite frequency is a point like any other that has no slope.
         finite = jnp.isfinite(trial)
         at = jnp.where(finite, trial, 1)
         one = jnp.ones_like(at)
-        (gain, slope), (_, bend) = jax.jvp(lambda w: _with_slope(plant, w), (at,), (one,))
+        there = lambda w: _with_slope(plant, w)
+        (gain, slope), (_, bend) = jax.jvp(there, (at,), (one,))
         usable = finite & (bend < 0) & jnp.isfinite(slope) & jnp.isfinite(bend)
         bend = jnp.where(usable, bend, -1)
-        up = usable & (gain >= best) & (trial >= 0)
+        # Near the top the gain is level but for rounding, and its slope decides.
+        up = usable & (gain >= best) & (jnp.abs(slope) < flattest) & (trial >= 0)
         top = jnp.where(up, trial, top)
         trial = jnp.where(up, at - slope / bend, trial)
-        best, curvature = jnp.where(up, gain, best), jnp.where(up, bend, curvature)
-        return best, top, curvature, jnp.where(up, top > 0, moves), trial
+        best = jnp.where(up, gain * (1 - level), best)
+        flattest = jnp.where(up, jnp.abs(slope), flattest)
+        curvature = jnp.where(up, bend, curvature)
+        return best, flattest, top, curvature, jnp.where(up, top > 0, moves), trial
 
-    low, unbent = jnp.zeros_like(omega), -jnp.ones_like(omega)
-    start = (low, omega, unbent, jnp.asarray(False), omega)
-    _, top, curvature, moves, _ = lax.fori_loop(0, _NEWTON_STEPS, step, start)
+    level = 100 * jnp.finfo(omega.dtype).eps
+    low, steep = jnp.zeros_like(omega), jnp.full_like(omega, jnp.inf)
+    start = (low, steep, omega, -jnp.ones_like(omega), jnp.asarray(False), omega)
+    *_, top, curvature, moves, _ = lax.fori_loop(0, _NEWTON_STEPS, step, start)
     return top, curvature, moves
 
 

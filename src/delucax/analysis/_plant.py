@@ -21,7 +21,7 @@ class Plant(eqx.Module):
     B: Array
     C: Array
     D: Array
-    dt: Array | None
+    dt: Any
 
     @property
     def is_discrete(self) -> bool:

@@ -11,7 +11,7 @@ from .._check import is_concrete
 from .._fields import as_float_array
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
-from ._plant import plant, Plant, response, solve
+from ._plant import Plant, plant, response, solve
 
 
 def frequency_response(

@@ -3,19 +3,16 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._check import as_vector, check_finite
 from .._fields import function_field, parameter, weight
 from ..dynamics import LinearDynamics
-from ..math import matvec
-from ..riccati import dare
+from ..riccati import filter_dare
 from ..riccati._solution import checked
 from ._gaussian_filter import (
     AbstractGaussianFilter,
-    covariance_matrix,
     first_belief,
     noise_covariances,
 )
@@ -32,8 +29,7 @@ class KalmanFilter(AbstractGaussianFilter):
     `L = Sigma C' (C Sigma C' + V)^-1`, and takes the covariance from `Sigma` to
     `(I - L C) Sigma (I - L C)' + L V L'` (Joseph's form); the time update takes it from
     `P` to `A P A' + E W E'`. In the steady state `Sigma` and `L` are constant: the
-    former solves the Riccati equation of the dual problem, with `A'`, `C'`, `E W E'`,
-    `V` in the places of `A`, `B`, `Q`, `R`.
+    former is that of [`delucax.riccati.filter_dare`][].
 
     **Arguments:**
 
@@ -135,9 +131,10 @@ class KalmanFilter(AbstractGaussianFilter):
                 "follows."
             )
         C = self._C
-        solution = dare(dynamics.A.T, C.T, self._noise(dynamics), self.V, throw=False)
-        dual = "the dual equation (A', C', E W E', V for A, B, Q, R)"
-        covariance = checked(solution, f"{where}: {dual}", True).X
+        noise = self._noise(dynamics)
+        solution = filter_dare(dynamics.A, C, noise, self.V, throw=False)
+        what = f"{where}: there is no steady state. Of A', C' in the places of A, B"
+        covariance = checked(solution, what, True).X
         self.mean, self.covariance = first_belief(
             mean, covariance, first_ref, like, where
         )

@@ -118,8 +118,13 @@ class LQG(AbstractController):
             observation_difference=observation_difference,
         )
         self.average_cost = None
-        if steady_state:
-            self.average_cost = _average_cost(self.regulator, self.estimator, R)
+        covariance = self.estimator.updated_covariance
+        if covariance is not None:
+            noise = self.estimator._noise(dynamics)
+            price = _price(dynamics.B, self.regulator, R)
+            self.average_cost = jnp.trace(self.regulator.P @ noise) + jnp.trace(
+                price @ covariance
+            )
 
     @property
     def _feedback(self) -> OutputFeedback:
@@ -135,8 +140,7 @@ class LQG(AbstractController):
         return self._feedback.applied(u, cost, state)
 
 
-def _average_cost(regulator: LQR, estimator: KalmanFilter, R: Any) -> Array:
-    B, P, K = estimator.dynamics.B, regulator.P, regulator.K
-    price = K.T @ (jnp.asarray(R) + B.T @ P @ B) @ K
-    noise = estimator._noise(estimator.dynamics)
-    return jnp.trace(P @ noise) + jnp.trace(price @ estimator.updated_covariance)
+def _price(B: Array, regulator: LQR, R: Any) -> Array:
+    """The weight of an error of the estimate: `K' (R + B'PB) K`."""
+    K = regulator.K
+    return K.T @ (jnp.asarray(R) + B.T @ regulator.P @ B) @ K

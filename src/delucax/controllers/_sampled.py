@@ -106,7 +106,8 @@ def lqrd(
     difference: Callable[[Array, Array], Array] | None = None,
 ) -> LQR:
     """The sampled-data regulator of a continuous problem: of all controls held over
-    each `dt` it minimises the integral over all time of `dx'Q dx + 2 dx'S du + du'R du`.
+    each `dt` it minimises the integral over all time of
+    `dx'Q dx + 2 dx'S du + du'R du`.
 
     Its `P` is that of the continuous cost: the minimum from a deviation `dx` is
     `dx' P dx`. As `dt` goes to 0 the gain goes to that of [`delucax.riccati.care`][].

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from .._check import check_finite, is_concrete
@@ -51,8 +52,8 @@ class Filtered(eqx.Module):
 
     @property
     def log_likelihood(self) -> Array:
-        """That of the whole record, a scalar."""
-        return jnp.sum(self.log_likelihoods)
+        """That of the whole record, a scalar; of a batch, of each of its records."""
+        return jnp.sum(self.log_likelihoods, axis=-1)
 
 
 class Smoothed(eqx.Module):
@@ -314,9 +315,10 @@ def _checked(found, where):
         return found.result.error_if(found, failed)
     if failed:
         filtered = found if isinstance(found, Filtered) else found.filtered
-        step = int(jnp.sum(jnp.isfinite(filtered.log_likelihoods)))
+        finite = np.isfinite(filtered.log_likelihoods)
+        where_to = "" if finite.all() else f" At observation {finite.argmin()}."
         raise RuntimeError(
-            f"{where}: {RESULTS[found.result]} At observation {step}. Pass throw=False "
-            "to look at the beliefs."
+            f"{where}: {RESULTS[found.result]}{where_to} Pass throw=False to look at "
+            "the beliefs."
         )
     return found

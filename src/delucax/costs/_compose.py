@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_positive
+from .._check import check_step
 from .._fields import function_field, parameter
 from .._typing import RealScalar
 from ._base import AbstractCost
@@ -68,7 +68,7 @@ class Rate(AbstractCost):
     dt: Array = parameter()
 
     def __init__(self, cost: AbstractCost, dt: Any):
-        check_positive(dt, "dt", "Rate")
+        check_step(dt, "Rate")
         self.cost = cost
         self.dt = dt
 

@@ -58,15 +58,7 @@ class Quadratic(AbstractCost):
         *,
         difference: Callable[[Array, Array], Array] | None = None,
     ):
-        where = "Quadratic"
-        self.Q = symmetric_matrix(Q, "Q", where)
-        self.R = symmetric_matrix(R, "R", where)
-        self.Qf = None if final is None else symmetric_matrix(final, "final", where)
-        if self.Qf is not None and self.Qf.shape != self.Q.shape:
-            raise ValueError(
-                f"{where}: final must have the shape of Q, {self.Q.shape}, got "
-                f"{self.Qf.shape}."
-            )
+        self.Q, self.R, self.Qf = _weights(Q, R, final, "Quadratic")
         self.state_target = _target(state_target, self.Q, "state_target")
         self.control_target = _target(control_target, self.R, "control_target")
         self.difference = difference
@@ -85,11 +77,7 @@ class Quadratic(AbstractCost):
         return x if self.state_target is None else x - self.state_target
 
     def __call__(self, t, x, u):
-        if u.shape != self.R.shape[:1]:
-            raise ValueError(
-                f"Quadratic: R has shape {self.R.shape} but the control has shape "
-                f"{u.shape}."
-            )
+        _check_control(self.R, u, "Quadratic")
         du = u if self.control_target is None else u - self.control_target
         return quadratic_form(self.Q, self._state(x)) + quadratic_form(self.R, du)
 
@@ -112,7 +100,8 @@ class Tracking(AbstractCost):
     - `output`: h, from the state to the vector that follows the reference; the state
         itself by default.
 
-    **Raises:** `ValueError` if a weight is not square, symmetric and finite.
+    **Raises:** `ValueError` if a weight is not square, symmetric and finite, or does
+    not fit what it weighs.
 
     !!! example
 
@@ -140,15 +129,12 @@ class Tracking(AbstractCost):
         final: Any = None,
         output: Callable[[Array], Array] | None = None,
     ):
-        where = "Tracking"
-        self.Q = symmetric_matrix(Q, "Q", where)
-        self.R = symmetric_matrix(R, "R", where)
+        self.Q, self.R, self.Qf = _weights(Q, R, final, "Tracking")
         if not callable(reference):
             raise ValueError(
-                f"{where}: reference must be a function of time, got {reference!r}."
+                f"Tracking: reference must be a function of time, got {reference!r}."
             )
         self.reference = reference
-        self.Qf = None if final is None else symmetric_matrix(final, "final", where)
         self.output = output
 
     def _error(self, t: RealScalar, x: Array) -> Array:
@@ -162,12 +148,33 @@ class Tracking(AbstractCost):
         return y - r
 
     def __call__(self, t, x, u):
+        _check_control(self.R, u, "Tracking")
         return quadratic_form(self.Q, self._error(t, x)) + quadratic_form(self.R, u)
 
     def final(self, t, x):
         if self.Qf is None:
             return jnp.zeros((), x.dtype)
         return quadratic_form(self.Qf, self._error(t, x))
+
+
+def _weights(Q: Any, R: Any, final: Any, where: str) -> tuple[Matrix, Matrix, Any]:
+    """The weights as symmetric matrices that fit each other, or an error."""
+    Q, R = symmetric_matrix(Q, "Q", where), symmetric_matrix(R, "R", where)
+    if final is None:
+        return Q, R, None
+    final = symmetric_matrix(final, "final", where)
+    if final.shape != Q.shape:
+        raise ValueError(
+            f"{where}: final must have the shape of Q, {Q.shape}, got {final.shape}."
+        )
+    return Q, R, final
+
+
+def _check_control(R: Array, u: Array, where: str) -> None:
+    if u.shape != R.shape[:1]:
+        raise ValueError(
+            f"{where}: R has shape {R.shape} but the control has shape {u.shape}."
+        )
 
 
 def _target(value: Any, weight: Array, name: str) -> Array | None:

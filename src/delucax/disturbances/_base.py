@@ -58,6 +58,14 @@ class AbstractDisturbance(eqx.Module):
         return Sum(self, other)
 
 
+def check_disturbance(value: Any, name: str, where: str) -> None:
+    """Raise unless `value` is a disturbance."""
+    if not isinstance(value, AbstractDisturbance):
+        raise ValueError(
+            f"{where}: {name} must be an AbstractDisturbance, got {value!r}."
+        )
+
+
 def common_size(where: str, size: int | None, **values: Any) -> tuple[int, dict]:
     """The size that arrays share, and the arrays; numbers fit any size."""
     arrays = {name: as_float_array(value) for name, value in values.items()}

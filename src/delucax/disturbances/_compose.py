@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
+from .._check import check_key, check_range
 from .._fields import parameter
-from ._base import AbstractDisturbance
+from ._base import AbstractDisturbance, check_disturbance
 from ._deterministic import Constant
 
 
@@ -16,7 +17,8 @@ class Sum(AbstractDisturbance):
 
     **Arguments:** `*terms`: disturbances of one size.
 
-    **Raises:** `ValueError` if there are none, or if sizes differ.
+    **Raises:** `ValueError` if there are none, if one is no disturbance, or if sizes
+    differ.
 
     !!! example
 
@@ -33,6 +35,8 @@ class Sum(AbstractDisturbance):
     terms: tuple[AbstractDisturbance, ...]
 
     def __init__(self, *terms: AbstractDisturbance):
+        for term in terms:
+            check_disturbance(term, "every term", "Sum")
         sizes = [term.size for term in terms]
         if len(set(sizes)) != 1:
             raise ValueError(f"Sum: terms must be of one size, got sizes {sizes}.")
@@ -45,6 +49,8 @@ class Sum(AbstractDisturbance):
 
     def sequence(self, key, times):
         n = len(self.terms)
+        if key is not None:
+            check_key(key, "Sum")
         keys = [None] * n if key is None else list(jr.split(key, n))
         drawn = [w.sequence(k, times) for w, k in zip(self.terms, keys, strict=True)]
         return sum(drawn[1:], drawn[0])
@@ -57,6 +63,8 @@ class Window(AbstractDisturbance):
 
     - `disturbance`: the one inside.
     - `start`, `stop`: the ends of the window, in units of time.
+
+    **Raises:** `ValueError` if `disturbance` is not one, or `stop` is before `start`.
 
     !!! example
 
@@ -74,6 +82,10 @@ class Window(AbstractDisturbance):
     disturbance: AbstractDisturbance
     start: Array = parameter()
     stop: Array = parameter()
+
+    def __check_init__(self):
+        check_disturbance(self.disturbance, "disturbance", "Window")
+        check_range(self.stop, "stop", "Window", self.start)
 
     @property
     def size(self) -> int:
@@ -99,7 +111,8 @@ def Shock(
 
     **Returns:** the disturbance.
 
-    **Raises:** `ValueError` if the size is unknown or does not fit.
+    **Raises:** `ValueError` if the size is unknown or does not fit, or `duration` is
+    negative.
 
     !!! example
 
@@ -110,4 +123,5 @@ def Shock(
         push = dlx.disturbances.Shock(jnp.array([0.0, 0.5]), start=5.0, duration=0.5)
         ```
     """
+    check_range(duration, "duration", "Shock")
     return Window(Constant(value, size=size), start, start + duration)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_matrix
+from .._check import as_matrix, check_range
 from .._fields import parameter, positive
 from ..math import sin
 from ._base import AbstractDisturbance, common_size, spread
@@ -131,13 +131,13 @@ class Square(AbstractDisturbance):
 
     - `amplitude`.
     - `period`: in units of time, positive.
-    - `duty`: the part of a period at `+amplitude`, 0.5 by default.
+    - `duty`: the part of a period at `+amplitude`, from 0 to 1; 0.5 by default.
     - `size`: entries a step; follows from the others if one is a vector.
 
     The gradient with respect to `period` and `duty` is zero almost everywhere.
 
-    **Raises:** `ValueError` if the size is unknown or does not fit, or the period is
-    not positive.
+    **Raises:** `ValueError` if the size is unknown or does not fit, the period is not
+    positive, or `duty` is not between 0 and 1.
 
     !!! example
 
@@ -162,6 +162,9 @@ class Square(AbstractDisturbance):
         )
         for name, array in arrays.items():
             setattr(self, name, array)
+
+    def __check_init__(self):
+        check_range(self.duty, "duty", "Square", 0, 1)
 
     def sequence(self, key, times):
         cycles = times[:, None] / self.period

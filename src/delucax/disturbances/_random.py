@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_count, check_positive
+from .._check import check_count, check_key, check_range, check_step
 from .._fields import parameter
 from ..math import clip
 from ..math._normal import normal
@@ -24,7 +24,8 @@ class Gaussian(AbstractDisturbance):
     - `mean`: 0 by default.
     - `size`: entries a step; follows from the others if one is a vector.
 
-    **Raises:** `ValueError` if the size is unknown or does not fit.
+    **Raises:** `ValueError` if the size is unknown or does not fit, or `std` is
+    negative.
 
     !!! example
 
@@ -46,8 +47,11 @@ class Gaussian(AbstractDisturbance):
         self.size, arrays = common_size("Gaussian", size, std=std, mean=mean)
         self.std, self.mean = arrays["std"], arrays["mean"]
 
+    def __check_init__(self):
+        check_range(self.std, "std", "Gaussian")
+
     def sequence(self, key, times):
-        w = normal(_need(key, "Gaussian"), (times.shape[0], self.size), times.dtype)
+        w = normal(check_key(key, "Gaussian"), (times.shape[0], self.size), times.dtype)
         return (self.std * w + self.mean).astype(times.dtype)
 
 
@@ -59,7 +63,8 @@ class Uniform(AbstractDisturbance):
     - `low`, `high`: the ends.
     - `size`: entries a step; follows from the others if one is a vector.
 
-    **Raises:** `ValueError` if the size is unknown or does not fit.
+    **Raises:** `ValueError` if the size is unknown or does not fit, or `high` is
+    below `low`.
 
     !!! example
 
@@ -81,8 +86,13 @@ class Uniform(AbstractDisturbance):
         self.size, arrays = common_size("Uniform", size, low=low, high=high)
         self.low, self.high = arrays["low"], arrays["high"]
 
+    def __check_init__(self):
+        check_range(self.high, "high", "Uniform", self.low)
+
     def sequence(self, key, times):
-        w = jr.uniform(_need(key, "Uniform"), (times.shape[0], self.size), times.dtype)
+        w = jr.uniform(
+            check_key(key, "Uniform"), (times.shape[0], self.size), times.dtype
+        )
         return (self.low + (self.high - self.low) * w).astype(times.dtype)
 
 
@@ -96,7 +106,8 @@ class RandomWalk(AbstractDisturbance):
     - `bound`: 1 by default.
     - `size`: entries a step; follows from the others if one is a vector.
 
-    **Raises:** `ValueError` if the size is unknown or does not fit.
+    **Raises:** `ValueError` if the size is unknown or does not fit, or `std` or
+    `bound` is negative.
 
     !!! example
 
@@ -118,9 +129,13 @@ class RandomWalk(AbstractDisturbance):
         self.size, arrays = common_size("RandomWalk", size, std=std, bound=bound)
         self.std, self.bound = arrays["std"], arrays["bound"]
 
+    def __check_init__(self):
+        check_range(self.std, "std", "RandomWalk")
+        check_range(self.bound, "bound", "RandomWalk")
+
     def sequence(self, key, times):
         shape = (times.shape[0], self.size)
-        e = normal(_need(key, "RandomWalk"), shape, times.dtype)
+        e = normal(check_key(key, "RandomWalk"), shape, times.dtype)
         std, bound = self.std.astype(e.dtype), self.bound.astype(e.dtype)
 
         def step(w, e):
@@ -138,7 +153,8 @@ class Brownian(AbstractDisturbance):
     **Arguments:**
 
     - `size`: Brownian motions.
-    - `dt`: the control interval.
+    - `dt`: the control interval; by default the distance between the times of the
+        sequence, of which there must be two then.
     - `substeps`: solver steps an interval, 1 by default; the increments of all of them
         follow one another in `w`.
 
@@ -156,22 +172,23 @@ class Brownian(AbstractDisturbance):
         ```
     """
 
-    dt: Array = parameter()
+    dt: Array | None = parameter()
     size: int = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
 
-    def __init__(self, size: int, dt: Any, substeps: int = 1):
-        check_positive(dt, "dt", "Brownian")
+    def __init__(self, size: int, dt: Any = None, substeps: int = 1):
+        if dt is not None:
+            check_step(dt, "Brownian")
         self.dt = dt
         self.substeps = check_count(substeps, "substeps", "Brownian")
         self.size = check_count(size, "size", "Brownian") * self.substeps
 
     def sequence(self, key, times):
-        e = normal(_need(key, "Brownian"), (times.shape[0], self.size), times.dtype)
-        return (jnp.sqrt(self.dt / self.substeps) * e).astype(times.dtype)
-
-
-def _need(key, where: str):
-    if key is None:
-        raise ValueError(f"{where}: key must be a key such as jax.random.key(0).")
-    return key
+        if self.dt is None and times.shape[0] < 2:
+            raise ValueError(
+                f"Brownian: dt must be given for {times.shape[0]} times, which do not "
+                "tell it."
+            )
+        dt = times[1] - times[0] if self.dt is None else self.dt
+        e = normal(check_key(key, "Brownian"), (times.shape[0], self.size), times.dtype)
+        return (jnp.sqrt(dt / self.substeps) * e).astype(times.dtype)

@@ -8,10 +8,10 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_count, check_positive
+from .._check import check_count, check_positive, check_step
 from .._components import by_components
 from .._fields import parameter
-from .._results import first_of, or_none, promote, RESULTS
+from .._results import choose, first_of, or_none, promote, RESULTS
 from ..systems import AbstractSystem
 from ..systems._base import zeros_if_none
 from ._base import AbstractDynamics
@@ -24,8 +24,10 @@ from ._runge_kutta import (
 )
 from ._solvers import (
     check_adaptive,
+    check_adjoint,
     check_fixed_step,
     check_solver,
+    check_stepsize_controller,
     for_fixed_steps,
     loud,
 )
@@ -124,7 +126,7 @@ class Discretized(AbstractDynamics):
                 f"{where}: system must be an AbstractSystem (wrap a function with "
                 f"`delucax.system`), got {type(system).__name__}."
             )
-        check_positive(dt, "dt", where)
+        check_step(dt, where)
         self.system = system
         self.dt = dt
         self.substeps = check_count(substeps, "substeps", where)
@@ -154,6 +156,7 @@ class Discretized(AbstractDynamics):
             if not noisy:
                 check_fixed_step(solver, where)
         else:
+            check_stepsize_controller(stepsize_controller, where)
             check_adaptive(solver, where)
             if noisy:
                 raise ValueError(
@@ -167,6 +170,7 @@ class Discretized(AbstractDynamics):
                 )
             if adjoint is None:
                 adjoint = diffrax.RecursiveCheckpointAdjoint()
+            check_adjoint(adjoint, where)
             max_steps = check_count(
                 256 if max_steps is None else max_steps, "max_steps", where
             )
@@ -350,12 +354,15 @@ def _field(t, x, args):
 def evaluate_field(system: AbstractSystem, t: Any, x: Array, u: Array, w: Any) -> Array:
     """The vector field of `system`, with its shape checked."""
     dx = system.vector_field(t, x, u, w)
-    if dx.shape != x.shape:
-        raise ValueError(
-            f"{type(system).__name__}: vector_field must return shape {x.shape}, as "
-            f"the state has, got {dx.shape}."
-        )
-    return dx
+    shape = getattr(dx, "shape", None)
+    if shape == x.shape:
+        return dx
+    got = f"a {type(dx).__name__}" if shape is None else shape
+    hint = " (jnp.stack makes one of a list)" if isinstance(dx, tuple | list) else ""
+    raise ValueError(
+        f"{type(system).__name__}: vector_field must return shape {x.shape}, as the "
+        f"state has, got {got}; it must be an array{hint}."
+    )
 
 
 def _solver_step(solver, term, t, x, h, args):
@@ -366,4 +373,8 @@ def _solver_step(solver, term, t, x, h, args):
     x_next, _, _, _, result = solver.step(
         term, t0, t1, x, args, state, made_jump=jnp.array(True)
     )
-    return x_next, promote(result)
+    if result is diffrax.RESULTS.successful:
+        return x_next, RESULTS.successful
+    # Diffrax says to take more steps of a kind that there is none of here.
+    solved = promote(result) == RESULTS.successful
+    return x_next, choose(solved, RESULTS.successful, RESULTS.stage_not_solved)

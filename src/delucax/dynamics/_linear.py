@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._check import as_matrix, as_vector, check_positive
+from .._check import as_matrix, as_vector, check_step
 from .._fields import as_float_array, parameter
 from .._results import RESULTS
 from ..math import matvec
@@ -94,7 +94,7 @@ class LinearDynamics(AbstractDynamics):
             A, B, C, E = check_matrices(A, B, C, E, where)
         n, m = B.shape[-2:]
         self.A, self.B, self.C, self.E = A, B, C, E
-        check_positive(dt, "dt", where)
+        check_step(dt, where)
         self.dt = dt
         self.x_ref = _point(x_ref, n, steps, "x_ref", jnp.zeros(n, A.dtype))
         self.u_ref = _point(u_ref, m, steps, "u_ref", jnp.zeros(m, A.dtype))

@@ -1,5 +1,6 @@
 """First-order models by automatic differentiation, and their sampled form."""
 
+import functools
 from typing import Any, overload
 
 import jax
@@ -8,11 +9,12 @@ import jax.scipy.linalg as jsl
 import lineax as lx
 from jaxtyping import Array
 
-from .._check import as_vector, check_positive
+from .._check import as_vector, check_step
 from .._typing import RealScalar
 from ..systems import AbstractSystem, LinearSystem
 from ..systems._base import zeros_if_none
 from ._base import AbstractDynamics
+from ._discretized import evaluate_field
 from ._linear import LinearDynamics
 
 
@@ -56,6 +58,8 @@ def linearize(
         upright.A
         ```
     """
+    if isinstance(model, LinearDynamics):
+        model = model.at(t)
     is_system = isinstance(model, AbstractSystem)
     if not is_system and not isinstance(model, AbstractDynamics):
         raise ValueError(
@@ -73,7 +77,7 @@ def linearize(
     if is_system:
         w = jnp.zeros(model.disturbance_size, x.dtype)
         held = w if model.disturbance_names else None
-        f = model.vector_field
+        f = functools.partial(evaluate_field, model)
         A, B = _jacobian(f, (1, 2))(t, x, u, held)
         E = None
         if model.disturbance_names:
@@ -147,7 +151,7 @@ def c2d(system: LinearSystem, dt: Any, method: str = "zoh") -> LinearDynamics:
             "c2d: system must be a LinearSystem (see `delucax.linearize`), got "
             f"{type(system).__name__}."
         )
-    check_positive(dt, "dt", "c2d")
+    check_step(dt, "c2d")
     n = system.state_size
     inputs = [system.B, system.dx_ref[:, None]]
     if system.E is not None:

@@ -23,6 +23,25 @@ def check_solver(solver: Any, where: str) -> None:
         )
 
 
+def check_stepsize_controller(stepsize_controller: Any, where: str) -> None:
+    """Raise unless `stepsize_controller` chooses steps by their error."""
+    if not isinstance(stepsize_controller, diffrax.AbstractAdaptiveStepSizeController):
+        raise ValueError(
+            f"{where}: stepsize_controller must be adaptive, such as "
+            "diffrax.PIDController(rtol=1e-6, atol=1e-8); for fixed steps leave it "
+            f"out and give substeps. Got {stepsize_controller!r}."
+        )
+
+
+def check_adjoint(adjoint: Any, where: str) -> None:
+    """Raise unless `adjoint` is a Diffrax adjoint."""
+    if not isinstance(adjoint, diffrax.AbstractAdjoint):
+        raise ValueError(
+            f"{where}: adjoint must be a Diffrax adjoint such as "
+            f"diffrax.RecursiveCheckpointAdjoint(), got {adjoint!r}."
+        )
+
+
 def check_fixed_step(solver: diffrax.AbstractSolver, where: str) -> None:
     """Raise unless `solver` takes fixed steps of `dx/dt = f(t, x, u, w)`."""
     if isinstance(solver, diffrax.AbstractImplicitSolver):

@@ -9,8 +9,15 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from .._check import as_vector, check_count, check_key, is_concrete
-from .._fields import as_float_array, function_field, parameter
+from .._check import (
+    as_bounds,
+    as_vector,
+    check_count,
+    check_finite,
+    check_key,
+    is_concrete,
+)
+from .._fields import as_float_array, as_module, function_field, parameter
 from .._paths import get_path, replace
 from .._results import Result
 from .._typing import PRNGKey, RealScalar
@@ -60,12 +67,22 @@ class UniformState(eqx.Module):
     high: Array = parameter()
 
     def __check_init__(self):
-        _check_bounds(self.low, self.high, jnp.shape(self.low), "UniformState: low")
+        what = "UniformState: low and high"
+        _check_bounds(self.low, self.high, jnp.shape(self.low), what)
 
     def __call__(self, key: PRNGKey) -> Array:
         """A state drawn with `key`."""
+        check_key(key, "UniformState")
         unit = jr.uniform(key, self.low.shape, self.low.dtype)
         return self.low + (self.high - self.low) * unit
+
+
+def _as_start(value: Any) -> Any:
+    return as_module(value) if callable(value) else as_float_array(value)
+
+
+def _as_control_bounds(value: Any) -> tuple[Array, Array] | None:
+    return as_bounds(value, "Environment", "control_bounds")
 
 
 class Environment(eqx.Module):
@@ -112,8 +129,8 @@ class Environment(eqx.Module):
     cost: AbstractCost
     disturbance: AbstractDisturbance
     sensor_noise: AbstractDisturbance | None
-    initial_state: Array | Callable[[PRNGKey], Array] = function_field()
-    control_bounds: tuple[Array, Array] | None
+    initial_state: Any = eqx.field(converter=_as_start)
+    control_bounds: tuple[Array, Array] | None = eqx.field(converter=_as_control_bounds)
     horizon: int = eqx.field(static=True)
     terminated: Callable[[RealScalar, Array], Array] | None = function_field()
     actions: Array | None = parameter()
@@ -132,30 +149,42 @@ class Environment(eqx.Module):
         actions: Any = None,
         encode: Callable[[Array], Array] | None = None,
     ):
-        where = "Environment"
+        self.dynamics = dynamics
+        self.cost = cost
+        if disturbance is None and isinstance(dynamics, AbstractDynamics):
+            k, substeps = dynamics.disturbance_size, getattr(dynamics, "substeps", 1)
+            if dynamics.is_stochastic:
+                disturbance = Brownian(k // substeps, substeps=substeps)
+            else:
+                disturbance = Zero(k)
+        self.disturbance = disturbance  # pyright: ignore[reportAttributeAccessIssue]
+        self.sensor_noise = sensor_noise
+        if initial_state is None and isinstance(dynamics, AbstractDynamics):
+            initial_state = jnp.zeros(dynamics.state_size)
+        self.initial_state = initial_state
+        self.control_bounds = control_bounds
+        self.horizon = check_count(horizon, "horizon", "Environment")
+        self.terminated = terminated
+        self.actions = actions
+        self.encode = _identity if encode is None else encode
+
+    def __check_init__(self):
+        where, dynamics = "Environment", self.dynamics
         if not isinstance(dynamics, AbstractDynamics):
             raise ValueError(
                 f"{where}: dynamics must be an AbstractDynamics (discretise a system "
                 f"with `delucax.Discretized`), got {type(dynamics).__name__}."
             )
-        if not isinstance(cost, AbstractCost):
+        if not isinstance(self.cost, AbstractCost):
             raise ValueError(
                 f"{where}: cost must be an AbstractCost (wrap a function with "
-                f"`delucax.costs.Function`), got {type(cost).__name__}."
+                f"`delucax.costs.Function`), got {type(self.cost).__name__}."
             )
-        n, m = dynamics.state_size, dynamics.control_size
-        k = dynamics.disturbance_size
-        if disturbance is None:
-            if dynamics.is_stochastic:
-                substeps = getattr(dynamics, "substeps", 1)
-                disturbance = Brownian(k // substeps, dynamics.dt, substeps)
-            else:
-                disturbance = Zero(k)
         for name, given, size in (
-            ("disturbance", disturbance, k),
-            ("sensor_noise", sensor_noise, None),
+            ("disturbance", self.disturbance, dynamics.disturbance_size),
+            ("sensor_noise", self.sensor_noise, None),
         ):
-            if given is None:
+            if given is None and name == "sensor_noise":
                 continue
             if not isinstance(given, AbstractDisturbance):
                 raise ValueError(
@@ -167,36 +196,25 @@ class Environment(eqx.Module):
                 raise ValueError(
                     f"{where}: {name} has size {given.size} where {size} is expected."
                 )
-        if initial_state is None:
-            initial_state = jnp.zeros(n)
-        if not callable(initial_state):
-            initial_state = as_vector(initial_state, n, "initial_state", where)
-        if control_bounds is not None:
-            if not isinstance(control_bounds, tuple | list) or len(control_bounds) != 2:
-                raise ValueError(
-                    f"{where}: control_bounds must be a pair (low, high), got "
-                    f"{control_bounds!r}."
-                )
-            low, high = (as_float_array(b) for b in control_bounds)
-            _check_bounds(low, high, (m,), f"{where}: control_bounds")
-            control_bounds = (low, high)
-        if actions is not None:
-            actions = as_float_array(actions)
-            if actions.ndim != 2 or actions.shape[1] != m:
+        m = dynamics.control_size
+        if not callable(self.initial_state):
+            x0 = as_vector(
+                self.initial_state, dynamics.state_size, "initial_state", where
+            )
+            check_finite(x0, "initial_state", where)
+        if self.control_bounds is not None:
+            for end in self.control_bounds:
+                if end.shape not in ((), (m,)):
+                    raise ValueError(
+                        f"{where}: control_bounds must be numbers or have shape "
+                        f"({m},), got {end.shape}."
+                    )
+        if self.actions is not None:
+            if self.actions.ndim != 2 or self.actions.shape[1] != m:
                 raise ValueError(
                     f"{where}: actions must have shape (actions, {m}), got "
-                    f"{actions.shape}."
+                    f"{self.actions.shape}."
                 )
-        self.dynamics = dynamics
-        self.cost = cost
-        self.disturbance = disturbance
-        self.sensor_noise = sensor_noise
-        self.initial_state = initial_state  # pyright: ignore[reportAttributeAccessIssue]
-        self.control_bounds = control_bounds
-        self.horizon = check_count(horizon, "horizon", where)
-        self.terminated = terminated
-        self.actions = actions
-        self.encode = _identity if encode is None else encode
 
     @property
     def dt(self) -> Array:
@@ -227,7 +245,13 @@ class Environment(eqx.Module):
     def feature_size(self) -> int:
         """The size of what `encode` returns."""
         y = jnp.zeros(self.observation_size)
-        return eqx.filter_eval_shape(self.encode, y).shape[0]
+        shape = jnp.shape(eqx.filter_eval_shape(self.encode, y))
+        if len(shape) != 1:
+            raise ValueError(
+                "Environment: encode must return a vector, got an array of shape "
+                f"{shape}."
+            )
+        return shape[0]
 
     def reset(self, key: PRNGKey) -> Array:
         """A first state.
@@ -236,6 +260,7 @@ class Environment(eqx.Module):
 
         **Returns:** the state, shape `(state_size,)`.
         """
+        check_key(key, "Environment.reset")
         if callable(self.initial_state):
             return as_vector(
                 self.initial_state(key), self.state_size, "initial_state", "Environment"
@@ -297,6 +322,11 @@ class Environment(eqx.Module):
             terminated = jnp.zeros((), bool)
         else:
             terminated = jnp.asarray(self.terminated(t + self.dt, x_next))
+            if terminated.shape != () or terminated.dtype != bool:
+                raise ValueError(
+                    "Environment: terminated must return one boolean, got shape "
+                    f"{terminated.shape} and dtype {terminated.dtype}."
+                )
         return Step(x_next, u, cost, terminated, result)
 
 
@@ -308,8 +338,7 @@ def _check_bounds(low: Array, high: Array, shape: tuple[int, ...], what: str) ->
     for end in (low, high):
         if not eqx.is_array(end) or end.shape not in ((), shape):
             raise ValueError(
-                f"{what} and high must be numbers or have shape {shape}, got "
-                f"{jnp.shape(end)}."
+                f"{what} must be numbers or have shape {shape}, got {jnp.shape(end)}."
             )
     if is_concrete(low) and is_concrete(high):
         if not np.all(np.asarray(low) <= np.asarray(high)):

@@ -11,6 +11,7 @@ from .._typing import PRNGKey
 from ..costs import Quadratic
 from ..dynamics import LinearDynamics
 from ._environment import Environment
+from ._registry import finish
 
 
 def lds(
@@ -90,4 +91,4 @@ def lds(
         cost=Quadratic(jnp.eye(n), jnp.eye(m)),
         horizon=horizon,
     )
-    return Environment(**(arguments | environment))
+    return finish(lds, arguments, environment)

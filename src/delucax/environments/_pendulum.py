@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_positive
+from .._check import check_positive, check_step
 from .._fields import parameter, positive
 from .._results import RESULTS
 from ..costs import PendulumCost
@@ -15,6 +15,7 @@ from ..dynamics import AbstractDynamics, Discretized
 from ..math import clip, cos, sin
 from ..systems import Pendulum
 from ._environment import Environment, UniformState
+from ._registry import finish
 
 
 class GymPendulum(AbstractDynamics):
@@ -106,7 +107,7 @@ def pendulum(
     dt: Any = 0.05,
     horizon: int = 200,
     max_torque: Any = 2.0,
-    max_speed: Any = 8.0,
+    max_speed: Any = None,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
     **environment: Any,
@@ -125,15 +126,16 @@ def pendulum(
     - `horizon`: steps an episode, 200 by default.
     - `max_torque`: 2 by default.
     - `max_speed`: the speed limit of Gym's arithmetic, 8 by default.
-    - `solver`: a Diffrax solver in place of Gym's arithmetic (there is no speed limit
-        then).
+    - `solver`: a Diffrax solver in place of Gym's arithmetic; there is no speed limit
+        then.
     - `substeps`: solver steps an interval, with `solver`.
     - `**environment`: other arguments of [`delucax.Environment`][], such as
         `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or `substeps` without `solver`.
+    **Raises:** `ValueError` on illegal numbers, `substeps` without `solver`, or
+        `max_speed` with it.
 
     Source: Gymnasium (Towers et al., 2023), `Pendulum-v1`.
 
@@ -146,11 +148,18 @@ def pendulum(
         ```
     """
     system = Pendulum(mass, length, gravity, damping)
+    check_step(dt, "pendulum")
     if solver is None:
         if substeps != 1:
             raise ValueError("pendulum: substeps needs a solver, such as RK4().")
-        dynamics = GymPendulum(system=system, dt=dt, max_speed=max_speed)
+        limit: Any = 8.0 if max_speed is None else max_speed
+        dynamics = GymPendulum(system=system, dt=dt, max_speed=limit)
     else:
+        if max_speed is not None:
+            raise ValueError(
+                "pendulum: max_speed is of Gym's arithmetic, and no solver has such a "
+                "limit; give one of max_speed and solver."
+            )
         dynamics = Discretized(system, dt, solver, substeps)
     corner = np.array([np.pi, 1.0])
     arguments: dict[str, Any] = dict(
@@ -161,4 +170,4 @@ def pendulum(
         horizon=horizon,
         encode=pendulum_features,
     )
-    return Environment(**(arguments | environment))
+    return finish(pendulum, arguments, environment)

@@ -2,6 +2,8 @@
 
 import difflib
 import importlib
+import inspect
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from ._environment import Environment
@@ -24,7 +26,8 @@ def make(name: str, **kwargs: Any) -> Environment:
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on an unknown name, with the close ones.
+    **Raises:** `ValueError` on an unknown name, with the close ones, or if what was
+    registered makes no environment.
 
     !!! example
 
@@ -42,7 +45,37 @@ def make(name: str, **kwargs: Any) -> Environment:
             f"{' or '.join(repr(n) for n in close)}? All names: {', '.join(names)}."
         )
     module, _, function = _REGISTRY[name].partition(":")
-    return getattr(importlib.import_module(module), function)(**kwargs)
+    env = getattr(importlib.import_module(module), function)(**kwargs)
+    if not isinstance(env, Environment):
+        raise ValueError(
+            f"make: {name!r} must be an Environment, but {_REGISTRY[name]!r} returned "
+            f"{type(env).__name__}."
+        )
+    return env
+
+
+def finish(
+    task: Callable[..., Environment],
+    arguments: Mapping[str, Any],
+    given: Mapping[str, Any],
+) -> Environment:
+    """The environment of a task that takes what else there is to give of one.
+
+    **Raises:** `ValueError` if one of `given` is no argument of `Environment`, with the
+    close ones, the task's own among them.
+    """
+    known = inspect.signature(Environment).parameters
+    own = inspect.signature(task).parameters.values()
+    for name in given:
+        if name not in known:
+            names = [p.name for p in own if p.kind is not p.VAR_KEYWORD]
+            names = list(dict.fromkeys([*names, *known]))
+            close = difflib.get_close_matches(name, names, n=3) or names
+            raise ValueError(
+                f"{task.__name__}: no argument is called {name!r}; did you mean "
+                f"{' or '.join(repr(n) for n in close)}?"
+            )
+    return Environment(**{**arguments, **given})
 
 
 def register(name: str, entry_point: str) -> None:

@@ -62,7 +62,7 @@ def to_control(
             f"{where}: model must be concrete, got one that is being traced (by "
             "jax.jit, jax.vmap or jax.grad); python-control computes in NumPy."
         )
-    inputs, columns = list(model.control_names), [model.B]
+    inputs, columns = list(model.control_names), [np.asarray(model.B)]
     if disturbances:
         if model.E is None and not discrete:
             raise ValueError(
@@ -75,7 +75,7 @@ def to_control(
     eye = np.eye(model.state_size)
     C = eye if model.C is None else np.asarray(model.C, float)
     states = list(model.state_names)
-    B = np.concatenate([np.asarray(column, float) for column in columns], axis=1)
+    B = np.concatenate(columns, axis=1).astype(float)
     return control.StateSpace(
         np.asarray(model.A, float),
         B,

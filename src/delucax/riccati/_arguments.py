@@ -83,8 +83,9 @@ def _check_definite(R, name, where, definite):
         return
     array = np.asarray(R)
     least, *_ = eigenvalues = np.linalg.eigvalsh(array)
-    slack = 100 * len(array) * np.finfo(array.dtype).eps * np.max(np.abs(eigenvalues))
-    if least < -slack or definite and least <= slack / 100:
+    rounding = np.finfo(array.dtype).eps * np.max(np.abs(eigenvalues))
+    slack = -rounding if definite else 100 * len(array) * rounding
+    if least < -slack or definite and least <= 0:
         kind = "definite" if definite else "semidefinite"
         raise ValueError(
             f"{where}: {name} must be positive {kind}, got {array}, whose least "
@@ -97,10 +98,8 @@ def is_complex(*matrices: Array | None) -> bool:
     return any(M is not None and jnp.iscomplexobj(M) for M in matrices)
 
 
-def real_form(M: Array | None) -> Array | None:
+def real_form(M: Array) -> Array:
     """`[[Re M, -Im M], [Im M, Re M]]`, which adds and multiplies as `M` does."""
-    if M is None:
-        return None
     return jnp.block([[M.real, -M.imag], [M.imag, M.real]])
 
 

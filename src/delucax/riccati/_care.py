@@ -12,7 +12,7 @@ from ._arguments import complex_form, is_complex, real_form, riccati_arguments
 from ._dare import double
 from ._lyapunov import lyapunov
 from ._newton import detached, found_tangent, outside, polish
-from ._search import Attempt, Found, PLAIN, search, SECOND, SHAKEN, verdict
+from ._search import Attempt, Found, search, SECOND, verdict, weights
 from ._small import full_precision, is_definite, solve, symmetric
 from ._solution import checked, RiccatiSolution
 from ._spectrum import abscissa_and_size
@@ -91,7 +91,7 @@ def continuous_solution(A, B, Q, R, S, E) -> RiccatiSolution:
     arguments = A, B, Q, R, S, E
     if not is_complex(*arguments):
         return _solution(*arguments)
-    found = _solution(*(real_form(M) for M in arguments))
+    found = _solution(*jax.tree.map(real_form, arguments))
     return eqx.tree_at(
         lambda s: (s.X, s.K, s.closed_loop), found, replace_fn=complex_form
     )
@@ -128,7 +128,7 @@ def _terms(A, B, R, S, E, X):
 
 
 def _equation(A, B, Q, R, S, E, X):
-    """What is left of the equation at `X`, also relatively, and the closed loop there."""
+    """What is left of the equation at `X`, also relatively; and the closed loop."""
     weighted, quadratic, _, closed_loop = _terms(A, B, R, S, E, X)
     moved = weighted @ A
     error = symmetric(moved + moved.T - quadratic + Q)
@@ -143,35 +143,40 @@ def _find(A, B, Q, R, S, E) -> Found:
     n, m, dtype = A.shape[0], B.shape[1], A.dtype
     eps = float(jnp.finfo(dtype).eps)
     plain_A, plain_B = (A, B) if E is None else (solve(E, A), solve(E, B))
-    size_Q, size_R = jnp.linalg.norm(Q), jnp.linalg.norm(R)
-    eye_Q, eye_R = jnp.eye(n, dtype=dtype), jnp.eye(m, dtype=dtype)
-    weight = jnp.where(size_Q > 0, size_Q, size_R)
-    posed = is_definite(R - m * eps * size_R * eye_R)
+    slack = eps * jnp.linalg.norm(R)
+    posed = is_definite(R - slack * jnp.eye(m, dtype=dtype))
     for M in (plain_A, plain_B, Q, R, S):
         posed = posed & jnp.all(jnp.isfinite(M))
 
     def attempt(kind):
-        plain, shaken = kind == PLAIN, kind == SHAKEN
-        less = jnp.where(shaken, 10 * n * eps * size_Q, 0)
-        q = jnp.where(plain, weight * eye_Q, Q - less * eye_Q)
-        r = jnp.where(plain, size_R * eye_R, R)
-        s = jnp.where(plain, 0, S)
-        X, iterations = _start(plain_A, plain_B, q, r, s, kind == SECOND)
+        q, r, s, size_Q = weights(kind, Q, R, S)
+        X, size_G, iterations = _start(plain_A, plain_B, q, r, s, kind == SECOND)
         X, residual, closed_loop = polish(
             lambda X: _equation(A, B, q, r, s, E, X),
             lambda loop, error: outside(E, lyapunov(loop, error)),
             outside(E, X),
         )
         abscissa, size = abscissa_and_size(closed_loop)
-        near = jnp.abs(abscissa) < 10 * eps**0.5 * size
-        margin = -abscissa - n * eps * size
-        return Attempt(X, residual, abscissa, margin, near, iterations)
+        rounding = n * eps * size
+        # A change of Q by rounding moves eigenvalues on the axis off it by its root.
+        reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
+        return Attempt(
+            X=X,
+            residual=residual,
+            bound=abscissa,
+            gap=-abscissa,
+            rounding=rounding,
+            near=jnp.abs(abscissa) < reach,
+            around=jnp.abs(abscissa) < 4 * eps**0.125 * jnp.linalg.norm(closed_loop),
+            iterations=iterations,
+        )
 
     return search(attempt, jnp.full_like(Q, jnp.nan), posed)
 
 
 def _start(A, B, Q, R, S, second):
-    """A solution to begin with, by the sign iteration or, if `second`, by doubling."""
+    """A solution to begin with, by the sign iteration or, if `second`, by doubling; the
+    size of `B R^-1 B'`; and the steps taken."""
     n = A.shape[0]
     solved = solve(R, jnp.concatenate([B.T, S.T], axis=1))
     G = symmetric(B @ solved[:, :n])
@@ -180,7 +185,7 @@ def _start(A, B, Q, R, S, second):
     by_sign, sign_steps = _by_sign(A, G, Q, ~second)
     by_doubling, doublings = _by_doubling(A, G, Q, second)
     X = jnp.where(second, by_doubling, by_sign)
-    return X, jnp.where(second, doublings, sign_steps)
+    return X, jnp.linalg.norm(G), jnp.where(second, doublings, sign_steps)
 
 
 def _by_sign(A, G, Q, wanted):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from ._arguments import complex_form, is_complex, real_form, riccati_arguments
 from ._newton import detached, found_tangent, outside, polish
-from ._search import Attempt, Found, PLAIN, search, SECOND, SHAKEN, verdict
+from ._search import Attempt, Found, search, SECOND, verdict, weights
 from ._small import full_precision, is_definite, solve, symmetric
 from ._solution import checked, RiccatiSolution
 from ._spectrum import spectral_radius
@@ -90,7 +90,7 @@ def discrete_solution(A, B, Q, R, S, E) -> RiccatiSolution:
     arguments = A, B, Q, R, S, E
     if not is_complex(*arguments):
         return _solution(*arguments)
-    found = _solution(*(real_form(M) for M in arguments))
+    found = _solution(*jax.tree.map(real_form, arguments))
     return eqx.tree_at(
         lambda s: (s.X, s.K, s.closed_loop), found, replace_fn=complex_form
     )
@@ -126,7 +126,7 @@ def _terms(A, B, R, S, E, X):
 
 
 def _equation(A, B, Q, R, S, E, X):
-    """What is left of the equation at `X`, also relatively, and the closed loop there."""
+    """What is left of the equation at `X`, also relatively; and the closed loop."""
     moved, quadratic, _, closed_loop = _terms(A, B, R, S, E, X)
     moved = moved @ A
     weight = X if E is None else E.T @ X @ E
@@ -139,24 +139,16 @@ def _equation(A, B, Q, R, S, E, X):
 @jax.custom_jvp
 def _find(A, B, Q, R, S, E) -> Found:
     """The stabilising `X`, and what is known about it."""
-    n, m, dtype = A.shape[0], B.shape[1], A.dtype
+    n, dtype = A.shape[0], A.dtype
     eps = float(jnp.finfo(dtype).eps)
     plain_A, plain_B = (A, B) if E is None else (solve(E, A), solve(E, B))
-    size_Q, size_R = jnp.linalg.norm(Q), jnp.linalg.norm(R)
-    weight = jnp.where(size_Q > 0, size_Q, jnp.where(size_R > 0, size_R, 1))
-    eye_Q, eye_R = jnp.eye(n, dtype=dtype), jnp.eye(m, dtype=dtype)
-    slack = 100 * m * eps * jnp.where(size_R > 0, size_R, 1)
-    posed = is_definite(R + slack * eye_R)
+    posed = _is_semidefinite(R)
     for M in (plain_A, plain_B, Q, R, S):
         posed = posed & jnp.all(jnp.isfinite(M))
 
     def attempt(kind):
-        plain, shaken = kind == PLAIN, kind == SHAKEN
-        less = jnp.where(shaken, 10 * n * eps * size_Q, 0)
-        q = jnp.where(plain, weight * eye_Q, Q - less * eye_Q)
-        r = jnp.where(plain, jnp.where(size_R > 0, size_R, 1) * eye_R, R)
-        s = jnp.where(plain, 0, S)
-        height = weight * jnp.where(kind == SECOND, _SECOND_START, 1)
+        q, r, s, size = weights(kind, Q, R, S)
+        height = size * jnp.where(kind == SECOND, _SECOND_START, 1)
         X, iterations = _start(plain_A, plain_B, q, r, s, height)
         X, residual, closed_loop = polish(
             lambda X: _equation(A, B, q, r, s, E, X),
@@ -164,11 +156,28 @@ def _find(A, B, Q, R, S, E) -> Found:
             outside(E, X),
         )
         radius = spectral_radius(closed_loop)
-        gap = 1 - radius
-        near = jnp.abs(gap) < 10 * eps**0.5
-        return Attempt(X, residual, radius, gap - n * eps, near, iterations)
+        # A stable loop may belong to a stationary point of a cost without a minimum.
+        gap = jnp.where(_is_semidefinite(r + B.T @ X @ B), 1 - radius, -jnp.inf)
+        return Attempt(
+            X=X,
+            residual=residual,
+            bound=radius,
+            gap=gap,
+            rounding=jnp.asarray(n * eps, dtype),
+            near=jnp.abs(gap) < 10 * eps**0.5,
+            around=jnp.abs(gap) < 4 * eps**0.125,
+            iterations=iterations,
+        )
 
     return search(attempt, jnp.full_like(Q, jnp.nan), posed)
+
+
+def _is_semidefinite(weight):
+    """Whether a symmetric matrix has no negative eigenvalue, up to rounding."""
+    m, dtype = weight.shape[0], weight.dtype
+    size = jnp.linalg.norm(weight)
+    slack = 100 * m * jnp.finfo(dtype).eps * jnp.where(size > 0, size, 1)
+    return is_definite(symmetric(weight) + slack * jnp.eye(m, dtype=dtype))
 
 
 def _start(A, B, Q, R, S, height):

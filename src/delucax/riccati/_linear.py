@@ -206,11 +206,11 @@ def _checked(where, A, B, C, name):
     return tuple(None if M is None else M.astype(dtype) for M in (A, B, C))
 
 
-@functools.partial(eqx.filter_jit)
+@eqx.filter_jit
 def _solution(discrete, A, B, C) -> MatrixSolution:
     complex_data = is_complex(A, B, C)
     if complex_data:
-        A, B, C = (real_form(M) for M in (A, B, C))
+        A, B, C = jax.tree.map(real_form, (A, B, C))
     found = _find(discrete, A, B, C)
     return MatrixSolution(
         X=complex_form(found.X) if complex_data else found.X,
@@ -238,13 +238,20 @@ def _verdict(found: _Found, unknowns: int) -> Result:
 
 
 def _left_side(discrete, A, B, X):
-    """`A X + X B`, or `X - A X B`, and its terms."""
+    """`A X + X B`, or `X - A X B`."""
     B = A.T if B is None else B
-    if discrete:
-        moved = A @ X @ B
-        return X - moved, (X, moved)
-    terms = A @ X, X @ B
-    return terms[0] + terms[1], terms
+    return X - A @ X @ B if discrete else A @ X + X @ B
+
+
+def _backward_error(discrete, A, B, C, X):
+    """By how much, relatively, the data would have to change for `X` to be exact."""
+    size_A = jnp.linalg.norm(A)
+    size_B = size_A if B is None else jnp.linalg.norm(B)
+    factor = 1 + size_A * size_B if discrete else size_A + size_B
+    size = factor * jnp.linalg.norm(X) + jnp.linalg.norm(C)
+    error = jnp.linalg.norm(_left_side(discrete, A, B, X) - C)
+    relative = error / jnp.where(size == 0, 1, size)
+    return jnp.where(jnp.isfinite(relative), relative, jnp.inf)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -260,11 +267,7 @@ def _find(discrete, A, B, C) -> _Found:
         X, iterations = _separated(discrete, A, B, C, plain, shifted)
         if last == _DENSELY:
             X = _densely(discrete, A, B, C, X, kind == _DENSELY)
-        left, terms = _left_side(discrete, A, B, X)
-        size = sum(jnp.linalg.norm(M) for M in (*terms, C))
-        error = jnp.linalg.norm(left - C)
-        residual = error / jnp.where(size == 0, 1, size)
-        return X, jnp.where(jnp.isfinite(residual), residual, jnp.inf), iterations
+        return X, _backward_error(discrete, A, B, C, X), iterations
 
     def more(carry):
         return carry[0] != _DONE
@@ -299,8 +302,7 @@ def _separated(discrete, A, B, C, plain, shifted):
         X, steps = smith(*_wanted(plain, A, B, C))
         # Where both spectra are outside the circle, the Cayley transform puts them to
         # the right of the axis.
-        eye_A, eye_B = jnp.eye(C.shape[0], dtype=C.dtype), jnp.eye(C.shape[1])
-        eye_B = eye_B.astype(C.dtype)
+        eye_A, eye_B = (jnp.eye(size, dtype=C.dtype) for size in C.shape)
         other = (A.T if B is None else B) + eye_B
         A, F = A + eye_A, solve(A + eye_A, A - eye_A)
         right = solve(A, C)
@@ -327,7 +329,7 @@ def _shift(A, B, wanted):
 
 
 def _one_side(A, B, C, sign, shift, wanted):
-    """The solution after a shift and a change of sign that make both matrices stable."""
+    """The solution after a shift and a change of sign that make the matrices stable."""
     sign, shift = sign.astype(C.dtype), shift.astype(C.dtype)
     A = sign * (A - shift * jnp.eye(A.shape[0], dtype=A.dtype))
     if B is not None:
@@ -345,7 +347,7 @@ def _wanted(wanted, A, B, C, scale=0):
 
 
 def _densely(discrete, A, B, C, X, wanted):
-    """The solution of the equation as one linear system, if that is wanted, else `X`."""
+    """The solution as that of one linear system, if it is wanted, else `X`."""
 
     def body(carry):
         _, going = carry
@@ -368,30 +370,20 @@ def _find_jvp(discrete, primals, tangents):
     found = _find(discrete, *primals)
     ok = found.solved
     # Guarded at both ends: what is not finite in a failed member stays in it.
-    dA, dB, dC = (
-        None if t is None else jnp.where(ok, t, 0) for t in tangents
-    )
+    dA, dB, dC = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents)
     X = jnp.where(ok, found.X, 0)
-    safe_A, safe_B = (
-        None if M is None else jnp.where(ok, M, -jnp.eye(M.shape[0], dtype=M.dtype) / 2)
-        for M in (A, B)
-    )
-    B_now = safe_A.T if B is None else safe_B
-    dB = dA.T if B is None else dB
+    half = functools.partial(jnp.where, ok)
+    A, B = jax.tree.map(lambda M: half(M, -jnp.eye(len(M), dtype=M.dtype) / 2), (A, B))
+    other, d_other = (A.T, dA.T) if B is None else (B, dB)
     if discrete:
-        right = dC + dA @ X @ B_now + safe_A @ X @ dB
+        right = dC + dA @ X @ other + A @ X @ d_other
     else:
-        right = dC - dA @ X - X @ dB
-
-    def transposed(M):
-        return None if M is None else M.T
-
+        right = dC - dA @ X - X @ d_other
+    across = None if B is None else B.T
     dX = lax.custom_linear_solve(
-        lambda X: _left_side(discrete, safe_A, safe_B, X)[0],
+        lambda X: _left_side(discrete, A, B, X),
         jnp.where(ok, right, 0),
-        solve=lambda _, C: _find(discrete, safe_A, safe_B, C).X,
-        transpose_solve=lambda _, C: _find(
-            discrete, transposed(safe_A), transposed(safe_B), C
-        ).X,
+        solve=lambda _, C: _find(discrete, A, B, C).X,
+        transpose_solve=lambda _, C: _find(discrete, A.T, across, C).X,
     )
     return found, no_tangent(found)._replace(X=jnp.where(ok, dX, 0))

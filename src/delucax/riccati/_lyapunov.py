@@ -28,7 +28,7 @@ def lyapunov(F: Float[Array, "n n"], Q: Float[Array, "n n"]) -> Float[Array, "n 
 def stable_sylvester(
     A: Float[Array, "n n"], B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
 ) -> tuple[Float[Array, "n m"], Array]:
-    """`A X + X B = C` for stable `A` and `B` (`A'` by default), and the doublings taken.
+    """`A X + X B = C` for stable `A` and `B` (default `A'`), and the doublings taken.
 
     With `P = (A - c)^-1 (A + c)` and likewise of `B` it is the Stein equation
     `X = P X P_B - 2c (A - c)^-1 C (B - c)^-1`. What the transform rounds away of a wide

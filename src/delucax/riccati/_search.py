@@ -11,10 +11,14 @@ from .._results import choose, Result, RESULTS
 
 
 # What an attempt is made at.
-FIRST, SECOND, SHAKEN, PLAIN, DONE = range(5)
+FIRST, SECOND, SHAKEN, PLAIN, LIFTED, DONE = range(6)
 """The problem; the problem from another start; the problem with a state weight less by
-rounding, which has no solution if that of the problem is on the boundary; the problem
-with unit weights, which has a solution if and only if the pair is stabilisable."""
+rounding, of which a solution on the boundary makes another or none; the problem with
+unit weights, which has a solution if and only if the pair is stabilisable; the problem
+with a state weight more by the root of rounding, whose loop tells by being close to the
+boundary that the problem's is on it."""
+_ALIKE = 0.3
+"""How much of its distance from the boundary a loop may owe to rounding."""
 
 
 class Attempt(NamedTuple):
@@ -23,8 +27,10 @@ class Attempt(NamedTuple):
     X: Array
     residual: Array
     bound: Array  # spectral radius or abscissa of the closed loop
-    margin: Array  # how far it is from the boundary; rounding counts as none
-    near: Array  # whether it is so close that the boundary has to be looked at
+    gap: Array  # the distance from the boundary, positive if it is stable
+    rounding: Array  # of the gap
+    near: Array  # whether the gap is so small that it has to be looked at
+    around: Array  # whether it is small
     iterations: Array
 
 
@@ -36,10 +42,11 @@ class Found(NamedTuple):
     bound: Array
     iterations: Array
     solved: Array
+    gap: Array
     stable: Array
-    near: Array
     fragile: Array
     stabilisable: Array
+    on_edge: Array
     posed: Array
 
     @property
@@ -67,7 +74,7 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
     def body(carry):
         kind, found = carry
         new = attempt(kind)
-        stable = new.margin > 0
+        stable = new.gap > new.rounding
         solved = stable & (new.residual <= close)
         given = kind <= SECOND
         # A second start that fails replaces the first only by being stable.
@@ -77,30 +84,44 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
             return jnp.where(take, now, before)
 
         survives = stable & (new.residual <= close**0.5)
+        same = jnp.abs(new.gap - found.gap) <= _ALIKE * found.gap
         found = found._replace(
             X=pick(new.X, found.X),
             residual=pick(new.residual, found.residual),
             bound=pick(new.bound, found.bound),
             iterations=found.iterations + jnp.where(given, new.iterations, 0),
             solved=pick(solved, found.solved),
+            gap=pick(new.gap, found.gap),
             stable=pick(stable, found.stable),
-            near=pick(new.near, found.near),
-            fragile=jnp.where(kind == SHAKEN, ~survives, found.fragile),
+            fragile=jnp.where(kind == SHAKEN, ~(survives & same), found.fragile),
             stabilisable=jnp.where(kind == PLAIN, survives, found.stabilisable),
+            on_edge=jnp.where(kind == LIFTED, survives & new.around, found.on_edge),
         )
         after_given = jnp.where(
             solved,
             jnp.where(new.near, SHAKEN, DONE),
             jnp.where(kind == FIRST, SECOND, PLAIN),
         )
-        after_shaken = jnp.where(survives, DONE, PLAIN)
-        after = jnp.where(kind == SHAKEN, after_shaken, DONE)
+        after_shaken = jnp.where(found.fragile, PLAIN, DONE)
+        after_plain = jnp.where(survives & ~found.fragile, LIFTED, DONE)
+        after = jnp.where(kind == PLAIN, after_plain, DONE)
+        after = jnp.where(kind == SHAKEN, after_shaken, after)
         return jnp.where(given, after_given, after), found
 
     number = jnp.asarray(jnp.inf, dtype)
     no, yes = jnp.asarray(False), jnp.asarray(True)
     nothing = Found(
-        X, number, number, jnp.asarray(0), no, no, no, no, stabilisable=yes, posed=posed
+        X=X,
+        residual=number,
+        bound=number,
+        iterations=jnp.asarray(0),
+        solved=no,
+        gap=-number,
+        stable=no,
+        fragile=no,
+        stabilisable=yes,
+        on_edge=no,
+        posed=posed,
     )
     start = jnp.where(posed, FIRST, DONE)
     return lax.while_loop(more, body, (start, nothing))[1]
@@ -109,9 +130,27 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
 def verdict(found: Found) -> Result:
     """The status of what was found."""
     good = found.solved & ~found.fragile
-    result = choose(found.stable, RESULTS.not_converged, RESULTS.not_stabilising)
-    on_boundary = found.fragile | (found.near & ~found.solved)
-    result = choose(on_boundary, RESULTS.on_boundary, result)
+    close = found.stable & (found.residual <= tolerance(found.X.dtype) ** 0.5)
+    result = choose(close, RESULTS.not_converged, RESULTS.not_stabilising)
+    result = choose(found.fragile | found.on_edge, RESULTS.on_boundary, result)
     result = choose(found.stabilisable, result, RESULTS.not_stabilisable)
     result = choose(good, RESULTS.successful, result)
     return choose(found.posed, result, RESULTS.ill_posed)
+
+
+def weights(
+    kind: Array, Q: Array, R: Array, S: Array
+) -> tuple[Array, Array, Array, Array]:
+    """The weights of the problem of this kind, and the size of the state weight."""
+    n, m, dtype = Q.shape[0], R.shape[0], Q.dtype
+    eps = jnp.finfo(dtype).eps
+    eye_Q, eye_R = jnp.eye(n, dtype=dtype), jnp.eye(m, dtype=dtype)
+    size_Q, size_R = jnp.linalg.norm(Q), jnp.linalg.norm(R)
+    unit = jnp.where(size_R > 0, size_R, 1)
+    size = jnp.where(size_Q > 0, size_Q, unit)
+    change = jnp.where(kind == SHAKEN, -10 * n * eps * size_Q, 0)
+    change = jnp.where(kind == LIFTED, eps**0.5 * size, change)
+    plain = kind == PLAIN
+    Q = jnp.where(plain, size * eye_Q, Q + change * eye_Q)
+    R = jnp.where(plain, unit * eye_R, R)
+    return Q, R, jnp.where(plain, 0, S), size

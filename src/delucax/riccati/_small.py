@@ -1,4 +1,4 @@
-"""Linear solves: one door for all sizes, with eliminations written out for small ones."""
+"""Linear solves: one door, with eliminations written out for small matrices."""
 
 import functools
 from collections.abc import Callable

@@ -63,8 +63,9 @@ class MatrixSolution(eqx.Module):
     **Attributes:**
 
     - `X`: the solution.
-    - `residual`: the norm of the equation's residual over the sum of the norms of its
-        terms.
+    - `residual`: the norm of the equation's residual over `(|A| + |B|) |X| + |C|`, in
+        discrete time over `(|A| |B| + 1) |X| + |C|`: the relative change of the data
+        that would make `X` exact.
     - `iterations`: doublings taken.
     - `result`: success, or why not; one of `delucax.RESULTS`.
 
@@ -92,7 +93,7 @@ Solution = TypeVar("Solution", RiccatiSolution, MatrixSolution)
 
 
 def checked(solution: Solution, where: str, throw: bool) -> Solution:
-    """Raise if asked to and the solve failed: now if it can be seen, else at run time."""
+    """Raise if asked to and it failed: now if that can be seen, else at run time."""
     failed = solution.result != RESULTS.successful
     if not throw:
         return solution

@@ -29,7 +29,7 @@ def stein(A: Float[Array, "n n"], Q: Float[Array, "n n"]) -> Float[Array, "n n"]
 def smith(
     A: Float[Array, "n n"], B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
 ) -> tuple[Float[Array, "n m"], Array]:
-    """`X = A X B + C` for stable `A` and `B` (`A'` by default), and the doublings taken.
+    """`X = A X B + C` for stable `A` and `B` (default `A'`), and the doublings taken.
 
     `X_2k = X_k + A^k X_k B^k`, the sum of the first 2k terms of the series.
 

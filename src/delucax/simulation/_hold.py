@@ -12,6 +12,7 @@ from .._controller import AbstractController
 from ..dynamics._discretized import evaluate_field
 from ..dynamics._solvers import AbstractTransparentSolver
 from ..systems import AbstractSystem
+from ._answer import answer, check_state
 
 
 class Inputs(eqx.Module):
@@ -35,7 +36,8 @@ class Inputs(eqx.Module):
         if self.controls is not None:
             return self.controls[self.index]
         if isinstance(self.source, AbstractController):
-            u, _ = self.source(t, self.system.observe(t, x), self.memory)
+            y = self.system.observe(t, x)
+            u, _ = answer(self.source, t, y, self.memory)
         else:
             u = self.source(t)
         check_control(u, self.source, self.system)
@@ -52,10 +54,12 @@ class Inputs(eqx.Module):
         """A held controller's answer at a switch, and its state after it."""
         arrays, static = memory, eqx.filter(self.memory, eqx.is_array, inverse=True)
         y = self.system.observe(t, x)
-        u, after = self.source(t, y, eqx.combine(arrays, static))
+        state = eqx.combine(arrays, static)
+        u, after = answer(self.source, t, y, state)
         check_control(u, self.source, self.system)
         u = u.astype(x.dtype)
         after = self.source.applied(u, jnp.zeros((), x.dtype), after)
+        check_state(self.source, self.memory, after)
         return u, eqx.filter(after, eqx.is_array)
 
 

@@ -7,11 +7,16 @@ import equinox as eqx
 import numpy as np
 from jax.core import Tracer
 
-from .._check import check_positive, is_concrete
+from .._check import check_finite, check_positive, is_concrete
 from .._controller import AbstractController
 from .._fields import as_float_array
 from ..dynamics._discretized import has_diffusion
-from ..dynamics._solvers import check_adaptive, check_solver
+from ..dynamics._solvers import (
+    check_adaptive,
+    check_adjoint,
+    check_solver,
+    check_stepsize_controller,
+)
 from ..systems import AbstractSystem
 
 
@@ -37,7 +42,7 @@ def check_system(system: Any, where: str) -> None:
         )
 
 
-def as_time(value: Any, name: str, where: str) -> Any:
+def as_number(value: Any, name: str, where: str) -> Any:
     """`value` as a scalar: a Python number if it is known, so that it stays known
     while other things are being traced.
     """
@@ -64,6 +69,7 @@ def as_sequence(value: Any, size: int, name: str, where: str) -> Any:
         raise ValueError(f"{where}: {name} must have shape (T, {size}), got {got}.")
     if array.shape[0] == 0:
         raise ValueError(f"{where}: {name} must have at least one interval.")
+    check_finite(array, name, where)
     return array
 
 
@@ -119,15 +125,11 @@ def as_save_times(ts: Any, t0: Any, t1: Any, where: str) -> Any:
     return ts
 
 
-def check_adjoint(
+def check_adjoint_fits(
     adjoint: Any, adaptive: bool, hold: str | None, source: Any, where: str
 ) -> None:
     """Raise unless `adjoint` fits the solve."""
-    if not isinstance(adjoint, diffrax.AbstractAdjoint):
-        raise ValueError(
-            f"{where}: adjoint must be a Diffrax adjoint such as "
-            f"diffrax.RecursiveCheckpointAdjoint(), got {adjoint!r}."
-        )
+    check_adjoint(adjoint, where)
     if isinstance(adjoint, diffrax.ImplicitAdjoint):
         raise ValueError(
             f"{where}: adjoint ImplicitAdjoint is for solves that end in a steady "
@@ -150,10 +152,5 @@ def check_adjoint(
         check_solver(adjoint.kwargs["solver"], f"{where}: BacksolveAdjoint")
         check_adaptive(adjoint.kwargs["solver"], f"{where}: BacksolveAdjoint")
     backwards = adjoint.kwargs.get("stepsize_controller")
-    if backwards is not None and not isinstance(
-        backwards, diffrax.AbstractAdaptiveStepSizeController
-    ):
-        raise ValueError(
-            f"{where}: BacksolveAdjoint: stepsize_controller must be adaptive, got "
-            f"{type(backwards).__name__}."
-        )
+    if backwards is not None:
+        check_stepsize_controller(backwards, f"{where}: BacksolveAdjoint")

@@ -9,9 +9,8 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
-import numpy as np
 
-from .._check import as_vector, check_count, check_key, is_concrete
+from .._check import as_vector, check_count, check_finite, check_key
 from .._components import by_components
 from .._controller import AbstractController
 from .._fields import as_float_array
@@ -20,6 +19,8 @@ from .._typing import PRNGKey
 from ..disturbances import Zero
 from ..dynamics._runge_kutta import join_state, split_state, stack_steps
 from ..environments import Environment
+from ._answer import answer, check_state
+from ._horizon import as_number
 from ._trajectory import checked, Trajectory
 
 
@@ -115,16 +116,17 @@ def rollout(
     horizon = check_count(horizon, "horizon", where)
     if x0 is not None:
         x0 = as_vector(x0, environment.state_size, "x0", where)
-        if is_concrete(x0) and not np.all(np.isfinite(x0)):
-            raise ValueError(f"{where}: x0 must be finite, got {x0}.")
+        check_finite(x0, "x0", where)
     if w is not None:
         w = as_float_array(w)
         shape = (horizon, environment.disturbance_size)
-        if jnp.shape(w) != shape:
+        if not eqx.is_inexact_array(w) or w.shape != shape:
+            got = w.shape if eqx.is_array(w) else repr(w)
             raise ValueError(
                 f"{where}: w must have shape (horizon, disturbances) = {shape}, got "
-                f"{jnp.shape(w)}."
+                f"{got}."
             )
+        check_finite(w, "w", where)
     keep = (keep,) if isinstance(keep, str) else tuple(keep)
     if not set(keep) <= set(KEEP):
         raise ValueError(
@@ -137,7 +139,7 @@ def rollout(
     if isinstance(gradient_decay, int | float) and gradient_decay == 1:
         decay = None
     else:
-        decay = as_float_array(gradient_decay)
+        decay = as_float_array(as_number(gradient_decay, "gradient_decay", where))
     trajectory = _rollout(
         environment,
         controller,
@@ -161,7 +163,9 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
     size, dtype, dt = x0.shape[0], x0.dtype, env.dt
     times = (jnp.arange(horizon + 1) * dt).astype(dtype)
     if w is None and not isinstance(env.disturbance, Zero):
-        w = _drawn(env.disturbance, w_key, times[:-1], env.disturbance_size)
+        # Two times at least, which tell Brownian motion the step between them.
+        shown = times[: max(horizon, 2)]
+        w = _drawn(env.disturbance, w_key, shown, env.disturbance_size)[:horizon]
     noise = None
     if env.sensor_noise is not None:
         noise = _drawn(env.sensor_noise, noise_key, times[:-1], env.observation_size)
@@ -182,16 +186,24 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
         y = dynamics.observe(t, x)
         plain_sight = noise is None and y is x
         y = y if noise is None else (y + noise).astype(dtype)
-        u, after = controller(t, y, eqx.combine(memory, static))
+        seen, (done, length) = y, ended or (None, None)
+        if done is not None:
+            # What is computed after the end is not used, but its derivatives must be
+            # finite: so it is computed where the episode began.
+            live = lambda now, first: jnp.where(done, first, now)  # noqa: E731
+            seen = live(y, lax.stop_gradient(dynamics.observe(t, x0)).astype(y.dtype))
+            x = live(x, lax.stop_gradient(x0))
+        u, after = answer(controller, t, seen, eqx.combine(memory, static))
         _check_control(controller, u, env)
         step = env.step(t, x, u, w)
         cost, x_next, result = step.cost.astype(dtype), step.state, step.result
+        applied = step.control
         after = controller.applied(step.control, cost, after)
+        check_state(controller, eqx.combine(first, static), after)
         after = eqx.filter(after, eqx.is_array)
-        if ends:
-            done, length = ended
-            cost = jnp.where(done, 0, cost)
-            x_next = jnp.where(done, x, x_next)
+        if done is not None:
+            cost, applied = jnp.where(done, 0, cost), jnp.where(done, 0, applied)
+            x_next = jnp.where(done, join_state(parts, size), x_next)
             after = jax.tree.map(lambda a, b: jnp.where(done, a, b), memory, after)
             if result is not RESULTS.successful:
                 result = choose(done, RESULTS.successful, result)
@@ -202,7 +214,7 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
             "observations": None
             if plain_sight and "states" in keep
             else split_state(y),
-            "controls": split_state(step.control),
+            "controls": split_state(applied),
             "costs": cost,
             "terminated": ended[0] if ends else None,
         }
@@ -223,6 +235,8 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
 
     def over_time(name: str, size: int, last: Any = ()) -> Any:
         found = kept.get(name)
+        if size == 0 and found is not None:
+            return jnp.zeros((horizon, 0), dtype)
         return None if found is None else stack_steps(found, size, last)
 
     length = jnp.asarray(horizon) if ended is None else ended[1]

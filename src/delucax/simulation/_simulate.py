@@ -6,9 +6,8 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from .._check import as_vector, check_count, is_concrete
+from .._check import as_vector, check_count, check_finite, check_key, is_concrete
 from .._controller import AbstractController
 from .._results import choose, first_failure, promote, RESULTS
 from .._typing import PRNGKey
@@ -16,6 +15,7 @@ from ..dynamics._solvers import (
     check_adaptive,
     check_fixed_step,
     check_solver,
+    check_stepsize_controller,
     for_fixed_steps,
     loud,
 )
@@ -30,10 +30,10 @@ from ._hold import (
     recorded,
 )
 from ._horizon import (
+    as_number,
     as_save_times,
     as_sequence,
-    as_time,
-    check_adjoint,
+    check_adjoint_fits,
     check_system,
     count_intervals,
 )
@@ -155,10 +155,11 @@ def simulate(
     if hold not in ("zero", None):
         raise ValueError(f"{where}: hold must be 'zero' or None, got {hold!r}.")
     x0 = as_vector(x0, system.state_size, "x0", where)
-    if is_concrete(x0) and not np.all(np.isfinite(x0)):
-        raise ValueError(f"{where}: x0 must be finite, got {x0}.")
-    t0, t1 = as_time(t0, "t0", where), as_time(t1, "t1", where)
-    dt = None if dt is None else as_time(dt, "dt", where)
+    check_finite(x0, "x0", where)
+    if key is not None:
+        check_key(key, where)
+    t0, t1 = as_number(t0, "t0", where), as_number(t1, "t1", where)
+    dt = None if dt is None else as_number(dt, "dt", where)
     if is_concrete(t0) and is_concrete(t1) and not t1 > t0:
         raise ValueError(f"{where}: t1 must be above t0, got t0 = {t0}, t1 = {t1}.")
     source = controller_or_controls
@@ -194,16 +195,9 @@ def simulate(
     solver = diffrax.Tsit5() if solver is None else solver
     check_solver(solver, where)
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-    check_adjoint(adjoint, adaptive, hold, source, where)
+    check_adjoint_fits(adjoint, adaptive, hold, source, where)
     if adaptive:
-        if not isinstance(
-            stepsize_controller, diffrax.AbstractAdaptiveStepSizeController
-        ):
-            raise ValueError(
-                f"{where}: stepsize_controller must be adaptive, such as "
-                "diffrax.PIDController(rtol=1e-6, atol=1e-8); for fixed steps leave it "
-                f"out and give substeps. Got {type(stepsize_controller).__name__}."
-            )
+        check_stepsize_controller(stepsize_controller, where)
         if substeps != 1:
             raise ValueError(
                 f"{where}: substeps must be 1 with a stepsize_controller, which "
@@ -383,7 +377,8 @@ def _simulate(
         recorded_disturbances=before(w),
         recorded_terminated=None,
         steps=count - 1,
-        keep=("states", "observations", "controls", "disturbances"),
+        # There is no cost to keep, which is not to have left it out.
+        keep=("states", "observations", "controls", "disturbances", "costs"),
         disturbance_size=system.disturbance_size,
         state_names=system.state_names,
         control_names=system.control_names,

@@ -136,7 +136,9 @@ class Trajectory(eqx.Module):
             )
         start, stop, _ = index.indices(self.steps)
         stop = max(stop, start)
-        if self.states is None or self.costs is None:
+        if self.states is None or (
+            self.costs is None and "costs" not in self.keep
+        ):
             raise ValueError(
                 "Trajectory: states and costs must be kept to slice in time; got "
                 "keep= without them."
@@ -148,7 +150,7 @@ class Trajectory(eqx.Module):
         def steps(leaf):
             return None if leaf is None else leaf[start:stop]
 
-        costs = self.costs[start:stop]
+        costs = steps(self.costs)
         is_end = stop == self.steps
         final_cost = self.final_cost if is_end else jnp.zeros_like(self.final_cost)
         return dataclasses.replace(
@@ -158,7 +160,7 @@ class Trajectory(eqx.Module):
             costs=costs,
             final_state=self.states[stop],
             final_cost=final_cost,
-            total_cost=jnp.sum(costs) + final_cost,
+            total_cost=final_cost if costs is None else jnp.sum(costs) + final_cost,
             length=jnp.clip(self.length - start, 0, stop - start),
             recorded_times=ends(self.times),
             recorded_observations=steps(self.recorded_observations),
@@ -170,7 +172,8 @@ class Trajectory(eqx.Module):
     def to_pandas(self) -> "pandas.DataFrame":
         """A tidy table, one row a time: `time`, states, controls, `cost`.
 
-        A batch has its index in the columns `batch` (`batch0`, `batch1`, ... if it has
+        A state or control whose name is taken gets `state` or `control` before it. A
+        batch has its index in the columns `batch` (`batch0`, `batch1`, ... if it has
         several axes). The last row of each trajectory has no control or cost.
 
         **Returns:** a `pandas.DataFrame`.
@@ -188,7 +191,7 @@ class Trajectory(eqx.Module):
             columns[name] = np.broadcast_to(index, shape)
         columns["time"] = np.broadcast_to(self.times, shape)
 
-        def put(names, array, pad):
+        def put(kind, names, array, pad):
             if array is None:
                 return
             array = np.asarray(array)
@@ -197,15 +200,21 @@ class Trajectory(eqx.Module):
                 width[len(axes)] = (0, 1)
                 array = np.pad(array, width, constant_values=np.nan)
             for i, name in enumerate(names):
+                # Names are the user's: two may be the same, or one of ours.
+                name = f"{kind} {name}" if name in columns else name
+                name = f"{name} {i}" if name in columns else name
                 columns[name] = array[..., i]
 
-        put(self.state_names, self.states, pad=False)
-        put(self.control_names, self.controls, pad=True)
+        cost = None if self.costs is None else self.costs[..., None]
+        put("", ["cost"], cost, pad=True)
+        put("state", self.state_names, self.states, pad=False)
+        put("control", self.control_names, self.controls, pad=True)
         if self.disturbances is not None:
             size = self.disturbances.shape[-1]
-            put([f"w{i}" for i in range(size)], self.disturbances, pad=True)
-        if self.costs is not None:
-            put(["cost"], self.costs[..., None], pad=True)
+            names = [f"w{i}" for i in range(size)]
+            put("disturbance", names, self.disturbances, pad=True)
+        if "cost" in columns:
+            columns["cost"] = columns.pop("cost")  # the last column
         return pd.DataFrame({k: np.ravel(v) for k, v in columns.items()})
 
     def summary(self) -> "pandas.DataFrame":

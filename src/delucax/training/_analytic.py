@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import PyTree
 
+from .._check import check_key
 from .._typing import PRNGKey
 from ._loss import cost_and_metrics
 from ._trainable import weights_of
@@ -34,7 +35,8 @@ def analytic(
     **Returns:** `(value, gradient)`: what the loss returned, and a pytree like the
     model with `None` in the place of what is not a weight.
 
-    **Raises:** `ValueError` if the loss is not a floating-point scalar.
+    **Raises:** `ValueError` if the loss is not a floating-point scalar, or `key` is no
+    random key.
 
     !!! example
 
@@ -50,6 +52,7 @@ def analytic(
         gradient.K
         ```
     """
+    check_key(key, "analytic")
     weights, rest = weights_of(model)
 
     def of(weights):

@@ -128,6 +128,36 @@ def _header(path: Path, where: str) -> dict[str, Any]:
     )
 
 
+def check_replay(
+    path: Any,
+    there: dict[str, np.ndarray],
+    here: dict[str, np.ndarray],
+    count: int,
+    where: str,
+) -> None:
+    """Raise unless the first steps, taken again, are those that were written.
+
+    A loss, a learning rate and the contents of data have no name to be compared by, but
+    all show there.
+    """
+    made = {"step", "seconds", *here}
+    if there.keys() != made:
+        raise ValueError(
+            f"{where}: checkpoint '{path}' is of another run: its history has "
+            f"{', '.join(sorted(there))}, and the loss makes "
+            f"{', '.join(sorted(made))}. Name another file, or delete this one."
+        )
+    for name in ("loss", "gradient_norm"):
+        old, new = there[name][:count], here[name][:count]
+        if not np.allclose(old, new, rtol=1e-4, atol=0):
+            raise ValueError(
+                f"{where}: checkpoint '{path}' is of another run: the {name} of its "
+                f"first steps is {old} and is {new} here, so that the loss, the "
+                "optimiser or the data must be others. Name another file, or delete "
+                "this one."
+            )
+
+
 def _check_same_run(
     path: Path, there: dict[str, Any], here: dict[str, Any], where: str
 ) -> None:

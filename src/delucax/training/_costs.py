@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_count
+from .._check import check_count, check_key
 from .._controller import AbstractController
 from .._fields import as_float_array
 from .._results import RESULTS
 from ..environments import Environment
 from ..simulation import rollout, Trajectory
+from ..simulation._horizon import as_number
 from ..simulation._rollout import Checkpoint
 
 
@@ -28,6 +29,8 @@ class _ExpectedCost(eqx.Module):
     checkpoint: Checkpoint = eqx.field(static=True)
 
     def __call__(self, controller, key):
+        check_key(key, "expected_cost")
+
         def total(key):
             trajectory = rollout(
                 self.environment,
@@ -76,7 +79,8 @@ def expected_cost(
     **Returns:** a function `loss(controller, key)` to a scalar.
 
     **Raises:** `ValueError` if `batch` or `horizon` is below 1, `environment` is not an
-    environment, or `checkpoint` is none of the above.
+    environment, `checkpoint` is none of the above, or `gradient_decay` is not a finite
+    number.
 
     !!! example
 
@@ -103,10 +107,11 @@ def expected_cost(
         raise ValueError(
             f"{where}: checkpoint must be 'step', 'sqrt' or None, got {checkpoint!r}."
         )
+    decay = as_float_array(as_number(gradient_decay, "gradient_decay", where))
     is_one = isinstance(gradient_decay, int | float) and gradient_decay == 1
     return _ExpectedCost(
         environment=environment,
-        gradient_decay=None if is_one else as_float_array(gradient_decay),
+        gradient_decay=None if is_one else decay,
         batch=check_count(batch, "batch", where),
         horizon=check_count(
             environment.horizon if horizon is None else horizon, "horizon", where
@@ -137,6 +142,7 @@ class _ScoredCost(eqx.Module):
     horizon: int = eqx.field(static=True)
 
     def __call__(self, controller, key):
+        check_key(key, "scored_cost")
         if not hasattr(controller, "log_prob"):
             raise ValueError(
                 "scored_cost: the controller must draw its controls and have "

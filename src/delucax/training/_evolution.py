@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, PyTree
 
-from .._check import check_count
+from .._check import check_count, check_key
 from .._fields import as_float_array, check_parameters, parameter, positive
 from .._typing import PRNGKey
 from ._loss import cost_and_metrics
@@ -83,6 +83,7 @@ class EvolutionStrategies(eqx.Module):
         check_parameters(self)
 
     def __call__(self, loss, model, key: PRNGKey) -> tuple[Any, PyTree]:
+        check_key(key, "EvolutionStrategies")
         weights, rest = weights_of(model)
         n = self.samples // 2 if self.antithetic else self.samples
         loss_key, noise_key, pair_key = jr.split(key, 3)

@@ -18,7 +18,7 @@ from .._check import check_count, check_key, is_concrete
 from .._results import Result, RESULTS
 from .._typing import PRNGKey
 from ._analytic import analytic
-from ._checkpoint import Checkpoint, describe, fingerprint, prepare
+from ._checkpoint import check_replay, Checkpoint, describe, fingerprint, prepare
 from ._history import History, history_of
 from ._loop import CAPACITY, FAULTS, run_block
 from ._trainable import strong, take_apart
@@ -202,14 +202,12 @@ def fit(
     state = jax.tree.map(strong, state)
     history: dict[str, np.ndarray] = {}
     seconds = 0.0
-    saved = None
+    saved, found = None, None
     if checkpoint is not None:
         run = _description(model, assembly, values, state, key, steps)
         run |= dict(batch_size=batch_size, data_size=data_size)
         saved = Checkpoint(prepare(checkpoint, _WHERE), run)
         found = saved.resume((values, state), _WHERE)
-        if found is not None:
-            (values, state), history, seconds = found
     elif checkpoint_every is not None:
         raise ValueError(f"{_WHERE}: checkpoint_every needs checkpoint, a path.")
     every = 10 * block if checkpoint_every is None else checkpoint_every
@@ -220,6 +218,12 @@ def fit(
         order = (jnp.zeros(data_size, jnp.int32), jnp.asarray(-1, jnp.int32))
     functions = (loss, gradient, optimiser, static, assembly)
     carry = (values, state, order)
+    if found is not None:
+        (values, state), history, seconds = found
+        span = np.asarray([0, min(2, len(history["step"]))], np.int32)
+        _, (rows, *_) = run_block(functions, carry, (key, data), span, batch_size)
+        check_replay(checkpoint, history, jax.device_get(rows), int(span[1]), _WHERE)
+        carry = (values, state, order)
     done = written = len(history.get("step", ()))
     fault, last, blocks = 0, {}, [history] if history else []
     began = time.perf_counter() - seconds
@@ -233,12 +237,6 @@ def fit(
             rows = {name: column[:count] for name, column in rows.items()}
             rows["step"] = np.arange(done, done + count)
             rows["seconds"] = np.full(count, seconds)
-            if blocks and blocks[0].keys() != rows.keys():
-                raise ValueError(
-                    f"{_WHERE}: checkpoint '{checkpoint}' is of another run: its "
-                    f"history has {', '.join(sorted(blocks[0]))}, and the loss makes "
-                    f"{', '.join(sorted(rows))}. Name another file, or delete this one."
-                )
             blocks.append(rows)
             done += count
             last = {name: float(column[-1]) for name, column in rows.items()}

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import PyTree
 
-from .._check import check_count
+from .._check import check_count, check_key
 from .._typing import PRNGKey
 from ._loss import cost_and_metrics
 from ._trainable import weights_of
@@ -77,6 +77,7 @@ class LikelihoodRatio(eqx.Module):
             )
 
     def __call__(self, loss, model, key: PRNGKey) -> tuple[Any, PyTree]:
+        check_key(key, "LikelihoodRatio")
         weights, rest = weights_of(model)
 
         def surrogate(weights):

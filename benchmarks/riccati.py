@@ -1,0 +1,170 @@
+"""`python -m benchmarks.riccati`: Riccati equations against SciPy, in double precision.
+
+One BLAS thread for both. A run asks for the solution, the residual, the spectral radius
+of the closed loop and the result, and reads all of them; SciPy returns the solution
+alone. Prints the tables and writes `benchmarks/results/riccati.json`.
+"""
+
+import os
+
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_name] = "1"
+
+import argparse  # noqa: E402
+import json  # noqa: E402
+import math  # noqa: E402
+from pathlib import Path  # noqa: E402
+from typing import Any  # noqa: E402
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+import pandas as pd  # noqa: E402
+import scipy.linalg  # noqa: E402
+
+import delucax as dlx  # noqa: E402
+from benchmarks._machine import describe, limit_cores  # noqa: E402
+from benchmarks._timing import compiled, python, race, Timing  # noqa: E402
+
+
+OUT = Path(__file__).parent / "results" / "riccati.json"
+SIZES = (4, 20, 100, 300, 480)
+LANES = 1000
+
+
+def system(n: int, lanes: int | None = None) -> tuple[np.ndarray, ...]:
+    """A random unstable system with a quarter as many controls as states."""
+    rng = np.random.default_rng(n)
+    m = max(1, n // 4)
+    batch = () if lanes is None else (lanes,)
+    A = 1.2 * rng.normal(size=(*batch, n, n)) / math.sqrt(n)
+    return A, rng.normal(size=(*batch, n, m)), np.eye(n), np.eye(m)
+
+
+def facts(A, B, Q, R) -> tuple[Any, ...]:
+    """All that a user would look at."""
+    solution = dlx.riccati.dare(A, B, Q, R, throw=False)
+    good = solution.result == dlx.RESULTS.successful
+    return solution.X, solution.residual, solution.spectral_radius, good
+
+
+def gradient(A, B, Q, R) -> Any:
+    """Of a number made of the whole solution, with respect to all four matrices."""
+
+    def number(A, B, Q, R):
+        solution = dlx.riccati.dare(A, B, Q, R, throw=False)
+        return jnp.sum(jnp.sin(solution.X)) + jnp.sum(solution.K)
+
+    return jax.grad(number, argnums=(0, 1, 2, 3))(A, B, Q, R)
+
+
+def compare(n: int, rounds: int) -> tuple[dict[str, Timing], dict[str, Any]]:
+    """Time one system of `n` states, forward and gradient."""
+    problem = system(n)
+    X, residual, radius, good = (np.asarray(v) for v in jax.jit(facts)(*problem))
+    theirs = scipy.linalg.solve_discrete_are(*problem)
+    contenders = [
+        python("SciPy", 1, lambda: scipy.linalg.solve_discrete_are(*problem)),
+        compiled("delucax", 1, facts, *problem),
+        compiled("delucax, gradient", 1, gradient, *problem),
+    ]
+    timings = {t.name: t for t in race(contenders, rounds=rounds, warmup=1)}
+    quality = {
+        "n": n,
+        "good": bool(good),
+        "residual": float(residual),
+        "spectral radius": float(radius),
+        "difference from SciPy": float(np.linalg.norm(X - theirs) / np.linalg.norm(X)),
+    }
+    return timings, quality
+
+
+def compare_batch(rounds: int) -> tuple[dict[str, Timing], dict[str, Any]]:
+    """Time a batch of systems of four states against a loop."""
+    A, B, Q, R = system(4, LANES)
+
+    def loop():
+        solve = scipy.linalg.solve_discrete_are
+        return [solve(A[i], B[i], Q, R) for i in range(LANES)]
+
+    batch = jax.vmap(facts, in_axes=(0, 0, None, None))
+    X, residual, radius, good = (np.asarray(v) for v in jax.jit(batch)(A, B, Q, R))
+    theirs = np.stack(loop())
+    contenders = [
+        python("SciPy loop", LANES, loop),
+        compiled("delucax", LANES, batch, A, B, Q, R),
+    ]
+    timings = {t.name: t for t in race(contenders, rounds=rounds, warmup=1)}
+    quality = {
+        "n": f"{LANES} x 4",
+        "good": bool(np.all(good)),
+        "residual": float(np.max(residual)),
+        "spectral radius": float(np.max(radius)),
+        "difference from SciPy": float(
+            np.max(
+                np.linalg.norm(X - theirs, axis=(1, 2))
+                / np.linalg.norm(theirs, axis=(1, 2))
+            )
+        ),
+    }
+    return timings, quality
+
+
+def main() -> None:
+    """Run, print and write."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.riccati")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--sizes", type=int, nargs="*", default=list(SIZES))
+    parser.add_argument("--out", default=str(OUT))
+    parser.add_argument("--cores", type=int, default=1)
+    options = parser.parse_args()
+    limit_cores(options.cores)
+    jax.config.update("jax_enable_x64", True)
+
+    ratios, record, qualities = [], [], []
+    limits = {100: ">= 6", 300: ">= 8", 480: ">= 8"}
+    for n in options.sizes:
+        timings, quality = compare(n, options.rounds)
+        ours = timings["delucax"]
+        slower = timings["SciPy"].ratio(ours)
+        ratios.append(
+            {"ratio": f"n={n}: SciPy / delucax", "measured": slower}
+            | {"limit": limits.get(n, "")}
+        )
+        steeper = timings["delucax, gradient"].ratio(ours)
+        ratios.append(
+            {"ratio": f"n={n}: gradient / forward", "measured": steeper}
+            | {"limit": "<= 3"}
+        )
+        record += [{"n": n} | t.row() for t in timings.values()]
+        qualities.append(quality)
+    timings, quality = compare_batch(options.rounds)
+    slower = timings["SciPy loop"].ratio(timings["delucax"])
+    name = f"{LANES} systems of n=4: SciPy loop / delucax"
+    ratios.append({"ratio": name, "measured": slower, "limit": ">= 50"})
+    record += [{"n": quality["n"]} | t.row() for t in timings.values()]
+    qualities.append(quality)
+
+    times = pd.DataFrame(record)
+    times = times.rename(columns=lambda c: c.replace("ns/step", "ns a system"))
+    print(times.to_string(index=False, float_format="%.4g"))
+    print("\nWhat was found")
+    print(pd.DataFrame(qualities).to_string(index=False, float_format="%.2g"))
+    print("\nRatios (median over the rounds of one run)")
+    print(pd.DataFrame(ratios).to_string(index=False, float_format="%.2f"))
+    out = Path(options.out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    content = {
+        "machine": describe(),
+        "scipy": scipy.__version__,
+        "ratios": ratios,
+        "found": qualities,
+        "timings": times.to_dict("records"),
+    }
+    out.write_text(json.dumps(content, indent=1) + "\n")
+    print(f"\nwritten: {out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,189 @@
+"""`python -m benchmarks.riccati_exam`: published Riccati equations, system by system.
+
+The relative residual of SciPy, of slycot if it is installed, and of delucax; what
+delucax certifies, and its result. Prints a table, and writes
+`benchmarks/results/riccati_exam.json` and `docs/riccati_exam.md`.
+"""
+
+import os
+
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_name] = "1"
+
+import argparse  # noqa: E402
+import importlib.util  # noqa: E402
+import json  # noqa: E402
+import sys  # noqa: E402
+import warnings  # noqa: E402
+from collections.abc import Callable  # noqa: E402
+from pathlib import Path  # noqa: E402
+from typing import Any  # noqa: E402
+
+import jax  # noqa: E402
+import numpy as np  # noqa: E402
+import scipy.linalg  # noqa: E402
+
+import delucax as dlx  # noqa: E402
+from benchmarks._machine import describe, limit_cores  # noqa: E402
+
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+
+import riccati_systems  # noqa: E402  # pyright: ignore[reportMissingImports]
+
+
+OUT = Path(__file__).parent / "results" / "riccati_exam.json"
+PAGE = ROOT / "docs" / "riccati_exam.md"
+HEAD = """# Riccati equations, system by system
+
+The 20 continuous and 15 discrete systems of the collections CAREX and DAREX (P. Benner,
+A. J. Laub and V. Mehrmann, 1995) with the data of SciPy's own tests, and four systems
+that users of SciPy reported; then families of them over their parameters. `python -m
+benchmarks.riccati_exam` makes this page.
+
+The residual is that of the equation, over the sum of the norms of its terms, in double
+precision, and is measured in the same way for all. A residual is no certificate: the
+bound is the spectral abscissa of the closed loop (below 0 if it is stable) in
+continuous time and its spectral radius (below 1) in discrete time.
+
+"""
+
+
+def slycot_solver(continuous: bool) -> Callable | None:
+    """slycot's solver behind python-control, if it is there."""
+    if importlib.util.find_spec("slycot") is None:
+        return None
+    import control
+
+    solver = control.care if continuous else control.dare
+    return lambda A, B, Q, R: solver(A, B, Q, R, method="slycot")[0]
+
+
+def residual_of(solver: Callable | None, measure: Callable, *data) -> float | None:
+    """The relative residual of a solver; NaN if it raises, `None` if there is none."""
+    if solver is None:
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return float(measure(*data, solver(*data))[0])
+        except (np.linalg.LinAlgError, ValueError, RuntimeError):
+            return float("nan")
+
+
+def examine(name: str, continuous: bool, *data: np.ndarray) -> dict[str, Any]:
+    """One row of the table."""
+    if continuous:
+        ours, theirs = dlx.riccati.care, scipy.linalg.solve_continuous_are
+        measure = riccati_systems.continuous_residual
+    else:
+        ours, theirs = dlx.riccati.dare, scipy.linalg.solve_discrete_are
+        measure = riccati_systems.discrete_residual
+    solution = ours(*data, throw=False)
+    bound = solution.spectral_abscissa if continuous else solution.spectral_radius
+    real = not any(map(np.iscomplexobj, data))
+    slycot = slycot_solver(continuous) if real else None
+    return {
+        "system": name,
+        "n": len(data[0]),
+        "SciPy": residual_of(theirs, measure, *data),
+        "slycot": residual_of(slycot, measure, *data),
+        "delucax": float(measure(*data, np.asarray(solution.X))[0]),
+        "bound": float(bound),
+        "result": dlx.RESULTS[solution.result].split(":")[0].rstrip(".")
+        or "stabilising",
+    }
+
+
+def number(value: float | None) -> str:
+    """A residual in one digit; a dash if there is none."""
+    if value is None:
+        return "-"
+    return "raises" if np.isnan(value) else f"{value:.0e}"
+
+
+def page(rows: list[dict[str, Any]], families: list[dict[str, Any]]) -> str:
+    """The table in Markdown."""
+    lines = [HEAD + "| system | n | SciPy | slycot | delucax | bound | result |"]
+    lines.append("|---|---|---|---|---|---|---|")
+    for row in rows:
+        residuals = (number(row[name]) for name in ("SciPy", "slycot", "delucax"))
+        cells = (row["system"], row["n"], *residuals, f"{row['bound']:.8g}")
+        lines.append("| " + " | ".join(map(str, (*cells, row["result"]))) + " |")
+    if all(row["slycot"] is None for row in rows):
+        lines.append("\nslycot was not installed where this page was made.")
+    lines.append("\n## Families\n")
+    lines.append(
+        "The worst relative residual of each, and how many of its members each solver "
+        "brings below 1e-12; for delucax with a certificate.\n"
+    )
+    lines.append("| family | members | SciPy | delucax | worst SciPy | worst delucax |")
+    lines.append("|---|---|---|---|---|---|")
+    for row in families:
+        cells = (row["family"], row["members"], row["SciPy good"], row["delucax good"])
+        worst = number(row["worst SciPy"]), number(row["worst delucax"])
+        lines.append("| " + " | ".join(map(str, (*cells, *worst))) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The families in a line each."""
+    families: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        families.setdefault(row["system"].split(",")[0], []).append(row)
+    return [
+        {
+            "family": name,
+            "members": len(members),
+            "SciPy good": sum(row["SciPy"] <= 1e-12 for row in members),
+            "delucax good": sum(
+                row["delucax"] <= 1e-12 and row["result"] == "stabilising"
+                for row in members
+            ),
+            "worst SciPy": float(np.max([row["SciPy"] for row in members])),
+            "worst delucax": max(row["delucax"] for row in members),
+        }
+        for name, members in families.items()
+    ]
+
+
+def main() -> None:
+    """Run, print and write."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.riccati_exam")
+    parser.add_argument("--out", default=str(OUT))
+    parser.add_argument("--page", default=str(PAGE))
+    parser.add_argument("--cores", type=int, default=1)
+    options = parser.parse_args()
+    limit_cores(options.cores)
+    jax.config.update("jax_enable_x64", True)
+
+    rows = [examine(name, True, *data) for name, *data in riccati_systems.carex()]
+    rows += [examine(name, False, *data) for name, *data in riccati_systems.darex()]
+    swept = [
+        examine(name, True, *data) for name, *data in riccati_systems.carex_families()
+    ]
+    swept += [
+        examine(name, False, *data)
+        for name, *data in riccati_systems.darex_families((2, 10, 50))
+    ]
+    families = summary(swept)
+    text = page(rows, families)
+    print(text)
+    content = {
+        "machine": describe(),
+        "scipy": scipy.__version__,
+        "systems": rows,
+        "families": families,
+        "members": swept,
+    }
+    out = Path(options.out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps(content, indent=1) + "\n")
+    Path(options.page).write_text(text)
+    print(f"written: {out} and {options.page}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,297 @@
+from typing import ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, central_difference, needs_x64, tolerance, user_error
+
+import delucax as dlx
+
+
+c = dlx.controllers
+EKF, UKF = c.ExtendedKalmanFilter, c.UnscentedKalmanFilter
+CLOSE = dict(rtol=tolerance(1e-3, 1e-10), atol=tolerance(1e-3, 1e-11))
+both = pytest.mark.parametrize("kind", [EKF, UKF])
+
+
+@pytest.mark.parametrize(
+    "kind, options",
+    [
+        (EKF, {}),
+        (UKF, {}),
+        (UKF, {"alpha": 0.5, "beta": 1.0, "kappa": 1.0}),
+    ],
+)
+def test_is_the_kalman_filter_of_linear_dynamics(kind, options):
+    rng = np.random.default_rng(0)
+    A = 0.5 * rng.standard_normal((3, 3))
+    B, C = rng.standard_normal((3, 1)), rng.standard_normal((2, 3))
+    E, x_ref = rng.standard_normal((3, 2)), rng.standard_normal(3)
+    dynamics = dlx.LinearDynamics(A, B, C, E, x_ref=x_ref)
+    noise = jnp.diag(jnp.array([0.3, 0.1])), jnp.diag(jnp.array([0.2, 0.5]))
+    start = dict(mean=jnp.ones(3), covariance=jnp.diag(jnp.array([1.0, 0.5, 2.0])))
+    ys, us = rng.standard_normal((6, 2)), rng.standard_normal((6, 1))
+    found = c.smooth(kind(dynamics, *noise, **start, **options), ys, us)
+    expected = c.smooth(c.KalmanFilter(dynamics, *noise, **start), ys, us)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert_close(a, b, **CLOSE)
+
+
+class Square(dlx.AbstractSystem):
+    """A number at rest, whose square is seen."""
+
+    state_names: ClassVar = ("x",)
+    control_names: ClassVar = ("u",)
+
+    def vector_field(self, t, x, u, w):
+        return u
+
+    def observe(self, t, x):
+        return x**2
+
+
+@pytest.mark.parametrize("alpha", [1.0, 0.3])
+def test_moments_of_a_square(alpha):
+    """Unscented, the square of a normal number has the right mean and variance."""
+    mean, variance, V = 0.7, 0.4, 0.1
+    dynamics = dlx.Discretized(Square(), dt=0.1)
+    options = dict(mean=[mean], covariance=[[variance]])
+    ukf = UKF(dynamics, jnp.eye(1), [[V]], alpha=alpha, **options)
+    y = jnp.array([2.0])
+    expected = mean**2 + variance
+    S = 4 * mean**2 * variance + 2 * variance**2 + V
+    gain = 2 * mean * variance / S
+    after = ukf.update(0.0, y, ukf.init())
+    close = dict(rtol=tolerance(1e-4, 1e-12))
+    assert_close(after.mean, [mean + gain * (2.0 - expected)], **close)
+    assert_close(after.covariance, [[variance - gain**2 * S]], **close)
+    ekf = EKF(dynamics, jnp.eye(1), [[V]], **options)
+    S = 4 * mean**2 * variance + V
+    gain = 2 * mean * variance / S
+    after = ekf.update(0.0, y, ekf.init())
+    assert_close(after.mean, [mean + gain * (2.0 - mean**2)], **close)
+
+
+class Sight(dlx.AbstractSystem):
+    """A pendulum, of which the place of the bob is seen; driven by noise torque."""
+
+    pendulum: dlx.systems.Pendulum
+    state_names: ClassVar = ("angle", "velocity")
+    control_names: ClassVar = ("torque",)
+    disturbance_names: ClassVar = ("noise",)
+
+    def vector_field(self, t, x, u, w):
+        return self.pendulum.vector_field(t, x, u + w, None)
+
+    def observe(self, t, x):
+        return jnp.stack([jnp.sin(x[0]), jnp.cos(x[0])])
+
+    def difference(self, x, x_ref):
+        return self.pendulum.difference(x, x_ref)
+
+
+def swinging(length=1.0):
+    return dlx.Discretized(Sight(dlx.systems.Pendulum(length=length)), dt=0.05)
+
+
+STD_W, STD_V = 1.0, 0.1
+NOISE = STD_W**2 * jnp.eye(1), STD_V**2 * jnp.eye(2)
+START = dict(mean=jnp.array([1.0, 0.0]), covariance=0.3**2 * jnp.eye(2))
+
+
+@both
+def test_better_than_dead_reckoning(kind, key):
+    """On noisy swings the filter beats the model alone and the sensor alone, the
+    smoother beats the filter, and both know how good they are."""
+    dynamics = swinging()
+    env = dlx.Environment(
+        dynamics,
+        dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1)),
+        disturbance=dlx.disturbances.Gaussian(STD_W, size=1),
+        sensor_noise=dlx.disturbances.Gaussian(STD_V, size=2),
+        horizon=60,
+    )
+    estimator = kind(dynamics, *NOISE, **START)
+
+    @eqx.filter_jit
+    @jax.vmap
+    def errors(key):
+        start, run = jax.random.split(key)
+        x0 = START["mean"] + 0.3 * jax.random.normal(start, (2,))
+        run = dlx.rollout(env, c.Zero(1), key=run, x0=x0)
+        states = run.states[:-1]
+        smoothed = c.smooth(estimator, run.observations, run.controls)
+        filtered = smoothed.filtered.updated
+        dead = dlx.open_loop(dynamics, START["mean"], run.controls)[:-1]
+        seen = jnp.arctan2(run.observations[:, 0], run.observations[:, 1])
+        off = jax.vmap(dynamics.difference)
+        deviation = off(smoothed.mean, states)
+        surprise = jax.vmap(jnp.linalg.solve)(smoothed.covariance, deviation)
+        return {
+            "dead": off(dead, states),
+            "filtered": off(filtered.mean, states),
+            "smoothed": deviation,
+            "seen": dlx.math.wrap(seen - states[:, 0]),
+            "surprise": jnp.sum(surprise * deviation, axis=-1),
+        }
+
+    found = errors(jax.random.split(key, 64))
+    rms = {k: np.sqrt(np.mean(np.square(v), axis=(0, 1))) for k, v in found.items()}
+    assert np.all(rms["filtered"] < 0.3 * rms["dead"])
+    assert rms["filtered"][0] < 0.8 * rms["seen"]
+    assert np.all(rms["smoothed"] < 0.85 * rms["filtered"])
+    # Of a normal estimate of two entries the surprise is 2 on average.
+    assert 1.8 < np.mean(found["surprise"]) < 2.2
+
+
+def test_angles_wrap():
+    """Over the top, the spread of the points and of the record is over the circle."""
+    pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+    noise = 0.01 * jnp.eye(2), 0.01 * jnp.eye(2)
+    turn = jnp.array([2 * np.pi, 0.0])
+
+    class Wrapped(dlx.AbstractSystem):
+        pendulum: dlx.systems.Pendulum
+        state_names: ClassVar = ("angle", "velocity")
+        control_names: ClassVar = ("torque",)
+
+        def vector_field(self, t, x, u, w):
+            return self.pendulum.vector_field(t, x, u, w)
+
+        def project(self, x):
+            return jnp.stack([dlx.math.wrap(x[0]), x[1]])
+
+        def difference(self, x, x_ref):
+            return self.pendulum.difference(x, x_ref)
+
+    wrapped = dlx.Discretized(Wrapped(dlx.systems.Pendulum()), dt=0.05)
+    ys = jnp.stack([3.0 + 0.1 * jnp.arange(5), jnp.full(5, 2.0)], axis=1)
+    turned = ys.at[2:].add(-turn)
+    start = dict(mean=ys[0], covariance=0.1 * jnp.eye(2))
+    for kind in (EKF, UKF):
+        options = dict(**start, observation_difference=pendulum.difference)
+        plain = c.smooth(kind(pendulum, *noise, **start), ys)
+        circle = c.smooth(kind(wrapped, *noise, **options), turned)
+        off = jax.vmap(pendulum.difference)(circle.mean, plain.mean)
+        assert_close(off, np.zeros((5, 2)), atol=tolerance(1e-4, 1e-11))
+        assert_close(circle.covariance, plain.covariance, **CLOSE)
+        assert np.max(np.abs(circle.filtered.predicted.mean[:, 0])) < 3.5
+
+
+@both
+@needs_x64
+def test_gradient_of_the_likelihood(kind):
+    """With respect to a length and to noise levels."""
+    ys = jnp.stack([jnp.sin(0.2 * jnp.arange(6)), jnp.cos(0.2 * jnp.arange(6))], 1)
+
+    @jax.jit
+    def likelihood(z):
+        noise = jnp.exp(z[1]) * NOISE[0], jnp.exp(z[2]) * NOISE[1]
+        return c.run_filter(kind(swinging(z[0]), *noise, **START), ys).log_likelihood
+
+    z = jnp.array([1.1, 0.2, -0.3])
+    numeric = central_difference(likelihood, z)
+    assert_close(jax.jit(jax.grad(likelihood))(z), numeric, rtol=1e-6)
+    assert_close(jax.jit(jax.jacfwd(likelihood))(z), numeric, rtol=1e-6)
+
+
+def test_points_of_a_singular_covariance():
+    """What is known for certain stays so, and a negative variance is a failure."""
+    dynamics = dlx.LinearDynamics(jnp.eye(2), jnp.ones((2, 1)))
+    noise = jnp.zeros((2, 2)), jnp.eye(2)
+    half = jnp.diag(jnp.array([0.0, 1.0]))
+    ys = jnp.ones((3, 2))
+    kalman, ukf = (
+        kind(dynamics, *noise, covariance=half) for kind in (c.KalmanFilter, UKF)
+    )
+    found, expected = c.run_filter(ukf, ys), c.run_filter(kalman, ys)
+    assert_close(found.updated.mean, expected.updated.mean, **CLOSE)
+    assert_close(found.updated.mean[:, 0], np.zeros(3))
+    spoilt = eqx.tree_at(lambda k: k.covariance, ukf, -jnp.eye(2))
+    with pytest.raises(RuntimeError, match="states.*At observation 0"):
+        c.run_filter(spoilt, ys)
+
+
+@both
+def test_solver_that_fails(kind):
+    """A step that is not solved is not passed off as a prediction."""
+    dynamics = dlx.Discretized(
+        dlx.systems.Pendulum(),
+        dt=10.0,
+        solver=diffrax.Tsit5(),
+        stepsize_controller=diffrax.PIDController(rtol=1e-5, atol=1e-5),
+        max_steps=2,
+    )
+    estimator = kind(dynamics, jnp.eye(2), jnp.eye(2))
+    found = c.run_filter(estimator, jnp.ones((2, 2)), throw=False)
+    assert found.result == dlx.RESULTS.diverged
+    assert np.all(np.isnan(found.predicted.mean[1:]))
+
+
+@both
+def test_precision_batch_and_file(kind, tmp_path):
+    ys = jnp.ones((2, 4, 2), jnp.float32)
+    pendulum = dlx.systems.Pendulum()
+    dynamics = dlx.Discretized(pendulum, dt=0.05)
+    eye = 0.1 * jnp.eye(2, dtype=jnp.float32)
+    options = dict(observation_difference=pendulum.difference)
+    estimator = kind(dynamics, eye, eye, **options)
+    assert estimator.init().mean.dtype == jnp.float32
+    run = jax.jit(jax.vmap(c.run_filter, in_axes=(None, 0)))
+    found = run(estimator, ys)
+    assert found.updated.covariance.dtype == jnp.float32
+    assert found.log_likelihood.shape == (2,) and found.log_likelihoods.shape == (2, 4)
+    dlx.save(tmp_path / "filter.dlx", estimator)
+    again = run(dlx.load(tmp_path / "filter.dlx"), ys)
+    np.testing.assert_array_equal(again.updated.mean, found.updated.mean)
+
+
+class Lifted(Square):
+    """A difference that is not of the size of the state."""
+
+    def difference(self, x, x_ref):
+        return jnp.concatenate([x, x_ref])
+
+
+BAD = [
+    (
+        {"dynamics": dlx.systems.Pendulum()},
+        "dynamics must be an AbstractDynamics.*Pend",
+    ),
+    ({"W": jnp.eye(2)}, r"W must have shape \(1, 1\), .*disturbance, got \(2, 2\)"),
+    ({"W": -jnp.eye(1)}, "W must be positive semidefinite"),
+    ({"V": jnp.eye(1)}, r"V must have shape \(2, 2\), .*observation, got \(1, 1\)"),
+    ({"V": jnp.full((2, 2), jnp.nan)}, "V must be finite"),
+    ({"mean": jnp.zeros(1)}, r"mean must have shape \(2,\)"),
+    ({"covariance": -jnp.eye(2)}, "covariance must be positive semidefinite"),
+]
+BAD_POINTS = [
+    ({"alpha": 0.0}, "alpha must be positive"),
+    ({"alpha": jnp.ones(2)}, r"alpha must be a number, got shape \(2,\)"),
+    ({"beta": jnp.ones(2)}, r"beta must be a number, got shape \(2,\)"),
+    ({"beta": float("nan")}, "beta must be finite"),
+    ({"kappa": -2.0}, "kappa must be above -n = -2.*got -2.0"),
+]
+
+
+@pytest.mark.parametrize(
+    "kind, arguments, message",
+    [(kind, *bad) for kind in (EKF, UKF) for bad in BAD]
+    + [(UKF, *bad) for bad in BAD_POINTS],
+)
+def test_wrong_arguments(kind, arguments, message):
+    given = {"dynamics": swinging(), "W": NOISE[0], "V": NOISE[1]} | arguments
+    with user_error(match=f"{kind.__name__}: {message}"):
+        kind(**given)
+
+
+@both
+def test_wrong_difference(kind):
+    lifted = dlx.Discretized(Lifted(), dt=0.1)
+    with user_error(
+        match=r"difference of the size of the state, \(1,\), got shape \(2"
+    ):
+        kind(lifted, jnp.eye(1), jnp.eye(1))

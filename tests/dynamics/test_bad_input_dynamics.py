@@ -1,0 +1,77 @@
+import diffrax
+import jax.numpy as jnp
+import pytest
+from helpers import user_error
+
+import delucax as dlx
+
+
+PENDULUM = dlx.systems.Pendulum()
+ADAPTIVE = dict(
+    solver=diffrax.Tsit5(),
+    stepsize_controller=diffrax.PIDController(rtol=1e-3, atol=1e-3),
+)
+LINEAR = dlx.linearize(PENDULUM)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda dt: dlx.Discretized(PENDULUM, dt),
+        lambda dt: dlx.LinearDynamics(jnp.eye(2), jnp.ones((2, 1)), dt=dt),
+        lambda dt: dlx.c2d(LINEAR, dt),
+        lambda dt: dlx.costs.Rate(dlx.costs.PendulumCost(), dt),
+    ],
+)
+@pytest.mark.parametrize(
+    "dt, match",
+    [
+        ("0.1", "positive and finite, got '0.1'"),
+        (None, "positive and finite, got None"),
+        (jnp.ones(2), r"a number, got shape \(2,\)"),
+    ],
+)
+def test_a_step_that_is_no_number(make, dt, match):
+    with user_error(match=f"dt must be {match}"):
+        make(dt)
+
+
+@pytest.mark.parametrize(
+    "arguments, match",
+    [
+        ({"stepsize_controller": "x"}, "stepsize_controller must be adaptive.*'x'"),
+        (
+            {"stepsize_controller": diffrax.ConstantStepSize()},
+            "stepsize_controller must be adaptive.*ConstantStepSize",
+        ),
+        ({"adjoint": "x"}, "adjoint must be a Diffrax adjoint.*got 'x'"),
+    ],
+)
+def test_bad_input(arguments, match):
+    with user_error(match=f"Discretized: {match}"):
+        dlx.Discretized(PENDULUM, 0.1, **(ADAPTIVE | arguments))
+
+
+@pytest.mark.parametrize(
+    "returned, match",
+    [
+        (lambda x, u: [x[1], u[0]], "got a list; it must be an array .*jnp.stack"),
+        (lambda x, u: None, "got a NoneType; it must be an array"),
+    ],
+)
+def test_a_vector_field_that_returns_no_array(returned, match):
+    system = dlx.system(lambda t, x, u, w: returned(x, u), states=2, controls=1)
+    dynamics, x, u = dlx.Discretized(system, 0.1), jnp.zeros(2), jnp.zeros(1)
+    match = rf"FunctionSystem: vector_field must return shape \(2,\).*{match}"
+    with user_error(match=match):
+        dynamics(0.0, x, u)
+    with user_error(match=match):
+        dlx.simulate(system, jnp.zeros((2, 1)), 0.0, 0.2, x)
+    with user_error(match=match):
+        dlx.linearize(system, 0.0, x, u)
+
+
+@pytest.mark.parametrize("mass", ["heavy", ["heavy"], object(), [[1.0], [1.0, 2.0]]])
+def test_parameters_that_are_no_numbers(mass):
+    with user_error(match="Pendulum: mass must be a number or an array"):
+        dlx.systems.Pendulum(mass=mass)

@@ -1,0 +1,164 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from helpers import assert_close, needs_x64, tolerance, user_error
+from jax.test_util import check_grads
+
+import delucax as dlx
+
+
+A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
+B = jnp.array([[0.0], [1.0]])
+Q, R = jnp.eye(2), jnp.eye(1)
+
+
+def test_double_integrator():
+    solution = dlx.riccati.care(A, B, Q, R)
+    root = np.sqrt(3)
+    assert_close(solution.X, [[root, 1], [1, root]], rtol=tolerance(1e-5, 1e-12))
+    assert_close(solution.K, [[1, root]], rtol=tolerance(1e-5, 1e-12))
+    assert_close(solution.closed_loop, A - B @ solution.K)
+    abscissa = np.max(np.linalg.eigvals(solution.closed_loop).real)
+    assert_close(solution.spectral_abscissa, abscissa, rtol=tolerance(1e-4, 1e-7))
+    assert solution.spectral_radius is None
+    assert solution.result == dlx.RESULTS.successful
+    assert solution.residual < tolerance(1e-6, 1e-15)
+
+
+def test_cross_weight_and_descriptor():
+    rng = np.random.default_rng(0)
+    A, B = rng.normal(size=(3, 3)), rng.normal(size=(3, 2))
+    root = rng.normal(size=(5, 5))
+    weight = root @ root.T
+    E = np.eye(3) + 0.3 * rng.normal(size=(3, 3))
+    Q, R, S = weight[:3, :3], weight[3:, 3:], weight[:3, 3:]
+    solution = dlx.riccati.care(A, B, Q, R, S, E)
+    X = scipy.linalg.solve_continuous_are(A, B, Q, R, E, S)
+    assert np.linalg.norm(solution.X - X) < tolerance(1e-3, 1e-10) * np.linalg.norm(X)
+    gain = np.linalg.solve(R, B.T @ X @ E + S.T)
+    assert_close(solution.K, gain, atol=tolerance(1e-2, 1e-9))
+    loop = np.linalg.solve(E, A - B @ gain)
+    assert_close(solution.closed_loop, loop, atol=tolerance(1e-2, 1e-9))
+    assert solution.spectral_abscissa < 0
+
+
+ROTATION = np.array([[1.0, 0.3], [-0.4, 1.0]])
+
+
+def rotated(modes, B, seen):
+    """Modes in other coordinates, so that nothing is zero by luck."""
+    back = np.linalg.inv(ROTATION)
+    A = ROTATION @ np.diag(modes) @ back
+    Q = back.T @ np.diag(seen) @ back
+    return A, ROTATION @ np.array(B)[:, None], (Q + Q.T) / 2
+
+
+@pytest.mark.parametrize(
+    "A, B, Q, status",
+    [
+        (*rotated([1.2, -0.5], [0.0, 1], [1.0, 1]), "not_stabilisable"),
+        ([[0.0, 0], [0, -0.5]], [[0.0], [1]], np.eye(2), "not_stabilisable"),
+        ([[0.0, 1], [0, 0]], [[0.0], [1]], np.zeros((2, 2)), "on_boundary"),
+        ([[0.0, 1], [-1, 0]], [[0.0], [1]], np.zeros((2, 2)), "on_boundary"),
+        (*rotated([0.0, -0.5], [1.0, 1], [0.0, 1]), "on_boundary"),
+        ([[1.1, 1], [0, 0.9]], [[0.0], [1]], -5 * np.eye(2), "not_stabilising"),
+    ],
+)
+def test_no_stabilising_solution(A, B, Q, status):
+    A, B = jnp.asarray(A, float), jnp.asarray(B, float)
+    solution = dlx.riccati.care(A, B, Q, R, throw=False)
+    assert solution.result == getattr(dlx.RESULTS, status)
+    with pytest.raises(RuntimeError, match="care: .*abscissa.*throw=False"):
+        dlx.riccati.care(A, B, Q, R)
+    with pytest.raises(eqx.EquinoxRuntimeError):
+        eqx.filter_jit(dlx.riccati.care)(A, B, Q, R)
+
+
+def test_least_energy():
+    # Unstable modes are mirrored at the axis.
+    unstable = jnp.array([[2.0, 1.0], [0.0, 1.5]])
+    solution = dlx.riccati.care(unstable, B, jnp.zeros((2, 2)), R)
+    moved = np.sort(np.linalg.eigvals(solution.closed_loop).real)
+    assert_close(moved, [-2, -1.5], rtol=tolerance(1e-3, 1e-9))
+
+
+def test_ill_posed_where_it_cannot_be_seen():
+    solve = jax.jit(lambda A, R: dlx.riccati.care(A, B, Q, R, throw=False).result)
+    ill_posed = dlx.RESULTS.ill_posed
+    assert solve(A, R) == dlx.RESULTS.successful
+    assert solve(A.at[0, 0].set(jnp.nan), R) == ill_posed
+    assert solve(A, 0 * R) == ill_posed
+    assert solve(A, -R) == ill_posed
+
+
+def test_one_bad_member_harms_no_other():
+    As = jnp.stack([A, A - jnp.eye(2), A + 0.1 * jnp.eye(2)])
+    spoilt = As.at[1].set(jnp.diag(jnp.array([1.3, 0.2])))
+
+    @jax.jit
+    def total_of_two(As, Q):
+        def total(As, Q):
+            batch = jax.vmap(lambda A: dlx.riccati.care(A, B, Q, R, throw=False))(As)
+            good = batch.result == dlx.RESULTS.successful
+            # What a failed member holds is not looked at.
+            costs = jnp.where(good[:, None, None], batch.X, 0)
+            return jnp.sum(costs[::2]), (batch.X, good)
+
+        return jax.value_and_grad(total, argnums=(0, 1), has_aux=True)(As, Q)
+
+    (value, (X, good)), (gradient, shared) = total_of_two(As, Q)
+    (value_beside, (X_beside, good_beside)), gradients = total_of_two(spoilt, Q)
+    np.testing.assert_array_equal(good, [True] * 3)
+    np.testing.assert_array_equal(good_beside, [True, False, True])
+    assert_close(X_beside[::2], X[::2])
+    assert_close(value_beside, value)
+    assert_close(gradients[0][::2], gradient[::2])
+    assert_close(gradients[1], shared, rtol=1e-6)
+
+
+@needs_x64
+def test_gradients_of_every_argument():
+    arguments = (
+        jnp.array([[0.8, 0.3], [-0.2, -1.1]]),
+        jnp.array([[1.0], [0.5]]),
+        Q,
+        R,
+        jnp.array([[0.1], [-0.1]]),
+        jnp.array([[1.1, 0.1], [0.0, 0.9]]),
+    )
+
+    def facts(A, B, Q, R, S, E):
+        Q, R = (Q + Q.T) / 2, (R + R.T) / 2
+        solution = dlx.riccati.care(A, B, Q, R, S, E, throw=False)
+        return jnp.sum(jnp.sin(solution.X)) + jnp.sum(jnp.sin(solution.K))
+
+    check_grads(jax.jit(facts), arguments, 1, modes=("rev",), rtol=1e-7, eps=1e-5)
+
+
+def test_complex_data():
+    turn = np.diag(np.exp([0.3j, -0.4j]))
+    plain = dlx.riccati.care(A, B, Q, R)
+    turned = dlx.riccati.care(turn @ A @ turn.conj(), turn @ B, Q, R)
+    X = turn @ plain.X @ turn.conj()
+    assert_close(turned.X, X, atol=tolerance(1e-4, 1e-12))
+
+
+@pytest.mark.parametrize(
+    "change, match",
+    [
+        ({"A": np.ones((2, 3))}, r"care: A must be square, got shape \(2, 3\)"),
+        ({"B": np.array([[np.inf], [0]])}, "care: B must be finite"),
+        ({"B": np.ones((3, 1))}, r"as many rows as A \(2\), got shape \(3, 1\)"),
+        ({"Q": np.array([[1.0, 1.0], [0.0, 1.0]])}, "Q must be symmetric"),
+        ({"R": np.zeros((1, 1))}, "R must be positive definite"),
+        ({"R": -np.eye(1)}, "R must be positive definite.*eigenvalue is -1"),
+        ({"S": np.ones((1, 2))}, r"S must have shape \(2, 1\).*got \(1, 2\)"),
+        ({"E": np.eye(3)}, r"E must have shape \(2, 2\).*got \(3, 3\)"),
+    ],
+)
+def test_wrong_arguments(change, match):
+    with user_error(match=match):
+        dlx.riccati.care(**({"A": A, "B": B, "Q": Q, "R": R} | change))

@@ -1,0 +1,55 @@
+"""Published discrete-time systems, and families of them."""
+
+import numpy as np
+import riccati_systems
+import scipy.linalg
+from helpers import needs_x64
+
+import delucax as dlx
+
+
+def exam(name, A, B, Q, R):
+    solution = dlx.riccati.dare(A, B, Q, R, throw=False)
+    residual, loop = riccati_systems.discrete_residual(A, B, Q, R, solution.X)
+    assert solution.result == dlx.RESULTS.successful, name
+    assert residual < 1e-12 and solution.residual < 1e-12, name
+    assert solution.spectral_radius < 1, name
+    assert np.max(np.abs(np.linalg.eigvals(loop))) < 1, name
+    return solution
+
+
+@needs_x64
+def test_published_systems():
+    systems = riccati_systems.darex()
+    assert len(systems) == 19
+    for name, A, B, Q, R in systems:
+        solution = exam(name, A, B, Q, R)
+        if name == "DAREX 14":
+            # A margin of 1e-8: the condition allows fewer digits.
+            continue
+        X = scipy.linalg.solve_discrete_are(A, B, Q, R)
+        assert np.linalg.norm(solution.X - X) < 1e-9 * np.linalg.norm(X), name
+
+
+@needs_x64
+def test_families():
+    systems = riccati_systems.darex_families()
+    assert len(systems) >= 70
+    for system in systems:
+        exam(*system)
+
+
+def test_single_precision():
+    for name, *data in riccati_systems.darex():
+        if any(map(np.iscomplexobj, data)):
+            continue
+        single = (np.asarray(M, np.float32) for M in data)
+        solution = dlx.riccati.dare(*single, throw=False)
+        X = np.asarray(solution.X, np.float64)
+        residual, _ = riccati_systems.discrete_residual(*data, X)
+        if name == "DAREX 14":
+            # Its margin of 1e-8 is below the precision.
+            assert solution.result != dlx.RESULTS.successful
+        else:
+            assert solution.result == dlx.RESULTS.successful, name
+            assert residual < 1e-5, name

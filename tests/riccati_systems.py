@@ -1,0 +1,174 @@
+"""Systems to try Riccati solvers on: published ones, and families of them.
+
+Each is `(name, A, B, Q, R)`. The families are those of the collections of P. Benner,
+A. J. Laub and V. Mehrmann (1995), CAREX and DAREX, in their parameters.
+"""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import scipy.linalg
+
+
+def scipy_cases(name):
+    """The cases of one class of SciPy's own tests of its solvers.
+
+    The assignments of the class are run alone: the module belongs to SciPy's own set-up
+    of pytest.
+    """
+    folder = Path(scipy.linalg.__file__).parent / "tests"
+    tree = ast.parse((folder / "test_solvers.py").read_text())
+    (found,) = (
+        node
+        for node in tree.body
+        if isinstance(node, ast.ClassDef) and node.name == name
+    )
+    body = [node for node in found.body if isinstance(node, ast.Assign)]
+    names = {
+        "np": np,
+        "block_diag": scipy.linalg.block_diag,
+        "_load_data": lambda file: np.load(folder / "data" / file),
+    }
+    exec(compile(ast.Module(body, []), name, "exec"), names)
+    return names["cases"]
+
+
+def matrices(case):
+    return tuple(np.atleast_2d(np.asarray(M)) for M in case[:4])
+
+
+def carex():
+    """The 20 systems of CAREX with SciPy's data."""
+    cases = scipy_cases("TestSolveContinuousAre")
+    return [(f"CAREX {i + 1}", *matrices(case)) for i, case in enumerate(cases)]
+
+
+def darex():
+    """Four reported by users of SciPy (three of them complex), and the 15 of DAREX."""
+    cases = scipy_cases("TestSolveDiscreteAre")
+    names = [f"user {i + 1}" for i in range(4)]
+    names += [f"DAREX {i + 1}" for i in range(15)]
+    return [(name, *matrices(case)) for name, case in zip(names, cases, strict=True)]
+
+
+def reflection():
+    """Of Petkov's scaled examples."""
+    return np.eye(3) - 2 / 3 * np.ones((3, 3))
+
+
+def shift(n):
+    """A chain of `n` integrators (of delays, in discrete time)."""
+    return np.eye(n, k=1), np.eye(n)[:, -1:]
+
+
+def carex_families(sizes=(6,), half_sizes=(5,)):
+    """CAREX 7 to 15, 17 and 19 over their parameters."""
+    I, column = np.eye, lambda *x: np.array(x, float)[:, None]
+    one = np.eye(1)
+    systems = []
+
+    def add(number, parameter, *problem):
+        systems.append((f"CAREX {number}, {parameter}", *problem))
+
+    for e in 10.0 ** np.arange(-8, 5):
+        add(7, f"{e:g}", np.diag([1.0, -2]), column(e, 0), np.ones((2, 2)), one)
+        Q = np.array([[1e2, 1e3], [1e3, 1e4]])
+        B = np.array([[0.1, 0], [0.001, 0.01]])
+        R = np.ones((2, 2)) + np.diag([e, 0])
+        if e >= 1e-8:
+            add(8, f"{e:g}", np.diag([-0.1, -0.02]), B, Q, R)
+    for e in 10.0 ** np.arange(-6, 7):
+        add(9, f"{e:g}", np.array([[0, e], [0, 0]]), column(0, 1), I(2), one)
+    for e in 10.0 ** np.arange(-7, 5):
+        A = np.ones((2, 2)) + e * I(2)
+        add(10, f"{e:g}", A, I(2), e**2 * I(2), I(2))
+        add(10, f"{e:g}, Q = I", A, I(2), I(2), I(2))
+    for e in 10.0 ** np.arange(-6, 1, 0.5):
+        A = np.array([[3 - e, 1], [4, 2 - e]])
+        Q = np.array([[4 * e - 11, 2 * e - 5], [2 * e - 5, 2 * e - 2]])
+        add(11, f"{e:g}", A, column(1, 1), Q, one)
+    V = reflection()
+    for e in 10.0 ** np.arange(0, 7):
+        A, Q = V @ np.diag([e, 2 * e, 3 * e]) @ V, V @ np.diag([1 / e, 1, e]) @ V
+        add(12, f"{e:g}", (A + A.T) / 2, I(3), (Q + Q.T) / 2, e * I(3))
+    for e in 10.0 ** np.arange(-6, 1):
+        A = np.diag([0.4, 0.345, 0.262 / e], 1)
+        A[2, 1:3], A[3, 3] = [-0.524 / e, -0.465 / e], -1 / e
+        add(13, f"{e:g}", A, column(0, 0, 0, 1 / e), np.diag([1.0, 0, 1, 0]), one)
+    for e in 10.0 ** np.arange(-6, 1):
+        A = np.zeros((4, 4))
+        A[:2, :2], A[2:, 2:] = [[-e, 1], [-1, -e]], [[e, 1], [-1, e]]
+        add(14, f"{e:g}", A, np.ones((4, 1)), np.ones((4, 4)), one)
+    for N in half_sizes:
+        n = 2 * N - 1
+        A, B = np.zeros((n, n)), np.zeros((n, N))
+        for i in range(N):
+            A[2 * i, 2 * i], B[2 * i, i] = -1, 1
+        for i in range(N - 1):
+            A[2 * i + 1, 2 * i], A[2 * i + 1, 2 * i + 2] = 1, -1
+        Q = np.diag([10.0 * (i % 2) for i in range(n)])
+        add(15, f"{N} vehicles", A, B, Q, I(N))
+    for n in sizes:
+        for q in 10.0 ** np.arange(-4, 5, 2):
+            for r in 10.0 ** np.arange(-4, 5, 2):
+                A, B = shift(n)
+                Q = np.diag([q] + [0.0] * (n - 1))
+                add(17, f"n={n}, q={q:g}, r={r:g}", A, B, Q, r * one)
+    for l in half_sizes:
+        for damping in (1e-2, 0.1, 1.0, 4.0):
+            for stiffness in (0.1, 1.0, 100.0):
+                K = 2 * I(l) - np.eye(l, k=1) - np.eye(l, k=-1)
+                K[0, 0] = K[-1, -1] = 1
+                A = np.block(
+                    [[np.zeros((l, l)), I(l)], [-stiffness * K, -damping * I(l)]]
+                )
+                B = np.zeros((2 * l, 2))
+                B[l, 0], B[-1, 1] = 1, -1
+                name = f"{l} springs, {damping:g}, {stiffness:g}"
+                add(19, name, A, B, I(2 * l), I(2))
+    return systems
+
+
+def darex_families(sizes=(10,)):
+    """DAREX 12 to 15 over their parameters."""
+    one, systems = np.eye(1), []
+
+    def add(number, parameter, *problem):
+        systems.append((f"DAREX {number}, {parameter}", *problem))
+
+    for e in 10.0 ** np.arange(-6, 7):
+        A, B = np.array([[0, e], [0, 0]]), np.array([[0.0], [1]])
+        add(12, f"{e:g}", A, B, np.eye(2), one)
+    V = reflection()
+    for e in 10.0 ** np.arange(0, 8):
+        A = V @ np.diag([0.0, 1, 3]) @ V
+        add(13, f"{e:g}", (A + A.T) / 2, np.eye(3), e * np.eye(3), e * np.eye(3))
+    for tau in 10.0 ** np.arange(0, 9):
+        for r in (1e-4, 1e-2, 0.25, 1.0, 100.0):
+            A = np.eye(4, k=-1)
+            A[0, 0] = 1 - 1 / tau
+            B, Q = np.eye(4)[:, :1] / tau, np.diag([0.0, 0, 0, 1])
+            add(14, f"tau={tau:g}, r={r:g}", A, B, Q, r * one)
+    for n in sizes:
+        for r in 10.0 ** np.arange(-4, 5):
+            add(15, f"n={n}, r={r:g}", *shift(n), np.eye(n), r * one)
+    return systems
+
+
+def discrete_residual(A, B, Q, R, X):
+    """Relatively to the sum of the norms of the terms; `'` conjugates."""
+    H = lambda M: M.conj().T
+    cross = H(A) @ X @ B
+    gain = np.linalg.solve(R + H(B) @ X @ B, H(cross))
+    terms = H(A) @ X @ A, X, cross @ gain, Q
+    left = terms[0] - terms[1] - terms[2] + terms[3]
+    return np.linalg.norm(left) / sum(map(np.linalg.norm, terms)), A - B @ gain
+
+
+def continuous_residual(A, B, Q, R, X):
+    H = lambda M: M.conj().T
+    gain = np.linalg.solve(R, H(B) @ X)
+    terms = X @ A, H(A) @ X, X @ B @ gain, Q
+    left = terms[0] + terms[1] - terms[2] + terms[3]
+    return np.linalg.norm(left) / sum(map(np.linalg.norm, terms)), A - B @ gain

@@ -1,0 +1,103 @@
+"""Slips in what the loops are given, and in what a controller answers."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import user_error
+
+import delucax as dlx
+
+
+PENDULUM = dlx.systems.Pendulum()
+FEEDBACK = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
+
+
+class Slip(dlx.AbstractController):
+    kind: str = eqx.field(static=True)
+
+    def init(self, *, key=None):
+        return {
+            "dtype": jnp.zeros((), jnp.int32),
+            "shape": {"seen": jnp.zeros(2)},
+            "number": 0,
+            "structure": (jnp.zeros(1),),
+        }.get(self.kind)
+
+    def __call__(self, t, y, state):
+        u = jnp.zeros(1, y.dtype)
+        if self.kind == "alone":
+            return u
+        if self.kind == "shape":
+            return u, {"seen": jnp.append(state["seen"], y[0])}
+        return u, {} if self.kind == "structure" else state + y[0]
+
+
+class Rise(dlx.AbstractController):
+    """Numbers whose dtype follows from what they meet, and what stays as it was."""
+
+    def init(self, *, key=None):
+        return jnp.asarray(0.0), "name", jnp.tanh
+
+    def __call__(self, t, y, state):
+        total, name, function = state
+        return jnp.zeros(1, y.dtype), (total + y[0], name, function)
+
+
+def rollout(controller=FEEDBACK, **arguments):
+    arguments = dict(key=jax.random.key(0), horizon=3) | arguments
+    return dlx.rollout(dlx.make("pendulum"), controller, **arguments)
+
+
+def simulate(controller=FEEDBACK, **arguments):
+    x0 = jnp.array([0.1, 0.0])
+    return dlx.simulate(PENDULUM, controller, 0.0, 0.3, x0, dt=0.1, **arguments)
+
+
+@pytest.mark.parametrize("run", [rollout, simulate])
+@pytest.mark.parametrize(
+    "kind, match",
+    [
+        ("alone", r"must return \(u, state\).*got an array of shape \(1,\)"),
+        ("dtype", r"state must keep .*i32\[\], got f\d\d\[\]"),
+        ("shape", r"state\['seen'\] must keep .*\[2\], got f\d\d\[3\]"),
+        ("number", "state must keep .*, 0, got .*JAX array from the start"),
+        ("structure", r"state must keep the structure.*\(f\d\d\[1\],\), got \{\}"),
+    ],
+)
+def test_a_slip_of_a_controller(run, kind, match):
+    with user_error(match=f"Slip: {match}"):
+        run(Slip(kind))
+
+
+def test_continuous_feedback_without_its_state():
+    with user_error(match=r"Slip: must return \(u, state\)"):
+        simulate(Slip("alone"), hold=None)
+
+
+@pytest.mark.parametrize("run", [rollout, simulate])
+def test_states_that_are_well_made(run):
+    assert run(Rise()).states.shape == (4, 2)
+
+
+@pytest.mark.parametrize(
+    "run, match",
+    [
+        (lambda: simulate(key=0), "simulate: key must be one random key.*got 0"),
+        (lambda: rollout(w=np.full((3, 2), np.nan)), "w must be finite"),
+        (lambda: rollout(w="wind"), r"w must have shape .*\(3, 2\), got 'wind'"),
+        (lambda: rollout(gradient_decay=np.nan), "gradient_decay must be finite"),
+        (lambda: rollout(gradient_decay="x"), "gradient_decay must be a number"),
+        (lambda: rollout(gradient_decay=[0.9]), "gradient_decay must be a number"),
+        (
+            lambda: dlx.simulate(
+                PENDULUM, np.full((3, 1), np.inf), 0.0, 0.3, jnp.zeros(2)
+            ),
+            "controller_or_controls must be finite",
+        ),
+    ],
+)
+def test_bad_input(run, match):
+    with user_error(match=match):
+        run()
