@@ -1,7 +1,7 @@
 """The pictures of the pages, drawn by the code that the pages show.
 
-`python docs/figures/pages.py` runs the Python blocks of the pages listed below, page by
-page, and puts what they draw, in fewer colours, into `docs/assets/`, in a minute or two.
+`python docs/figures/pages.py` runs the Python blocks of the pages below and
+puts what they draw, in fewer colours, into `docs/assets/`, in a few minutes.
 """
 
 import os

@@ -8,18 +8,13 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 
 from . import (
-    analysis as analysis,
-    controllers as controllers,
     costs as costs,
     disturbances as disturbances,
     dynamics as dynamics,
     environments as environments,
-    interop as interop,
     math as math,
     references as references,
-    riccati as riccati,
     systems as systems,
-    training as training,
 )
 from ._controller import (
     AbstractController as AbstractController,
@@ -60,19 +55,36 @@ from .systems import AbstractSystem as AbstractSystem, system as system
 
 
 if TYPE_CHECKING:
-    from . import plotting as plotting
+    from . import (
+        analysis as analysis,
+        controllers as controllers,
+        interop as interop,
+        plotting as plotting,
+        riccati as riccati,
+        training as training,
+    )
     from .plotting import animate as animate, plot as plot
 del TYPE_CHECKING
 
-_LAZY = ("animate", "plot", "plotting")
+_LAZY = (
+    "analysis",
+    "animate",
+    "controllers",
+    "interop",
+    "plot",
+    "plotting",
+    "riccati",
+    "training",
+)
 
 
 def __getattr__(name: str):
-    """What needs Matplotlib, which is optional, imported when it is first asked for."""
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    plotting = _import_module(".plotting", __name__)
-    return plotting if name == "plotting" else getattr(plotting, name)
+    """What the core does not need, imported when it is first asked for."""
+    if name in ("animate", "plot"):
+        return getattr(_import_module(".plotting", __name__), name)
+    if name in _LAZY:
+        return _import_module(f".{name}", __name__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -6,7 +6,6 @@ import pytest
 import scipy.integrate
 import scipy.linalg
 from helpers import assert_close, needs_x64, tolerance, user_error
-from jax.test_util import check_grads
 
 import delucax as dlx
 
@@ -92,7 +91,7 @@ def free_controls(stages):
 
 
 @needs_x64
-@pytest.mark.parametrize("T, n, m", [(1, 2, 1), (9, 4, 2), (64, 3, 3), (100, 12, 4)])
+@pytest.mark.parametrize("T, n, m", [(1, 2, 1), (20, 3, 3), (33, 9, 3)])
 def test_in_parallel_as_in_sequence(T, n, m):
     problem = random_stages(T, T, n, m)
     for stages in [problem, free_controls(problem)] if n == m else [problem]:
@@ -213,16 +212,22 @@ def test_one_bad_member_harms_no_other(parallel):
 @needs_x64
 @pytest.mark.parametrize("parallel", [False, True])
 def test_derivatives_of_the_recursion(parallel):
-    stages = {k: jnp.asarray(v) for k, v in random_stages(3, 4, 2, 1).items()}
+    stages = {k: jnp.asarray(v) for k, v in random_stages(3, 3, 2, 1).items()}
+    rng = np.random.default_rng(0)
+    direction = {k: jnp.asarray(rng.normal(size=v.shape)) for k, v in stages.items()}
 
-    def facts(stages):
-        turned = lambda M: (M + jnp.swapaxes(M, -1, -2)) / 2
-        even = {name: turned(stages[name]) for name in ("Q", "R", "final")}
-        solution = dlx.riccati.dre(**(stages | even), parallel=parallel, throw=False)
+    def line(e):
+        moved = {name: stages[name] + e * direction[name] for name in stages}
+        for name in ("Q", "R", "final"):
+            moved[name] = (moved[name] + jnp.swapaxes(moved[name], -1, -2)) / 2
+        solution = dlx.riccati.dre(**moved, parallel=parallel, throw=False)
         parts = solution.X, solution.K, solution.k, solution.p, solution.s
         return sum(jnp.sum(jnp.sin(part)) for part in parts)
 
-    check_grads(jax.jit(facts), (stages,), 2, rtol=1e-6, atol=1e-6, eps=1e-5)
+    value, first, h = jax.jit(line), jax.jit(jax.grad(line)), 1e-6
+    assert_close(first(0.0), (value(h) - value(-h)) / (2 * h), rtol=1e-7)
+    second = (first(h) - first(-h)) / (2 * h)
+    assert_close(jax.jit(jax.jacfwd(jax.jacrev(line)))(0.0), second, rtol=1e-6)
 
 
 @needs_x64

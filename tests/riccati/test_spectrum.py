@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers import needs_x64, tolerance
 
-from delucax.riccati._small import is_definite, solve
+from delucax.math._linear_solve import is_definite, solve
 from delucax.riccati._spectrum import spectral_abscissa, spectral_radius
 
 

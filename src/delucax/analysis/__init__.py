@@ -1,5 +1,6 @@
 """What linear models tell of themselves: modes, Gramians, norms, margins."""
 
+from ._disk import disk_margin as disk_margin, DiskMargin as DiskMargin
 from ._gramians import (
     controllability_gramian as controllability_gramian,
     controllability_matrix as controllability_matrix,
@@ -7,8 +8,6 @@ from ._gramians import (
     observability_matrix as observability_matrix,
 )
 from ._margins import (
-    disk_margin as disk_margin,
-    DiskMargin as DiskMargin,
     Margins as Margins,
     margins as margins,
 )
@@ -21,7 +20,7 @@ from ._modes import (
     modal_observability as modal_observability,
     ModalTest as ModalTest,
     poles as poles,
-    zeros as zeros,
 )
 from ._norms import h2_norm as h2_norm, hinf_norm as hinf_norm, PeakGain as PeakGain
 from ._response import dcgain as dcgain, frequency_response as frequency_response
+from ._zeros import zeros as zeros

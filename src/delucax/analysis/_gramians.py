@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from .._check import check_count, check_positive, is_concrete
 from ..dynamics import LinearDynamics
+from ..math._linear_solve import full_precision
 from ..riccati._lyapunov import lyapunov
-from ..riccati._small import full_precision
 from ..riccati._stein import stein
 from ..systems import LinearSystem
 from ._plant import is_stable, Plant, plant

@@ -34,9 +34,7 @@ class Zero(AbstractController):
     control_size: int = eqx.field(static=True)
 
     def __init__(self, control_size: int):
-        self.control_size = check_count(
-            control_size, "control_size", "Zero", least=0
-        )
+        self.control_size = check_count(control_size, "control_size", "Zero", least=0)
 
     def __call__(self, t, y, state):
         return jnp.zeros(self.control_size, y.dtype), state

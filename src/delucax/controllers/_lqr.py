@@ -11,8 +11,8 @@ from .._controller import AbstractController
 from .._fields import function_field, parameter, weight
 from ..dynamics import LinearDynamics
 from ..math import matvec
+from ..math._linear_solve import solve
 from ..riccati import dare
-from ..riccati._small import solve
 from ._feed_forward import known_signals, Preview
 from ._operating_point import (
     check_observed,

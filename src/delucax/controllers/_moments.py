@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float
 
-from ..riccati._small import full_precision, is_definite, SMALL, solve, symmetric
+from ..math._linear_solve import full_precision, is_definite, SMALL, solve, symmetric
 
 
 class AbstractJoint(eqx.Module):

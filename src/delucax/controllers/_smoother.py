@@ -12,7 +12,7 @@ from jaxtyping import Array
 from .._check import check_finite, is_concrete
 from .._fields import as_float_array
 from .._results import choose, Result, RESULTS
-from ..riccati._small import full_precision
+from ..math._linear_solve import full_precision
 from ._estimator import Belief
 from ._gaussian_filter import AbstractGaussianFilter
 
@@ -159,10 +159,10 @@ def smooth(
     r"""The estimate of each state from the whole record, by the smoother of Rauch, Tung
     and Striebel.
 
-    Back from the end, with `G_k = P_k A' Sigma_{k+1}^-1`, `P_k` and `Sigma_k` being the
-    covariances of the filter after and before `y_k`:
+    Back from the end, with `G_k = P_k A' Sigma_{k+1}^-1`, the filter's belief being
+    `N(mu_k, Sigma_k)` before `y_k` and `N(m_k, P_k)` after it:
 
-    `mean_k = m_k + G_k (mean_{k+1} - A m_k - ...)`,
+    `mean_k = m_k + G_k (mean_{k+1} - mu_{k+1})`,
     `covariance_k = P_k + G_k (covariance_{k+1} - Sigma_{k+1}) G_k'`,
 
     the latter in a form that stays semidefinite. Of a nonlinear filter, `P_k A'` is the

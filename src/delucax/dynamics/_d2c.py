@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._check import is_concrete
-from ..riccati._small import full_precision, solve
+from ..math._linear_solve import full_precision, solve
 from ..systems import LinearSystem
 from ._linear import LinearDynamics
 

@@ -8,12 +8,12 @@ import jax.lax as lax
 import jax.numpy as jnp
 import lineax as lx
 
+from ..math._linear_solve import full_precision, is_definite, solve, symmetric
 from ._arguments import complex_form, is_complex, real_form, riccati_arguments
 from ._dare import double
 from ._lyapunov import lyapunov
 from ._newton import detached, found_tangent, outside, polish
 from ._search import Attempt, Found, search, SECOND, verdict, weights
-from ._small import full_precision, is_definite, solve, symmetric
 from ._solution import checked, RiccatiSolution
 from ._spectrum import abscissa_and_size
 

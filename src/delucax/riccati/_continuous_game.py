@@ -5,6 +5,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..math._linear_solve import full_precision, solve
 from ._flow import hamiltonian, lyapunov, scale_of, short_element
 from ._game import (
     double,
@@ -17,7 +18,6 @@ from ._game import (
 )
 from ._level import Game, search
 from ._recursion import is_clearly_definite, symmetric
-from ._small import full_precision, solve
 from ._spectrum import spectral_abscissa
 
 

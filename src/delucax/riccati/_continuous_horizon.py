@@ -11,11 +11,11 @@ from jaxtyping import Array
 from .._check import as_matrix, check_finite, is_concrete, symmetric_matrix
 from .._fields import as_float_array
 from .._results import choose, Result, RESULTS
+from ..math._linear_solve import full_precision, solve
 from ._finite_horizon import raised
 from ._flow import flow_values
 from ._horizon_arguments import common_dtype, final_weight
 from ._recursion import is_clearly_definite, symmetric
-from ._small import full_precision, solve
 
 
 class ContinuousHorizonSolution(eqx.Module):

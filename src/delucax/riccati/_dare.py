@@ -7,10 +7,10 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 
+from ..math._linear_solve import full_precision, is_definite, solve, symmetric
 from ._arguments import complex_form, is_complex, real_form, riccati_arguments
 from ._newton import detached, found_tangent, outside, polish
 from ._search import Attempt, Found, search, SECOND, verdict, weights
-from ._small import full_precision, is_definite, solve, symmetric
 from ._solution import checked, RiccatiSolution
 from ._spectrum import spectral_radius
 from ._stein import MAX_DOUBLINGS, stein

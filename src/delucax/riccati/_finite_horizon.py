@@ -9,9 +9,9 @@ from jaxtyping import Array
 
 from .._check import as_vector, is_concrete
 from .._results import choose, Result, RESULTS
+from ..math._linear_solve import full_precision, solve
 from ._horizon_arguments import final_weight, in_time, symmetric_stack
 from ._recursion import gain, linear_recursion, sanitised, values
-from ._small import full_precision, solve
 
 
 class FiniteHorizonSolution(eqx.Module):

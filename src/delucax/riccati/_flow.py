@@ -7,8 +7,8 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..math._linear_solve import full_precision, solve
 from ._recursion import joined, symmetric
-from ._small import full_precision, solve
 from ._stein import stein
 
 
@@ -60,21 +60,37 @@ def short_element(H: Float[Array, "_ _"], time: Array) -> tuple[Array, Array, Ar
 def elements(H: Float[Array, "_ _"], times: Float[Array, " N"], is_game: bool):
     """The elements of intervals of these lengths, by doubling from short ones; and
     whether the equation has a solution from 0 over each."""
-    count = jnp.max(jax.vmap(lambda time: halvings(H, time))(times))
-    count = jnp.minimum(count, _MAX_HALVINGS)
-    short = jax.vmap(lambda time: short_element(H, time))(times * 0.5**count)
+    count, short = _short_elements(H, times)
     reach = lambda C, J: is_within_reach(C, J, is_game)
 
-    def double(carry):
+    def twice(_, carry):
         element, good = carry
         good &= jax.vmap(reach)(element[1], element[2])
         return jax.vmap(joined)(element, element), good
 
-    def twice(carry, k):
-        return lax.cond(k < count, double, lambda carry: carry, carry), None
-
     start = (short, jnp.ones(times.shape, bool))
-    return lax.scan(twice, start, jnp.arange(_MAX_HALVINGS))[0]
+    return lax.fori_loop(0, count, twice, start)
+
+
+def elements_to_differentiate(H: Float[Array, "_ _"], times: Float[Array, " N"]):
+    """The same elements, by a loop of fixed length, which reverse mode needs."""
+    count, short = _short_elements(H, times)
+
+    def twice(element, k):
+        # Beyond the last doubling nothing is joined to nothing, which is harmless.
+        going = k < count
+        tried = jax.tree.map(lambda M: jnp.where(going, M, 0), element)
+        after = jax.vmap(joined)(tried, tried)
+        kept = jax.tree.map(lambda a, b: jnp.where(going, a, b), after, element)
+        return kept, None
+
+    return lax.scan(twice, short, jnp.arange(_MAX_HALVINGS))[0]
+
+
+def _short_elements(H, times):
+    count = jnp.max(jax.vmap(lambda time: halvings(H, time))(times))
+    count = jnp.minimum(count, _MAX_HALVINGS)
+    return count, jax.vmap(lambda time: short_element(H, time))(times * 0.5**count)
 
 
 def is_within_reach(C: Array, X: Array, is_game: bool) -> Array:
@@ -102,14 +118,8 @@ def flow_values(A, G, Q, final, times, is_game: bool):
 
     NaN at a time, and at all before it, from which there is no solution to the end.
     """
-    X, good = _flow_values(A, G, Q, final, times, is_game)
-    return jnp.where(good[:, None, None], X, jnp.nan)
-
-
-def _flow_values(A, G, Q, final, times, is_game):
-    unit = scale_of(G, Q)
-    H = hamiltonian(A, unit * G, Q / unit)
-    parts, good = elements(H, jnp.diff(times), is_game)
+    unit, H = _scaled(A, G, Q)
+    parts, possible = elements(H, jnp.diff(times), is_game)
 
     def back(carry, here):
         X, good = carry
@@ -117,12 +127,30 @@ def _flow_values(A, G, Q, final, times, is_game):
         good &= possible & is_within_reach(element[1], X, is_game)
         X = passed(element, X)
         good &= jnp.all(jnp.isfinite(X))
-        return (X, good), (X, good)
+        return (X, good), jnp.where(good, X, jnp.nan)
 
     start = (final / unit, jnp.ones((), bool))
-    _, (X, good) = lax.scan(back, start, (parts, good), reverse=True)
-    X = jnp.concatenate([unit * X, final[None]])
-    return X, jnp.concatenate([good, jnp.ones(1, bool)])
+    _, X = lax.scan(back, start, (parts, possible), reverse=True)
+    return jnp.concatenate([unit * X, final[None]])
+
+
+def _scaled(A, G, Q):
+    """The unit of `X` that makes the parts of the flow alike, and the flow in it."""
+    unit = scale_of(G, Q)
+    return unit, hamiltonian(A, unit * G, Q / unit)
+
+
+def _to_differentiate(A, G, Q, final, times):
+    """The same `X`, where there is one, by loops that can be differentiated."""
+    unit, H = _scaled(A, G, Q)
+    parts = elements_to_differentiate(H, jnp.diff(times))
+
+    def back(X, element):
+        X = passed(element, X)
+        return X, X
+
+    _, X = lax.scan(back, final / unit, parts, reverse=True)
+    return jnp.concatenate([unit * X, final[None]])
 
 
 @flow_values.defjvp
@@ -133,8 +161,7 @@ def _flow_values_jvp(is_game, primals, tangents):
     *matrices, times = primals
     # What fails is replaced, so that no NaN of it is in a derivative.
     safe = (*(jnp.where(good, M, 0) for M in matrices), times)
-    plain = lambda *arguments: _flow_values(*arguments, is_game)[0]
-    _, tangent = jax.jvp(plain, safe, tangents)
+    _, tangent = jax.jvp(_to_differentiate, safe, tangents)
     return X, jnp.where(good, tangent, 0)
 
 

@@ -7,9 +7,9 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..math._linear_solve import full_precision, solve
 from ._level import Game
 from ._recursion import gain, is_saddle, joined, one_step, symmetric
-from ._small import full_precision, solve
 from ._spectrum import spectral_radius
 from ._stein import MAX_DOUBLINGS, stein
 

@@ -10,6 +10,7 @@ from jaxtyping import Array
 from .._check import as_matrix, check_positive, is_concrete, symmetric_matrix
 from .._fields import as_float_array
 from .._results import choose, Result, RESULTS
+from ..math._linear_solve import full_precision, solve
 from ._continuous_game import (
     continuous_attached,
     continuous_barrier,
@@ -28,7 +29,6 @@ from ._game import (
 from ._horizon_arguments import common_dtype
 from ._level import followed, Search, search
 from ._recursion import gain
-from ._small import full_precision, solve
 from ._spectrum import spectral_abscissa, spectral_radius
 
 

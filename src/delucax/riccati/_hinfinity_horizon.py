@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._results import choose, Result, RESULTS
+from ..math._linear_solve import full_precision, solve
 from ._continuous_game import joint_gain
 from ._continuous_horizon import checked_times
 from ._flow import flow_values
@@ -17,7 +18,6 @@ from ._hinfinity import checked_game, checked_level, LOOSE, thrown
 from ._horizon_arguments import final_weight, in_time, symmetric_stack
 from ._level import followed, Game, search
 from ._recursion import gain, is_clearly_definite, sanitised, symmetric, values
-from ._small import full_precision, solve
 
 
 class HorizonGameSolution(eqx.Module):

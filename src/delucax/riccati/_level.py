@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._small import full_precision
+from ..math._linear_solve import full_precision
 
 
 _WIDEST = 1e18

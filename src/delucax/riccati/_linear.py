@@ -11,10 +11,10 @@ from jaxtyping import Array
 
 from .._check import as_matrix
 from .._results import choose, Result, RESULTS
+from ..math._linear_solve import full_precision, no_tangent, solve
 from ._arguments import complex_form, is_complex, real_form, square_matrix
 from ._lyapunov import stable_sylvester
 from ._search import tolerance
-from ._small import full_precision, no_tangent, solve
 from ._solution import checked, MatrixSolution
 from ._spectrum import spectral_abscissa
 from ._stein import smith

@@ -4,7 +4,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._small import solve
+from ..math._linear_solve import solve
 from ._stein import smith
 
 

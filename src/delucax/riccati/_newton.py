@@ -8,11 +8,13 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..math._linear_solve import no_tangent, solve, symmetric
 from ._search import Found
-from ._small import no_tangent, solve, symmetric
 
 
 _NEWTON_STEPS = 8
+_FINE = 64
+"""Units of rounding in the relative residual that need no correction."""
 
 
 def polish(
@@ -26,11 +28,11 @@ def polish(
     `correction(closed_loop, error)` solves it to first order. Returns `X`, the relative
     residual and the closed loop.
     """
-    fine = (10 + 2 * X.shape[0] ** 0.5) * jnp.finfo(X.dtype).eps
+    fine = _FINE * jnp.finfo(X.dtype).eps
 
     def more(carry):
-        *_, better, k = carry
-        return (k < _NEWTON_STEPS) & better
+        *_, going, k = carry
+        return (k < _NEWTON_STEPS) & going
 
     def body(carry):
         *before, _, k = carry
@@ -38,9 +40,11 @@ def polish(
         candidate = symmetric(X + correction(closed_loop, error))
         error, (found, closed_loop) = equation(candidate)
         better = found < residual
+        # Where steps stop to help much, rounding is all that is left.
+        going = (found < residual / 4) & (found > fine)
         now = candidate, error, found, closed_loop
         kept = (jnp.where(better, a, b) for a, b in zip(now, before, strict=True))
-        return *kept, better & (found > fine), k + 1
+        return *kept, going, k + 1
 
     error, (residual, closed_loop) = equation(X)
     start = (X, error, residual, closed_loop, residual > fine, jnp.asarray(0))

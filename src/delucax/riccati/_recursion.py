@@ -7,7 +7,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ._small import full_precision, solve
+from ..math._linear_solve import full_precision, solve
 
 
 def symmetric(X: Float[Array, "*T n n"]) -> Float[Array, "*T n n"]:
@@ -165,10 +165,10 @@ def linear_recursion(loop, added, final, parallel: bool, product):
 @values.defjvp
 @full_precision
 def _values_jvp(players, parallel, primals, tangents):
-    *matrices, final = primals
+    *matrices, _ = primals
     X = values(*primals, players, parallel)  # pyright: ignore[reportCallIssue]
     good = jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
-    A, B, Q, R, S, after = sanitised(good, *matrices, X[1:])
+    A, B, Q, R, S, after = sanitised(good, *matrices, X[1:])  # pyright: ignore[reportCallIssue]
     K, loop = jax.vmap(gain)(A, B, R, S, after)
 
     # At the best gain the cost-to-go is stationary in it: its change is not needed.

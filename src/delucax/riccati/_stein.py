@@ -4,7 +4,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._small import full_precision as full_precision, solve as solve
+from ..math._linear_solve import full_precision as full_precision, solve as solve
 from ._spectrum import spectral_radius as spectral_radius
 
 

@@ -136,9 +136,7 @@ class Trajectory(eqx.Module):
             )
         start, stop, _ = index.indices(self.steps)
         stop = max(stop, start)
-        if self.states is None or (
-            self.costs is None and "costs" not in self.keep
-        ):
+        if self.states is None or (self.costs is None and "costs" not in self.keep):
             raise ValueError(
                 "Trajectory: states and costs must be kept to slice in time; got "
                 "keep= without them."
