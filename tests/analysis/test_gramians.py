@@ -81,11 +81,11 @@ def test_disturbances_enter_through_E():
     [(LinearSystem, None), (LinearSystem, 0.7), (dlx.LinearDynamics, None)],
 )
 def test_gradients_are_central_differences(make, horizon):
-    start = jnp.asarray(A if make is LinearSystem else A_STEP)
-    weight = jnp.asarray(np.random.default_rng(2).normal(size=(4, 4)))
+    start = jnp.asarray((A if make is LinearSystem else A_STEP)[:2, :2])
+    weight = jnp.array([[1.0, -2.0], [0.5, 3.0]])
 
     def loss(A):
-        W = an.controllability_gramian(make(A, jnp.asarray(B)), horizon)
+        W = an.controllability_gramian(make(A, jnp.asarray(B[:2])), horizon)
         return jnp.sum(weight * W)
 
     numeric = central_difference(jax.jit(loss), start)

@@ -34,7 +34,7 @@ def test_random_controls(key):
 @pytest.mark.parametrize(
     "make, match",
     [
-        (lambda c: c.Zero(0), "control_size must be a whole number of at least 1"),
+        (lambda c: c.Zero(-1), "control_size must be a whole number of at least 0"),
         (lambda c: c.Constant(1.0), "value must be a vector"),
         (lambda c: c.Constant([np.nan]), "value must be finite"),
         (lambda c: c.Random(1.0), "std must be a vector"),
