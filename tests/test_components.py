@@ -9,6 +9,9 @@ from jax.test_util import check_grads
 from delucax._components import by_components
 
 
+pytestmark = needs_x64
+
+
 @jax.jit
 def _inner(x):
     return x[::-1] * 2

@@ -2,10 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-from helpers import assert_close, tolerance
+from helpers import assert_close, once, tolerance
 from jax.test_util import check_grads
 
 from delucax._fence import fence
+
+
+pytestmark = once
 
 
 def _fenced(x, y):

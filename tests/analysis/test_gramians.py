@@ -2,12 +2,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, central_difference, needs_x64, tolerance, user_error
+from helpers import (
+    assert_close,
+    central_difference,
+    needs_x64,
+    tolerance,
+    user_error,
+)
 from scipy.integrate import quad_vec
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_lyapunov
 
 import delucax as dlx
 from delucax.systems import LinearSystem
+
+
+pytestmark = needs_x64
 
 
 an = dlx.analysis

@@ -3,9 +3,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, tolerance, user_error
+from helpers import assert_close, needs_x64, tolerance, user_error
 
 import delucax as dlx
+
+
+pytestmark = needs_x64
 
 
 A = jnp.array([[1.0, 1.0], [0.0, 1.0]])

@@ -4,9 +4,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import assert_close, central_difference, needs_x64, tolerance, user_error
+from helpers import (
+    assert_close,
+    central_difference,
+    needs_x64,
+    tolerance,
+    user_error,
+)
 
 import delucax as dlx
+
+
+pytestmark = needs_x64
 
 
 c = dlx.controllers

@@ -6,9 +6,18 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from helpers import assert_close, central_difference, needs_x64, tolerance, user_error
+from helpers import (
+    assert_close,
+    central_difference,
+    needs_x64,
+    tolerance,
+    user_error,
+)
 
 import delucax as dlx
+
+
+pytestmark = needs_x64
 
 
 A = jnp.array([[1.0, 0.2], [-0.1, 1.05]])

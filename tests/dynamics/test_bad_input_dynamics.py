@@ -1,9 +1,12 @@
 import diffrax
 import jax.numpy as jnp
 import pytest
-from helpers import user_error
+from helpers import once, user_error
 
 import delucax as dlx
+
+
+pytestmark = once
 
 
 PENDULUM = dlx.systems.Pendulum()

@@ -11,6 +11,9 @@ import delucax as dlx
 from delucax.systems import LinearSystem
 
 
+pytestmark = needs_x64
+
+
 def random_system(seed, n=4):
     rng = np.random.default_rng(seed)
     return LinearSystem(

@@ -21,6 +21,9 @@ from scipy.integrate import solve_ivp
 import delucax as dlx
 
 
+pytestmark = needs_x64
+
+
 PENDULUM = dlx.systems.Pendulum(damping=0.1)
 X, U = jnp.array([1.0, -0.5]), jnp.array([0.7])
 PID = diffrax.PIDController(rtol=1e-6, atol=1e-6)

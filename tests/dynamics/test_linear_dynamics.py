@@ -3,10 +3,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, central_difference, needs_x64, tolerance, user_error
+from helpers import (
+    assert_close,
+    central_difference,
+    needs_x64,
+    tolerance,
+    user_error,
+)
 from scipy.signal import cont2discrete
 
 import delucax as dlx
+
+
+pytestmark = needs_x64
 
 
 A = jnp.array([[1.0, 0.1], [-0.2, 0.9]])

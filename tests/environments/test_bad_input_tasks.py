@@ -2,9 +2,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import user_error
+from helpers import once, user_error
 
 import delucax as dlx
+
+
+pytestmark = once
 
 
 def environment(**arguments):

@@ -2,12 +2,15 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 import pytest
-from helpers import needs_x32, user_error
+from helpers import needs_x32, once, user_error
 from PIL import Image
 
 import delucax as dlx
 from delucax import experiments
 from delucax.__main__ import main
+
+
+pytestmark = once
 
 
 def test_the_demo_writes_what_it_says(tmp_path):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import pytest
-from helpers import user_error
+from helpers import once, user_error
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from PIL import Image
@@ -25,6 +25,9 @@ from delucax.plotting._drawings import (
 from delucax.plotting._export import compressed, expanded
 from delucax.plotting._runs import as_runs
 from delucax.plotting._scene import Scene
+
+
+pytestmark = once
 
 
 class Cart(dlx.AbstractSystem):

@@ -5,8 +5,12 @@ import sys
 import textwrap
 
 import pytest
+from helpers import once
 
 import delucax as dlx
+
+
+pytestmark = once
 
 
 def python(code):

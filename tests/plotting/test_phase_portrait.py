@@ -4,11 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import user_error
+from helpers import once, user_error
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 import delucax as dlx
+
+
+pytestmark = once
 
 
 LIMITS = ((-4.0, 4.0), (-6.0, 6.0))

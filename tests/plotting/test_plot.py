@@ -9,11 +9,14 @@ import matplotlib
 import matplotlib.colors
 import numpy as np
 import pytest
-from helpers import user_error
+from helpers import once, user_error
 from matplotlib.collections import PolyCollection
 from PIL import Image
 
 import delucax as dlx
+
+
+pytestmark = once
 
 
 class Drone(dlx.AbstractSystem):

@@ -10,6 +10,9 @@ from jax.test_util import check_grads
 import delucax as dlx
 
 
+pytestmark = needs_x64
+
+
 A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
 B = jnp.array([[0.0], [1.0]])
 Q, R = jnp.eye(2), jnp.eye(1)

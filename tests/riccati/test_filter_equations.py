@@ -1,9 +1,12 @@
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from helpers import assert_close, tolerance, user_error
+from helpers import assert_close, needs_x64, tolerance, user_error
 
 import delucax as dlx
+
+
+pytestmark = needs_x64
 
 
 rng = np.random.default_rng(0)

@@ -10,6 +10,9 @@ from helpers import assert_close, needs_x64, tolerance, user_error
 import delucax as dlx
 
 
+pytestmark = needs_x64
+
+
 A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
 B = jnp.array([[0.0], [1.0]])
 Q, R = jnp.eye(2), jnp.eye(1)

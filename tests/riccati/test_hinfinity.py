@@ -4,10 +4,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import assert_close, central_difference, needs_x64, tolerance, user_error
+from helpers import (
+    assert_close,
+    central_difference,
+    needs_x64,
+    tolerance,
+    user_error,
+)
 from jax.test_util import check_grads
 
 import delucax as dlx
+
+
+pytestmark = needs_x64
 
 
 A = jnp.array([[1.0, 1.0], [0.0, 1.0]])

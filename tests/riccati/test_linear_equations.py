@@ -9,6 +9,9 @@ from jax.test_util import check_grads
 import delucax as dlx
 
 
+pytestmark = needs_x64
+
+
 rng = np.random.default_rng(0)
 A, B = rng.normal(size=(5, 5)) / np.sqrt(5), rng.normal(size=(3, 3)) / np.sqrt(3)
 Q, C = rng.normal(size=(5, 5)), rng.normal(size=(5, 3))

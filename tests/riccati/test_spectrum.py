@@ -8,6 +8,9 @@ from delucax.math._linear_solve import is_definite, solve
 from delucax.riccati._spectrum import spectral_abscissa, spectral_radius
 
 
+pytestmark = needs_x64
+
+
 def matrices(n):
     rng = np.random.default_rng(n)
     A = rng.normal(size=(n, n)) / np.sqrt(n)

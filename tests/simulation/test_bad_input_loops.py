@@ -5,9 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import user_error
+from helpers import once, user_error
 
 import delucax as dlx
+
+
+pytestmark = once
 
 
 PENDULUM = dlx.systems.Pendulum()

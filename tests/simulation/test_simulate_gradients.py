@@ -10,6 +10,9 @@ from jaxtyping import Array
 import delucax as dlx
 
 
+pytestmark = needs_x64
+
+
 PENDULUM = dlx.systems.Pendulum(damping=0.1)
 FEEDBACK = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
 INTEGRATOR = dlx.system(lambda t, x, u, w: u, states=1, controls=1)

@@ -1,10 +1,13 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import user_error
+from helpers import once, user_error
 
 import delucax as dlx
 from delucax import training
+
+
+pytestmark = once
 
 
 ENV = dlx.make("pendulum")

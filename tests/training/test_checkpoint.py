@@ -11,11 +11,14 @@ import jax.random as jr
 import numpy as np
 import optax
 import pytest
-from helpers import user_error
+from helpers import once, user_error
 from jaxtyping import Array
 
 import delucax as dlx
 from delucax.training import fit
+
+
+pytestmark = once
 
 
 class Line(dlx.AbstractController):

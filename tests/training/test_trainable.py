@@ -4,11 +4,14 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import optax
-from helpers import assert_close, user_error
+from helpers import assert_close, once, user_error
 from jaxtyping import Array
 
 import delucax as dlx
 from delucax.training import fit
+
+
+pytestmark = once
 
 
 class Plant(eqx.Module):
