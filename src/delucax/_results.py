@@ -23,7 +23,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     not_stabilisable = (
         "The pair (A, B) is not stabilisable: no control moves some mode that does not "
-        "decay."
+        "decay, or so weakly that rounding of the data hides it."
     )
     not_stabilising = (
         "There is no stabilising solution: the cost may not see an unstable mode, or "
@@ -31,7 +31,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     on_boundary = (
         "The closed loop is on the boundary of stability, up to rounding: a mode there "
-        "is not seen by the cost, or the cost is the least that has a minimum."
+        "is not seen by the cost, or the cost is the least that has a minimum, or the "
+        "precision is too low to tell."
     )
     ill_posed = (
         "The data are not those of a well-posed problem: not finite, a weight that is "

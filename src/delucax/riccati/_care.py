@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 
 from ..math._linear_solve import full_precision, is_definite, solve, symmetric
+from ..math._size import relative_size, size
 from ._arguments import complex_form, is_complex, real_form, riccati_arguments
 from ._dare import double
 from ._lyapunov import lyapunov
@@ -132,8 +133,7 @@ def _equation(A, B, Q, R, S, E, X):
     weighted, quadratic, _, closed_loop = _terms(A, B, R, S, E, X)
     moved = weighted @ A
     error = symmetric(moved + moved.T - quadratic + Q)
-    size = sum(jnp.linalg.norm(M) for M in (moved, moved, quadratic, Q))
-    relative = jnp.linalg.norm(error) / jnp.where(size == 0, 1, size)
+    relative = relative_size(error, moved, moved, quadratic, Q)
     return error, (relative, closed_loop)
 
 
@@ -143,7 +143,7 @@ def _find(A, B, Q, R, S, E) -> Found:
     n, m, dtype = A.shape[0], B.shape[1], A.dtype
     eps = float(jnp.finfo(dtype).eps)
     plain_A, plain_B = (A, B) if E is None else (solve(E, A), solve(E, B))
-    slack = eps * jnp.linalg.norm(R)
+    slack = eps * size(R)
     posed = is_definite(R - slack * jnp.eye(m, dtype=dtype))
     for M in (plain_A, plain_B, Q, R, S):
         posed = posed & jnp.all(jnp.isfinite(M))
@@ -156,8 +156,8 @@ def _find(A, B, Q, R, S, E) -> Found:
             lambda loop, error: outside(E, lyapunov(loop, error)),
             outside(E, X),
         )
-        abscissa, size = abscissa_and_size(closed_loop)
-        rounding = n * eps * size
+        abscissa, scale = abscissa_and_size(closed_loop)
+        rounding = n * eps * scale
         # A change of Q by rounding moves eigenvalues on the axis off it by its root.
         reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
         return Attempt(
@@ -167,7 +167,8 @@ def _find(A, B, Q, R, S, E) -> Found:
             gap=-abscissa,
             rounding=rounding,
             near=jnp.abs(abscissa) < reach,
-            around=jnp.abs(abscissa) < 4 * eps**0.125 * jnp.linalg.norm(closed_loop),
+            modest=size(X) * eps**0.5 < size_Q,
+            around=jnp.abs(abscissa) < 4 * eps**0.125 * size(closed_loop),
             iterations=iterations,
         )
 
@@ -185,7 +186,7 @@ def _start(A, B, Q, R, S, second):
     by_sign, sign_steps = _by_sign(A, G, Q, ~second)
     by_doubling, doublings = _by_doubling(A, G, Q, second)
     X = jnp.where(second, by_doubling, by_sign)
-    return X, jnp.linalg.norm(G), jnp.where(second, doublings, sign_steps)
+    return X, size(G), jnp.where(second, doublings, sign_steps)
 
 
 def _by_sign(A, G, Q, wanted):
@@ -208,12 +209,12 @@ def _by_sign(A, G, Q, wanted):
     def body(carry):
         W, before, _, k = carry
         turned = J(solve(W, J(both)))
-        ratio = jnp.linalg.norm(turned) / jnp.linalg.norm(W)
+        ratio = size(turned) / size(W)
         # Scaling speeds up the way to the neighbourhood of the limit, where it would
         # keep the iteration from settling.
         scale = jnp.where(before < 1e-2, 1, jnp.sqrt(ratio))
         new = symmetric(scale * W + turned / scale) / 2
-        change = jnp.linalg.norm(new - W) / jnp.linalg.norm(new)
+        change = size(new - W) / size(new)
         stalled = (change < 1e-6) & (change > before / 2)
         # A NaN compares false, so that a lane that diverges stops.
         going = (change > 10 * eps) & ~stalled
@@ -237,7 +238,7 @@ def _by_sign(A, G, Q, wanted):
 def _by_doubling(A, G, Q, wanted):
     """`X` by doubling of the Cayley transform `(H - shift)^-1 (H + shift)`."""
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
-    shift = jnp.linalg.norm(A)
+    shift = size(A)
     shift = jnp.where(shift > 0, shift, 1)
     moved = A - shift * eye
     left = solve(moved, G)

@@ -6,13 +6,13 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..math._linear_solve import full_precision, solve
+from ..math._size import relative_size
 from ._flow import hamiltonian, lyapunov, scale_of, short_element
 from ._game import (
     double,
     is_semidefinite,
     players,
     polish,
-    relative,
     rounding,
     sanitised_game,
 )
@@ -84,7 +84,7 @@ def continuous_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     moved = A.T @ X
     # What control and disturbance do nearly cancels at the least level.
     terms = (moved, moved.T, X @ B @ K[:m], X @ D @ K[m:], Q)
-    residual = relative(error, terms)
+    residual = relative_size(error, *terms)
     slack = n * jnp.finfo(A.dtype).eps * jnp.linalg.norm(A)
     loops = jnp.stack([loop, A - B @ K[:m]])
     holds = is_semidefinite(X) & is_clearly_definite(R)

@@ -8,6 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 
 from ..math._linear_solve import full_precision, is_definite, solve, symmetric
+from ..math._size import relative_size, size
 from ._arguments import complex_form, is_complex, real_form, riccati_arguments
 from ._newton import detached, found_tangent, outside, polish
 from ._search import Attempt, Found, search, SECOND, verdict, weights
@@ -131,8 +132,7 @@ def _equation(A, B, Q, R, S, E, X):
     moved = moved @ A
     weight = X if E is None else E.T @ X @ E
     error = symmetric(moved - weight - quadratic + Q)
-    size = sum(jnp.linalg.norm(M) for M in (moved, weight, quadratic, Q))
-    relative = jnp.linalg.norm(error) / jnp.where(size == 0, 1, size)
+    relative = relative_size(error, moved, weight, quadratic, Q)
     return error, (relative, closed_loop)
 
 
@@ -147,8 +147,8 @@ def _find(A, B, Q, R, S, E) -> Found:
         posed = posed & jnp.all(jnp.isfinite(M))
 
     def attempt(kind):
-        q, r, s, size = weights(kind, Q, R, S)
-        height = size * jnp.where(kind == SECOND, _SECOND_START, 1)
+        q, r, s, size_Q = weights(kind, Q, R, S)
+        height = size_Q * jnp.where(kind == SECOND, _SECOND_START, 1)
         X, iterations = _start(plain_A, plain_B, q, r, s, height)
         X, residual, closed_loop = polish(
             lambda X: _equation(A, B, q, r, s, E, X),
@@ -165,6 +165,7 @@ def _find(A, B, Q, R, S, E) -> Found:
             gap=gap,
             rounding=jnp.asarray(n * eps, dtype),
             near=jnp.abs(gap) < 10 * eps**0.5,
+            modest=size(X) * eps**0.5 < size_Q,
             around=jnp.abs(gap) < 4 * eps**0.125,
             iterations=iterations,
         )
@@ -175,8 +176,8 @@ def _find(A, B, Q, R, S, E) -> Found:
 def _is_semidefinite(weight):
     """Whether a symmetric matrix has no negative eigenvalue, up to rounding."""
     m, dtype = weight.shape[0], weight.dtype
-    size = jnp.linalg.norm(weight)
-    slack = 100 * m * jnp.finfo(dtype).eps * jnp.where(size > 0, size, 1)
+    scale = size(weight)
+    slack = 100 * m * jnp.finfo(dtype).eps * jnp.where(scale > 0, scale, 1)
     return is_definite(symmetric(weight) + slack * jnp.eye(m, dtype=dtype))
 
 
@@ -217,9 +218,8 @@ def double(A, G, H, X0, wanted):
             for new, old in zip(after, (A, G, H), strict=True)
         )
         # The next change is at most |A|^2 |H|.
-        size = jnp.linalg.norm(X0 + H)
-        next_change = jnp.linalg.norm(A) ** 2 * jnp.linalg.norm(H)
-        rest = jnp.minimum(jnp.linalg.norm(change), next_change) / size
+        next_change = size(A) ** 2 * size(H)
+        rest = jnp.minimum(size(change), next_change) / size(X0 + H)
         return A, G, H, jnp.where(finite, rest, 0), k + 1
 
     rest = jnp.where(wanted, jnp.asarray(jnp.inf, A.dtype), 0)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..math._linear_solve import full_precision, solve
+from ..math._size import relative_size
 from ._level import Game
 from ._recursion import gain, is_saddle, joined, one_step, symmetric
 from ._spectrum import spectral_radius
@@ -71,18 +72,12 @@ def discrete_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     # What control and disturbance do nearly cancels at the least level.
     moved = A.T @ X
     terms = (moved @ A, X, moved @ B @ K[:m], moved @ D @ K[m:], Q)
-    residual = relative(error, terms)
+    residual = relative_size(error, *terms)
     bound = 1 - n * jnp.finfo(A.dtype).eps
     loops = jnp.stack([loop, A - B @ K[:m]])
     holds = is_semidefinite(X) & is_saddle(pivot, D.shape[1])
     holds &= jnp.all(jax.vmap(spectral_radius)(loops) < bound)
     return Game(X, residual, holds, residual < rounding(n, A.dtype), iterations)
-
-
-def relative(error: Array, terms: tuple) -> Array:
-    """The norm of an equation's residual over the sum of the norms of its terms."""
-    size = sum(jnp.linalg.norm(M) for M in terms)
-    return jnp.linalg.norm(error) / jnp.where(size == 0, 1, size)
 
 
 def double(element, X0):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..math._linear_solve import solve
+from ..math._size import relative_size
 from ._stein import smith
 
 
@@ -55,8 +56,7 @@ def stable_sylvester(
     def measured(X):
         left, right = A @ X, X @ other
         rest = C - left - right
-        size = sum(jnp.linalg.norm(M) for M in (left, right, C))
-        return rest, jnp.linalg.norm(rest) / jnp.where(size == 0, 1, size)
+        return rest, relative_size(rest, left, right, C)
 
     def more(carry):
         *_, going, k = carry

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._results import choose, Result, RESULTS
+from ..math._size import size
 
 
 # What an attempt is made at.
@@ -31,6 +32,7 @@ class Attempt(NamedTuple):
     rounding: Array  # of the gap
     near: Array  # whether the gap is so small that it has to be looked at
     around: Array  # whether it is small
+    modest: Array  # whether X is far from what rounding makes of an infinite one
     iterations: Array
 
 
@@ -84,6 +86,9 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
             return jnp.where(take, now, before)
 
         survives = stable & (new.residual <= close**0.5)
+        # Rounding hides on which side of the boundary the loop is.
+        undecided = ~stable & (new.gap >= -new.rounding)
+        undecided &= (new.residual <= close) & new.modest
         same = jnp.abs(new.gap - found.gap) <= _ALIKE * found.gap
         found = found._replace(
             X=pick(new.X, found.X),
@@ -94,8 +99,14 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
             gap=pick(new.gap, found.gap),
             stable=pick(stable, found.stable),
             fragile=jnp.where(kind == SHAKEN, ~(survives & same), found.fragile),
-            stabilisable=jnp.where(kind == PLAIN, survives, found.stabilisable),
-            on_edge=jnp.where(kind == LIFTED, survives & new.around, found.on_edge),
+            stabilisable=jnp.where(
+                kind == PLAIN, survives | undecided, found.stabilisable
+            ),
+            on_edge=jnp.where(
+                kind == PLAIN,
+                undecided,
+                jnp.where(kind == LIFTED, survives & new.around, found.on_edge),
+            ),
         )
         after_given = jnp.where(
             solved,
@@ -145,12 +156,12 @@ def weights(
     n, m, dtype = Q.shape[0], R.shape[0], Q.dtype
     eps = jnp.finfo(dtype).eps
     eye_Q, eye_R = jnp.eye(n, dtype=dtype), jnp.eye(m, dtype=dtype)
-    size_Q, size_R = jnp.linalg.norm(Q), jnp.linalg.norm(R)
+    size_Q, size_R = size(Q), size(R)
     unit = jnp.where(size_R > 0, size_R, 1)
-    size = jnp.where(size_Q > 0, size_Q, unit)
+    scale = jnp.where(size_Q > 0, size_Q, unit)
     change = jnp.where(kind == SHAKEN, -10 * n * eps * size_Q, 0)
-    change = jnp.where(kind == LIFTED, eps**0.5 * size, change)
+    change = jnp.where(kind == LIFTED, eps**0.5 * scale, change)
     plain = kind == PLAIN
-    Q = jnp.where(plain, size * eye_Q, Q + change * eye_Q)
+    Q = jnp.where(plain, scale * eye_Q, Q + change * eye_Q)
     R = jnp.where(plain, unit * eye_R, R)
-    return Q, R, jnp.where(plain, 0, S), size
+    return Q, R, jnp.where(plain, 0, S), scale

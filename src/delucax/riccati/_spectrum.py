@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..math._size import size
+
 
 _SQUARINGS = 60
 """Beyond it no more digits of `log |A^N| / N` are to be had in float64."""
@@ -49,16 +51,15 @@ def abscissa_and_size(
     if A.shape[0] > _LARGE:
         part = span.T @ A @ span
         # Directions left out come last.
-        size = jnp.linalg.norm(part)
-        part = part - jnp.diag(jnp.where(kept, 0, size))
+        part = part - jnp.diag(jnp.where(kept, 0, size(part)))
         within, *_ = _slowest(balanced(part), False)
         value = jnp.where(found, within, value)
-    return value, jnp.linalg.norm(A)
+    return value, size(A)
 
 
 def _slowest(A, probing):
-    size = jnp.linalg.norm(A)
-    h = 0.25 / jnp.where(size > 0, size, 1)
+    scale = size(A)
+    h = 0.25 / jnp.where(scale > 0, scale, 1)
     logarithm, *rest = _growth(_exponential(h * A), probing)
     return logarithm / h, *rest
 
@@ -92,10 +93,10 @@ def _growth(A, probing):
 
     def body(carry):
         power, span, kept, logarithm, weight, _ = carry
-        size = jnp.linalg.norm(power)
-        finished = ~(size > 0)
-        scaled = power / jnp.where(finished, 1, size)
-        logarithm = logarithm + weight * jnp.log(size)
+        grown = size(power)
+        finished = ~(grown > 0)
+        scaled = power / jnp.where(finished, 1, grown)
+        logarithm = logarithm + weight * jnp.log(grown)
         if probing:
             span, kept, left = _range(scaled, probes)
             finished = finished | (left < 4 * math.sqrt(n) * eps)
@@ -115,7 +116,7 @@ def _range(power, probes):
     # What is as small as the rounding of the rest is no direction of the range.
     kept = weight > math.sqrt(jnp.finfo(power.dtype).eps) * jnp.max(weight)
     basis = jnp.where(kept, basis, 0)
-    return basis, kept, jnp.linalg.norm(power - basis @ (basis.T @ power))
+    return basis, kept, size(power - basis @ (basis.T @ power))
 
 
 def balanced(A: Float[Array, "n n"]) -> Float[Array, "n n"]:

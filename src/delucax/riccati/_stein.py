@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..math._linear_solve import full_precision as full_precision, solve as solve
+from ..math._size import relative_size
 from ._spectrum import spectral_radius as spectral_radius
 
 
@@ -48,7 +49,7 @@ def smith(
         change = left @ X @ right
         X = X + change
         # A NaN compares false, so that a lane that diverges stops.
-        relative = jnp.linalg.norm(change) / jnp.linalg.norm(X)
+        relative = relative_size(change, X)
         return X, tuple(power @ power for power in powers), relative, k + 1
 
     start = (C, powers, jnp.asarray(jnp.inf, C.dtype), jnp.asarray(0))
