@@ -52,6 +52,10 @@ test-float64: $(VENV)/.tests ## the tests in double precision; the docs' example
 	JAX_ENABLE_X64=1 $(pytest) --ignore tests/contracts/test_public.py \
 		--ignore tests/test_docs.py $(PYTEST_ARGS)
 
+.PHONY: thorough
+thorough: $(VENV)/.tests ## the tests that `test` leaves out, for they compile for minutes
+	JAX_ENABLE_X64=1 $(pytest) -m thorough $(PYTEST_ARGS)
+
 .PHONY: notebooks
 notebooks: $(VENV)/.tests ## run every notebook from top to bottom
 	CI=1 MPLBACKEND=agg $(pytest) -o addopts= -W default \

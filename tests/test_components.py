@@ -61,8 +61,8 @@ def test_same_derivatives():
 
     ours, plain = scalar(by_components(_everything)), scalar(_everything)
     for derivative in (jax.grad, jax.jacfwd, jax.hessian):
-        found = derivative(ours, (0, 1, 2))(*_arguments())
-        expected = derivative(plain, (0, 1, 2))(*_arguments())
+        found = jax.jit(derivative(ours, (0, 1, 2)))(*_arguments())
+        expected = jax.jit(derivative(plain, (0, 1, 2)))(*_arguments())
         _leaves_close(found, expected)
 
 
@@ -71,7 +71,7 @@ def test_batches_and_loops():
     batch = jnp.stack([x, 2 * x, -x])
     f = by_components(lambda x: _everything(x, A, s)["w"])
     g = lambda x: _everything(x, A, s)["w"]
-    _leaves_close(jax.vmap(f)(batch), jax.vmap(g)(batch))
+    _leaves_close(jax.jit(jax.vmap(f))(batch), jax.jit(jax.vmap(g))(batch))
     step = by_components(lambda x, k: (0.1 * f(x) + k, x[0]))
     _, found = jax.lax.scan(step, x, jnp.arange(3.0))
     _, expected = jax.lax.scan(lambda x, k: (0.1 * g(x) + k, x[0]), x, jnp.arange(3.0))
@@ -94,8 +94,7 @@ def test_the_gradient_does_not_pad():
     assert "pad[" not in program(by_components(loss))
 
 
-@needs_x64
 def test_check_grads():
     x, A, s = _arguments()
-    f = by_components(lambda x: _everything(x, A, s)["n"])
+    f = jax.jit(by_components(lambda x: _everything(x, A, s)["n"]))
     check_grads(f, (x,), order=2, modes=("fwd", "rev"))

@@ -7,7 +7,6 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
-    tolerance,
     user_error,
 )
 
@@ -48,16 +47,14 @@ def swept(model, discrete):
     return np.max(sizes), omegas[np.argmax(sizes)]
 
 
-@pytest.mark.parametrize(
-    "shape, discrete", [((4, 2, 3), False), ((5, 2, 2), False), ((5, 2, 2), True)]
-)
+@pytest.mark.parametrize("shape, discrete", [((4, 2, 3), False), ((5, 2, 2), True)])
 def test_norms_are_controls_and_no_sweep_is_above(shape, discrete):
     for seed in (0, 1):
         model, theirs = random_model(seed, *shape, discrete)
         peak = an.hinf_norm(model)
         gain, omega = swept(model, discrete)
         assert peak.result == dlx.RESULTS.successful
-        slack = tolerance(1e-4, 1e-13)
+        slack = 1e-13
         assert gain * (1 - slack) <= peak.gain <= gain * (1 + 2e-4)
         if omega > 0:
             assert_close(peak.frequency, omega, rtol=2e-2)
@@ -65,15 +62,14 @@ def test_norms_are_controls_and_no_sweep_is_above(shape, discrete):
             assert_close(peak.frequency, 0, atol=1e-3)
         there = an.frequency_response(model, peak.frequency)
         there = np.linalg.norm(np.asarray(there), 2)
-        assert_close(there, peak.gain, rtol=tolerance(1e-4, 1e-13))
+        assert_close(there, peak.gain, rtol=1e-13)
         h2 = control.system_norm(theirs, 2)
-        assert_close(an.h2_norm(model), h2, rtol=tolerance(1e-4, 1e-12))
+        assert_close(an.h2_norm(model), h2, rtol=1e-12)
         if shape[1] == shape[2]:  # python-control refuses others
             hinf = control.system_norm(theirs, "inf", tol=1e-11)
-            assert_close(peak.gain, hinf, rtol=tolerance(1e-4, 1e-10))
+            assert_close(peak.gain, hinf, rtol=1e-10)
 
 
-@needs_x64
 @pytest.mark.parametrize("damping", [0.3, 1e-3, 1e-6])
 def test_resonance_is_the_formula(damping):
     A = jnp.array([[0.0, 1.0], [-1.0, -2 * damping]])
@@ -84,7 +80,6 @@ def test_resonance_is_the_formula(damping):
     assert_close(peak.frequency, np.sqrt(1 - 2 * damping**2), rtol=1e-9)
 
 
-@needs_x64
 def test_of_two_peaks_the_higher_is_found():
     # Two resonances far apart, the narrow one higher by one part in a thousand.
     def resonance(omega, damping, gain):
@@ -113,70 +108,74 @@ def spring_chain(theta, discrete):
     return dlx.c2d(system, 0.4) if discrete else system
 
 
-@needs_x64
-@pytest.mark.parametrize("discrete", [False, True])
-def test_gradients_are_central_differences(discrete):
-    theta = jnp.array([1.0, 0.1, 1.5])
+THETA = np.array([1.0, 0.1, 1.5])
+SIDES = np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))])
 
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_gradients_are_central_differences_beside_an_unstable_model(discrete):
     def measures(theta):
         model = spring_chain(theta, discrete)
-        peak = an.hinf_norm(model)
-        return jnp.stack([peak.gain, peak.frequency, an.h2_norm(model)])
+        peak = an.hinf_norm(model, throw=False)
+        values = jnp.stack([peak.gain, an.h2_norm(model), peak.frequency])
+        return values, values
 
-    steps = 1e-6 * jnp.concatenate([jnp.eye(3), -jnp.eye(3)])
-    around = jax.jit(jax.vmap(measures))(theta + steps)
-    numeric = (around[:3] - around[3:]).T / 2e-6
+    thetas = np.concatenate([THETA + 1e-6 * SIDES, [[1, -5, 1.5]]])
     mode = jax.jacfwd if discrete else jax.jacrev
-    assert_close(jax.jit(mode(measures))(theta), numeric, rtol=1e-6, atol=1e-7)
+    slopes, values = jax.jit(jax.vmap(mode(measures, has_aux=True)))(thetas)
+    numeric = np.transpose(values[:3] - values[3:6]) / 2e-6
+    assert_close(slopes[6], numeric, rtol=1e-6, atol=1e-7)
+    # The unstable one harms no other.
+    assert np.all(np.isinf(values[7, :2])) and np.all(np.isfinite(values[:7]))
+    assert np.all(np.isfinite(slopes))
 
 
-@needs_x64
 def test_second_derivatives_are_central_differences():
-    theta = jnp.array([1.0, 0.1, 1.5])
-    gain = lambda theta: an.hinf_norm(spring_chain(theta, False)).gain
-    slope = jax.jit(jax.grad(gain))
-    curvature = jax.jit(jax.hessian(gain))(theta)
-    for i in range(3):
-        h = jnp.zeros(3).at[i].set(1e-5)
-        numeric = (slope(theta + h) - slope(theta - h)) / 2e-5
-        assert_close(curvature[i], numeric, rtol=1e-6, atol=1e-6)
+    gain = lambda theta: an.hinf_norm(spring_chain(theta, False), throw=False).gain
+
+    def slope(theta):
+        found = jax.grad(gain)(theta)
+        return found, found
+
+    both = jax.jit(jax.vmap(jax.jacfwd(slope, has_aux=True)))
+    curvatures, slopes = both(THETA + 1e-5 * SIDES)
+    numeric = (slopes[:3] - slopes[3:6]) / 2e-5
+    assert_close(curvatures[6], numeric, rtol=1e-6, atol=1e-6)
 
 
 def test_alike_channels_have_finite_gradients():
     def gain(a):
         system = LinearSystem(-a * jnp.eye(3), jnp.eye(3))
-        return an.hinf_norm(system).gain
+        return an.hinf_norm(system, throw=False).gain
 
-    value, slope = jax.value_and_grad(gain)(jnp.asarray(2.0))
+    value, slope = jax.jit(jax.value_and_grad(gain))(2.0)
     assert_close(value, 0.5, rtol=1e-6)
     assert_close(slope, -0.25, rtol=1e-4)
 
 
-def test_unstable_models_have_infinite_norms_and_harm_no_other():
-    def measures(a):
-        A = jnp.array([[0.0, 1.0], [-4.0, -1.0]]).at[1, 1].set(-a)
-        system = LinearSystem(A, jnp.array([[0.0], [1.0]]), C=jnp.array([[1.0, 0.0]]))
+def test_unstable_models_have_infinite_norms():
+    values = []
+    for damping in (0.5, 0.0, -0.5):
+        A = np.array([[0.0, 1.0], [-4.0, -damping]])
+        system = LinearSystem(A, np.array([[0.0], [1.0]]), C=np.array([[1.0, 0.0]]))
         peak = an.hinf_norm(system, throw=False)
-        return jnp.stack([peak.gain, an.h2_norm(system), peak.frequency])
-
-    dampings = jnp.array([0.5, 0.0, -0.5])
-    twice = lambda a: (measures(a), measures(a))
-    slopes, values = jax.jit(jax.vmap(jax.jacfwd(twice, has_aux=True)))(dampings)
+        values.append([peak.gain, an.h2_norm(system), peak.frequency])
+    values = np.array(values)
     assert_close(values[1:, :2], np.full((2, 2), np.inf))
     # Where the pole is that is to blame.
     assert_close(values[1:, 2], [2.0, np.sqrt(4 - 0.0625)], rtol=1e-5)
-    assert np.all(np.isfinite(slopes))
     # Of 1 / (s^2 + s/2 + 4), with damping ratio 1/8.
     expected = [1 / (4 * 0.25 * np.sqrt(1 - 1 / 64)), np.sqrt(1 / (2 * 4 * 0.5))]
     assert_close(values[0, :2], expected, rtol=1e-5)
 
 
 def test_a_gain_of_zero():
-    A, B = -jnp.eye(2), jnp.array([[1.0], [0.0]])
-    silent = LinearSystem(A, B, C=jnp.array([[0.0, 1.0]]))
+    A, B = -np.eye(2), np.array([[1.0], [0.0]])
+    silent = LinearSystem(A, B, C=np.array([[0.0, 1.0]]))
     assert an.hinf_norm(silent).gain == 0
-    assert an.h2_norm(silent) == 0
-    slope = jax.grad(lambda A: an.h2_norm(LinearSystem(A, B, silent.C)))(A)
+    norm = lambda A: an.h2_norm(LinearSystem(A, B, silent.C))
+    value, slope = jax.jit(jax.value_and_grad(norm))(A)
+    assert value == 0
     assert np.all(np.isfinite(slope))
 
 
@@ -189,17 +188,17 @@ def test_frequency_response_and_dcgain_are_controls():
         s = np.exp(1j * omegas * 0.3) if discrete else 1j * omegas
         expected = theirs(s.reshape(-1), squeeze=False)
         expected = np.moveaxis(expected, -1, 0).reshape(found.shape)
-        close = tolerance(1e-4, 1e-12)
+        close = 1e-12
         assert_close(found, expected, rtol=close, atol=close)
         assert_close(an.dcgain(model), theirs.dcgain(), rtol=close, atol=close)
 
 
-@needs_x64
 def test_frequency_response_is_differentiable_in_the_frequency():
     model, _ = random_model(4, 3, 1, 1, False)
     decibels = lambda w: 20 * jnp.log10(jnp.abs(an.frequency_response(model, w)[0, 0]))
-    slope = jax.grad(decibels)(jnp.asarray(1.3))
-    assert_close(slope, central_difference(decibels, jnp.asarray(1.3)), atol=1e-7)
+    both = jax.jit(jax.value_and_grad(decibels))
+    numeric = central_difference(lambda w: both(w)[0], 1.3)
+    assert_close(both(1.3)[1], numeric, atol=1e-7)
 
 
 def test_integrators_have_no_dcgain():
@@ -214,7 +213,7 @@ def test_integrators_have_no_dcgain():
         )
     gain = lambda A: an.dcgain(LinearSystem(A, B), throw=False)[0, 0]
     As = jnp.stack([A, A.at[1, 0].set(-2.0)])
-    values, slopes = jax.vmap(jax.value_and_grad(gain))(As)
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(gain)))(As)
     assert_close(values, [np.inf, 0.5], rtol=1e-6)
     assert np.all(np.isfinite(slopes))
     response = an.frequency_response(integrator, jnp.array([0.0, 1.0]))

@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, tolerance, user_error
+from helpers import assert_close, needs_x64, once, tolerance, user_error
 from jax.flatten_util import ravel_pytree
 
 import delucax as dlx
@@ -20,6 +20,7 @@ DT = 0.1
 A = jnp.array([[1.0, DT], [0.3 * DT, 0.98]])
 B = jnp.array([[0.0], [DT]])
 FEEDBACK = jnp.array([[1.0, 1.5]])
+CLOSE = dict(rtol=tolerance(1e-4, 1e-11), atol=tolerance(1e-5, 1e-12))
 
 
 class Case(NamedTuple):
@@ -146,32 +147,30 @@ def test_every_controller_is_listed():
 
 
 @every
-def test_jit(case, key):
-    """It goes into plain `jax.jit`, and other numbers in it do not compile again."""
+def test_jit_and_vmap(case, key):
+    """It goes into plain `jax.jit`, where other numbers in it do not compile again; a
+    batch over controllers and keys is what the loop over them gives."""
     env, traced = environment(), 0
 
     @jax.jit
+    @jax.vmap
     def run(controller, key):
         nonlocal traced
         traced += 1
-        return dlx.rollout(env, controller, key=key).total_cost
+        found = dlx.rollout(env, controller, key=key)
+        return found.controls, found.total_cost
 
-    first = run(case.make(1.0), key)
-    second = run(case.make(1.1), jax.random.key(5))
-    assert np.isfinite(first) and np.isfinite(second) and first != second
+    one, other = case.make(1.0), case.make(1.1)
+    pair = jax.tree.map(lambda *leaves: jnp.stack(leaves), one, other)
+    turned = jax.tree.map(lambda leaf: leaf[::-1], pair)
+    keys = jax.random.split(key, 2)
+    (batch, costs), (_, turned_costs) = run(pair, keys), run(turned, keys[::-1])
+    assert np.all(np.isfinite(costs)) and costs[0] != costs[1]
+    assert_close(turned_costs, costs[::-1], **CLOSE)
     assert traced == 1
-
-
-@every
-def test_vmap(case, key):
-    """A batch over controllers and keys is what the loop over them gives."""
-    env = environment()
-    run = lambda controller, key: dlx.rollout(env, controller, key=key).controls
-    pair, keys = [case.make(1.0), case.make(1.1)], jax.random.split(key, 2)
-    batch = jax.vmap(run)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *pair), keys)
-    close = dict(rtol=tolerance(1e-4, 1e-11), atol=tolerance(1e-5, 1e-12))
-    for controls, controller, key in zip(batch, pair, keys, strict=True):
-        assert_close(controls, run(controller, key), **close)
+    for controls, controller, key in zip(batch, (one, other), keys, strict=True):
+        alone = dlx.rollout(env, controller, key=key).controls
+        assert_close(controls, alone, **CLOSE)
 
 
 class Known(dlx.AbstractController):
@@ -190,6 +189,7 @@ class Known(dlx.AbstractController):
         return self.base.applied(u, cost, state)
 
 
+@needs_x64
 @every
 def test_scan(case, key):
     """Calling it by hand, its state carried by `lax.scan`, is what a rollout does."""
@@ -211,8 +211,7 @@ def test_scan(case, key):
 
     _, controls = lax.scan(step, (env.reset(key), state), (jnp.arange(8), w))
     assert controls.shape == (8, 1)
-    close = dict(rtol=tolerance(1e-4, 1e-11), atol=tolerance(1e-5, 1e-12))
-    assert_close(controls, run.controls, **close)
+    assert_close(controls, run.controls, rtol=1e-11, atol=1e-12)
 
 
 @every
@@ -261,6 +260,7 @@ def test_precision(case, key, dtype):
     assert run.result == dlx.RESULTS.successful
 
 
+@once
 @pytest.mark.parametrize("case", PARTICULAR.values(), ids=PARTICULAR)
 def test_wrong_observation(case, key):
     """An observation of another size is an error that names both sizes."""
@@ -270,6 +270,7 @@ def test_wrong_observation(case, key):
         controller(0.0, jnp.zeros(5), state)
 
 
+@once
 @every
 def test_saved_and_loaded(case, key, tmp_path):
     """What is loaded acts as what was saved did, and compiles no more."""

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import scipy.linalg
 from helpers import assert_close, needs_x64, tolerance, user_error
-from jax.test_util import check_grads
 
 import delucax as dlx
 
@@ -98,8 +97,8 @@ def test_ill_posed_where_it_cannot_be_seen():
 
 
 def test_one_bad_member_harms_no_other():
-    As = jnp.stack([A, A - jnp.eye(2), A + 0.1 * jnp.eye(2)])
-    spoilt = As.at[1].set(jnp.diag(jnp.array([1.3, 0.2])))
+    As = np.stack([A, A - np.eye(2), A + 0.1 * np.eye(2)])
+    spoilt = np.stack([As[0], np.diag([1.3, 0.2]), As[2]])
 
     @jax.jit
     def total_of_two(As, Q):
@@ -120,25 +119,6 @@ def test_one_bad_member_harms_no_other():
     assert_close(value_beside, value)
     assert_close(gradients[0][::2], gradient[::2])
     assert_close(gradients[1], shared, rtol=1e-6)
-
-
-@needs_x64
-def test_gradients_of_every_argument():
-    arguments = (
-        jnp.array([[0.8, 0.3], [-0.2, -1.1]]),
-        jnp.array([[1.0], [0.5]]),
-        Q,
-        R,
-        jnp.array([[0.1], [-0.1]]),
-        jnp.array([[1.1, 0.1], [0.0, 0.9]]),
-    )
-
-    def facts(A, B, Q, R, S, E):
-        Q, R = (Q + Q.T) / 2, (R + R.T) / 2
-        solution = dlx.riccati.care(A, B, Q, R, S, E, throw=False)
-        return jnp.sum(jnp.sin(solution.X)) + jnp.sum(jnp.sin(solution.K))
-
-    check_grads(jax.jit(facts), arguments, 1, modes=("rev",), rtol=1e-7, eps=1e-5)
 
 
 def test_complex_data():

@@ -1,15 +1,27 @@
 """Published discrete-time systems, and families of them."""
 
+import jax
 import numpy as np
 import riccati_systems
 import scipy.linalg
-from helpers import needs_x64
+from helpers import needs_x64, once
 
 import delucax as dlx
 
 
-def exam(name, A, B, Q, R):
-    solution = dlx.riccati.dare(A, B, Q, R, throw=False)
+# Compiled once for each size.
+solve = jax.jit(lambda *problem: dlx.riccati.dare(*problem, throw=False))
+
+
+def as_floats(*problem):
+    if any(map(np.iscomplexobj, problem)):
+        return tuple(np.asarray(M, complex) for M in problem)
+    return tuple(np.asarray(M, float) for M in problem)
+
+
+def exam(name, *problem):
+    A, B, Q, R = as_floats(*problem)
+    solution = solve(A, B, Q, R)
     residual, loop = riccati_systems.discrete_residual(A, B, Q, R, solution.X)
     assert solution.result == dlx.RESULTS.successful, name
     assert residual < 1e-12 and solution.residual < 1e-12, name
@@ -33,18 +45,18 @@ def test_published_systems():
 
 @needs_x64
 def test_families():
-    systems = riccati_systems.darex_families()
+    systems = riccati_systems.darex_families(sizes=(4,))
     assert len(systems) >= 70
     for system in systems:
         exam(*system)
 
 
+@once
 def test_single_precision():
     for name, *data in riccati_systems.darex():
         if any(map(np.iscomplexobj, data)):
             continue
-        single = (np.asarray(M, np.float32) for M in data)
-        solution = dlx.riccati.dare(*single, throw=False)
+        solution = solve(*(np.asarray(M, np.float32) for M in data))
         X = np.asarray(solution.X, np.float64)
         residual, _ = riccati_systems.discrete_residual(*data, X)
         if name == "DAREX 14":

@@ -1,10 +1,11 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import assert_close, needs_x64, tolerance, user_error
-from jax.test_util import check_grads
+from helpers import assert_close, needs_x64, user_error
 
 import delucax as dlx
 
@@ -13,10 +14,10 @@ pytestmark = needs_x64
 
 
 rng = np.random.default_rng(0)
-A, B = rng.normal(size=(5, 5)) / np.sqrt(5), rng.normal(size=(3, 3)) / np.sqrt(3)
-Q, C = rng.normal(size=(5, 5)), rng.normal(size=(5, 3))
-EYE = np.eye(5)
-CLOSE = {"rtol": tolerance(1e-3, 1e-10), "atol": tolerance(1e-4, 1e-11)}
+A, B = rng.normal(size=(6, 6)) / np.sqrt(6), rng.normal(size=(3, 3)) / np.sqrt(3)
+Q, C = rng.normal(size=(6, 6)), rng.normal(size=(6, 3))
+EYE = np.eye(6)
+CLOSE = {"rtol": 1e-10, "atol": 1e-11}
 
 
 @pytest.mark.parametrize("moved", [-2, 2, 0], ids=["stable", "unstable", "both"])
@@ -25,7 +26,7 @@ def test_lyap(moved):
     solution = dlx.riccati.lyap(matrix, Q)
     X = scipy.linalg.solve_continuous_lyapunov(matrix, -Q)
     assert_close(solution.X, X, **CLOSE)
-    assert solution.residual < tolerance(1e-5, 1e-13)
+    assert solution.residual < 1e-13
 
 
 @pytest.mark.parametrize(
@@ -37,7 +38,7 @@ def test_dlyap(matrix):
     solution = dlx.riccati.dlyap(matrix, Q)
     X = scipy.linalg.solve_discrete_lyapunov(matrix, Q)
     assert_close(solution.X, X, **CLOSE)
-    assert solution.residual < tolerance(1e-5, 1e-13)
+    assert solution.residual < 1e-13
 
 
 @pytest.mark.parametrize("a, b", [(-2, -2), (-5, 2), (5, -2), (0, 0)])
@@ -52,10 +53,9 @@ def test_dsylvester(a, b):
     left, right = scipy.linalg.expm(A + a * EYE), scipy.linalg.expm(B + b * np.eye(3))
     solution = dlx.riccati.dsylvester(left, right, C)
     rest = left @ solution.X @ right - solution.X + C
-    assert np.linalg.norm(rest) < tolerance(1e-3, 1e-10) * np.linalg.norm(C)
+    assert np.linalg.norm(rest) < 1e-10 * np.linalg.norm(C)
 
 
-@needs_x64
 def test_large_and_wide():
     rng = np.random.default_rng(1)
     n = 60
@@ -71,71 +71,55 @@ def test_large_and_wide():
 
 def test_honest_where_it_cannot_be_done():
     solve = dlx.riccati.lyap
-    singular = solve(np.diag([1.0, -1]), np.eye(2), throw=False)
+    singular = solve(np.diag([1.0, -1, 2, 3, 4, 5]), EYE, throw=False)
     assert singular.result == dlx.RESULTS.ill_posed
-    both = np.diag([(-1.0) ** i * (i + 1) for i in range(20)])
-    apart = solve(both, np.eye(20), throw=False)
+    both = np.diag([(-1.0) ** i * (i + 1) for i in range(60)])
+    apart = solve(both, np.eye(60), throw=False)
     assert apart.result == dlx.RESULTS.not_separated
     with pytest.raises(RuntimeError, match="lyap: .*two sides"):
-        solve(both, np.eye(20))
-    nan = jax.jit(lambda A: solve(A, jnp.eye(2), throw=False).result)
-    assert nan(jnp.full((2, 2), jnp.nan)) == dlx.RESULTS.ill_posed
+        solve(both, np.eye(60))
 
 
 def test_complex_data():
-    turn = np.diag(np.exp(1j * np.arange(5)))
-    stable = A - 2 * EYE
-    plain = dlx.riccati.lyap(stable, Q).X
-    turned = dlx.riccati.lyap(turn @ stable @ turn.conj(), turn @ Q @ turn.conj()).X
-    assert_close(turned, turn @ plain @ turn.conj(), atol=tolerance(1e-4, 1e-12))
+    turn = np.diag(np.exp(1j * np.arange(3)))
+    stable, weight = A[:3, :3] - 2 * np.eye(3), Q[:3, :3]
+    plain = scipy.linalg.solve_continuous_lyapunov(stable, -weight)
+    turned = dlx.riccati.lyap(
+        turn @ stable @ turn.conj(), turn @ weight @ turn.conj()
+    ).X
+    assert_close(turned, turn @ plain @ turn.conj(), atol=1e-12)
 
 
 def test_one_bad_member_harms_no_other():
-    As = jnp.stack([-jnp.eye(2), jnp.diag(jnp.array([1.0, -1])), -2 * jnp.eye(2)])
+    eye = np.eye(2)
+    As = np.stack([-eye, np.diag([1.0, -1]), -2 * eye, np.full((2, 2), np.nan)])
 
     @jax.jit
-    @jax.value_and_grad
+    @functools.partial(jax.value_and_grad, has_aux=True)
     def total(Q):
         def value(A):
             solution = dlx.riccati.lyap(A, Q, throw=False)
             good = solution.result == dlx.RESULTS.successful
-            return jnp.where(good, jnp.sum(solution.X), 0)
+            ill_posed = solution.result == dlx.RESULTS.ill_posed
+            return jnp.where(good, jnp.sum(solution.X), 0), (good, ill_posed)
 
-        return jnp.sum(jax.vmap(value)(As))
+        values, which = jax.vmap(value)(As)
+        return jnp.sum(values), which
 
-    value, gradient = total(jnp.eye(2))
+    (value, (good, ill_posed)), gradient = total(eye)
+    np.testing.assert_array_equal(good, [True, False, True, False])
+    np.testing.assert_array_equal(ill_posed, [False, True, False, True])
     assert_close(value, 2 * (1 / 2 + 1 / 4), rtol=1e-6)
     assert_close(gradient, np.full((2, 2), 3 / 4), rtol=1e-6)
-
-
-SOLVES = {
-    "lyap": lambda e: dlx.riccati.lyap(A[:2, :2] - (1 + e) * EYE[:2, :2], Q[:2, :2]),
-    "dlyap": lambda e: dlx.riccati.dlyap((0.5 + e) * A[:2, :2], Q[:2, :2]),
-    "sylvester": lambda e: dlx.riccati.sylvester(
-        A[:2, :2] + (3 + e) * EYE[:2, :2], (1 + e) * B[:1, :1], (1 + e) * C[:2, :1]
-    ),
-    "dsylvester": lambda e: dlx.riccati.dsylvester(
-        (0.5 + e) * A[:2, :2], (0.5 - e) * B[:1, :1], (1 + e) * C[:2, :1]
-    ),
-}
-
-
-@needs_x64
-@pytest.mark.parametrize("name", SOLVES)
-def test_derivatives_to_second_order(name):
-    def line(e):
-        return jnp.sum(jnp.sin(SOLVES[name](e).X))
-
-    check_grads(jax.jit(line), (0.1,), 2, modes=("fwd", "rev"), rtol=1e-6, eps=1e-5)
 
 
 @pytest.mark.parametrize(
     "call, match",
     [
-        (lambda: dlx.riccati.lyap(C, Q), r"lyap: A must be square, got shape \(5, 3\)"),
-        (lambda: dlx.riccati.lyap(A, C), r"lyap: Q must have shape \(5, 5\)"),
+        (lambda: dlx.riccati.lyap(C, Q), r"lyap: A must be square, got shape \(6, 3\)"),
+        (lambda: dlx.riccati.lyap(A, C), r"lyap: Q must have shape \(6, 6\)"),
         (lambda: dlx.riccati.dlyap(A * np.nan, Q), "dlyap: A must be finite"),
-        (lambda: dlx.riccati.sylvester(A, B, Q), r"sylvester: C must have .*\(5, 3\)"),
+        (lambda: dlx.riccati.sylvester(A, B, Q), r"sylvester: C must have .*\(6, 3\)"),
         (lambda: dlx.riccati.dsylvester(A, C, C), "dsylvester: B must be square"),
     ],
 )
