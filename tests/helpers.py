@@ -11,6 +11,7 @@ import pytest
 
 needs_x64 = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="float64 only")
 needs_x32 = pytest.mark.skipif(bool(jax.config.jax_enable_x64), reason="float32 only")
+thorough = pytest.mark.thorough
 once = pytest.mark.skipif(
     bool(jax.config.jax_enable_x64), reason="precision plays no part: float32 will do"
 )

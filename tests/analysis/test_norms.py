@@ -7,6 +7,7 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
+    thorough,
     user_error,
 )
 
@@ -112,7 +113,7 @@ THETA = np.array([1.0, 0.1, 1.5])
 SIDES = np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))])
 
 
-@pytest.mark.parametrize("discrete", [False, True])
+@pytest.mark.parametrize("discrete", [False, pytest.param(True, marks=thorough)])
 def test_gradients_are_central_differences_beside_an_unstable_model(discrete):
     def measures(theta):
         model = spring_chain(theta, discrete)

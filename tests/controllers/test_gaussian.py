@@ -14,6 +14,9 @@ from helpers import (
 import delucax as dlx
 
 
+pytestmark = needs_x64
+
+
 Gaussian = dlx.controllers.Gaussian
 A = jnp.array([[1.0, 0.1], [0.0, 0.9]])
 B = jnp.array([[0.0], [0.1]])

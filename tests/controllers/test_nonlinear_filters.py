@@ -10,6 +10,7 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
+    thorough,
     user_error,
 )
 
@@ -200,7 +201,7 @@ def test_angles_wrap(kind):
     assert np.max(angles[1]) < 3.5 and np.max(found.mean[0, :, 0]) > 3.2
 
 
-@both
+@pytest.mark.parametrize("kind", [EKF, pytest.param(UKF, marks=thorough)])
 def test_gradient_of_the_likelihood(kind):
     """With respect to a length and to noise levels."""
     ys = jnp.stack([jnp.sin(0.2 * jnp.arange(6)), jnp.cos(0.2 * jnp.arange(6))], 1)

@@ -12,6 +12,7 @@ from helpers import (
     central_difference,
     dtype,
     needs_x64,
+    thorough,
     tolerance,
     user_error,
 )
@@ -327,7 +328,7 @@ def test_a_backward_solve_that_fails_is_loud():
         jax.block_until_ready(jax.grad(final_angle)(at, backsolve(max_steps=1)))
 
 
-@needs_x64
+@thorough
 def test_backsolve_inside_a_rollout():
     def slopes(dynamics):
         env = dlx.Environment(dynamics, dlx.costs.PendulumCost(), horizon=3)

@@ -68,10 +68,10 @@ def test_linearize_is_central_differences():
     for solver in (diffrax.Tsit5(), diffrax.Kvaerno3()):
         dynamics = dlx.Discretized(system, 0.05, solver)
         model = dlx.linearize(dynamics, 0.0, x, u)
+        step = jax.jit(lambda x, u, d=dynamics: d(0.0, x, u, w))
         for i in range(2):
-            f = lambda x, u, i=i, d=dynamics: d(0.0, x, u, w)[i]
-            by_x = central_difference(lambda x, f=f: f(x, u), x)
-            by_u = central_difference(lambda u, f=f: f(x, u), u)
+            by_x = central_difference(lambda x, f=step, i=i: f(x, u)[i], x)
+            by_u = central_difference(lambda u, f=step, i=i: f(x, u)[i], u)
             assert_close(model.A[i], by_x, atol=1e-8)
             assert_close(model.B[i], by_u, atol=1e-8)
         assert_close(model.E, jnp.eye(2))

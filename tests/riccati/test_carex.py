@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 import riccati_systems
 import scipy.linalg
-from helpers import needs_x64
+from helpers import (
+    needs_x64,
+    thorough,
+)
 
 import delucax as dlx
 
@@ -35,7 +38,11 @@ def exam(name, *problem):
     return solution
 
 
-@pytest.mark.parametrize("number", range(1, 21))
+LARGE = 6, 15, 16, 18, 20
+NUMBERS = [pytest.param(i, marks=thorough if i in LARGE else ()) for i in range(1, 21)]
+
+
+@pytest.mark.parametrize("number", NUMBERS)
 def test_published_systems(number):
     name, A, B, Q, R = SYSTEMS[number - 1]
     solution = exam(name, A, B, Q, R)

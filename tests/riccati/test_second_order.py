@@ -6,7 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64
+from helpers import (
+    assert_close,
+    needs_x64,
+    thorough,
+)
 
 import delucax as dlx
 
@@ -57,7 +61,14 @@ PROBLEMS = {
 OTHERS = {"dlyap": (LEFT, SQUARE), "sylvester": (STABLE, RIGHT, TALL)}
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "dare",
+        "lyap",
+        *(pytest.param(n, marks=thorough) for n in ("care", "dsylvester")),
+    ],
+)
 def test_to_second_order(name):
     solve, pairs = getattr(dlx.riccati, name), PROBLEMS[name]
 
@@ -78,6 +89,7 @@ def test_to_second_order(name):
     assert_close(derivatives, np.tile(numeric, 2), rtol=1e-6)
 
 
+@thorough
 @pytest.mark.parametrize("name", OTHERS)
 def test_forwards_over_backwards(name):
     # By the same rules as those above.

@@ -6,11 +6,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
-from helpers import assert_close, dtype, tolerance, user_error
+from helpers import (
+    assert_close,
+    dtype,
+    needs_x64,
+    tolerance,
+    user_error,
+)
 from jaxtyping import Array
 
 import delucax as dlx
 from delucax.simulation._hold import Hold, interval_before
+
+
+pytestmark = needs_x64
 
 
 PENDULUM = dlx.systems.Pendulum(damping=0.1)

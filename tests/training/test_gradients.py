@@ -5,7 +5,13 @@ import jax.random as jr
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, dtype, tolerance, user_error
+from helpers import (
+    assert_close,
+    dtype,
+    needs_x64,
+    tolerance,
+    user_error,
+)
 from jaxtyping import Array
 
 import delucax as dlx
@@ -16,6 +22,9 @@ from delucax.training import (
     LikelihoodRatio,
     scored_cost,
 )
+
+
+pytestmark = needs_x64
 
 
 A = np.array([[1.0, 0.3], [-0.2, 0.9]])

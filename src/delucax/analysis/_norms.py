@@ -17,6 +17,8 @@ from ._plant import growth, is_stable, largest_gain, Plant, plant, response, sol
 
 
 _LEVELS = 30
+_SWEEP = 64
+"""Frequencies to begin with, besides those of the poles."""
 _NEWTON_STEPS = 5
 
 
@@ -253,7 +255,7 @@ def _search(plant: Plant) -> tuple[Array, Array]:
     axis = Plant(A, B, C, D, None)
     gain = lambda w: largest_gain(response(axis, w))
     eps = jnp.finfo(A.dtype).eps
-    step = eps**0.625
+    at_infinity = largest_gain(D)
 
     def best_of(gain_now, omega_now, omegas):
         gains = jax.vmap(gain)(omegas)
@@ -267,9 +269,11 @@ def _search(plant: Plant) -> tuple[Array, Array]:
 
     poles = jnp.linalg.eigvals(A)
     at_poles = jnp.concatenate([jnp.abs(poles), jnp.abs(jnp.imag(poles))])
-    starts = jnp.concatenate([jnp.zeros(1, A.dtype), at_poles])
+    ends = jnp.log(jnp.stack([jnp.min(at_poles[:n]) / 100, jnp.max(at_poles) * 100]))
+    sweep = jnp.exp(jnp.linspace(*ends, _SWEEP))
+    starts = jnp.concatenate([jnp.zeros(1, A.dtype), at_poles, sweep])
     infinity = jnp.asarray(jnp.inf, A.dtype)
-    found = best_of(largest_gain(D), infinity, starts)
+    found = best_of(at_infinity, infinity, starts)
 
     def crossings(level):
         """Frequencies of the eigenvalues of the Hamiltonian at a level.
@@ -294,6 +298,9 @@ def _search(plant: Plant) -> tuple[Array, Array]:
 
     def body(carry):
         gain_now, omega_now, _, k = carry
+        # At the level of D the Hamiltonian is not finite, and close to it not accurate.
+        is_close = gain_now < (1 + eps**0.375) * at_infinity
+        step = jnp.where(is_close, eps**0.375, eps**0.625)
         level = (1 + step) * jnp.where(gain_now > 0, gain_now, 1)
         nodes = crossings(level)
         between = (nodes[1:] + nodes[:-1]) / 2
