@@ -135,6 +135,7 @@ def environment(dtype=None):
     )
 
 
+@once
 def test_every_controller_is_listed():
     members = {
         name

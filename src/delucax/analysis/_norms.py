@@ -269,8 +269,8 @@ def _search(plant: Plant) -> tuple[Array, Array]:
 
     poles = jnp.linalg.eigvals(A)
     at_poles = jnp.concatenate([jnp.abs(poles), jnp.abs(jnp.imag(poles))])
-    ends = jnp.log(jnp.stack([jnp.min(at_poles[:n]) / 100, jnp.max(at_poles) * 100]))
-    sweep = jnp.exp(jnp.linspace(*ends, _SWEEP))
+    low, high = jnp.log(jnp.min(at_poles[:n]) / 100), jnp.log(jnp.max(at_poles) * 100)
+    sweep = jnp.exp(jnp.linspace(low, high, _SWEEP))
     starts = jnp.concatenate([jnp.zeros(1, A.dtype), at_poles, sweep])
     infinity = jnp.asarray(jnp.inf, A.dtype)
     found = best_of(at_infinity, infinity, starts)

@@ -1,12 +1,12 @@
 """Linear models as `control.StateSpace`, and back."""
 
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from .._check import is_concrete
+from .._extras import extra
 from .._names import indexed_names
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
@@ -44,7 +44,7 @@ def to_control(
         ```
     """
     where = "to_control"
-    control = _control(where)
+    control = extra("control", "control")
     if not isinstance(model, LinearSystem | LinearDynamics):
         raise ValueError(
             f"{where}: model must be a LinearSystem or LinearDynamics "
@@ -122,7 +122,7 @@ def from_control(
         ```
     """
     where = "from_control"
-    control = _control(where)
+    control = extra("control", "control")
     if not isinstance(system, control.StateSpace):
         raise ValueError(
             f"{where}: system must be a control.StateSpace (`control.ss` makes one of "
@@ -173,12 +173,3 @@ def _index(disturbance: Any, labels: list[str], where: str) -> int:
         f"{where}: disturbances must be among the inputs {labels}, by name or index, "
         f"got {disturbance!r}."
     )
-
-
-def _control(where: str) -> Any:
-    try:
-        return import_module("control")
-    except ImportError as error:
-        raise ImportError(
-            f"{where} needs python-control: pip install 'delucax[control]'."
-        ) from error

@@ -1,0 +1,95 @@
+"""Linear models from files of matrices."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..dynamics import LinearDynamics
+from ..systems import LinearSystem
+
+
+def read_linear(
+    path: str | os.PathLike, *, dt: Any = None
+) -> LinearSystem | LinearDynamics:
+    """A linear model from a file of its matrices, `.npz` of NumPy or `.mat` of MATLAB.
+
+    The file holds `A` and `B`, and may hold `C`, `E` (how disturbances enter), `D` if
+    it is zero, and the step `dt`.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `dt`: the step, 0 for continuous time; by default the one that the file holds.
+
+    **Returns:** [`delucax.LinearDynamics`][] with a step, and
+    [`delucax.systems.LinearSystem`][] in continuous time.
+
+    **Raises:** `ValueError` if the file is of another kind, lacks `A`, `B` or a step,
+    has one that differs from `dt`, has a `D` that is not zero, or if shapes do not fit;
+    `OSError` if it cannot be read.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import numpy as np
+
+        np.savez("plant.npz", A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [1.0]], dt=0.1)
+        env = dlx.make("lds", system=dlx.interop.read_linear("plant.npz"))
+        ```
+    """
+    where = "read_linear"
+    held = _matrices(Path(path), where)
+    for name in ("A", "B"):
+        if name not in held:
+            raise ValueError(
+                f"{where}: '{path}' must hold A and B, got {', '.join(held) or 'none'}."
+            )
+    if "D" in held and np.any(held["D"]):
+        raise ValueError(
+            f"{where}: D must be zero, as the models here have no feed-through, got "
+            f"{held['D'].tolist()}."
+        )
+    if "dt" in held:
+        step = float(held["dt"].reshape(()))
+        if dt is not None and float(dt) != step:
+            raise ValueError(
+                f"{where}: dt must be that of '{path}', {step}, or left out, got {dt}."
+            )
+    elif dt is None:
+        raise ValueError(
+            f"{where}: '{path}' holds no dt; give it: 0 for continuous time, or the "
+            "step."
+        )
+    else:
+        step = float(dt)
+    matrices = [held["A"], held["B"], held.get("C"), held.get("E")]
+    if step == 0:
+        return LinearSystem(*matrices)
+    return LinearDynamics(*matrices, dt=step)
+
+
+def _matrices(path: Path, where: str) -> dict[str, Any]:
+    """The matrices in a file, by name."""
+    names = ("A", "B", "C", "D", "E", "dt")
+    if path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as file:
+            held = {name: file[name] for name in names if name in file}
+    elif path.suffix == ".mat":
+        from scipy.io import loadmat
+
+        try:
+            file = loadmat(path, variable_names=names)
+        except NotImplementedError as error:
+            raise ValueError(
+                f"{where}: '{path}' is a .mat file of version 7.3; save it with "
+                "'-v7' in MATLAB."
+            ) from error
+        held = {name: file[name] for name in names if name in file}
+    else:
+        raise ValueError(
+            f"{where}: path must end in .npz or .mat, got '{path}'."
+        )
+    return {name: np.asarray(value, float) for name, value in held.items()}
