@@ -85,6 +85,10 @@ def _as_control_bounds(value: Any) -> tuple[Array, Array] | None:
     return as_bounds(value, "Environment", "control_bounds")
 
 
+def _as_observation_bounds(value: Any) -> tuple[Array, Array] | None:
+    return as_bounds(value, "Environment", "observation_bounds")
+
+
 class Environment(eqx.Module):
     """Dynamics, a cost, and what else makes a task of them.
 
@@ -109,6 +113,9 @@ class Environment(eqx.Module):
     - `encode`: what a network or a Gymnasium user sees of an observation (cosine and
         sine of an angle, for example): a function of a vector to a vector; the identity
         by default. Controllers are given the observation itself.
+    - `observation_bounds`: `(low, high)`, each a number or a vector, between which what
+        `encode` returns lies: the observation space of a Gymnasium user. It is said,
+        not enforced. None by default.
 
     **Raises:** `ValueError` if sizes do not fit each other or bounds cross.
 
@@ -135,6 +142,9 @@ class Environment(eqx.Module):
     terminated: Callable[[RealScalar, Array], Array] | None = function_field()
     actions: Array | None = parameter()
     encode: Callable[[Array], Array] = function_field()
+    observation_bounds: tuple[Array, Array] | None = eqx.field(
+        converter=_as_observation_bounds
+    )
 
     def __init__(
         self,
@@ -148,6 +158,7 @@ class Environment(eqx.Module):
         terminated: Callable[[RealScalar, Array], Array] | None = None,
         actions: Any = None,
         encode: Callable[[Array], Array] | None = None,
+        observation_bounds: tuple[Any, Any] | None = None,
     ):
         self.dynamics = dynamics
         self.cost = cost
@@ -167,6 +178,7 @@ class Environment(eqx.Module):
         self.terminated = terminated
         self.actions = actions
         self.encode = _identity if encode is None else encode
+        self.observation_bounds = observation_bounds
 
     def __check_init__(self):
         where, dynamics = "Environment", self.dynamics
@@ -208,6 +220,14 @@ class Environment(eqx.Module):
                     raise ValueError(
                         f"{where}: control_bounds must be numbers or have shape "
                         f"({m},), got {end.shape}."
+                    )
+        if self.observation_bounds is not None:
+            size = self.feature_size
+            for end in self.observation_bounds:
+                if end.shape not in ((), (size,)):
+                    raise ValueError(
+                        f"{where}: observation_bounds must be numbers or have shape "
+                        f"({size},), got {end.shape}."
                     )
         if self.actions is not None:
             if self.actions.ndim != 2 or self.actions.shape[1] != m:

@@ -89,7 +89,5 @@ def _matrices(path: Path, where: str) -> dict[str, Any]:
             ) from error
         held = {name: file[name] for name in names if name in file}
     else:
-        raise ValueError(
-            f"{where}: path must end in .npz or .mat, got '{path}'."
-        )
+        raise ValueError(f"{where}: path must end in .npz or .mat, got '{path}'.")
     return {name: np.asarray(value, float) for name, value in held.items()}

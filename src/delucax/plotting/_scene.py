@@ -1,18 +1,17 @@
 """The figure of an animation: what stays is drawn once, what moves once a frame."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from ..environments import Environment
-from ._drawings import Drawing, drawing_for, PHASE
-from ._figure import PALETTE
+from ._drawings import drawing_for, PHASE
+from ._plant import Plant
 from ._plot import draw_panel
 from ._runs import HELD, Panel, panels_of, Run, time_label
 
@@ -53,52 +52,22 @@ class Scene:
         ]
         grid = self.figure.add_gridspec(1, 1 if drawing is None else 2)
         self.lines = self._panels(panels, grid[0, -1].subgridspec(len(panels), 1))
-        self.plant: Axes | None = None
+        self.plant: Plant | None = None
         if drawing is not None:
-            self.plant = self.figure.add_subplot(grid[0, 0])
-            self._prepare(self.plant, drawing, environment, indices)
+            ax = self.figure.add_subplot(grid[0, 0])
+            moments = map(self._moment, indices)
+            self.plant = Plant(ax, drawing, environment, run.trajectory, moments)
 
         moving = [*self.texts, *(line for line, _ in self.lines)]
-        self.moving = moving if self.plant is None else [self.plant, *moving]
+        self.moving = moving if self.plant is None else [self.plant.ax, *moving]
         for artist in self.moving:
             artist.set_animated(True)
         self.canvas.draw()
         self.figure.set_layout_engine("none")
         self.background = self.canvas.copy_from_bbox(self.figure.bbox)
 
-    def _prepare(
-        self,
-        ax: Axes,
-        drawing: Drawing,
-        environment: Environment,
-        indices: Sequence[int],
-    ) -> None:
-        ax.set_aspect("equal")
-        ax.set_axis_off()
-        self.draw, self.keywords = drawing.draw, {}
-        if drawing.setup is not None:
-            keywords = drawing.setup(ax, environment, self.run.trajectory)
-            if keywords is not None and not isinstance(keywords, Mapping):
-                raise ValueError(
-                    "animate: the setup of a drawing must return a dictionary or "
-                    f"None, got {type(keywords).__name__}."
-                )
-            self.keywords = dict(keywords or {})
-        self.fixed = set(map(id, ax.get_children()))
-        if drawing.setup is None:
-            for k in indices:
-                self._draw_plant(ax, k)
-            ax.autoscale_view()
-        # The limits stay as they are now, unless the draw function moves them.
-        ax.set(xlim=ax.get_xlim(), ylim=ax.get_ylim())
-
-    def _draw_plant(self, ax: Axes, k: int) -> None:
-        for artist in ax.get_children():
-            if id(artist) not in self.fixed:
-                artist.remove()
-        ax.set_prop_cycle(color=PALETTE)
-        u = self.controls[min(k, len(self.controls) - 1)]
-        self.draw(ax, self.states[k], u, **self.keywords)
+    def _moment(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        return self.states[k], self.controls[min(k, len(self.controls) - 1)]
 
     def _panels(self, panels: Sequence[Panel], grid: Any) -> list[tuple[Line2D, Any]]:
         """Faint traces of the whole run; the lines over them that grow, and their dots,
@@ -138,7 +107,7 @@ class Scene:
             else:
                 line.set_data(times[: k + 1], values[: k + 1])
         if self.plant is not None:
-            self._draw_plant(self.plant, k)
+            self.plant.draw(*self._moment(k))
         self.canvas.restore_region(self.background)
         renderer = self.canvas.get_renderer()
         for artist in self.moving:

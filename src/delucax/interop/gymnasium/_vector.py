@@ -1,0 +1,216 @@
+"""A batch of environments with Gymnasium's vector interface."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium.error import InvalidAction, ResetNeeded
+from gymnasium.spaces import Discrete
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from ..._check import check_count, check_finite
+from ...environments import Environment
+from ._program import FAILED, program, REWARD, TERMINATED, TRUNCATED
+from ._spaces import action_space, is_discrete, observation_space
+
+
+class GymnasiumVectorEnv(VectorEnv):
+    """Many copies of a [`delucax.Environment`][] as one `gymnasium.vector.VectorEnv`.
+
+    A step of all of them, with the resets of those that have ended, is one call of one
+    compiled function. Observations, rewards and ends are those of
+    [`delucax.interop.gymnasium.GymnasiumEnv`][].
+
+    **Arguments:**
+
+    - `env`: the environment.
+    - `num_envs`: how many.
+    - `autoreset_mode`: `AutoresetMode.NEXT_STEP` (default: the step after the end
+        resets, whatever its action), `SAME_STEP` (the observation is of the next
+        episode already, the last one is in `info["final_obs"]`) or `DISABLED` (what has
+        ended rests until `reset`).
+    - `discrete`: whether actions are whole numbers, indices into `env.actions`; by
+        default they are if there is such a table.
+
+    `reset(options={"state": x})` starts all at the state `x`; with
+    `options={"reset_mask": mask}` only some are reset.
+
+    **Raises:** `ValueError` on a wrong argument. `step` raises
+    `gymnasium.error.ResetNeeded` before `reset`, `gymnasium.error.InvalidAction` on
+    actions of the wrong shape or kind, not finite, or not in the table; and
+    `RuntimeError` if a simulation fails.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import numpy as np
+        from delucax.interop.gymnasium import GymnasiumVectorEnv
+
+        envs = GymnasiumVectorEnv(dlx.make("pendulum"), 16)
+        observations, infos = envs.reset(seed=0)
+        observations, rewards, *_ = envs.step(np.zeros((16, 1), np.float32))
+        ```
+    """
+
+    def __init__(
+        self,
+        env: Environment,
+        num_envs: int,
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        discrete: bool | None = None,
+    ):
+        where = "GymnasiumVectorEnv"
+        if not isinstance(env, Environment):
+            raise ValueError(
+                f"{where}: env must be a delucax.Environment, got {type(env).__name__}."
+            )
+        try:
+            self._mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            raise ValueError(
+                f"{where}: autoreset_mode must be one of "
+                f"{[mode.value for mode in AutoresetMode]}, got {autoreset_mode!r}."
+            ) from None
+        self.environment = env
+        self.num_envs = check_count(num_envs, "num_envs", where)
+        self.discrete = is_discrete(env, discrete, where)
+        self.metadata = {"autoreset_mode": self._mode, "render_modes": []}
+        self.single_action_space = action_space(env, self.discrete)
+        self.single_observation_space = observation_space(env)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._program = program(env, self.discrete)
+        self._packed: Any = None
+        self._signals: Any = None
+        self._key: Any = None
+
+    @property
+    def states(self) -> np.ndarray:
+        """The states, shape `(num_envs, state_size)`."""
+        if self._packed is None:
+            raise ResetNeeded("GymnasiumVectorEnv: there is no state before reset().")
+        return np.array(self._packed)[:, : self._program.layout.states]
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode in each.
+
+        **Arguments:**
+
+        - `seed`: of all that is random from now on; by default it goes on as it was.
+        - `options`: `{"state": x}`, the state that all start at;
+            `{"reset_mask": mask}`, shape `(num_envs,)`, which are reset.
+
+        **Returns:** the observations, and an empty dictionary.
+        """
+        super().reset(seed=seed)
+        where, size = "GymnasiumVectorEnv", self.environment.state_size
+        options = dict(options or {})
+        state, mask = options.pop("state", None), options.pop("reset_mask", None)
+        if options:
+            raise ValueError(
+                f"{where}: options takes 'state' and 'reset_mask' alone, got "
+                f"{', '.join(map(repr, options))}."
+            )
+        if state is not None:
+            state = jnp.asarray(state, float)
+            if state.shape != (size,):
+                raise ValueError(
+                    f"{where}: state must have shape ({size},), got {state.shape}."
+                )
+            check_finite(state, "state", where)
+        key = jax.random.key(int(self.np_random.integers(2**32)))
+        self._key, use = jax.random.split(key)
+        keys = jax.random.split(use, self.num_envs)
+        made = self._program
+        packed, signals = made.start_batch(keys, state)
+        if mask is not None:
+            mask = np.asarray(mask)
+            if mask.shape != (self.num_envs,) or mask.dtype != bool:
+                raise ValueError(
+                    f"{where}: reset_mask must be {self.num_envs} booleans, got "
+                    f"{mask.dtype} of shape {mask.shape}."
+                )
+            if self._packed is None:
+                raise ResetNeeded(f"{where}: reset all before some with reset_mask.")
+            packed, signals = jax.tree.map(
+                lambda new, old: jnp.where(
+                    mask.reshape(-1, *[1] * (old.ndim - 1)), new, old
+                ),
+                (packed, signals),
+                (self._packed, self._signals),
+            )
+        self._packed, self._signals = packed, signals
+        return self._observations(np.asarray(packed)), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """One step of each.
+
+        **Arguments:** `actions`: in the action space.
+
+        **Returns:** observations, rewards, terminations, truncations, and a dictionary.
+        """
+        if self._packed is None:
+            raise ResetNeeded("GymnasiumVectorEnv: call reset() before step().")
+        actions = self._checked(actions)
+        made = self._program
+        seen, moved, self._signals, self._key = made.step_batch(
+            self._mode.value,
+            self._packed,
+            actions,
+            self._signals,
+            self._key,
+        )
+        self._packed = seen
+        packed, last = np.asarray(seen), np.asarray(moved)
+        if last[:, FAILED].any() and packed[:, FAILED].any():
+            which = np.flatnonzero(packed[:, FAILED])[:5].tolist()
+            self._packed = None
+            raise RuntimeError(
+                f"GymnasiumVectorEnv: the simulation of {which} failed: the state or "
+                "the reward is not finite, or the solver did not converge. Call "
+                "reset()."
+            )
+        terminations, truncations = packed[:, TERMINATED] > 0, packed[:, TRUNCATED] > 0
+        info: dict[str, Any] = {}
+        ended = terminations | truncations
+        if self._mode is AutoresetMode.SAME_STEP and ended.any():
+            final = np.full(self.num_envs, None, dtype=object)
+            observations = self._observations(last)
+            for i in np.flatnonzero(ended):
+                final[i] = observations[i]
+            info = {"final_obs": final, "_final_obs": ended.copy()}
+        rewards = packed[:, REWARD].astype(np.float64)
+        return self._observations(packed), rewards, terminations, truncations, info
+
+    def _observations(self, packed: np.ndarray) -> np.ndarray:
+        return packed[:, self._program.layout.observation].astype(np.float32)
+
+    def _checked(self, actions: Any) -> np.ndarray:
+        actions, where = np.asarray(actions), "GymnasiumVectorEnv"
+        space = self.single_action_space
+        kinds = "iu" if isinstance(space, Discrete) else "iuf"
+        shape = (self.num_envs, *(space.shape or ()))
+        if actions.shape != shape or actions.dtype.kind not in kinds:
+            what = "whole numbers" if isinstance(space, Discrete) else "numbers"
+            raise InvalidAction(
+                f"{where}: actions must be {what} of shape {shape}, got "
+                f"{actions.dtype} of shape {actions.shape}."
+            )
+        if isinstance(space, Discrete):
+            if not ((actions >= 0) & (actions < space.n)).all():
+                raise InvalidAction(
+                    f"{where}: actions must be from 0 to {space.n - 1}, got {actions}."
+                )
+            return actions[:, None].astype(np.float32)
+        if not np.isfinite(actions).all():
+            raise InvalidAction(f"{where}: actions must be finite.")
+        return actions

@@ -1,0 +1,67 @@
+"""One moment of a plant as a picture, or in a window."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ..controllers import Zero
+from ..environments import Environment
+from ..simulation import rollout
+from ._drawings import drawing_for, PHASE
+from ._plant import Plant
+
+
+_INCHES, _DPI = (5.0, 5.0), 100
+
+
+class Picture:
+    """Draws the plant of an environment, state by state; in a `window` too if asked."""
+
+    def __init__(self, environment: Environment, window: bool = False):
+        drawing = drawing_for(environment)
+        if drawing is None:
+            if environment.state_size < 2:
+                raise ValueError(
+                    "render: this plant has no drawing; give it one with "
+                    "delucax.plotting.register_drawing."
+                )
+            drawing = PHASE
+        if window:
+            import matplotlib.pyplot as plt
+
+            self.figure = plt.figure(figsize=_INCHES, dpi=_DPI, layout="constrained")
+        else:
+            self.figure = Figure(_INCHES, _DPI, layout="constrained")
+            FigureCanvasAgg(self.figure)
+        self.window = window
+        # A run that says how far things move.
+        idle, key = Zero(environment.control_size), jax.random.key(0)
+        trajectory = rollout(environment, idle, key=key, throw=False)
+        moments = zip(
+            np.asarray(trajectory.states, float),
+            np.asarray(trajectory.controls, float),
+            strict=False,
+        )
+        ax = self.figure.add_subplot()
+        self.plant = Plant(ax, drawing, environment, trajectory, moments)
+
+    def frame(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """The picture at a state and a control, shape `(height, width, 3)`."""
+        self.plant.draw(np.asarray(x, float), np.asarray(u, float))
+        canvas: Any = self.figure.canvas
+        canvas.draw()
+        if self.window:
+            import matplotlib.pyplot as plt
+
+            plt.pause(1e-3)  # shows it, where there is a screen
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self.window:
+            import matplotlib.pyplot as plt
+
+            plt.close(self.figure)

@@ -1,0 +1,223 @@
+"""The environments in Gymnasium's interface."""
+
+import warnings
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.error import InvalidAction, ResetNeeded
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from helpers import assert_close, once, user_error
+
+import delucax as dlx
+import delucax.interop.gymnasium as interop
+
+
+pytestmark = once
+
+
+IDS = interop.register_ids()
+ZERO = np.zeros(1, np.float32)
+
+
+def test_every_task_has_an_id():
+    made = {gymnasium.spec(id).kwargs["task"] for id in IDS}
+    names = {n for n in dlx.environments.registered() if "/" not in n}
+    assert names <= made
+
+
+@pytest.mark.parametrize("id", IDS)
+def test_check_env(id):
+    env = gymnasium.make(id, disable_env_checker=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # A recommendation that Gymnasium's own tasks do not follow either.
+        warnings.filterwarnings("ignore", ".*symmetric and normalized space")
+        check_env(env.unwrapped, skip_render_check=True)
+        env = gymnasium.make(id)  # with the passive checker
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        for _ in range(3):
+            env.step(env.action_space.sample())
+
+
+def test_episode_is_a_rollout():
+    env = dlx.make("pendulum", horizon=5)
+    controls = np.linspace(-1, 3, 5, dtype=np.float32)[:, None]
+    x0 = np.array([0.5, -0.2], np.float32)
+    sequence = dlx.controllers.Sequence(controls)
+    run = dlx.rollout(env, sequence, key=jax.random.key(0), x0=x0)
+    made = interop.GymnasiumEnv(env)
+    first, _ = made.reset(options={"state": x0})
+    assert_close(first, env.encode(jnp.asarray(x0)), atol=1e-6)
+    for k, control in enumerate(controls):
+        seen, reward, terminated, truncated, _ = made.step(control)
+        assert_close(made.state, run.states[k + 1], atol=1e-6)
+        assert_close(seen, env.encode(run.states[k + 1]), atol=1e-6)
+        assert_close(reward, -run.costs[k], rtol=1e-6)
+        assert terminated is False and truncated is (k == 4)
+    with pytest.raises(ResetNeeded, match="has ended"):
+        made.step(ZERO)
+
+
+def test_final_cost_comes_with_the_end():
+    system = dlx.systems.Pendulum()
+    cost = dlx.costs.Quadratic(0 * jnp.eye(2), jnp.eye(1), final=jnp.eye(2))
+    env = dlx.Environment(
+        dlx.Discretized(system, 0.05),
+        cost,
+        terminated=lambda t, x: x[0] > 1,
+        initial_state=[0.9, 3.0],
+    )
+    made = interop.GymnasiumEnv(env)
+    made.reset()
+    seen, reward, terminated, truncated, _ = made.step(ZERO)
+    assert terminated and not truncated
+    assert_close(reward, -np.sum(seen**2), rtol=1e-6)
+
+
+def test_integers_and_forces():
+    env = dlx.make("cartpole")
+    index, force = interop.GymnasiumEnv(env), interop.GymnasiumEnv(env, discrete=False)
+    x0 = np.array([0.01, 0.0, 0.02, 0.0], np.float32)
+    for made in (index, force):
+        made.reset(options={"state": x0})
+    one, other = index.step(1), force.step(np.asarray(env.actions)[1])
+    assert_close(one[0], other[0])
+    assert one[1] == other[1] == 1
+    for bad in (2, -1, 0.5, [1], None):
+        with pytest.raises(InvalidAction, match="whole number from 0 to 1"):
+            index.step(bad)
+    with user_error(match="discrete needs a table"):
+        interop.GymnasiumEnv(dlx.make("pendulum"), discrete=True)
+
+
+def test_seeds():
+    noisy = dlx.disturbances.Gaussian(0.1, size=2)
+    made = [interop.make("pendulum", disturbance=noisy) for _ in range(2)]
+    runs = []
+    for env, seed in zip(made, (3, 3), strict=True):
+        env.reset(seed=seed)
+        runs.append([env.step(ZERO)[0] for _ in range(3)] + [env.reset()[0]])
+    np.testing.assert_array_equal(*runs)
+    assert np.any(runs[0][-1] != made[0].reset()[0])
+
+
+def test_bad_input():
+    made = interop.make("pendulum")
+    with pytest.raises(ResetNeeded, match=r"reset\(\) before step"):
+        made.step(ZERO)
+    with pytest.raises(ResetNeeded, match="no state"):
+        _ = made.state
+    made.reset(seed=0)
+    for bad in (0.0, np.zeros(2), "up", [None], [[0.0]]):
+        with pytest.raises(InvalidAction, match=r"numbers of shape \(1,\)"):
+            made.step(bad)
+    with pytest.raises(InvalidAction, match="finite"):
+        made.step([np.nan])
+    made.step([100])  # clipped, and the episode goes on
+    with user_error(match="state .*2"):
+        made.reset(options={"state": np.zeros(3)})
+    with user_error(match="'start'"):
+        made.reset(options={"start": np.zeros(2)})
+    with user_error(match="render_mode must be"):
+        interop.make("pendulum", render_mode="ascii")
+    with user_error(match="must be a delucax.Environment"):
+        interop.GymnasiumEnv(gymnasium.make("Pendulum-v1"))
+
+
+def test_a_simulation_that_fails_says_so():
+    growing = dlx.LinearDynamics(1e30 * jnp.eye(1), jnp.eye(1))
+    cost = dlx.costs.Quadratic(jnp.eye(1), jnp.eye(1))
+    env = dlx.Environment(growing, cost, initial_state=[1.0])
+    made = interop.GymnasiumEnv(env)
+    made.reset()
+    with pytest.raises(RuntimeError, match="failed at step"):
+        for _ in range(3):
+            made.step(ZERO)
+    many = interop.GymnasiumVectorEnv(env, 2)
+    many.reset()
+    with pytest.raises(RuntimeError, match=r"\[0, 1\] failed"):
+        for _ in range(3):
+            many.step(np.zeros((2, 1)))
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_vector_modes(mode):
+    many = interop.make_vector("pendulum", 3, autoreset_mode=mode, horizon=2)
+    start, _ = many.reset(seed=0)
+    assert many.observation_space.contains(start)
+    actions = np.zeros((3, 1), np.float32)
+    many.step(actions)
+    before = many.states
+    ended, rewards, terminated, truncated, info = many.step(actions)
+    assert truncated.all() and not terminated.any() and (rewards < 0).all()
+    after, rewards, _, truncated, _ = many.step(actions)
+    single = interop.make("pendulum", horizon=2)
+    single.reset(options={"state": before[1]})
+    last = single.step(ZERO)[0]
+    if mode is AutoresetMode.SAME_STEP:
+        assert_close(info["final_obs"][1], last, atol=1e-6)
+        assert info["_final_obs"].all() and np.any(ended != start)
+        assert not truncated.any() and (rewards < 0).all()
+    else:
+        assert info == {}
+        assert_close(ended[1], last, atol=1e-6)
+        assert (rewards == 0).all()
+    if mode is AutoresetMode.NEXT_STEP:
+        assert not truncated.any() and np.any(after != ended)
+    if mode is AutoresetMode.DISABLED:
+        np.testing.assert_array_equal(after, ended)
+        mask = np.array([True, False, False])
+        again, _ = many.reset(options={"reset_mask": mask})
+        np.testing.assert_array_equal(again[1:], ended[1:])
+        assert np.any(again[0] != ended[0])
+
+
+def test_vector_is_each_alone():
+    noisy = dlx.disturbances.Gaussian(0.1, size=2)
+    many = interop.make_vector("pendulum", 4, disturbance=noisy)
+    many.reset(seed=1, options={"state": np.array([0.3, 0.1])})
+    first = many.step(np.zeros((4, 1)))[0]
+    assert len(np.unique(first[:, 2])) == 4
+    quiet = interop.make_vector("cartpole", 4)
+    quiet.reset(seed=1)
+    states = quiet.states
+    seen, rewards, *_ = quiet.step(np.array([0, 1, 1, 0]))
+    assert (rewards == 1).all()
+    single = interop.make("cartpole")
+    for i, action in enumerate([0, 1, 1, 0]):
+        single.reset(options={"state": states[i]})
+        assert_close(single.step(action)[0], seen[i], atol=1e-6)
+    for bad in (np.zeros(3, int), np.zeros(4), np.full(4, 2)):
+        with pytest.raises(InvalidAction, match="actions must be"):
+            quiet.step(bad)
+
+
+def test_by_gymnasiums_own_doors():
+    many = gymnasium.make_vec(
+        "delucax/Pendulum-v1",
+        num_envs=2,
+        vectorization_mode="vector_entry_point",
+        length=1.2,
+    )
+    assert many.num_envs == 2
+    assert_close(many.environment.dynamics.system.length, 1.2, rtol=1e-6)
+    each = gymnasium.make_vec("delucax/CartPole-v1", num_envs=2)
+    each.reset(seed=0)
+    each.step(np.array([0, 1]))
+
+
+def test_pictures():
+    made = gymnasium.make("delucax/Pendulum-v1", render_mode="rgb_array")
+    made.reset(seed=0)
+    first = made.render()
+    for _ in range(3):
+        made.step(np.array([2.0], np.float32))
+    second = made.render()
+    assert first.shape == second.shape and first.shape[2] == 3
+    assert first.dtype == np.uint8 and np.any(first != second)
+    made.close()
