@@ -15,6 +15,7 @@ from jaxtyping import Array
 
 _ROLE = "delucax_role"
 _CONSTRAINT = "delucax_constraint"
+_FUNCTION = "delucax_function"
 
 
 class AbstractConstraint(eqx.Module):
@@ -211,11 +212,12 @@ def weight(
 
 
 def _field(role: str, default: Any, constraint: AbstractConstraint | None) -> Any:
-    return eqx.field(
-        default=default,
-        converter=as_float_array,
-        metadata={_ROLE: role, _CONSTRAINT: constraint},
-    )
+    given: dict[str, Any] = {"default": default}
+    if isinstance(default, list | np.ndarray | jax.Array):
+        # A dataclass wants what can be changed, or has no hash, from a function.
+        given = {"default_factory": lambda: default}
+    metadata = {_ROLE: role, _CONSTRAINT: constraint}
+    return eqx.field(**given, converter=as_float_array, metadata=metadata)
 
 
 class StaticFunction(eqx.Module):
@@ -249,7 +251,7 @@ def _is_leaf(value: Any) -> bool:
 
 def function_field(default: Any = dataclasses.MISSING) -> Any:
     """A field that holds a function: plain, or a module with a `__call__`."""
-    return eqx.field(default=default, converter=as_module)
+    return eqx.field(default=default, converter=as_module, metadata={_FUNCTION: True})
 
 
 def converter_of(module: eqx.Module, name: str) -> Callable[[Any], Any]:
@@ -297,11 +299,18 @@ def marked_leaves(
 
 
 def check_parameters(module: eqx.Module) -> None:
-    """Raise unless every `parameter()` and `weight()` of `module` is legal.
+    """Raise unless every `parameter()`, `weight()` and function of `module` is legal.
 
     Traced values cannot be looked at and are let through.
     """
     for field in dataclasses.fields(module):
+        if _FUNCTION in field.metadata:
+            function = getattr(module, field.name, None)
+            if function is not None and not callable(function):
+                raise ValueError(
+                    f"{type(module).__name__}: {field.name} must be a function, got "
+                    f"{function!r}."
+                )
         if _ROLE not in field.metadata:
             continue
         value = getattr(module, field.name, None)

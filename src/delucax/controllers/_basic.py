@@ -5,9 +5,10 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
+import numpy as np
 from jaxtyping import Array
 
-from .._check import as_matrix, check_count
+from .._check import as_matrix, check_count, check_key, is_concrete
 from .._controller import AbstractController, wrong_observation
 from .._fields import as_float_array, parameter, weight
 from ..math import matvec
@@ -105,9 +106,12 @@ class Random(AbstractController):
                 f"{std!r}."
             )
 
+    def __check_init__(self):
+        if is_concrete(self.std) and np.any(np.asarray(self.std) < 0):
+            raise ValueError(f"Random: std must not be negative, got {self.std}.")
+
     def init(self, *, key=None):
-        if key is None:
-            raise ValueError("Random: key must be a key such as jax.random.key(0).")
+        check_key(key, "Random.init")
         return key
 
     def __call__(self, t, y, state):

@@ -9,7 +9,7 @@ import jax.random as jr
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, PyTree
 
-from .._check import as_bounds
+from .._check import as_bounds, check_key
 from .._controller import AbstractController
 from .._fields import as_float_array, weight
 from .._typing import PRNGKey, RealScalar
@@ -86,8 +86,7 @@ class Gaussian(AbstractController):
         self.bounds = as_bounds(bounds, where)
 
     def init(self, *, key=None):
-        if key is None:
-            raise ValueError("Gaussian: key must be a key such as jax.random.key(0).")
+        check_key(key, "Gaussian.init")
         key, base_key = jr.split(key)
         return _State(self.base.init(key=base_key), key)
 

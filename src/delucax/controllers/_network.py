@@ -78,6 +78,11 @@ class MLP(AbstractController):
         key: PRNGKey,
     ):
         where = "MLP"
+        if not callable(activation):
+            raise ValueError(
+                f"{where}: activation must be a function such as jnp.tanh, got "
+                f"{activation!r}."
+            )
         check_key(key, where)
         out_size = check_count(out_size, "out_size", where)
         if isinstance(depth, bool) or not isinstance(depth, int) or depth < 0:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_bounds, check_finite, is_concrete
+from .._check import as_bounds, check_finite, check_step, is_concrete
 from .._controller import AbstractController, wrong_observation
 from .._fields import (
     as_float_array,
@@ -129,6 +129,7 @@ class PID(AbstractController):
                 f"{where}: derivative_on must be 'measurement' or 'error', got "
                 f"{derivative_on!r}."
             )
+        check_step(dt, where)
         self.kp, self.ki, self.kd, self.dt = kp, ki, kd, dt
         self.reference = as_module(reference)
         self.output = _as_output(output, where)

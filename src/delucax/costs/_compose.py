@@ -68,6 +68,10 @@ class Rate(AbstractCost):
     dt: Array = parameter()
 
     def __init__(self, cost: AbstractCost, dt: Any):
+        if not isinstance(cost, AbstractCost):
+            raise ValueError(
+                f"Rate: cost must be an AbstractCost, got {type(cost).__name__}."
+            )
         check_step(dt, "Rate")
         self.cost = cost
         self.dt = dt

@@ -126,12 +126,13 @@ class AbstractDynamics(eqx.Module):
     @property
     def observation_size(self) -> int:
         """The size of what `observe` returns."""
-        shape = eqx.filter_eval_shape(
+        y: Any = eqx.filter_eval_shape(
             self.observe, jnp.zeros(()), jnp.zeros(self.state_size)
-        ).shape
-        if len(shape) != 1:
+        )
+        shape = getattr(y, "shape", None)
+        if shape is None or len(shape) != 1:
+            got = type(y).__name__ if shape is None else f"an array of shape {shape}"
             raise ValueError(
-                f"{type(self).__name__}: observe must return a vector, got an array of "
-                f"shape {shape}."
+                f"{type(self).__name__}: observe must return a vector, got {got}."
             )
         return shape[0]

@@ -17,7 +17,13 @@ from .._check import (
     check_key,
     is_concrete,
 )
-from .._fields import as_float_array, as_module, function_field, parameter
+from .._fields import (
+    as_float_array,
+    as_module,
+    check_parameters,
+    function_field,
+    parameter,
+)
 from .._paths import get_path, replace
 from .._results import Result
 from .._typing import PRNGKey, RealScalar
@@ -208,6 +214,7 @@ class Environment(eqx.Module):
                 raise ValueError(
                     f"{where}: {name} has size {given.size} where {size} is expected."
                 )
+        check_parameters(self)
         m = dynamics.control_size
         if not callable(self.initial_state):
             x0 = as_vector(
@@ -301,6 +308,11 @@ class Environment(eqx.Module):
                 raise ValueError(
                     "Environment: u must be one integer action (a scalar) or a control "
                     f"of shape ({self.control_size},), got shape {jnp.shape(u)}."
+                )
+            count = len(self.actions)
+            if is_concrete(u) and not 0 <= int(u) < count:
+                raise ValueError(
+                    f"Environment: u must be an action from 0 to {count - 1}, got {u}."
                 )
             u = self.actions[u]
         if self.control_bounds is None:

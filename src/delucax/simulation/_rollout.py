@@ -19,7 +19,7 @@ from .._typing import PRNGKey
 from ..disturbances import Zero
 from ..dynamics._runge_kutta import join_state, split_state, stack_steps
 from ..environments import Environment
-from ._answer import answer, check_state
+from ._answer import answer, begun, check_state
 from ._horizon import as_number
 from ._trajectory import checked, Trajectory
 
@@ -172,7 +172,7 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
     ends = env.terminated is not None
     plain_sight = True  # whether the observation is the state itself, found by tracing
 
-    first = controller.init(key=controller_key)
+    first = begun(controller, controller_key)
     first, static = eqx.partition(first, eqx.is_array)
 
     def body(carry, inputs):
@@ -184,6 +184,8 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
         if decay is not None:
             x = lax.stop_gradient(x) + decay * (x - lax.stop_gradient(x))
         y = dynamics.observe(t, x)
+        if not eqx.is_inexact_array(y) or y.ndim != 1:
+            y = as_vector(y, env.observation_size, "observe(t, x)", "rollout")
         plain_sight = noise is None and y is x
         y = y if noise is None else (y + noise).astype(dtype)
         seen, (done, length) = y, ended or (None, None)

@@ -125,9 +125,15 @@ class Trajectory(eqx.Module):
         final cost only if the last step is among them.
 
         **Raises:** `ValueError` if one trajectory is indexed by anything but a slice
-        of step 1.
+        of step 1; `IndexError` beyond the batch.
         """
         if self.batch_shape:
+            size = self.batch_shape[0]
+            if isinstance(index, int | np.integer) and not -size <= index < size:
+                raise IndexError(
+                    f"Trajectory: index must be from {-size} to {size - 1} in a batch "
+                    f"of {size}, got {index}."
+                )
             return jax.tree.map(lambda leaf: leaf[index], self)
         if not isinstance(index, slice) or index.step not in (None, 1):
             raise ValueError(

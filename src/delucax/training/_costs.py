@@ -15,6 +15,7 @@ from .._fields import as_float_array
 from .._results import RESULTS
 from ..environments import Environment
 from ..simulation import rollout, Trajectory
+from ..simulation._answer import begun
 from ..simulation._horizon import as_number
 from ..simulation._rollout import Checkpoint
 
@@ -179,7 +180,7 @@ class _ScoredCost(eqx.Module):
                 trajectory.costs,
             )
         )
-        first, static = eqx.partition(controller.init(key=controller_key), eqx.is_array)
+        first, static = eqx.partition(begun(controller, controller_key), eqx.is_array)
 
         def body(state, inputs):
             after, score = replay(eqx.combine(state, static), inputs)
