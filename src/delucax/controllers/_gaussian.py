@@ -86,8 +86,7 @@ class Gaussian(AbstractController):
         self.bounds = as_bounds(bounds, where)
 
     def init(self, *, key=None):
-        check_key(key, "Gaussian.init")
-        key, base_key = jr.split(key)
+        key, base_key = jr.split(check_key(key, "Gaussian.init"))
         return _State(self.base.init(key=base_key), key)
 
     def _mean(self, t, y, state):

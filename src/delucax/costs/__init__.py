@@ -1,5 +1,7 @@
 """Stage and final costs, each minus a reward."""
 
+from ._acrobot import AcrobotHeight as AcrobotHeight
+from ._arrival import Arrival as Arrival
 from ._base import AbstractCost as AbstractCost
 from ._compose import Function as Function, Rate as Rate
 from ._pendulum import PendulumCost as PendulumCost

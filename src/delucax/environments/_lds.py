@@ -9,7 +9,8 @@ import numpy as np
 from .._check import check_count, check_key, is_concrete
 from .._typing import PRNGKey
 from ..costs import Quadratic
-from ..dynamics import LinearDynamics
+from ..dynamics import c2d, LinearDynamics
+from ..systems import LinearSystem
 from ._environment import Environment
 from ._registry import finish
 
@@ -19,6 +20,8 @@ def lds(
     B: Any = None,
     C: Any = None,
     *,
+    system: LinearDynamics | LinearSystem | None = None,
+    dt: Any = None,
     key: PRNGKey | None = None,
     states: int = 2,
     controls: int = 1,
@@ -35,6 +38,11 @@ def lds(
     - `A`, `B`, `C`: the matrices; `C` is the identity by default. If neither `A` nor
         `B` is given, all are drawn with `key`: entries standard normal, `A` scaled to
         the spectral radius.
+    - `system`: a linear model in place of matrices. One in continuous time is sampled
+        exactly with `dt`. `delucax.interop.from_control` makes one of a python-control
+        object, `delucax.interop.read_linear` of a file, [`delucax.linearize`][] of any
+        system.
+    - `dt`: the step; 1 by default, and that of a `system` that has one.
     - `key`: a random key, for random matrices.
     - `states`, `controls`: sizes of random matrices, 2 and 1 by default.
     - `observations`: rows of a random `C`; the identity by default.
@@ -43,10 +51,11 @@ def lds(
     - `**environment`: other arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
 
-    **Returns:** an [`delucax.Environment`][], with `dt = 1`.
+    **Returns:** an [`delucax.Environment`][].
 
     **Raises:** `ValueError` if one of `A` and `B` is missing, if there is no key to
-    draw them with, or if shapes do not fit.
+    draw them with, if shapes do not fit, or if `system` is not linear, is given with
+    matrices or a key, or has a step where `dt` is given, or none where it is not.
 
     !!! example
 
@@ -55,36 +64,29 @@ def lds(
         import jax
 
         env = dlx.make("lds", key=jax.random.key(0), states=4, spectral_radius=0.95)
+        upright = dlx.linearize(dlx.systems.Pendulum())
+        sampled = dlx.make("lds", system=upright, dt=0.05)
         ```
     """
-    if (A is None) != (B is None):
-        missing = "A" if A is None else "B"
-        raise ValueError(f"lds: {missing} must be given with the other, or neither.")
-    if A is None:
-        if C is not None:
-            raise ValueError("lds: C needs A and B; for a random C give observations.")
-        if key is None:
+    if system is not None:
+        others = {"A": A, "B": B, "C": C, "key": key}
+        for name, other in others.items():
+            if other is not None:
+                raise ValueError(f"lds: give {name} or a system, not both.")
+        dynamics = _sampled(system, dt)
+    else:
+        if (A is None) != (B is None):
+            missing = "A" if A is None else "B"
             raise ValueError(
-                "lds: give A and B, or a key to draw them with, such as "
-                "key=jax.random.key(0)."
+                f"lds: {missing} must be given with the other, or neither."
             )
-        check_key(key, "lds")
-        n = check_count(states, "states", "lds")
-        m = check_count(controls, "controls", "lds")
-        known = is_concrete(spectral_radius)
-        if known and not 0 <= spectral_radius < np.inf:
-            raise ValueError(
-                "lds: spectral_radius must be finite and not negative, got "
-                f"{spectral_radius}."
-            )
-        a, b, c = jr.split(key, 3)
-        A = jr.normal(a, (n, n))
-        A = A * (spectral_radius / jnp.max(jnp.abs(jnp.linalg.eigvals(A))))
-        B = jr.normal(b, (n, m))
-        if observations is not None:
-            p = check_count(observations, "observations", "lds")
-            C = jr.normal(c, (p, n))
-    dynamics = LinearDynamics(A, B, C)
+        if A is None:
+            if C is not None:
+                raise ValueError(
+                    "lds: C needs A and B; for a random C give observations."
+                )
+            A, B, C = _random(key, states, controls, observations, spectral_radius)
+        dynamics = LinearDynamics(A, B, C, dt=1.0 if dt is None else dt)
     n, m = dynamics.state_size, dynamics.control_size
     arguments: dict[str, Any] = dict(
         dynamics=dynamics,
@@ -92,3 +94,51 @@ def lds(
         horizon=horizon,
     )
     return finish(lds, arguments, environment)
+
+
+def _sampled(system: Any, dt: Any) -> LinearDynamics:
+    """A linear model in discrete time."""
+    if isinstance(system, LinearDynamics):
+        if dt is not None:
+            raise ValueError(
+                f"lds: dt must be left out for a system that has one, got {dt} and "
+                f"{system.dt}."
+            )
+        return system
+    if not isinstance(system, LinearSystem):
+        raise ValueError(
+            "lds: system must be a LinearSystem or LinearDynamics "
+            "(`delucax.interop.from_control` makes one of a python-control object, "
+            "`delucax.interop.read_linear` of a file), got "
+            f"{type(system).__name__}."
+        )
+    if dt is None:
+        raise ValueError(
+            "lds: dt must be given for a system in continuous time, got None."
+        )
+    return c2d(system, dt)
+
+
+def _random(
+    key: Any, states: int, controls: int, observations: int | None, radius: Any
+) -> tuple[Any, Any, Any]:
+    """Matrices with standard normal entries, the first scaled to a spectral radius."""
+    if key is None:
+        raise ValueError(
+            "lds: give A and B, or a key to draw them with, such as "
+            "key=jax.random.key(0)."
+        )
+    check_key(key, "lds")
+    n = check_count(states, "states", "lds")
+    m = check_count(controls, "controls", "lds")
+    if is_concrete(radius) and not 0 <= radius < np.inf:
+        raise ValueError(
+            f"lds: spectral_radius must be finite and not negative, got {radius}."
+        )
+    a, b, c = jr.split(key, 3)
+    A = jr.normal(a, (n, n))
+    A = A * (radius / jnp.max(jnp.abs(jnp.linalg.eigvals(A))))
+    B = jr.normal(b, (n, m))
+    if observations is None:
+        return A, B, None
+    return A, B, jr.normal(c, (check_count(observations, "observations", "lds"), n))

@@ -7,13 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_positive, check_step
+from .._check import check_positive
 from .._fields import parameter, positive
 from .._results import RESULTS
 from ..costs import PendulumCost
-from ..dynamics import AbstractDynamics, Discretized
+from ..dynamics import AbstractDynamics
 from ..math import clip, cos, sin
 from ..systems import Pendulum
+from ._arithmetic import own_or_solver
 from ._environment import Environment, UniformState
 from ._registry import finish
 
@@ -148,19 +149,10 @@ def pendulum(
         ```
     """
     system = Pendulum(mass, length, gravity, damping)
-    check_step(dt, "pendulum")
-    if solver is None:
-        if substeps != 1:
-            raise ValueError("pendulum: substeps needs a solver, such as RK4().")
-        limit: Any = 8.0 if max_speed is None else max_speed
-        dynamics = GymPendulum(system=system, dt=dt, max_speed=limit)
-    else:
-        if max_speed is not None:
-            raise ValueError(
-                "pendulum: max_speed is of Gym's arithmetic, and no solver has such a "
-                "limit; give one of max_speed and solver."
-            )
-        dynamics = Discretized(system, dt, solver, substeps)
+    options = {"max_speed": max_speed}
+    dynamics = own_or_solver(
+        GymPendulum, system, dt, solver, substeps, "pendulum", options
+    )
     corner = np.array([np.pi, 1.0])
     arguments: dict[str, Any] = dict(
         dynamics=dynamics,

@@ -10,9 +10,31 @@ from ._environment import Environment
 
 
 _REGISTRY: dict[str, str] = {
+    "acrobot": "delucax.environments:acrobot",
+    "classic/acrobot": "delucax.environments:acrobot",
+    "cartpole": "delucax.environments:cartpole",
+    "classic/cartpole": "delucax.environments:cartpole",
+    "cartpole_linear": "delucax.environments:cartpole_linear",
+    "mountain_car": "delucax.environments:mountain_car",
+    "classic/mountain_car": "delucax.environments:mountain_car",
+    "mountain_car_discrete": "delucax.environments:mountain_car_discrete",
     "pendulum": "delucax.environments:pendulum",
     "classic/pendulum": "delucax.environments:pendulum",
     "lds": "delucax.environments:lds",
+    "planar_quadrotor": "delucax.environments:planar_quadrotor",
+    "classic/planar_quadrotor": "delucax.environments:planar_quadrotor",
+    "reacher": "delucax.environments:reacher",
+    "classic/reacher": "delucax.environments:reacher",
+    "double_integrator": "delucax.environments:double_integrator",
+    "mass_spring_damper": "delucax.environments:mass_spring_damper",
+    "van_der_pol": "delucax.environments:van_der_pol",
+    "lorenz": "delucax.environments:lorenz",
+    "quadrotor": "delucax.environments:quadrotor",
+    "kinematic_bicycle": "delucax.environments:kinematic_bicycle",
+    "dynamic_bicycle": "delucax.environments:dynamic_bicycle",
+    "two_tank": "delucax.environments:two_tank",
+    "permanent_magnet_motor": "delucax.environments:permanent_magnet_motor",
+    "neural": "delucax.environments:neural",
 }
 
 

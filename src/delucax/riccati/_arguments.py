@@ -20,17 +20,19 @@ def square_matrix(value: Any, name: str, where: str) -> Array:
 def hermitian_matrix(value: Any, name: str, where: str) -> Array:
     """`value` as a matrix that is its own conjugate transpose, or an error.
 
-    An asymmetry of the size of rounding is averaged away.
+    An asymmetry of the size of rounding is averaged away. While it is being traced, a
+    larger one makes it NaN.
     """
     matrix = square_matrix(value, name, where)
-    if is_concrete(matrix):
-        array = np.asarray(matrix)
-        scale = np.max(np.abs(array), initial=0.0)
-        slack = 100 * np.finfo(array.dtype).eps * scale
-        if np.max(np.abs(array - array.conj().T), initial=0.0) > slack:
-            kind = "Hermitian" if np.iscomplexobj(array) else "symmetric"
-            raise ValueError(f"{where}: {name} must be {kind}, got {array}.")
-    return (matrix + matrix.conj().T) / 2
+    transposed = matrix.conj().T
+    slack = 100 * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
+    wrong = jnp.max(jnp.abs(matrix - transposed)) > slack
+    if is_concrete(wrong) and wrong:
+        kind = "Hermitian" if jnp.iscomplexobj(matrix) else "symmetric"
+        raise ValueError(f"{where}: {name} must be {kind}, got {matrix}.")
+    average = (matrix + transposed) / 2
+    # Of data that cannot be looked at yet, the result will say that they are ill-posed.
+    return average if is_concrete(wrong) else jnp.where(wrong, jnp.nan, average)
 
 
 def riccati_arguments(
@@ -71,14 +73,16 @@ def riccati_arguments(
                 f"{where}: {name} must have shape {shape} to fit {n_A} and {n_B}, got "
                 f"{matrix.shape}."
             )
-    _check_definite(R, n_R, where, definite)
+    check_definite(R, n_R, where, definite)
     given = [A, B, Q, R, S, E]
     dtype = jnp.result_type(*(M for M in given if M is not None))
     S = jnp.zeros((n, m), dtype) if S is None else S
     return tuple(None if M is None else M.astype(dtype) for M in (A, B, Q, R, S, E))
 
 
-def _check_definite(R, name, where, definite):
+def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
+    """Raise unless `R`, as far as it can be seen, is positive definite or, if not
+    `definite`, semidefinite."""
     if not is_concrete(R):
         return
     array = np.asarray(R)

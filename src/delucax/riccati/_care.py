@@ -13,7 +13,7 @@ from ..math._size import relative_size, size
 from ._arguments import complex_form, is_complex, real_form, riccati_arguments
 from ._dare import double
 from ._lyapunov import lyapunov
-from ._newton import detached, found_tangent, outside, polish
+from ._newton import attainable, found_tangent, outside, polish, settled
 from ._search import Attempt, Found, search, SECOND, verdict, weights
 from ._solution import checked, RiccatiSolution
 from ._spectrum import abscissa_and_size
@@ -46,6 +46,9 @@ def care(
     and `jax.vmap`; in a batch, a member that fails harms no other. It is differentiable
     to any order, in either mode, by the implicit function theorem.
 
+    Where the cost does not see an unstable mode, the stabilising solution is not the
+    cheapest: no control at all would cost less, and the state would grow.
+
     **Arguments:**
 
     - `A`: shape `(n, n)`. Real, or complex, as all others; then `'` is the conjugate
@@ -60,7 +63,8 @@ def care(
         look at `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][] with a `spectral_abscissa`. It
-    is successful if the `residual` is at most 1e-12 (1e-5 in single precision) and the
+    is successful if the `residual` is at most 1e-12 (1e-5 in single precision), or what
+    rounding of `X` alone may leave, and the
     closed loop is stable: a small residual alone is no certificate. Else `result` is
     one of `RESULTS.not_stabilisable`, `not_stabilising` (no such solution),
     `on_boundary` (eigenvalues on the imaginary axis, or so close that data changed by
@@ -103,10 +107,9 @@ def continuous_solution(A, B, Q, R, S, E) -> RiccatiSolution:
 def _solution(A, B, Q, R, S, E):
     found = _find(A, B, Q, R, S, E)
     arguments = A, B, Q, R, S, E, found.X
-    A, B, Q, R, S, E, X = detached(arguments, found.differentiable)
-    _, _, K, closed_loop = _terms(A, B, R, S, E, X)
+    K, closed_loop = settled(found.differentiable, _terms, *arguments)
     return RiccatiSolution(
-        X=X,
+        X=found.X,
         K=K,
         residual=lax.stop_gradient(found.residual),
         closed_loop=closed_loop,
@@ -148,10 +151,12 @@ def _find(A, B, Q, R, S, E) -> Found:
     for M in (plain_A, plain_B, Q, R, S):
         posed = posed & jnp.all(jnp.isfinite(M))
 
+    magnified = 1 if E is None else size(E) ** 2
+
     def attempt(kind):
         q, r, s, size_Q = weights(kind, Q, R, S)
         X, size_G, iterations = _start(plain_A, plain_B, q, r, s, kind == SECOND)
-        X, residual, closed_loop = polish(
+        X, residual, closed_loop, terms = polish(
             lambda X: _equation(A, B, q, r, s, E, X),
             lambda loop, error: outside(E, lyapunov(loop, error)),
             outside(E, X),
@@ -167,6 +172,7 @@ def _find(A, B, Q, R, S, E) -> Found:
             gap=-abscissa,
             rounding=rounding,
             near=jnp.abs(abscissa) < reach,
+            least=attainable(X, (2 * size(closed_loop)) * magnified, terms),
             modest=size(X) * eps**0.5 < size_Q,
             around=jnp.abs(abscissa) < 4 * eps**0.125 * size(closed_loop),
             iterations=iterations,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from ..math._linear_solve import full_precision, is_definite, solve, symmetric
 from ..math._size import relative_size, size
 from ._arguments import complex_form, is_complex, real_form, riccati_arguments
-from ._newton import detached, found_tangent, outside, polish
+from ._newton import attainable, found_tangent, outside, polish, settled
 from ._search import Attempt, Found, search, SECOND, verdict, weights
 from ._solution import checked, RiccatiSolution
 from ._spectrum import spectral_radius
@@ -45,6 +45,9 @@ def dare(
     alone, no eigenvalues, which suits accelerators and `jax.vmap`; in a batch, a member
     that fails harms no other. It is differentiable to any order, in either mode, by the
     implicit function theorem.
+
+    Where the cost does not see an unstable mode, the stabilising solution is not the
+    cheapest: no control at all would cost less, and the state would grow.
 
     **Arguments:**
 
@@ -102,10 +105,9 @@ def discrete_solution(A, B, Q, R, S, E) -> RiccatiSolution:
 def _solution(A, B, Q, R, S, E):
     found = _find(A, B, Q, R, S, E)
     arguments = A, B, Q, R, S, E, found.X
-    A, B, Q, R, S, E, X = detached(arguments, found.differentiable)
-    _, _, K, closed_loop = _terms(A, B, R, S, E, X)
+    K, closed_loop = settled(found.differentiable, _terms, *arguments)
     return RiccatiSolution(
-        X=X,
+        X=found.X,
         K=K,
         residual=lax.stop_gradient(found.residual),
         closed_loop=closed_loop,
@@ -146,11 +148,13 @@ def _find(A, B, Q, R, S, E) -> Found:
     for M in (plain_A, plain_B, Q, R, S):
         posed = posed & jnp.all(jnp.isfinite(M))
 
+    magnified = 1 if E is None else size(E) ** 2
+
     def attempt(kind):
         q, r, s, size_Q = weights(kind, Q, R, S)
         height = size_Q * jnp.where(kind == SECOND, _SECOND_START, 1)
         X, iterations = _start(plain_A, plain_B, q, r, s, height)
-        X, residual, closed_loop = polish(
+        X, residual, closed_loop, terms = polish(
             lambda X: _equation(A, B, q, r, s, E, X),
             lambda loop, error: outside(E, stein(loop, error)),
             outside(E, X),
@@ -165,6 +169,7 @@ def _find(A, B, Q, R, S, E) -> Found:
             gap=gap,
             rounding=jnp.asarray(n * eps, dtype),
             near=jnp.abs(gap) < 10 * eps**0.5,
+            least=attainable(X, (1 + size(closed_loop) ** 2) * magnified, terms),
             modest=size(X) * eps**0.5 < size_Q,
             around=jnp.abs(gap) < 4 * eps**0.125,
             iterations=iterations,

@@ -11,6 +11,7 @@ from .._check import as_matrix, check_positive, is_concrete, symmetric_matrix
 from .._fields import as_float_array
 from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision, solve
+from ._arguments import check_definite
 from ._continuous_game import (
     continuous_attached,
     continuous_barrier,
@@ -271,6 +272,7 @@ def checked_game(where, A, B, D, Q, R):
     given["D"] = as_matrix(jnp.eye(n) if D is None else D, "D", where)
     given["Q"] = symmetric_matrix(Q, "Q", where)
     given["R"] = symmetric_matrix(R, "R", where)
+    check_definite(given["Q"], "Q", where, False)
     m, k = given["B"].shape[1], given["D"].shape[1]
     shapes = {"A": (n, n), "B": (n, m), "D": (n, k), "Q": (n, n), "R": (m, m)}
     for name, shape in shapes.items():

@@ -1,7 +1,6 @@
 """What both Riccati equations share: Newton steps, and derivatives."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.lax as lax
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..math._linear_solve import no_tangent, solve, symmetric
+from ..math._size import size
 from ._search import Found
 
 
@@ -21,12 +21,12 @@ def polish(
     equation: Callable[[Array], tuple[Array, tuple[Array, Array]]],
     correction: Callable[[Array, Array], Array],
     X: Array,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """Newton steps on the equation itself, if it asks for them, while they help.
 
     `equation(X)` is what is left of it, `(error, (relative, closed_loop))`;
     `correction(closed_loop, error)` solves it to first order. Returns `X`, the relative
-    residual and the closed loop.
+    residual, the closed loop, and the size of the equation's terms.
     """
     fine = _FINE * jnp.finfo(X.dtype).eps
 
@@ -48,8 +48,18 @@ def polish(
 
     error, (residual, closed_loop) = equation(X)
     start = (X, error, residual, closed_loop, residual > fine, jnp.asarray(0))
-    X, _, residual, closed_loop, *_ = lax.while_loop(more, body, start)
-    return X, residual, closed_loop
+    X, error, residual, closed_loop, *_ = lax.while_loop(more, body, start)
+    terms = size(error) / jnp.where(residual > 0, residual, 1)
+    return X, residual, closed_loop, terms
+
+
+def attainable(X: Array, gain: Array, terms: Array) -> Array:
+    """The relative residual that rounding of `X` may leave.
+
+    `gain` is by how much the equation magnifies a change of `X`.
+    """
+    eps = jnp.finfo(X.dtype).eps
+    return 8 * eps * size(X) * gain / jnp.where(terms > 0, terms, jnp.inf)
 
 
 def found_tangent(
@@ -67,18 +77,39 @@ def found_tangent(
     # Guarded at both ends: what is not finite in a failed member stays in it.
     tangents = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents)
 
+    A, B, Q, R, S, E = primals
+    *safe, X = harmless(ok, A, B, Q, R, S, E, found.X)
+
     def left(*data):
-        return equation(*data, found.X)
+        return equation(*data, X)
 
-    _, error, (_, loop) = jax.jvp(left, primals, tangents, has_aux=True)
+    _, error, (_, loop) = jax.jvp(left, tuple(safe), tangents, has_aux=True)
     stand_in = -jnp.eye(loop.shape[0], dtype=loop.dtype) / 2
-    X = correction(jnp.where(ok, loop, stand_in), jnp.where(ok, error, 0))
-    return no_tangent(found)._replace(X=jnp.where(ok, X, 0))
+    change = correction(jnp.where(ok, loop, stand_in), jnp.where(ok, error, 0))
+    return no_tangent(found)._replace(X=jnp.where(ok, change, 0))
 
 
-def detached(tree: Any, ok: Array) -> Any:
-    """The same values, without derivatives in members that are not `ok`."""
-    return jax.tree.map(lambda x: jnp.where(ok, x, lax.stop_gradient(x)), tree)
+def harmless(ok: Array, A, B, Q, R, S, E, X) -> tuple:
+    """The data and `X`, and in members that are not `ok` others that are finite.
+
+    So that no derivative of them meets a matrix that cannot be solved with.
+    """
+
+    def eye(M):
+        return jnp.eye(M.shape[0], dtype=M.dtype)
+
+    given = (A, 0), (B, 0), (Q, 0), (R, eye(R)), (S, 0), (X, 0)
+    A, B, Q, R, S, X = (jnp.where(ok, M, other) for M, other in given)
+    return A, B, Q, R, S, None if E is None else jnp.where(ok, E, eye(E)), X
+
+
+def settled(ok: Array, terms: Callable, *data) -> tuple[Array, Array]:
+    """`K` and the closed loop, with derivatives in members that are `ok` alone."""
+    A, B, _, R, S, E, X = lax.stop_gradient(data)
+    *_, K, closed_loop = terms(A, B, R, S, E, X)
+    A, B, _, R, S, E, X = harmless(ok, *data)
+    *_, live_K, live_loop = terms(A, B, R, S, E, X)
+    return jnp.where(ok, live_K, K), jnp.where(ok, live_loop, closed_loop)
 
 
 def outside(E: Array | None, Y: Array) -> Array:

@@ -32,6 +32,7 @@ class Attempt(NamedTuple):
     rounding: Array  # of the gap
     near: Array  # whether the gap is so small that it has to be looked at
     around: Array  # whether it is small
+    least: Array  # the relative residual that rounding of X may leave
     modest: Array  # whether X is far from what rounding makes of an infinite one
     iterations: Array
 
@@ -77,7 +78,9 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
         kind, found = carry
         new = attempt(kind)
         stable = new.gap > new.rounding
-        solved = stable & (new.residual <= close)
+        # No X of this precision may come closer; a hundred times is looked past.
+        enough = jnp.clip(new.least, close, 100 * close)
+        solved = stable & (new.residual <= enough)
         given = kind <= SECOND
         # A second start that fails replaces the first only by being stable.
         take = given & (solved | (kind == FIRST) | stable & ~found.stable)
@@ -100,7 +103,9 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
             stable=pick(stable, found.stable),
             fragile=jnp.where(kind == SHAKEN, ~(survives & same), found.fragile),
             stabilisable=jnp.where(
-                kind == PLAIN, survives | undecided, found.stabilisable
+                kind == PLAIN,
+                survives | undecided | found.stable,
+                found.stabilisable,
             ),
             on_edge=jnp.where(
                 kind == PLAIN,

@@ -54,13 +54,17 @@ class FunctionSystem(AbstractSystem):
         return self.function(t, x, u, w)
 
 
-def _names(given: int | Sequence[str], letter: str, argument: str) -> tuple[str, ...]:
+def names_of(
+    given: int | Sequence[str], letter: str, argument: str, where: str
+) -> tuple[str, ...]:
+    """Names, indexed if it is their number that is given, or an error."""
     if isinstance(given, int) and not isinstance(given, bool) and given >= 0:
         return indexed_names(letter, given)
     if isinstance(given, tuple | list) and all(isinstance(n, str) for n in given):
         return tuple(given)
     raise ValueError(
-        f"system: {argument} must be a whole number or a tuple of names, got {given!r}."
+        f"{where}: {argument} must be a whole number or a tuple of names, got "
+        f"{given!r}."
     )
 
 
@@ -101,7 +105,7 @@ def system(
         raise ValueError(f"system: f must be a function of (t, x, u, w), got {f!r}.")
     return FunctionSystem(
         f,
-        _names(states, "x", "states"),
-        _names(controls, "u", "controls"),
-        _names(disturbances, "w", "disturbances"),
+        names_of(states, "x", "states", "system"),
+        names_of(controls, "u", "controls", "system"),
+        names_of(disturbances, "w", "disturbances", "system"),
     )

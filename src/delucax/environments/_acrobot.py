@@ -1,0 +1,219 @@
+"""Swing the tip of a two-link arm above a line: Gym's Acrobot-v1."""
+
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._check import check_positive, check_step
+from .._fields import parameter, positive
+from .._results import RESULTS
+from .._typing import RealScalar
+from ..costs import Arrival
+from ..dynamics import AbstractDynamics, RK4
+from ..dynamics._runge_kutta import runge_kutta_step
+from ..math import clip, cos, sin, wrap
+from ..systems import Acrobot
+from ._arithmetic import own_or_solver
+from ._environment import Environment, UniformState
+from ._registry import finish
+
+
+class GymAcrobot(AbstractDynamics):
+    """Gym's arithmetic for the acrobot: one Runge-Kutta step of order 4, the torque
+    held; then the angles are wrapped to +-pi and the velocities clipped; then `w` is
+    added.
+
+    Not smooth where a velocity meets its limit: the gradient through it is 0 beyond.
+    The state jumps where an angle wraps, the gradient does not.
+
+    **Arguments:**
+
+    - `system`: the acrobot.
+    - `dt`: the step, 0.2 by default.
+    - `max_velocity_1`, `max_velocity_2`: 4 pi and 9 pi by default.
+
+    **Raises:** `ValueError` if `dt` or a limit is not positive.
+
+    Source: Gymnasium (Towers et al., 2023), `Acrobot-v1`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dynamics = dlx.environments.GymAcrobot(dlx.systems.Acrobot())
+        dynamics(0.0, jnp.array([0.1, 0.0, 0.0, 0.0]), jnp.ones(1))
+        ```
+    """
+
+    system: Acrobot
+    dt: Array = parameter(0.2, constraint=positive)
+    max_velocity_1: Array = parameter(4 * np.pi, constraint=positive)
+    max_velocity_2: Array = parameter(9 * np.pi, constraint=positive)
+
+    state_names: ClassVar = Acrobot.state_names
+    control_names: ClassVar = Acrobot.control_names
+    state_units = Acrobot.state_units
+    control_units = Acrobot.control_units
+
+    def __check_init__(self):
+        check_step(self.dt, "GymAcrobot")
+        check_positive(self.max_velocity_1, "max_velocity_1", "GymAcrobot")
+        check_positive(self.max_velocity_2, "max_velocity_2", "GymAcrobot")
+
+    def advance(self, t, x, u, w):
+        field = lambda t, x: self.system.vector_field(t, x, u, None)
+        free = runge_kutta_step(RK4.tableau, field, t, x, self.dt)
+        x_next = jnp.stack(
+            [
+                wrap(free[0]),
+                wrap(free[1]),
+                clip(free[2], -self.max_velocity_1, self.max_velocity_1),
+                clip(free[3], -self.max_velocity_2, self.max_velocity_2),
+            ]
+        )
+        if w is not None:
+            x_next = x_next + w
+        return x_next.astype(x.dtype), RESULTS.successful
+
+    def difference(self, x, x_ref):
+        return self.system.difference(x, x_ref)
+
+    def equilibrium(self):
+        return self.system.equilibrium()
+
+
+def acrobot_features(x: Array) -> Array:
+    """Cosine and sine of both angles, and the velocities: what Gymnasium users see.
+
+    **Arguments:** `x`: (angle_1, angle_2, velocity_1, velocity_2).
+
+    **Returns:** (cos(angle_1), sin(angle_1), cos(angle_2), sin(angle_2), velocity_1,
+    velocity_2).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.environments.acrobot_features(jnp.array([0.1, 0.0, 0.0, 0.0]))
+        ```
+    """
+    return jnp.stack([cos(x[0]), sin(x[0]), cos(x[1]), sin(x[1]), x[2], x[3]])
+
+
+class _AboveLine(eqx.Module):
+    """Whether the tip is above a line, with links of length 1."""
+
+    goal_height: Array = parameter()
+
+    def __call__(self, t: RealScalar, x: Array) -> Array:
+        return -cos(x[0]) - cos(x[1] + x[0]) > self.goal_height
+
+
+def acrobot(
+    mass_1: Any = 1.0,
+    mass_2: Any = 1.0,
+    length_1: Any = 1.0,
+    center_1: Any = 0.5,
+    center_2: Any = 0.5,
+    inertia_1: Any = 1.0,
+    inertia_2: Any = 1.0,
+    gravity: Any = 9.8,
+    form: str = "book",
+    *,
+    dt: Any = 0.2,
+    horizon: int = 500,
+    max_torque: Any = 1.0,
+    goal_height: Any = 1.0,
+    max_velocity_1: Any = None,
+    max_velocity_2: Any = None,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **environment: Any,
+) -> Environment:
+    """Swing the tip of two hanging links above a line, by a torque at the elbow.
+
+    State (angle_1, angle_2, velocity_1, velocity_2), hanging at 0; control (torque);
+    the integer actions 0, 1, 2 are the torques -1, 0, 1. Starts with each state uniform
+    in +-0.1. A step costs 1; the episode ends when
+    `-cos(angle_1) - cos(angle_1 + angle_2) > goal_height`, which takes 1 off the cost:
+    Gym rewards the last step with 0.
+
+    That cost has no gradient. For planning and policy gradients give
+    `cost=`[`delucax.costs.AcrobotHeight`][]`()` and `terminated=None`, and a `solver`
+    for dynamics without wraps and clips.
+
+    **Arguments:**
+
+    - `mass_1`, `mass_2`, `length_1`, `center_1`, `center_2`, `inertia_1`, `inertia_2`,
+        `gravity`, `form`: of [`delucax.systems.Acrobot`][].
+    - `dt`: the control interval, 0.2 by default.
+    - `horizon`: steps an episode, 500 by default.
+    - `max_torque`: 1 by default.
+    - `goal_height`: of the line above the first joint, in lengths of a link, 1 by
+        default.
+    - `max_velocity_1`, `max_velocity_2`: the limits of Gym's arithmetic, 4 pi and 9 pi
+        by default.
+    - `solver`: a Diffrax solver in place of Gym's arithmetic; no angle is wrapped and
+        no velocity clipped then.
+    - `substeps`: solver steps an interval, with `solver`.
+    - `**environment`: other arguments of [`delucax.Environment`][], such as
+        `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, `substeps` without `solver`, or a
+        velocity limit with it.
+
+    Source: Gymnasium (Towers et al., 2023), `Acrobot-v1`; Sutton, 1996.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        env = dlx.environments.acrobot()
+        env.step(0.0, jnp.array([0.1, 0.0, 0.0, 0.0]), 2)
+        smooth = dlx.make(
+            "acrobot",
+            solver=dlx.dynamics.RK4(),
+            cost=dlx.costs.AcrobotHeight(),
+            terminated=None,
+        )
+        ```
+    """
+    system = Acrobot(
+        mass_1,
+        mass_2,
+        length_1,
+        center_1,
+        center_2,
+        inertia_1,
+        inertia_2,
+        gravity,
+        form,
+    )
+    options = {"max_velocity_1": max_velocity_1, "max_velocity_2": max_velocity_2}
+    dynamics = own_or_solver(
+        GymAcrobot, system, dt, solver, substeps, "acrobot", options
+    )
+    above = _AboveLine(goal_height)
+    arguments: dict[str, Any] = dict(
+        dynamics=dynamics,
+        cost=Arrival(above, arrival_cost=-1.0),
+        initial_state=UniformState(jnp.full(4, -0.1), jnp.full(4, 0.1)),
+        control_bounds=(-max_torque, max_torque),
+        horizon=horizon,
+        terminated=above,
+        actions=max_torque * jnp.array([[-1.0], [0.0], [1.0]]),
+        encode=acrobot_features,
+    )
+    return finish(acrobot, arguments, environment)

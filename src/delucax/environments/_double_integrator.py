@@ -1,0 +1,63 @@
+"""Bring a mass on a line to rest at the origin."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+
+from ..costs import Quadratic
+from ..dynamics import Discretized
+from ..systems import DoubleIntegrator
+from ._environment import Environment, UniformState
+from ._registry import finish
+
+
+def double_integrator(
+    mass: Any = 1.0,
+    *,
+    dt: Any = 0.1,
+    horizon: int = 100,
+    max_force: Any = 1.0,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **environment: Any,
+) -> Environment:
+    """Bring a mass on a line to rest at the origin.
+
+    State (position, velocity); control (force). Starts with the position uniform in
+    +-2 and the velocity in +-1. Cost `|x|^2 + 0.1 force^2` a step. Never terminates.
+
+    **Arguments:**
+
+    - `mass`: of [`delucax.systems.DoubleIntegrator`][].
+    - `max_force`: 1 by default.
+    - `dt`: the control interval, 0.1 by default.
+    - `horizon`: steps an episode, 100 by default.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+    - `substeps`: solver steps an interval, 1 by default.
+    - `**environment`: other arguments of [`delucax.Environment`][], such as
+        `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers.
+
+    Source: Åström and Murray, 2008.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("double_integrator", mass=2.0)
+        ```
+    """
+    corner = jnp.array([2.0, 1.0])
+    arguments: dict[str, Any] = dict(
+        dynamics=Discretized(DoubleIntegrator(mass), dt, solver, substeps),
+        cost=Quadratic(jnp.eye(2), 0.1 * jnp.eye(1)),
+        initial_state=UniformState(-corner, corner),
+        control_bounds=(-max_force, max_force),
+        horizon=horizon,
+    )
+    return finish(double_integrator, arguments, environment)

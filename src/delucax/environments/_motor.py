@@ -1,0 +1,81 @@
+"""Run a synchronous motor at a speed."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+
+from ..costs import Quadratic
+from ..dynamics import Discretized
+from ..systems import PermanentMagnetMotor
+from ._environment import Environment, UniformState
+from ._registry import finish
+
+
+def permanent_magnet_motor(
+    resistance: Any = 2.875,
+    d_inductance: Any = 0.0085,
+    q_inductance: Any = 0.0085,
+    flux: Any = 0.175,
+    inertia: Any = 0.0008,
+    friction: Any = 0.001,
+    pole_pairs: Any = 4.0,
+    *,
+    speed: Any = 100.0,
+    dt: Any = 0.0005,
+    horizon: int = 200,
+    max_voltage: Any = 150.0,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **environment: Any,
+) -> Environment:
+    """Bring a synchronous motor to a speed and hold it.
+
+    State (i_d, i_q, speed); control (v_d, v_q), each within +-max_voltage; disturbance
+    (load). Starts with the currents uniform in +-1 A and the speed in +-50 rad/s. Cost
+    `0.01 (di_d^2 + di_q^2) + 0.001 dspeed^2 + 1e-5 |dv|^2` a step, each measured from
+    what holds the speed without load. Never terminates.
+
+    **Arguments:**
+
+    - `resistance`, `d_inductance`, `q_inductance`, `flux`, `inertia`, `friction`,
+        `pole_pairs`: of [`delucax.systems.PermanentMagnetMotor`][].
+    - `speed`: to hold [rad/s], 100 by default.
+    - `max_voltage`: 150 by default.
+    - `dt`: the control interval, 0.0005 by default.
+    - `horizon`: steps an episode, 200 by default.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+    - `substeps`: solver steps an interval, 1 by default.
+    - `**environment`: other arguments of [`delucax.Environment`][], such as
+        `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers.
+
+    Source: Krause, Wasynczuk and Sudhoff, 2002.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        load = dlx.disturbances.Constant(jnp.array([0.5]))
+        env = dlx.make("permanent_magnet_motor", speed=80.0, disturbance=load)
+        ```
+    """
+    system = PermanentMagnetMotor(
+        resistance, d_inductance, q_inductance, flux, inertia, friction, pole_pairs
+    )
+    x, u = system.equilibrium(speed)
+    Q, R = jnp.diag(jnp.array([0.01, 0.01, 0.001])), 1e-5 * jnp.eye(2)
+    corner = jnp.array([1.0, 1.0, 50.0])
+    arguments: dict[str, Any] = dict(
+        dynamics=Discretized(system, dt, solver, substeps),
+        cost=Quadratic(Q, R, state_target=x, control_target=u),
+        initial_state=UniformState(-corner, corner),
+        control_bounds=(-max_voltage, max_voltage),
+        horizon=horizon,
+    )
+    return finish(permanent_magnet_motor, arguments, environment)

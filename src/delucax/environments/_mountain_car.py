@@ -1,0 +1,285 @@
+"""Drive an underpowered car out of a valley: Gym's MountainCarContinuous-v0 and
+MountainCar-v0."""
+
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import check_positive, check_range, check_step
+from .._fields import parameter, positive
+from .._results import RESULTS
+from .._typing import RealScalar
+from ..costs import AbstractCost, Arrival
+from ..dynamics import AbstractDynamics
+from ..math import clip
+from ..systems import MountainCar
+from ._arithmetic import own_or_solver
+from ._environment import Environment, UniformState
+from ._registry import finish
+
+
+class GymMountainCar(AbstractDynamics):
+    """Gym's arithmetic for the mountain car, a semi-implicit Euler step with limits:
+
+    `velocity_next = clip(velocity + acceleration dt, -max_speed, max_speed)`,
+    `position_next = clip(position + velocity_next dt, min_position, max_position)`; a
+    car that runs into the left wall stops there, `velocity_next = 0`; then `w` is
+    added.
+
+    Not smooth where the speed or the position meets its limit: the gradient through it
+    is 0 beyond.
+
+    **Arguments:**
+
+    - `system`: the car.
+    - `dt`: the step, 1 by default, for the system's unit of time is Gym's step.
+    - `max_speed`: 0.07 by default.
+    - `min_position`, `max_position`: the walls, -1.2 and 0.6 by default. Only the left
+        one stops the car.
+
+    **Raises:** `ValueError` if `dt` or `max_speed` is not positive, or the walls cross.
+
+    Source: Gymnasium (Towers et al., 2023), `MountainCarContinuous-v0` and
+    `MountainCar-v0`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dynamics = dlx.environments.GymMountainCar(dlx.systems.MountainCar())
+        dynamics(0.0, jnp.array([-0.5, 0.0]), jnp.ones(1))
+        ```
+    """
+
+    system: MountainCar
+    dt: Array = parameter(1.0, constraint=positive)
+    max_speed: Array = parameter(0.07, constraint=positive)
+    min_position: Array = parameter(-1.2)
+    max_position: Array = parameter(0.6)
+
+    state_names: ClassVar = MountainCar.state_names
+    control_names: ClassVar = MountainCar.control_names
+    state_units = MountainCar.state_units
+    control_units = MountainCar.control_units
+
+    def __check_init__(self):
+        where = "GymMountainCar"
+        check_step(self.dt, where)
+        check_positive(self.max_speed, "max_speed", where)
+        check_range(self.max_position, "max_position", where, self.min_position)
+
+    def advance(self, t, x, u, w):
+        position, velocity = x[0], x[1]
+        acceleration = self.system.acceleration(position, u[0])
+        velocity = velocity + acceleration * self.dt
+        velocity = clip(velocity, -self.max_speed, self.max_speed)
+        position = position + velocity * self.dt
+        position = clip(position, self.min_position, self.max_position)
+        stopped = (position <= self.min_position) & (velocity < 0)
+        velocity = jnp.where(stopped, 0, velocity)
+        x_next = jnp.stack([position, velocity])
+        if w is not None:
+            x_next = x_next + w
+        return x_next.astype(x.dtype), RESULTS.successful
+
+    def difference(self, x, x_ref):
+        return self.system.difference(x, x_ref)
+
+    def equilibrium(self):
+        return self.system.equilibrium()
+
+
+class _AtGoal(eqx.Module):
+    """Whether the car is at the goal or beyond it, and fast enough."""
+
+    goal_position: Array = parameter()
+    goal_velocity: Array = parameter()
+
+    def __call__(self, t: RealScalar, x: Array) -> Array:
+        return (x[0] >= self.goal_position) & (x[1] >= self.goal_velocity)
+
+
+def mountain_car(
+    power: Any = 0.0015,
+    gravity: Any = 0.0025,
+    *,
+    dt: Any = 1.0,
+    horizon: int = 999,
+    goal_position: Any = 0.45,
+    goal_velocity: Any = 0.0,
+    max_speed: Any = None,
+    min_position: Any = None,
+    max_position: Any = None,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **environment: Any,
+) -> Environment:
+    """Drive a car out of a valley by rocking it: Gym's MountainCarContinuous-v0.
+
+    State (position, velocity); control (push), in +-1. Starts at rest with the position
+    uniform in [-0.6, -0.4]. A step costs `0.1 push^2`, and the arrival at the goal
+    -100, where the episode ends. Gym charges the push that was asked for; here it is
+    the one that was applied, within the bounds.
+
+    The arrival has no gradient. For planning and policy gradients give as `cost` a
+    [`delucax.costs.Quadratic`][] with the goal as `state_target`, `terminated=None`,
+    and a `solver` for dynamics without walls and limits.
+
+    **Arguments:**
+
+    - `power`, `gravity`: of [`delucax.systems.MountainCar`][], in Gym's units a step.
+    - `dt`: the control interval in Gym's steps, 1 by default.
+    - `horizon`: steps an episode, 999 by default.
+    - `goal_position`: 0.45 by default.
+    - `goal_velocity`: the least velocity at the goal, 0 by default.
+    - `max_speed`, `min_position`, `max_position`: the limits of Gym's arithmetic, 0.07,
+        -1.2 and 0.6 by default.
+    - `solver`: a Diffrax solver in place of Gym's arithmetic; there are no limits then.
+    - `substeps`: solver steps an interval, with `solver`.
+    - `**environment`: other arguments of [`delucax.Environment`][], such as
+        `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, `substeps` without `solver`, or a limit
+        with it.
+
+    Source: Gymnasium (Towers et al., 2023), `MountainCarContinuous-v0`; Moore, 1990.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        env = dlx.environments.mountain_car(power=0.002)
+        cost = dlx.costs.Quadratic(
+            jnp.diag(jnp.array([1.0, 0.0])), 0.1 * jnp.eye(1), state_target=[0.45, 0.0]
+        )
+        smooth = dlx.make(
+            "mountain_car", solver=dlx.dynamics.RK4(), cost=cost, terminated=None
+        )
+        ```
+    """
+    goal = _AtGoal(goal_position, goal_velocity)
+    limits = {
+        "max_speed": max_speed,
+        "min_position": min_position,
+        "max_position": max_position,
+    }
+    arguments = _valley(
+        MountainCar(power, gravity),
+        dt,
+        solver,
+        substeps,
+        "mountain_car",
+        limits,
+        Arrival(goal, step_cost=0.0, control_weight=0.1, arrival_cost=-100.0),
+        goal,
+    )
+    arguments["horizon"] = horizon
+    return finish(mountain_car, arguments, environment)
+
+
+def mountain_car_discrete(
+    power: Any = 0.001,
+    gravity: Any = 0.0025,
+    *,
+    dt: Any = 1.0,
+    horizon: int = 200,
+    goal_position: Any = 0.5,
+    goal_velocity: Any = 0.0,
+    max_speed: Any = None,
+    min_position: Any = None,
+    max_position: Any = None,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **environment: Any,
+) -> Environment:
+    """Drive a car out of a valley in the fewest steps: Gym's MountainCar-v0.
+
+    As [`delucax.environments.mountain_car`][] with a weaker motor and a farther goal;
+    the integer actions 0, 1, 2 are the pushes -1, 0, 1, and a push between them is
+    taken too. A step costs 1, the arrival nothing.
+
+    That cost has no gradient; what has is named there.
+
+    **Arguments:**
+
+    - `power`, `gravity`: of [`delucax.systems.MountainCar`][]; the power is 0.001 by
+        default.
+    - `dt`: the control interval in Gym's steps, 1 by default.
+    - `horizon`: steps an episode, 200 by default.
+    - `goal_position`: 0.5 by default.
+    - `goal_velocity`: the least velocity at the goal, 0 by default.
+    - `max_speed`, `min_position`, `max_position`: the limits of Gym's arithmetic, 0.07,
+        -1.2 and 0.6 by default.
+    - `solver`: a Diffrax solver in place of Gym's arithmetic; there are no limits then.
+    - `substeps`: solver steps an interval, with `solver`.
+    - `**environment`: other arguments of [`delucax.Environment`][], such as
+        `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, `substeps` without `solver`, or a limit
+        with it.
+
+    Source: Gymnasium (Towers et al., 2023), `MountainCar-v0`; Moore, 1990.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        env = dlx.environments.mountain_car_discrete()
+        env.step(0.0, jnp.array([-0.5, 0.0]), 2)
+        ```
+    """
+    goal = _AtGoal(goal_position, goal_velocity)
+    limits = {
+        "max_speed": max_speed,
+        "min_position": min_position,
+        "max_position": max_position,
+    }
+    arguments = _valley(
+        MountainCar(power, gravity),
+        dt,
+        solver,
+        substeps,
+        "mountain_car_discrete",
+        limits,
+        Arrival(goal),
+        goal,
+    )
+    arguments["horizon"] = horizon
+    arguments["actions"] = jnp.array([[-1.0], [0.0], [1.0]])
+    return finish(mountain_car_discrete, arguments, environment)
+
+
+def _valley(
+    system: MountainCar,
+    dt: Any,
+    solver: diffrax.AbstractSolver | None,
+    substeps: int,
+    where: str,
+    limits: dict[str, Any],
+    cost: AbstractCost,
+    goal: _AtGoal,
+) -> dict[str, Any]:
+    """What both tasks share."""
+    low, high = jnp.array([-0.6, 0.0]), jnp.array([-0.4, 0.0])
+    return dict(
+        dynamics=own_or_solver(
+            GymMountainCar, system, dt, solver, substeps, where, limits
+        ),
+        cost=cost,
+        initial_state=UniformState(low, high),
+        control_bounds=(-1.0, 1.0),
+        terminated=goal,
+    )

@@ -1,0 +1,142 @@
+"""Fly a quadrotor to a point in space and hover there."""
+
+from typing import Any, Literal
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._fields import as_float_array
+from .._typing import PRNGKey
+from ..costs import Quadratic
+from ..dynamics import Discretized
+from ..systems import Quadrotor
+from ..systems._quadrotor import attitude_difference, unit_attitude
+from ._environment import Environment, UniformState
+from ._registry import finish
+
+
+class _Start(eqx.Module):
+    """A state from a box, its quaternion of length 1."""
+
+    box: UniformState
+
+    def __call__(self, key: PRNGKey) -> Array:
+        return unit_attitude(self.box(key))
+
+
+def quadrotor_features(x: Array) -> Array:
+    """The state with the rotation matrix in place of the quaternion: q and -q, which
+    are one attitude, look the same.
+
+    **Arguments:** `x`: the state of a [`delucax.systems.Quadrotor`][].
+
+    **Returns:** (position, rotation matrix from body to world row by row, velocity,
+    body rates), shape `(18,)`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        x, _ = dlx.systems.Quadrotor().equilibrium()
+        dlx.environments.quadrotor_features(x)
+        ```
+    """
+    w, a, b, c = x[3], x[4], x[5], x[6]
+    rotation = [
+        1 - 2 * (b * b + c * c),
+        2 * (a * b - w * c),
+        2 * (a * c + w * b),
+        2 * (a * b + w * c),
+        1 - 2 * (a * a + c * c),
+        2 * (b * c - w * a),
+        2 * (a * c - w * b),
+        2 * (b * c + w * a),
+        1 - 2 * (a * a + b * b),
+    ]
+    return jnp.concatenate([x[:3], jnp.stack(rotation), x[7:]])
+
+
+def quadrotor(
+    mass: Any = 0.716,
+    arm: Any = 0.17,
+    inertia_x: Any = 0.007,
+    inertia_y: Any = 0.007,
+    inertia_z: Any = 0.012,
+    moment: Any = 0.016,
+    drag: Any = 0.0,
+    gravity: Any = 9.81,
+    *,
+    inputs: Literal["rotors", "wrench"] = "rotors",
+    dt: Any = 0.02,
+    horizon: int = 250,
+    max_thrust: Any = 6.0,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **environment: Any,
+) -> Environment:
+    """Fly a quadrotor to the origin and hover there.
+
+    State (position, quaternion, velocity, body rates), 13 entries; control (front,
+    left, back, right), the thrusts, or (thrust, torque); disturbance, a force. Starts
+    with the position uniform in +-1 m, the velocity in +-0.5 m/s, the rates in +-0.5
+    rad/s and the attitude up to about 40 degrees from level. Cost a step: the squares
+    of position and of the quaternion's deviation, 0.1 times those of the velocities,
+    and 0.1 times those of the control's deviation from hovering. Never terminates.
+
+    **Arguments:**
+
+    - `mass`, `arm`, `inertia_x`, `inertia_y`, `inertia_z`, `moment`, `drag`,
+        `gravity`, `inputs`: of [`delucax.systems.Quadrotor`][].
+    - `max_thrust`: of a rotor, 6 by default; none is negative. A wrench is bounded by
+        the largest that the rotors give on each axis.
+    - `dt`: the control interval, 0.02 by default.
+    - `horizon`: steps an episode, 250 by default.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+    - `substeps`: solver steps an interval, 1 by default.
+    - `**environment`: other arguments of [`delucax.Environment`][], such as
+        `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers.
+
+    Source: Mahony, Kumar and Corke, 2012; Furrer, Burri, Achtelik and Siegwart, 2016.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("quadrotor", mass=0.8)
+        ```
+    """
+    system = Quadrotor(
+        *(mass, arm, inertia_x, inertia_y, inertia_z, moment, drag, gravity),
+        inputs=inputs,
+    )
+    x, hover = system.equilibrium()
+    low, high = 0.0, as_float_array(max_thrust)
+    if inputs == "wrench":
+        turn, yaw = system.arm * high, 2 * system.moment * high
+        high = jnp.stack([4 * high, turn, turn, yaw])
+        low = -high.at[0].set(0.0)
+    corner = jnp.array([1.0] * 3 + [0.0] + [0.2] * 3 + [0.5] * 6)
+    weights = jnp.array([1.0] * 7 + [0.1] * 6)
+    arguments: dict[str, Any] = dict(
+        dynamics=Discretized(system, dt, solver, substeps),
+        cost=Quadratic(
+            jnp.diag(weights),
+            0.1 * jnp.eye(4),
+            state_target=x,
+            control_target=hover,
+            difference=attitude_difference,
+        ),
+        initial_state=_Start(UniformState(x - corner, x + corner)),
+        control_bounds=(low, high),
+        horizon=horizon,
+        encode=quadrotor_features,
+    )
+    return finish(quadrotor, arguments, environment)

@@ -1,0 +1,78 @@
+"""Hold the level of a tank that is fed through another one."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+
+from .._check import check_range
+from ..costs import Quadratic
+from ..dynamics import Discretized
+from ..systems import TwoTank
+from ._environment import Environment, UniformState
+from ._registry import finish
+
+
+def two_tank(
+    upper_area: Any = 28.0,
+    lower_area: Any = 28.0,
+    upper_outlet: Any = 0.071,
+    lower_outlet: Any = 0.071,
+    gravity: Any = 981.0,
+    smoothing: Any = 0.01,
+    *,
+    level: Any = 10.0,
+    dt: Any = 2.0,
+    horizon: int = 200,
+    max_flow: Any = 30.0,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **environment: Any,
+) -> Environment:
+    """Hold the lower of two tanks at a level.
+
+    State (upper, lower) [cm]; control (flow) [cm^3/s], not negative. Starts with the
+    levels uniform in [0, 20]. Cost `(lower - level)^2 + 0.01 (flow - flow*)^2` a step,
+    flow* being what holds the level. Never terminates.
+
+    **Arguments:**
+
+    - `upper_area`, `lower_area`, `upper_outlet`, `lower_outlet`, `gravity`,
+        `smoothing`: of [`delucax.systems.TwoTank`][].
+    - `level`: to hold [cm], 10 by default.
+    - `max_flow`: of the pump, 30 by default.
+    - `dt`: the control interval, 2 by default.
+    - `horizon`: steps an episode, 200 by default.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+    - `substeps`: solver steps an interval, 1 by default.
+    - `**environment`: other arguments of [`delucax.Environment`][], such as
+        `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers.
+
+    Source: Johansson, 2000.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("two_tank", level=12.0)
+        ```
+    """
+    check_range(level, "level", "two_tank")
+    system = TwoTank(
+        upper_area, lower_area, upper_outlet, lower_outlet, gravity, smoothing
+    )
+    x, u = system.equilibrium(level)
+    Q, R = jnp.diag(jnp.array([0.0, 1.0])), 0.01 * jnp.eye(1)
+    arguments: dict[str, Any] = dict(
+        dynamics=Discretized(system, dt, solver, substeps),
+        cost=Quadratic(Q, R, state_target=x, control_target=u),
+        initial_state=UniformState(jnp.zeros(2), jnp.full(2, 20.0)),
+        control_bounds=(0.0, max_flow),
+        horizon=horizon,
+    )
+    return finish(two_tank, arguments, environment)

@@ -1,0 +1,63 @@
+"""Stop van der Pol's oscillator."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+
+from ..costs import Quadratic
+from ..dynamics import Discretized
+from ..systems import VanDerPol
+from ._environment import Environment, UniformState
+from ._registry import finish
+
+
+def van_der_pol(
+    mu: Any = 1.0,
+    *,
+    dt: Any = 0.05,
+    horizon: int = 200,
+    max_control: Any = 3.0,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **environment: Any,
+) -> Environment:
+    """Bring van der Pol's oscillator from its limit cycle to rest.
+
+    State (x, v); control (u). Starts with each state uniform in +-2. Cost
+    `|x|^2 + 0.1 u^2` a step. Never terminates.
+
+    **Arguments:**
+
+    - `mu`: of [`delucax.systems.VanDerPol`][].
+    - `max_control`: 3 by default.
+    - `dt`: the control interval, 0.05 by default.
+    - `horizon`: steps an episode, 200 by default.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+    - `substeps`: solver steps an interval, 1 by default.
+    - `**environment`: other arguments of [`delucax.Environment`][], such as
+        `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers.
+
+    Source: van der Pol, 1926.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("van_der_pol", mu=2.0)
+        ```
+    """
+    corner = jnp.full(2, 2.0)
+    arguments: dict[str, Any] = dict(
+        dynamics=Discretized(VanDerPol(mu), dt, solver, substeps),
+        cost=Quadratic(jnp.eye(2), 0.1 * jnp.eye(1)),
+        initial_state=UniformState(-corner, corner),
+        control_bounds=(-max_control, max_control),
+        horizon=horizon,
+    )
+    return finish(van_der_pol, arguments, environment)

@@ -1,0 +1,98 @@
+"""A car as a bicycle, moved by the forces of its tyres."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._fields import parameter, positive
+from ..math import cos, sin, wrap
+from ._base import AbstractSystem
+
+
+class DynamicBicycle(AbstractSystem):
+    r"""A car on tyres whose lateral force is proportional to the slip angle:
+
+    `d(vx)/dt = acceleration - F_f sin(steering) / m + vy rate`,
+    `d(vy)/dt = (F_f cos(steering) + F_r) / m - vx rate`,
+    `d(rate)/dt = (front F_f cos(steering) - rear F_r) / I`,
+    `F_f = -C_f (angle(vy + front rate, vx) - steering)`,
+    `F_r = -C_r angle(vy - rear rate, vx)`,
+
+    `angle(v, vx) = atan(v / sqrt(vx^2 + standstill^2))`. The state is (x [m], y [m],
+    heading [rad], vx [m/s], vy [m/s], rate [rad/s]), the velocities those of the centre
+    of mass along and across the car; the control is (acceleration [m/s^2], steering
+    [rad]).
+
+    The slip angle itself, `atan(v / vx)`, has no value at rest: `standstill` is what
+    keeps this one smooth there. It is meant for driving forward, much faster than that.
+
+    **Arguments:**
+
+    - `mass`: m [kg], 1573 by default.
+    - `inertia`: I, about the vertical axis [kg m^2], 2873 by default.
+    - `front`, `rear`: from the centre of mass to the axles [m], 1.1 and 1.58 by
+        default.
+    - `front_stiffness`, `rear_stiffness`: C_f and C_r, of both tyres of an axle
+        [N/rad], 160000 by default.
+    - `standstill`: a speed [m/s], 1 by default.
+
+    **Raises:** `ValueError` if a number is not positive.
+
+    Source: Rajamani, 2012; Kong, Pfeiffer, Schildbach and Borrelli, 2015.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        car = dlx.systems.DynamicBicycle()
+        x = jnp.array([0.0, 0.0, 0.0, 20.0, 0.0, 0.0])
+        car.vector_field(0.0, x, jnp.array([0.0, 0.02]), None)
+        ```
+    """
+
+    mass: Array = parameter(1573.0, constraint=positive)
+    inertia: Array = parameter(2873.0, constraint=positive)
+    front: Array = parameter(1.1, constraint=positive)
+    rear: Array = parameter(1.58, constraint=positive)
+    front_stiffness: Array = parameter(160000.0, constraint=positive)
+    rear_stiffness: Array = parameter(160000.0, constraint=positive)
+    standstill: Array = parameter(1.0, constraint=positive)
+
+    state_names: ClassVar = ("x", "y", "heading", "vx", "vy", "rate")
+    control_names: ClassVar = ("acceleration", "steering")
+    state_units: ClassVar = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+    control_units: ClassVar = ("m/s^2", "rad")
+
+    def vector_field(self, t, x, u, w):
+        heading, vx, vy, rate = x[2], x[3], x[4], x[5]
+        speed = (vx * vx + self.standstill**2) ** 0.5
+        slip_front = jnp.arctan2(vy + self.front * rate, speed) - u[1]
+        slip_rear = jnp.arctan2(vy - self.rear * rate, speed)
+        force_front = -self.front_stiffness * slip_front
+        force_rear = -self.rear_stiffness * slip_rear
+        c, s = cos(heading), sin(heading)
+        aside = force_front * cos(u[1])
+        return jnp.stack(
+            [
+                vx * c - vy * s,
+                vx * s + vy * c,
+                rate,
+                u[0] - force_front * sin(u[1]) / self.mass + vy * rate,
+                (aside + force_rear) / self.mass - vx * rate,
+                (self.front * aside - self.rear * force_rear) / self.inertia,
+            ]
+        )
+
+    def difference(self, x, x_ref):
+        d = x - x_ref
+        return jnp.stack([d[0], d[1], wrap(d[2]), d[3], d[4], d[5]])
+
+    def equilibrium(self):
+        """Standing at the origin.
+
+        **Returns:** the zero state and control.
+        """
+        return jnp.zeros(6), jnp.zeros(2)

@@ -1,0 +1,104 @@
+"""Masses on a line, joined by springs and dampers."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import check_count
+from .._fields import parameter, positive
+from ._base import AbstractSystem
+
+
+class MassSpringDamper(AbstractSystem):
+    """A mass on a spring and a damper, or a chain of them from a wall to the mass that
+    the force acts on:
+
+    `m_i d2(q_i)/dt2 = T_(i+1) - T_i`, `T_i = k_i (q_i - q_(i-1)) + c_i (v_i - v_(i-1))`
+
+    with `q_0 = v_0 = 0` the wall and `T_(n+1)` the force. The state is the positions
+    [m], measured from rest, and then the velocities [m/s]; the control is (force [N]).
+
+    **Arguments:**
+
+    - `mass`: m [kg], a number or one for each mass, 1 by default.
+    - `stiffness`: k [N/m], a number or one for each spring, 1 by default.
+    - `damping`: c [N s/m], a number or one for each damper, 0.1 by default.
+    - `masses`: how many there are, 1 by default.
+
+    **Raises:** `ValueError` if a mass is not positive, a number is not finite, or there
+    are not as many numbers as masses.
+
+    Source: Åström and Murray, 2008.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        chain = dlx.systems.MassSpringDamper(stiffness=[1.0, 2.0, 3.0], masses=3)
+        chain.vector_field(0.0, jnp.ones(6), jnp.zeros(1), None)
+        ```
+    """
+
+    mass: Array = parameter(constraint=positive)
+    stiffness: Array = parameter()
+    damping: Array = parameter()
+    masses: int = eqx.field(static=True)
+
+    control_names: ClassVar = ("force",)
+    control_units: ClassVar = ("N",)
+
+    def __init__(
+        self,
+        mass: Any = 1.0,
+        stiffness: Any = 1.0,
+        damping: Any = 0.1,
+        *,
+        masses: int = 1,
+    ):
+        self.mass = mass
+        self.stiffness = stiffness
+        self.damping = damping
+        self.masses = check_count(masses, "masses", "MassSpringDamper")
+
+    def __check_init__(self):
+        for name in ("mass", "stiffness", "damping"):
+            shape = jnp.shape(getattr(self, name))
+            if shape not in ((), (self.masses,)):
+                raise ValueError(
+                    f"MassSpringDamper: {name} must be a number or have shape "
+                    f"({self.masses},), got {shape}."
+                )
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Positions, then velocities; numbered if there are several masses."""
+        if self.masses == 1:
+            return ("position", "velocity")
+        each = range(1, self.masses + 1)
+        return (*(f"position_{i}" for i in each), *(f"velocity_{i}" for i in each))
+
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """Metres, then metres per second."""
+        return ("m",) * self.masses + ("m/s",) * self.masses
+
+    def vector_field(self, t, x, u, w):
+        n = self.masses
+        m, k, c = (
+            jnp.broadcast_to(a, (n,)).astype(x.dtype)
+            for a in (self.mass, self.stiffness, self.damping)
+        )
+        tension, q, v = [], 0.0, 0.0
+        for i in range(n):
+            tension.append(k[i] * (x[i] - q) + c[i] * (x[n + i] - v))
+            q, v = x[i], x[n + i]
+        tension.append(u[0])
+        pulls = [(tension[i + 1] - tension[i]) / m[i] for i in range(n)]
+        return jnp.stack([*(x[n + i] for i in range(n)), *pulls])
+
+    def equilibrium(self):
+        return jnp.zeros(2 * self.masses), jnp.zeros(1)

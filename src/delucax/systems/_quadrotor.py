@@ -1,0 +1,189 @@
+"""A quadrotor in space, its attitude a quaternion."""
+
+from typing import ClassVar, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._fields import parameter, positive
+from ._base import AbstractSystem
+
+
+class Quadrotor(AbstractSystem):
+    r"""A rigid body with four rotors, at front, left, back and right:
+
+    `dp/dt = v`, `dq/dt = q (0, omega) / 2`,
+    `m dv/dt = thrust R(q) e_z - m g e_z - drag v + F`,
+    `J domega/dt = torque - omega x J omega`, `J` diagonal.
+
+    The state is the position p [m] and, after the unit quaternion q = (qw, qx, qy, qz)
+    from body to world, the velocity v [m/s], both in a world whose z axis points up,
+    and the body rates omega [rad/s]. The disturbance is the force F [N] in the world.
+
+    The control is the thrust of each rotor [N], with
+
+    `thrust = front + left + back + right`,
+    `torque = (l (left - right), l (back - front), k (left + right - front - back))`,
+
+    or, with `inputs="wrench"`, (thrust [N], torque [N m]) itself. Smooth, and takes
+    thrusts of either sign.
+
+    `project` puts the quaternion back on the unit sphere after each control interval,
+    and `difference` takes that one of q and -q which is closer to the reference. Design
+    a regulator on the linearisation of [`delucax.Discretized`][], which projects, and
+    give it this `difference`: of the 13 coordinates the length of the quaternion is not
+    controllable, and is at rest after one step. In the linearisation of the system
+    itself it stays as it is for ever, and no regulator exists.
+
+    **Arguments:**
+
+    - `mass`: m [kg], 0.716 by default.
+    - `arm`: l, from the centre to a rotor [m], 0.17 by default.
+    - `inertia_x`, `inertia_y`, `inertia_z`: J [kg m^2], 0.007, 0.007 and 0.012 by
+        default.
+    - `moment`: k, torque per thrust of a rotor [m], 0.016 by default.
+    - `drag`: of the air [N s/m], 0 by default.
+    - `gravity`: g [m/s^2], 9.81 by default.
+    - `inputs`: `"rotors"` (default) or `"wrench"`.
+
+    **Raises:** `ValueError` if a mass, length or inertia is not positive, a number is
+    not finite or `inputs` is neither of the two.
+
+    Source: Mahony, Kumar and Corke, 2012; Furrer, Burri, Achtelik and Siegwart, 2016
+    (RotorS), for the constants of the Hummingbird.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        quadrotor = dlx.systems.Quadrotor(mass=0.8)
+        x, u = quadrotor.equilibrium()
+        quadrotor.vector_field(0.0, x, u, None)
+        ```
+    """
+
+    mass: Array = parameter(0.716, constraint=positive)
+    arm: Array = parameter(0.17, constraint=positive)
+    inertia_x: Array = parameter(0.007, constraint=positive)
+    inertia_y: Array = parameter(0.007, constraint=positive)
+    inertia_z: Array = parameter(0.012, constraint=positive)
+    moment: Array = parameter(0.016, constraint=positive)
+    drag: Array = parameter(0.0)
+    gravity: Array = parameter(9.81)
+    inputs: Literal["rotors", "wrench"] = eqx.field(static=True, default="rotors")
+
+    state_names: ClassVar = (
+        *("px", "py", "pz", "qw", "qx", "qy", "qz"),
+        *("vx", "vy", "vz", "rate_x", "rate_y", "rate_z"),
+    )
+    disturbance_names: ClassVar = ("force_x", "force_y", "force_z")
+    state_units: ClassVar = (
+        *("m", "m", "m", "1", "1", "1", "1"),
+        *("m/s", "m/s", "m/s", "rad/s", "rad/s", "rad/s"),
+    )
+
+    def __check_init__(self):
+        if self.inputs not in ("rotors", "wrench"):
+            raise ValueError(
+                f"Quadrotor: inputs must be 'rotors' or 'wrench', got {self.inputs!r}."
+            )
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        """Those of the rotors, or of the thrust and torque."""
+        if self.inputs == "rotors":
+            return ("front", "left", "back", "right")
+        return ("thrust", "torque_x", "torque_y", "torque_z")
+
+    @property
+    def control_units(self) -> tuple[str, ...]:
+        """Newtons, and newton metres."""
+        return ("N",) * 4 if self.inputs == "rotors" else ("N", "N m", "N m", "N m")
+
+    def wrench(self, u: Array) -> Array:
+        """What the rotors do to the body.
+
+        **Arguments:** `u`: control.
+
+        **Returns:** (thrust [N], torque [N m]), shape `(4,)`.
+        """
+        if self.inputs == "wrench":
+            return u
+        front, left, back, right = u[0], u[1], u[2], u[3]
+        return jnp.stack(
+            [
+                front + left + back + right,
+                self.arm * (left - right),
+                self.arm * (back - front),
+                self.moment * (left + right - front - back),
+            ]
+        )
+
+    def vector_field(self, t, x, u, w):
+        qw, qx, qy, qz = x[3], x[4], x[5], x[6]
+        a, b, c = x[10], x[11], x[12]
+        wrench = self.wrench(u)
+        lift, pull = wrench[0] / self.mass, self.drag / self.mass
+        ax = 2 * (qx * qz + qw * qy) * lift - pull * x[7]
+        ay = 2 * (qy * qz - qw * qx) * lift - pull * x[8]
+        az = (1 - 2 * (qx * qx + qy * qy)) * lift - pull * x[9] - self.gravity
+        if w is not None:
+            push = 1 / self.mass
+            ax, ay, az = ax + push * w[0], ay + push * w[1], az + push * w[2]
+        jx, jy, jz = self.inertia_x, self.inertia_y, self.inertia_z
+        return jnp.stack(
+            [
+                x[7],
+                x[8],
+                x[9],
+                -0.5 * (qx * a + qy * b + qz * c),
+                0.5 * (qw * a + qy * c - qz * b),
+                0.5 * (qw * b + qz * a - qx * c),
+                0.5 * (qw * c + qx * b - qy * a),
+                ax,
+                ay,
+                az,
+                (wrench[1] - (jz - jy) * b * c) / jx,
+                (wrench[2] - (jx - jz) * c * a) / jy,
+                (wrench[3] - (jy - jx) * a * b) / jz,
+            ]
+        )
+
+    def project(self, x):
+        return unit_attitude(x)
+
+    def difference(self, x, x_ref):
+        return attitude_difference(x, x_ref)
+
+    def equilibrium(self):
+        """Hovering at the origin.
+
+        **Returns:** the state, level and at rest, and a quarter of the weight for each
+            rotor.
+        """
+        x = jnp.zeros(13).at[3].set(1.0)
+        weight = self.mass * self.gravity
+        if self.inputs == "rotors":
+            return x, jnp.stack([weight / 4] * 4)
+        return x, jnp.stack([weight, *[jnp.zeros_like(weight)] * 3])
+
+
+def attitude_difference(x: Array, x_ref: Array) -> Array:
+    """`x - x_ref` with the quaternion, entries 3 to 6, of the sign closer to that of
+    `x_ref`; both turn alike."""
+    along = sum(x[i] * x_ref[i] for i in range(3, 7))
+    sign = jnp.where(along < 0, -1.0, 1.0).astype(x.dtype)
+    q = [sign * x[i] - x_ref[i] for i in range(3, 7)]
+    d = x - x_ref
+    return jnp.stack([d[0], d[1], d[2], *q, *(d[i] for i in range(7, 13))])
+
+
+def unit_attitude(x: Array) -> Array:
+    """`x` with the quaternion, entries 3 to 6, of length 1."""
+    square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5] + x[6] * x[6]
+    # A quaternion of zeros has no direction; it is left, not turned into NaN.
+    scale = jnp.where(square > 0, square, 1.0) ** -0.5
+    q = [scale * x[i] for i in range(3, 7)]
+    return jnp.stack([x[0], x[1], x[2], *q, *(x[i] for i in range(7, 13))])

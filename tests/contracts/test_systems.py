@@ -1,0 +1,225 @@
+"""What every system must do. A new one is covered by being listed in
+`systems_catalogue.py`."""
+
+import functools
+import inspect
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x64, once, thorough, tolerance
+from jax.flatten_util import ravel_pytree
+from systems_catalogue import CONSERVED, SYSTEMS
+
+import delucax as dlx
+
+
+every = pytest.mark.parametrize("name", SYSTEMS)
+
+
+@functools.cache
+def system_of(name):
+    return SYSTEMS[name].make()
+
+
+def drawn(name, size, seed=0, edges=0.5):
+    """States and controls inside their boxes, a share of the entries at the ends."""
+    case, rng = SYSTEMS[name], np.random.default_rng(seed)
+
+    def box(low, high):
+        low, high = np.asarray(low), np.asarray(high)
+        unit = rng.uniform(0, 1, (size, low.size))
+        ends = rng.uniform(0, 1, unit.shape) < edges
+        # Every other sample is inside altogether.
+        ends[::2] = False
+        unit = np.where(ends, np.round(unit), unit)
+        return jnp.asarray(low + (high - low) * unit)
+
+    return box(case.low, case.high), box(case.u_low, case.u_high)
+
+
+def disturbed(system, size, seed=1):
+    rng = np.random.default_rng(seed)
+    return jnp.asarray(rng.normal(0, 0.1, (size, system.disturbance_size)))
+
+
+@once
+def test_every_system_is_listed():
+    members = {
+        name
+        for name, member in vars(dlx.systems).items()
+        if inspect.isclass(member)
+        and issubclass(member, dlx.AbstractSystem)
+        and not inspect.isabstract(member)
+    }
+    assert members == {type(system_of(name)).__name__ for name in SYSTEMS}
+    assert set(CONSERVED) <= members
+
+
+@once
+@every
+def test_names_and_units(name):
+    system = system_of(name)
+    for names in (system.state_names, system.control_names, system.disturbance_names):
+        assert len(set(names)) == len(names)
+    assert len(system.state_units) in (0, system.state_size)
+    assert len(system.control_units) in (0, system.control_size)
+
+
+@once
+@every
+def test_finite_inside_and_at_the_edges(name):
+    finite_on(name, 256)
+
+
+@thorough
+@every
+def test_finite_on_many(name):
+    finite_on(name, 100_000)
+
+
+def finite_on(name, size):
+    """Values, and gradients with respect to all there is, on states and controls."""
+    system = system_of(name)
+    x, u = drawn(name, size)
+    w = disturbed(system, size) if system.disturbance_names else None
+
+    @jax.jit
+    def both(system, x, u, w):
+        def one(x, u, w):
+            field = lambda system, x, u, w: system.vector_field(0.3, x, u, w)
+            dx, back = jax.vjp(field, system, x, u, w)
+            x_next = system.project(x + 0.01 * dx)
+            apart = system.difference(x_next, x)
+            return dx, apart, back(jnp.ones_like(dx))
+
+        return jax.vmap(one, in_axes=(0, 0, None if w is None else 0))(x, u, w)
+
+    dx, apart, gradients = both(system, x, u, w)
+    assert dx.shape == apart.shape == x.shape and dx.dtype == x.dtype
+    for leaf in jax.tree.leaves((dx, apart, gradients)):
+        assert np.all(np.isfinite(leaf))
+    assert np.mean(np.any(np.asarray(dx) != 0, axis=1)) > 0.9
+
+
+@needs_x64
+@every
+def test_linearisation_is_the_central_difference(name):
+    system = system_of(name)
+    held = jnp.zeros(system.disturbance_size) if system.disturbance_names else None
+    x, u = (one[0] for one in drawn(name, 1, seed=2))
+
+    z = jnp.concatenate([x, u] if held is None else [x, u, held])
+    cuts = (x.size, x.size + u.size)
+
+    @jax.jit
+    def both(system, z):
+        def field(z):
+            x, u, w = jnp.split(z, cuts)
+            return system.vector_field(0.0, x, u, None if held is None else w)
+
+        h, eye = 1e-4, jnp.eye(z.size)
+        f = jax.vmap(field)(z + h * jnp.concatenate([eye, -eye, 2 * eye, -2 * eye]))
+        a, b, c, d = jnp.split(f, 4)
+        slopes = (8 * (a - b) - (c - d)) / (12 * h)
+        return dlx.linearize(system, 0.0, *jnp.split(z, cuts)[:2]), slopes, field(z)
+
+    model, slopes, dx = both(system, z)
+    blocks = [model.A, model.B] + ([] if model.E is None else [model.E])
+    assert (model.E is None) == (held is None)
+    ours = jnp.concatenate(blocks, axis=1).T
+    assert_close(ours, slopes, atol=1e-8 * (1 + np.max(np.abs(slopes))))
+    assert_close(model.dx_ref, dx, rtol=1e-12)
+
+
+def resting():
+    for name in SYSTEMS:
+        system = system_of(name)
+        if type(system).equilibrium is not dlx.AbstractSystem.equilibrium:
+            yield name
+
+
+@pytest.mark.parametrize("name", list(resting()))
+def test_equilibria_rest(name):
+    system = system_of(name)
+    x, u = system.equilibrium()
+    held = jnp.zeros(system.disturbance_size) if system.disturbance_names else None
+    dx = jax.jit(type(system).vector_field)(system, 0.0, x, u, held)
+    scale = 1 + np.max(np.abs(x)) + np.max(np.abs(u))
+    assert_close(dx, 0 * x, atol=tolerance(3e-5, 1e-13) * scale)
+    assert x.dtype == u.dtype == jnp.zeros(()).dtype
+
+
+def gradient_on(name, steps):
+    """The gradient of a rollout with respect to the start, the controls and every
+    constant, along a direction, against its difference quotient."""
+    system, case = system_of(name), SYSTEMS[name]
+    x, u = drawn(name, steps, seed=4, edges=0.0)
+    theta, unravel = ravel_pytree((eqx.filter(system, eqx.is_array), 0.5 * x[0], u))
+    direction = np.random.default_rng(5).normal(0, 1, theta.size)
+    direction = jnp.asarray(direction * (np.abs(theta) + 0.01))
+    rest = eqx.filter(system, eqx.is_array, inverse=True)
+    scale = 1 + jnp.max(jnp.abs(x), axis=0)
+
+    def cost(theta):
+        arrays, x0, controls = unravel(theta)
+        dynamics = dlx.Discretized(eqx.combine(arrays, rest), case.dt)
+        states = dlx.open_loop(dynamics, x0, controls)
+        return jnp.mean(jnp.sum((states / scale) ** 2, axis=1))
+
+    @jax.jit
+    def both(theta, direction):
+        h = 3e-5
+        near = jnp.array([2.0, 1.0, -1.0, -2.0]) * h
+        f = jax.vmap(lambda s: cost(theta + s * direction))(near)
+        quotient = (8 * (f[1] - f[2]) - (f[0] - f[3])) / (12 * h)
+        gradient = jax.grad(cost)(theta)
+        return gradient, jnp.dot(gradient, direction), quotient
+
+    gradient, ours, theirs = both(theta, direction)
+    assert np.all(np.isfinite(gradient)) and theirs != 0
+    assert_close(ours, theirs, rtol=1e-6)
+
+
+GRADIENTS = ["Reacher", "TwoTank"]
+
+
+@needs_x64
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_gradient_of_a_rollout(name):
+    gradient_on(name, 200)
+
+
+@thorough
+@needs_x64
+@pytest.mark.parametrize("name", [name for name in SYSTEMS if name not in GRADIENTS])
+def test_gradient_of_the_other_rollouts(name):
+    gradient_on(name, 200)
+
+
+@needs_x64
+@pytest.mark.parametrize("name", CONSERVED)
+def test_what_is_conserved_is_conserved(name):
+    """To the fourth order of the solver, and exactly so where that is exact."""
+    case = CONSERVED[name]
+    system, steps = case.make(), 40
+
+    @jax.jit
+    def drift(dt):
+        dynamics = dlx.Discretized(system, dt)
+        value = functools.partial(case.value, system)
+        controls = jnp.tile(jnp.array(case.u), (steps, 1))
+        states = dlx.open_loop(dynamics, jnp.array(case.x0), controls)
+        found = jax.vmap(value)(dt * jnp.arange(steps + 1), states)
+        largest = jnp.max(jnp.abs(found), axis=0)
+        return jnp.max(jnp.abs(found - found[0]) / (1e-3 + largest)), states
+
+    (coarse, states), (fine, _) = drift(case.dt), drift(case.dt / 2)
+    # The run moves: what stays is not merely the state.
+    assert np.max(np.abs(states - states[0])) > 0.03
+    assert 1e-14 < coarse < 1e-3
+    # Over half the time with half the step, an error of order four falls 32-fold, and
+    # an oscillating one at least 16-fold.
+    assert fine < coarse / 12

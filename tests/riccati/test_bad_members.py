@@ -1,0 +1,58 @@
+"""Members of a batch that have no solution, and data that cannot be looked at."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x64, user_error
+
+import delucax as dlx
+
+
+pytestmark = needs_x64
+
+
+B, EYE = jnp.array([[0.0], [1.0]]), jnp.eye(2)
+RESULTS = dlx.RESULTS
+
+
+@pytest.mark.parametrize("name", ["dare", "care"])
+def test_gradients_beside_bad_members(name):
+    good = np.array([[-0.9, 0.3], [0.1, -0.2]])
+    bad = (
+        np.diag([2.0, -0.5]),
+        np.diag([np.nan, -0.5]),
+    )
+
+    def value(A):
+        found = getattr(dlx.riccati, name)(A, B, EYE, EYE[:1, :1], throw=False)
+        return jnp.sum(found.X) + jnp.sum(found.K), found.result == RESULTS.successful
+
+    both = jax.value_and_grad(value, has_aux=True)
+    (values, solved), gradients = jax.jit(jax.vmap(both))(np.stack([good, *bad]))
+    np.testing.assert_array_equal(solved, [True, False, False])
+    (alone, _), gradient = jax.jit(both)(good)
+    assert_close(values[0], alone, rtol=1e-12)
+    assert_close(gradients[0], gradient, rtol=1e-10)
+    assert_close(gradients[1:], np.zeros((2, 2, 2)))
+
+
+def test_asymmetry_that_cannot_be_seen():
+    @jax.jit
+    def result(Q):
+        return dlx.riccati.dare(EYE / 2, B, Q, EYE[:1, :1], throw=False).result
+
+    assert result(EYE) == RESULTS.successful
+    assert result(jnp.array([[1.0, 0.5], [0.0, 1.0]])) == RESULTS.ill_posed
+
+
+def test_as_close_as_rounding_allows():
+    rng = np.random.default_rng(32)
+    A, B = rng.normal(size=(30, 30)) / np.sqrt(30), rng.normal(size=(30, 2))
+    found = dlx.riccati.care(A, B, np.eye(30), np.eye(2))
+    assert 1e-12 < found.residual < 1e-11
+
+
+def test_games_need_a_semidefinite_weight():
+    with user_error(match="hinf_dare: Q must be positive semidefinite"):
+        dlx.riccati.hinf_dare(EYE, B, None, np.diag([1.0, -1.0]), EYE[:1, :1])
