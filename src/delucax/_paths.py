@@ -77,6 +77,11 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
         longer = dlx.replace(env, {"dynamics.system.length": 1.2})
         ```
     """
+    if not isinstance(changes, Mapping):
+        raise ValueError(
+            "replace: changes must be a dictionary from paths to values, such as "
+            f"{{'dynamics.system.length': 1.2}}, got {changes!r}."
+        )
     for path, value in changes.items():
         parent_path, _, name = path.rpartition(".")
         parent = get_path(tree, parent_path) if parent_path else tree

@@ -109,7 +109,7 @@ def test_ends_that_meet_are_legal(key):
         (lambda: d.Gaussian(1.0, size=1).sequence(None, TIMES), "key must be"),
         (lambda: d.Sum(d.Zero(1), d.Zero(2)), "one size"),
         (lambda: d.Brownian(1, dt=-1.0), "dt must be positive"),
-        (lambda: d.Zero(0), "size must be at least 1"),
+        (lambda: d.Zero(0), "size must be a whole number of at least 1"),
         (lambda: d.Gaussian(-0.1, size=1), "std must be at least 0, got -0.1"),
         (lambda: d.Uniform(1, -1, size=1), "high must be at least 1.0, got -1"),
         (lambda: d.RandomWalk(-0.1, size=1), "std must be at least 0, got -0.1"),

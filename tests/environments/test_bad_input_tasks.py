@@ -5,6 +5,7 @@ import pytest
 from helpers import once, user_error
 
 import delucax as dlx
+from delucax.environments import _registry
 
 
 pytestmark = once
@@ -69,3 +70,39 @@ BOX = dlx.environments.UniformState(-jnp.ones(2), jnp.ones(2))
 def test_bad_input(call, match):
     with user_error(match=match):
         call()
+
+
+@pytest.mark.parametrize(
+    "call, match",
+    [
+        (lambda: dlx.make(["pendulum"]), r"no task is called \['pendulum'\]"),
+        (lambda: dlx.make("pendulum", max_torque=-1.0), "pendulum: max_torque must be"),
+        (lambda: dlx.replace(dlx.make("pendulum"), "x"), "replace: changes must be"),
+        (
+            lambda: dlx.randomise(dlx.make("pendulum"), jax.random.key(0), ["x"]),
+            "randomise: ranges must be",
+        ),
+        (
+            lambda: dlx.rollout(
+                dlx.make("pendulum"),
+                dlx.controllers.Zero(1),
+                key=jax.random.key(0),
+                keep=None,
+            ),
+            "rollout: keep must be",
+        ),
+        (
+            lambda: dlx.disturbances.Gaussian(1.0, size=1.5),
+            "Gaussian: size must be a whole number",
+        ),
+    ],
+)
+def test_wrong_kinds(call, match):
+    with user_error(match=match):
+        call()
+
+
+def test_what_is_registered_must_be_there(monkeypatch):
+    monkeypatch.setattr(_registry, "_REGISTRY", {"nowhere": "no.such.module:task"})
+    with user_error(match="'nowhere' is registered as 'no.such.module:task'"):
+        dlx.make("nowhere")

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._check import check_count
 from .._fields import as_float_array, check_parameters
 from .._typing import PRNGKey
 
@@ -88,9 +89,7 @@ def common_size(where: str, size: int | None, **values: Any) -> tuple[int, dict]
             f"{where}: size must be given when every other argument is a number, such "
             f"as {where}(..., size=2)."
         )
-    if size < 1:
-        raise ValueError(f"{where}: size must be at least 1, got {size}.")
-    return size, arrays
+    return check_count(size, "size", where), arrays
 
 
 def spread(values: Array, steps: int, size: int) -> Array:

@@ -1,6 +1,6 @@
 """The closed world that a controller acts in."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -412,6 +412,11 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
         ```
     """
     check_key(key, "randomise")
+    if not isinstance(ranges, Mapping):
+        raise ValueError(
+            "randomise: ranges must be a dictionary from paths to ranges, such as "
+            f"{{'dynamics.system.length': (0.8, 1.2)}}, got {ranges!r}."
+        )
     changes = {}
     for (path, given), one in zip(
         ranges.items(), jr.split(key, len(ranges)), strict=True

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_positive
+from .._check import check_positive, check_range
 from .._fields import parameter, positive
 from .._results import RESULTS
 from ..costs import PendulumCost
@@ -149,6 +149,7 @@ def pendulum(
         ```
     """
     system = Pendulum(mass, length, gravity, damping)
+    check_range(max_torque, "max_torque", "pendulum")
     options = {"max_speed": max_speed}
     dynamics = own_or_solver(
         GymPendulum, system, dt, solver, substeps, "pendulum", options

@@ -59,7 +59,7 @@ def make(name: str, **kwargs: Any) -> Environment:
         env = dlx.make("pendulum", length=1.2)
         ```
     """
-    if name not in _REGISTRY:
+    if not isinstance(name, str) or name not in _REGISTRY:
         names = sorted(_REGISTRY)
         close = difflib.get_close_matches(str(name), names, n=3, cutoff=0.4) or names
         raise ValueError(
@@ -67,7 +67,14 @@ def make(name: str, **kwargs: Any) -> Environment:
             f"{' or '.join(repr(n) for n in close)}? All names: {', '.join(names)}."
         )
     module, _, function = _REGISTRY[name].partition(":")
-    env = getattr(importlib.import_module(module), function)(**kwargs)
+    try:
+        task = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"make: {name!r} is registered as {_REGISTRY[name]!r}, which cannot be "
+            f"imported: {error}."
+        ) from error
+    env = task(**kwargs)
     if not isinstance(env, Environment):
         raise ValueError(
             f"make: {name!r} must be an Environment, but {_REGISTRY[name]!r} returned "

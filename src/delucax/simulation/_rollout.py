@@ -127,8 +127,9 @@ def rollout(
                 f"{got}."
             )
         check_finite(w, "w", where)
-    keep = (keep,) if isinstance(keep, str) else tuple(keep)
-    if not set(keep) <= set(KEEP):
+    keep = (keep,) if isinstance(keep, str) else keep
+    named = isinstance(keep, tuple | list | set | frozenset)
+    if not named or not set(keep) <= set(KEEP):
         raise ValueError(
             f"{where}: keep must be some of {', '.join(KEEP)}; got {keep!r}."
         )
