@@ -38,7 +38,7 @@ def test_random_controls(key):
         (lambda c: c.Constant(1.0), "value must be a vector"),
         (lambda c: c.Constant([np.nan]), "value must be finite"),
         (lambda c: c.Random(1.0), "std must be a vector"),
-        (lambda c: c.Random(jnp.ones(1)).init(), "key must be a key"),
+        (lambda c: c.Random(jnp.ones(1)).init(), "key must be one random key"),
         (lambda c: c.Linear(jnp.ones(2)), r"K must be a matrix, got shape \(2,\)"),
         (lambda c: c.Linear([[np.inf]]), "K must be finite"),
         (lambda c: c.Sequence(jnp.ones((0, 1))), "values must have at least one row"),

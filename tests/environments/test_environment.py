@@ -14,7 +14,7 @@ COST = dlx.costs.PendulumCost()
 
 @pytest.mark.parametrize("name", dlx.environments.registered())
 def test_every_task(name, key):
-    arguments = {"key": key} if name == "lds" else {}
+    arguments = {"key": key} if name in ("lds", "neural") else {}
     env = dlx.make(name, **arguments)
     x0 = env.reset(key)
     step = eqx.filter_jit(env.step)(0.0, x0, jnp.zeros(env.control_size))

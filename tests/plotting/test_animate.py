@@ -246,8 +246,8 @@ def test_other_plants_are_a_dot_in_a_plane_or_traces_alone(key):
     assert drawing_for(lds) is None
     scene = Scene(as_runs(run, None, "", "")[0], lds, range(5), 40)
     scene.frame(2)
-    assert scene.plant.get_xlabel() == "x0" and scene.plant.get_ylabel() == "x1"
-    path, dot = scene.plant.get_lines()
+    assert scene.plant.ax.get_xlabel() == "x0" and scene.plant.ax.get_ylabel() == "x1"
+    path, dot = scene.plant.ax.get_lines()
     np.testing.assert_allclose(np.ravel(dot.get_data()), run.states[2, :2])
     assert len(path.get_xdata()) == 5
     tank = environment_of(Tank())
@@ -277,9 +277,9 @@ def test_registered_drawing_is_used(key):
     assert [s[2] for s in seen] == [0.5] * 3
     np.testing.assert_allclose(np.stack([s[0] for s in seen]), run.states[::10])
     assert all(isinstance(a, np.ndarray) for s in seen for a in s[:2])
-    assert scene.plant.get_xlim() == (-3, 3)
+    assert scene.plant.ax.get_xlim() == (-3, 3)
     # What was drawn before is gone.
-    assert len(scene.plant.get_lines()) == len(scene.plant.texts) == 1
+    assert len(scene.plant.ax.get_lines()) == len(scene.plant.ax.texts) == 1
     np.testing.assert_array_equal(scene.frame(0), frames[0])
 
 
@@ -288,9 +288,9 @@ def test_drawing_without_setup_fits_all_that_it_draws():
     env = environment_of(Tank())
     try:
         scene = Scene(as_runs(run_of(env), None, "", "")[0], env, range(21), 40)
-        low, high = scene.plant.get_ylim()
+        low, high = scene.plant.ax.get_ylim()
         assert low <= np.exp(-2) and 7 <= high <= 8
-        assert scene.plant.get_aspect() == 1
+        assert scene.plant.ax.get_aspect() == 1
     finally:
         del sys.modules["delucax.plotting._drawings"]._DRAWINGS[Tank]
 

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import riccati_systems
 import scipy.linalg
-from helpers import needs_x64, once
+from helpers import needs_x64, once, thorough
 
 import delucax as dlx
 
@@ -51,6 +51,7 @@ def test_families():
         exam(*system)
 
 
+@thorough
 @once
 def test_single_precision():
     for name, *data in riccati_systems.darex():
