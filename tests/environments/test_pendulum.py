@@ -108,7 +108,7 @@ def test_a_solver_swaps_the_arithmetic():
         ({"gravity": float("nan")}, "gravity must be finite"),
         ({"dt": 0.0}, "dt must be positive"),
         ({"max_speed": -1.0}, "max_speed must be positive"),
-        ({"max_torque": -1.0}, "low <= high"),
+        ({"max_torque": -1.0}, "max_torque must be at least 0"),
         ({"horizon": 0}, "horizon must be a whole number of at least 1"),
     ],
 )
