@@ -113,6 +113,7 @@ THETA = np.array([1.0, 0.1, 1.5])
 SIDES = np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))])
 
 
+@thorough
 @pytest.mark.parametrize("discrete", [False, pytest.param(True, marks=thorough)])
 def test_gradients_are_central_differences_beside_an_unstable_model(discrete):
     def measures(theta):

@@ -227,7 +227,7 @@ def test_wrong_arguments(key):
         Gaussian(3, 0.0)
     with user_error(match="log_std must be a number or a vector"):
         Gaussian(MEAN, jnp.zeros((1, 1)))
-    with user_error(match="key must be a key"):
+    with user_error(match="key must be one random key"):
         Gaussian(MEAN, 0.0).init()
     wrong = Gaussian(MEAN, jnp.zeros(3))
     with user_error(match=r"have shape \(1,\).*got shape \(3,\)"):

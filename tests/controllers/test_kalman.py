@@ -8,6 +8,7 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
+    thorough,
     tolerance,
     user_error,
 )
@@ -262,6 +263,7 @@ def test_gradient_of_the_likelihood():
     assert_close(hessian, rows, rtol=1e-6, atol=1e-7)
 
 
+@thorough
 @needs_x64
 def test_gradient_of_the_smoother():
     kalman = problem(3, 2)[0]

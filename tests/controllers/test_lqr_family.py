@@ -10,6 +10,7 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
+    thorough,
     user_error,
 )
 
@@ -283,6 +284,7 @@ def test_sampled_regulator_of_short_steps_is_the_continuous_one():
     assert_close(pendulum(0.0, far, None)[0], u, atol=1e-4)
 
 
+@thorough
 def test_gradients_of_designs(key):
     x0, T = jnp.array([1.0, 0.5]), 8
     env = dlx.Environment(DYNAMICS, dlx.costs.Quadratic(Q, R), horizon=T)

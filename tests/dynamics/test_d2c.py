@@ -3,7 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, tolerance, user_error
+from helpers import assert_close, needs_x64, thorough, tolerance, user_error
 from jax.test_util import check_grads
 from scipy.linalg import logm
 
@@ -86,6 +86,7 @@ def test_what_control_samples_comes_back(ours, theirs):
     assert_close(back.B, system.B, atol=tolerance(1e-4, 1e-11))
 
 
+@thorough
 @needs_x64
 def test_gradients_are_central_differences():
     A = jnp.array([[0.9, 0.3], [-0.4, 0.7]])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from helpers import assert_close, needs_x64, user_error
+from helpers import assert_close, needs_x64, thorough, user_error
 
 import delucax as dlx
 
@@ -297,6 +297,7 @@ def test_escape_in_finite_time():
     assert bad.result == dlx.RESULTS.infeasible
 
 
+@thorough
 def test_derivatives_of_the_differential_equation():
     arguments = (A, B, Q, R, np.array([[0.1], [-0.2]]), Q)
     rng = np.random.default_rng(0)

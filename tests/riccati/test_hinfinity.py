@@ -321,6 +321,7 @@ def test_the_least_level_has_first_derivatives_only(solve):
         jax.jit(jax.hessian(level))(SMOOTH[0])
 
 
+@thorough
 def test_single_precision():
     single = [jnp.asarray(M, jnp.float32) for M in (A, B, Q, Q, R)]
     solution = hinf_dare(*single)

@@ -65,8 +65,7 @@ OTHERS = {"dlyap": (LEFT, SQUARE), "sylvester": (STABLE, RIGHT, TALL)}
     "name",
     [
         "dare",
-        "lyap",
-        *(pytest.param(n, marks=thorough) for n in ("care", "dsylvester")),
+        *(pytest.param(n, marks=thorough) for n in ("care", "lyap", "dsylvester")),
     ],
 )
 def test_to_second_order(name):

@@ -265,7 +265,7 @@ def test_a_controller_that_draws(key):
     assert len(np.unique(run.controls)) == 10
     sums = np.cumsum(np.asarray(run.controls)[:, 0]) * 0.1
     assert_close(run.states[1:, 0], sums, atol=1e-5)
-    with user_error(match="Random: key must be a key"):
+    with user_error(match="key must be one random key"):
         dlx.simulate(INTEGRATOR, noise, 0.0, 1.0, jnp.zeros(1), dt=0.1)
 
 
