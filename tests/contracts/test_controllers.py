@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, once, tolerance, user_error
+from helpers import assert_close, needs_x64, once, thorough, tolerance, user_error
 from jax.flatten_util import ravel_pytree
 
 import delucax as dlx
@@ -79,6 +79,47 @@ def mlp(size, in_size=2, features=None):
     return c.MLP(in_size, 1, width=4, depth=2, **options)
 
 
+def learner(kind, size, **options):
+    """As fast as it need be for its weights to matter."""
+    dynamics = dlx.LinearDynamics(A, B, dt=DT)
+    cost = dlx.costs.Quadratic(size * jnp.eye(2), 0.1 * jnp.eye(1))
+    options = dict(horizon=3, learning_rate=size) | options
+    return kind(dynamics, cost, **options)
+
+
+def swing(size):
+    """A learner that linearises along the way."""
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=DT)
+    cost = dlx.costs.Quadratic(size * jnp.eye(2), 0.1 * jnp.eye(1))
+    base = c.Linear(size * jnp.array([[20.0, 5.0]]))
+    return c.DRC(dynamics, cost, base=base, memory=2, horizon=3, learning_rate=size)
+
+
+def network(size):
+    key = jax.random.key(int(10 * size))
+    return learner(c.NeuralGPC, size, memory=2, width=3, key=key)
+
+
+def bandit(size):
+    dynamics = dlx.LinearDynamics(A, B, dt=DT)
+    options = dict(memory=2, horizon=3, learning_rate=size, delta=size)
+    return c.BPC(dynamics, c.Linear(size * FEEDBACK), **options)
+
+
+def build(model):
+    cost = dlx.costs.Quadratic(jnp.eye(2), 0.1 * jnp.eye(1))
+    return c.GPC(model, cost, memory=2, horizon=3)
+
+
+def explorer(size):
+    return c.Explore(build, size * FEEDBACK, steps=5, scale=2 * size, dt=DT)
+
+
+def scheduled(size):
+    gains = size * jnp.linspace(1, 2, 5)
+    return c.Scheduled(eqx.filter_vmap(lambda g: c.Linear(g * FEEDBACK))(gains), DT)
+
+
 def features(y):
     return jnp.stack([y[0], y[1], y[0] * y[1]])
 
@@ -115,8 +156,31 @@ CASES = {
             c.PID(size, 2.0, dt=DT, output=[[1.0, 0.1]]), -1.0, bounds=(-9.0, 9.0)
         )
     ),
+    "Scheduled": Case(scheduled),
+    "GPC": Case(lambda size: learner(c.GPC, size, memory=2)),
+    "DRC": Case(lambda size: learner(c.DRC, size, memory=2)),
+    "DRC along the way": Case(swing),
+    "SFC": Case(lambda size: learner(c.SFC, size, memory=4, filters=2)),
+    "DSC": Case(lambda size: learner(c.DSC, size, memory=3, filters=1)),
+    "NeuralGPC": Case(network),
+    "GPC, fixed": Case(
+        lambda size: learner(c.GPC, size, memory=2).fixed(size * jnp.ones((1, 4)))
+    ),
+    "Adaptive": Case(
+        lambda size: c.Adaptive(learner(c.GPC, size, memory=2), slots=2, every=3)
+    ),
+    "BPC": Case(bandit),
+    "Explore": Case(explorer),
 }
-every = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+# What differs from another case in its filters or its network alone.
+KIN = "SFC", "DSC", "NeuralGPC", "OutputFeedback of an unscented filter"
+every = pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=name, marks=thorough if name in KIN else ())
+        for name, case in CASES.items()
+    ],
+)
 PARTICULAR = {name: case for name, case in CASES.items() if case.reads_all}
 
 

@@ -23,9 +23,26 @@ from ._nonlinear_filters import (
 from ._output_feedback import OutputFeedback as OutputFeedback
 from ._pid import LeakyPID as LeakyPID, PID as PID
 from ._sampled import lqrd as lqrd, sampled_weights as sampled_weights
+from ._scheduled import Scheduled as Scheduled
 from ._smoother import (
     Filtered as Filtered,
     run_filter as run_filter,
     smooth as smooth,
     Smoothed as Smoothed,
+)
+from .online import (
+    adagrad_norm as adagrad_norm,
+    Adaptive as Adaptive,
+    best_in_hindsight as best_in_hindsight,
+    BPC as BPC,
+    DRC as DRC,
+    DSC as DSC,
+    Explore as Explore,
+    FixedPolicy as FixedPolicy,
+    GPC as GPC,
+    Hindsight as Hindsight,
+    NeuralGPC as NeuralGPC,
+    OnlineLearner as OnlineLearner,
+    regret as regret,
+    SFC as SFC,
 )

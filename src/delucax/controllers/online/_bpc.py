@@ -1,0 +1,185 @@
+"""Learning from the cost alone."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.random as jr
+import optax
+from jaxtyping import Array
+
+from ..._check import check_count, check_key
+from ..._controller import AbstractController
+from ..._fields import parameter, weight
+from ...dynamics import AbstractDynamics
+from ._base import RADIUS, scale
+from ._features import Features
+from ._loop import Loop, LoopState, observes_state, shift
+from ._policy import within
+from ._step_size import adagrad_norm
+
+
+class BPCState(NamedTuple):
+    """What it remembers.
+
+    - `loop`: of the plant and the base controller.
+    - `signal`: its last values, newest first.
+    - `theta`: what has been learned, and `optimiser`, the state of the optimiser.
+    - `tried`: the unit directions that theta was moved in, newest first.
+    - `level`: the running mean of the cost, and `steps`, how many it is of.
+    - `key`: of the next direction.
+    """
+
+    loop: LoopState
+    signal: Array
+    theta: Array
+    optimiser: Any
+    tried: Array
+    level: Array
+    steps: Array
+    key: Array
+
+
+class BPC(AbstractController):
+    """The bandit perturbation controller, which is told the cost of each step and
+    nothing about how it came about,
+
+    `u_t = base(y_t) + (theta_t + delta e_t) s`, `e_t` uniform on the unit sphere,
+
+    with s the last disturbances (nature's outputs where the state is not observed).
+    After the step theta moves against
+
+    `g_t = (d / delta) (c_t - level_t) sum_{i < horizon} e_{t-i}`,
+
+    an estimate of the gradient of the cost that a fixed theta would have had, in
+    dimension d; `level_t` is the mean of the costs before, which changes no expectation
+    and takes most of the variance away. Its regret grows as `T^(3/4)`.
+
+    **Arguments:**
+
+    - `dynamics`: the model, which recovers the disturbances.
+    - `base`: a controller that stabilises the dynamics, such as
+        [`delucax.controllers.LQR`][].
+    - `memory`: the number of past values of the signal, 5 by default: each adds a
+        dimension to search.
+    - `horizon`: how long a direction is held responsible, 5 by default.
+    - `delta`: the size of the directions tried; by default 0.2 over the size of the
+        first response of the observation to a unit of control.
+    - `learning_rate`: scales the optimiser's step; by default 0.05 over the same size.
+    - `optimiser`: an Optax transformation; [`delucax.controllers.adagrad_norm`][] by
+        default.
+    - `radius`: theta is kept inside this ball in the Frobenius norm, by default 50 over
+        the same size.
+
+    **Attributes:** `start`, the first theta, trainable, zero.
+
+    **Raises:** `ValueError` if the base does not stabilise the dynamics or does not fit
+    them, or a number is out of its range; when it is run, if there is no key.
+
+    Source: Gradu, Hallman and Hazan, 2020.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        A, B = jnp.array([[0.8, 0.5], [0.0, 0.8]]), jnp.array([[0.0], [0.8]])
+        push = dlx.disturbances.Sinusoid(jnp.full(2, 0.3), frequency=0.16)
+        env = dlx.make("lds", A=A, B=B, disturbance=push)
+        base = dlx.controllers.LQR(env.dynamics, jnp.eye(2), jnp.eye(1))
+        learner = dlx.controllers.BPC(env.dynamics, base)
+        dlx.rollout(env, learner, key=jax.random.key(0), horizon=1000).total_cost
+        ```
+    """
+
+    loop: Loop
+    features: Features
+    start: Array = weight()
+    radius: Array = parameter()
+    delta: Array = parameter()
+    learning_rate: Array = parameter()
+    optimiser: optax.GradientTransformation = eqx.field(static=True)
+    window: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        dynamics: AbstractDynamics,
+        base: AbstractController,
+        *,
+        memory: int = 5,
+        horizon: int = 5,
+        delta: Any = None,
+        learning_rate: Any = None,
+        optimiser: optax.GradientTransformation | None = None,
+        radius: Any = None,
+    ):
+        where = "BPC"
+        if not isinstance(dynamics, AbstractDynamics):
+            raise ValueError(
+                f"{where}: dynamics must be an AbstractDynamics, got "
+                f"{type(dynamics).__name__}."
+            )
+        echoes = not observes_state(dynamics)
+        # A roll-out as long as it takes a control to be seen.
+        loop = Loop(dynamics, base, dynamics.state_size, where, echoes=echoes)
+        memory = check_count(memory, "memory", where)
+        size = dynamics.observation_size
+        self.features = Features(None, memory, size, nature=echoes)
+        self.start = jnp.zeros((dynamics.control_size, memory * size), loop.dtype)
+        self.radius = scale(loop, radius, "radius", RADIUS, where)
+        self.delta = scale(loop, delta, "delta", 0.2, where)
+        self.learning_rate = scale(loop, learning_rate, "learning_rate", 0.05, where)
+        self.loop = loop
+        self.optimiser = adagrad_norm() if optimiser is None else optimiser
+        self.window = check_count(horizon, "horizon", where)
+
+    def init(self, *, key=None):
+        own, base_key = jr.split(check_key(key, "BPC.init"))
+        dtype = self.loop.dtype
+        return BPCState(
+            self.loop.init(base_key, 0),
+            signal=self.features.init(dtype),
+            theta=self.start,
+            optimiser=self.optimiser.init(self.start),
+            tried=jnp.zeros((self.window, *self.start.shape), dtype),
+            level=jnp.zeros((), dtype),
+            steps=jnp.zeros((), dtype),
+            key=own,
+        )
+
+    def __call__(self, t, y, state):
+        loop, before = self.loop, state.loop.base
+        moved = loop.act(self, t, y, state.loop)
+        signal = self.features.observe(loop, moved, state.signal)
+        key, now = jr.split(state.key)
+        direction = jr.normal(now, self.start.shape, loop.dtype)
+        direction = direction / jnp.sqrt(jnp.sum(direction**2))
+        v = (state.theta + self.delta * direction) @ self.features(signal)
+        state = state._replace(
+            loop=loop.linearised(v, before, moved),
+            signal=signal,
+            tried=shift(direction, state.tried),
+            key=key,
+        )
+        return (moved.u_base + v).astype(y.dtype), state
+
+    def applied(self, u, cost, state):
+        cost = cost.astype(state.level.dtype)
+        steps = state.steps + 1
+        # The first cost has nothing to be compared with.
+        off = jnp.where(state.steps > 0, cost - state.level, 0)
+        size = self.start.size
+        gradient = size / self.delta * off * jnp.sum(state.tried, axis=0)
+        step: Any = gradient.astype(state.theta.dtype)
+        step, optimiser = self.optimiser.update(step, state.optimiser, state.theta)
+        theta = state.theta + self.learning_rate * step
+        theta = within(theta, self.radius).astype(state.theta.dtype)
+        return state._replace(
+            loop=self.loop.applied(u, cost, state.loop),
+            theta=theta,
+            optimiser=optimiser,
+            level=state.level + (cost - state.level) / steps,
+            steps=steps,
+        )

@@ -1,0 +1,216 @@
+"""Control of a plant that is not known."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array
+
+from ..._check import as_matrix, check_count, check_key, check_positive
+from ..._controller import AbstractController, wrong_observation
+from ..._fields import function_field, parameter
+from ...dynamics import LinearDynamics
+from ...math._linear_solve import solve
+from ._loop import shift
+
+
+class ExploreState(NamedTuple):
+    """What is remembered.
+
+    - `step`: how many steps were made.
+    - `pushes`: the last random controls, newest first.
+    - `moments`: of the state with the random control j + 1 steps before, summed up,
+      shape `(order + 1, n, m)`.
+    - `model`: the dynamics that were identified, and `arrays`, the controller made for
+      them; `inner` is its state.
+    - `key`: of the next random control.
+    """
+
+    step: Array
+    pushes: Array
+    moments: Array
+    model: LinearDynamics
+    arrays: Any
+    inner: Any
+    key: Array
+
+
+class Explore(AbstractController):
+    """Explore, identify, then control: an online learner for an unknown linear plant.
+
+    For `steps` steps the control is `u_t = -K x_t + scale e_t`, the entries of e random
+    signs. Their correlation with the states that follow does not depend on what the
+    disturbances are, even if an adversary chose them:
+
+    `N_j = mean over t of x_{t+j+1} e_t' / scale`, which tends to `(A - BK)^j B`,
+
+    `B = N_0`, and `A - BK` is the least-squares solution of
+    `(A - BK) [N_0 ... N_{order-1}] = [N_1 ... N_order]`. From then on the controller
+    that `build` makes for `x_next = A x + B u` is in charge. With
+    [`delucax.controllers.GPC`][] and `steps` near `T^(2/3)`, its regret over T steps
+    grows as `T^(2/3)`.
+
+    **Arguments:**
+
+    - `build`: a function that makes a controller for a given
+        [`delucax.LinearDynamics`][]. It is called under `jax.jit`: a learner needs its
+        `horizon` given.
+    - `K`: a gain that stabilises the plant, shape `(m, n)`; zero for one that is stable
+        by itself.
+    - `steps`: of exploration.
+    - `scale`: the size of the random controls, 1 by default.
+    - `order`: how many steps of the response are compared, n by default: as many as it
+        takes to move the state anywhere.
+    - `dt`: the control interval, 1 by default.
+
+    **Raises:** `ValueError` if `build` does not make a controller, `K` is not a matrix
+    or a number is out of its range; when it is run, if there is no key.
+
+    Source: Hazan, Kakade and Singh, 2020; Chen and Hazan, 2021.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("lds", A=jnp.array([[0.9, 0.3], [0.0, 0.8]]), B=jnp.eye(2))
+
+        def build(model):
+            return dlx.controllers.GPC(model, env.cost, horizon=20)
+
+        learner = dlx.controllers.Explore(build, jnp.zeros((2, 2)), steps=200)
+        dlx.rollout(env, learner, key=jax.random.key(0), horizon=1000).total_cost
+        ```
+    """
+
+    build: Callable[[LinearDynamics], AbstractController] = function_field()
+    K: Array = parameter()
+    scale: Array = parameter()
+    dt: Array = parameter()
+    steps: int = eqx.field(static=True)
+    order: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        build: Callable[[LinearDynamics], AbstractController],
+        K: Any,
+        steps: int,
+        *,
+        scale: Any = 1.0,
+        order: int | None = None,
+        dt: Any = 1.0,
+    ):
+        where = "Explore"
+        if not callable(build):
+            raise ValueError(
+                f"{where}: build must be a function that makes a controller for linear "
+                f"dynamics, got {type(build).__name__}."
+            )
+        self.K = as_matrix(K, "K", where)
+        check_positive(scale, "scale", where)
+        order = self.K.shape[1] if order is None else order
+        self.order = check_count(order, "order", where)
+        self.steps = check_count(steps, "steps", where, least=self.order + 2)
+        self.build, self.scale, self.dt = build, scale, dt
+
+    def init(self, *, key=None):
+        key = check_key(key, "Explore.init")
+        m, n = self.K.shape
+        dtype = self.K.dtype
+        # Any plant that every design has an answer for.
+        model = self._model(jnp.eye(n, dtype=dtype) / 2, jnp.eye(n, m, dtype=dtype))
+        arrays, inner = self._made(model)
+        return ExploreState(
+            step=jnp.zeros((), jnp.int32),
+            pushes=jnp.zeros((self.order + 1, m), dtype),
+            moments=jnp.zeros((self.order + 1, n, m), dtype),
+            model=model,
+            arrays=arrays,
+            inner=inner,
+            key=key,
+        )
+
+    def __call__(self, t, y, state):
+        if y.shape != self.K.shape[1:]:
+            raise wrong_observation(self, self.K.shape[1], y)
+        dtype, y = y.dtype, y.astype(self.K.dtype)
+        # Row j of the pushes is that of j + 1 steps ago.
+        seen = y[:, None] * state.pushes[:, None, :] / self.scale**2
+        exploring = state.step < self.steps
+        moments = jnp.where(exploring, state.moments + seen, state.moments)
+        state = state._replace(moments=moments)
+        identify = lambda s: self._identify(s)  # noqa: E731
+        state = lax.cond(state.step == self.steps, identify, lambda s: s, state)
+        key, now = jr.split(state.key)
+        push = self.scale * jr.rademacher(now, (self.K.shape[0],), y.dtype)
+        controller = eqx.combine(state.arrays, self._structure())
+        acted, inner = controller(t, y, state.inner)
+        u = jnp.where(exploring, -self.K @ y + push, acted.astype(y.dtype))
+        inner = jax.tree.map(
+            lambda old, new: jnp.where(exploring, old, new), state.inner, inner
+        )
+        pushes = shift(push, state.pushes)
+        state = state._replace(inner=inner, pushes=pushes, key=key)
+        return u.astype(dtype), state
+
+    def applied(self, u, cost, state):
+        controller = eqx.combine(state.arrays, self._structure())
+        inner = controller.applied(u, cost, state.inner)
+        exploring = state.step < self.steps
+        inner = jax.tree.map(
+            lambda old, new: jnp.where(exploring, old, new), state.inner, inner
+        )
+        return state._replace(inner=inner, step=state.step + 1)
+
+    def _identify(self, state: ExploreState) -> ExploreState:
+        # Lag j has been seen j steps fewer.
+        counts = self.steps - 1 - jnp.arange(self.order + 1)
+        N = state.moments / counts[:, None, None].astype(state.moments.dtype)
+        before = jnp.concatenate(list(N[:-1]), axis=1)
+        after = jnp.concatenate(list(N[1:]), axis=1)
+        gram = before @ before.T
+        # A direction that was not moved is left as it is.
+        least = jnp.finfo(gram.dtype).eps * jnp.trace(gram)
+        loop = solve(
+            gram + least * jnp.eye(len(gram), dtype=gram.dtype), before @ after.T
+        )
+        model = self._model(loop.T + N[0] @ self.K, N[0])
+        arrays, inner = self._made(model)
+        return state._replace(model=model, arrays=arrays, inner=inner)
+
+    def _model(self, A: Array, B: Array) -> LinearDynamics:
+        return LinearDynamics(A, B, dt=self.dt)
+
+    def _made(self, model: LinearDynamics) -> tuple[Any, Any]:
+        """The arrays of the controller for a model, and its state."""
+
+        @eqx.filter_jit
+        def made(model):
+            controller = self.build(model)
+            if not isinstance(controller, AbstractController):
+                raise ValueError(
+                    "Explore: build must make an AbstractController, got "
+                    f"{type(controller).__name__}."
+                )
+            return eqx.filter(controller, eqx.is_array), controller.init(key=None)
+
+        strong = lambda x: lax.convert_element_type(x, x.dtype)  # noqa: E731
+        return jax.tree.map(strong, made(model))
+
+    def _structure(self) -> Any:
+        """All of the controller but its arrays."""
+        m, n = self.K.shape
+        shapes = eqx.filter_eval_shape(
+            lambda A, B: eqx.filter(
+                self.build(self._model(A, B)), eqx.is_array, inverse=True
+            ),
+            jax.ShapeDtypeStruct((n, n), self.K.dtype),
+            jax.ShapeDtypeStruct((n, m), self.K.dtype),
+        )
+        return shapes

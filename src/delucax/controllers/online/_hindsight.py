@@ -1,0 +1,227 @@
+"""The best controller of a class, once the disturbances are known."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from ..._check import check_count
+from ..._controller import AbstractController
+from ..._fields import marked_leaves
+from ..._results import choose, Result, RESULTS
+from ...environments import Environment
+from ...math._linear_solve import solve
+from ...simulation import rollout, Trajectory
+from ._fixed import FixedPolicy
+
+
+class Hindsight(NamedTuple):
+    """The best controller of a class for disturbances that are known.
+
+    - `controller`: it, and `trajectory`, its run.
+    - `decrement`: how much less Newton's method still expected, relative to the cost.
+    - `iterations`: steps tried.
+    - `result`: success, or `delucax.RESULTS.not_converged`.
+
+    [`delucax.controllers.best_in_hindsight`][] returns it.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        push = dlx.disturbances.Constant(0.1 * jnp.ones(2))
+        env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
+        gain = dlx.controllers.Linear(jnp.zeros((1, 2)))
+        run = dlx.rollout(env, gain, key=jax.random.key(0))
+        found = dlx.controllers.best_in_hindsight(env, gain, run)
+        found.controller.K, found.decrement, found.result
+        ```
+    """
+
+    controller: AbstractController
+    trajectory: Trajectory
+    decrement: Array
+    iterations: Array
+    result: Result
+
+
+def best_in_hindsight(
+    environment: Environment,
+    controller: AbstractController,
+    trajectory: Trajectory,
+    *,
+    iterations: int = 30,
+    tolerance: float | None = None,
+) -> Hindsight:
+    """The fixed controller that would have cost least, the disturbances being known:
+
+    `min over theta of sum_t c(t, x_t(theta), u_t(theta)) + final(x_T(theta))`,
+
+    with theta the trainable weights of `controller` (of a
+    [`delucax.controllers.FixedPolicy`][] those of its policy, not of its base), from
+    the start and under the disturbances that `trajectory` recorded. It is found by
+    Newton's method with Levenberg's damping through the rollout, and is the global
+    minimum where the cost is convex in theta: of a disturbance-action policy on a
+    linear plant with a convex cost it is, of a linear gain in general not.
+
+    - `GPC(...).fixed()`: the best disturbance-action policy.
+    - `DRC(...).fixed()`: the best disturbance-response policy.
+    - `Linear(K)` or `LQR(...)`: the best gain, from that one on.
+    - `Sequence(controls)`: the best open loop, for short horizons.
+
+    **Arguments:**
+
+    - `environment`: the environment.
+    - `controller`: the class, and where the search starts.
+    - `trajectory`: a run with its states and disturbances, over the whole of which the
+        search goes.
+    - `iterations`: Newton steps at most, 30 by default.
+    - `tolerance`: stop when a step promises less than this part of the cost; by default
+        the square root of the rounding error.
+
+    **Returns:** [`delucax.controllers.Hindsight`][].
+
+    **Raises:** `ValueError` if the trajectory has no states or disturbances, or the
+    controller no trainable weights.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        push = dlx.disturbances.Constant(0.1 * jnp.ones(2))
+        env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
+        learner = dlx.controllers.GPC(env.dynamics, env.cost)
+        run = dlx.rollout(env, learner, key=jax.random.key(0))
+        best = dlx.controllers.best_in_hindsight(env, learner.fixed(), run)
+        run.total_cost / best.trajectory.total_cost
+        ```
+    """
+    where = "best_in_hindsight"
+    states, w = trajectory.states, trajectory.disturbances
+    if states is None or w is None:
+        raise ValueError(
+            f"{where}: trajectory must have its states and disturbances, got one that "
+            f"kept {trajectory.keep}."
+        )
+    weights, _ = _split(controller)
+    if not jax.tree.leaves(weights):
+        raise ValueError(
+            f"{where}: controller must have trainable weights, got "
+            f"{type(controller).__name__}."
+        )
+    iterations = check_count(iterations, "iterations", where)
+    if tolerance is None:
+        tolerance = float(jnp.finfo(states.dtype).eps ** 0.5)
+    return _search(
+        environment, controller, states[0], w, trajectory.steps, iterations, tolerance
+    )
+
+
+def regret(trajectory: Trajectory, comparator: Trajectory) -> Array:
+    """By how much a run has cost more than another, up to each step,
+
+    `regret_k = sum_{t <= k} (cost_t - comparator's cost_t)`.
+
+    The final costs are left out.
+
+    **Arguments:**
+
+    - `trajectory`: a run with its costs.
+    - `comparator`: another under the same disturbances, such as that of
+        [`delucax.controllers.best_in_hindsight`][].
+
+    **Returns:** shape `(T,)`.
+
+    **Raises:** `ValueError` if one has no costs, or they differ in length.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        noise = dlx.disturbances.Gaussian(0.1, size=2)
+        env = dlx.make("lds", key=jax.random.key(0), disturbance=noise)
+        learner = dlx.controllers.GPC(env.dynamics, env.cost)
+        run = dlx.rollout(env, learner, key=jax.random.key(0))
+        best = dlx.controllers.best_in_hindsight(env, learner.fixed(), run)
+        dlx.controllers.regret(run, best.trajectory)[-1]
+        ```
+    """
+    costs, others = trajectory.costs, comparator.costs
+    if costs is None or others is None or costs.shape != others.shape:
+        shape = lambda c: "none" if c is None else c.shape  # noqa: E731
+        raise ValueError(
+            "regret: trajectory and comparator must have costs of one shape, got "
+            f"{shape(costs)} and {shape(others)}."
+        )
+    return jnp.cumsum(costs - others, axis=-1)
+
+
+def _split(controller: AbstractController) -> tuple[Any, Any]:
+    """The weights that the search moves, and the rest."""
+    # A policy is judged on top of the base that it was given.
+    inside = "policy" if isinstance(controller, FixedPolicy) else ""
+    marks = [
+        role == "weight"
+        and eqx.is_inexact_array(leaf)
+        and jax.tree_util.keystr(path, simple=True).startswith(inside)
+        for path, leaf, role, _ in marked_leaves(controller)
+    ]
+    mask = jax.tree.unflatten(jax.tree.structure(controller), marks)
+    return eqx.partition(controller, mask)
+
+
+@eqx.filter_jit
+def _search(environment, controller, x0, w, horizon, iterations, tolerance):
+    weights, rest = _split(controller)
+    start, unravel = ravel_pytree(weights)
+
+    def run(theta, keep=(), checkpoint="step"):
+        found = eqx.combine(unravel(theta), rest)
+        options: Any = dict(key=jax.random.key(0), horizon=horizon, throw=False)
+        options |= dict(keep=keep, checkpoint=checkpoint)
+        return found, rollout(environment, found, x0=x0, w=w, **options)
+
+    def total(theta):
+        return run(theta, checkpoint="sqrt")[1].total_cost
+
+    def step(carry):
+        theta, cost, damping, _, k = carry
+        gradient, hessian = jax.grad(total)(theta), jax.hessian(total)(theta)
+        unit = jnp.trace(jnp.abs(hessian)) / len(theta)
+        unit = jnp.where(unit > 0, unit, 1)
+        damped = hessian + damping * unit * jnp.eye(len(theta), dtype=theta.dtype)
+        move = solve(damped, -gradient[:, None])[:, 0]
+        promised = -(gradient @ move + move @ hessian @ move / 2)
+        tried = total(theta + move)
+        better = (tried < cost) & jnp.all(jnp.isfinite(move))
+        theta = jnp.where(better, theta + move, theta)
+        # What is promised below rounding is not to be had.
+        left = jnp.where(promised > 0, promised / (1e-30 + jnp.abs(cost)), jnp.inf)
+        left = jnp.where(better | (left <= tolerance), left, jnp.inf)
+        # Never so little that rounding moves what the cost does not see.
+        damping = jnp.where(better, jnp.maximum(damping / 10, least), damping * 10)
+        return theta, jnp.where(better, tried, cost), damping, left, k + 1
+
+    def going(carry):
+        *_, left, k = carry
+        return (k < iterations) & ~(left <= tolerance)
+
+    least = jnp.finfo(start.dtype).eps ** 0.75
+    carry = start, total(start), 10 * least, jnp.asarray(jnp.inf, start.dtype), 0
+    theta, _, _, left, k = lax.while_loop(going, step, carry)
+    found, trajectory = run(theta, ("states", "controls", "costs", "disturbances"))
+    converged = left <= tolerance
+    result = choose(converged, RESULTS.successful, RESULTS.not_converged)
+    return Hindsight(found, trajectory, left, jnp.asarray(k), result)

@@ -1,0 +1,153 @@
+"""The engine of online control: learning what to add to a base controller's control."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array
+
+from ..._controller import AbstractLearner
+from ..._fields import function_field, parameter
+from ._features import Features
+from ._fixed import FixedPolicy
+from ._loop import Loop, LoopState, shift
+from ._policy import AbstractPolicy
+
+
+class LearnerState(NamedTuple):
+    """What an online learner remembers.
+
+    - `loop`: of the plant and the base controller.
+    - `signal`: its last values, newest first.
+    - `features`: of this step and those of the roll-out before it, newest first.
+    - `theta`: what has been learned.
+    - `optimiser`: the state of the optimiser.
+    """
+
+    loop: LoopState
+    signal: Array
+    features: Array
+    theta: Any
+    optimiser: Any
+
+
+class OnlineLearner(AbstractLearner):
+    """A base controller, and what is learned online to add to it,
+
+    `u_t = base(y_t) + policy(theta_t, features_t)`,
+
+    where the features are filters of a signal that does not depend on what was added:
+    the past disturbances, or nature's output. Before it acts, theta moves against the
+    gradient of what this step would have cost had it been in use all along a roll-out,
+
+    `loss_t(theta) = c(t, y_t(theta), u_t(theta))`,
+    `y_t(theta) = y_t + sum_{j < horizon} G_j (v_{t-1-j}(theta) - v_{t-1-j})`,
+
+    with `G_j` the closed loop's response to an impulse j steps ago, `v_s(theta)` what
+    theta would have added at step s and `v_s` what was added, saturation included; and
+    likewise for the control. The responses are those of linear dynamics, or of any
+    dynamics linearised along the way.
+
+    [`delucax.controllers.GPC`][], [`delucax.controllers.DRC`][],
+    [`delucax.controllers.SFC`][], [`delucax.controllers.DSC`][] and
+    [`delucax.controllers.NeuralGPC`][] make it.
+
+    **Attributes:**
+
+    - `loop`: the model with its base controller: `loop.base`; `loop.horizon`, the
+        length of the roll-out; `loop.response`, the G_j, if they are always the same.
+    - `cost`: the stage cost.
+    - `features`: the filters, and which signal they are of.
+    - `policy`: the family of policies; `policy.start`, the first theta, is trainable.
+    - `learning_rate`: an array that scales the optimiser's step; it can be
+        differentiated.
+    - `optimiser`: an Optax transformation.
+
+    The state that `init` makes and a run carries along has `theta`, what has been
+    learned, and `signal`, the last values of the signal, newest first.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("lds", key=jax.random.key(0))
+        learner = dlx.controllers.GPC(env.dynamics, env.cost)
+        dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
+        ```
+    """
+
+    loop: Loop
+    cost: Callable[..., Array] = function_field()
+    features: Features
+    policy: AbstractPolicy
+    learning_rate: Array = parameter()
+    optimiser: optax.GradientTransformation = eqx.field(static=True)
+
+    def init(self, *, key=None):
+        loop, features = self.loop, self.features
+        theta, dtype = self.policy.init(), loop.dtype
+        return LearnerState(
+            loop.init(key, loop.horizon),
+            signal=features.init(dtype),
+            features=jnp.zeros((loop.horizon + 1, features.size), dtype),
+            theta=theta,
+            optimiser=self.optimiser.init(theta),
+        )
+
+    def __call__(self, t, y, state):
+        loop, before = self.loop, state.loop.base
+        moved = loop.act(self, t, y, state.loop)
+        signal = self.features.observe(loop, moved, state.signal)
+        features = shift(self.features(signal), state.features)
+        moved = loop.linearised(self.policy(state.theta, features[0]), before, moved)
+        state = state._replace(loop=moved, signal=signal, features=features)
+        theta, optimiser = self._learn(state)
+        v = self.policy(theta, features[0])
+        state = state._replace(theta=theta, optimiser=optimiser)
+        return (moved.u_base + v).astype(y.dtype), state
+
+    def applied(self, u, cost, state):
+        return state._replace(loop=self.loop.applied(u, cost, state.loop))
+
+    def loss(self, t, state):
+        del t
+        return self._loss(state.theta, state)
+
+    def fresh(self, state, key):
+        del key
+        theta = self.policy.init()
+        return state._replace(theta=theta, optimiser=self.optimiser.init(theta))
+
+    def fixed(self, theta: Any = None) -> "FixedPolicy":
+        """The same controller, no longer learning.
+
+        **Arguments:** `theta`: what it has learned, from its state; by default what it
+        starts with.
+
+        **Returns:** a controller whose `policy.start` is trainable.
+        """
+        policy = self.policy if theta is None else self.policy.at(theta)
+        return FixedPolicy(self.loop, self.features, policy)
+
+    def _learn(self, state):
+        gradient = jax.grad(self._loss)(state.theta, state)
+        direction, optimiser = self.optimiser.update(
+            gradient, state.optimiser, state.theta
+        )
+        rate = self.learning_rate
+        theta = jax.tree.map(
+            lambda old, step: old + (rate * step).astype(old.dtype),
+            state.theta,
+            direction,
+        )
+        return self.policy.project(theta), optimiser
+
+    def _loss(self, theta, state):
+        v = jax.vmap(self.policy, in_axes=(None, 0))(theta, state.features)
+        y, u = self.loop.counterfactual(v[0], v[1:], state.loop)
+        return self.cost(state.loop.t, y, u)

@@ -1,0 +1,103 @@
+"""A network of the past disturbances, learned online."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array
+
+from ..._check import check_count, check_key, check_positive
+from ..._controller import AbstractController
+from ..._fields import as_module
+from ..._typing import PRNGKey
+from ...dynamics import AbstractDynamics
+from ._base import as_base, checked_cost
+from ._features import Features
+from ._learner import OnlineLearner
+from ._loop import Loop, observes_state
+from ._policy import NetworkPolicy
+from ._step_size import adagrad_norm
+
+
+def NeuralGPC(
+    dynamics: AbstractDynamics,
+    cost: Callable[..., Array],
+    *,
+    base: AbstractController | None = None,
+    memory: int = 10,
+    width: int = 32,
+    depth: int = 1,
+    horizon: int | None = None,
+    learning_rate: Any = 1e-3,
+    optimiser: optax.GradientTransformation | None = None,
+    key: PRNGKey,
+) -> OnlineLearner:
+    """A network in place of the matrices of [`delucax.controllers.GPC`][],
+
+    `u_t = base(y_t) + network(s_t, ..., s_{t-memory+1})`,
+
+    where the signal s is the last disturbance if the state is observed, nature's output
+    otherwise. The network starts by adding nothing. There is no bound on its regret;
+    it is for costs and plants that a linear map of the past does not suit.
+
+    **Arguments:**
+
+    - `dynamics`, `cost`, `base`, `memory`, `horizon`: as for
+        [`delucax.controllers.GPC`][] and [`delucax.controllers.DRC`][].
+    - `width`, `depth`: of the hidden layers, 32 units in 1 layer by default.
+    - `learning_rate`: scales the optimiser's step, 1e-3 by default.
+    - `optimiser`: an Optax transformation; by default Adam, with the norm of the
+        gradient clipped at 1.
+    - `key`: a random key, for the first weights.
+
+    **Returns:** a [`delucax.controllers.OnlineLearner`][], whose `theta` are the
+    network's weights.
+
+    **Raises:** `ValueError` as [`delucax.controllers.GPC`][].
+
+    Source: Chen, Minasyan, Lee and Hazan, 2022.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("lds", key=jax.random.key(0))
+        key, run_key = jax.random.split(jax.random.key(0))
+        learner = dlx.controllers.NeuralGPC(env.dynamics, env.cost, key=key)
+        dlx.rollout(env, learner, key=run_key).total_cost
+        ```
+    """
+    where = "NeuralGPC"
+    cost = checked_cost(dynamics, cost, where)
+    base = as_base(dynamics, cost, base, where)
+    echoes = not observes_state(dynamics)
+    loop = Loop(dynamics, base, horizon, where, echoes=echoes)
+    check_key(key, where)
+    check_positive(learning_rate, "learning_rate", where)
+    memory = check_count(memory, "memory", where)
+    features = Features(None, memory, dynamics.observation_size, nature=echoes)
+    network = eqx.nn.MLP(
+        features.size,
+        dynamics.control_size,
+        check_count(width, "width", where),
+        check_count(depth, "depth", where),
+        as_module(jnp.tanh),
+        as_module(jax.nn.identity),
+        dtype=loop.dtype,
+        key=key,
+    )
+    last = lambda net: [net.layers[-1].weight, net.layers[-1].bias]  # noqa: E731
+    network = eqx.tree_at(last, network, [0 * leaf for leaf in last(network)])
+    return OnlineLearner(
+        loop,
+        cost,
+        features,
+        NetworkPolicy(network),
+        learning_rate,
+        adagrad_norm() if optimiser is None else optimiser,
+    )

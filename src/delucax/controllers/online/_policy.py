@@ -1,0 +1,82 @@
+"""What is learned: a map from features to what is added to the base's control."""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..._fields import parameter, weight
+
+
+class AbstractPolicy(eqx.Module):
+    """A family of maps `v = policy(theta, features)` and the set that `theta` is in."""
+
+    @abc.abstractmethod
+    def init(self) -> Any:
+        """The first `theta`."""
+
+    @abc.abstractmethod
+    def at(self, theta: Any) -> "AbstractPolicy":
+        """The same family, starting with `theta`."""
+
+    @abc.abstractmethod
+    def __call__(self, theta: Any, features: Array) -> Array:
+        """What is added to the base's control."""
+
+    @abc.abstractmethod
+    def project(self, theta: Any) -> Any:
+        """The nearest point of the set."""
+
+
+class LinearPolicy(AbstractPolicy):
+    """`v = theta features`, with the Frobenius norm of `theta` at most `radius`."""
+
+    start: Float[Array, "m f"] = weight()
+    radius: Array = parameter()
+
+    def init(self):
+        return self.start
+
+    def at(self, theta):
+        return LinearPolicy(theta, self.radius)
+
+    def __call__(self, theta, features):
+        return theta @ features
+
+    def project(self, theta):
+        return within(theta, self.radius)
+
+
+class NetworkPolicy(AbstractPolicy):
+    """`v = network(features)`, where `theta` are the network's weights."""
+
+    start: eqx.nn.MLP = weight()
+
+    def init(self):
+        return eqx.filter(self.start, eqx.is_inexact_array)
+
+    def at(self, theta):
+        return NetworkPolicy(eqx.combine(theta, self.start))
+
+    def __call__(self, theta, features):
+        return eqx.combine(theta, self.start)(features)
+
+    def project(self, theta):
+        return theta
+
+
+def within(theta: Array, radius: Array) -> Array:
+    """The nearest point of a ball in the Frobenius norm."""
+    squared = jnp.sum(theta**2)
+    over = squared > radius**2
+    # The square root is taken where it has a derivative.
+    norm = jnp.sqrt(jnp.where(over, squared, 1))
+    return jnp.where(over, radius / norm, 1).astype(theta.dtype) * theta
+
+
+def squared_norm(tree: Any) -> Array:
+    """The sum of squares of all that a tree holds."""
+    return sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

@@ -1,0 +1,181 @@
+"""Learners whose features are spectral filters of the past."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array
+
+from ..._check import check_count
+from ..._controller import AbstractController
+from ...dynamics import AbstractDynamics
+from ._base import as_base, checked_cost, linear_learner
+from ._features import Features
+from ._learner import OnlineLearner
+from ._loop import Loop, observes_state
+
+
+def SFC(
+    dynamics: AbstractDynamics,
+    cost: Callable[..., Array],
+    *,
+    base: AbstractController | None = None,
+    filters: int = 5,
+    memory: int = 30,
+    margin: float = 0.2,
+    horizon: int | None = None,
+    learning_rate: Any = None,
+    optimiser: optax.GradientTransformation | None = None,
+    radius: Any = None,
+) -> OnlineLearner:
+    """The spectral filtering controller,
+
+    `u_t = base(y_t) + M_0 s_t + sum_i M_i f_i(s_{t-1}, ..., s_{t-memory})`,
+
+    where the signal s is the last disturbance if the state is observed, nature's output
+    otherwise, and `f_i(s) = sigma_i^(1/4) sum_k phi_i(k) s_{t-k}` with
+    `(sigma_i, phi_i)` the largest eigenvalues and eigenvectors of the matrix
+    `H_jk = (1 - margin)^(j + k - 1) / (j + k - 1)`.
+
+    A few such filters do for a long memory what [`delucax.controllers.GPC`][] and
+    [`delucax.controllers.DRC`][] need a matrix a step for: there is less to learn where
+    the closed loop is slow. They depend on the memory and the margin alone, not on the
+    plant.
+
+    **Arguments:**
+
+    - `dynamics`, `cost`, `base`, `horizon`, `learning_rate`, `optimiser`, `radius`: as
+        for [`delucax.controllers.DRC`][].
+    - `filters`: how many, 5 by default.
+    - `memory`: the number of past values that are filtered, 30 by default.
+    - `margin`: the stability margin, between 0 and 1: memories that fade as
+        `(1 - margin)^k` or faster are well represented. 0.2 by default.
+
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state, `signal` has
+    the last `memory + 1` values and `theta` the matrices M side by side.
+
+    **Raises:** `ValueError` as [`delucax.controllers.DRC`][]; and if there are more
+    filters than the memory has room for, or the margin is not between 0 and 1.
+
+    Source: Brahmbhatt, Buzaglo, Druchyna and Hazan, 2025 (spectral control).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("lds", key=jax.random.key(0))
+        learner = dlx.controllers.SFC(env.dynamics, env.cost)
+        dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
+        ```
+    """
+    where = "SFC"
+    bank = _bank(filters, memory, margin, where)
+    past = np.pad(bank, ((0, 0), (1, 0)))
+    parts = dynamics, cost, base, horizon, learning_rate, optimiser, radius
+    return _learner(np.concatenate([np.eye(1, memory + 1), past]), *parts, where)
+
+
+def DSC(
+    dynamics: AbstractDynamics,
+    cost: Callable[..., Array],
+    *,
+    base: AbstractController | None = None,
+    filters: int = 5,
+    memory: int = 30,
+    margin: float = 0.2,
+    horizon: int | None = None,
+    learning_rate: Any = None,
+    optimiser: optax.GradientTransformation | None = None,
+    radius: Any = None,
+) -> OnlineLearner:
+    """The double spectral controller, for a state that is not observed,
+
+    `u_t = base(y_t) + M_0 s_t + sum_i M_i f_i(s_{t-1}, ...)`
+    `    + sum_i M'_i f_i(s_t, ...) + sum_{i <= j} M''_ij (f_i * f_j)(s_t, ...)`,
+
+    with the signal s and the filters f of [`delucax.controllers.SFC`][]; `f_i * f_j` is
+    one filter after the other, which represents what an observer, itself a filter,
+    makes of the past.
+
+    **Arguments:** `dynamics`, `cost`, `base`, `filters`, `memory`, `margin`, `horizon`,
+    `learning_rate`, `optimiser`, `radius`: as for [`delucax.controllers.SFC`][].
+
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state, `signal` has
+    the last `2 memory` values and `theta` the matrices M side by side.
+
+    **Raises:** `ValueError` as [`delucax.controllers.SFC`][].
+
+    Source: Brahmbhatt, Buzaglo, Druchyna and Hazan, 2025 (double spectral control).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("lds", key=jax.random.key(0))
+        learner = dlx.controllers.DSC(env.dynamics, env.cost)
+        dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
+        ```
+    """
+    where = "DSC"
+    bank = _bank(filters, memory, margin, where)
+    length = 2 * memory
+    wide = lambda rows, first: np.pad(  # noqa: E731
+        rows, ((0, 0), (first, length - first - rows.shape[1]))
+    )
+    # f_i * f_j is f_j * f_i: a matrix for each pair.
+    pairs = [(i, j) for i in range(filters) for j in range(i, filters)]
+    twice = np.stack([np.convolve(bank[i], bank[j]) for i, j in pairs])
+    rows = [np.eye(1, length), wide(bank, 1), wide(bank, 0), wide(twice, 0)]
+    parts = dynamics, cost, base, horizon, learning_rate, optimiser, radius
+    return _learner(np.concatenate(rows), *parts, where)
+
+
+def _learner(
+    rows, dynamics, cost, base, horizon, learning_rate, optimiser, radius, where
+):
+    cost = checked_cost(dynamics, cost, where)
+    base = as_base(dynamics, cost, base, where)
+    loop = Loop(dynamics, base, horizon, where, echoes=not observes_state(dynamics))
+    size = dynamics.observation_size
+    features = Features(
+        jnp.asarray(rows, loop.dtype), rows.shape[1], size, nature=loop.echoes
+    )
+    return linear_learner(loop, cost, features, learning_rate, optimiser, radius, where)
+
+
+def _bank(filters: int, memory: int, margin: float, where: str) -> np.ndarray:
+    memory = check_count(memory, "memory", where)
+    filters = check_count(filters, "filters", where)
+    if filters > memory:
+        raise ValueError(
+            f"{where}: filters must be at most memory, {memory}, got {filters}."
+        )
+    number = isinstance(margin, int | float) and not isinstance(margin, bool)
+    if not number or not (math.isfinite(margin) and 0 < margin < 1):
+        raise ValueError(
+            f"{where}: margin must be a number between 0 and 1, got {margin!r}."
+        )
+    return spectral_filters(memory, filters, float(margin))
+
+
+@functools.lru_cache
+def spectral_filters(memory: int, count: int, margin: float) -> np.ndarray:
+    """The filters, shape `(count, memory)`, newest first.
+
+    Source: Hazan, Singh and Zhang, 2017.
+    """
+    index = np.arange(1, memory + 1)
+    total = index[:, None] + index[None, :] - 1.0
+    # In float64 whatever JAX computes in: the matrix is all but singular.
+    values, vectors = np.linalg.eigh((1 - margin) ** total / total)
+    values, vectors = values[::-1][:count], vectors[:, ::-1][:, :count]
+    sign = np.where(vectors.sum(axis=0) < 0, -1.0, 1.0)
+    return (np.maximum(values, 0.0) ** 0.25 * sign * vectors).T

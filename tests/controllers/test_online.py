@@ -1,0 +1,392 @@
+"""Learners: what they recover, what they compute and what they reach."""
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from helpers import assert_close, needs_x64, user_error
+
+import delucax as dlx
+
+
+pytestmark = needs_x64
+
+
+c = dlx.controllers
+A, B = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.0], [1.0]])
+Q, R = np.eye(2), np.eye(1)
+PLANT = dlx.LinearDynamics(A, B)
+COST = dlx.costs.Quadratic(Q, R)
+STEPS = 1000
+TIMES = np.arange(STEPS)
+SLOW = np.sin(TIMES / (2 * np.pi))[:, None] * np.ones(2)
+
+
+def run(controller, w, dynamics=PLANT, cost=COST, x0=None, **options):
+    env = dlx.Environment(dynamics, cost, **options)
+    x0 = jnp.zeros(dynamics.state_size) if x0 is None else x0
+    key = jax.random.key(0)
+    return dlx.rollout(env, controller, key=key, x0=x0, w=w, horizon=len(w))
+
+
+def follow(env, controller, x0, w):
+    """Every state of a controller, and of the plant, along a run."""
+
+    @jax.jit
+    def loop(x0, w):
+        def step(carry, inputs):
+            x, state = carry
+            k, w = inputs
+            t = k * env.dt
+            u, state = controller(t, env.dynamics.observe(t, x), state)
+            here = env.step(t, x, u, w)
+            after = controller.applied(here.control, here.cost, state)
+            return (here.state, after), (state, here.control, u, here.cost)
+
+        state = controller.init(key=jax.random.key(1))
+        return lax.scan(step, (x0, state), (jnp.arange(len(w)), w))[1]
+
+    return loop(jnp.asarray(x0), jnp.asarray(w))
+
+
+PENDULUM = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+LEARNERS = {
+    "GPC": lambda d, cost: c.GPC(d, cost),
+    "SFC": lambda d, cost: c.SFC(d, cost, memory=6, filters=2),
+    "NeuralGPC": lambda d, cost: c.NeuralGPC(d, cost, width=3, key=jax.random.key(0)),
+    "BPC": lambda d, cost: c.BPC(d, c.GPC(d, cost).loop.base, delta=5.0),
+}
+
+
+@pytest.mark.parametrize("make", LEARNERS.values(), ids=LEARNERS)
+@pytest.mark.parametrize("dynamics", [PLANT, PENDULUM], ids=["linear", "pendulum"])
+def test_recovered_disturbances(dynamics, make):
+    """Exactly zero where there are none, and else what they were, under saturation."""
+    env = dlx.Environment(dynamics, COST, control_bounds=(-0.4, 0.4))
+    learner, x0 = make(dynamics, COST), jnp.array([0.3, -0.5])
+    quiet, *_ = follow(env, learner, x0, jnp.zeros((12, dynamics.disturbance_size)))
+    assert np.all(np.asarray(quiet.signal) == 0)
+    w = 0.2 * np.random.default_rng(0).normal(size=(12, dynamics.disturbance_size))
+    states, applied, asked, _ = follow(env, learner, x0, w)
+    assert np.any(np.asarray(applied) != np.asarray(asked))
+    if dynamics is PLANT:
+        assert_close(states.signal[1:, 0], w[:-1], rtol=0, atol=1e-14)
+        return
+    found = dlx.rollout(env, learner, key=jax.random.key(1), x0=x0, w=w, horizon=12)
+    x = found.states
+    undisturbed = jax.vmap(lambda x, u: dynamics(0.0, x, u))(x[:-1], applied)
+    assert np.any(np.abs(states.signal[1:, 0]) > 1e-3)
+    if not isinstance(learner, c.BPC):  # which draws another key in a rollout
+        assert_close(states.signal[1:, 0], (x[1:] - undisturbed)[:-1], atol=1e-13)
+
+
+def partial(base=None):
+    C = np.array([[1.0, 0.0]])
+    plant = dlx.LinearDynamics(A, B, C)
+    return plant, c.DRC(plant, dlx.costs.Quadratic(R, R), base=base, memory=3)
+
+
+def test_natures_output():
+    """It is what the base alone would have shown, whatever was added."""
+    plant, learner = partial()
+    env = dlx.Environment(plant, COST, control_bounds=(-1.0, 1.0))
+    w = np.random.default_rng(1).normal(size=(20, 2))
+    start = np.array([0.1, -0.1])
+    loud = eqx.tree_at(lambda d: d.policy.start, learner, jnp.full((1, 3), 0.3))
+    states, applied, asked, _ = follow(env, loud, start, w)
+    base = dlx.rollout(
+        dlx.Environment(plant, COST, horizon=20),
+        learner.loop.base,
+        key=jax.random.key(0),
+        x0=start,
+        w=w,
+    )
+    assert np.any(np.asarray(applied) != np.asarray(asked))
+    assert_close(states.signal[:, 0], base.observations, rtol=0, atol=1e-12)
+
+
+class Filtering(dlx.AbstractController):
+    """A gain with a filter of its own."""
+
+    K: jax.Array
+
+    def init(self, *, key=None):
+        return jnp.zeros(1)
+
+    def __call__(self, t, y, state):
+        u = -self.K @ y
+        return u + 0.1 * state, 0.5 * state + 0.1 * u
+
+
+@pytest.mark.parametrize("along", [False, True], ids=["once", "along the way"])
+def test_loss_is_what_the_step_would_have_cost(along):
+    """With a roll-out as long as the run, exactly so where the loop is linear."""
+    gain = dlx.riccati.dare(A, B, Q, R).K
+    base = Filtering(gain) if along else c.Linear(gain)
+    learner = c.GPC(PLANT, COST, base=base, memory=3, horizon=12)
+    assert (learner.loop.tangents is None) == along
+    env = dlx.Environment(PLANT, COST)
+    w = np.random.default_rng(2).normal(size=(12, 2))
+    states, *_ = follow(env, learner, np.zeros(2), w)
+    theta = jnp.asarray(np.random.default_rng(3).normal(size=(1, 6)))
+    other = states._replace(theta=jnp.broadcast_to(theta, (12, 1, 6)))
+    losses = jax.vmap(learner.loss)(jnp.arange(12.0), other)
+    expected = run(learner.fixed(theta), w).costs
+    assert_close(losses, expected, rtol=1e-10, atol=1e-10)
+
+
+def hindsight_policy(A, B, K, w, memory):
+    """The best disturbance-action policy, as least squares."""
+    n, m = B.shape
+    loop, x = A - B @ K, np.zeros(n)
+    S, past = np.zeros((n, m, memory * n)), np.zeros((memory, n))
+    rows, right = [], []
+    for now in w:
+        added = -np.einsum("mn,nkp->mkp", K, S)
+        added[range(m), range(m)] += past.ravel()
+        rows += [S.reshape(n, -1), added.reshape(m, -1)]
+        right += [x, -K @ x]
+        S = np.einsum("ij,jkp->ikp", loop, S)
+        S += np.einsum("ik,p->ikp", B, past.ravel())
+        x, past = loop @ x + now, np.concatenate([now[None], past[:-1]])
+    rows, right = np.concatenate(rows), np.concatenate(right)
+    theta = np.linalg.lstsq(rows, -right, rcond=None)[0]
+    return np.sum((rows @ theta + right) ** 2)
+
+
+def test_defaults_reach_what_is_possible():
+    """Under noise, a slow sine and a constant, in any units of cost and disturbance."""
+    learner, base = c.GPC(PLANT, COST), c.LQR(PLANT, Q, R)
+    rng = np.random.default_rng(0)
+    w = np.stack([rng.normal(size=(STEPS, 2)), SLOW, np.ones((STEPS, 2))])
+    total = jax.jit(jax.vmap(lambda c, w: run(c, w).total_cost, (None, 0)))
+    costs, regulated = np.asarray(total(learner, w)), np.asarray(total(base, w))
+    best = [hindsight_policy(A, B, np.asarray(base.K), each, 10) for each in w]
+    assert np.all(costs <= np.array([1.05, 0.15, 0.15]) * regulated)
+    assert np.all(costs <= 1.5 * np.array(best))
+
+    def scaled(size, w):
+        cost = dlx.costs.Quadratic(size * Q, size * R)
+        return run(c.GPC(PLANT, cost), size * w, cost=cost).total_cost
+
+    for size in 1e-2, 1e2:
+        again = jax.vmap(scaled, (None, 0))(size, w)
+        assert_close(again / size**3, costs, rtol=1e-6)
+
+
+def test_published_setting():
+    """The averages over 1000 steps, relative to the regulator's, to 2 percent."""
+    rate = optax.scale_by_schedule(lambda k: 1 / jnp.sqrt(k + 1.0))
+    learner = c.GPC(
+        PLANT,
+        COST,
+        memory=10,
+        horizon=10,
+        learning_rate=0.005,
+        optimiser=optax.chain(rate, optax.scale(-1.0)),
+    )
+    base = c.LQR(PLANT, Q, R)
+    for w, published in ((SLOW, 0.091), (np.ones((STEPS, 2)), 0.073)):
+        ratio = run(learner, w).total_cost / run(base, w).total_cost
+        assert abs(ratio - published) < 0.02 * published
+
+
+def test_best_in_hindsight():
+    """The least-squares solution for a policy; a stationary point for a gain."""
+    w = np.random.default_rng(4).normal(size=(200, 2))
+    learner = c.GPC(PLANT, COST, memory=4)
+    played = run(learner, w)
+    env = dlx.Environment(PLANT, COST)
+    found = c.best_in_hindsight(env, learner.fixed(), played)
+    assert found.result == dlx.RESULTS.successful
+    exact = hindsight_policy(A, B, np.asarray(learner.loop.base.K), w, 4)
+    assert_close(found.trajectory.total_cost, exact, rtol=1e-9)
+    assert_close(
+        c.regret(played, found.trajectory)[-1],
+        played.total_cost - exact,
+        rtol=1e-6,
+    )
+    gain = c.best_in_hindsight(env, c.Linear(learner.loop.base.K), played)
+    cost = lambda K: run(c.Linear(K), w).total_cost
+    slope = jax.grad(cost)(gain.controller.K)
+    assert np.max(np.abs(slope)) < 1e-4 * gain.trajectory.total_cost
+    assert gain.trajectory.total_cost < cost(learner.loop.base.K)
+
+
+def switched():
+    """A plant that becomes another one halfway."""
+    first = np.arange(600)[:, None, None] < 300
+    A = np.where(first, [[1, 0.5], [0, 1]], [[1, 1.5], [0, 1]])
+    return dlx.LinearDynamics(A, np.where(first, [[0], [1.2]], [[0], [0.9]]))
+
+
+def test_adaptive_keeps_up():
+    """The switching study in the setting that was published for it."""
+    plant = switched()
+    rate = optax.scale_by_schedule(lambda k: 1 / jnp.sqrt(k + 1.0))
+    optimiser = optax.chain(rate, optax.scale(-1.0))
+    options = dict(horizon=10, learning_rate=0.005, optimiser=optimiser)
+    learner = c.GPC(plant, COST, **options)
+    assert isinstance(learner.loop.base, c.Scheduled)
+    noise = 0.2 * np.random.default_rng(0).normal(size=(5, 600, 2))
+    t = np.arange(600)[:, None]
+    w = np.where((t // 150) % 2 == 0, noise, 0.4 * np.sin(t))
+    total = jax.jit(jax.vmap(lambda c, w: run(c, w, plant).total_cost, (None, 0)))
+    one, many = total(learner, w), total(c.Adaptive(learner), w)
+    assert_close(np.mean(one) / 600, 0.515, rtol=0.05)
+    assert np.mean(many) / 600 < 0.45
+    assert np.all(many < 0.92 * one)
+
+
+def test_births_and_deaths():
+    """Experts live as published, and one of the slots always holds the first."""
+    slots, every, steps = 6, 2, 60
+    learner = c.Adaptive(c.GPC(PLANT, COST, memory=2), slots=slots, every=every)
+    env = dlx.Environment(PLANT, COST)
+    w = np.random.default_rng(5).normal(size=(steps, 2))
+    states, *_ = follow(env, learner, np.zeros(2), w)
+    alive = [(0, np.inf)]
+    for step in range(1, steps):
+        alive = [(born, end) for born, end in alive if end > step]
+        if step % every == 0:
+            birth = step // every
+            power = birth & -birth
+            if len(alive) == slots:
+                alive.remove(min(alive, key=lambda expert: expert[1]))
+            alive.append((step, step + every * (4 * power + 1)))
+        ends = sorted(e for _, e in alive if e < np.inf)
+        # The state of step k was made after step k - 1.
+        found = np.asarray(states.ends[step])
+        lasting = np.iinfo(np.int32).max
+        assert sorted(e for e in found if step < e < lasting) == ends
+        weights = np.asarray(states.weights[step])
+        assert np.all((weights > 0) == (found > step))
+        assert np.isclose(weights.sum(), 1)
+
+
+def test_switching_follows_one():
+    w = np.random.default_rng(6).normal(size=(100, 2))
+    learner = c.Adaptive(c.GPC(PLANT, COST, memory=2), every=5, play="switch")
+    states, applied, *_ = follow(dlx.Environment(PLANT, COST), learner, np.zeros(2), w)
+    chosen = np.asarray(states.chosen)
+    assert len(set(chosen)) > 1 and np.mean(chosen[1:] != chosen[:-1]) < 0.5
+    assert np.all(np.take_along_axis(states.weights, chosen[:, None], 1) > 0)
+
+
+def test_bandit_feedback():
+    """It beats its base where there is something to learn, seeing only costs."""
+    dynamics = dlx.LinearDynamics(np.array([[0.8, 0.5], [0.0, 0.8]]), 0.8 * B)
+    base = c.LQR(dynamics, Q, R)
+    w = 0.3 * np.ones((5000, 2))
+    costs = run(c.BPC(dynamics, base), w, dynamics).costs
+    assert np.mean(costs[-1000:]) < 0.6 * np.mean(run(base, w, dynamics).costs[-1000:])
+
+
+def build(model):
+    return c.GPC(model, COST, horizon=15)
+
+
+def test_explore_identifies():
+    """From steps that an adversary disturbs, and then controls by what it found."""
+    K = np.array([[0.2, 0.8]])
+    learner = c.Explore(build, K, steps=3000, scale=3.0)
+    env = dlx.Environment(PLANT, COST)
+    w = np.concatenate([SLOW] * 4)
+    states, *_, costs = follow(env, learner, np.zeros(2), w)
+    model = jax.tree.map(lambda leaf: leaf[-1], states.model)
+    assert np.max(np.abs(model.A - A)) < 0.1 and np.max(np.abs(model.B - B)) < 0.1
+    known = run(c.GPC(PLANT, COST), w).costs
+    assert np.mean(costs[3500:]) < 1.3 * np.mean(known[3500:])
+    assert np.mean(costs[3500:]) < 0.3 * np.mean(run(c.Linear(K), w).costs[3500:])
+
+
+def test_adagrad_norm():
+    """Sums of squares over all leaves, and nothing before the first gradient."""
+    optimiser = c.adagrad_norm()
+    params = {"a": jnp.zeros(2), "b": jnp.zeros(())}
+    state = optimiser.init(params)
+    step, state = optimiser.update({"a": jnp.zeros(2), "b": jnp.zeros(())}, state)
+    assert step["b"] == 0
+    for total in 26.0, 52.0:
+        gradient = {"a": jnp.array([3.0, 4.0]), "b": jnp.ones(())}
+        step, state = optimiser.update(gradient, state)
+        assert_close(step["a"], -np.array([3.0, 4.0]) / np.sqrt(total))
+        assert_close(step["b"], -1 / np.sqrt(total))
+
+
+def test_projection_holds():
+    learner = c.GPC(PLANT, COST, learning_rate=100.0, radius=0.2)
+    states, *_ = follow(dlx.Environment(PLANT, COST), learner, np.zeros(2), SLOW[:200])
+    norms = np.linalg.norm(states.theta[:, 0], axis=-1)
+    assert np.max(norms) <= 0.2 * (1 + 1e-12) and np.max(norms) > 0.199
+
+
+def test_spectral_filters():
+    """Few of them hold all that fades quickly enough."""
+    memory, count, margin = 30, 8, 0.2
+    bank = dlx.controllers.online._spectral.spectral_filters(memory, count, margin)
+    k = np.arange(1, memory + 1)
+    H = (1 - margin) ** (k[:, None] + k - 1) / (k[:, None] + k - 1)
+    norms = np.linalg.norm(bank, axis=1)
+    assert_close(norms, np.linalg.eigvalsh(H)[::-1][:count] ** 0.25, rtol=1e-6)
+    for rate in np.linspace(0, 1 - margin, 9):
+        wanted = rate ** (k - 1)
+        weights = np.linalg.lstsq(bank.T, wanted, rcond=None)[0]
+        assert np.linalg.norm(bank.T @ weights - wanted) < 2e-4
+
+
+UNSTABLE = c.Linear(np.zeros((1, 2)))
+LOOSE = dlx.LinearDynamics(A, B, np.array([[1.0, 0.0]]))
+vector = lambda t, x, u: x
+NO_POINT = dlx.Discretized(dlx.systems.Lorenz(), dt=0.01)
+
+
+@pytest.mark.parametrize(
+    "make, match",
+    [
+        (lambda: c.GPC(PLANT, COST, base=UNSTABLE), "must stabilise.*radius 1"),
+        (lambda: c.GPC(PLANT, COST, memory=0), "GPC: memory must be a whole"),
+        (lambda: c.GPC(PLANT, COST, horizon=0), "GPC: horizon must be a whole"),
+        (lambda: c.GPC(PLANT, vector), r"cost must give a scalar.*shape \(2,\)"),
+        (lambda: c.GPC(PLANT, 3.0), "cost must be a function"),
+        (lambda: c.GPC(None, COST), "dynamics must be an AbstractDynamics.*Explore"),
+        (lambda: c.GPC(PLANT, COST, base=3), "base must be an AbstractController"),
+        (lambda: c.GPC(PLANT, COST, base=c.Zero(2)), "control of size 1.*shape"),
+        (lambda: c.GPC(PLANT, COST, base=c.Linear(np.ones((1, 3)))), "of size 2"),
+        (lambda: c.GPC(PLANT, COST, radius=-1.0), "radius must be positive"),
+        (lambda: c.GPC(PLANT, COST, learning_rate=np.nan), "learning_rate must be"),
+        (lambda: c.GPC(LOOSE, dlx.costs.Quadratic(R, R)), "must observe their state"),
+        (lambda: c.GPC(PLANT, lambda t, x, u: jnp.abs(u[0])), "base must be given"),
+        (lambda: c.DRC(LOOSE, dlx.costs.Quadratic(R, R), memory=0), "memory must be"),
+        (lambda: c.SFC(PLANT, COST, filters=9, memory=8), "filters must be at most"),
+        (lambda: c.SFC(PLANT, COST, margin=1.0), "margin must be a number between"),
+        (lambda: c.NeuralGPC(PLANT, COST, key=3), "key must be one random key"),
+        (lambda: c.BPC(PLANT, UNSTABLE), "must stabilise"),
+        (lambda: c.BPC(PLANT, c.LQR(PLANT, Q, R)).init(), "key must be one random"),
+        (lambda: c.Adaptive(c.Zero(1)), "base must be an AbstractLearner"),
+        (lambda: c.Adaptive(c.GPC(PLANT, COST), slots=1), "slots must be a whole"),
+        (lambda: c.Adaptive(c.GPC(PLANT, COST), play="both"), "'mix' or 'switch'"),
+        (lambda: c.Explore(3, np.zeros((1, 2)), 100), "build must be a function"),
+        (lambda: c.Explore(build, np.zeros((1, 2)), 3), "steps must be a whole"),
+        (lambda: c.Scheduled(c.Linear(np.ones((1, 2))), 0.0), "dt must be positive"),
+        (lambda: c.Scheduled(3, 1.0), "controllers must be an AbstractController"),
+    ],
+)
+def test_bad_input(make, match):
+    with user_error(match=match):
+        make()
+
+
+def test_traced_dynamics_need_a_horizon():
+    def cost(b, **options):
+        dynamics = dlx.LinearDynamics(A, b * B)
+        return run(c.GPC(dynamics, COST, **options), SLOW[:30], dynamics).total_cost
+
+    with user_error(match="horizon must be given"):
+        jax.jit(cost)(1.0)
+    slope = jax.jit(jax.grad(lambda b: cost(b, horizon=10)))(1.0)
+    numeric = (cost(1 + 1e-6, horizon=10) - cost(1 - 1e-6, horizon=10)) / 2e-6
+    assert_close(slope, numeric, rtol=1e-5)
