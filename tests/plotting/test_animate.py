@@ -16,12 +16,10 @@ from matplotlib.patches import Polygon
 from PIL import Image
 
 import delucax as dlx
-from delucax.plotting._drawings import (
-    arc_arrow,
-    draw_pendulum,
-    drawing_for,
-    setup_pendulum,
-)
+from delucax.plotting._drawings import drawing_for
+from delucax.plotting._drawings._arms import draw_pendulum, setup_pendulum
+from delucax.plotting._drawings._parts import arc_arrow
+from delucax.plotting._drawings._registry import _DRAWINGS
 from delucax.plotting._export import compressed, expanded
 from delucax.plotting._runs import as_runs
 from delucax.plotting._scene import Scene
@@ -240,19 +238,42 @@ def test_pendulum_knows_its_largest_torque(env, trajectory):
     )
 
 
-def test_other_plants_are_a_dot_in_a_plane_or_traces_alone(key):
-    lds = dlx.make("lds", A=0.9 * jnp.eye(3), B=jnp.ones((3, 1)), horizon=4)
-    run = dlx.rollout(lds, dlx.controllers.Zero(1), key=key, x0=jnp.ones(3))
-    assert drawing_for(lds) is None
+def test_other_plants_are_a_dot_in_a_plane_or_bars(key):
+    lds = dlx.make("lds", A=0.9 * jnp.eye(2), B=jnp.ones((2, 1)), horizon=4)
+    run = dlx.rollout(lds, dlx.controllers.Zero(1), key=key, x0=jnp.ones(2))
     scene = Scene(as_runs(run, None, "", "")[0], lds, range(5), 40)
     scene.frame(2)
     assert scene.plant.ax.get_xlabel() == "x0" and scene.plant.ax.get_ylabel() == "x1"
-    path, dot = scene.plant.ax.get_lines()
-    np.testing.assert_allclose(np.ravel(dot.get_data()), run.states[2, :2])
-    assert len(path.get_xdata()) == 5
-    tank = environment_of(Tank())
-    animation = dlx.animate(tank, run_of(tank), max_frames=3)
-    assert animation._frames[0].width == 360
+    goal, path, past, dot = scene.plant.ax.get_lines()
+    np.testing.assert_allclose(np.ravel(dot.get_data()), run.states[2])
+    assert len(path.get_xdata()) == 5 and len(past.get_xdata()) == 3
+    np.testing.assert_allclose(np.ravel(goal.get_data()), 0)
+    tank = environment_of(Tank(), horizon=4)
+    run = run_of(tank)
+    scene = Scene(as_runs(run, None, "", "")[0], tank, range(5), 40)
+    fixed = len(scene.plant.ax.patches)
+    scene.frame(3)
+    level, inflow = [bar.get_height() for bar in scene.plant.ax.patches[fixed:]]
+    np.testing.assert_allclose([level, inflow], [run.states[3, 0], 0.0], rtol=1e-6)
+
+
+def test_plant_alone(env, trajectory):
+    alone = dlx.animate(env, trajectory, traces=False, max_frames=2)
+    assert alone._frames[0].width == 300
+    run = as_runs(trajectory, None, "trajectory", "test")[0]
+    scene = Scene(run, env, [0], 60, traces=False)
+    assert scene.figure.axes == [scene.plant.ax] and not scene.lines
+
+
+def test_flat_colours_leave_no_ghost():
+    paper = np.full((40, 60, 3), 239, np.uint8)
+    rng = np.random.default_rng(0)
+    frames = [paper.copy() for _ in range(3)]
+    for k, frame in enumerate(frames):
+        frame[10:30, 20 * k : 20 * k + 20] = rng.integers(0, 256, (20, 20, 3))
+    for image, frame in zip(expanded(compressed(frames)), frames, strict=True):
+        flat = np.all(frame == 239, axis=-1)
+        assert np.all(np.asarray(image)[flat] == 239)
 
 
 def test_registered_drawing_is_used(key):
@@ -292,7 +313,7 @@ def test_drawing_without_setup_fits_all_that_it_draws():
         assert low <= np.exp(-2) and 7 <= high <= 8
         assert scene.plant.ax.get_aspect() == 1
     finally:
-        del sys.modules["delucax.plotting._drawings"]._DRAWINGS[Tank]
+        del _DRAWINGS[Tank]
 
 
 def test_drawings_are_found_by_type(env):
@@ -303,14 +324,14 @@ def test_drawings_are_found_by_type(env):
     def draw(ax, x, u):
         pass
 
-    kept = dict(sys.modules["delucax.plotting._drawings"]._DRAWINGS)
+    kept = dict(_DRAWINGS)
     try:
         dlx.plotting.register_drawing(dlx.environments.GymPendulum, draw)
         assert drawing_for(env).draw is draw_pendulum
         dlx.plotting.register_drawing(dlx.systems.Pendulum, draw)
         assert drawing_for(env).draw is draw
     finally:
-        sys.modules["delucax.plotting._drawings"]._DRAWINGS.update(kept)
+        _DRAWINGS.update(kept)
 
 
 def test_registration_errors():
@@ -376,10 +397,10 @@ def test_errors_name_the_argument(env, trajectory, key):
 
 def test_setup_must_return_keywords(env, trajectory):
     run = as_runs(trajectory, None, "trajectory", "test")[0]
-    kept = dict(sys.modules["delucax.plotting._drawings"]._DRAWINGS)
+    kept = dict(_DRAWINGS)
     try:
         dlx.plotting.register_drawing(dlx.systems.Pendulum, print, lambda *args: 3)
         with user_error(match="setup of a drawing must return a dictionary or None"):
             Scene(run, env, [0], 40)
     finally:
-        sys.modules["delucax.plotting._drawings"]._DRAWINGS.update(kept)
+        _DRAWINGS.update(kept)

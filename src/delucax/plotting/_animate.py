@@ -32,6 +32,7 @@ class Animation:
     - `indices`: the step of the trajectory that each frame shows.
     - `fps`: frames a second.
     - `dpi`: pixels an inch.
+    - `traces`: whether states, controls and costs are drawn beside the plant.
 
     !!! example
 
@@ -52,6 +53,7 @@ class Animation:
     indices: tuple[int, ...]
     fps: float
     dpi: float
+    traces: bool = True
 
     def __repr__(self) -> str:
         return f"Animation({len(self)} frames, {self.fps:.3g} a second)"
@@ -62,7 +64,7 @@ class Animation:
     @functools.cached_property
     def _frames(self) -> list[Image.Image]:
         run = as_runs(self.trajectory, None, "trajectory", "Animation")[0]
-        scene = Scene(run, self.environment, self.indices, self.dpi)
+        scene = Scene(run, self.environment, self.indices, self.dpi, self.traces)
         return compressed(scene.frame(k) for k in self.indices)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -89,12 +91,14 @@ def animate(
     fps: float | int | None = None,
     max_frames: int = 100,
     dpi: float | int = 60,
+    traces: bool = True,
 ) -> Animation:
     """A moving picture of a trajectory: the plant, and its states, controls and costs.
 
-    How the plant looks is found by the type of its system; see
-    [`delucax.plotting.register_drawing`][]. One that has no drawing is shown as a dot
-    in the plane of its first two states. It ends where the episode ends.
+    How the plant looks is found by the type of its system; every system of the library
+    has a drawing, and [`delucax.plotting.register_drawing`][] gives one to yours. One
+    that has none is shown as a dot in the plane of its two states, or, if it has more
+    or fewer, as bars. It ends where the episode ends.
 
     **Arguments:**
 
@@ -106,7 +110,10 @@ def animate(
         frames a second: a longer run plays faster than it was.
     - `max_frames`: the most frames, 100 by default; they are spread evenly over the
         steps.
-    - `dpi`: pixels an inch, 60 by default: a picture about 600 pixels wide.
+    - `dpi`: pixels an inch, 60 by default: a picture 600 pixels wide, or half of that
+        without `traces`.
+    - `traces`: whether to draw states, controls and costs beside the plant, True by
+        default.
 
     **Returns:** an [`delucax.plotting.Animation`][], which a notebook plays, and which
     has `save(path)`.
@@ -173,6 +180,7 @@ def animate(
         tuple(indices.tolist()),
         float(FASTEST if fps is None else fps),
         float(dpi),
+        bool(traces),
     )
     if target is not None:
         write(target, animation._frames, animation.fps)

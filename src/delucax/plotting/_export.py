@@ -50,6 +50,41 @@ def _ffmpeg() -> str:
     return matplotlib.rcParams["animation.ffmpeg_path"]
 
 
+def few_colours(
+    colours: np.ndarray, counts: np.ndarray, most: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """A palette of at most `most` colours, and the entry in it for each of `colours`.
+
+    Those that are seen most are kept as they are: a tint where something was in the
+    frame before would be a ghost of it.
+    """
+    if len(colours) <= most:
+        return np.arange(len(colours)), colours
+    order = np.argsort(-counts, kind="stable")
+    common, rest = order[: most // 2], order[most // 2 :]
+    image = quantised(Image.fromarray(colours[rest][None]), most - len(common))
+    indices = np.empty(len(colours), int)
+    indices[common] = np.arange(len(common))
+    indices[rest] = len(common) + np.asarray(image)[0]
+    table = np.reshape(image.getpalette(), (-1, 3))[: most - len(common)]
+    return indices, np.concatenate([colours[common], table.astype(np.uint8)])
+
+
+def _colours(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The colours of pixels `(..., 3)`, which of them each pixel has, and how often
+    each is seen."""
+    packed = pixels.reshape(-1, 3).astype(int) @ np.array([65536, 256, 1])
+    packed, index, counts = np.unique(packed, return_inverse=True, return_counts=True)
+    colours = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], axis=-1)
+    return colours.astype(np.uint8), index.reshape(pixels.shape[:-1]), counts
+
+
+def _image(indices: np.ndarray, table: np.ndarray) -> Image.Image:
+    image = Image.fromarray(indices.astype(np.uint8))
+    image.putpalette(table.ravel().tolist())
+    return image
+
+
 def compressed(frames: Iterable[np.ndarray]) -> list[Image.Image]:
     """Frames of shape `(height, width, 3)` in few colours: the first whole, the others
     transparent where they are as the first, so that a page of them is small."""
@@ -58,19 +93,17 @@ def compressed(frames: Iterable[np.ndarray]) -> list[Image.Image]:
     for frame in frames:
         if first is None:
             first = frame
-            images.append(quantised(Image.fromarray(frame), 255))
+            colours, which, counts = _colours(frame)
+            entry, table = few_colours(colours, counts, 255)
+            images.append(_image(entry[which], table))
             continue
         changed = np.any(frame != first, axis=-1)
-        indices = np.full(frame.shape[:2], CLEAR, np.uint8)
-        palette: list[int] = []
-        if changed.any():
-            colours = quantised(Image.fromarray(frame[changed][None]), CLEAR)
-            indices[changed] = np.asarray(colours)[0]
-            palette = colours.getpalette() or []
-        image = Image.fromarray(indices)
+        indices = np.full(frame.shape[:2], CLEAR)
+        colours, which, counts = _colours(frame[changed])
+        entry, table = few_colours(colours, counts, CLEAR)
+        indices[changed] = entry[which]
         # Filled up to the clear colour: a PNG knows only of those in its palette.
-        entries = 3 * (CLEAR + 1)
-        image.putpalette((palette + [0] * entries)[:entries])
+        image = _image(indices, np.resize(table, (CLEAR + 1, 3)))
         image.info["transparency"] = CLEAR
         images.append(image)
     return images
@@ -100,33 +133,21 @@ def write(path: pathlib.Path, frames: Sequence[Image.Image], fps: float) -> None
 
 
 def _write_gif(path, frames, fps):
-    # One palette for all frames, so that nothing flickers. What was compressed has few
-    # colours, and each is looked up for itself: Pillow's own look-up is coarse enough
-    # to tint white paper.
+    # One palette for all frames, so that nothing flickers.
     indices = [np.asarray(image) for image in frames]
-    tables = [np.reshape(image.getpalette(), (-1, 3)) for image in frames]
-    used = [tables[0][np.unique(indices[0])]]
-    for table, index in zip(tables[1:], indices[1:], strict=True):
-        used.append(table[np.unique(index[index != CLEAR])])
-    colours = np.unique(np.concatenate(used), axis=0).astype(np.uint8)
-    main = quantised(Image.fromarray(colours[None]), 255).getpalette()
-    paper = tables[0][np.bincount(indices[0].ravel()).argmax()]
-    palette = np.concatenate([np.reshape(main, (-1, 3))[:255], paper[None]])
-
-    def look_up(table):
-        distance = np.sum((table[:, None] - palette) ** 2, axis=-1)
-        return np.argmin(distance, axis=-1).astype(np.uint8)
-
-    first = look_up(tables[0])[indices[0]]
-    images = []
-    for k, (table, index) in enumerate(zip(tables, indices, strict=True)):
-        whole = first
-        if k:
-            shown = look_up(table)[np.minimum(index, len(table) - 1)]
-            whole = np.where(index == CLEAR, first, shown)
-        image = Image.fromarray(whole)
-        image.putpalette(palette.ravel().tolist())
-        images.append(image)
+    tables = [np.resize(image.getpalette(), (256, 3)) for image in frames]
+    seen = [np.bincount(index.ravel(), minlength=256) for index in indices]
+    for count in seen[1:]:
+        count[CLEAR] = 0
+    colours, which, _ = _colours(np.stack(tables))
+    counts = np.bincount(which.ravel(), np.stack(seen).ravel(), len(colours))
+    used = np.flatnonzero(counts)
+    entry = np.zeros(len(colours), int)
+    entry[used], palette = few_colours(colours[used], counts[used], 256)
+    first = entry[which[0]][indices[0]]
+    images = [_image(first, palette)]
+    for index, look_up in zip(indices[1:], entry[which[1:]], strict=True):
+        images.append(_image(np.where(index == CLEAR, first, look_up[index]), palette))
     # The format counts in hundredths of a second; browsers take less than 2 for 10.
     duration = max(20, 10 * round(100 / fps))
     images[0].save(

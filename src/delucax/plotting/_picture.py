@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from ..controllers import Zero
 from ..environments import Environment
 from ..simulation import rollout
-from ._drawings import drawing_for, PHASE
+from ._drawings import drawing_for
 from ._plant import Plant
 
 
@@ -21,14 +21,6 @@ class Picture:
     """Draws the plant of an environment, state by state; in a `window` too if asked."""
 
     def __init__(self, environment: Environment, window: bool = False):
-        drawing = drawing_for(environment)
-        if drawing is None:
-            if environment.state_size < 2:
-                raise ValueError(
-                    "render: this plant has no drawing; give it one with "
-                    "delucax.plotting.register_drawing."
-                )
-            drawing = PHASE
         if window:
             import matplotlib.pyplot as plt
 
@@ -46,7 +38,9 @@ class Picture:
             strict=False,
         )
         ax = self.figure.add_subplot()
-        self.plant = Plant(ax, drawing, environment, trajectory, moments)
+        self.plant = Plant(
+            ax, drawing_for(environment), environment, trajectory, moments
+        )
 
     def frame(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """The picture at a state and a control, shape `(height, width, 3)`."""

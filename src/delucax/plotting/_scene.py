@@ -10,13 +10,15 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from ..environments import Environment
-from ._drawings import drawing_for, PHASE
+from ._drawings import drawing_for
 from ._plant import Plant
 from ._plot import draw_panel
-from ._runs import HELD, Panel, panels_of, Run, time_label
+from ._runs import HELD, last_seen, Panel, panels_of, Run, time_label
 
 
 SIZE = 11.0
+# Inches: without the traces and with them, the least height, and what the texts take.
+ALONE, BESIDE, LOWEST, HEADER = (5.0, 4.4), (10.0, 4.6), 1.5, 0.35
 
 
 class Scene:
@@ -28,38 +30,47 @@ class Scene:
         environment: Environment,
         indices: Sequence[int],
         dpi: float | int,
+        traces: bool = True,
     ):
         self.run = run
         self.states = np.asarray(run.trajectory.states, float)
         self.controls = np.asarray(run.trajectory.controls, float)
-        drawing = drawing_for(environment)
-        if drawing is None and self.states.shape[1] > 1:
-            drawing = PHASE
-        panels = panels_of(run, None, grouped=True, where="animate")
+        panels = panels_of(run, None, grouped=True, where="animate") if traces else []
         step = np.diff(run.times[0]).max(initial=0.0) or 1.0
         self.decimals = int(np.clip(np.ceil(-np.log10(step) - 1e-3), 0, 3))
 
-        size = (6.0 if drawing is None else 10.0, max(4.6, 1.2 * len(panels) + 0.8))
-        room = 0.35 / size[1]  # at the top, for the texts
-        layout = ConstrainedLayoutEngine(rect=(0, 0, 1, 1 - room))
-        self.figure = Figure(size, dpi, layout=layout)
+        width, height = BESIDE if traces else ALONE
+        height = max(height, 1.2 * len(panels) + 0.8)
+        self.figure = Figure((width, height), dpi)
         self.canvas = FigureCanvasAgg(self.figure)
+        grid = self.figure.add_gridspec(1, 2 if traces else 1)
+        self.lines: list[tuple[Line2D, Any]] = []
+        if traces:
+            stack = grid[0, 1].subgridspec(len(panels), 1)
+            self.lines = self._panels(panels, stack)
+        self.plant = Plant(
+            self.figure.add_subplot(grid[0, 0]),
+            drawing_for(environment),
+            environment,
+            run.trajectory,
+            map(self._moment, indices),
+            self.states[: int(last_seen(run)[0]) + 1],
+        )
+
+        if not traces and self.plant.ax.get_aspect() == 1:  # no higher than it must be
+            left, right, low, high = self.plant.ax.axis()
+            seen = (high - low) / (right - left)
+            height = min(height, max(LOWEST, width * seen + HEADER))
+            self.figure.set_size_inches(width, height)
+        rect = (0, 0, 1, 1 - HEADER / height)
+        self.figure.set_layout_engine(ConstrainedLayoutEngine(rect=rect, wspace=0.06))
+        at = 1 - 0.1 / height
         self.texts = [
-            self.figure.text(
-                x / size[0], 1 - 0.1 / size[1], "", va="top", fontsize=SIZE + 1
-            )
+            self.figure.text(x / width, at, "", va="top", fontsize=SIZE + 1)
             for x in (0.2, 2.0)
         ]
-        grid = self.figure.add_gridspec(1, 1 if drawing is None else 2)
-        self.lines = self._panels(panels, grid[0, -1].subgridspec(len(panels), 1))
-        self.plant: Plant | None = None
-        if drawing is not None:
-            ax = self.figure.add_subplot(grid[0, 0])
-            moments = map(self._moment, indices)
-            self.plant = Plant(ax, drawing, environment, run.trajectory, moments)
-
-        moving = [*self.texts, *(line for line, _ in self.lines)]
-        self.moving = moving if self.plant is None else [self.plant.ax, *moving]
+        lines = [line for line, _ in self.lines]
+        self.moving = [self.plant.ax, *self.texts, *lines]
         for artist in self.moving:
             artist.set_animated(True)
         self.canvas.draw()
@@ -106,8 +117,7 @@ class Scene:
                 line.set_data(times[i : i + 1], values[i : i + 1])
             else:
                 line.set_data(times[: k + 1], values[: k + 1])
-        if self.plant is not None:
-            self.plant.draw(*self._moment(k))
+        self.plant.draw(*self._moment(k), self.states[: k + 1])
         self.canvas.restore_region(self.background)
         renderer = self.canvas.get_renderer()
         for artist in self.moving:

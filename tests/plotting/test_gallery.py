@@ -1,0 +1,53 @@
+"""The gallery shows every task, and its code makes its pictures."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+from helpers import once, thorough
+from PIL import Image
+
+import delucax as dlx
+
+
+pytestmark = once
+
+DOCS = Path(__file__).parents[2] / "docs"
+PICTURES = DOCS / "assets" / "gallery"
+TASKS = {name for name in dlx.environments.registered() if "/" not in name}
+
+
+def test_every_task_is_shown_and_nothing_else():
+    page = (DOCS / "gallery.md").read_text()
+    assert set(re.findall(r"^### (\w+)$", page, re.MULTILINE)) == TASKS
+    assert set(re.findall(r"assets/gallery/(\w+)\.gif", page)) == TASKS
+    assert set(re.findall(r'film\("(\w+)"', page)) == TASKS
+    assert {path.stem for path in PICTURES.glob("*")} == TASKS
+
+
+def test_pictures_move_and_are_small():
+    sizes = [path.stat().st_size for path in PICTURES.glob("*.gif")]
+    assert max(sizes) < 200_000 and sum(sizes) < 3_000_000
+    for path in PICTURES.glob("*.gif"):
+        with Image.open(path) as image:
+            assert image.n_frames >= 20 and image.info["loop"] == 0
+            assert image.width == 300
+
+
+@thorough
+def test_code_of_the_page_draws_its_pictures(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = DOCS / "figures" / "gallery.py"
+    spec = importlib.util.spec_from_file_location("gallery_figures", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    pictures = module.draw([], tmp_path)
+    assert {picture.stem for picture in pictures} == TASKS
+
+
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_code_of_the_page_names_the_task(name):
+    page = (DOCS / "gallery.md").read_text()
+    (section,) = re.findall(rf"^### {name}\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    assert f'dlx.make("{name}"' in section
