@@ -98,3 +98,8 @@ def test_check_grads():
     x, A, s = _arguments()
     f = jax.jit(by_components(lambda x: _everything(x, A, s)["n"]))
     check_grads(f, (x,), order=2, modes=("fwd", "rev"))
+
+
+def test_an_only_entry_meets_all():
+    twice = lambda x: jax.lax.mul(jnp.stack([x[0], x[1]]), jnp.stack([x[0]]))
+    assert_close(by_components(twice)(jnp.array([2.0, 3.0])), [4.0, 6.0])

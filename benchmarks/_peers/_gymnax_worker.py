@@ -4,6 +4,8 @@ Reads one JSON request a line from standard input and answers each with one JSON
 
 - `{"prepare": {case}, "stepping": "step"}` -> `{"id": 0, "compile_seconds": 1.2}`
 - `{"measure": 0}` -> `{"seconds": 0.01}`
+- `{"episodes": {case}, "name": "CartPole-v1", "action": 1, "stepping": "step"}` -> as
+  `prepare` does, for whole episodes of any of gymnax's tasks
 - `{"simulate": {case}, "stepping": "step"}` -> `{"angle": [...], ...}`
 - `{"versions": true}` -> `{"gymnax": "1.0.1", "jax": ...}`
 """
@@ -23,7 +25,7 @@ from gymnax.environments.classic_control.pendulum import (  # pyright: ignore[re
 )
 
 from benchmarks._peers import raw
-from benchmarks._problem import Case, GAIN
+from benchmarks._problem import Case, Episodes, GAIN
 from benchmarks._timing import compiled, Contender
 
 
@@ -118,6 +120,39 @@ def prepare(case: Case, stepping: str) -> Contender:
     return compiled("gymnax", case.total_steps, function, *arguments(case))
 
 
+def episodes(case: Episodes, name: str, action: Any, stepping: str) -> Contender:
+    """Compile whole episodes of one of gymnax's tasks, an action held.
+
+    Each returns the sum of its rewards and its last state. Starts are drawn beforehand.
+    """
+    env, params = gymnax.make(name)
+
+    def episode(key: jax.Array, action: jax.Array, state: Any) -> Any:
+        def body(carry: Any, key: Any) -> Any:
+            state, total = carry
+            if stepping == "step":
+                _, state, reward, *_ = env.step(key, state, action, params)
+            else:
+                # The acrobot alone uses its key, for a noise of strength 0.
+                _, state, reward, *_ = env.step_env(unused, state, action, params)
+            return (state, total - reward), None
+
+        unused = key
+        keys = jax.random.split(key, case.steps) if stepping == "step" else None
+        (state, total), _ = jax.lax.scan(body, (state, jnp.zeros(())), keys, case.steps)
+        return total, state
+
+    def run(keys: jax.Array, action: jax.Array, states: Any) -> Any:
+        one = lambda inputs: episode(inputs[0], action, inputs[1])
+        given = keys, states
+        return jax.vmap(one)(given) if case.batched else jax.lax.map(one, given)
+
+    keys = jax.random.split(jax.random.key(0), case.count)
+    _, states = jax.vmap(env.reset_env, in_axes=(0, None))(keys, params)
+    states = jax.tree.map(jnp.asarray, states)
+    return compiled("gymnax", case.total_steps, run, keys, jnp.asarray(action), states)
+
+
 def simulate(case: Case, stepping: str) -> dict[str, Any]:
     """What a run returns, as lists."""
     outputs = case.named(jax.jit(program(case, stepping))(*arguments(case)))
@@ -134,6 +169,13 @@ def main() -> None:
         answer: dict[str, Any]
         if "prepare" in request:
             ready.append(prepare(Case(**request["prepare"]), request["stepping"]))
+            seconds = ready[-1].compile_seconds
+            answer = {"id": len(ready) - 1, "compile_seconds": seconds}
+        elif "episodes" in request:
+            case = Episodes(**request["episodes"])
+            ready.append(
+                episodes(case, request["name"], request["action"], request["stepping"])
+            )
             seconds = ready[-1].compile_seconds
             answer = {"id": len(ready) - 1, "compile_seconds": seconds}
         elif "measure" in request:

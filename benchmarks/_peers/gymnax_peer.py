@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from benchmarks._problem import Case
+from benchmarks._problem import Case, Episodes
 from benchmarks._timing import Contender, Missing
 
 
@@ -135,6 +135,35 @@ def contender(
     if isinstance(running, str):
         return Missing(name, running)
     answer = running.ask(prepare=asdict(case), stepping=stepping)
+
+    def measure() -> float:
+        return running.ask(measure=answer["id"])["seconds"]
+
+    return Contender(name, case.total_steps, measure, answer["compile_seconds"])
+
+
+TASKS = {
+    "acrobot": ("Acrobot-v1", 2),
+    "cartpole": ("CartPole-v1", 1),
+    "mountain_car": ("MountainCarContinuous-v0", 0.5),
+    "mountain_car_discrete": ("MountainCar-v0", 2),
+    "pendulum": ("Pendulum-v1", 0.5),
+}
+"""The tasks that gymnax has too: its name for each, and the action that is held."""
+
+
+def episodes(case: Episodes, *, stepping: Stepping = "step") -> Contender | Missing:
+    """Compile whole episodes of a named task in gymnax's environment."""
+    name = f"gymnax {stepping}"
+    if case.task not in TASKS:
+        return Missing(name, "gymnax has no such task")
+    running = worker()
+    if isinstance(running, str):
+        return Missing(name, running)
+    theirs, action = TASKS[case.task]
+    answer = running.ask(
+        episodes=asdict(case), name=theirs, action=action, stepping=stepping
+    )
 
     def measure() -> float:
         return running.ask(measure=answer["id"])["seconds"]

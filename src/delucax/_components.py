@@ -137,9 +137,9 @@ def _of_components(primitive, params, shape, values):
 
 
 def _entries(value: Any, size: int) -> Sequence[Any] | None:
-    """`size` entries of a vector, or as many times a scalar."""
+    """`size` entries of a vector, or as many times a scalar or the only entry."""
     if isinstance(value, _Components):
-        return value.entries
+        return value.entries * (size // len(value.entries))
     if jnp.shape(value) == ():
         return [value] * size
     return [value[i] for i in range(size)] if jnp.shape(value) == (size,) else None

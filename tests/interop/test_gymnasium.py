@@ -1,5 +1,6 @@
 """The environments in Gymnasium's interface."""
 
+import copy
 import warnings
 
 import gymnasium
@@ -104,6 +105,29 @@ def test_seeds():
         runs.append([env.step(ZERO)[0] for _ in range(3)] + [env.reset()[0]])
     np.testing.assert_array_equal(*runs)
     assert np.any(runs[0][-1] != made[0].reset()[0])
+
+
+def test_copies_go_their_own_way():
+    noisy = dlx.disturbances.Gaussian(0.1, size=2)
+    made = interop.make("pendulum", disturbance=noisy)
+    made.reset(seed=0)
+    made.step(ZERO)
+    one, other = copy.deepcopy(made), copy.deepcopy(made)
+    pushed = one.step(ZERO + 2)[0]
+    np.testing.assert_array_equal(other.step(ZERO + 2)[0], pushed)
+    np.testing.assert_array_equal(made.step(ZERO + 2)[0], pushed)
+    assert np.any(one.step(ZERO)[0] != pushed)
+    np.testing.assert_array_equal(made.state, other.state)
+
+
+def test_what_is_returned_is_the_users_own():
+    made = interop.make("pendulum")
+    first, _ = made.reset(seed=0)
+    second = made.step(ZERO)[0]
+    kept, state = second.copy(), made.state
+    second[:] = made.state[:] = 0
+    np.testing.assert_array_equal(made.state, state)
+    assert made.step(ZERO)[0] is not second and np.any(kept) and not np.any(second)
 
 
 def test_bad_input():

@@ -1,5 +1,7 @@
 """One environment with Gymnasium's interface."""
 
+import functools
+import operator
 from typing import Any, NoReturn
 
 import gymnasium
@@ -10,7 +12,8 @@ from gymnasium.error import InvalidAction, ResetNeeded
 
 from ..._check import as_vector, check_finite
 from ...environments import Environment
-from ._program import program, REWARD, STEP
+from .._episode import has_signals
+from ._program import program, REWARD, shared, STEP
 from ._spaces import action_space, is_discrete, observation_space
 
 
@@ -79,19 +82,10 @@ class GymnasiumEnv(gymnasium.Env):
         self.action_space = action_space(env, self.discrete)
         self.observation_space = observation_space(env)
         self._program = program(env, self.discrete)
-        self._observation = self._program.layout.observation
         self._table = np.asarray(env.actions) if self.discrete else None
-        self._shape, self._kinds = (
-            ((), "iu")
-            if self.discrete
-            else (
-                (env.control_size,),
-                "iuf",
-            )
-        )
-        # The packed array, and the action after it.
+        self._count = 0 if env.actions is None else len(env.actions)
+        self._shape = (env.control_size,)
         self._given: Any = None
-        self._signals: Any = None
         self._ended = True
         self._picture: Any = None
 
@@ -127,14 +121,50 @@ class GymnasiumEnv(gymnasium.Env):
             state = as_vector(jnp.asarray(state, float), size, "state", where)
             check_finite(state, "state", where)
         key = jax.random.key(int(self.np_random.integers(2**32)))
-        packed, self._signals = self._program.start(key, state)
+        packed, signals = self._program.start(key, state)
         packed = np.asarray(packed)
-        action = np.zeros(self.action_space.shape or 1, packed.dtype)
-        self._given = np.concatenate([packed, action])
+        if self._given is None or self._given.dtype != packed.dtype:
+            self._allocate(packed.dtype)
+        self._signals = jax.device_put(signals, self._shared.device)
+        self._bind(packed)
+        self._action[...] = 0
         self._ended, self._moved = False, False
         if self.render_mode == "human":
             self.render()
-        return packed[self._observation].astype(np.float32), {}
+        return packed[self._program.layout.observation].astype(np.float32), {}
+
+    def _allocate(self, dtype: Any) -> None:
+        """Make the arrays that steps are taken in."""
+        layout, actions = self._program.layout, self.action_space.shape or (1,)
+        # The packed array with the action after it, and views of its parts.
+        self._given, self._shared = shared(layout.size + actions[0], dtype)
+        self._packed, self._action = np.split(self._given, [layout.size])
+        self._told = self._packed[REWARD:]
+        seen = self._packed[layout.observation]
+        same = seen.dtype == np.float32
+        self._see = seen.copy if same else functools.partial(seen.astype, np.float32)
+
+    def _bind(self, packed: np.ndarray) -> None:
+        """Go on from here."""
+        # Whole, for the case that a step fails.
+        self._packed[...] = self._last = packed
+        drawn = (self._signals,) if has_signals(self.environment) else ()
+        self._advance = functools.partial(self._program.step, self._shared, *drawn)
+
+    def __getstate__(self):
+        """What a copy is made of: all but compiled functions, and views."""
+        made = "_program _shared _packed _action _told _see _advance".split()
+        state = {k: v for k, v in self.__dict__.items() if k not in made}
+        return state | {"_picture": None}
+
+    def __setstate__(self, state):
+        self.__dict__.update(state)
+        self._program = program(self.environment, self.discrete)
+        given = self._given
+        if given is not None:
+            self._allocate(given.dtype)
+            self._bind(np.asarray(self._last))
+            self._given[...] = given
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One step.
@@ -150,24 +180,30 @@ class GymnasiumEnv(gymnasium.Env):
                 "GymnasiumEnv: call reset() before step(): the episode has "
                 + ("not begun." if self._given is None else "ended.")
             )
-        asked, given, size = np.asarray(action), self._given, self._program.layout.size
-        if asked.shape != self._shape or asked.dtype.kind not in self._kinds:
-            self._refuse(action)
-        if self._table is not None and not 0 <= asked < len(self._table):
-            self._refuse(action)
-        given[size:] = asked
-        packed = np.asarray(self._program.step(given, self._signals))
-        reward, terminated, truncated, failed, _ = packed[REWARD:].tolist()
+        if self.discrete:
+            try:
+                index = operator.index(action)
+            except TypeError:
+                self._refuse(action)
+            if not 0 <= index < self._count:
+                self._refuse(action)
+            self._action[0] = index
+        else:
+            asked = np.asarray(action)
+            if asked.shape != self._shape or asked.dtype.kind not in "iuf":
+                self._refuse(action)
+            self._action[...] = asked
+        self._packed[...] = after = self._advance()
+        reward, terminated, truncated, failed, _ = self._told.tolist()
         if failed:
             self._fail(action)
-        given[:size] = packed
+        self._last = after
         if terminated or truncated:
             self._ended = True
         self._moved = True
         if self.render_mode == "human":
             self.render()
-        observation = packed[self._observation].astype(np.float32)
-        return observation, reward, terminated > 0, truncated > 0, {}
+        return self._see(), reward, terminated > 0, truncated > 0, {}
 
     def _refuse(self, action: Any) -> NoReturn:
         """Say what an action must be."""
@@ -184,10 +220,11 @@ class GymnasiumEnv(gymnasium.Env):
 
     def _fail(self, action: Any) -> NoReturn:
         """Say why a step failed. An illegal action leaves the episode where it was."""
+        self._packed[...] = self._last
         if not np.all(np.isfinite(action)):
             raise InvalidAction(f"GymnasiumEnv: action must be finite, got {action}.")
         self._ended = True
-        step = int(self._given[self._program.layout.size + STEP])
+        step = int(self._packed[STEP])
         raise RuntimeError(
             f"GymnasiumEnv: the simulation failed at step {step}: the state or the "
             "reward is not finite, or the solver did not converge. Call reset()."
@@ -210,7 +247,7 @@ class GymnasiumEnv(gymnasium.Env):
             from ...plotting._picture import Picture
 
             self._picture = Picture(self.environment, self.render_mode == "human")
-        control = self._given[self._program.layout.size :]
+        control = self._action
         if self._table is not None:
             shown = self._table[int(control[0])]
             control = shown if self._moved else np.zeros_like(shown)

@@ -3,21 +3,21 @@
 A call of a compiled function costs a few microseconds for each array that goes in or
 comes out, which is more than the arithmetic. So all that a step returns is one array,
 `[state, observation, reward, terminated, truncated, failed, step]`, which goes back in
-with the action at its end; and the numbers of the environment are compiled in.
+with the action at its end, in memory that NumPy and JAX share; and the numbers of the
+environment are compiled in.
 """
 
 import functools
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
-from ..._results import RESULTS
-from ...disturbances import Zero
 from ...environments import Environment
+from .._by_value import ByValue
+from .._episode import draw_signals, has_signals, move, NO_SIGNALS, see, split_key
 
 
 class Layout(NamedTuple):
@@ -36,20 +36,15 @@ class Layout(NamedTuple):
 
 
 REWARD, TERMINATED, TRUNCATED, FAILED, STEP = range(-5, 0)
-
-
-class Signals(NamedTuple):
-    """What is drawn for a whole episode."""
-
-    disturbance: Any  # (horizon, w), or none
-    noise: Any  # (horizon + 1, y), or none
+# The memory that JAX shares with NumPy begins at a multiple of it.
+_ALIGNMENT = 64
 
 
 class Program(NamedTuple):
     """The compiled functions."""
 
     start: Any  # (key, state or None) -> packed, signals
-    step: Any  # (packed and action, signals) -> packed
+    step: Any  # (packed and action, signals if there are any) -> packed
     start_batch: Any
     step_batch: Any
     layout: Layout
@@ -57,47 +52,38 @@ class Program(NamedTuple):
 
 def program(env: Environment, discrete: bool) -> Program:
     """The program of an environment; one that is the same compiles no more."""
-    return _compiled(_ByValue(env), discrete)
+    return _compiled(ByValue(env), discrete)
 
 
-class _ByValue:
-    """An environment that equals another if all of their numbers do."""
+def shared(size: int, dtype: Any) -> tuple[np.ndarray, jax.Array]:
+    """An array of NumPy, and one of JAX in the same memory.
 
-    def __init__(self, env: Environment):
-        self.env = env
-        arrays, static = eqx.partition(env, eqx.is_array)
-        leaves, treedef = jax.tree.flatten(arrays)
-        values = [(a.shape, str(a.dtype), _bytes(a)) for a in leaves]
-        self.value = (*values, treedef, static)
-
-    def __hash__(self):
-        return hash(self.value)
-
-    def __eq__(self, other):
-        return isinstance(other, _ByValue) and self.value == other.value
-
-
-def _bytes(array):
-    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
-        array = jr.key_data(array)
-    return np.asarray(array).tobytes()
+    What is written to the first is in the second, so that nothing is transferred when a
+    compiled function is called with it. It is for the function alone: JAX takes it to
+    be constant, and nothing may be written before what was called has returned.
+    """
+    itemsize = np.dtype(dtype).itemsize
+    memory = np.zeros(size * itemsize + _ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % _ALIGNMENT
+    written = memory[start : start + size * itemsize].view(dtype)
+    return written, jax.dlpack.from_dlpack(written, copy=False)
 
 
 @functools.lru_cache(maxsize=64)
-def _compiled(same: _ByValue, discrete: bool) -> Program:
+def _compiled(same: ByValue, discrete: bool) -> Program:
     env = same.env
     layout = Layout(env.state_size, env.feature_size)
 
-    def move(packed, action, signals):
+    def act(packed, action, signals):
         action = action[0].astype(int) if discrete else action
         return _step(env, packed, action, signals)
 
-    def step(given, signals):
-        return move(given[: layout.size], given[layout.size :], signals)
+    def step(given, signals=NO_SIGNALS):
+        return act(given[: layout.size], given[layout.size :], signals)
 
     start = functools.partial(_start, env)
     start_batch = jax.vmap(start, in_axes=(0, None))
-    step_batch = functools.partial(_step_batch, move, start_batch)
+    step_batch = functools.partial(_step_batch, act, start_batch)
     return Program(
         jax.jit(start),
         jax.jit(step),
@@ -107,10 +93,8 @@ def _compiled(same: _ByValue, discrete: bool) -> Program:
     )
 
 
-def _packed(env, t, k, x, noise, reward, terminated, truncated, failed):
-    y = env.dynamics.observe(t, x)
-    y = y if noise is None else y + noise
-    observation = env.encode(y)
+def _packed(env, k, x, signals, reward, terminated, truncated, failed):
+    observation = see(env, k, x, signals)
     failed = failed | ~jnp.all(jnp.isfinite(x)) | ~jnp.isfinite(reward)
     rest = (reward, terminated, truncated, failed, k)
     rest = jnp.stack([jnp.asarray(part, x.dtype) for part in rest])
@@ -118,35 +102,17 @@ def _packed(env, t, k, x, noise, reward, terminated, truncated, failed):
 
 
 def _start(env, key, state):
-    start_key, w_key, noise_key = jr.split(key, 3)
-    x = env.reset(start_key) if state is None else state
-    times = (jnp.arange(max(env.horizon, 2) + 1) * env.dt).astype(x.dtype)
-    w = noise = None
-    if not isinstance(env.disturbance, Zero):
-        w = env.disturbance.sequence(w_key, times[:-1]).astype(x.dtype)
-    if env.sensor_noise is not None:
-        noise = env.sensor_noise.sequence(noise_key, times).astype(x.dtype)
-    first = None if noise is None else noise[0]
-    nothing = 0, False, False, False
-    return _packed(env, 0.0, 0, x, first, *nothing), Signals(w, noise)
+    # A key that is not split saves a batch a third of the time of a reset.
+    key, keys = split_key(key) if has_signals(env) else (key, None)
+    x = env.reset(key) if state is None else state
+    signals = draw_signals(env, keys, x.dtype)
+    return _packed(env, jnp.asarray(0), x, signals, 0, False, False, False), signals
 
 
 def _step(env, packed, action, signals):
-    n, dtype = env.state_size, packed.dtype
-    x, k = packed[:n], packed[STEP].astype(int)
-    w = None if signals.disturbance is None else signals.disturbance[k]
-    t, after = (k * env.dt).astype(dtype), k + 1
-    t_after = (after * env.dt).astype(dtype)
-    step = env.step(t, x, action, w)
-    x_next = step.state.astype(dtype)
-    truncated = after >= env.horizon
-    ended = step.terminated | truncated
-    final = jnp.where(ended, env.cost.final(t_after, x_next), 0)
-    failed = (step.result != RESULTS.successful) | ~jnp.all(jnp.isfinite(action))
-    noise = None if signals.noise is None else signals.noise[after]
-    reward = -(step.cost + final)
-    flags = step.terminated, truncated, failed
-    return _packed(env, t_after, after, x_next, noise, reward, *flags)
+    x, k = packed[: env.state_size], packed[STEP].astype(int)
+    x_next, *told = move(env, k, x, action, signals)
+    return _packed(env, k + 1, x_next, signals, *told)
 
 
 def _step_batch(move, start_batch, mode, packed, actions, signals, key):
@@ -163,18 +129,22 @@ def _step_batch(move, start_batch, mode, packed, actions, signals, key):
     if mode == "SameStep":
         ended = (moved[:, TERMINATED] + moved[:, TRUNCATED]) > 0
 
-    def anew(_):
-        use, left = jr.split(key)
-        fresh, drawn = start_batch(jr.split(use, len(packed)), None)
-        pick = lambda new, old: jnp.where(  # noqa: E731
-            ended.reshape(-1, *[1] * (old.ndim - 1)), new, old
-        )
+    # A few at a time, for most steps end few episodes.
+    count = len(packed)
+    few = min(count, max(16, count // 16))
+
+    def anew(carry):
+        ended, seen, signals, key = carry
+        which = jnp.flatnonzero(ended, size=few, fill_value=count)
+        use, key = jr.split(key)
+        fresh, drawn = start_batch(jr.split(use, few), None)
         if mode == "SameStep":  # the reward and the end are those of the old episode
             told = slice(REWARD, STEP)
-            fresh = fresh.at[:, told].set(moved[:, told])
-        return pick(fresh, moved), jax.tree.map(pick, drawn, signals), left
+            fresh = fresh.at[:, told].set(moved[which, told])
+        put = lambda new, old: old.at[which].set(new, mode="drop")
+        after = put(False, ended), put(fresh, seen), jax.tree.map(put, drawn, signals)
+        return *after, key
 
-    seen, signals, key = jax.lax.cond(
-        jnp.any(ended), anew, lambda _: (moved, signals, key), None
-    )
+    carry = ended, moved, signals, key
+    _, seen, signals, key = jax.lax.while_loop(lambda c: jnp.any(c[0]), anew, carry)
     return seen, moved, signals, key

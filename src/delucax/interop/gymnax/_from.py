@@ -1,0 +1,381 @@
+"""An environment in gymnax's protocol as one of ours."""
+
+import dataclasses
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array
+
+from ..._check import check_step
+from ..._fields import as_float_array, parameter
+from ..._results import RESULTS
+from ..._typing import RealScalar
+from ...costs import AbstractCost
+from ...dynamics import AbstractDynamics
+from ...environments import Environment
+
+
+@dataclasses.dataclass(frozen=True)
+class _Layout:
+    """How the state of a gymnax environment lies in a vector.
+
+    The leaves of the state in their order, then the key of the episode if steps draw
+    from it, then whether the episode is over.
+    """
+
+    structure: Any
+    shapes: tuple[tuple[int, ...], ...]
+    dtypes: tuple[Any, ...]
+    dtype: Any
+    draws: bool
+
+    def ravel(self, state: Any, words: Any, done: Any) -> Array:
+        """The vector of a state."""
+        leaves, structure = jax.tree.flatten(state)
+        shapes = tuple(jnp.shape(leaf) for leaf in leaves)
+        if (structure, shapes) != (self.structure, self.shapes):
+            raise ValueError(
+                f"from_gymnax: a state must be {self.structure} with leaves of shapes "
+                f"{self.shapes}, as reset_env returns it, got {structure} with leaves "
+                f"of shapes {shapes}."
+            )
+        parts = [
+            _halves(leaf) if dtype == jnp.uint32 else jnp.ravel(leaf)
+            for leaf, dtype in zip(leaves, self.dtypes, strict=True)
+        ]
+        if self.draws:
+            parts.append(_halves(words))
+        parts.append(jnp.reshape(done, 1))
+        return jnp.concatenate([part.astype(self.dtype) for part in parts])
+
+    def unravel(self, x: Array) -> tuple[Any, Any]:
+        """The state in a vector, and the words of the key."""
+        leaves, at = [], 0
+        for shape, dtype in zip(self.shapes, self.dtypes, strict=True):
+            size = int(np.prod(shape)) * (2 if dtype == jnp.uint32 else 1)
+            part, at = x[at : at + size], at + size
+            if dtype == jnp.uint32:
+                part = _whole(part)
+            elif not jnp.issubdtype(dtype, jnp.inexact):
+                part = jnp.round(part)
+            leaves.append(part.reshape(shape).astype(dtype))
+        words = _whole(x[at : at + 4]) if self.draws else None
+        return jax.tree.unflatten(self.structure, leaves), words
+
+
+def _halves(words: Any) -> Array:
+    """32 bits as two numbers, which a float holds exactly."""
+    words = jnp.ravel(jnp.asarray(words, jnp.uint32))
+    return jnp.stack([words >> 16, words & 0xFFFF], axis=1).ravel()
+
+
+def _whole(halves: Array) -> Array:
+    """The inverse of `_halves`."""
+    high, low = jnp.round(halves).astype(jnp.uint32).reshape(-1, 2).T
+    return (high << 16) | low
+
+
+def _names(leaves: Any, draws: bool) -> tuple[str, ...]:
+    names = []
+    for path, leaf in leaves:
+        name = jax.tree_util.keystr(path).lstrip(".") or "state"
+        if leaf.dtype == jnp.uint32:
+            entries = [(*i, part) for i in np.ndindex(leaf.shape) for part in (0, 1)]
+        else:
+            entries = list(np.ndindex(leaf.shape))
+        names += [name + "".join(f"[{i}]" for i in entry) for entry in entries]
+    return (*names, *(f"key[{i}]" for i in range(4 * draws)), "done")
+
+
+def _check_protocol(env: Any, where: str) -> None:
+    for name in ("reset_env", "step_env", "action_space"):
+        if not callable(getattr(env, name, None)):
+            raise ValueError(
+                f"{where}: env must speak gymnax's protocol, but {type(env).__name__} "
+                f"has no {name}."
+            )
+
+
+def _as_params(params: Any) -> Any:
+    return jax.tree.map(
+        lambda leaf: as_float_array(leaf) if isinstance(leaf, float) else leaf, params
+    )
+
+
+class GymnaxDynamics(AbstractDynamics):
+    """A step of an environment in gymnax's protocol; see
+    [`delucax.interop.gymnax.from_gymnax`][], which makes it.
+
+    The state is the environment's as a vector: the entries of its leaves, whole numbers
+    and booleans as floats (exact up to 2^24 in float32); four numbers for a random key
+    if steps draw; and whether the episode is over. `w` is added to it.
+
+    Differentiable as far as the environment is; the derivative by what is a whole
+    number is 0.
+
+    **Arguments:**
+
+    - `env`: the environment.
+    - `params`: its parameters.
+    - `dt`: the time of a step, 1 by default.
+
+    **Raises:** `ValueError` if the environment does not speak the protocol, or `dt` is
+    not positive.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        from delucax.interop.gymnax import GymnaxDynamics, to_gymnax
+
+        env = to_gymnax(dlx.make("pendulum"))
+        dynamics = GymnaxDynamics(env, env.default_params)
+        dynamics(0.0, jnp.array([0.5, 0.0, 0.0, 0.0]), jnp.ones(1))
+        ```
+    """
+
+    env: Any = eqx.field(static=True)
+    params: Any
+    dt: Array = parameter()
+    layout: _Layout = eqx.field(static=True)
+    action_shape: tuple[int, ...] = eqx.field(static=True)
+    discrete: bool = eqx.field(static=True)
+    state_names: tuple[str, ...] = eqx.field(static=True)
+    control_names: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(self, env: Any, params: Any, dt: Any = 1.0):
+        where = "from_gymnax"
+        _check_protocol(env, where)
+        if getattr(env, "supports_transition_gradients", False):
+            env = env.with_transition_gradients()  # else gymnax cuts them
+        check_step(dt, where)
+        self.env, self.params, self.dt = env, _as_params(params), dt
+        space = env.action_space(params)
+        self.discrete = hasattr(space, "n")
+        if not self.discrete and not hasattr(space, "low"):
+            raise ValueError(
+                f"{where}: the action space must be a Box or Discrete, got {space!r}."
+            )
+        self.action_shape = () if self.discrete else tuple(space.shape)
+        size = int(np.prod(self.action_shape))
+        self.control_names = (
+            ("action",) if size == 1 else tuple(f"action[{i}]" for i in range(size))
+        )
+        key = jr.key(0)
+        reset = jax.eval_shape(lambda key: env.reset_env(key, params)[1], key)
+        leaves, structure = jax.tree_util.tree_flatten_with_path(reset)
+        for path, leaf in leaves:
+            if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+                raise ValueError(
+                    f"{where}: the state holds a typed key, "
+                    f"{jax.tree_util.keystr(path)}, where a raw one "
+                    "(`jax.random.PRNGKey`) is expected."
+                )
+        floats = [leaf.dtype for _, leaf in leaves if eqx.is_inexact_array(leaf)]
+        action = jnp.zeros(self.action_shape, int if self.discrete else float)
+        step = jax.make_jaxpr(lambda key, *args: env.step_env(key, *args, params))(
+            key, reset, action
+        )
+        draws = any(step.jaxpr.invars[0] is v for e in step.eqns for v in e.invars)
+        self.layout = _Layout(
+            structure,
+            tuple(leaf.shape for _, leaf in leaves),
+            tuple(leaf.dtype for _, leaf in leaves),
+            jnp.result_type(*floats) if floats else jnp.zeros(()).dtype,
+            draws,
+        )
+        self.state_names = _names(leaves, draws)
+
+    def ravel(self, state: Any, key: Any = None) -> Array:
+        """The vector of a state, such as `x0` of `delucax.rollout`.
+
+        **Arguments:**
+
+        - `state`: of the environment.
+        - `key`: what the steps of the episode draw from, if they draw;
+            `jax.random.key(0)` by default.
+
+        **Returns:** shape `(state_size,)`.
+        """
+        words = jr.bits(jr.key(0) if key is None else key, (2,), jnp.uint32)
+        return self.layout.ravel(state, words, False)
+
+    def unravel(self, x: Array) -> Any:
+        """The state that a vector holds.
+
+        **Arguments:** `x`: shape `(state_size,)`.
+
+        **Returns:** a state of the environment.
+        """
+        return self.layout.unravel(x)[0]
+
+    def move(self, x: Array, u: Array) -> tuple[Array, Array]:
+        """One step.
+
+        **Arguments:** `x`: state. `u`: control.
+
+        **Returns:** the next state, and the reward.
+        """
+        state, words = self.layout.unravel(x)
+        use = jr.key(0)
+        if words is not None:
+            use, after = jr.split(jr.wrap_key_data(words, impl="threefry2x32"))
+            words = jr.key_data(after)
+        action = u.reshape(self.action_shape)
+        if self.discrete:
+            action = jnp.round(action).astype(int)
+        _, state, reward, done, _ = self.env.step_env(use, state, action, self.params)
+        x_next = self.layout.ravel(state, words, done).astype(x.dtype)
+        return x_next, jnp.reshape(reward, ()).astype(x.dtype)
+
+    def advance(self, t, x, u, w):
+        x_next, _ = self.move(x, u)
+        return x_next if w is None else x_next + w, RESULTS.successful
+
+
+class _MinusReward(AbstractCost):
+    dynamics: GymnaxDynamics
+
+    def __call__(self, t, x, u):
+        return -self.dynamics.move(x, u)[1]
+
+
+class _Start(eqx.Module):
+    dynamics: GymnaxDynamics
+
+    def __call__(self, key):
+        start_key, step_key = jr.split(key)
+        _, state = self.dynamics.env.reset_env(start_key, self.dynamics.params)
+        return self.dynamics.ravel(state, step_key)
+
+
+class _Observation(eqx.Module):
+    """What gymnax's users see, as a vector."""
+
+    dynamics: GymnaxDynamics
+
+    def __call__(self, x):
+        env, state = self.dynamics.env, self.dynamics.unravel(x)
+        known = dict(
+            key=jr.key(0), state=state, action=None, params=self.dynamics.params
+        )
+        function = _observer(env)
+        assert function is not None
+        takes = inspect.signature(function).parameters
+        seen = function(**{name: known[name] for name in known if name in takes})
+        leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(seen)]
+        return jnp.concatenate(leaves)
+
+
+def _observer(env: Any) -> Callable | None:
+    return getattr(env, "observe", None) or getattr(env, "get_obs", None)
+
+
+def _is_done(t: RealScalar, x: Array) -> Array:
+    return x[-1] > 0.5
+
+
+def from_gymnax(
+    env: Any, params: Any = None, *, dt: Any = 1.0, **environment: Any
+) -> Environment:
+    """An environment in gymnax's protocol as a [`delucax.Environment`][].
+
+    Anything with `reset_env`, `step_env`, `action_space` and either `observe` or
+    `get_obs` will do, of gymnax before 1.0 and since, if `jax.jit` takes it.
+    Controllers are given the whole state as a vector, see
+    [`delucax.interop.gymnax.GymnaxDynamics`][], named after the leaves of the state;
+    `encode` makes of it what gymnax's users observe. The cost is minus the reward; a
+    step that is done terminates. Integer actions go through the table of `actions`; a
+    number between two of them is rounded.
+
+    The random key of `step_env` is drawn at the start of an episode, from the key of
+    the rollout, and is carried in the state if a step uses it at all.
+
+    A reward may hang on the next state, so that a step of the environment is computed
+    for the dynamics and for the cost. Both hold the parameters: to change them, or to
+    differentiate with respect to them, make the environment anew. Gradients pass where
+    the environment lets them: of gymnax 1.0, `with_transition_gradients` is used where
+    there is one; before, and elsewhere, gymnax's own environments stop them.
+
+    **Arguments:**
+
+    - `env`: the environment.
+    - `params`: its parameters; `env.default_params` by default.
+    - `dt`: the time of a step, 1 by default; the protocol has none.
+    - `**environment`: other arguments of [`delucax.Environment`][], such as `encode`,
+        or `horizon`, which is `params.max_steps_in_episode` by default.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` if the environment does not speak the protocol, if its
+    action space is neither a box nor discrete, if a state changes its shape in a step,
+    or without a horizon or an observation.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        from delucax.interop.gymnax import from_gymnax, to_gymnax
+
+        theirs = to_gymnax(dlx.make("pendulum"))  # or gymnax.make("Pendulum-v1")[0]
+        env = from_gymnax(theirs, dt=0.05)
+        controller = dlx.controllers.Zero(env.control_size)
+        dlx.rollout(env, controller, key=jax.random.key(0)).total_cost
+        ```
+    """
+    where = "from_gymnax"
+    if params is None:
+        params = getattr(env, "default_params", None)
+    _check_protocol(env, where)
+    for name in environment:
+        if name not in inspect.signature(Environment).parameters:
+            raise ValueError(f"{where}: Environment has no argument {name!r}.")
+    horizon = getattr(params, "max_steps_in_episode", None)
+    if "horizon" not in environment and (
+        horizon is None or isinstance(horizon, Tracer)
+    ):
+        raise ValueError(
+            f"{where}: horizon must be given, for params has no max_steps_in_episode "
+            "that is known."
+        )
+    if "encode" not in environment and _observer(env) is None:
+        raise ValueError(
+            f"{where}: encode must be given, for {type(env).__name__} has neither "
+            "observe nor get_obs."
+        )
+    dynamics = GymnaxDynamics(env, params, dt)
+    env = dynamics.env
+    space = env.action_space(params)
+    if dynamics.discrete:
+        bounds = (0.0, float(space.n - 1))
+        actions = jnp.arange(float(space.n))[:, None]
+    else:
+        size = (dynamics.control_size,)
+        bounds = tuple(
+            jnp.broadcast_to(jnp.asarray(end, float), dynamics.action_shape).reshape(
+                size
+            )
+            for end in (space.low, space.high)
+        )
+        actions = None
+    arguments: dict[str, Any] = dict(
+        dynamics=dynamics,
+        cost=_MinusReward(dynamics),
+        initial_state=_Start(dynamics),
+        control_bounds=bounds,
+        terminated=_is_done,
+        actions=actions,
+        encode=_Observation(dynamics),
+    )
+    if horizon is not None:
+        arguments["horizon"] = horizon
+    return Environment(**{**arguments, **environment})

@@ -1,0 +1,82 @@
+"""The spaces of the gymnax protocol."""
+
+import sys
+from typing import Any
+
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array
+
+from ..._check import is_concrete
+
+
+# A space has to end somewhere, and of an action space samples are drawn.
+LARGEST = float(np.finfo(np.float32).max)
+LARGEST_ACTION = 1e3
+
+
+class Box:
+    """The arrays between two ends."""
+
+    def __init__(self, low: Any, high: Any, shape: tuple[int, ...], dtype: Any):
+        self.low, self.high = low, high
+        self.shape, self.dtype = shape, dtype
+
+    def sample(self, key: Any) -> Array:
+        """A uniform draw."""
+        return jr.uniform(key, self.shape, self.dtype, self.low, self.high)
+
+    def contains(self, x: Any) -> Array:
+        """Whether `x` lies between the ends."""
+        return jnp.all((x >= self.low) & (x <= self.high))
+
+    def __repr__(self):
+        return f"Box({self.low}, {self.high}, {self.shape}, {self.dtype})"
+
+
+class Discrete:
+    """The whole numbers from 0 to `n - 1`."""
+
+    def __init__(self, n: int):
+        self.n, self.shape, self.dtype = n, (), jnp.zeros((), int).dtype
+
+    def sample(self, key: Any) -> Array:
+        """A uniform draw."""
+        return jr.randint(key, (), 0, self.n, self.dtype)
+
+    def contains(self, x: Any) -> Array:
+        """Whether `x` is one of them."""
+        return (jnp.asarray(x) >= 0) & (jnp.asarray(x) < self.n)
+
+    def __repr__(self):
+        return f"Discrete({self.n})"
+
+
+def discrete_space(n: int) -> Any:
+    """A `Discrete`; gymnax's own where gymnax is in use, for its clients ask for the
+    class.
+    """
+    theirs = sys.modules.get("gymnax.environments.spaces")
+    return Discrete(n) if theirs is None else theirs.Discrete(n)
+
+
+def box_space(bounds: Any, size: int, largest: float) -> Any:
+    """A `Box`, or gymnax's own; a side without a bound ends at the largest number."""
+    theirs = sys.modules.get("gymnax.environments.spaces")
+    dtype = jnp.zeros(()).dtype
+    low, high = (-np.inf, np.inf) if bounds is None else bounds
+    low, high = _end(low, size, largest), _end(high, size, largest)
+    return (Box if theirs is None else theirs.Box)(low, high, (size,), dtype)
+
+
+def _end(end: Any, size: int, largest: float) -> Any:
+    """A float if all entries are one, for networks want what has a hash."""
+    if not is_concrete(end):
+        end = jnp.nan_to_num(end, posinf=largest, neginf=-largest)
+        return jnp.broadcast_to(end, (size,))
+    values = np.asarray(end)
+    values = np.where(np.isfinite(values), values, np.sign(values) * largest)
+    if np.all(values == values.flat[0]):
+        return float(values.flat[0])
+    return jnp.broadcast_to(values, (size,))

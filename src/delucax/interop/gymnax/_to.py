@@ -1,0 +1,395 @@
+"""One of our environments in gymnax's protocol."""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..._check import is_concrete
+from ..._fields import as_float_array
+from ...environments import Environment
+from .._by_value import ByValue
+from .._episode import (
+    draw_signals,
+    has_signals,
+    move,
+    NO_SIGNALS,
+    see,
+    Signals,
+    split_key,
+)
+from ._spaces import box_space, discrete_space, LARGEST, LARGEST_ACTION
+
+
+class GymnaxParams(eqx.Module):
+    """The numbers of an environment, as the `params` of gymnax's protocol.
+
+    **Arguments:** `environment`: the environment.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        from delucax.interop.gymnax import GymnaxParams, to_gymnax
+
+        env = to_gymnax(dlx.make("pendulum"))
+        longer = GymnaxParams(dlx.make("pendulum", length=1.2))
+        env.action_space(longer)
+        ```
+    """
+
+    arrays: Any
+    static: Any = eqx.field(static=True)
+
+    def __init__(self, environment: Environment):
+        if not isinstance(environment, Environment):
+            raise ValueError(
+                "GymnaxParams: environment must be a delucax.Environment, got "
+                f"{type(environment).__name__}."
+            )
+        self.arrays, self.static = eqx.partition(environment, eqx.is_array)
+
+    @property
+    def environment(self) -> Environment:
+        """The environment."""
+        return eqx.combine(self.arrays, self.static)
+
+    @property
+    def max_steps_in_episode(self) -> int:
+        """The horizon."""
+        return self.environment.horizon
+
+
+class GymnaxState(eqx.Module):
+    """The state of an episode.
+
+    **Arguments:**
+
+    - `state`: of the environment, shape `(state_size,)`.
+    - `time`: steps since it began.
+    - `keys`: what the disturbances and the noise of the episode are drawn with; none if
+        nothing is drawn.
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax.interop.gymnax import GymnaxState
+
+        GymnaxState(jnp.array([0.5, 0.0]), jnp.asarray(0))
+        ```
+    """
+
+    state: Array
+    time: Array
+    keys: Any = None
+
+
+class GymnaxEnv:
+    """A [`delucax.Environment`][] in gymnax's protocol; see
+    [`delucax.interop.gymnax.to_gymnax`][].
+
+    It holds no arrays that JAX sees, has a hash, and equals another if all numbers do.
+
+    **Arguments:**
+
+    - `env`: the environment, whose numbers are the `default_params`.
+    - `discrete`: whether actions are whole numbers, indices into `env.actions`. By
+        default they are if there is such a table.
+    - `separate_ends`: whether `step` returns `terminated` and `truncated`, as gymnax
+        does from 1.0 on, in place of `done`. False by default.
+
+    **Raises:** `ValueError` on a wrong argument; in a step, on an action of the wrong
+    size.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        from delucax.interop.gymnax import GymnaxEnv
+
+        env = GymnaxEnv(dlx.make("cartpole"))
+        observation, state = env.reset(jax.random.key(0))
+        ```
+    """
+
+    def __init__(
+        self,
+        env: Environment,
+        *,
+        discrete: bool | None = None,
+        separate_ends: bool = False,
+    ):
+        where = "to_gymnax"
+        if not isinstance(env, Environment):
+            raise ValueError(
+                f"{where}: env must be a delucax.Environment, got {type(env).__name__}."
+            )
+        leaves = jax.tree.leaves(eqx.filter(env, eqx.is_array))
+        if not all(map(is_concrete, leaves)):
+            raise ValueError(
+                f"{where}: env must be concrete, got one that is being traced (by "
+                "jax.jit, jax.vmap or jax.grad); give traced numbers as params, "
+                "GymnaxParams(env)."
+            )
+        if discrete and env.actions is None:
+            raise ValueError(
+                f"{where}: discrete needs a table of actions in the environment, which "
+                "has none."
+            )
+        self.discrete = env.actions is not None if discrete is None else bool(discrete)
+        self.separate_ends = bool(separate_ends)
+        self._made = ByValue(env)
+        self._identity = (self._made, self.discrete, self.separate_ends)
+
+    def __hash__(self):
+        return hash(self._identity)
+
+    def __eq__(self, other):
+        return isinstance(other, GymnaxEnv) and self._identity == other._identity
+
+    @property
+    def default_params(self) -> GymnaxParams:
+        """The numbers of the environment that it was made of."""
+        return GymnaxParams(self._made.env)
+
+    @property
+    def name(self) -> str:
+        """The name of the plant."""
+        dynamics = self._made.env.dynamics
+        return type(getattr(dynamics, "system", dynamics)).__name__
+
+    @property
+    def num_actions(self) -> int:
+        """The number of actions; of controls if they are not whole numbers."""
+        env = self._made.env
+        if self.discrete:
+            assert env.actions is not None
+            return len(env.actions)
+        return env.control_size
+
+    @functools.partial(jax.jit, static_argnames=("self",))
+    def reset(
+        self, key: Any, params: GymnaxParams | None = None
+    ) -> tuple[Array, GymnaxState]:
+        """Begin an episode, the one of `delucax.rollout` with the same key.
+
+        **Arguments:**
+
+        - `key`: a random key.
+        - `params`: `default_params` by default.
+
+        **Returns:** the observation, and a [`delucax.interop.gymnax.GymnaxState`][].
+        """
+        return self.reset_env(key, params)
+
+    @functools.partial(jax.jit, static_argnames=("self",))
+    def step(
+        self,
+        key: Any,
+        state: GymnaxState,
+        action: Any,
+        params: GymnaxParams | None = None,
+    ) -> tuple[Any, ...]:
+        """One step; at the end of the episode, the first state of the next.
+
+        **Arguments:**
+
+        - `key`: a random key, of the next episode.
+        - `state`: of the episode.
+        - `action`: in the action space; a control beyond the bounds is clipped.
+        - `params`: `default_params` by default.
+
+        **Returns:** observation, state, reward, done and a dictionary; `terminated` and
+        `truncated` in place of `done` with `separate_ends`. The dictionary has these
+        two, `"final_observation"` (before the reset), `"discount"` (0 if terminated)
+        and `"failed"` (whether the solver did not converge).
+        """
+        seen, moved, reward, _, info = self.step_env(key, state, action, params)
+        terminated, truncated = info["terminated"], info["truncated"]
+        done = terminated | truncated
+        fresh = self.reset_env(key, params)
+        pick = lambda new, old: jnp.where(done, new, old)
+        observation, after = jax.tree.map(pick, fresh, (seen, moved))
+        info["final_observation"] = seen
+        ends = (terminated, truncated) if self.separate_ends else (done,)
+        return observation, after, reward, *ends, info
+
+    def reset_env(
+        self, key: Any, params: GymnaxParams | None = None
+    ) -> tuple[Array, GymnaxState]:
+        """`reset`, not compiled.
+
+        **Arguments:** `key`, `params`: of `reset`.
+
+        **Returns:** as `reset` does.
+        """
+        env = self._params(params).environment
+        start_key, keys = split_key(key)
+        x = env.reset(start_key)
+        drawn = keys if has_signals(env) else None
+        state = GymnaxState(x, jnp.zeros((), int), drawn)
+        return self.get_obs(state, params), state
+
+    def step_env(
+        self,
+        key: Any,
+        state: GymnaxState,
+        action: Any,
+        params: GymnaxParams | None = None,
+    ) -> tuple[Any, ...]:
+        """One step, without a reset and not compiled.
+
+        **Arguments:** `key`: not used. `state`, `action`, `params`: of `step`.
+
+        **Returns:** observation, state, reward, done (`terminated` alone with
+        `separate_ends`) and a dictionary.
+        """
+        del key
+        env = self._params(params).environment
+        signals = self._signals(env, state)
+        action = self._action(env, action)
+        moved = move(env, state.time, state.state, action, signals)
+        after = GymnaxState(moved.state, state.time + 1, state.keys)
+        seen = see(env, after.time, moved.state, signals)
+        info = {
+            "terminated": moved.terminated,
+            "truncated": moved.truncated,
+            "discount": 1 - moved.terminated.astype(moved.reward.dtype),
+            "failed": moved.failed,
+        }
+        ended = moved.terminated | moved.truncated
+        done = moved.terminated if self.separate_ends else ended
+        return seen, after, moved.reward, done, info
+
+    def get_obs(
+        self, state: GymnaxState, params: GymnaxParams | None = None, key: Any = None
+    ) -> Array:
+        """What is observed of a state.
+
+        **Arguments:** `state`, `params`: of `step`. `key`: not used.
+
+        **Returns:** the observation.
+        """
+        del key
+        env = self._params(params).environment
+        return see(env, state.time, state.state, self._signals(env, state))
+
+    def is_terminal(
+        self, state: GymnaxState, params: GymnaxParams | None = None
+    ) -> Array:
+        """Whether the episode ends at a state, by itself or at the horizon.
+
+        **Arguments:** `state`, `params`: of `step`.
+
+        **Returns:** a boolean.
+        """
+        env = self._params(params).environment
+        truncated = state.time >= env.horizon
+        if env.terminated is None:
+            return truncated
+        t = (state.time * env.dt).astype(state.state.dtype)
+        return env.terminated(t, state.state) | truncated
+
+    def action_space(self, params: GymnaxParams | None = None) -> Any:
+        """The actions.
+
+        **Arguments:** `params`: `default_params` by default.
+
+        **Returns:** a space with `shape` and `dtype`, `low` and `high` or `n`, and
+        `sample(key)` and `contains(x)`: gymnax's own where gymnax is in use.
+        """
+        env = self._params(params).environment
+        if self.discrete:
+            assert env.actions is not None
+            return discrete_space(len(env.actions))
+        return box_space(env.control_bounds, env.control_size, LARGEST_ACTION)
+
+    def observation_space(self, params: GymnaxParams | None = None) -> Any:
+        """The observations.
+
+        **Arguments:** `params`: `default_params` by default.
+
+        **Returns:** a space as of `action_space`.
+        """
+        env = self._params(params).environment
+        return box_space(env.observation_bounds, env.feature_size, LARGEST)
+
+    def _params(self, params: GymnaxParams | None) -> GymnaxParams:
+        if params is None:
+            return self.default_params
+        if not isinstance(params, GymnaxParams):
+            raise ValueError(
+                "GymnaxEnv: params must be GymnaxParams, such as default_params, got "
+                f"{type(params).__name__}."
+            )
+        return params
+
+    def _action(self, env: Environment, action: Any) -> Array:
+        action = as_float_array(jnp.asarray(action))
+        size = 1 if self.discrete else env.control_size
+        if action.size != size:
+            raise ValueError(
+                f"GymnaxEnv: action must have {size} entries, got shape {action.shape}."
+            )
+        if self.discrete:
+            return action.reshape(()).astype(int)
+        return action.reshape(size)
+
+    def _signals(self, env: Environment, state: GymnaxState) -> Signals:
+        if state.keys is None:
+            return NO_SIGNALS
+        return draw_signals(env, state.keys, state.state.dtype)
+
+
+def to_gymnax(
+    env: Environment, *, discrete: bool | None = None, separate_ends: bool = False
+) -> GymnaxEnv:
+    """An environment in gymnax's protocol, without gymnax.
+
+    What trains on gymnax's environments (rejax, PureJaxRL, ...) trains on it. The
+    observation is what `encode` makes of the environment's; the reward is minus the
+    cost, with the final cost in the last step; the episode is truncated at the horizon,
+    and `step` then begins the next. Gradients pass through a step, not through a reset.
+
+    All numbers are in `params`, [`delucax.interop.gymnax.GymnaxParams`][], so that
+    `jax.vmap` over params runs many plants at once.
+
+    The disturbances and the sensor noise of an episode are drawn from the key that it
+    was reset with. They are drawn for the whole horizon at every step, as a coloured
+    disturbance must be; without any, nothing is drawn.
+
+    **Arguments:**
+
+    - `env`: the environment.
+    - `discrete`: whether actions are whole numbers, indices into `env.actions`. By
+        default they are if there is such a table.
+    - `separate_ends`: whether `step` returns `terminated` and `truncated`, as gymnax
+        does from 1.0 on, in place of `done`, which rejax and PureJaxRL want. False by
+        default.
+
+    **Returns:** a [`delucax.interop.gymnax.GymnaxEnv`][].
+
+    **Raises:** `ValueError` on a wrong argument, or if `env` is being traced.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+        from delucax.interop.gymnax import to_gymnax
+
+        env = to_gymnax(dlx.make("pendulum"))
+        params, key = env.default_params, jax.random.key(0)
+        observation, state = env.reset(key, params)
+        observation, state, reward, done, info = env.step(
+            key, state, jnp.zeros(1), params
+        )
+        ```
+    """
+    return GymnaxEnv(env, discrete=discrete, separate_ends=separate_ends)
