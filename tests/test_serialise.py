@@ -14,7 +14,7 @@ import lineax as lx
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, needs_x32, needs_x64, user_error
+from helpers import assert_close, needs_x32, needs_x64, once, user_error
 from jaxtyping import Array
 
 import delucax as dlx
@@ -522,3 +522,17 @@ def test_double_precision_is_narrowed_with_a_warning(tmp_path):
         dlx.load(tmp_path / "f")
     write({"numpy": 0})
     assert dlx.load(tmp_path / "f").dtype == np.float64
+
+
+@once
+@pytest.mark.parametrize(
+    "call, match",
+    [
+        (lambda: dlx.save(3, jnp.ones(1)), "save: path must be the path of a file"),
+        (lambda: dlx.load(None), "load: path must be the path of a file, got None"),
+        (lambda: dlx.load("a.dlx", trust=3), "trust must be the names of packages"),
+    ],
+)
+def test_wrong_kinds_of_argument(call, match):
+    with user_error(match=match):
+        call()

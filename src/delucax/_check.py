@@ -1,5 +1,7 @@
 """Checks of arguments, with errors that name the argument and what was expected."""
 
+import os
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -33,12 +35,26 @@ def check_key(key: Any, where: str) -> Any:
 
 
 def as_vector(value: Any, size: int, name: str, where: str) -> Array:
-    """`value` as a floating-point vector of `size` entries, or an error."""
+    """`value` as a real floating-point vector of `size` entries, or an error."""
     array = as_float_array(value)
     if not eqx.is_inexact_array(array) or array.shape != (size,):
         got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
         raise ValueError(f"{where}: {name} must have shape ({size},), got {got}.")
+    check_real(array, name, where)
     return array
+
+
+def check_real(array: Array, name: str, where: str) -> None:
+    """Raise if an array is complex: its imaginary part would be lost on the way."""
+    if jnp.iscomplexobj(array):
+        raise ValueError(f"{where}: {name} must be real, got dtype {array.dtype}.")
+
+
+def as_path(value: Any, name: str, where: str) -> Path:
+    """`value` as a path, or an error."""
+    if not isinstance(value, str | os.PathLike):
+        raise ValueError(f"{where}: {name} must be the path of a file, got {value!r}.")
+    return Path(value)
 
 
 def as_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:

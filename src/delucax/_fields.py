@@ -314,6 +314,11 @@ def check_parameters(module: eqx.Module) -> None:
         if _ROLE not in field.metadata:
             continue
         value = getattr(module, field.name, None)
+        if value is None and field.default not in (dataclasses.MISSING, None):
+            raise ValueError(
+                f"{type(module).__name__}: {field.name} must be a number or an array, "
+                "got None."
+            )
         constraint = field.metadata[_CONSTRAINT]
         for leaf in jax.tree.leaves(value):
             name = f"{type(module).__name__}: {field.name}"

@@ -15,7 +15,6 @@ import os
 import secrets
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -25,6 +24,7 @@ import jax.random as jr
 import numpy as np
 from jax.core import Tracer
 
+from ._check import as_path
 from ._qualified import name_of, thing_of
 from ._results import Result
 
@@ -59,7 +59,7 @@ def save(path: str | os.PathLike, obj: Any) -> None:
         controller = dlx.load("controller.dlx")
         ```
     """
-    path = Path(path)
+    path = as_path(path, "path", "save")
     writer = _Writer()
     header = {"library": _library(), "tree": writer.describe(obj, "obj")}
     header["arrays"] = [
@@ -117,7 +117,13 @@ def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
         env = dlx.load("pendulum.dlx")
         ```
     """
-    path = Path(path)
+    path = as_path(path, "path", "load")
+    trust = (trust,) if isinstance(trust, str) else trust
+    listed = isinstance(trust, list | tuple | set | frozenset)
+    if not (listed and all(isinstance(name, str) for name in trust)):
+        raise ValueError(
+            f"load: trust must be the names of packages or modules, got {trust!r}."
+        )
     if path.is_dir():
         raise ValueError(f"load: path must be that of a file, got the folder '{path}'.")
     try:
@@ -143,8 +149,7 @@ def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
     try:
         header = json.loads(text)
         arrays = _split(payload, header["arrays"])
-        trust = (trust,) if isinstance(trust, str) else tuple(trust)
-        reader = _Reader(arrays, trust)
+        reader = _Reader(arrays, tuple(trust))
         obj = reader.build(header["tree"])
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         raise ValueError(f"load: '{path}' cannot be used: {error}") from error

@@ -1,4 +1,5 @@
 import diffrax
+import equinox as eqx
 import jax.numpy as jnp
 import pytest
 from helpers import once, user_error
@@ -74,7 +75,40 @@ def test_a_vector_field_that_returns_no_array(returned, match):
         dlx.linearize(system, 0.0, x, u)
 
 
-@pytest.mark.parametrize("mass", ["heavy", ["heavy"], object(), [[1.0], [1.0, 2.0]]])
+@pytest.mark.parametrize(
+    "mass", [None, "heavy", ["heavy"], object(), [[1.0], [1.0, 2.0]]]
+)
 def test_parameters_that_are_no_numbers(mass):
     with user_error(match="Pendulum: mass must be a number or an array"):
         dlx.systems.Pendulum(mass=mass)
+
+
+class Listed(dlx.AbstractSystem):
+    """Its methods return lists."""
+
+    state_names = ("x",)
+    control_names = ("u",)
+    kind: str = eqx.field(static=True)
+
+    def vector_field(self, t, x, u, w):
+        return -x
+
+    def project(self, x):
+        return [x[0]] if self.kind == "project" else x
+
+    def diffusion(self, t, x, u):
+        return [[1.0]] if self.kind == "diffusion" else None
+
+
+@pytest.mark.parametrize("kind", ["project", "diffusion"])
+def test_a_method_that_returns_no_array(kind):
+    with user_error(match=f"Listed: {kind} must return an array.*got a list"):
+        dlx.Discretized(Listed(kind), 0.1)(0.0, jnp.ones(1), jnp.zeros(1))
+
+
+def test_complex_controls():
+    dynamics = dlx.Discretized(PENDULUM, 0.1)
+    with user_error(match="controls must be real, got dtype complex"):
+        dlx.open_loop(dynamics, jnp.zeros(2), 1j * jnp.ones((3, 1)))
+    with user_error(match="must be real, got dtype complex"):
+        dlx.open_loop(dynamics, 1j * jnp.ones(2), jnp.ones((3, 1)))

@@ -104,3 +104,23 @@ def test_states_that_are_well_made(run):
 def test_bad_input(run, match):
     with user_error(match=match):
         run()
+
+
+def test_constants_with_a_batch_axis():
+    heavy = dlx.make("pendulum", mass=jnp.ones(3))
+    with user_error(match=r"shapes \(2, 3\).*batch axis.*jax.vmap"):
+        dlx.rollout(heavy, FEEDBACK, key=jax.random.key(0))
+
+
+class Rows(dlx.disturbances.AbstractDisturbance):
+    size: int = eqx.field(static=True, default=2)
+
+    def sequence(self, key, times):
+        return [[0.0, 0.0]] * len(times)
+
+
+def test_a_sequence_that_is_no_array():
+    env = dlx.make("pendulum")
+    env = dlx.Environment(env.dynamics, env.cost, disturbance=Rows())
+    with user_error(match=r"Rows: sequence must return an array.*got a list"):
+        dlx.rollout(env, FEEDBACK, key=jax.random.key(0))

@@ -1,5 +1,7 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from helpers import once, user_error
 
@@ -40,3 +42,16 @@ def test_a_seed_for_a_key(name, call):
 def test_a_decay_that_is_no_number(value):
     with user_error(match="expected_cost: gradient_decay must be"):
         training.expected_cost(ENV, batch=1, gradient_decay=value)
+
+
+@pytest.mark.parametrize(
+    "arguments, match",
+    [
+        ({"checkpoint": 3}, "fit: checkpoint must be the path of a file, got 3"),
+        ({"gradient": training.EvolutionStrategies}, "gradient must be an estimator"),
+    ],
+)
+def test_wrong_kinds_for_fit(arguments, match):
+    options = dict(steps=1, key=jax.random.key(0), progress=False) | arguments
+    with user_error(match=match):
+        training.fit(LOSS, FEEDBACK, optax.sgd(0.1), **options)

@@ -8,7 +8,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_matrix, check_count, check_key, is_concrete
+from .._check import as_matrix, check_count, check_key, check_real, is_concrete
 from .._controller import AbstractController, wrong_observation
 from .._fields import as_float_array, parameter, weight
 from ..math import matvec
@@ -177,6 +177,7 @@ class Sequence(AbstractController):
 
     def __init__(self, values: Any):
         self.values = as_matrix(values, "values", "Sequence")
+        check_real(self.values, "values", "Sequence")
         if self.values.shape[0] == 0:
             raise ValueError("Sequence: values must have at least one row, got none.")
 

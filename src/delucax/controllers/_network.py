@@ -112,7 +112,7 @@ class MLP(AbstractController):
                 )
 
     def __call__(self, t, y, state):
-        z = y if self.features is None else self.features(y)
+        z = y if self.features is None else jnp.asarray(self.features(y))
         if z.shape != (self.network.in_size,):
             raise wrong_observation(self, int(self.network.in_size), z)
         u = self.network(z)

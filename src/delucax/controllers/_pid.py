@@ -349,7 +349,7 @@ def _error(pid: Any, t: Any, y: Array) -> tuple[Array, Array]:
         )
     given: Any = pid.reference
     reference: Any = given(t) if callable(given) else given
-    reference = 0 if reference is None else reference
+    reference = 0 if reference is None else jnp.asarray(reference)
     if jnp.shape(reference) not in ((), (pid.loops,)):
         raise ValueError(
             f"{name}: reference must have an entry for each of {pid.loops} loops, got "

@@ -238,7 +238,7 @@ class Discretized(AbstractDynamics):
             x_next, result = self._adaptive(t, x, args)
         else:
             x_next, result = self._fixed(t, x, args)
-        x_next = system.project(x_next)
+        x_next = _array(system, "project", system.project(x_next), x.shape)
         if added is not None:
             x_next = x_next + added
         return x_next.astype(x.dtype), result
@@ -317,7 +317,13 @@ def has_diffusion(system: AbstractSystem) -> bool:
         jnp.zeros(system.state_size),
         jnp.zeros(system.control_size),
     )
-    return eqx.filter_eval_shape(system.diffusion, t, x, u) is not None
+    found: Any = eqx.filter_eval_shape(system.diffusion, t, x, u)
+    if found is not None and not hasattr(found, "shape"):
+        raise ValueError(
+            f"{type(system).__name__}: diffusion must return an array, got a "
+            f"{type(found).__name__}."
+        )
+    return found is not None
 
 
 def _apply(g: Array, dB: Array) -> Array:
@@ -362,6 +368,17 @@ def evaluate_field(system: AbstractSystem, t: Any, x: Array, u: Array, w: Any) -
     raise ValueError(
         f"{type(system).__name__}: vector_field must return shape {x.shape}, as the "
         f"state has, got {got}; it must be an array{hint}."
+    )
+
+
+def _array(system: Any, method: str, found: Any, shape: tuple[int, ...]) -> Array:
+    """What a method of `system` returned, if it has the shape that it should."""
+    if getattr(found, "shape", None) == shape:
+        return found
+    got = getattr(found, "shape", f"a {type(found).__name__}")
+    raise ValueError(
+        f"{type(system).__name__}: {method} must return an array of shape {shape}, got "
+        f"{got}."
     )
 
 

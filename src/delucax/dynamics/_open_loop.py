@@ -8,7 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_vector
+from .._check import as_vector, check_real
 from .._components import by_components
 from .._fields import as_float_array
 from .._results import choose, first_failure, first_of, or_none, RESULTS
@@ -98,4 +98,5 @@ def _sequence(value: Any, size: int, name: str, where: str) -> Array:
         raise ValueError(f"{where}: {name} must have shape (steps, {size}), got {got}.")
     if array.shape[0] == 0:
         raise ValueError(f"{where}: {name} must have at least one step.")
+    check_real(array, name, where)
     return array

@@ -201,6 +201,12 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
         step = env.step(t, x, u, w)
         cost, x_next, result = step.cost.astype(dtype), step.state, step.result
         applied = step.control
+        if x_next.shape != x.shape or cost.shape != ():
+            raise ValueError(
+                f"rollout: a step must give a state of shape {x.shape} and a scalar "
+                f"cost, got shapes {x_next.shape} and {cost.shape}. If a constant has "
+                "a batch axis, run a batch of environments: jax.vmap."
+            )
         after = controller.applied(step.control, cost, after)
         check_state(controller, eqx.combine(first, static), after)
         after = eqx.filter(after, eqx.is_array)
@@ -306,10 +312,11 @@ def _drawn(disturbance, key, times, size):
     """The sequence that a disturbance draws, with its shape checked."""
     w = disturbance.sequence(key, times)
     shape = (times.shape[0], size)
-    if jnp.shape(w) != shape:
+    if getattr(w, "shape", None) != shape:
+        got = getattr(w, "shape", f"a {type(w).__name__}")
         raise ValueError(
-            f"{type(disturbance).__name__}: sequence must return shape {shape}, got "
-            f"{jnp.shape(w)}."
+            f"{type(disturbance).__name__}: sequence must return an array of shape "
+            f"{shape}, got {got}."
         )
     return w
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
+from .._check import as_path
 from ._trainable import is_float
 
 
@@ -71,7 +72,7 @@ class Checkpoint(NamedTuple):
 
 def prepare(path: Any, where: str) -> Path:
     """The path of a checkpoint, in a folder that is there and can be written to."""
-    path = Path(path)
+    path = as_path(path, "checkpoint", where)
     if path.is_dir():
         raise ValueError(
             f"{where}: checkpoint must be the path of a file, such as "

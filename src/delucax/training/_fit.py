@@ -185,7 +185,7 @@ def fit(
     check_key(key, _WHERE)
     data, data_size, batch_size = _checked_data(data, batch_size)
     _check_callbacks(callbacks)
-    if not callable(gradient):
+    if not callable(gradient) or isinstance(gradient, type):
         raise ValueError(
             f"{_WHERE}: gradient must be an estimator such as "
             f"delucax.training.analytic, got {gradient!r}."

@@ -191,17 +191,21 @@ class Adaptive(AbstractController):
         divisor = birth & -birth
         slot = jnp.argmin(ends)
         life = self.every * (4 * divisor + 1)
-        ends = ends.at[slot].set(jnp.where(born, step + life, ends[slot]))
+        newborn = born & (jnp.arange(self.slots) == slot)
+        ends = jnp.where(newborn, step + life, ends)
         old = jax.tree.map(lambda leaf: leaf[slot], state.experts)
         new = self.base.fresh(old, None)
-        experts = jax.tree.map(
-            lambda leaf, a, b: leaf.at[slot].set(jnp.where(born, a, b)),
-            state.experts,
-            new,
-            old,
-        )
+
+        def replaced(leaf, before, after):
+            # What a birth leaves as it is need not be written.
+            if after is before:
+                return leaf
+            mask = newborn.reshape((-1,) + (1,) * (leaf.ndim - 1))
+            return jnp.where(mask, after, leaf)
+
+        experts = jax.tree.map(replaced, state.experts, old, new)
         alive = ends > step
-        kept = alive & ~(born & (jnp.arange(self.slots) == slot))
+        kept = alive & ~newborn
         weights = jnp.where(kept, state.weights, 0)
         weights = weights / jnp.sum(weights)
         dealt = alive / jnp.sum(alive)
