@@ -96,3 +96,33 @@ class Case:
             angle = generator.uniform(-np.pi, np.pi, self.lanes)
             speed = generator.uniform(-1.0, 1.0, self.lanes)
         return np.asarray(angle, np.float32), np.asarray(speed, np.float32)
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Whole episodes of a named task under a control that is held.
+
+    - `task`: a name that `delucax.make` knows.
+    - `steps`: of an episode.
+    - `count`: how many episodes.
+    - `batched`: all at once, as lanes of a batch; else one after the other.
+    - `kept`: `"trajectory"` keeps states, controls and costs of each step, `"cost"` the
+      total cost and the last state.
+    """
+
+    task: str
+    steps: int
+    count: int
+    batched: bool = False
+    kept: Literal["trajectory", "cost"] = "cost"
+
+    @property
+    def total_steps(self) -> int:
+        """Simulated steps in one run."""
+        return self.steps * self.count
+
+    @property
+    def label(self) -> str:
+        """A short name for tables."""
+        lanes = f"{self.count} lanes" if self.batched else "one chain"
+        return f"{self.task}, {self.kept}, {lanes}"

@@ -51,6 +51,16 @@ def box(*half):
     return -half, half
 
 
+def sample(rng, size, edges, low, high):
+    """Vectors inside a box; of every other one a share of the entries at the ends."""
+    low, high = np.asarray(low), np.asarray(high)
+    unit = rng.uniform(0, 1, (size, low.size))
+    ends = rng.uniform(0, 1, unit.shape) < edges
+    ends[::2] = False
+    unit = np.where(ends, np.round(unit), unit)
+    return jnp.asarray(low + (high - low) * unit)
+
+
 def _linear():
     A = jnp.array([[0.0, 1.0, 0.0], [-2.0, -0.3, 0.5], [0.0, 0.2, -1.0]])
     B = jnp.array([[0.0, 1.0], [1.0, 0.0], [0.5, 0.5]])

@@ -43,6 +43,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "time), and the equation is too large to be solved as one linear system."
     )
     not_converged = "The iteration did not converge within its step limit."
+    no_descent = (
+        "No step lowered the cost, although the gradient is not zero: the problem may "
+        "not be smooth there, or the tolerance may be below rounding."
+    )
     infeasible = (
         "The problem has no solution: the cost has no unique minimum over the control, "
         "or gamma is below the least level that any controller attains."

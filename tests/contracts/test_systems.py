@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import assert_close, needs_x64, once, thorough, tolerance
+from hypothesis import given, settings, strategies as st
 from jax.flatten_util import ravel_pytree
-from systems_catalogue import CONSERVED, SYSTEMS
+from systems_catalogue import CONSERVED, sample, SYSTEMS
 
 import delucax as dlx
 
@@ -27,17 +28,8 @@ def system_of(name):
 def drawn(name, size, seed=0, edges=0.5):
     """States and controls inside their boxes, a share of the entries at the ends."""
     case, rng = SYSTEMS[name], np.random.default_rng(seed)
-
-    def box(low, high):
-        low, high = np.asarray(low), np.asarray(high)
-        unit = rng.uniform(0, 1, (size, low.size))
-        ends = rng.uniform(0, 1, unit.shape) < edges
-        # Every other sample is inside altogether.
-        ends[::2] = False
-        unit = np.where(ends, np.round(unit), unit)
-        return jnp.asarray(low + (high - low) * unit)
-
-    return box(case.low, case.high), box(case.u_low, case.u_high)
+    states = sample(rng, size, edges, case.low, case.high)
+    return states, sample(rng, size, edges, case.u_low, case.u_high)
 
 
 def disturbed(system, size, seed=1):
@@ -76,16 +68,15 @@ def test_finite_inside_and_at_the_edges(name):
 
 @thorough
 @every
-def test_finite_on_many(name):
-    finite_on(name, 100_000)
+@settings(max_examples=100, deadline=None, database=None)
+@given(seed=st.integers(0, 2**32 - 1), edges=st.sampled_from([0.0, 0.1, 0.5, 1.0]))
+def test_finite_on_many(name, seed, edges):
+    """A thousand states an example."""
+    finite_on(name, 1_000, seed, edges)
 
 
-def finite_on(name, size):
-    """Values, and gradients with respect to all there is, on states and controls."""
-    system = system_of(name)
-    x, u = drawn(name, size)
-    w = disturbed(system, size) if system.disturbance_names else None
-
+@functools.cache
+def compiled_field(name):
     @jax.jit
     def both(system, x, u, w):
         def one(x, u, w):
@@ -97,7 +88,15 @@ def finite_on(name, size):
 
         return jax.vmap(one, in_axes=(0, 0, None if w is None else 0))(x, u, w)
 
-    dx, apart, gradients = both(system, x, u, w)
+    return both
+
+
+def finite_on(name, size, seed=0, edges=0.5):
+    """Values, and gradients with respect to all there is, on states and controls."""
+    system = system_of(name)
+    x, u = drawn(name, size, seed, edges)
+    w = disturbed(system, size) if system.disturbance_names else None
+    dx, apart, gradients = compiled_field(name)(system, x, u, w)
     assert dx.shape == apart.shape == x.shape and dx.dtype == x.dtype
     for leaf in jax.tree.leaves((dx, apart, gradients)):
         assert np.all(np.isfinite(leaf))

@@ -2,12 +2,16 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import assert_close, needs_x64, once, thorough, user_error
+from hypothesis import given, settings, strategies as st
+from jax.flatten_util import ravel_pytree
 from scipy.integrate import solve_ivp
+from systems_catalogue import box, Case, sample, SYSTEMS
 
 import delucax as dlx
 
@@ -78,6 +82,11 @@ def test_task(name, key, tmp_path):
     assert features.shape == (env.feature_size,)
     assert run.observations.shape == (6, env.observation_size)
     assert np.all(np.isfinite(features))
+    if env.observation_bounds is not None:
+        low, high = env.observation_bounds
+        assert low.shape == high.shape == features.shape
+        seen = jax.vmap(env.encode)(run.observations)
+        assert np.all(seen >= low) and np.all(seen <= high)
 
     dlx.save(tmp_path / "task.dlx", env)
     again = dlx.load(tmp_path / "task.dlx")
@@ -92,6 +101,130 @@ def test_task(name, key, tmp_path):
 def test_a_wrong_argument_is_named(name):
     with user_error(match=f"{name}: no argument is called 'horizn'"):
         dlx.make(name, horizn=3, **ARGUMENTS.get(name, {}))
+
+
+def states_of(env, size, seed, edges):
+    """States and controls of a task, at the ends of their boxes too."""
+    rng, n, m = np.random.default_rng(seed), env.state_size, env.control_size
+    system = getattr(env.dynamics, "system", None)
+    case = SYSTEMS.get(type(system).__name__)
+    if case is None or len(case.low) != n:
+        case = Case(None, *box(*[1.0] * n), *box(*[1.0] * m), None)
+    low, high = case.u_low, case.u_high
+    if env.control_bounds is not None:
+        low, high = (np.broadcast_to(end, m) for end in env.control_bounds)
+    return sample(rng, size, edges, case.low, case.high), sample(
+        rng, size, edges, low, high
+    )
+
+
+@functools.cache
+def compiled_step(name):
+    """A step with its cost and features, and their gradients with respect to all."""
+
+    @jax.jit
+    def step(env, x, u):
+        arrays, rest = eqx.partition(env, eqx.is_inexact_array)
+
+        def one(x, u):
+            def outputs(arrays, x, u):
+                env = eqx.combine(arrays, rest)
+                step = env.step(0.3, x, u)
+                final = env.cost.final(0.3, step.state)
+                y = env.dynamics.observe(0.3, step.state)
+                return step.state, step.cost, final, env.encode(y)
+
+            out, back = jax.vjp(outputs, arrays, x, u)
+            return out, back(jax.tree.map(jnp.ones_like, out))
+
+        return jax.vmap(one)(x, u)
+
+    return step
+
+
+def finite_on(name, size, seed=0, edges=0.5):
+    env = task(name)
+    x, u = states_of(env, size, seed, edges)
+    for leaf in jax.tree.leaves(compiled_step(name)(env, x, u)):
+        assert np.all(np.isfinite(leaf))
+
+
+CLIPPED = ["mountain_car", "pendulum"]
+ONCE = [n for n in NAMES if "/" not in n]
+
+
+@once
+@pytest.mark.parametrize("name", CLIPPED)
+def test_a_step_is_finite_inside_and_at_the_edges(name):
+    finite_on(name, 256)
+
+
+@thorough
+@pytest.mark.parametrize("name", ONCE)
+@settings(max_examples=100, deadline=None, database=None)
+@given(seed=st.integers(0, 2**32 - 1), edges=st.sampled_from([0.0, 0.1, 0.5, 1.0]))
+def test_a_step_is_finite_on_many(name, seed, edges):
+    """A thousand states an example."""
+    finite_on(name, 1_000, seed, edges)
+
+
+# Where a state runs into no limit within 200 steps.
+CALM = {
+    "acrobot": ([0.5, -0.4, 0.0, 0.0], 0.1),
+    "cartpole": ([0.0, 0.1, 3.0, 0.0], 0.3),
+    "mountain_car": ([-0.5, 0.0], 0.1),
+    "pendulum": ([3.0, 0.0], 0.3),
+}
+
+
+def gradient_of(name):
+    """The gradient of a task's whole cost, by its own arithmetic, with respect to the
+    start, the controls and every constant, along a direction, against its difference
+    quotient. Arrivals have no gradient: a quadratic cost is in their place."""
+    start, strength = CALM[name]
+    n, steps = len(start), 200
+    arguments = dict(terminated=None)
+    if name != "pendulum":
+        arguments["cost"] = dlx.costs.Quadratic(np.ones(n), np.ones(1))
+    env = dlx.make(name, **arguments)
+    rng = np.random.default_rng(4)
+    controls = jnp.asarray(strength * rng.uniform(-1, 1, (steps, 1)))
+    parts = eqx.partition(env.dynamics, eqx.is_inexact_array)
+    theta, unravel = ravel_pytree((parts[0], jnp.array(start), controls))
+    direction = rng.normal(0, 1, theta.size) * (np.abs(theta) + 0.01)
+
+    def cost(theta):
+        arrays, x0, controls = unravel(theta)
+        plant = eqx.tree_at(lambda e: e.dynamics, env, eqx.combine(arrays, parts[1]))
+        controller = dlx.controllers.Sequence(controls)
+        key = jax.random.key(0)
+        run = dlx.rollout(plant, controller, key=key, x0=x0, horizon=steps)
+        return run.total_cost / steps
+
+    @jax.jit
+    def both(theta, direction):
+        h = 3e-5
+        near = jnp.array([2.0, 1.0, -1.0, -2.0]) * h
+        f = jax.vmap(lambda s: cost(theta + s * direction))(near)
+        quotient = (8 * (f[1] - f[2]) - (f[0] - f[3])) / (12 * h)
+        gradient = jax.grad(cost)(theta)
+        return gradient, jnp.dot(gradient, direction), quotient
+
+    gradient, ours, theirs = both(theta, jnp.asarray(direction))
+    assert np.all(np.isfinite(gradient)) and theirs != 0
+    assert_close(ours, theirs, rtol=1e-6)
+
+
+@needs_x64
+def test_gradient_of_a_task():
+    gradient_of("pendulum")
+
+
+@thorough
+@needs_x64
+@pytest.mark.parametrize("name", [name for name in CALM if name != "pendulum"])
+def test_gradient_of_the_other_tasks(name):
+    gradient_of(name)
 
 
 # The order of Gym's own arithmetic, where that is the default.

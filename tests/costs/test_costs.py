@@ -19,6 +19,20 @@ def test_quadratic():
     assert target(0.0, x, u) == 0 and target.final(0.0, x) == 0
 
 
+def test_a_vector_weighs_as_its_diagonal():
+    x, u = jnp.array([1.0, -2.0]), jnp.array([3.0])
+    q, r = jnp.array([2.0, 0.5]), jnp.array([0.1])
+    vectors = dlx.costs.Quadratic(q, r, final=3 * q)
+    matrices = dlx.costs.Quadratic(jnp.diag(q), jnp.diag(r), final=jnp.diag(3 * q))
+    assert_close(vectors(0.0, x, u), matrices(0.0, x, u), rtol=1e-6)
+    assert_close(vectors.final(0.0, x), matrices.final(0.0, x), rtol=1e-6)
+    mixed = dlx.costs.Tracking(q, R, lambda t: jnp.ones(2), final=jnp.diag(q))
+    assert_close(mixed(0.0, x, u), 0.5 * 9 + 0.1 * 9, rtol=1e-6)
+    assert_close(mixed.final(0.0, x), 0.5 * 9, rtol=1e-6)
+    slope = jax.grad(lambda q: dlx.costs.Quadratic(q, r)(0.0, x, u))(q)
+    assert_close(slope, x**2)
+
+
 def test_quadratic_wraps_angles():
     difference = dlx.systems.Pendulum().difference
     target = jnp.array([3.0, 0.0])
@@ -65,9 +79,12 @@ def test_weights_are_differentiable():
     [
         (lambda: dlx.costs.Quadratic(jnp.ones((2, 3)), R), "Q must be square"),
         (lambda: dlx.costs.Quadratic(jnp.array([[1.0, 1], [0, 1]]), R), "symmetric"),
-        (lambda: dlx.costs.Quadratic(jnp.ones(2), R), "Q must be a matrix"),
+        (lambda: dlx.costs.Quadratic(2.0, R), "Q must be a matrix"),
+        (lambda: dlx.costs.Quadratic(jnp.ones(2) * jnp.nan, R), "Q must be finite"),
+        (lambda: dlx.costs.Quadratic(Q, R, final=jnp.ones(3)), "final must fit Q"),
+        (lambda: dlx.costs.Quadratic(jnp.ones(3), R)(0.0, Q[0], R[0]), "state has"),
         (lambda: dlx.costs.Quadratic(Q * jnp.nan, R), "Q must be finite"),
-        (lambda: dlx.costs.Quadratic(Q, R, final=jnp.eye(3)), "final must have"),
+        (lambda: dlx.costs.Quadratic(Q, R, final=jnp.eye(3)), "final must fit Q"),
         (lambda: dlx.costs.Quadratic(Q, R, state_target=jnp.ones(3)), "state_target"),
         (lambda: dlx.costs.Quadratic(Q, R)(0.0, jnp.ones(3), jnp.ones(1)), "state has"),
         (lambda: dlx.costs.Quadratic(Q, R)(0.0, jnp.ones(2), jnp.ones(2)), "control"),
@@ -86,7 +103,7 @@ def test_weights_are_differentiable():
         ),
         (
             lambda: dlx.costs.Tracking(Q, R, lambda t: jnp.ones(2), final=jnp.eye(3)),
-            "Tracking: final must have the shape of Q",
+            "Tracking: final must fit Q",
         ),
         (lambda: dlx.costs.Rate(dlx.costs.PendulumCost(), 0.0), "dt must be positive"),
         (

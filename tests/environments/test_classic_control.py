@@ -213,6 +213,15 @@ def test_a_smooth_acrobot_has_gradients(key):
         (lambda: dlx.make("acrobot", mass_1=0.0), "mass_1 must be positive"),
         (lambda: dlx.make("acrobot", max_velocity_1=-1.0), "max_velocity_1 must be p"),
         (lambda: dlx.make("acrobot", substeps=2), "acrobot: substeps needs a solver"),
+        (lambda: dlx.make("acrobot", torque_noise=-1.0), "torque_noise must be at le"),
+        (
+            lambda: dlx.make(
+                "acrobot",
+                torque_noise=0.1,
+                disturbance=dlx.disturbances.Gaussian(0.1, size=1),
+            ),
+            "acrobot: give torque_noise or a disturbance, not both",
+        ),
         (
             lambda: dlx.make("acrobot", solver=diffrax.Heun(), max_velocity_1=1.0),
             "acrobot: max_velocity_1 is of Gym's arithmetic.*one of max_velocity_1 and",

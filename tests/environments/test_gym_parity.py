@@ -1,5 +1,6 @@
 """Our tasks against Gymnasium's own, stepped from the same states."""
 
+import copy
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -324,4 +325,26 @@ def test_start_horizon_and_bounds_are_gyms(task, key):
     else:
         assert env.actions.shape == (gym.action_space.n, 1)
         assert np.min(env.actions) == low and np.max(env.actions) == high
-    assert env.feature_size == gym.observation_space.shape[0]
+    for ours, theirs in zip(
+        env.observation_bounds,
+        (gym.observation_space.low, gym.observation_space.high),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(np.asarray(ours, np.float32), theirs)
+
+
+def test_torque_noise_is_gyms():
+    gym, env = gym_of(CASES["acrobot"]), dlx.make("acrobot", torque_noise=0.3)
+    gym.torque_noise_max = 0.3
+    rng, n = np.random.default_rng(0), 300
+    states, actions, noise, found = swung(rng, n), rng.integers(0, 3, n), [], []
+    for x, u in zip(states, actions, strict=True):
+        noise.append([copy.deepcopy(gym.np_random).uniform(-0.3, 0.3)])
+        found.append(gym_step(gym, x, u)[0])
+    noise = np.array(noise)
+    step = jax.jit(jax.vmap(lambda x, u, w: env.step(0.0, x, u, w).state))
+    assert np.max(np.abs(np.array(found) - step(states, actions, noise))) <= 1e-12
+    calm = step(states, actions, 0 * noise)
+    assert np.min(np.abs(np.array(found) - calm)[:, 3]) > 1e-6
+    drawn = env.disturbance.sequence(jax.random.key(0), jnp.arange(1000.0))
+    assert np.max(np.abs(drawn)) <= 0.3 and np.std(drawn) > 0.15

@@ -65,6 +65,21 @@ def test_start_is_gyms(key):
     assert_close(x0.std(axis=0), np.array([np.pi, 1.0]) / np.sqrt(3), rtol=0.05)
 
 
+def test_observation_bounds_are_gyms(gym):
+    low, high = dlx.make("pendulum").observation_bounds
+    np.testing.assert_array_equal(np.asarray(high), gym.observation_space.high)
+    np.testing.assert_array_equal(np.asarray(low), gym.observation_space.low)
+    free = dlx.make("pendulum", solver=diffrax.Heun()).observation_bounds
+    np.testing.assert_array_equal(np.asarray(free[1]), [1.0, 1.0, np.inf])
+    # What moves what is seen takes the task's bounds away.
+    noisy = dlx.disturbances.Gaussian(0.1, size=2)
+    plain = dlx.make("pendulum", encode=lambda y: y)
+    for env in (plain, dlx.make("pendulum", sensor_noise=noisy)):
+        assert env.observation_bounds is None
+    own = dlx.make("pendulum", encode=lambda y: y, observation_bounds=(-9.0, 9.0))
+    assert own.observation_bounds[1] == 9
+
+
 def test_bounds_and_cost(key):
     env = dlx.make("pendulum")
     push = dlx.controllers.Constant(jnp.array([5.0]))

@@ -7,10 +7,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import symmetric_matrix
+from .._check import check_finite, symmetric_matrix
 from .._fields import as_float_array, function_field, parameter
-from .._typing import Matrix, RealScalar
+from .._typing import Matrix, RealScalar, Vector
 from ..math import quadratic_form
+from ..math._small import dot
 from ._base import AbstractCost
 
 
@@ -19,9 +20,10 @@ class Quadratic(AbstractCost):
 
     **Arguments:**
 
-    - `Q`: state weight, shape `(n, n)`, symmetric.
-    - `R`: control weight, shape `(m, m)`, symmetric.
-    - `final`: final weight Qf, shape `(n, n)`, symmetric; none by default.
+    - `Q`: state weight, shape `(n, n)`, symmetric; or its diagonal, shape `(n,)`, which
+        takes n products a step where the matrix takes n^2.
+    - `R`: control weight, shape `(m, m)`, symmetric; or its diagonal, shape `(m,)`.
+    - `final`: final weight Qf, as `Q`; none by default.
     - `state_target`: x*, shape `(n,)`; zero by default.
     - `control_target`: u*, shape `(m,)`; zero by default.
     - `difference`: `(x, x*) -> deviation`, such as `system.difference`, which wraps
@@ -37,13 +39,14 @@ class Quadratic(AbstractCost):
         import jax.numpy as jnp
 
         cost = dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1), final=10 * jnp.eye(2))
+        same = dlx.costs.Quadratic(jnp.ones(2), jnp.ones(1), final=10 * jnp.ones(2))
         cost(0.0, jnp.ones(2), jnp.zeros(1))
         ```
     """
 
-    Q: Matrix = parameter()
-    R: Matrix = parameter()
-    Qf: Matrix | None = parameter()
+    Q: Matrix | Vector = parameter()
+    R: Matrix | Vector = parameter()
+    Qf: Matrix | Vector | None = parameter()
     state_target: Array | None = parameter()
     control_target: Array | None = parameter()
     difference: Callable[[Array, Array], Array] | None = function_field()
@@ -79,12 +82,12 @@ class Quadratic(AbstractCost):
     def __call__(self, t, x, u):
         _check_control(self.R, u, "Quadratic")
         du = u if self.control_target is None else u - self.control_target
-        return quadratic_form(self.Q, self._state(x)) + quadratic_form(self.R, du)
+        return _form(self.Q, self._state(x)) + _form(self.R, du)
 
     def final(self, t, x):
         if self.Qf is None:
             return jnp.zeros((), x.dtype)
-        return quadratic_form(self.Qf, self._state(x))
+        return _form(self.Qf, self._state(x))
 
 
 class Tracking(AbstractCost):
@@ -92,11 +95,11 @@ class Tracking(AbstractCost):
 
     **Arguments:**
 
-    - `Q`: error weight, shape `(p, p)`, symmetric.
-    - `R`: control weight, shape `(m, m)`, symmetric.
+    - `Q`: error weight, shape `(p, p)`, symmetric; or its diagonal, shape `(p,)`.
+    - `R`: control weight, shape `(m, m)`, symmetric; or its diagonal, shape `(m,)`.
     - `reference`: any function of time to a vector of size p, such as those in
         `delucax.references`.
-    - `final`: final weight Qf, shape `(p, p)`; none by default.
+    - `final`: final weight Qf, as `Q`; none by default.
     - `output`: h, from the state to the vector that follows the reference; the state
         itself by default.
 
@@ -115,10 +118,10 @@ class Tracking(AbstractCost):
         ```
     """
 
-    Q: Matrix = parameter()
-    R: Matrix = parameter()
+    Q: Matrix | Vector = parameter()
+    R: Matrix | Vector = parameter()
     reference: Callable[[RealScalar], Array] = function_field()
-    Qf: Matrix | None = parameter()
+    Qf: Matrix | Vector | None = parameter()
     output: Callable[[Array], Array] | None = function_field()
 
     def __init__(
@@ -149,25 +152,42 @@ class Tracking(AbstractCost):
 
     def __call__(self, t, x, u):
         _check_control(self.R, u, "Tracking")
-        return quadratic_form(self.Q, self._error(t, x)) + quadratic_form(self.R, u)
+        return _form(self.Q, self._error(t, x)) + _form(self.R, u)
 
     def final(self, t, x):
         if self.Qf is None:
             return jnp.zeros((), x.dtype)
-        return quadratic_form(self.Qf, self._error(t, x))
+        return _form(self.Qf, self._error(t, x))
 
 
-def _weights(Q: Any, R: Any, final: Any, where: str) -> tuple[Matrix, Matrix, Any]:
-    """The weights as symmetric matrices that fit each other, or an error."""
-    Q, R = symmetric_matrix(Q, "Q", where), symmetric_matrix(R, "R", where)
+def _form(weight: Array, d: Array) -> Array:
+    """`d' weight d`, the weight a matrix or its diagonal."""
+    if weight.ndim == 2:
+        return quadratic_form(weight, d)
+    return dot(weight * d, d)
+
+
+def _weights(Q: Any, R: Any, final: Any, where: str) -> tuple[Array, Array, Any]:
+    """The weights as symmetric matrices, or their diagonals, that fit each other, or an
+    error."""
+    Q, R = _weight(Q, "Q", where), _weight(R, "R", where)
     if final is None:
         return Q, R, None
-    final = symmetric_matrix(final, "final", where)
-    if final.shape != Q.shape:
+    final = _weight(final, "final", where)
+    if len(final) != len(Q):
         raise ValueError(
-            f"{where}: final must have the shape of Q, {Q.shape}, got {final.shape}."
+            f"{where}: final must fit Q of shape {Q.shape}, got shape {final.shape}."
         )
     return Q, R, final
+
+
+def _weight(value: Any, name: str, where: str) -> Array:
+    """A symmetric matrix or the diagonal of one, or an error."""
+    array = as_float_array(value)
+    if eqx.is_inexact_array(array) and array.ndim == 1:
+        check_finite(array, name, where)
+        return array
+    return symmetric_matrix(value, name, where)
 
 
 def _check_control(R: Array, u: Array, where: str) -> None:

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_positive, check_step
+from .._check import check_positive, check_range, check_step
 from .._fields import parameter, positive
 from .._results import RESULTS
 from .._typing import RealScalar
 from ..costs import Arrival
+from ..disturbances import Uniform
 from ..dynamics import AbstractDynamics, RK4
 from ..dynamics._runge_kutta import runge_kutta_step
 from ..math import clip, cos, sin, wrap
@@ -24,11 +25,12 @@ from ._registry import finish
 
 class GymAcrobot(AbstractDynamics):
     """Gym's arithmetic for the acrobot: one Runge-Kutta step of order 4, the torque
-    held; then the angles are wrapped to +-pi and the velocities clipped; then `w` is
-    added.
+    held with `w` added to it; then the angles are wrapped to +-pi and the velocities
+    clipped.
 
     Not smooth where a velocity meets its limit: the gradient through it is 0 beyond.
-    The state jumps where an angle wraps, the gradient does not.
+    The state jumps where an angle wraps, the gradient does not. The smooth variant is
+    [`delucax.Discretized`][] of the same system.
 
     **Arguments:**
 
@@ -61,13 +63,18 @@ class GymAcrobot(AbstractDynamics):
     state_units = Acrobot.state_units
     control_units = Acrobot.control_units
 
+    @property
+    def disturbance_size(self) -> int:
+        """That of the system."""
+        return self.system.disturbance_size
+
     def __check_init__(self):
         check_step(self.dt, "GymAcrobot")
         check_positive(self.max_velocity_1, "max_velocity_1", "GymAcrobot")
         check_positive(self.max_velocity_2, "max_velocity_2", "GymAcrobot")
 
     def advance(self, t, x, u, w):
-        field = lambda t, x: self.system.vector_field(t, x, u, None)
+        field = lambda t, x: self.system.vector_field(t, x, u, w)
         free = runge_kutta_step(RK4.tableau, field, t, x, self.dt)
         x_next = jnp.stack(
             [
@@ -77,8 +84,6 @@ class GymAcrobot(AbstractDynamics):
                 clip(free[3], -self.max_velocity_2, self.max_velocity_2),
             ]
         )
-        if w is not None:
-            x_next = x_next + w
         return x_next.astype(x.dtype), RESULTS.successful
 
     def difference(self, x, x_ref):
@@ -131,6 +136,7 @@ def acrobot(
     dt: Any = 0.2,
     horizon: int = 500,
     max_torque: Any = 1.0,
+    torque_noise: Any = None,
     goal_height: Any = 1.0,
     max_velocity_1: Any = None,
     max_velocity_2: Any = None,
@@ -141,10 +147,10 @@ def acrobot(
     """Swing the tip of two hanging links above a line, by a torque at the elbow.
 
     State (angle_1, angle_2, velocity_1, velocity_2), hanging at 0; control (torque);
-    the integer actions 0, 1, 2 are the torques -1, 0, 1. Starts with each state uniform
-    in +-0.1. A step costs 1; the episode ends when
-    `-cos(angle_1) - cos(angle_1 + angle_2) > goal_height`, which takes 1 off the cost:
-    Gym rewards the last step with 0.
+    disturbance (push), a torque that is added; the integer actions 0, 1, 2 are the
+    torques -1, 0, 1. Starts with each state uniform in +-0.1. A step costs 1; the
+    episode ends when `-cos(angle_1) - cos(angle_1 + angle_2) > goal_height`, which
+    takes 1 off the cost: Gym rewards the last step with 0.
 
     That cost has no gradient. For planning and policy gradients give
     `cost=`[`delucax.costs.AcrobotHeight`][]`()` and `terminated=None`, and a `solver`
@@ -157,6 +163,8 @@ def acrobot(
     - `dt`: the control interval, 0.2 by default.
     - `horizon`: steps an episode, 500 by default.
     - `max_torque`: 1 by default.
+    - `torque_noise`: at each step a torque drawn uniformly from +-torque_noise is
+        added, beyond the bounds too, as by Gym's `torque_noise_max`; none by default.
     - `goal_height`: of the line above the first joint, in lengths of a link, 1 by
         default.
     - `max_velocity_1`, `max_velocity_2`: the limits of Gym's arithmetic, 4 pi and 9 pi
@@ -169,8 +177,8 @@ def acrobot(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, `substeps` without `solver`, or a
-        velocity limit with it.
+    **Raises:** `ValueError` on illegal numbers, `substeps` without `solver`, a
+        velocity limit with it, or `torque_noise` with a `disturbance`.
 
     Source: Gymnasium (Towers et al., 2023), `Acrobot-v1`; Sutton, 1996.
 
@@ -205,15 +213,27 @@ def acrobot(
     dynamics = own_or_solver(
         GymAcrobot, system, dt, solver, substeps, "acrobot", options
     )
+    noise = None
+    if torque_noise is not None:
+        if "disturbance" in environment:
+            raise ValueError("acrobot: give torque_noise or a disturbance, not both.")
+        check_range(torque_noise, "torque_noise", "acrobot")
+        noise = Uniform(-torque_noise, torque_noise, size=1)
+    fastest = np.inf, np.inf
+    if isinstance(dynamics, GymAcrobot):
+        fastest = dynamics.max_velocity_1, dynamics.max_velocity_2
+    seen = jnp.stack([jnp.asarray(end) for end in (1.0, 1.0, 1.0, 1.0, *fastest)])
     above = _AboveLine(goal_height)
     arguments: dict[str, Any] = dict(
         dynamics=dynamics,
         cost=Arrival(above, arrival_cost=-1.0),
+        disturbance=noise,
         initial_state=UniformState(jnp.full(4, -0.1), jnp.full(4, 0.1)),
         control_bounds=(-max_torque, max_torque),
         horizon=horizon,
         terminated=above,
         actions=max_torque * jnp.array([[-1.0], [0.0], [1.0]]),
         encode=acrobot_features,
+        observation_bounds=(-seen, seen),
     )
     return finish(acrobot, arguments, environment)

@@ -118,9 +118,9 @@ def cartpole(
     with each state uniform in +-0.05. A step costs -1; the episode ends when the
     position or the angle leaves its bounds.
 
-    That cost has no gradient. For planning and policy gradients give a
-    [`delucax.costs.Quadratic`][] as `cost`. The linear model about the upright pole is
-    `dlx.linearize(env.dynamics)`.
+    The dynamics are smooth as they are. That cost has no gradient: for planning and
+    policy gradients give a [`delucax.costs.Quadratic`][] as `cost`. The linear model
+    about the upright pole is `dlx.linearize(env.dynamics)`.
 
     **Arguments:**
 
@@ -165,6 +165,9 @@ def cartpole(
     )
     check_positive(max_position, "max_position", "cartpole")
     check_positive(max_angle, "max_angle", "cartpole")
+    # Gym's own: twice where the episode ends, which no state of an episode reaches.
+    ends = (2 * jnp.asarray(max_position), np.inf, 2 * jnp.asarray(max_angle), np.inf)
+    seen = jnp.stack([jnp.asarray(end) for end in ends])
     arguments: dict[str, Any] = dict(
         dynamics=dynamics,
         cost=Arrival(step_cost=-1.0),
@@ -173,6 +176,7 @@ def cartpole(
         horizon=horizon,
         terminated=_Fallen(max_position, max_angle),
         actions=max_force * jnp.array([[-1.0], [1.0]]),
+        observation_bounds=(-seen, seen),
     )
     return finish(cartpole, arguments, environment)
 
@@ -206,7 +210,8 @@ def cartpole_linear(
     - `length`: l, of the rod [m], 1 by default.
     - `gravity`: g [m/s^2], 9.81 by default.
     - `dt`: the step, 0.02 by default.
-    - `horizon`: steps an episode, 200 by default.
+    - `horizon`: steps an episode, 200 by default: 4 s, where the paper's code stops
+        after 10 steps.
     - `**environment`: other arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
 
@@ -255,7 +260,7 @@ def cartpole_linear(
     )
     arguments: dict[str, Any] = dict(
         dynamics=dynamics,
-        cost=Quadratic(jnp.eye(4), jnp.eye(1)),
+        cost=Quadratic(jnp.ones(4), jnp.ones(1)),
         initial_state=UniformState(jnp.full(4, -0.05), jnp.full(4, 0.05)),
         horizon=horizon,
     )

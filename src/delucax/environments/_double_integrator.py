@@ -55,7 +55,7 @@ def double_integrator(
     corner = jnp.array([2.0, 1.0])
     arguments: dict[str, Any] = dict(
         dynamics=Discretized(DoubleIntegrator(mass), dt, solver, substeps),
-        cost=Quadratic(jnp.eye(2), 0.1 * jnp.eye(1)),
+        cost=Quadratic(jnp.ones(2), 0.1 * jnp.ones(1)),
         initial_state=UniformState(-corner, corner),
         control_bounds=(-max_force, max_force),
         horizon=horizon,

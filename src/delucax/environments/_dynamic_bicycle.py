@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from ..dynamics import Discretized
 from ..systems import DynamicBicycle
 from ._environment import Environment, UniformState
-from ._lane import bicycle_features, lane_cost
+from ._lane import bicycle_features, lane_bounds, lane_cost
 from ._registry import finish
 
 
@@ -80,5 +80,6 @@ def dynamic_bicycle(
         control_bounds=(-limit, limit),
         horizon=horizon,
         encode=bicycle_features,
+        observation_bounds=lane_bounds(6),
     )
     return finish(dynamic_bicycle, arguments, environment)

@@ -30,14 +30,20 @@ def bicycle_features(x: Array) -> Array:
     return jnp.concatenate([turned, x[3:]])
 
 
+def lane_bounds(states: int) -> tuple[Array, Array]:
+    """Between which the features lie: the cosine and the sine have bounds."""
+    high = jnp.full(states + 1, jnp.inf).at[2:4].set(1.0)
+    return -high, high
+
+
 def lane_cost(speed: Any, states: int) -> Quadratic:
     """`y^2 + heading^2 + 0.1 (speed - speed*)^2`, 0.1 times the squares of what else
     moves, and `0.1 acceleration^2 + steering^2`."""
     weights = jnp.array([0.0, 1.0, 1.0] + [0.1] * (states - 3))
     target = jnp.zeros(states).at[3].set(speed)
-    effort = jnp.diag(jnp.array([0.1, 1.0]))
+    effort = jnp.array([0.1, 1.0])
     return Quadratic(
-        jnp.diag(weights), effort, state_target=target, difference=heading_difference
+        weights, effort, state_target=target, difference=heading_difference
     )
 
 

@@ -90,7 +90,7 @@ def lds(
     n, m = dynamics.state_size, dynamics.control_size
     arguments: dict[str, Any] = dict(
         dynamics=dynamics,
-        cost=Quadratic(jnp.eye(n), jnp.eye(m)),
+        cost=Quadratic(jnp.ones(n), jnp.ones(m)),
         horizon=horizon,
     )
     return finish(lds, arguments, environment)

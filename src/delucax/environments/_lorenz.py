@@ -59,7 +59,7 @@ def lorenz(
     low, high = jnp.array([-20.0, -20.0, 10.0]), jnp.array([20.0, 20.0, 40.0])
     arguments: dict[str, Any] = dict(
         dynamics=Discretized(system, dt, solver, substeps),
-        cost=Quadratic(jnp.eye(3), 0.001 * jnp.eye(1), state_target=centre),
+        cost=Quadratic(jnp.ones(3), 0.001 * jnp.ones(1), state_target=centre),
         initial_state=UniformState(low, high),
         control_bounds=(-max_control, max_control),
         horizon=horizon,

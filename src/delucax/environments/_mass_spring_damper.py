@@ -60,7 +60,7 @@ def mass_spring_damper(
     corner = jnp.ones(system.state_size)
     arguments: dict[str, Any] = dict(
         dynamics=Discretized(system, dt, solver, substeps),
-        cost=Quadratic(jnp.eye(system.state_size), 0.1 * jnp.eye(1)),
+        cost=Quadratic(jnp.ones(system.state_size), 0.1 * jnp.ones(1)),
         initial_state=UniformState(-corner, corner),
         control_bounds=(-max_force, max_force),
         horizon=horizon,

@@ -69,7 +69,7 @@ def permanent_magnet_motor(
         resistance, d_inductance, q_inductance, flux, inertia, friction, pole_pairs
     )
     x, u = system.equilibrium(speed)
-    Q, R = jnp.diag(jnp.array([0.01, 0.01, 0.001])), 1e-5 * jnp.eye(2)
+    Q, R = jnp.array([0.01, 0.01, 0.001]), 1e-5 * jnp.ones(2)
     corner = jnp.array([1.0, 1.0, 50.0])
     arguments: dict[str, Any] = dict(
         dynamics=Discretized(system, dt, solver, substeps),

@@ -30,7 +30,7 @@ class GymMountainCar(AbstractDynamics):
     added.
 
     Not smooth where the speed or the position meets its limit: the gradient through it
-    is 0 beyond.
+    is 0 beyond. The smooth variant is [`delucax.Discretized`][] of the same system.
 
     **Arguments:**
 
@@ -274,12 +274,20 @@ def _valley(
 ) -> dict[str, Any]:
     """What both tasks share."""
     low, high = jnp.array([-0.6, 0.0]), jnp.array([-0.4, 0.0])
+    dynamics = own_or_solver(
+        GymMountainCar, system, dt, solver, substeps, where, limits
+    )
+    seen = None
+    if isinstance(dynamics, GymMountainCar):
+        seen = (
+            jnp.stack([dynamics.min_position, -dynamics.max_speed]),
+            jnp.stack([dynamics.max_position, dynamics.max_speed]),
+        )
     return dict(
-        dynamics=own_or_solver(
-            GymMountainCar, system, dt, solver, substeps, where, limits
-        ),
+        dynamics=dynamics,
         cost=cost,
         initial_state=UniformState(low, high),
         control_bounds=(-1.0, 1.0),
         terminated=goal,
+        observation_bounds=seen,
     )

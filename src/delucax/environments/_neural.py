@@ -78,7 +78,7 @@ def neural(
     n, m = dynamics.state_size, dynamics.control_size
     arguments: dict[str, Any] = dict(
         dynamics=dynamics,
-        cost=Quadratic(jnp.eye(n), 0.1 * jnp.eye(m)),
+        cost=Quadratic(jnp.ones(n), 0.1 * jnp.ones(m)),
         initial_state=UniformState(-jnp.ones(n), jnp.ones(n)),
         control_bounds=(-max_control, max_control),
         horizon=horizon,

@@ -26,7 +26,8 @@ class GymPendulum(AbstractDynamics):
     `angle_next = angle + velocity_next dt`; then `w` is added.
 
     Not smooth where the speed meets its limit: the gradient through the velocity is 0
-    beyond it. The angle is not wrapped.
+    beyond it. The smooth variant is [`delucax.Discretized`][] of the same system. The
+    angle is not wrapped.
 
     **Arguments:**
 
@@ -120,6 +121,9 @@ def pendulum(
     angle uniform over the circle and the velocity in +-1. Cost
     `wrap(angle)^2 + 0.1 velocity^2 + 0.001 torque^2` a step. Never terminates.
 
+    Not smooth where the speed meets the limit of Gym's arithmetic; a `solver` gives the
+    smooth variant. The slope of the cost jumps where the pendulum hangs straight down.
+
     **Arguments:**
 
     - `mass`, `length`, `gravity`, `damping`: of [`delucax.systems.Pendulum`][].
@@ -154,6 +158,8 @@ def pendulum(
     dynamics = own_or_solver(
         GymPendulum, system, dt, solver, substeps, "pendulum", options
     )
+    fastest = dynamics.max_speed if isinstance(dynamics, GymPendulum) else np.inf
+    seen = jnp.stack([jnp.asarray(end) for end in (1.0, 1.0, fastest)])
     corner = np.array([np.pi, 1.0])
     arguments: dict[str, Any] = dict(
         dynamics=dynamics,
@@ -162,5 +168,6 @@ def pendulum(
         control_bounds=(-max_torque, max_torque),
         horizon=horizon,
         encode=pendulum_features,
+        observation_bounds=(-seen, seen),
     )
     return finish(pendulum, arguments, environment)

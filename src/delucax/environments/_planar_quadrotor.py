@@ -76,7 +76,7 @@ def planar_quadrotor(
     _, hover = PlanarQuadrotor(mass, length, gravity).equilibrium()
     arguments: dict[str, Any] = dict(
         dynamics=Discretized(system, dt, solver or diffrax.Euler(), substeps),
-        cost=Quadratic(jnp.eye(6), 0.1 * jnp.eye(2), control_target=hover),
+        cost=Quadratic(jnp.ones(6), 0.1 * jnp.ones(2), control_target=hover),
         initial_state=jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0]),
         horizon=horizon,
     )

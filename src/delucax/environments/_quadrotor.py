@@ -17,6 +17,10 @@ from ._environment import Environment, UniformState
 from ._registry import finish
 
 
+# The entries of a rotation matrix, with room for what rounding adds.
+_ROTATION = 1.00001
+
+
 class _Start(eqx.Module):
     """A state from a box, its quaternion of length 1."""
 
@@ -123,13 +127,14 @@ def quadrotor(
         turn, yaw = system.arm * high, 2 * system.moment * high
         high = jnp.stack([4 * high, turn, turn, yaw])
         low = -high.at[0].set(0.0)
+    seen = jnp.full(18, jnp.inf).at[3:12].set(_ROTATION)
     corner = jnp.array([1.0] * 3 + [0.0] + [0.2] * 3 + [0.5] * 6)
     weights = jnp.array([1.0] * 7 + [0.1] * 6)
     arguments: dict[str, Any] = dict(
         dynamics=Discretized(system, dt, solver, substeps),
         cost=Quadratic(
-            jnp.diag(weights),
-            0.1 * jnp.eye(4),
+            weights,
+            0.1 * jnp.ones(4),
             state_target=x,
             control_target=hover,
             difference=attitude_difference,
@@ -138,5 +143,6 @@ def quadrotor(
         control_bounds=(low, high),
         horizon=horizon,
         encode=quadrotor_features,
+        observation_bounds=(-seen, seen),
     )
     return finish(quadrotor, arguments, environment)

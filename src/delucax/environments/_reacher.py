@@ -135,11 +135,23 @@ def reacher(
     """
     system = Reacher(mass_1, mass_2, length_1, length_2, gravity)
     cost = ReacherCost(system, goal)
+    reach = system.length_1 + system.length_2
+    ends = [
+        jnp.stack(
+            [
+                *[jnp.full((), sign)] * 4,
+                *[jnp.full((), sign * np.inf)] * 2,
+                *(sign * reach - cost.goal),
+            ]
+        )
+        for sign in (-1.0, 1.0)
+    ]
     arguments: dict[str, Any] = dict(
         dynamics=Discretized(system, dt, solver or diffrax.Euler(), substeps),
         cost=cost,
         initial_state=jnp.array([np.pi / 4, np.pi / 2, 0.0, 0.0]),
         horizon=horizon,
         encode=_Features(cost),
+        observation_bounds=tuple(ends),
     )
     return finish(reacher, arguments, environment)

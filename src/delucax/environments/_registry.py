@@ -38,6 +38,16 @@ _REGISTRY: dict[str, str] = {
 }
 
 
+_MOVES_WHAT_IS_SEEN = {
+    "disturbance",
+    "dynamics",
+    "encode",
+    "initial_state",
+    "sensor_noise",
+    "terminated",
+}
+
+
 def make(name: str, **kwargs: Any) -> Environment:
     """The task of that name.
 
@@ -90,6 +100,9 @@ def finish(
 ) -> Environment:
     """The environment of a task that takes what else there is to give of one.
 
+    The task's `observation_bounds` hold for the task as it is: they are left out where
+    something is given that moves what is seen.
+
     **Raises:** `ValueError` if one of `given` is no argument of `Environment`, with the
     close ones, the task's own among them.
     """
@@ -104,7 +117,10 @@ def finish(
                 f"{task.__name__}: no argument is called {name!r}; did you mean "
                 f"{' or '.join(repr(n) for n in close)}?"
             )
-    return Environment(**{**arguments, **given})
+    arguments = {**arguments, **given}
+    if not _MOVES_WHAT_IS_SEEN.isdisjoint(given) and "observation_bounds" not in given:
+        arguments["observation_bounds"] = None
+    return Environment(**arguments)
 
 
 def register(name: str, entry_point: str) -> None:

@@ -67,7 +67,7 @@ def two_tank(
         upper_area, lower_area, upper_outlet, lower_outlet, gravity, smoothing
     )
     x, u = system.equilibrium(level)
-    Q, R = jnp.diag(jnp.array([0.0, 1.0])), 0.01 * jnp.eye(1)
+    Q, R = jnp.array([0.0, 1.0]), 0.01 * jnp.ones(1)
     arguments: dict[str, Any] = dict(
         dynamics=Discretized(system, dt, solver, substeps),
         cost=Quadratic(Q, R, state_target=x, control_target=u),

@@ -55,7 +55,7 @@ def van_der_pol(
     corner = jnp.full(2, 2.0)
     arguments: dict[str, Any] = dict(
         dynamics=Discretized(VanDerPol(mu), dt, solver, substeps),
-        cost=Quadratic(jnp.eye(2), 0.1 * jnp.eye(1)),
+        cost=Quadratic(jnp.ones(2), 0.1 * jnp.ones(1)),
         initial_state=UniformState(-corner, corner),
         control_bounds=(-max_control, max_control),
         horizon=horizon,

@@ -67,11 +67,15 @@ def quadratic_form(matrix: ArrayLike, vector: ArrayLike) -> Array:
         ```
     """
     vector = jnp.asarray(vector)
-    product = matvec(matrix, vector)
-    (n,) = vector.shape
-    if n == 0 or n * n > _UNROLL:
-        return vector @ product
-    total = vector[0] * product[0]
+    return dot(vector, matvec(matrix, vector))
+
+
+def dot(a: Array, b: Array) -> Array:
+    """The sum of the products of two vectors, a few written out."""
+    (n,) = a.shape
+    if n == 0 or n > _UNROLL:
+        return a @ b
+    total = a[0] * b[0]
     for i in range(1, n):
-        total = total + vector[i] * product[i]
+        total = total + a[i] * b[i]
     return total

@@ -27,9 +27,10 @@ class Acrobot(AbstractSystem):
     ```
 
     The state is (angle_1 [rad], angle_2 [rad], velocity_1 [rad/s], velocity_2 [rad/s]),
-    the control is (torque [N m]). `angle_1 = 0` hangs down; `angle_2` is measured from
-    the line of the first link. The vector field is smooth. The equilibrium that it
-    names is the upright one, `angle_1 = pi`.
+    the control is (torque [N m]), to which the disturbance w, (push [N m]), is added.
+    `angle_1 = 0` hangs down; `angle_2` is measured from the line of the first link. The
+    vector field is smooth. The equilibrium that it names is the upright one,
+    `angle_1 = pi`.
 
     **Arguments:**
 
@@ -72,6 +73,7 @@ class Acrobot(AbstractSystem):
 
     state_names: ClassVar = ("angle_1", "angle_2", "velocity_1", "velocity_2")
     control_names: ClassVar = ("torque",)
+    disturbance_names: ClassVar = ("push",)
     state_units: ClassVar = ("rad", "rad", "rad/s", "rad/s")
     control_units: ClassVar = ("N m",)
 
@@ -94,7 +96,8 @@ class Acrobot(AbstractSystem):
         swing = velocity_2 * velocity_2 + 2 * velocity_1 * velocity_2
         phi1 = (m1 * c1 + m2 * l1) * g * sin(angle_1) + phi2
         phi1 = phi1 - m2 * l1 * c2 * swing * bend
-        push = u[0] + d2 / d1 * phi1 - phi2
+        torque = u[0] if w is None else u[0] + w[0]
+        push = torque + d2 / d1 * phi1 - phi2
         if self.form == "book":
             push = push - m2 * l1 * c2 * velocity_1 * velocity_1 * bend
         acceleration_2 = push / (own - d2 * d2 / d1)

@@ -97,7 +97,9 @@ class MassSpringDamper(AbstractSystem):
             tension.append(k[i] * (x[i] - q) + c[i] * (x[n + i] - v))
             q, v = x[i], x[n + i]
         tension.append(u[0])
-        pulls = [(tension[i + 1] - tension[i]) / m[i] for i in range(n)]
+        # Loops compute the reciprocals once.
+        lightness = 1 / m
+        pulls = [(tension[i + 1] - tension[i]) * lightness[i] for i in range(n)]
         return jnp.stack([*(x[n + i] for i in range(n)), *pulls])
 
     def equilibrium(self):

@@ -75,16 +75,17 @@ class PermanentMagnetMotor(AbstractSystem):
         electrical = self.pole_pairs * x[2]
         d_flux = self.d_inductance * x[0] + self.flux
         q_flux = self.q_inductance * x[1]
+        d_voltage = u[0] - self.resistance * x[0] + electrical * q_flux
+        q_voltage = u[1] - self.resistance * x[1] - electrical * d_flux
         torque = self.torque(x) - self.friction * x[2]
         if w is not None:
             torque = torque - w[0]
+        # Loops compute the reciprocals once.
         return jnp.stack(
             [
-                (u[0] - self.resistance * x[0] + electrical * q_flux)
-                / self.d_inductance,
-                (u[1] - self.resistance * x[1] - electrical * d_flux)
-                / self.q_inductance,
-                torque / self.inertia,
+                d_voltage * (1 / self.d_inductance),
+                q_voltage * (1 / self.q_inductance),
+                torque * (1 / self.inertia),
             ]
         )
 
