@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..._fields import parameter, weight
-from ...math import matvec
 
 
 class AbstractPolicy(eqx.Module):
@@ -45,7 +44,7 @@ class LinearPolicy(AbstractPolicy):
         return LinearPolicy(theta, self.radius)
 
     def __call__(self, theta, features):
-        return matvec(theta, features)
+        return theta @ features
 
     def project(self, theta):
         return within(theta, self.radius)
