@@ -11,6 +11,7 @@ from jaxtyping import Array
 from ..._check import check_count, check_key, check_positive
 from ..._controller import AbstractController, AbstractLearner
 from ..._fields import parameter
+from ._learner import OnlineLearner
 
 
 class AdaptiveState(NamedTuple):
@@ -122,7 +123,11 @@ class Adaptive(AbstractController):
             base_key = key
         one = self.base.init(key=base_key)
         experts = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (self.slots, *leaf.shape)), one
+            lambda leaf, axis: (
+                leaf if axis < 0 else jnp.broadcast_to(leaf, (self.slots, *leaf.shape))
+            ),
+            one,
+            self._axes(one),
         )
         first = jnp.arange(self.slots) == 0
         zero = jnp.zeros(())
@@ -139,7 +144,8 @@ class Adaptive(AbstractController):
         )
 
     def __call__(self, t, y, state):
-        act = jax.vmap(self.base, in_axes=(None, None, 0))
+        axes = self._vmapped(state.experts)
+        act = jax.vmap(self.base, in_axes=(None, None, axes), out_axes=(0, axes))
         controls, experts = act(t, y, state.experts)
         if state.chosen is None:
             u = state.weights.astype(y.dtype) @ controls
@@ -149,13 +155,24 @@ class Adaptive(AbstractController):
         return u, state._replace(experts=experts, t=t)
 
     def applied(self, u, cost, state):
-        losses = jax.vmap(self.base.loss, in_axes=(None, 0))(state.t, state.experts)
+        axes = self._vmapped(state.experts)
+        charged = jax.vmap(self.base.loss, in_axes=(None, axes))
+        losses = charged(state.t, state.experts)
         state = self._judge(losses.astype(state.weights.dtype), state)
-        told = jax.vmap(self.base.applied, in_axes=(None, None, 0))
+        told = jax.vmap(self.base.applied, (None, None, axes), out_axes=axes)
         state = state._replace(
             experts=told(u, cost, state.experts), step=state.step + 1
         )
         return self._renew(state)
+
+    def _axes(self, expert: Any) -> Any:
+        """0 for what each expert has its own of, -1 for what is the same for all."""
+        if isinstance(self.base, OnlineLearner):
+            return self.base.own(expert)
+        return jax.tree.map(lambda _: 0, expert)
+
+    def _vmapped(self, experts: Any) -> Any:
+        return jax.tree.map(lambda axis: axis if axis == 0 else None, self._axes(experts))
 
     def _judge(self, losses: Array, state: AdaptiveState) -> AdaptiveState:
         """New weights, and perhaps another choice, after the losses of a step."""
@@ -193,7 +210,10 @@ class Adaptive(AbstractController):
         life = self.every * (4 * divisor + 1)
         newborn = born & (jnp.arange(self.slots) == slot)
         ends = jnp.where(newborn, step + life, ends)
-        old = jax.tree.map(lambda leaf: leaf[slot], state.experts)
+        axes = self._axes(state.experts)
+        old = jax.tree.map(
+            lambda leaf, axis: leaf if axis < 0 else leaf[slot], state.experts, axes
+        )
         new = self.base.fresh(old, None)
 
         def replaced(leaf, before, after):

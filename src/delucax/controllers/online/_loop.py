@@ -211,9 +211,7 @@ class Loop(eqx.Module):
         response: Any = self.response
         if response is None:
             response = state.now.output @ state.impulses
-        # Products and a sum, which XLA fuses with what is around them, as a batched
-        # product of small matrices is not.
-        change = jnp.sum(response * (v_past - state.added)[:, None], axis=(0, 2))
+        change = jnp.einsum("hom,hm->o", response, v_past - state.added)
         p = state.y.shape[0]
         return state.y + change[:p], state.u_base + change[p:] + v
 
