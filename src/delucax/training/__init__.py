@@ -6,3 +6,4 @@ from ._evolution import EvolutionStrategies as EvolutionStrategies
 from ._fit import fit as fit, Fitted as Fitted
 from ._history import History as History
 from ._likelihood import LikelihoodRatio as LikelihoodRatio
+from ._worst_case import Attack as Attack, worst_case as worst_case

@@ -1,0 +1,130 @@
+"""An adversary that sees the state."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._check import as_matrix, check_positive
+from .._fields import parameter
+from ..math import matvec
+from ._base import AbstractDynamics
+
+
+class WorstCase(AbstractDynamics):
+    """Dynamics with an adversary who sees the state and adds to the disturbance,
+
+    `x_next = F(t, x, u, w + L difference(x, x_ref))`,
+
+    about the operating point that the dynamics name. With the `L` of
+    [`delucax.controllers.HInfinity`][] or of [`delucax.riccati.hinf_dare`][] it is the
+    worst disturbance of the H-infinity game; a `bound` keeps it within what a
+    disturbance can be.
+
+    **Arguments:**
+
+    - `dynamics`: the plant, which names an equilibrium.
+    - `L`: the adversary's gain, shape `(k, n)`.
+    - `bound`: what it adds is scaled back to this Euclidean norm; none by default.
+
+    **Raises:** `ValueError` if `dynamics` are none or name no equilibrium, `L` does not
+    fit them, or `bound` is not positive.
+
+    Source: Basar and Bernhard, 1995.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
+        dynamics = dlx.LinearDynamics(A, B)
+        robust = dlx.controllers.HInfinity(dynamics, jnp.eye(2), jnp.eye(1))
+        attacked = dlx.dynamics.WorstCase(dynamics, 0.9 * robust.L, bound=1.0)
+        env = dlx.Environment(attacked, dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1)))
+        x0 = jnp.ones(2)
+        dlx.rollout(env, robust, key=jax.random.key(0), x0=x0, horizon=50).total_cost
+        ```
+    """
+
+    dynamics: AbstractDynamics
+    L: Float[Array, "k n"] = parameter()
+    bound: Array | None = parameter()
+
+    def __init__(self, dynamics: AbstractDynamics, L: Any, *, bound: Any = None):
+        where = "WorstCase"
+        if not isinstance(dynamics, AbstractDynamics):
+            raise ValueError(
+                f"{where}: dynamics must be an AbstractDynamics, got "
+                f"{type(dynamics).__name__}."
+            )
+        dynamics.equilibrium()
+        self.L = as_matrix(L, "L", where)
+        shape = dynamics.disturbance_size, dynamics.state_size
+        if self.L.shape != shape:
+            raise ValueError(
+                f"{where}: L must have shape {shape}, a row for each disturbance and a "
+                f"column for each state, got shape {self.L.shape}."
+            )
+        if bound is not None:
+            check_positive(bound, "bound", where)
+        self.dynamics, self.bound = dynamics, bound
+
+    @property
+    def dt(self):
+        return self.dynamics.dt
+
+    @property
+    def state_names(self):
+        return self.dynamics.state_names
+
+    @property
+    def control_names(self):
+        return self.dynamics.control_names
+
+    @property
+    def state_units(self):
+        return self.dynamics.state_units
+
+    @property
+    def control_units(self):
+        return self.dynamics.control_units
+
+    @property
+    def disturbance_size(self):
+        return self.dynamics.disturbance_size
+
+    @property
+    def is_stochastic(self):
+        return self.dynamics.is_stochastic
+
+    def attack(self, x: Array) -> Array:
+        """What the adversary adds to the disturbance.
+
+        **Arguments:** `x`: the state.
+
+        **Returns:** shape `(k,)`.
+        """
+        x_ref, _ = self.dynamics.equilibrium()
+        added = matvec(self.L, self.dynamics.difference(x, x_ref)).astype(x.dtype)
+        if self.bound is None:
+            return added
+        squared = jnp.sum(added**2)
+        over = squared > self.bound**2
+        norm = jnp.sqrt(jnp.where(over, squared, 1))
+        return jnp.where(over, self.bound / norm, 1).astype(x.dtype) * added
+
+    def advance(self, t, x, u, w):
+        added = self.attack(x)
+        return self.dynamics.advance(t, x, u, added if w is None else w + added)
+
+    def observe(self, t, x):
+        return self.dynamics.observe(t, x)
+
+    def difference(self, x, x_ref):
+        return self.dynamics.difference(x, x_ref)
+
+    def equilibrium(self):
+        return self.dynamics.equilibrium()
