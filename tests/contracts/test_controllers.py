@@ -206,7 +206,8 @@ def test_every_controller_is_listed():
         for name, member in vars(c).items()
         if inspect.isclass(member) and issubclass(member, dlx.AbstractController)
     }
-    listed = {type(case.make(1.0)).__name__ for case in CASES.values()}
+    made = lambda case: eqx.filter_eval_shape(case.make, 1.0)
+    listed = {type(made(case)).__name__ for case in CASES.values()}
     assert members - listed == set()
     assert members >= {"Zero", "LQR", "PID", "MLP", "Gaussian"}
 
@@ -280,6 +281,7 @@ def test_scan(case, key):
     assert_close(controls, run.controls, rtol=1e-11, atol=1e-12)
 
 
+@needs_x64
 @every
 def test_grad(case, key):
     """Every number that it holds has a finite gradient, and the right one."""
@@ -295,8 +297,6 @@ def test_grad(case, key):
 
     _, gradient = cost(flat)
     assert np.all(np.isfinite(gradient))
-    if not jax.config.jax_enable_x64:
-        return
     # One direction a leaf, so that none hides behind a larger one.
     rng, start, h = np.random.default_rng(0), 0, 1e-6
     for path, leaf in jax.tree_util.tree_leaves_with_path(arrays):

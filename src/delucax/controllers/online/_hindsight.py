@@ -193,35 +193,43 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
         options |= dict(keep=keep, checkpoint=checkpoint)
         return found, rollout(environment, found, x0=x0, w=w, **options)
 
-    def total(theta):
-        return run(theta, checkpoint="sqrt")[1].total_cost
+    def derivatives(theta):
+        total = lambda theta: run(theta, checkpoint="sqrt")[1].total_cost  # noqa: E731
+        both = jax.value_and_grad(total)
+        (cost, gradient), along = jax.linearize(both, theta)
+        _, hessian = jax.vmap(along)(eye)
+        return cost, gradient, (hessian + hessian.T) / 2
 
     def step(carry):
-        theta, cost, damping, _, k = carry
-        gradient, hessian = jax.grad(total)(theta), jax.hessian(total)(theta)
-        unit = jnp.trace(jnp.abs(hessian)) / len(theta)
-        unit = jnp.where(unit > 0, unit, 1)
-        damped = hessian + damping * unit * jnp.eye(len(theta), dtype=theta.dtype)
+        best, found, damping, _, k = carry
+        cost, gradient, hessian = found
+        size = jnp.trace(jnp.abs(hessian)) / len(start)
+        damped = hessian + damping * jnp.where(size > 0, size, 1) * eye
         move = solve(damped, -gradient[:, None])[:, 0]
+        move = jnp.where(k > 0, move, 0)
         promised = -(gradient @ move + move @ hessian @ move / 2)
-        tried = total(theta + move)
-        better = (tried < cost) & jnp.all(jnp.isfinite(move))
-        theta = jnp.where(better, theta + move, theta)
+        tried = derivatives(best + move)
+        better = tried[0] < cost
+        pick = lambda new, old: jnp.where(better, new, old)  # noqa: E731
+        left = promised / (jnp.abs(cost) + jnp.finfo(start.dtype).tiny)
         # What is promised below rounding is not to be had.
-        left = jnp.where(promised > 0, promised / (1e-30 + jnp.abs(cost)), jnp.inf)
-        left = jnp.where(better | (left <= tolerance), left, jnp.inf)
-        # Never so little that rounding moves what the cost does not see.
-        damping = jnp.where(better, jnp.maximum(damping / 10, least), damping * 10)
-        return theta, jnp.where(better, tried, cost), damping, left, k + 1
+        left = jnp.where((k > 0) & (promised >= 0), left, jnp.inf)
+        # Never so little damping that rounding moves what the cost does not see.
+        damping = pick(jnp.maximum(damping / 10, least), damping * 10)
+        found = jax.tree.map(pick, tried, found)
+        return pick(best + move, best), found, damping, left, k + 1
 
     def going(carry):
         *_, left, k = carry
-        return (k < iterations) & ~(left <= tolerance)
+        return (k <= iterations) & ~(left <= tolerance)
 
+    eye = jnp.eye(len(start), dtype=start.dtype)
     least = jnp.finfo(start.dtype).eps ** 0.75
-    carry = start, total(start), 10 * least, jnp.asarray(jnp.inf, start.dtype), 0
+    # The first step stays where it is, and is better than this.
+    unknown = jnp.asarray(jnp.inf, start.dtype), jnp.zeros_like(start), 0 * eye
+    carry = start, unknown, 100 * least, jnp.asarray(jnp.inf, start.dtype), 0
     theta, _, _, left, k = lax.while_loop(going, step, carry)
     found, trajectory = run(theta, ("states", "controls", "costs", "disturbances"))
     converged = left <= tolerance
     result = choose(converged, RESULTS.successful, RESULTS.not_converged)
-    return Hindsight(found, trajectory, left, jnp.asarray(k), result)
+    return Hindsight(found, trajectory, left, jnp.asarray(k - 1), result)
