@@ -49,7 +49,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     infeasible = (
         "The problem has no solution: the cost has no unique minimum over the control, "
-        "or gamma is below the least level that any controller attains."
+        "the constraints cannot all hold, or gamma is below the least level that any "
+        "controller attains."
     )
 
 

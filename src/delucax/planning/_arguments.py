@@ -1,0 +1,97 @@
+"""Arguments that every planner takes, checked."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import as_bounds, as_vector, check_finite
+from .._fields import as_float_array, as_module
+from ..costs import AbstractCost
+from ..dynamics import AbstractDynamics
+from ._constraints import Constraints
+from ._problem import Problem
+
+
+def as_problem(
+    dynamics: Any,
+    cost: Any,
+    x0: Any,
+    controls: Any,
+    t0: Any,
+    w: Any,
+    bounds: Any,
+    difference: Any,
+    constraints: Any,
+    where: str,
+) -> tuple[Problem, Array]:
+    """The problem, and the controls to start from, or an error."""
+    if not isinstance(dynamics, AbstractDynamics):
+        raise ValueError(
+            f"{where}: dynamics must be an AbstractDynamics (for an environment, its "
+            f"`dynamics`), got {type(dynamics).__name__}."
+        )
+    if not isinstance(cost, AbstractCost):
+        raise ValueError(
+            f"{where}: cost must be an AbstractCost, got {type(cost).__name__}."
+        )
+    m = dynamics.control_size
+    x0 = as_vector(x0, dynamics.state_size, "x0", where)
+    check_finite(x0, "x0", where)
+    controls = as_sequence(controls, None, m, "controls", where)
+    T = controls.shape[0]
+    if w is not None:
+        w = as_sequence(w, T, dynamics.disturbance_size, "w", where)
+    t0 = as_float_array(t0)
+    if not eqx.is_inexact_array(t0) or t0.shape != ():
+        raise ValueError(f"{where}: t0 must be a number, got {t0!r}.")
+    check_finite(t0, "t0", where)
+    if difference is not None and not callable(difference):
+        raise ValueError(f"{where}: difference must be a function, got {difference!r}.")
+    if constraints is not None and not isinstance(constraints, Constraints):
+        raise ValueError(
+            f"{where}: constraints must be delucax.planning.Constraints, got "
+            f"{type(constraints).__name__}."
+        )
+    dtype = jnp.result_type(x0, controls)
+    low = high = None
+    ends = as_bounds(bounds, where)
+    if ends is not None:
+        for end in ends:
+            if end.shape not in ((), (m,)):
+                raise ValueError(
+                    f"{where}: bounds must be numbers or vectors of {m} entries, one "
+                    f"for each control, got shape {end.shape}."
+                )
+        low, high = (jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
+    problem = Problem(
+        dynamics,
+        cost,
+        x0.astype(dtype),
+        t0.astype(dtype),
+        w,
+        low,
+        high,
+        as_module(difference),
+        constraints,
+    )
+    return problem, controls.astype(dtype)
+
+
+def as_sequence(
+    value: Any, steps: int | None, size: int, name: str, where: str
+) -> Array:
+    """`value` as a finite array of `steps` rows of `size` entries, or an error."""
+    array = as_float_array(value)
+    fits = eqx.is_inexact_array(array) and array.ndim == 2 and array.shape[1] == size
+    if not fits or steps is not None and array.shape[0] != steps:
+        got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+        rows = "steps" if steps is None else steps
+        raise ValueError(
+            f"{where}: {name} must have shape ({rows}, {size}), got {got}."
+        )
+    if array.shape[0] == 0:
+        raise ValueError(f"{where}: {name} must have at least one step, got horizon 0.")
+    check_finite(array, name, where)
+    return array

@@ -1,0 +1,135 @@
+"""Constraints, by the method of multipliers."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ._constraints import (
+    final_equalities,
+    final_values,
+    Multipliers,
+    stage_equalities,
+    stage_values,
+    updated,
+    violated,
+)
+from ._descent import (
+    CONVERGED,
+    DIVERGED,
+    INFEASIBLE,
+    NOT_CONVERGED,
+    optimise,
+    Options,
+    Outcome,
+    Tolerances,
+)
+from ._problem import Problem
+
+
+FIRST_RHO = 10.0
+GROWTH = 10.0
+ENOUGH = 0.25
+"""The weight stays if the violation falls to this share."""
+
+
+class _Progress(NamedTuple):
+    out: Outcome
+    rho: Array
+    tolerance: Array
+    done: Array
+
+
+def with_constraints(
+    problem: Problem,
+    controls: Array,
+    guess: Array | None,
+    tolerances: Tolerances,
+    options: Options,
+) -> Outcome:
+    """Minimise the augmented Lagrangian, update the multipliers, and so on.
+
+    Source: Bertsekas, 1982; Howell, Jackson and Manchester, 2019 (in this setting).
+    """
+    if problem.constraints is None:
+        return optimise(problem, controls, guess, tolerances.gradient, options)
+    constraints, T = problem.constraints, controls.shape[0]
+    dtype = problem.x0.dtype
+    most_rho = 1 / jnp.finfo(dtype).eps ** 0.6
+
+    def constrained(states, controls):
+        times = problem.times(T)
+        here = lambda t, x, u: stage_values(constraints, t, x, u)
+        stage = jax.vmap(here)(times[:-1], states[:-1], controls)
+        return stage, final_values(constraints, times[-1], states[-1])
+
+    equal = (
+        stage_equalities(constraints, problem.x0, controls[0]),
+        final_equalities(constraints, problem.x0),
+    )
+
+    def inner(controls, states, multipliers, tolerance, before):
+        augmented = eqx.tree_at(
+            lambda p: p.multipliers, problem, multipliers, is_leaf=lambda p: p is None
+        )
+        start = None if guess is None else states
+        tolerance = jnp.maximum(tolerance, tolerances.gradient)
+        out = optimise(augmented, controls, start, tolerance, options, before)
+        values = constrained(out.states, out.controls)
+        rho = multipliers.rho
+        known = multipliers.stage, multipliers.final
+        each = list(zip(values, known, equal, strict=True))
+        y = [updated(c, y, rho, e) for c, y, e in each]
+        missed = [jnp.max(violated(c, y, rho, e), initial=0.0) for c, y, e in each]
+        violation = jnp.maximum(*missed)
+        return out._replace(
+            violation=violation, multipliers=Multipliers(y[0], y[1], rho)
+        )
+
+    def body(before):
+        out, rho = before.out, before.rho
+        assert out.multipliers is not None
+        multipliers = out.multipliers._replace(rho=rho)
+        after = inner(out.controls, out.states, multipliers, before.tolerance, out)
+        precise = before.tolerance <= tolerances.gradient
+        holds = after.violation <= tolerances.constraints
+        settled = (after.status == CONVERGED) & precise & holds
+        spent = after.iterations >= options.max_iterations
+        enough = holds | (after.violation <= ENOUGH * out.violation)
+        rho = jnp.where(enough, rho, GROWTH * rho)
+        hopeless = (rho > most_rho) & ~settled & ~spent
+        status = jnp.where(settled, CONVERGED, NOT_CONVERGED)
+        status = jnp.where(hopeless, INFEASIBLE, status)
+        lost = after.status == DIVERGED
+        status = jnp.where(lost, DIVERGED, status)
+        # Once the constraints hold, the last minimisations are to full precision.
+        tolerance = before.tolerance * jnp.where(holds, 0, 0.1)
+        done = settled | spent | hopeless | lost
+        return _Progress(after._replace(status=status), rho, tolerance, done)
+
+    zero = jnp.zeros((), dtype)
+    sizes = jax.eval_shape(constrained, jnp.zeros((T + 1, *problem.x0.shape)), controls)
+    y = tuple(jnp.zeros(c.shape, dtype) for c in sizes)
+    still = jnp.broadcast_to(problem.x0, (T + 1, *problem.x0.shape))
+    states = still if guess is None else guess
+    start = Outcome(
+        states=states,
+        controls=controls,
+        gains=jnp.zeros((T, controls.shape[1], problem.x0.shape[0]), dtype),
+        cost=zero,
+        residual=zero,
+        trace=jnp.zeros(options.max_iterations + 1, dtype),
+        status=jnp.asarray(NOT_CONVERGED),
+        iterations=jnp.asarray(0),
+        rollouts=jnp.asarray(0),
+        mu=zero,
+        violation=jnp.full((), jnp.inf, dtype),
+        multipliers=Multipliers(y[0], y[1], zero),
+    )
+    rho, loose = jnp.full((), FIRST_RHO, dtype), jnp.full((), 1e-2, dtype)
+    first = _Progress(start, rho, loose, jnp.asarray(False))
+    out = lax.while_loop(lambda progress: ~progress.done, body, first).out
+    return out._replace(cost=problem.total(out.states, out.controls))

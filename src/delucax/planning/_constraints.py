@@ -1,0 +1,136 @@
+"""Constraints on states and controls, and what they add to the cost."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._fields import check_parameters, function_field
+
+
+class Constraints(eqx.Module):
+    """What must hold along a plan: `inequality(t, x, u) <= 0` and
+    `equality(t, x, u) = 0` at each step, `final_inequality(t, x) <= 0` and
+    `final_equality(t, x) = 0` at the end.
+
+    Each returns a number or a vector. The constraints of a step hold at the first one
+    too, where the state is given: one on the state alone must hold there anyway. Bounds
+    on the controls alone are cheaper as `bounds` of the planner.
+
+    **Arguments:**
+
+    - `inequality`: a function of time, state and control; none by default.
+    - `equality`: likewise; none by default.
+    - `final_inequality`: a function of time and the last state; none by default.
+    - `final_equality`: likewise; none by default.
+
+    A function that is a module with [`delucax.parameter`][] fields can be
+    differentiated with respect to them.
+
+    **Raises:** `ValueError` if one is no function, or if there is none.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        slow = lambda t, x, u: jnp.abs(x[1]) - 3.0
+        upright = lambda t, x: x
+        constraints = dlx.planning.Constraints(slow, final_equality=upright)
+        dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+        cost = dlx.costs.Quadratic([0.0, 0.0], [1.0])
+        plan = dlx.planning.ilqr(
+            dynamics,
+            cost,
+            jnp.array([1.0, 0.0]),
+            jnp.zeros((20, 1)),
+            constraints=constraints,
+        )
+        plan.states[-1], plan.violation
+        ```
+    """
+
+    inequality: Callable[[Any, Any, Any], Any] | None = function_field(None)
+    equality: Callable[[Any, Any, Any], Any] | None = function_field(None)
+    final_inequality: Callable[[Any, Any], Any] | None = function_field(None)
+    final_equality: Callable[[Any, Any], Any] | None = function_field(None)
+
+    def __check_init__(self):
+        check_parameters(self)
+        if self.inequality is None and self.equality is None:
+            if self.final_inequality is None and self.final_equality is None:
+                raise ValueError("Constraints: at least one function must be given.")
+
+
+class Multipliers(NamedTuple):
+    """Of the constraints: at each step, at the end, and the weight of the squares."""
+
+    stage: Array  # (T, p)
+    final: Array  # (q,)
+    rho: Array
+
+
+def values_of(functions: tuple[Any, Any], arguments: tuple, dtype: Any) -> Array:
+    """Of the inequalities, then the equalities, as one vector."""
+    found = [jnp.zeros(0, dtype)]
+    for function in functions:
+        if function is not None:
+            found.append(jnp.ravel(jnp.asarray(function(*arguments), dtype)))
+    return jnp.concatenate(found)
+
+
+def stage_values(constraints: Constraints, t: Any, x: Array, u: Array) -> Array:
+    """Of the constraints of a step."""
+    functions = constraints.inequality, constraints.equality
+    return values_of(functions, (t, x, u), x.dtype)
+
+
+def final_values(constraints: Constraints, t: Any, x: Array) -> Array:
+    """Of the constraints at the end."""
+    functions = constraints.final_inequality, constraints.final_equality
+    return values_of(functions, (t, x), x.dtype)
+
+
+def is_equality(functions: tuple[Any, Any], arguments: tuple, dtype: Any) -> Array:
+    """Which entries of `values_of` are of equalities."""
+    size = lambda pair: eqx.filter_eval_shape(values_of, pair, arguments, dtype).size
+    first, second = functions
+    above, both = size((first, None)), size((first, second))
+    return jnp.arange(both) >= above
+
+
+def stage_equalities(constraints: Constraints, x: Array, u: Array) -> Array:
+    """Which of the constraints of a step are equalities."""
+    functions = constraints.inequality, constraints.equality
+    return is_equality(functions, (jnp.zeros((), x.dtype), x, u), x.dtype)
+
+
+def final_equalities(constraints: Constraints, x: Array) -> Array:
+    """Which of the constraints at the end are equalities."""
+    functions = constraints.final_inequality, constraints.final_equality
+    return is_equality(functions, (jnp.zeros((), x.dtype), x), x.dtype)
+
+
+def augmented(c: Array, y: Array, rho: Array, equal: Array) -> Array:
+    """What constraints with values `c` and multipliers `y` add to the cost.
+
+    Source: Hestenes, 1969; Powell, 1969; Rockafellar, 1973 (inequalities).
+    """
+    raised = y + rho * c
+    active = equal | (raised > 0)
+    safe = jnp.where(rho > 0, rho, 1)
+    return jnp.sum(jnp.where(active, c * (y + rho * c / 2), -(y**2) / (2 * safe)))
+
+
+def updated(c: Array, y: Array, rho: Array, equal: Array) -> Array:
+    """The multipliers after a minimisation."""
+    return jnp.where(equal, y + rho * c, jnp.maximum(y + rho * c, 0))
+
+
+def violated(c: Array, y: Array, rho: Array, equal: Array) -> Array:
+    """How far each constraint is from holding, or its multiplier from being needed."""
+    slack = jnp.maximum(c, -y / rho)
+    return jnp.where(equal, jnp.abs(c), jnp.abs(slack))

@@ -1,0 +1,257 @@
+"""The iteration of iterative LQR and differential dynamic programming."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ._constraints import Multipliers
+from ._lq import in_parallel, in_sequence, Policy, promised, Stages
+from ._problem import gaps_of, model, Problem, roll_out
+from ._search import Found, search
+
+
+FACTOR = 2.0
+LEAST_MU = 1e-6
+MOST_MU = 1e10
+
+NOT_CONVERGED, CONVERGED, NO_DESCENT, DIVERGED, INFEASIBLE = range(5)
+
+
+class Options(eqx.Module):
+    """What is fixed when the planner is compiled."""
+
+    second_order: bool = eqx.field(static=True)
+    on_state: bool = eqx.field(static=True)
+    line_search: str = eqx.field(static=True)
+    parallel: bool = eqx.field(static=True)
+    max_iterations: int = eqx.field(static=True)
+
+
+class Tolerances(NamedTuple):
+    """How precise the solution has to be."""
+
+    gradient: Array
+    constraints: Array
+
+
+class Outcome(NamedTuple):
+    """What the iteration ends with."""
+
+    states: Array
+    controls: Array
+    gains: Array
+    cost: Array
+    residual: Array
+    trace: Array
+    status: Array
+    iterations: Array
+    rollouts: Array
+    mu: Array
+    violation: Array
+    multipliers: Multipliers | None
+
+
+class _Progress(NamedTuple):
+    now: Found
+    gains: Array
+    mu: Array
+    delta: Array
+    curved: Array
+    penalty: Array
+    residual: Array
+    trace: Array
+    iteration: Array
+    status: Array
+    done: Array
+
+
+def optimise(
+    problem: Problem,
+    controls: Array,
+    guess: Array | None,
+    tolerance: Array,
+    options: Options,
+    before: Outcome | None = None,
+) -> Outcome:
+    """Iterate from controls, and from states that need not follow from them if there
+    is a guess of those; counting on from `before`, if that is given."""
+    T, m = controls.shape
+    dtype = problem.x0.dtype
+    n = problem.x0.shape[0]
+    zero = jnp.zeros((), dtype)
+    controls = jax.vmap(problem.clip)(controls)
+    K, k = jnp.zeros((T, m, n), dtype), jnp.zeros((T, m), dtype)
+    gaps = None
+    if guess is None:
+        still = jnp.broadcast_to(problem.x0, (T + 1, n))
+        start = (problem, still, controls, K, k, zero, None)
+        states, controls, cost = roll_out(*start)
+        # Of a start that diverges at least the controls are as they were given.
+        controls = jnp.where(jnp.isfinite(cost), controls, start[2])
+    else:
+        states = guess.at[0].set(problem.x0)
+        gaps = gaps_of(problem, states, controls)
+        cost = problem.total(states, controls)
+        good = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gaps))
+        cost = jnp.where(good, cost, jnp.inf)
+    lost = ~jnp.isfinite(cost)
+    iteration = jnp.asarray(0) if before is None else before.iterations
+    rollouts = jnp.asarray(0) if before is None else before.rollouts
+    trace = jnp.full((options.max_iterations + 1,), cost)
+    if before is not None:
+        earlier = jnp.arange(options.max_iterations + 1) < iteration
+        trace = jnp.where(earlier, before.trace, trace)
+    now = Found(
+        states,
+        controls,
+        cost,
+        gaps,
+        jnp.asarray(True),
+        jnp.ones((), dtype),
+        rollouts + (1 if guess is None else 0),
+    )
+    first = _Progress(
+        now=now,
+        gains=K,
+        mu=zero,
+        delta=jnp.ones((), dtype),
+        curved=jnp.asarray(True),
+        penalty=zero,
+        residual=jnp.full((), jnp.inf, dtype),
+        trace=trace,
+        iteration=iteration,
+        status=jnp.where(lost, DIVERGED, NOT_CONVERGED),
+        done=lost,
+    )
+
+    def body(before):
+        return _iterate(problem, before, tolerance, options)
+
+    last = lax.while_loop(lambda progress: ~progress.done, body, first)
+    reached = jnp.arange(options.max_iterations + 1) <= last.iteration
+    return Outcome(
+        last.now.states,
+        last.now.controls,
+        last.gains,
+        last.now.cost,
+        last.residual,
+        jnp.where(reached, last.trace, last.now.cost),
+        last.status,
+        last.iteration,
+        last.now.rollouts,
+        last.mu,
+        jnp.zeros((), dtype),
+        problem.multipliers,
+    )
+
+
+def _iterate(
+    problem: Problem, before: _Progress, tolerance: Array, options: Options
+) -> _Progress:
+    now, mu = before.now, before.mu
+    about = problem, now.states, now.controls, now.gaps, options.second_order
+    stages = model(*about, before.curved)
+    policy, residual, settled = directions(
+        problem, stages, now.controls, mu, tolerance, options
+    )
+    penalty = _penalty(before.penalty, now, policy)
+    missed = 0.0 if now.gaps is None else jnp.max(jnp.abs(now.gaps))
+    precise = 1 + jnp.max(jnp.abs(now.states))
+    settled = settled & (missed <= tolerance * precise)
+    # What is promised may be below the rounding of the cost. Full steps still lower the
+    # gradient then; when they no longer do there is nothing left to gain.
+    promise = -policy.slope - policy.curvature / 2
+    rounding = jnp.finfo(now.cost.dtype).eps * jnp.abs(now.cost)
+    spent = (jnp.abs(promise) <= rounding) & (mu == 0) & (tolerance > 0)
+    spent = spent & (missed <= tolerance * precise) & (residual >= before.residual)
+    converged = policy.ok & (settled | spent)
+    out_of_time = before.iteration >= options.max_iterations
+    rest = now._replace(accepted=jnp.asarray(False))
+    found = lax.cond(
+        converged | out_of_time | ~policy.ok,
+        lambda: rest,
+        lambda: search(options.line_search, problem, now, policy, penalty),
+    )
+    # Where the second derivatives make the problem concave, or mislead, it is tried
+    # without them first.
+    flatten = ~found.accepted & before.curved & options.second_order
+    changed = _schedule(found.accepted, mu, before.delta)
+    keep = lambda old, new: jnp.where(flatten, old, new)
+    mu, delta = jax.tree.map(keep, (mu, before.delta), changed)
+    curved = jnp.where(flatten, False, before.curved | found.accepted)
+    if options.line_search == "deluca":
+        stuck, mu = ~found.accepted & ~flatten, jnp.zeros_like(mu)
+    else:
+        stuck = mu > MOST_MU
+    stuck = stuck & ~converged & ~out_of_time
+    ended = converged | out_of_time
+    status = jnp.where(converged, CONVERGED, jnp.where(stuck, NO_DESCENT, 0))
+    iteration = before.iteration + jnp.where(ended, 0, 1)
+    return _Progress(
+        found,
+        jnp.where(policy.ok, policy.K, before.gains),
+        jnp.where(ended, before.mu, mu),
+        delta,
+        curved,
+        penalty,
+        residual,
+        before.trace.at[iteration].set(found.cost),
+        iteration,
+        status,
+        ended | stuck,
+    )
+
+
+def directions(
+    problem: Problem,
+    stages: Stages,
+    controls: Array,
+    mu: Array,
+    tolerance: Array,
+    options: Options,
+) -> tuple[Policy, Array, Array]:
+    """The policy of the model, the residual, and whether that is small enough."""
+    box = None
+    if problem.low is not None and problem.high is not None:
+        box = (problem.low - controls, problem.high - controls)
+    if options.parallel:
+        policy = in_parallel(stages, mu)
+    else:
+        policy = in_sequence(stages, mu, options.on_state, box)
+    if stages.d is not None:
+        slope, bent = promised(stages, policy.K, policy.k)
+        policy = policy._replace(slope=slope, curvature=bent)
+    slope = policy.gradient
+    if box is not None:
+        slope = jnp.minimum(jnp.maximum(-slope, box[0]), box[1])
+    residual = jnp.max(jnp.abs(slope))
+    return policy, residual, residual <= tolerance * (1 + policy.scale)
+
+
+def _penalty(before: Array, now: Found, policy: Policy) -> Array:
+    """A weight of the gaps with which the step goes downhill.
+
+    Source: Nocedal and Wright, 2006, equation 18.36.
+    """
+    if now.gaps is None:
+        return before
+    missed = jnp.sum(jnp.abs(now.gaps))
+    rise = policy.slope + jnp.maximum(policy.curvature, 0) / 2
+    least = rise / (0.9 * jnp.where(missed > 0, missed, 1))
+    return jnp.where(missed > 0, jnp.maximum(before, least), before)
+
+
+def _schedule(accepted: Array, mu: Array, delta: Array) -> tuple[Array, Array]:
+    """The regularisation of the next iteration, and the factor it changed by.
+
+    Source: Tassa, Erez and Todorov, 2012.
+    """
+    down = jnp.minimum(1 / FACTOR, delta / FACTOR)
+    lower = jnp.where(mu * down > LEAST_MU, mu * down, 0)
+    up = jnp.maximum(FACTOR, delta * FACTOR)
+    higher = jnp.maximum(LEAST_MU, mu * up)
+    return jnp.where(accepted, lower, higher), jnp.where(accepted, down, up)

@@ -1,0 +1,245 @@
+"""Derivatives of a plan, by the implicit function theorem.
+
+At a solution the gradient of the Lagrangian is zero. So the change of the solution with
+the problem solves one linear-quadratic problem, with the exact second derivatives.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..math import matvec
+from ._augmented import with_constraints
+from ._constraints import (
+    final_equalities,
+    final_values,
+    Multipliers,
+    stage_equalities,
+    stage_values,
+)
+from ._descent import CONVERGED, Options, Outcome, Tolerances
+from ._lq import apply, in_parallel, in_sequence, product, solve_free, Stages
+from ._poison import poison
+from ._problem import costates_of, model, Problem
+
+
+REFINEMENTS = 20
+"""Of the linear problem with constraints, each of which gains more than a digit."""
+STIFFER = 10.0
+"""The weight of constraints there, times that at which the planner converged."""
+
+
+@eqx.filter_custom_jvp
+def solution(
+    problem: Problem,
+    controls: Array,
+    guess: Array | None,
+    tolerances: Tolerances,
+    *,
+    options: Options,
+) -> Outcome:
+    """What the iteration ends with; differentiable with respect to the problem."""
+    return with_constraints(problem, controls, guess, tolerances, options)
+
+
+@solution.def_jvp
+def _solution_jvp(primals: Any, tangents: Any, *, options: Options) -> Any:
+    with jax.default_matmul_precision("highest"):
+        return _with_tangents(primals, tangents, options)
+
+
+def _with_tangents(primals: Any, tangents: Any, options: Options) -> Any:
+    out = solution(*primals, options=options)
+    problem, change = primals[0], tangents[0]
+    fields = {name: None for name in Outcome._fields}
+    if out.multipliers is not None:
+        fields["multipliers"] = Multipliers(None, None, None)  # pyright: ignore
+    nothing = Outcome(**fields)  # pyright: ignore[reportArgumentType]
+    if not jax.tree.leaves(change):
+        return out, nothing
+    is_none = lambda leaf: leaf is None
+    choose = lambda f: jax.tree.map(f, change, problem, is_leaf=is_none)
+    varied = choose(lambda t, p: None if t is None else p)
+    rest = choose(lambda t, p: p if t is None else None)
+    solved = out.status == CONVERGED
+    # What failed is not used, but must be finite for what is to have a derivative: so
+    # the problem is looked at where it began.
+    x0 = jnp.where(jnp.isfinite(problem.x0), problem.x0, 0)
+    X = jnp.where(solved, out.states, x0)
+    U = jnp.where(solved, out.controls, primals[1])
+    y = out.multipliers
+
+    def given(varied) -> Problem:
+        return eqx.combine(varied, rest)
+
+    dX, dU, dy, free, definite = _change(X, U, y, problem, given, varied, change)
+
+    def cost(varied, X, U):
+        return given(varied).total(X, U)
+
+    def gains(varied, X, U, y):
+        stages = model(held_at(given(varied), y), X, U, None, options.second_order)
+        if options.parallel:
+            return in_parallel(stages, out.mu).K
+        return in_sequence(stages, out.mu, options.on_state, None, free).K
+
+    _, dJ = jax.jvp(cost, (varied, X, U), (change, dX, dU))
+    _, dK = jax.jvp(gains, (varied, X, U, y), (change, dX, dU, dy))
+    ok = solved & definite
+    dX, dU, dK, dJ = (poison(d, ok) for d in (dX, dU, dK, dJ))
+    return out, nothing._replace(states=dX, controls=dU, gains=dK, cost=dJ)
+
+
+def held_at(problem: Problem, multipliers: Multipliers | None) -> Problem:
+    """The problem with the multipliers given."""
+    if multipliers is None:
+        return problem
+    return eqx.tree_at(
+        lambda p: p.multipliers, problem, multipliers, is_leaf=lambda p: p is None
+    )
+
+
+def _change(
+    X: Array, U: Array, y: Multipliers | None, problem: Problem, given, varied, change
+):
+    """Of states, controls and multipliers with the problem; which controls are free;
+    and whether the solution is a strict minimum."""
+    n, T = X.shape[1], U.shape[0]
+    # Without the squares the augmented Lagrangian is the Lagrangian.
+    plain = None if y is None else y._replace(rho=jnp.zeros_like(y.rho))
+    stages = model(held_at(problem, plain), X, U, None, True)
+    costates = costates_of(stages.F, stages.h, stages.v)
+    z = jnp.concatenate([X[:-1], U], axis=1)
+
+    def conditions(varied):
+        problem = held_at(given(varied), plain)
+        times = problem.times(T)
+
+        def lagrangian(z, t, w, y, costate):
+            after = problem.step(t, z[:n], z[n:], w)
+            charged = problem.charged(t, z[:n], z[n:], y)
+            return charged + costate @ after, after
+
+        each = jax.vmap(jax.grad(lagrangian, has_aux=True))
+        h, after = each(z, times[:-1], problem.w, problem.stage_multipliers, costates)
+        v = jax.grad(lambda x: problem.final(times[-1], x))(X[-1])
+        held = None
+        constraints = problem.constraints
+        if constraints is not None:
+            here = lambda z, t: stage_values(constraints, t, z[:n], z[n:])
+            last = final_values(constraints, times[-1], X[-1])
+            held = jax.vmap(here)(z, times[:-1]), last
+        return (h, after, v), problem.x0, (problem.low, problem.high), held
+
+    at, linear = jax.jvp(conditions, (varied,), (change,))
+    ((slope, *_), *_), ((h, d, v), dx0, (dlow, dhigh), dc) = at, linear
+    free, fixed = jnp.ones_like(U, bool), jnp.zeros_like(U)
+    if problem.low is not None and problem.high is not None:
+        at_low = (U <= problem.low) & (slope[:, n:] > 0)
+        at_high = (U >= problem.high) & (slope[:, n:] < 0)
+        free = ~(at_low | at_high)
+        fixed = jnp.where(at_low, dlow, jnp.where(at_high, dhigh, fixed))
+    stages = stages._replace(h=h, d=d, v=v)
+    if y is None:
+        factors = factorise(stages, free)
+        dX, dU = substitute(stages, factors, dx0, fixed, free)
+        return dX, dU, None, free, jnp.all(factors.ok)
+    active = _active(problem, X, U, z, y)
+    dX, dU, dy, ok = _with_constraints(stages, active, dc, y, dx0, fixed, free)
+    return dX, dU, dy, free, ok
+
+
+def _active(problem: Problem, X: Array, U: Array, z: Array, y: Multipliers):
+    """The slopes of the constraints that hold with equality; zero for the others."""
+    constraints, n = problem.constraints, X.shape[1]
+    assert constraints is not None
+    times = problem.times(U.shape[0])
+    here = lambda z, t: stage_values(constraints, t, z[:n], z[n:])
+    slope = jax.vmap(jax.jacfwd(here))(z, times[:-1])
+    last = jax.jacfwd(lambda x: final_values(constraints, times[-1], x))(X[-1])
+    on = stage_equalities(constraints, X[0], U[0]) | (y.stage > 0)
+    at_end = final_equalities(constraints, X[0]) | (y.final > 0)
+    slope = jnp.where(on[..., None], slope, 0)
+    return (slope, on), (jnp.where(at_end[:, None], last, 0), at_end)
+
+
+def _with_constraints(stages, active, dc, y, dx0, fixed, free):
+    """The linear problem with equality constraints, by the method of multipliers."""
+    (G, on), (end, at_end) = active
+    rho = STIFFER * y.rho
+    dc = jnp.where(on, dc[0], 0), jnp.where(at_end, dc[1], 0)
+    H = stages.H + rho * jnp.einsum("tpi,tpj->tij", G, G)
+    V = stages.V + rho * end.T @ end
+    factors = factorise(stages._replace(H=H, V=V), free)
+
+    def minimum(dy):
+        push = rho * dc[0] + dy[0], rho * dc[1] + dy[1]
+        h = stages.h + jnp.einsum("tpi,tp->ti", G, push[0])
+        pushed = stages._replace(H=H, V=V, h=h, v=stages.v + end.T @ push[1])
+        dX, dU = substitute(pushed, factors, dx0, fixed, free)
+        dz = jnp.concatenate([dX[:-1], dU], axis=1)
+        moved = jnp.einsum("tpi,ti->tp", G, dz) + dc[0], end @ dX[-1] + dc[1]
+        return dX, dU, (dy[0] + rho * moved[0], dy[1] + rho * moved[1])
+
+    def refine(dy, _):
+        return minimum(dy)[2], None
+
+    nothing = jnp.zeros_like(y.stage), jnp.zeros_like(y.final)
+    dy, _ = lax.scan(refine, nothing, None, length=REFINEMENTS)
+    dX, dU, dy = minimum(dy)
+    change = Multipliers(dy[0], dy[1], jnp.zeros_like(y.rho))
+    return dX, dU, change, jnp.all(factors.ok)
+
+
+class Factors(NamedTuple):
+    """What a linear problem with other linear terms has in common."""
+
+    K: Array
+    V: Array  # of the next state
+    M: Array  # the rows of the control
+    ok: Array
+
+
+def factorise(stages: Stages, free: Array) -> Factors:
+    """The quadratic part of the recursion, controls that are not free held."""
+    n = stages.V.shape[0]
+
+    def back(V, here):
+        F, H, free = here
+        M = H + product(F.T, product(V, F))
+        K, ok = solve_free(M[n:, n:], M[n:, :n], free)
+        K = jnp.where(ok, K, 0)
+        before = M[:n, :n] - product(M[:n, n:], K)
+        return (before + before.T) / 2, Factors(K, V, M[n:], ok)
+
+    return lax.scan(back, stages.V, (stages.F, stages.H, free), reverse=True)[1]
+
+
+def substitute(
+    stages: Stages, factors: Factors, dx0: Array, fixed: Array, free: Array
+) -> tuple[Array, Array]:
+    """The minimum, linear in `h`, `d`, `v`, `dx0` and the changes `fixed` of the
+    controls that are not free; written so that it transposes."""
+    n = dx0.shape[0]
+
+    def back(v, here):
+        F, h, d, V, M, free, fixed = here
+        g = h + apply(F.T, v + apply(V, d))
+        push = (g[n:] + apply(M[:, n:], fixed))[:, None]
+        change = fixed - solve_free(M[:, n:], push, free)[0][:, 0]
+        return g[:n] + apply(M[:, :n].T, change), change
+
+    xs = (stages.F, stages.h, stages.d, factors.V, factors.M, free, fixed)
+    _, change = lax.scan(back, stages.v, xs, reverse=True)
+
+    def forward(dx, here):
+        F, K, change, d = here
+        du = change - matvec(K, dx)
+        return apply(F, jnp.concatenate([dx, du])) + d, (dx, du)
+
+    last, (dX, dU) = lax.scan(forward, dx0, (stages.F, factors.K, change, stages.d))
+    return jnp.concatenate([dX, last[None]]), dU

@@ -1,0 +1,264 @@
+"""The linear-quadratic problem that each iteration of a planner solves.
+
+`minimise sum_k 1/2 z'H z + h'z + 1/2 x_T'V x_T + v'x_T` along `x_next = F z + d`, with
+`z = (x, u)`: in sequence, or in parallel over time.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..math import matvec
+from ..math._linear_solve import full_precision, is_definite, SMALL, solve
+from ..riccati._recursion import gain, linear_recursion, values
+
+
+_UNROLL = 16
+"""Products of matrices with an inner dimension up to this are written out."""
+
+
+class Stages(NamedTuple):
+    """The problem; `d` is `None` where all defects are zero."""
+
+    F: Array  # (T, n, n + m)
+    H: Array  # (T, n + m, n + m)
+    h: Array  # (T, n + m)
+    d: Array | None  # (T, n)
+    V: Array  # (n, n)
+    v: Array  # (n,)
+
+
+class Policy(NamedTuple):
+    """The changes `-k - K dx` of the controls, and what they promise.
+
+    A step of length `alpha` is promised to change the cost by
+    `alpha slope + alpha^2 curvature / 2`.
+    """
+
+    K: Array
+    k: Array
+    gradient: Array  # of the cost-to-go with respect to each control, (T, m)
+    scale: Array  # the size of the two terms that cancel in it
+    slope: Array
+    curvature: Array
+    ok: Array
+
+
+def product(a: Array, b: Array) -> Array:
+    """`a @ b`, as a sum of outer products where it is small.
+
+    XLA on CPU makes one loop of it that vectorises, where a product of small matrices
+    is a loop of its own for each.
+    """
+    inner = a.shape[1]
+    if inner > _UNROLL:
+        return a @ b
+    total = a[:, 0, None] * b[0]
+    for i in range(1, inner):
+        total = total + a[:, i, None] * b[i]
+    return total
+
+
+def apply(matrix: Array, vector: Array) -> Array:
+    """`matrix @ vector`, written out likewise."""
+    return product(matrix, vector[:, None])[:, 0]
+
+
+def solve_definite(matrix: Array, right: Array) -> tuple[Array, Array]:
+    """`matrix^-1 right` of a symmetric matrix, and whether it is positive definite.
+
+    Where it is not, the solution means nothing, but is finite if its arguments are.
+    """
+    m = matrix.shape[0]
+    if m > SMALL:
+        ok = is_definite(matrix)
+        safe = jnp.where(ok, matrix, jnp.eye(m, dtype=matrix.dtype))
+        return solve(safe, right), ok
+    # No pivoting: a definite matrix needs none. Rows of the matrix start at the
+    # diagonal, as what is to the left of it follows by symmetry. They are kept apart
+    # from the right sides, in which the solution is linear.
+    rows = [matrix[i, i:] for i in range(m)]
+    sides = [right[i] for i in range(m)]
+    least = m * jnp.finfo(matrix.dtype).eps
+    pivots, ok = [], jnp.asarray(True)
+    for i in range(m):
+        good = rows[i][0] > least * jnp.abs(matrix[i, i])
+        ok = ok & good
+        pivots.append(jnp.where(good, rows[i][0], 1))
+        for j in range(i + 1, m):
+            factor = rows[i][j - i] / pivots[i]
+            rows[j] = rows[j] - factor * rows[i][j - i :]
+            sides[j] = sides[j] - factor * sides[i]
+    solved: list[Any] = [None] * m
+    for i in reversed(range(m)):
+        total = sides[i]
+        for j in range(i + 1, m):
+            total = total - rows[i][j - i] * solved[j]
+        solved[i] = total / pivots[i]
+    return jnp.stack(solved), ok
+
+
+@full_precision
+def in_sequence(
+    stages: Stages, mu: Array, on_state: bool, box: Any = None, free: Any = None
+) -> Policy:
+    """The regularised recursion, back in time.
+
+    `box` is `(low, high)` of each change of a control, shapes `(T, m)`, if there are
+    bounds. `free`, boolean, shape `(T, m)`, says which controls may change at all.
+
+    Source: Tassa, Erez and Todorov, 2012; Tassa, Mansard and Todorov, 2014 (bounds).
+    """
+    n = stages.V.shape[0]
+    m = stages.F.shape[2] - n
+
+    def back(carry, here):
+        V, v = carry
+        F, H, h, d, box, free = here
+        VF = product(V, F)
+        M = H + product(F.T, VF)
+        pushed = apply(F.T, v if d is None else v + apply(V, d))
+        g = h + pushed
+        Quu, Qux, Qu = M[n:, n:], M[n:, :n], g[n:]
+        if on_state:
+            extra = mu * product(F[:, n:].T, F)
+        else:
+            extra = mu * jnp.eye(m, n + m, n, dtype=M.dtype)
+        pivot, cross = Quu + extra[:, n:], Qux + extra[:, :n]
+        change = None
+        if box is not None:
+            change, free = box_minimum(pivot, Qu, *box)
+        S, ok = solve_free(pivot, jnp.concatenate([cross, Qu[:, None]], 1), free)
+        K, k = S[:, :n], S[:, n] if change is None else -change
+        ok = ok & jnp.all(jnp.isfinite(k))
+        K, k = jnp.where(ok, K, 0), jnp.where(ok, k, 0)
+        # In this form nothing is assumed of K and k.
+        bent = apply(Quu, k)
+        D = product(K.T, product(Quu, K) - Qux)
+        V = M[:n, :n] + D - product(Qux.T, K)
+        v = g[:n] + apply(K.T, bent - Qu) - apply(Qux.T, k)
+        kept = K, k, Qu, pushed[n:], bent, ok
+        return ((V + V.T) / 2, v), kept
+
+    xs = (stages.F, stages.H, stages.h, stages.d, box, free)
+    _, kept = lax.scan(back, (stages.V, stages.v), xs, reverse=True)
+    K, k, Qu, pushed, bent, ok = kept
+    slope, curvature = -jnp.sum(k * Qu), jnp.sum(k * bent)
+    scale = jnp.max(jnp.abs(pushed))
+    return Policy(K, k, Qu, scale, slope, curvature, jnp.all(ok))
+
+
+def solve_free(matrix: Array, right: Array, free: Array | None) -> tuple[Array, Array]:
+    """As `solve_definite`, over the entries that are free; zero in the others."""
+    if free is None:
+        return solve_definite(matrix, right)
+    both = free[:, None] & free[None]
+    matrix = jnp.where(both, matrix, jnp.eye(free.shape[0], dtype=matrix.dtype))
+    return solve_definite(matrix, jnp.where(free[:, None], right, 0))
+
+
+def box_minimum(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """The minimum of `1/2 u'H u + g'u` between bounds, and which entries are free.
+
+    By projected Newton steps, which find the active bounds in a few.
+
+    Source: Bertsekas, 1982; Tassa, Mansard and Todorov, 2014.
+    """
+    m = g.shape[0]
+    if m == 1:
+        ok = H[0] > 0
+        u = jnp.clip(-g / jnp.where(ok, H[0], 1), low, high)
+        return u, (u > low) & (u < high)
+    slack = 10 * jnp.finfo(g.dtype).eps
+    lengths = 0.5 ** jnp.arange(16.0, dtype=g.dtype)
+    steep = jnp.diagonal(H)
+    steep = jnp.where(steep > 0, steep, 1)
+
+    def gradient(u):
+        return g + matvec(H, u)
+
+    def is_free(u, slope, near):
+        held = (u <= low + near) & (slope > 0) | (u >= high - near) & (slope < 0)
+        return ~held
+
+    def value(u):
+        return jnp.sum(u * (g + gradient(u))) / 2
+
+    def body(state):
+        u, _, count = state
+        slope = gradient(u)
+        # Entries that are near a bound and go to it are kept out of the Newton step,
+        # or they would shorten it.
+        plain = -slope / steep
+        left = jnp.max(jnp.abs(jnp.clip(u + plain, low, high) - u))
+        free = is_free(u, slope, jnp.minimum(left, 0.01 * (high - low)))
+        newton, _ = solve_free(H, -slope[:, None], free)
+        step = jnp.where(free, newton[:, 0], plain)
+        tried = jnp.clip(u + lengths[:, None] * step, low, high)
+        found = jax.vmap(value)(tried)
+        best = tried[jnp.argmin(found)]
+        lower = jnp.min(found) < value(u)
+        after = jnp.where(lower, best, u)
+        going = lower & (left > slack * (1 + jnp.max(jnp.abs(u))))
+        return after, going, count + 1
+
+    def going(state):
+        return state[1] & (state[2] < 10 * m)
+
+    zero = jnp.clip(jnp.zeros_like(g), low, high)
+    u, _, _ = lax.while_loop(going, body, (zero, jnp.asarray(True), 0))
+    return u, is_free(u, gradient(u), 0.0)
+
+
+@full_precision
+def in_parallel(stages: Stages, mu: Array) -> Policy:
+    """The recursion by associative scans, of logarithmic depth in the horizon.
+
+    The control is regularised as if `mu |du|^2 / 2` were a cost.
+
+    Source: Sarkka and Garcia-Fernandez, 2023.
+    """
+    F, H, h, d, V, v = stages
+    n = V.shape[0]
+    m = F.shape[2] - n
+    A, B = F[..., :n], F[..., n:]
+    Q, S, R = H[:, :n, :n], H[:, :n, n:], H[:, n:, n:]
+    damped = R + mu * jnp.eye(m, dtype=F.dtype)
+    X = values(A, B, Q, damped, S, V, 0, True)
+    ok = jnp.all(jnp.isfinite(X))
+    after = jnp.where(ok, X[1:], 0)
+    safe = jnp.where(ok, damped, jnp.eye(m, dtype=F.dtype))
+    K, loop = jax.vmap(gain)(A, B, safe, S, after)
+    q, r = h[:, :n], h[:, n:]
+    shift = 0 if d is None else jnp.einsum("tij,tj->ti", after, d)
+    added = jnp.einsum("tji,tj->ti", loop, shift + jnp.zeros_like(q)) + q
+    added = added - jnp.einsum("tji,tj->ti", K, r)
+    p = linear_recursion(loop, added, v, True, lambda loop, p: loop.T @ p)
+    pushed = jnp.einsum("tji,tj->ti", B, p[1:] + shift)
+    gradient = r + pushed
+    curved = jnp.swapaxes(B, 1, 2) @ after @ B
+    k = jax.vmap(solve)(safe + curved, gradient[..., None])[..., 0]
+    ok = ok & jnp.all(jnp.isfinite(k))
+    K, k = jnp.where(ok, K, 0), jnp.where(ok, k, 0)
+    slope, curvature = promised(stages, K, k)
+    return Policy(K, k, gradient, jnp.max(jnp.abs(pushed)), slope, curvature, ok)
+
+
+def promised(stages: Stages, K: Array, k: Array) -> tuple[Array, Array]:
+    """Slope and curvature of the cost along the step, by following the linear model."""
+    F, H, h, d, V, v = stages
+
+    def forward(dx, here):
+        F, K, k, d = here
+        z = jnp.concatenate([dx, -k - matvec(K, dx)])
+        after = matvec(F, z)
+        return after if d is None else after + d, z
+
+    start = jnp.zeros_like(v)
+    last, z = lax.scan(forward, start, (F, K, k, d))
+    slope = jnp.sum(h * z) + v @ last
+    curvature = jnp.einsum("ti,tij,tj->", z, H, z) + last @ V @ last
+    return slope, curvature

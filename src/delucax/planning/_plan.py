@@ -1,0 +1,93 @@
+"""A plan: a trajectory, and feedback about it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._controller import AbstractController, wrong_observation
+from .._fields import function_field, parameter, weight
+from .._results import Result
+from ..math import matvec
+
+
+class Plan(AbstractController):
+    """A locally optimal trajectory, and a controller that follows it,
+
+    `u = controls[k] - gains[k] (y - states[k])` with `k = round((t - t0) / dt)`,
+
+    between the bounds that it was planned with. Outside the horizon the control is NaN,
+    which a rollout reports. [`delucax.planning.ilqr`][] makes it.
+
+    **Arguments:**
+
+    - `states`: shape `(T+1, n)`.
+    - `controls`: shape `(T, m)`, trainable.
+    - `gains`: shape `(T, m, n)`, trainable. The rows of controls that a bound holds are
+        zero.
+    - `cost`: the cost of the trajectory, with its final cost.
+    - `trace`: the cost at the start and after each iteration, shape
+        `(max_iterations + 1,)`; the last one repeated where there were fewer. With
+        constraints, of the augmented Lagrangian.
+    - `residual`: the largest entry of the gradient of the cost with respect to the
+        controls, of its projection where a bound holds.
+    - `violation`: by how much a constraint is violated, or is inactive although its
+        multiplier is not zero; 0 without constraints.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+    - `iterations`: the iterations taken.
+    - `rollouts`: the trajectories computed, each candidate of a line search being one.
+    - `regularisation`: that of the last iteration. Above zero, the problem has no
+        positive definite control Hessian at the solution, or the search was hard.
+    - `t0`: the time of the first state.
+    - `dt`: the control interval.
+    - `low`, `high`: the bounds of the controls, shape `(m,)`; `None` if there are none.
+    - `difference`: `(x, x_ref) -> deviation`; subtraction by default.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("planar_quadrotor", horizon=40)
+        _, hover = env.dynamics.equilibrium()
+        start = jnp.tile(hover, (40, 1))
+        plan = dlx.planning.ilqr(env.dynamics, env.cost, env.initial_state, start)
+        dlx.rollout(env, plan, key=jax.random.key(0)).total_cost
+        ```
+    """
+
+    states: Float[Array, "*batch T+1 n"] = parameter()
+    controls: Float[Array, "*batch T m"] = weight()
+    gains: Float[Array, "*batch T m n"] = weight()
+    cost: Array
+    trace: Array
+    residual: Array
+    violation: Array
+    result: Result
+    iterations: Array
+    rollouts: Array
+    regularisation: Array
+    t0: Array = parameter()
+    dt: Array = parameter()
+    low: Array | None = parameter()
+    high: Array | None = parameter()
+    difference: Callable[[Any, Any], Any] | None = function_field()
+
+    def __call__(self, t, y, state):
+        size = self.states.shape[1]
+        if y.shape != (size,):
+            raise wrong_observation(self, size, y)
+        step = jnp.round((t - self.t0) / self.dt).astype(int)
+        horizon = self.controls.shape[0]
+        # Negative indices would count from the end.
+        step = jnp.where(step < 0, horizon, step)
+        at = lambda a: a.at[step].get(mode="fill", fill_value=jnp.nan)  # noqa: E731
+        x_ref = at(self.states[:-1])
+        e = y - x_ref if self.difference is None else self.difference(y, x_ref)
+        u = at(self.controls) - matvec(at(self.gains), e)
+        if self.low is not None and self.high is not None:
+            u = jnp.minimum(jnp.maximum(u, self.low), self.high)
+        return u.astype(y.dtype), state

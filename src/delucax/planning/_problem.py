@@ -1,0 +1,259 @@
+"""What is planned: dynamics, a cost, a start; its trajectories and its local model."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._components import by_components
+from .._results import first_of, or_none, RESULTS
+from ..costs import AbstractCost
+from ..dynamics import AbstractDynamics
+from ..dynamics._runge_kutta import join_state, split_state, stack_steps
+from ..math import matvec
+from ._constraints import (
+    augmented,
+    Constraints,
+    final_equalities,
+    final_values,
+    Multipliers,
+    stage_equalities,
+    stage_values,
+)
+from ._lq import Stages
+
+
+class Problem(eqx.Module):
+    """A planning problem. Everything in it can be differentiated.
+
+    With multipliers its cost is the augmented Lagrangian.
+    """
+
+    dynamics: AbstractDynamics
+    cost: AbstractCost
+    x0: Array
+    t0: Array
+    w: Array | None
+    low: Array | None
+    high: Array | None
+    difference: Any
+    constraints: Constraints | None
+    multipliers: Multipliers | None = None
+
+    def deviation(self, x: Array, x_ref: Array) -> Array:
+        """`x` from `x_ref`, as the caller measures it."""
+        return x - x_ref if self.difference is None else self.difference(x, x_ref)
+
+    def times(self, horizon: int) -> Array:
+        """The times of the states, shape `(T + 1,)`."""
+        steps = jnp.arange(horizon + 1)
+        return (self.t0 + steps * self.dynamics.dt).astype(self.x0.dtype)
+
+    def clip(self, u: Array) -> Array:
+        """The control between the bounds."""
+        if self.low is None or self.high is None:
+            return u
+        return jnp.minimum(jnp.maximum(u, self.low), self.high)
+
+    def step(self, t: Array, x: Array, u: Array, w: Any) -> Array:
+        """The next state."""
+        return self.dynamics.advance(t, x, u, w)[0].astype(x.dtype)
+
+    def added(self, t: Array, x: Array, u: Array, y: Any) -> Array | float:
+        """What the constraints add to the cost of a step."""
+        if self.multipliers is None or self.constraints is None:
+            return 0.0
+        c = stage_values(self.constraints, t, x, u)
+        equal = stage_equalities(self.constraints, x, u)
+        return augmented(c, y, self.multipliers.rho, equal)
+
+    def charged(self, t: Array, x: Array, u: Array, y: Any) -> Array:
+        """The cost of a step."""
+        return self.cost(t, x, u) + self.added(t, x, u, y)
+
+    def final(self, t: Array, x: Array) -> Array:
+        """The cost at the end."""
+        cost = self.cost.final(t, x)
+        if self.multipliers is None or self.constraints is None:
+            return cost
+        c = final_values(self.constraints, t, x)
+        _, y, rho = self.multipliers
+        return cost + augmented(c, y, rho, final_equalities(self.constraints, x))
+
+    @property
+    def stage_multipliers(self) -> Any:
+        """Those of the steps."""
+        return None if self.multipliers is None else self.multipliers.stage
+
+    def total(self, states: Array, controls: Array) -> Array:
+        """The cost of a trajectory."""
+        times = self.times(controls.shape[0])
+        each = (times[:-1], states[:-1], controls, self.stage_multipliers)
+        final = self.final(times[-1], states[-1])
+        return (jnp.sum(jax.vmap(self.charged)(*each)) + final).astype(states.dtype)
+
+
+def roll_out(
+    problem: Problem,
+    states: Array,
+    controls: Array,
+    K: Array,
+    k: Array,
+    length: Array,
+    gaps: Array | None,
+) -> tuple[Array, Array, Array]:
+    """The trajectory under `u - length k - K (x - x_planned)`, and its cost.
+
+    `1 - length` of each gap is left. The cost is infinite if anything goes wrong.
+    """
+    size = problem.x0.shape[0]
+
+    @by_components
+    def body(parts, inputs):
+        t, planned, u, K, k, gap, w = inputs
+        x = join_state(parts, size)
+        u = u - length * k - matvec(K, problem.deviation(x, planned))
+        u = problem.clip(u)
+        x_next, result = problem.dynamics.advance(t, x, u, w)
+        x_next = x_next.astype(x.dtype)
+        if gap is not None:
+            x_next = x_next - (1 - length) * gap
+        return split_state(x_next), (parts, u, or_none(result))
+
+    times = problem.times(controls.shape[0])[:-1]
+    inputs = (times, states[:-1], controls, K, k, gaps, problem.w)
+    last, (parts, controls, results) = lax.scan(body, split_state(problem.x0), inputs)
+    states = stack_steps(parts, size, last)
+    cost = problem.total(states, controls)
+    good = jnp.isfinite(cost) & jnp.all(jnp.isfinite(states))
+    good = good & (first_of(results) == RESULTS.successful)
+    return states, controls, jnp.where(good, cost, jnp.inf)
+
+
+def gaps_of(problem: Problem, states: Array, controls: Array) -> Array:
+    """How far each step misses the next state of the guess, shape `(T, n)`."""
+    times = problem.times(controls.shape[0])[:-1]
+    inputs = (times, states[:-1], controls, problem.w)
+    reached = jax.vmap(problem.step)(*inputs)
+    return jax.vmap(problem.deviation)(reached, states[1:])
+
+
+def model(
+    problem: Problem,
+    states: Array,
+    controls: Array,
+    gaps: Array | None,
+    second_order: bool,
+    curved: Array | None = None,
+) -> Stages:
+    """The linear-quadratic model of the problem about a trajectory.
+
+    The second derivatives of dynamics and constraints are left out where `curved` is
+    false.
+    """
+    horizon, size = controls.shape[0], states.shape[1]
+    times = problem.times(horizon)
+    z = jnp.concatenate([states[:-1], controls], axis=1)
+
+    def step(z, t, w):
+        return problem.step(t, z[:size], z[size:], w)
+
+    def charged(z, t, y):
+        return problem.charged(t, z[:size], z[size:], y)
+
+    def bent(z, t, y):
+        """The cost, with the constraints as their linear parts squared."""
+        constraints = problem.constraints
+        if problem.multipliers is None or constraints is None:
+            return jax.hessian(charged)(z, t, y)
+        c = lambda z: stage_values(constraints, t, z[:size], z[size:])
+        equal = stage_equalities(constraints, z[:size], z[size:])
+        cost = jax.hessian(lambda z: problem.cost(t, z[:size], z[size:]))(z)
+        return cost + squared(c, z, y, problem.multipliers.rho, equal)
+
+    y = problem.stage_multipliers
+    v = jax.grad(lambda x: problem.final(times[-1], x))(states[-1])
+    F = jax.vmap(jacobian(step))(z, times[:-1], problem.w)
+    h = jax.vmap(jax.grad(charged))(z, times[:-1], y)
+    H = jax.vmap(bent)(z, times[:-1], y)
+    V = jax.hessian(lambda x: problem.cost.final(times[-1], x))(states[-1])
+    constraints = problem.constraints
+    if problem.multipliers is not None and constraints is not None:
+        c = lambda x: final_values(constraints, times[-1], x)
+        equal = final_equalities(constraints, states[-1])
+        V = V + squared(c, states[-1], *problem.multipliers[1:], equal)
+    if second_order:
+        costates = costates_of(F, h, v)
+
+        def lagrangian(z, t, w, y, costate):
+            return charged(z, t, y) + costate @ step(z, t, w)
+
+        each = (z, times[:-1], problem.w, y, costates)
+        exact = jax.vmap(curvature(lagrangian))(*each)
+        at_end = jax.hessian(lambda x: problem.final(times[-1], x))(states[-1])
+        if curved is None:
+            H, V = exact, at_end
+        else:
+            H, V = jnp.where(curved, exact, H), jnp.where(curved, at_end, V)
+    H, V = (H + jnp.swapaxes(H, 1, 2)) / 2, (V + V.T) / 2
+    stages = Stages(F, H, h, gaps, V, v)
+    return jax.tree.map(lambda a: a.astype(states.dtype), stages)
+
+
+def squared(c: Any, z: Array, y: Array, rho: Array, equal: Array) -> Array:
+    """The Hessian of the active constraints' squares, without second derivatives."""
+    slope = jax.jacfwd(c)(z)
+    active = equal | (y + rho * c(z) > 0)
+    return rho * slope.T @ jnp.where(active[:, None], slope, 0)
+
+
+def costates_of(F: Array, h: Array, v: Array) -> Array:
+    """The gradient of the cost with respect to each next state, shape `(T, n)`."""
+    size = v.shape[0]
+
+    def back(costate, here):
+        F, h = here
+        return h[:size] + matvec(F[:, :size].T, costate), costate
+
+    return lax.scan(back, v.astype(h.dtype), (F, h), reverse=True)[1]
+
+
+def jacobian(f: Any) -> Any:
+    """Of the first argument, in reverse: a step has fewer outputs than inputs.
+    Forward where a solver inside has only that."""
+
+    def evaluate(*args):
+        try:
+            return jax.jacrev(f)(*args)
+        except (RuntimeError, TypeError, ValueError) as error:
+            if "everse-mode" not in str(error):
+                raise
+            return jax.jacfwd(f)(*args)
+
+    return evaluate
+
+
+def curvature(f: Any) -> Any:
+    """The Hessian in the first argument; in reverse alone, or forward alone, where a
+    solver inside has only that."""
+
+    def evaluate(*args):
+        last: Exception | None = None
+        for outer, inner in (
+            (jax.jacfwd, jax.grad),
+            (jax.jacrev, jax.grad),
+            (jax.jacfwd, jax.jacfwd),
+        ):
+            try:
+                return outer(inner(f))(*args)
+            except (RuntimeError, TypeError, ValueError) as error:
+                if "-mode" not in str(error):
+                    raise
+                last = error
+        assert last is not None
+        raise last
+
+    return evaluate

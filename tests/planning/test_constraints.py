@@ -1,0 +1,105 @@
+"""State and general constraints, by the method of multipliers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x64, thorough, tolerance, user_error
+
+import delucax as dlx
+
+
+ilqr = dlx.planning.ilqr
+Constraints = dlx.planning.Constraints
+
+
+def steered():
+    """A point of unit mass in the plane, to be moved past an obstacle."""
+    dt = 0.2
+    A = jnp.eye(4).at[0, 2].set(dt).at[1, 3].set(dt)
+    B = jnp.zeros((4, 2)).at[2, 0].set(dt).at[3, 1].set(dt)
+    cost = dlx.costs.Quadratic(0.01 * jnp.ones(4), 0.1 * jnp.ones(2))
+    x0 = jnp.array([-1.0, 0.05, 0.0, 0.0])
+    return dlx.LinearDynamics(A, B, dt=dt), cost, x0, jnp.zeros((15, 2))
+
+
+def clear(t, x, u):
+    return 0.16 - x[0] ** 2 - x[1] ** 2
+
+
+def arrived(t, x):
+    return x - jnp.array([1.0, 0.0, 0.0, 0.0])
+
+
+@needs_x64
+def test_an_obstacle_and_an_end_against_scipy():
+    optimize = pytest.importorskip("scipy.optimize")
+    dynamics, cost, x0, U = steered()
+    constraints = Constraints(clear, final_equality=arrived)
+    plan = ilqr(dynamics, cost, x0, U, bounds=(-2.5, 2.5), constraints=constraints)
+    inside = jax.vmap(lambda x: clear(0.0, x, None))(plan.states[:-1])
+    assert jnp.max(inside) < 1e-6 and jnp.max(inside) > -1e-6
+    assert jnp.max(jnp.abs(arrived(0.0, plan.states[-1]))) < 1e-6
+    assert plan.residual < 1e-6 and plan.violation < 1e-6
+
+    states = jax.jit(lambda u: dlx.open_loop(dynamics, x0, u.reshape(U.shape)))
+
+    def objective(u):
+        return jax.vmap(cost)(jnp.zeros(15), states(u)[:-1], u.reshape(U.shape)).sum()
+
+    above = jax.jit(lambda u: -jax.vmap(lambda x: clear(0, x, 0))(states(u)[:-1]))
+    ended = jax.jit(lambda u: arrived(0, states(u)[-1]))
+    near = np.asarray(plan.controls).ravel() + 0.01 * np.cos(np.arange(30.0))
+    found = optimize.minimize(
+        jax.jit(objective),
+        near,
+        jac=jax.jit(jax.grad(objective)),
+        bounds=[(-2.5, 2.5)] * 30,
+        constraints=[
+            dict(type="ineq", fun=above, jac=jax.jit(jax.jacfwd(above))),
+            dict(type="eq", fun=ended, jac=jax.jit(jax.jacfwd(ended))),
+        ],
+        method="SLSQP",
+        options=dict(ftol=1e-13, maxiter=500),
+    )
+    assert found.success
+    assert_close(plan.cost, found.fun, rtol=1e-5)
+    assert_close(plan.controls.ravel(), found.x, atol=1e-3)
+
+
+@thorough
+def test_a_state_limit_costs_and_holds():
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+    cost = dlx.costs.Quadratic([1.0, 0.1], [0.1], final=[20.0, 2.0])
+    start = jnp.array([1.3, 0.0]), jnp.zeros((12, 1))
+    free = ilqr(dynamics, cost, *start)
+    slow = lambda t, x, u: jnp.stack([x[1] - 1.8, -x[1] - 1.8])
+    plan = ilqr(dynamics, cost, *start, constraints=Constraints(slow))
+    assert jnp.max(jnp.abs(free.states[:, 1])) > 1.9
+    assert jnp.max(jnp.abs(plan.states[:-1, 1])) < 1.8 + tolerance(5e-3, 1e-6)
+    assert plan.cost > free.cost
+    # A limit that is not met changes nothing.
+    wide = Constraints(lambda t, x, u: jnp.abs(u) - 1e3, final_inequality=_low)
+    same = ilqr(dynamics, cost, *start, constraints=wide)
+    assert_close(same.cost, free.cost, rtol=tolerance(1e-4, 1e-8))
+
+
+def _low(t, x):
+    return x[0] - 100.0
+
+
+def test_what_cannot_hold():
+    dynamics, cost, x0, U = steered()
+    never = Constraints(equality=lambda t, x, u: u[0] - 1, final_equality=arrived)
+    plan = ilqr(dynamics, cost, x0, U, constraints=never, throw=False)
+    assert plan.result == dlx.RESULTS.infeasible and plan.violation > 1e-2
+    assert all(jnp.all(jnp.isfinite(a)) for a in jax.tree.leaves(plan))
+    with pytest.raises(RuntimeError, match="constraints cannot all hold"):
+        ilqr(dynamics, cost, x0, U, constraints=never)
+
+
+def test_bad_constraints_are_named():
+    with user_error(match="at least one function"):
+        Constraints()
+    with user_error(match="inequality must be a function"):
+        Constraints(3.0)

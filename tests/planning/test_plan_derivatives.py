@@ -1,0 +1,148 @@
+"""Derivatives of plans against finite differences, and what has none."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+from helpers import assert_close, central_difference, needs_x64, thorough
+from jaxtyping import Array
+
+import delucax as dlx
+
+
+ilqr = dlx.planning.ilqr
+pytestmark = needs_x64
+AT = jnp.array([1.0, 1.0, 1.3])
+
+
+class Limit(eqx.Module):
+    speed: Array
+
+    def __call__(self, t, x, u):
+        return jnp.stack([x[1] - self.speed, -x[1] - self.speed])
+
+
+def outcomes(theta, horizon=12, speed=None, **options):
+    """Of a pendulum of a mass, a cost weight and a first angle: the optimal cost, the
+    first control, a gain and a state."""
+    pendulum = dlx.systems.Pendulum(mass=theta[0])
+    dynamics = dlx.Discretized(pendulum, dt=0.1, solver=diffrax.Euler())
+    weights = jnp.stack([theta[1], jnp.array(0.1)]), jnp.array([0.1])
+    cost = dlx.costs.Quadratic(*weights, final=jnp.array([20.0, 2.0]))
+    x0 = jnp.stack([theta[2], 0 * theta[2]])
+    if speed is not None:
+        upright = lambda t, x: x[:1]
+        options["constraints"] = dlx.planning.Constraints(
+            Limit(speed), final_equality=upright
+        )
+        options["constraint_tolerance"] = 1e-10
+    start = jnp.zeros((horizon, 1))
+    options = dict(tolerance=1e-11, line_search="backtracking") | options
+    plan = ilqr(dynamics, cost, x0, start, **options)
+    found = plan.cost, plan.controls[0, 0], plan.gains[3, 0, 1], plan.states[9, 0]
+    return jnp.stack(found)
+
+
+def check(f, at, forward=True):
+    f = eqx.filter_jit(f)
+    reverse = eqx.filter_jit(jax.jacrev(f))(at)
+    for i, row in enumerate(reverse):
+        expected = central_difference(lambda a, i=i: f(a)[i], at, step=1e-5)
+        assert_close(row, expected, rtol=1e-5, atol=1e-6)
+    if forward:
+        assert_close(jax.jacfwd(f)(at), reverse, rtol=1e-9, atol=1e-9)
+    return reverse
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        dict(bounds=(-4.0, 4.0)),
+        pytest.param(dict(), marks=thorough),
+        pytest.param(dict(second_order=True), marks=thorough),
+        pytest.param(dict(parallel=True), marks=thorough),
+        pytest.param(dict(regularise="state"), marks=thorough),
+    ],
+)
+def test_against_finite_differences(options):
+    check(lambda theta: outcomes(theta, **options), AT, forward=not options)
+
+
+@thorough
+def test_forward_is_reverse():
+    along = jnp.array([0.3, -1.0, 0.5])
+    cost = lambda theta: outcomes(theta)[0]
+    change = jax.jit(lambda a: jax.jvp(cost, (a,), (along,))[1])(AT)
+    assert_close(change, jax.jit(jax.grad(cost))(AT) @ along, rtol=1e-10)
+
+
+@thorough
+def test_with_active_constraints():
+    at = jnp.array([1.0, 1.0, 1.3, 1.6])
+    rows = check(lambda a: outcomes(a[:3], speed=a[3]), at)
+    # The limit on the speed is felt.
+    assert abs(rows[0, 3]) > 1
+
+
+@thorough
+def test_of_bounds_disturbances_and_time_twice():
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+    reference = lambda t: jnp.stack([jnp.sin(t), jnp.cos(t)])
+    cost = dlx.costs.Tracking([1.0, 0.1], [0.01], reference)
+
+    @eqx.filter_jit
+    def optimal(a):
+        bounds, w = (-a[0], 2.0), a[1] * jnp.ones((10, 2))
+        options = dict(t0=a[2], w=w, bounds=bounds, tolerance=1e-11)
+        options["line_search"] = "backtracking"
+        return ilqr(dynamics, cost, jnp.zeros(2), jnp.zeros((10, 1)), **options).cost
+
+    at = jnp.array([2.5, 0.02, 1.5])
+    gradient = eqx.filter_jit(jax.grad(optimal))
+    expected = central_difference(optimal, at, step=1e-5)
+    assert_close(gradient(at), expected, rtol=1e-5, atol=1e-7)
+    assert jnp.all(jnp.abs(expected) > 1e-3)
+    twice = jax.jacfwd(gradient)(at)
+    for i, row in enumerate(twice):
+        expected = central_difference(lambda a, i=i: gradient(a)[i], at, step=1e-5)
+        assert_close(row, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_it_does_not_depend_on_the_guess():
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+    cost = dlx.costs.Quadratic([1.0, 0.1], [0.1])
+
+    def optimal(scale):
+        start = scale * jnp.ones((8, 1))
+        return ilqr(dynamics, cost, jnp.array([0.5, 0.0]), start).cost
+
+    assert jax.grad(optimal)(1.0) == 0
+
+
+def test_an_unconverged_plan_is_not_detached():
+    def asked(theta, keep):
+        options = dict(max_iterations=1, throw=False)
+        found = outcomes(theta, **options)
+        return jnp.sum(jnp.where(keep, found, 0)), found
+
+    gradient = jax.jit(jax.grad(asked, has_aux=True))
+    unknown, found = gradient(AT, True)
+    assert jnp.all(jnp.isfinite(found)) and jnp.all(jnp.isnan(unknown))
+    # What is masked is not asked for.
+    masked, _ = gradient(AT, False)
+    assert jnp.all(masked == 0)
+
+
+@thorough
+def test_a_batch_with_a_failure():
+    def total(mass, start, keep):
+        theta = lambda angle: jnp.stack([mass, 0 * mass + 1, angle])
+        plan = lambda angle: outcomes(theta(angle), throw=False)[0]
+        return jnp.sum(jnp.where(keep, jax.vmap(plan)(start), 0))
+
+    gradient = jax.jit(jax.grad(total))
+    start, good = jnp.array([0.5, jnp.nan, 0.4]), jnp.array([True, False, True])
+    expected = gradient(1.0, jnp.array([0.5, 0.5, 0.4]), good)
+    assert_close(gradient(1.0, start, good), expected, rtol=1e-9)
+    assert jnp.isnan(gradient(1.0, start, ~good))
