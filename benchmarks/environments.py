@@ -1,7 +1,8 @@
 """`python -m benchmarks.environments`: every named task against a raw scan, gymnax and
 Gymnasium, in one run.
 
-Prints three tables and writes `benchmarks/results/environments.json`:
+Prints three tables and writes `benchmarks/results/environments.json`, of which
+`--table` prints those of `docs/benchmarks.md`:
 
 - the whole of delucax against a raw `lax.scan` of the task's own vector field;
 - the tasks that gymnax has too, one after the other and as a batch;
@@ -160,6 +161,86 @@ def limits(
     return found
 
 
+def documented(found: dict[str, Any]) -> str:
+    """The tables of `docs/benchmarks.md`, of what a run has written.
+
+    Times are the best of all rounds, ratios the medians over the rounds.
+    """
+    times = lambda row, *keys: [_number(row.get(key)) for key in keys]
+    lanes = f"{LANES} lanes"
+    raw = [
+        [
+            f"`{row['task']}`",
+            *times(row, "chain, trajectory: ns", "chain, trajectory: raw ns"),
+            *times(row, "chain, trajectory: ratio", "chain, cost: ns"),
+            *times(row, "chain, cost: ratio", f"{lanes}: ns", f"{lanes}: ratio"),
+        ]
+        for row in found["raw"]
+    ]
+    gymnax = [
+        [f"`{row['task']}`"]
+        + [
+            cell
+            for what in ("chain", lanes)
+            for cell in (
+                *times(row, f"{what}: delucax ns"),
+                *times(row, f"{what}: gymnax step / delucax"),
+                *times(row, f"{what}: gymnax step_env / delucax"),
+            )
+        ]
+        for row in found["gymnax"]
+    ]
+    many = {row["id"]: row for row in found["vector step"]}
+    ours, theirs = f"{_adapter.OURS}: us", f"{_adapter.THEIRS}: us"
+    adapted = [
+        [
+            f"`{row['id']}`",
+            *times(row, ours, theirs, "delucax / Gymnasium"),
+            *times(many[row["id"]], ours, f"{_adapter.SYNC} / delucax"),
+            *times(many[row["id"]], f"{_adapter.VECTOR} / delucax"),
+        ]
+        for row in found["one step"]
+    ]
+    worst = [
+        [row["what"], _number(row["measured"]), f"`{row['of']}`", row["limit"]]
+        for row in found["worst"]
+    ]
+    chain, batch = "one chain, cost only", f"{lanes}, cost only"
+    return "\n\n".join(
+        [
+            _markdown(
+                ["", "one chain, all kept", "raw", "ratio"]
+                + [chain, "ratio", batch, "ratio"],
+                raw,
+            ),
+            _markdown(
+                ["", "one chain: delucax", "`step` / delucax", "`step_env` / delucax"]
+                + [f"{lanes}: delucax", "`step` / delucax", "`step_env` / delucax"],
+                gymnax,
+            ),
+            _markdown(
+                ["", "delucax", "Gymnasium", "delucax / Gymnasium"]
+                + [f"{LANES}: delucax", "`SyncVectorEnv` / delucax"]
+                + ["Gymnasium's own batch / delucax"],
+                adapted,
+            ),
+            _markdown(["the worst of each kind", "measured", "of", "limit"], worst),
+        ]
+    )
+
+
+def _number(value: Any) -> str:
+    """Three digits."""
+    if not isinstance(value, float):
+        return ""
+    return f"{value:,.0f}" if abs(value) >= 999.5 else f"{value:#.3g}".rstrip(".")
+
+
+def _markdown(titles: list[str], rows: list[list[str]]) -> str:
+    lines = [titles, ["---"] * len(titles), *rows]
+    return "\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |") for line in lines)
+
+
 def main() -> None:
     """Run, print and write."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.environments")
@@ -168,7 +249,13 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="*", help="these alone, and no file")
     parser.add_argument("--out", default=str(RESULTS / "environments.json"))
     parser.add_argument("--cores", type=int, default=1, help="cores to run on")
+    parser.add_argument(
+        "--table", action="store_true", help="run nothing, print the tables of --out"
+    )
     options = parser.parse_args()
+    if options.table:
+        print(documented(json.loads(Path(options.out).read_text())))
+        return
     limit_cores(options.cores)
     rounds = 3 if options.quick else options.rounds
     chain, batch = (5_000, 50) if options.quick else (50_000, 200)

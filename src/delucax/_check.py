@@ -132,6 +132,16 @@ def check_step(dt: Any, where: str) -> None:
         raise ValueError(f"{where}: dt must be a number, got shape {jnp.shape(dt)}.")
 
 
+def check_number(value: Any, name: str, where: str) -> None:
+    """Raise unless `value` is one finite real number, as far as can be seen."""
+    array = as_float_array(value)
+    if not eqx.is_inexact_array(array) or array.shape != ():
+        got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+        raise ValueError(f"{where}: {name} must be a number, got {got}.")
+    check_real(array, name, where)
+    check_finite(array, name, where)
+
+
 def check_range(
     value: Any, name: str, where: str, low: Any = 0, high: float | int = np.inf
 ) -> None:
@@ -145,6 +155,13 @@ def check_range(
             return
     ends = f"at least {low}" if high == np.inf else f"between {low} and {high}"
     raise ValueError(f"{where}: {name} must be {ends}, got {got}.")
+
+
+def check_bool(value: Any, name: str, where: str) -> bool:
+    """`value`, if it is True or False, or an error."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{where}: {name} must be True or False, got {value!r}.")
+    return bool(value)
 
 
 def check_count(value: Any, name: str, where: str, least: int = 1) -> int:

@@ -311,6 +311,13 @@ def check_parameters(module: eqx.Module) -> None:
                     f"{type(module).__name__}: {field.name} must be a function, got "
                     f"{function!r}."
                 )
+            inner = getattr(function, "function", function)
+            if isinstance(function, StaticFunction) and isinstance(inner, type):
+                raise ValueError(
+                    f"{type(module).__name__}: {field.name} must be a function, got "
+                    f"the class {inner.__name__} where {inner.__name__}(...) may be "
+                    "meant."
+                )
         if _ROLE not in field.metadata:
             continue
         value = getattr(module, field.name, None)

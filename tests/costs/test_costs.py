@@ -79,7 +79,7 @@ def test_weights_are_differentiable():
     [
         (lambda: dlx.costs.Quadratic(jnp.ones((2, 3)), R), "Q must be square"),
         (lambda: dlx.costs.Quadratic(jnp.array([[1.0, 1], [0, 1]]), R), "symmetric"),
-        (lambda: dlx.costs.Quadratic(2.0, R), "Q must be a matrix"),
+        (lambda: dlx.costs.Quadratic(2.0, R), "Q must be a matrix or its diag"),
         (lambda: dlx.costs.Quadratic(jnp.ones(2) * jnp.nan, R), "Q must be finite"),
         (lambda: dlx.costs.Quadratic(Q, R, final=jnp.ones(3)), "final must fit Q"),
         (lambda: dlx.costs.Quadratic(jnp.ones(3), R)(0.0, Q[0], R[0]), "state has"),

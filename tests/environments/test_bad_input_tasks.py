@@ -72,6 +72,40 @@ def test_bad_input(call, match):
         call()
 
 
+def step_with(u):
+    return dlx.make("pendulum").step(0.0, jnp.zeros(2), u)
+
+
+NUMBERS = {
+    "acrobot": ["goal_height", "max_torque"],
+    "cartpole": ["max_force"],
+    "double_integrator": ["max_force"],
+    "dynamic_bicycle": ["speed", "max_acceleration", "max_steering"],
+    "kinematic_bicycle": ["speed", "max_acceleration", "max_steering"],
+    "lorenz": ["max_control"],
+    "mass_spring_damper": ["max_force"],
+    "mountain_car": ["goal_position", "goal_velocity"],
+    "mountain_car_discrete": ["goal_position", "goal_velocity"],
+    "permanent_magnet_motor": ["speed", "max_voltage"],
+    "quadrotor": ["max_thrust"],
+    "two_tank": ["max_flow"],
+    "van_der_pol": ["max_control"],
+}
+
+
+@pytest.mark.parametrize("task", NUMBERS)
+def test_numbers_of_tasks(task):
+    for name in NUMBERS[task]:
+        for bad in ("a", np.nan):
+            with user_error(match=f"{name} must be .*, got '?{bad}"):
+                dlx.make(task, **{name: bad})
+
+
+def test_a_goal_is_one_number():
+    with user_error(match=r"mountain_car: goal_velocity must be a number, got .*\(2,"):
+        dlx.make("mountain_car", goal_velocity=jnp.zeros(2))
+
+
 @pytest.mark.parametrize(
     "call, match",
     [
@@ -94,6 +128,30 @@ def test_bad_input(call, match):
         (
             lambda: dlx.disturbances.Gaussian(1.0, size=1.5),
             "Gaussian: size must be a whole number",
+        ),
+        (lambda: dlx.register(3, "a:b"), "register: name must be a string.*got 3"),
+        (
+            lambda: dlx.randomise(
+                dlx.make("pendulum"), jax.random.key(0), {"dynamics.dt": ("a", "b")}
+            ),
+            "randomise: the range of 'dynamics.dt' must be of numbers",
+        ),
+        (
+            lambda: step_with(None),
+            r"u \(the control\) must have shape \(1,\), got None",
+        ),
+        (lambda: step_with("a"), r"u \(the control\) must have shape \(1,\), got 'a'"),
+        (lambda: step_with([1j]), r"u \(the control\) must be real"),
+        (
+            lambda: dlx.make("planar_quadrotor", wind=dlx.systems.VortexWind),
+            r"wind must be a function, got the class VortexWind where VortexWind\(",
+        ),
+        (lambda: dlx.make("lds", A=jnp.eye(2)), "lds: B must be given with A"),
+        (
+            lambda: dlx.make(
+                "lds", A=jnp.eye(2), B=jnp.ones((2, 1)), key=jax.random.key(0)
+            ),
+            "lds: give A and B, or a key to draw them with, not both",
         ),
     ],
 )

@@ -233,7 +233,7 @@ FLOW = dlx.systems.LinearSystem(jnp.eye(1), jnp.eye(1))
         ("reacher", dict(goal=[1.0]), r"goal must have shape \(2,\), got \(1,\)"),
         ("reacher", dict(goal=[1.0, np.nan]), "goal must be finite"),
         ("two_tank", dict(level=-1.0), "level must be at least 0"),
-        ("lorenz", dict(max_control=-1.0), "low <= high"),
+        ("lorenz", dict(max_control=-1.0), "max_control must be at least 0"),
         ("quadrotor", dict(inputs="motors"), "inputs must be 'rotors' or 'wrench'"),
         ("neural", {}, "give a system, or a key .* got neither"),
         (

@@ -59,8 +59,11 @@ def test_files_that_do_not_fit(written, tmp_path):
         read_linear(written(A=A, B=C, dt=1.0))
     with user_error(match="path must end in .npz or .mat, got 'plant.csv'"):
         read_linear("plant.csv")
-    with user_error(FileNotFoundError):
-        read_linear(tmp_path / "none.npz")
+    for name in ("none.npz", "none.mat"):
+        with user_error(FileNotFoundError, match=f"path must be a file, got .*{name}"):
+            read_linear(tmp_path / name)
+    with user_error(match="read_linear: path must be the path of a file, got 3"):
+        read_linear(3)
 
 
 def test_a_control_object_is_a_task(key):

@@ -37,12 +37,62 @@ def test_check_env(id):
         warnings.simplefilter("error")
         # A recommendation that Gymnasium's own tasks do not follow either.
         warnings.filterwarnings("ignore", ".*symmetric and normalized space")
+        if "CartPole" in id and "Linear" not in id:
+            # Its space is Gymnasium's own, which has no ends.
+            warnings.filterwarnings("ignore", ".*observation space m.*infinity")
         check_env(env.unwrapped, skip_render_check=True)
         env = gymnasium.make(id)  # with the passive checker
         env.reset(seed=0)
         env.action_space.seed(0)
         for _ in range(3):
             env.step(env.action_space.sample())
+
+
+@pytest.mark.parametrize("id", IDS)
+def test_specs(id):
+    """Gymnasium's own where it has the task, and the horizon of the task."""
+    spec, bare = gymnasium.spec(id), id.partition("/")[2]
+    kwargs = {"key": jax.random.key(0)} if bare in ("LDS-v1", "Neural-v1") else {}
+    task = dlx.make(spec.kwargs["task"], **kwargs)
+    assert spec.max_episode_steps == task.horizon
+    if bare in gymnasium.registry:
+        theirs = gymnasium.spec(bare)
+        assert spec.max_episode_steps == theirs.max_episode_steps
+        assert spec.reward_threshold == theirs.reward_threshold
+    else:
+        assert spec.reward_threshold is None
+
+
+def length(env, most=300):
+    """The steps of an episode."""
+    env.reset(seed=0)
+    for k in range(most):
+        _, _, terminated, truncated, _ = env.step(ZERO)
+        if terminated or truncated:
+            return k + 1
+    return None
+
+
+def test_gymnasiums_time_limit_is_what_ends():
+    make = lambda **kwargs: gymnasium.make("delucax/Pendulum-v1", **kwargs)
+    noisy = dlx.disturbances.Gaussian(0.1, size=2)
+    final = dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1), final=jnp.eye(2))
+    plain = dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1))
+    assert make().spec.max_episode_steps == 200
+    assert length(make()) == 200
+    assert length(make(max_episode_steps=250)) == 250
+    assert length(make(max_episode_steps=250, cost=plain)) == 250
+    assert length(make(max_episode_steps=-1)) is None
+    # What is drawn or charged at the end has to know when it is.
+    assert length(make(horizon=5)) == 5
+    assert length(make(max_episode_steps=250, disturbance=noisy)) == 200
+    assert length(make(max_episode_steps=250, cost=final)) == 200
+    with user_error(match="truncate must be True where there are disturbances"):
+        interop.GymnasiumEnv(dlx.make("pendulum", disturbance=noisy), truncate=False)
+    make = lambda **kwargs: gymnasium.make_vec("delucax/Pendulum-v1", 2, **kwargs)
+    assert make().environment.horizon == 200
+    assert make(max_episode_steps=250).environment.horizon == 250
+    assert make(max_episode_steps=250, horizon=5).environment.horizon == 5
 
 
 def test_episode_is_a_rollout():
@@ -137,7 +187,7 @@ def test_bad_input():
     with pytest.raises(ResetNeeded, match="no state"):
         _ = made.state
     made.reset(seed=0)
-    for bad in (0.0, np.zeros(2), "up", [None], [[0.0]]):
+    for bad in (0.0, np.zeros(2), "up", [None], [[0.0]], [[0.0], [1.0, 2.0]]):
         with pytest.raises(InvalidAction, match=r"numbers of shape \(1,\)"):
             made.step(bad)
     with pytest.raises(InvalidAction, match="finite"):
@@ -147,6 +197,15 @@ def test_bad_input():
         made.reset(options={"state": np.zeros(3)})
     with user_error(match="'start'"):
         made.reset(options={"start": np.zeros(2)})
+    for bad in ("up", np.array([1j, 0])):
+        with user_error(match="GymnasiumEnv: state must "):
+            made.reset(options={"state": bad})
+    with user_error(match=r"options must be a dictionary, got \[1, 2\]"):
+        made.reset(options=[1, 2])
+    with user_error(match="discrete must be True or False, got 'no'"):
+        interop.make("cartpole", discrete="no")
+    with user_error(match="truncate must be True or False, got 'no'"):
+        interop.GymnasiumEnv(dlx.make("pendulum"), truncate="no")
     with user_error(match="render_mode must be"):
         interop.make("pendulum", render_mode="ascii")
     with user_error(match="must be a delucax.Environment"):
@@ -186,6 +245,7 @@ def test_vector_modes(mode):
     if mode is AutoresetMode.SAME_STEP:
         assert_close(info["final_obs"][1], last, atol=1e-6)
         assert info["_final_obs"].all() and np.any(ended != start)
+        assert info["final_info"] == {} and info["_final_info"].all()
         assert not truncated.any() and (rewards < 0).all()
     else:
         assert info == {}
@@ -219,6 +279,62 @@ def test_vector_is_each_alone():
     for bad in (np.zeros(3, int), np.zeros(4), np.full(4, 2)):
         with pytest.raises(InvalidAction, match="actions must be"):
             quiet.step(bad)
+
+
+def test_vector_starts_with_a_seed_or_a_state_each():
+    many, single = interop.make_vector("pendulum", 3), interop.make("pendulum")
+    first, _ = many.reset(seed=[5, None, 7])
+    for i, seed in ((0, 5), (2, 7)):
+        assert_close(first[i], single.reset(seed=seed)[0], atol=1e-6)
+    once_more, _ = many.reset(seed=[5, None, 7])
+    np.testing.assert_array_equal(first, once_more)
+    states = np.array([[0.1, 0.0], [0.2, 0.1], [0.3, 0.2]])
+    many.reset(options={"state": states})
+    assert_close(many.states, states, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "call, match",
+    [
+        (lambda e: e.reset(seed=[1, 2, 3]), "seed must be 2 whole numbers from 0"),
+        (lambda e: e.reset(seed=[1, -2]), "seed must be 2 whole numbers from 0"),
+        (lambda e: e.reset(options=[1, 2]), "options must be a dictionary"),
+        (lambda e: e.reset(options={"state": "up"}), r"state must have.*got 'up'"),
+        (
+            lambda e: e.reset(options={"state": np.zeros((3, 2))}),
+            r"state must have shape \(2,\), or \(2, 2\) for one each, got .*\(3, 2\)",
+        ),
+        (
+            lambda e: e.reset(options={"state": np.array([1j, 0])}),
+            "state must be real",
+        ),
+        (
+            lambda e: interop.make_vector("pendulum", 2, render_mode="rgb_array"),
+            "make_vector: render_mode must be left out",
+        ),
+        (
+            lambda e: interop.make_vector("pendulum", 2, max_episode_steps=0),
+            "max_episode_steps must be a whole number of at least 1",
+        ),
+    ],
+)
+def test_bad_input_of_many(call, match):
+    many = interop.make_vector("pendulum", 2)
+    with user_error(match=match):
+        call(many)
+
+
+def test_ragged_actions_are_refused():
+    many = interop.make_vector("pendulum", 2)
+    many.reset(seed=0)
+    with pytest.raises(InvalidAction, match=r"actions must have the shape \(2, 1\)"):
+        many.step([[0.0], [0.0, 1.0]])
+
+
+def test_a_window_needs_a_display():
+    made = interop.make("pendulum", render_mode="human")
+    with pytest.raises(RuntimeError, match="human' needs a display.*'rgb_array'"):
+        made.reset(seed=0)
 
 
 def test_by_gymnasiums_own_doors():

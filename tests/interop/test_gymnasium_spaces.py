@@ -21,15 +21,10 @@ THEIRS = [
 
 @pytest.mark.parametrize("id", THEIRS)
 def test_spaces_are_gymnasiums(id):
-    """Where Gymnasium's have no end, ours end at the largest number."""
     ours = gymnasium.make(f"delucax/{id}")
     theirs = gymnasium.make(id)
     assert ours.action_space == theirs.action_space
-    seen, expected = ours.observation_space, theirs.observation_space
-    largest = np.finfo(np.float32).max
-    np.testing.assert_array_equal(seen.high, np.minimum(expected.high, largest))
-    np.testing.assert_array_equal(seen.low, np.maximum(expected.low, -largest))
-    assert seen.dtype == expected.dtype
+    assert ours.observation_space == theirs.observation_space
 
 
 def test_spaces_end_where_the_physics_does():

@@ -129,6 +129,37 @@ class TestToGymnax:
         assert to_gymnax(dlx.make("cartpole")).action_space() == 2
         assert env.action_space()[:3] == (-2.0, 2.0, (1,))
 
+    def test_actions_that_are_traced_are_clamped(self):
+        env = to_gymnax(dlx.make("cartpole"))
+        state = interop.GymnaxState(jnp.zeros(4), jnp.asarray(0))
+        step = jax.jit(lambda u: env.step_env(KEY, state, u)[1].state)
+        pushed = [step(u) for u in (jnp.asarray(9), jnp.asarray(1), jnp.asarray(-3))]
+        assert_close(pushed[0], pushed[1])
+        assert pushed[2][1] < 0 < pushed[0][1]
+
+    def test_nan_is_told(self):
+        env = to_gymnax(dlx.make("pendulum"))
+        good, bad = jnp.array([0.1, 0.0]), jnp.array([jnp.nan, 0.0])
+        for x, u, failed in (
+            (good, 0.0, False),
+            (bad, 0.0, True),
+            (good, np.nan, True),
+        ):
+            state = interop.GymnaxState(x, jnp.asarray(0))
+            assert env.step_env(KEY, state, u)[-1]["failed"] == failed
+
+    def test_ends_are_those_of_the_gymnax_that_is_there(self, monkeypatch):
+        task, where = dlx.make("pendulum"), "gymnax.environments.environment"
+        assert not to_gymnax(task).separate_ends
+        one, two = type("Environment", (), {}), type("Environment", (), {})
+        two.is_truncated = None
+        for theirs, separate in ((one, False), (two, True)):
+            there = types.SimpleNamespace(Environment=theirs)
+            monkeypatch.setitem(sys.modules, where, there)
+            assert to_gymnax(task).separate_ends == separate
+        monkeypatch.setitem(sys.modules, "rejax", types.SimpleNamespace())
+        assert not to_gymnax(task).separate_ends
+
     def test_bad_input(self):
         task = dlx.make("pendulum")
         env = to_gymnax(task)
@@ -140,6 +171,19 @@ class TestToGymnax:
             to_gymnax(task, discrete=True)
         with user_error(match="action must have 1 entries"):
             env.step(KEY, env.reset(KEY)[1], jnp.zeros(2))
+        cart = to_gymnax(dlx.make("cartpole"))
+        state = cart.reset(KEY)[1]
+        for bad in (2, -1, 0.5, np.nan):
+            for step in (cart.step, cart.step_env):
+                with user_error(match="action must be a whole number from 0 to 1, got"):
+                    step(KEY, state, bad)
+        with user_error(match="action must have 1 entries, got None"):
+            cart.step(KEY, state, None)
+        with user_error(match="GymnaxEnv.reset: key must be one random key"):
+            cart.reset(0)
+        for name in ("discrete", "separate_ends"):
+            with user_error(match=f"{name} must be True or False, got 'no'"):
+                to_gymnax(task, **{name: "no"})
         with user_error(match="params must be GymnaxParams"):
             env.step(KEY, env.reset(KEY)[1], jnp.zeros(1), task)
         with user_error(match="being traced"):

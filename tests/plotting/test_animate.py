@@ -389,6 +389,7 @@ def test_errors_name_the_argument(env, trajectory, key):
         ({"fps": 0}, "fps must be positive and finite, got 0"),
         ({"fps": jnp.inf}, "fps must be positive and finite"),
         ({"dpi": "high"}, "dpi must be positive and finite, got 'high'"),
+        ({"traces": "no"}, "traces must be True or False, got 'no'"),
         ({"max_frames": 0}, "max_frames must be a whole number of at least 1"),
     ):
         with user_error(match=f"animate: {match}"):

@@ -13,6 +13,7 @@ from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..math._linear_solve import solve
 from ..riccati import dare
+from ..riccati._arguments import riccati_arguments
 from ._feed_forward import known_signals, Preview
 from ._operating_point import (
     check_observed,
@@ -119,7 +120,9 @@ class LQR(AbstractController):
                 f"{where}: preview must be a number of steps, from 0, at which a "
                 f"reference or disturbance is looked up, got {preview!r}."
             )
-        solution = dare(dynamics.A, dynamics.B, Q, R, S)
+        A, B = dynamics.A, dynamics.B
+        A, B, Q, R, S, _ = riccati_arguments(where, A, B, Q, R, S, None, definite=False)
+        solution = dare(A, B, Q, R, S)
         self.K, self.P = solution.K, solution.X
         if signals is None:
             self.feed_forward = None

@@ -187,6 +187,11 @@ def _weight(value: Any, name: str, where: str) -> Array:
     if eqx.is_inexact_array(array) and array.ndim == 1:
         check_finite(array, name, where)
         return array
+    if not eqx.is_inexact_array(array) or array.ndim != 2:
+        got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+        raise ValueError(
+            f"{where}: {name} must be a matrix or its diagonal, got {got}."
+        )
     return symmetric_matrix(value, name, where)
 
 

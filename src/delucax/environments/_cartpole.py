@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_positive, check_step
+from .._check import check_positive, check_range, check_step
 from .._fence import fence
 from .._fields import as_float_array, parameter, positive
 from .._results import RESULTS
@@ -158,6 +158,7 @@ def cartpole(
         lqr = dlx.controllers.LQR(dlx.linearize(env.dynamics), jnp.eye(4), jnp.eye(1))
         ```
     """
+    check_range(max_force, "max_force", "cartpole")
     system = CartPole(cart_mass, pole_mass, half_length, gravity)
     options = {"semi_implicit": semi_implicit}
     dynamics = own_or_solver(

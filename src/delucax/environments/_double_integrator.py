@@ -5,6 +5,7 @@ from typing import Any
 import diffrax
 import jax.numpy as jnp
 
+from .._check import check_range
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import DoubleIntegrator
@@ -52,6 +53,7 @@ def double_integrator(
         env = dlx.make("double_integrator", mass=2.0)
         ```
     """
+    check_range(max_force, "max_force", "double_integrator")
     corner = jnp.array([2.0, 1.0])
     arguments: dict[str, Any] = dict(
         dynamics=Discretized(DoubleIntegrator(mass), dt, solver, substeps),

@@ -5,6 +5,7 @@ from typing import Any
 import diffrax
 import jax.numpy as jnp
 
+from .._check import check_number, check_range
 from ..dynamics import Discretized
 from ..systems import DynamicBicycle
 from ._environment import Environment, UniformState
@@ -67,6 +68,9 @@ def dynamic_bicycle(
         icy = dlx.make("dynamic_bicycle", front_stiffness=3e4, rear_stiffness=3e4)
         ```
     """
+    check_number(speed, "speed", "dynamic_bicycle")
+    check_range(max_acceleration, "max_acceleration", "dynamic_bicycle")
+    check_range(max_steering, "max_steering", "dynamic_bicycle")
     system = DynamicBicycle(
         mass, inertia, front, rear, front_stiffness, rear_stiffness, standstill
     )

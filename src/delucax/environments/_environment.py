@@ -15,6 +15,7 @@ from .._check import (
     check_count,
     check_finite,
     check_key,
+    check_real,
     is_concrete,
 )
 from .._fields import (
@@ -31,6 +32,10 @@ from ..costs import AbstractCost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics
 from ..math import clip
+
+
+# A number to end a space where there is no bound; Gymnasium advises against infinity.
+LARGEST = float(np.finfo(np.float32).max)
 
 
 class Step(NamedTuple):
@@ -302,7 +307,15 @@ class Environment(eqx.Module):
 
         **Returns:** shape `(m,)`.
         """
-        u = jnp.asarray(u)
+        given = u
+        try:
+            u = jnp.asarray(u)
+        except (TypeError, ValueError):  # no number, or ragged
+            raise ValueError(
+                "Environment: u (the control) must have shape "
+                f"({self.control_size},), got {given!r}."
+            ) from None
+        check_real(u, "u (the control)", "Environment")
         if self.actions is not None and jnp.issubdtype(jnp.result_type(u), jnp.integer):
             if jnp.ndim(u) != 0:
                 raise ValueError(
@@ -333,12 +346,16 @@ class Environment(eqx.Module):
             `actions`.
         - `w`: disturbance, shape `(disturbance_size,)`; `None` for zero.
 
+        It is the bare map: of a state or a control that is not finite comes one that
+        is not finite, and `result` says what became of the dynamics alone.
+        [`delucax.rollout`][] and what else takes steps check the numbers themselves.
+
         **Returns:** a [`delucax.environments.Step`][].
 
-        **Raises:** `ValueError` on a wrong shape.
+        **Raises:** `ValueError` on a wrong shape or kind.
         """
         x = as_vector(x, self.state_size, "x (the state)", "Environment.step")
-        u = self.saturate(as_float_array(u) if self.actions is None else jnp.asarray(u))
+        u = self.saturate(as_float_array(u) if self.actions is None else u)
         u = as_vector(u, self.control_size, "u (the control)", "Environment.step")
         if w is not None:
             size = self.disturbance_size
@@ -426,6 +443,11 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
             changes[path] = given(one)
         elif isinstance(given, tuple | list) and len(given) == 2:
             low, high = (as_float_array(end) for end in given)
+            if not (eqx.is_inexact_array(low) and eqx.is_inexact_array(high)):
+                raise ValueError(
+                    f"randomise: the range of {path!r} must be of numbers, got "
+                    f"{given!r}."
+                )
             if is_concrete(low) and is_concrete(high) and not np.all(low <= high):
                 raise ValueError(
                     f"randomise: the range of {path!r} must have low <= high, got "

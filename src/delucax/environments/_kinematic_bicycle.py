@@ -5,6 +5,7 @@ from typing import Any
 import diffrax
 import jax.numpy as jnp
 
+from .._check import check_number, check_range
 from ..dynamics import Discretized
 from ..systems import KinematicBicycle
 from ._environment import Environment, UniformState
@@ -60,6 +61,9 @@ def kinematic_bicycle(
         env = dlx.make("kinematic_bicycle", speed=5.0)
         ```
     """
+    check_number(speed, "speed", "kinematic_bicycle")
+    check_range(max_acceleration, "max_acceleration", "kinematic_bicycle")
+    check_range(max_steering, "max_steering", "kinematic_bicycle")
     corner = jnp.array([0.0, 2.0, 0.3, 3.0])
     middle = jnp.zeros(4).at[3].set(speed)
     limit = jnp.stack([jnp.asarray(max_acceleration), jnp.asarray(max_steering)])

@@ -7,6 +7,7 @@ from jaxtyping import Array
 
 from ..costs import Quadratic
 from ..math import cos, sin, wrap
+from ._environment import LARGEST
 
 
 def bicycle_features(x: Array) -> Array:
@@ -32,7 +33,7 @@ def bicycle_features(x: Array) -> Array:
 
 def lane_bounds(states: int) -> tuple[Array, Array]:
     """Between which the features lie: the cosine and the sine have bounds."""
-    high = jnp.full(states + 1, jnp.inf).at[2:4].set(1.0)
+    high = jnp.full(states + 1, LARGEST).at[2:4].set(1.0)
     return -high, high
 
 

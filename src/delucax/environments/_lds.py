@@ -54,8 +54,9 @@ def lds(
     **Returns:** an [`delucax.Environment`][].
 
     **Raises:** `ValueError` if one of `A` and `B` is missing, if there is no key to
-    draw them with, if shapes do not fit, or if `system` is not linear, is given with
-    matrices or a key, or has a step where `dt` is given, or none where it is not.
+    draw them with, or one with them, if shapes do not fit, or if `system` is not
+    linear, is given with matrices or a key, or has a step where `dt` is given, or none
+    where it is not.
 
     !!! example
 
@@ -77,8 +78,9 @@ def lds(
     else:
         if (A is None) != (B is None):
             missing = "A" if A is None else "B"
+            other = "B" if A is None else "A"
             raise ValueError(
-                f"lds: {missing} must be given with the other, or neither."
+                f"lds: {missing} must be given with {other}, or neither of them."
             )
         if A is None:
             if C is not None:
@@ -86,6 +88,8 @@ def lds(
                     "lds: C needs A and B; for a random C give observations."
                 )
             A, B, C = _random(key, states, controls, observations, spectral_radius)
+        elif key is not None:
+            raise ValueError("lds: give A and B, or a key to draw them with, not both.")
         dynamics = LinearDynamics(A, B, C, dt=1.0 if dt is None else dt)
     n, m = dynamics.state_size, dynamics.control_size
     arguments: dict[str, Any] = dict(

@@ -5,6 +5,7 @@ from typing import Any
 import diffrax
 import jax.numpy as jnp
 
+from .._check import check_range
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import Lorenz
@@ -54,6 +55,7 @@ def lorenz(
         env = dlx.make("lorenz", rho=24.0)
         ```
     """
+    check_range(max_control, "max_control", "lorenz")
     system = Lorenz(sigma, rho, beta)
     centre, _ = system.equilibrium()
     low, high = jnp.array([-20.0, -20.0, 10.0]), jnp.array([20.0, 20.0, 40.0])

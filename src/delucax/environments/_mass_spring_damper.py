@@ -5,6 +5,7 @@ from typing import Any
 import diffrax
 import jax.numpy as jnp
 
+from .._check import check_range
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import MassSpringDamper
@@ -56,6 +57,7 @@ def mass_spring_damper(
         env = dlx.make("mass_spring_damper", masses=3)
         ```
     """
+    check_range(max_force, "max_force", "mass_spring_damper")
     system = MassSpringDamper(mass, stiffness, damping, masses=masses)
     corner = jnp.ones(system.state_size)
     arguments: dict[str, Any] = dict(

@@ -5,6 +5,7 @@ from typing import Any
 import diffrax
 import jax.numpy as jnp
 
+from .._check import check_number, check_range
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import PermanentMagnetMotor
@@ -65,6 +66,8 @@ def permanent_magnet_motor(
         env = dlx.make("permanent_magnet_motor", speed=80.0, disturbance=load)
         ```
     """
+    check_number(speed, "speed", "permanent_magnet_motor")
+    check_range(max_voltage, "max_voltage", "permanent_magnet_motor")
     system = PermanentMagnetMotor(
         resistance, d_inductance, q_inductance, flux, inertia, friction, pole_pairs
     )

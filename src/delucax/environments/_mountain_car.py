@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_positive, check_range, check_step
+from .._check import check_number, check_positive, check_range, check_step
 from .._fields import parameter, positive
 from .._results import RESULTS
 from .._typing import RealScalar
@@ -273,6 +273,8 @@ def _valley(
     goal: _AtGoal,
 ) -> dict[str, Any]:
     """What both tasks share."""
+    check_number(goal.goal_position, "goal_position", where)
+    check_number(goal.goal_velocity, "goal_velocity", where)
     low, high = jnp.array([-0.6, 0.0]), jnp.array([-0.4, 0.0])
     dynamics = own_or_solver(
         GymMountainCar, system, dt, solver, substeps, where, limits

@@ -5,6 +5,7 @@ from typing import Any
 import diffrax
 import jax.numpy as jnp
 
+from .._check import check_range
 from .._typing import PRNGKey
 from ..costs import Quadratic
 from ..dynamics import Discretized
@@ -65,6 +66,7 @@ def neural(
         again = dlx.make("neural", system=env.dynamics.system)
         ```
     """
+    check_range(max_control, "max_control", "neural")
     if (system is None) == (key is None):
         got = "neither" if key is None else "both"
         raise ValueError(

@@ -7,13 +7,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._check import check_range
 from .._fields import as_float_array
 from .._typing import PRNGKey
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import Quadrotor
 from ..systems._quadrotor import attitude_difference, unit_attitude
-from ._environment import Environment, UniformState
+from ._environment import Environment, LARGEST, UniformState
 from ._registry import finish
 
 
@@ -117,6 +118,7 @@ def quadrotor(
         env = dlx.make("quadrotor", mass=0.8)
         ```
     """
+    check_range(max_thrust, "max_thrust", "quadrotor")
     system = Quadrotor(
         *(mass, arm, inertia_x, inertia_y, inertia_z, moment, drag, gravity),
         inputs=inputs,
@@ -127,7 +129,7 @@ def quadrotor(
         turn, yaw = system.arm * high, 2 * system.moment * high
         high = jnp.stack([4 * high, turn, turn, yaw])
         low = -high.at[0].set(0.0)
-    seen = jnp.full(18, jnp.inf).at[3:12].set(_ROTATION)
+    seen = jnp.full(18, LARGEST).at[3:12].set(_ROTATION)
     corner = jnp.array([1.0] * 3 + [0.0] + [0.2] * 3 + [0.5] * 6)
     weights = jnp.array([1.0] * 7 + [0.1] * 6)
     arguments: dict[str, Any] = dict(

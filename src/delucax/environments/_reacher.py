@@ -14,7 +14,7 @@ from ..costs import AbstractCost
 from ..dynamics import Discretized
 from ..math import cos, sin
 from ..systems import Reacher
-from ._environment import Environment
+from ._environment import Environment, LARGEST
 from ._registry import finish
 
 
@@ -140,7 +140,7 @@ def reacher(
         jnp.stack(
             [
                 *[jnp.full((), sign)] * 4,
-                *[jnp.full((), sign * np.inf)] * 2,
+                *[jnp.full((), sign * LARGEST)] * 2,
                 *(sign * reach - cost.goal),
             ]
         )

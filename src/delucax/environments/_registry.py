@@ -93,6 +93,13 @@ def make(name: str, **kwargs: Any) -> Environment:
     return env
 
 
+def horizon_of(name: str) -> int:
+    """The horizon of one of our own tasks, unless another is given."""
+    module, _, function = _REGISTRY[name].partition(":")
+    task = getattr(importlib.import_module(module), function)
+    return inspect.signature(task).parameters["horizon"].default
+
+
 def finish(
     task: Callable[..., Environment],
     arguments: Mapping[str, Any],
@@ -144,6 +151,10 @@ def register(name: str, entry_point: str) -> None:
         env = dlx.make("my_pendulum")
         ```
     """
+    if not isinstance(name, str) or not name:
+        raise ValueError(
+            f"register: name must be a string that is not empty, got {name!r}."
+        )
     module, _, function = str(entry_point).partition(":")
     if not module or not function.isidentifier():
         raise ValueError(

@@ -62,6 +62,7 @@ def two_tank(
         env = dlx.make("two_tank", level=12.0)
         ```
     """
+    check_range(max_flow, "max_flow", "two_tank")
     check_range(level, "level", "two_tank")
     system = TwoTank(
         upper_area, lower_area, upper_outlet, lower_outlet, gravity, smoothing

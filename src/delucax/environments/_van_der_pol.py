@@ -5,6 +5,7 @@ from typing import Any
 import diffrax
 import jax.numpy as jnp
 
+from .._check import check_range
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import VanDerPol
@@ -52,6 +53,7 @@ def van_der_pol(
         env = dlx.make("van_der_pol", mu=2.0)
         ```
     """
+    check_range(max_control, "max_control", "van_der_pol")
     corner = jnp.full(2, 2.0)
     arguments: dict[str, Any] = dict(
         dynamics=Discretized(VanDerPol(mu), dt, solver, substeps),

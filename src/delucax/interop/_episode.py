@@ -64,13 +64,22 @@ def see(env: Environment, k: Any, x: Array, signals: Signals) -> Array:
     return env.encode(y if signals.noise is None else y + signals.noise[k])
 
 
-def move(env: Environment, k: Any, x: Array, action: Array, signals: Signals) -> Moved:
-    """One step; the final cost is charged with the last."""
+def move(
+    env: Environment,
+    k: Any,
+    x: Array,
+    action: Array,
+    signals: Signals,
+    truncate: bool = True,
+) -> Moved:
+    """One step; the final cost is charged with the last, which is at the horizon if
+    episodes are to be truncated there."""
     w = None if signals.disturbance is None else signals.disturbance[k]
     step = env.step(time_of(env, k, x.dtype), x, action, w)
     x_next, after = step.state.astype(x.dtype), k + 1
-    truncated = after >= env.horizon
+    truncated = (after >= env.horizon) & truncate
     ended = step.terminated | truncated
     final = jnp.where(ended, env.cost.final(time_of(env, after, x.dtype), x_next), 0)
-    failed = (step.result != RESULTS.successful) | ~jnp.all(jnp.isfinite(action))
+    finite = jnp.all(jnp.isfinite(action)) & jnp.all(jnp.isfinite(x_next))
+    failed = (step.result != RESULTS.successful) | ~finite
     return Moved(x_next, -(step.cost + final), step.terminated, truncated, failed)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from .._check import as_path
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
 
@@ -41,7 +42,7 @@ def read_linear(
         ```
     """
     where = "read_linear"
-    held = _matrices(Path(path), where)
+    held = _matrices(as_path(path, "path", where), where)
     for name in ("A", "B"):
         if name not in held:
             raise ValueError(
@@ -74,6 +75,8 @@ def read_linear(
 def _matrices(path: Path, where: str) -> dict[str, Any]:
     """The matrices in a file, by name."""
     names = ("A", "B", "C", "D", "E", "dt")
+    if path.suffix in (".npz", ".mat") and not path.is_file():
+        raise FileNotFoundError(f"{where}: path must be a file, got '{path}'.")
     if path.suffix == ".npz":
         with np.load(path, allow_pickle=False) as file:
             held = {name: file[name] for name in names if name in file}

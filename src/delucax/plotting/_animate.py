@@ -8,7 +8,7 @@ import os
 import numpy as np
 from PIL import Image
 
-from .._check import check_count
+from .._check import check_bool, check_count
 from ..environments import Environment
 from ..simulation import Trajectory
 from ._export import check_path, compressed, html_player, write
@@ -180,7 +180,7 @@ def animate(
         tuple(indices.tolist()),
         float(FASTEST if fps is None else fps),
         float(dpi),
-        bool(traces),
+        check_bool(traces, "traces", "animate"),
     )
     if target is not None:
         write(target, animation._frames, animation.fps)

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from matplotlib.backend_bases import FigureManagerBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -25,6 +26,14 @@ class Picture:
             import matplotlib.pyplot as plt
 
             self.figure = plt.figure(figsize=_INCHES, dpi=_DPI, layout="constrained")
+            manager: Any = self.figure.canvas.manager
+            if type(manager).show is FigureManagerBase.show:
+                plt.close(self.figure)
+                raise RuntimeError(
+                    "render_mode='human' needs a display, and Matplotlib's backend "
+                    f"here, {plt.get_backend()!r}, opens no window; render_mode="
+                    "'rgb_array' draws without one."
+                )
         else:
             self.figure = Figure(_INCHES, _DPI, layout="constrained")
             FigureCanvasAgg(self.figure)

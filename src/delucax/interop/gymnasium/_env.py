@@ -6,15 +6,14 @@ from typing import Any, NoReturn
 
 import gymnasium
 import jax
-import jax.numpy as jnp
 import numpy as np
 from gymnasium.error import InvalidAction, ResetNeeded
 
-from ..._check import as_vector, check_finite
+from ..._check import as_vector, check_bool, check_finite
 from ...environments import Environment
 from .._episode import has_signals
 from ._program import program, REWARD, shared, STEP
-from ._spaces import action_space, is_discrete, observation_space
+from ._spaces import action_space, is_discrete, observation_space, read_options
 
 
 RENDER_MODES = ("rgb_array", "human")
@@ -35,6 +34,9 @@ class GymnasiumEnv(gymnasium.Env):
     - `discrete`: whether actions are whole numbers, indices into `env.actions`. By
         default they are if there is such a table.
     - `render_mode`: `"rgb_array"`, `"human"`, or none (default).
+    - `truncate`: whether episodes are truncated at the horizon, True by default. False
+        leaves that to a wrapper, such as Gymnasium's `TimeLimit`, where nothing is
+        drawn for the whole episode; no final cost is charged at its limit.
 
     `reset(seed=..., options={"state": x})` starts at the state `x`.
 
@@ -63,6 +65,7 @@ class GymnasiumEnv(gymnasium.Env):
         *,
         discrete: bool | None = None,
         render_mode: str | None = None,
+        truncate: bool = True,
     ):
         where = "GymnasiumEnv"
         if not isinstance(env, Environment):
@@ -74,14 +77,20 @@ class GymnasiumEnv(gymnasium.Env):
                 f"{where}: render_mode must be one of {RENDER_MODES} or None, got "
                 f"{render_mode!r}."
             )
+        if not check_bool(truncate, "truncate", where) and has_signals(env):
+            raise ValueError(
+                f"{where}: truncate must be True where there are disturbances or "
+                "sensor noise, which are drawn up to the horizon, got False."
+            )
         self.environment = env
         self.discrete = is_discrete(env, discrete, where)
+        self.truncate = bool(truncate)
         self.render_mode = render_mode
         fps = int(np.clip(np.round(1 / float(env.dt)), 1, 60))
         self.metadata = type(self).metadata | {"render_fps": fps}
         self.action_space = action_space(env, self.discrete)
         self.observation_space = observation_space(env)
-        self._program = program(env, self.discrete)
+        self._program = program(env, self.discrete, self.truncate)
         self._table = np.asarray(env.actions) if self.discrete else None
         self._count = 0 if env.actions is None else len(env.actions)
         self._shape = (env.control_size,)
@@ -109,17 +118,12 @@ class GymnasiumEnv(gymnasium.Env):
         **Returns:** the observation, and an empty dictionary.
         """
         super().reset(seed=seed)
-        options = dict(options or {})
-        state = options.pop("state", None)
-        if options:
-            raise ValueError(
-                "GymnasiumEnv: options takes 'state' alone, got "
-                f"{', '.join(map(repr, options))}."
-            )
+        where = "GymnasiumEnv"
+        (state,) = read_options(options, ("state",), where)
         if state is not None:
-            size, where = self.environment.state_size, "GymnasiumEnv"
-            state = as_vector(jnp.asarray(state, float), size, "state", where)
+            state = as_vector(state, self.environment.state_size, "state", where)
             check_finite(state, "state", where)
+            state = state.astype(float)
         key = jax.random.key(int(self.np_random.integers(2**32)))
         packed, signals = self._program.start(key, state)
         packed = np.asarray(packed)
@@ -159,7 +163,7 @@ class GymnasiumEnv(gymnasium.Env):
 
     def __setstate__(self, state):
         self.__dict__.update(state)
-        self._program = program(self.environment, self.discrete)
+        self._program = program(self.environment, self.discrete, self.truncate)
         given = self._given
         if given is not None:
             self._allocate(given.dtype)
@@ -189,7 +193,10 @@ class GymnasiumEnv(gymnasium.Env):
                 self._refuse(action)
             self._action[0] = index
         else:
-            asked = np.asarray(action)
+            try:
+                asked = np.asarray(action)
+            except ValueError:  # ragged
+                self._refuse(action)
             if asked.shape != self._shape or asked.dtype.kind not in "iuf":
                 self._refuse(action)
             self._action[...] = asked

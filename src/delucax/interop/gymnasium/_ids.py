@@ -4,10 +4,14 @@ from typing import Any
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 from gymnasium.envs.registration import EnvSpec
 
 from ..._check import check_count
+from ...costs import AbstractCost
 from ...environments import Environment, make as make_task
+from ...environments._registry import horizon_of
+from .._episode import has_signals
 from ._env import GymnasiumEnv
 from ._vector import GymnasiumVectorEnv
 
@@ -38,6 +42,15 @@ _IDS = {
 }
 
 
+# The mean return at which Gymnasium takes a task to be solved.
+_THRESHOLDS = {
+    "Acrobot-v1": -100.0,
+    "CartPole-v1": 475.0,
+    "MountainCar-v0": -110.0,
+    "MountainCarContinuous-v0": 90.0,
+}
+
+
 # Tasks whose plants are drawn at random, unless one is given.
 _DRAWN = {"lds": ("A", "B", "system", "key"), "neural": ("system", "key")}
 
@@ -55,10 +68,11 @@ def make(
     render_mode: str | None = None,
     **kwargs: Any,
 ) -> GymnasiumEnv:
-    """The task of that name as a `gymnasium.Env`: the entry point of all ids.
+    """The task of that name as a `gymnasium.Env`.
 
-    `gymnasium.make("delucax/Pendulum-v1", length=1.2)` calls it, once
-    `delucax.interop.gymnasium` has been imported.
+    `gymnasium.make("delucax/Pendulum-v1", length=1.2)` makes it too, once
+    `delucax.interop.gymnasium` has been imported. There `max_episode_steps`, of
+    Gymnasium, ends the episodes: the horizon of the task by default.
 
     **Arguments:**
 
@@ -83,12 +97,37 @@ def make(
     return GymnasiumEnv(env, discrete=discrete, render_mode=render_mode)
 
 
+def make_registered(task: str, **kwargs: Any) -> GymnasiumEnv:
+    """The entry point of all ids, whose episodes Gymnasium's time limit ends.
+
+    What has to know when that is ends at its own horizon: a task with a horizon that is
+    given, with disturbances or noise, which are drawn for all of it, or with a cost
+    that is given and charges a final state.
+    """
+    own = {k: kwargs.pop(k) for k in ("discrete", "render_mode") if k in kwargs}
+    env = _task(task, kwargs)
+    ends = (
+        "horizon" in kwargs or has_signals(env) or _has_final(kwargs.get("cost"), env)
+    )
+    return GymnasiumEnv(env, truncate=ends, **own)
+
+
+def _has_final(cost: AbstractCost | None, env: Environment) -> bool:
+    """Whether a cost that is given charges the last state."""
+    if cost is None:
+        return False
+    final = jax.make_jaxpr(cost.final)(0.0, jnp.zeros(env.state_size))
+    x = final.jaxpr.invars[1]
+    return any(x is v for e in final.jaxpr.eqns for v in e.invars)
+
+
 def make_vector(
     task: str,
     num_envs: int = 1,
     *,
     discrete: bool | None = None,
     autoreset_mode: Any = "NextStep",
+    max_episode_steps: int | None = None,
     **kwargs: Any,
 ) -> GymnasiumVectorEnv:
     """Many of the task of that name as one `gymnasium.vector.VectorEnv`.
@@ -102,9 +141,14 @@ def make_vector(
     - `num_envs`: how many.
     - `discrete`, `autoreset_mode`: of
         [`delucax.interop.gymnasium.GymnasiumVectorEnv`][].
+    - `max_episode_steps`: steps an episode, if it is below the `horizon` that is given;
+        that of the task by default.
     - `**kwargs`: passed to the task.
 
     **Returns:** a [`delucax.interop.gymnasium.GymnasiumVectorEnv`][].
+
+    **Raises:** `ValueError` on a wrong argument, a `render_mode` among them: pictures
+    are of one environment.
 
     !!! example
 
@@ -115,9 +159,17 @@ def make_vector(
         envs.reset(seed=0)
         ```
     """
-    kwargs.pop("render_mode", None)
+    where = "make_vector"
+    if kwargs.pop("render_mode", None) is not None:
+        raise ValueError(
+            f"{where}: render_mode must be left out, for pictures are of one "
+            'environment (`gymnasium.make`, or `vectorization_mode="sync"`).'
+        )
+    if max_episode_steps not in (None, -1):  # -1 is Gymnasium's word for none
+        steps = check_count(max_episode_steps, "max_episode_steps", where)
+        kwargs["horizon"] = min(steps, kwargs.get("horizon", steps))
     env = _task(task, kwargs)
-    num_envs = check_count(num_envs, "num_envs", "make_vector")
+    num_envs = check_count(num_envs, "num_envs", where)
     return GymnasiumVectorEnv(
         env, num_envs, discrete=discrete, autoreset_mode=autoreset_mode
     )
@@ -142,9 +194,11 @@ def register_ids() -> tuple[str, ...]:
     for name, (task, discrete) in _IDS.items():
         spec = EnvSpec(
             id=f"delucax/{name}",
-            entry_point=f"{__package__}:make",
+            entry_point=f"{__name__}:make_registered",
             vector_entry_point=f"{__package__}:make_vector",
-            # Ends and orders are checked by the environment itself.
+            max_episode_steps=horizon_of(task),
+            reward_threshold=_THRESHOLDS.get(name),
+            # Orders are checked by the environment itself.
             order_enforce=False,
             kwargs={"task": task, "discrete": discrete},
         )

@@ -50,9 +50,9 @@ class Program(NamedTuple):
     layout: Layout
 
 
-def program(env: Environment, discrete: bool) -> Program:
+def program(env: Environment, discrete: bool, truncate: bool = True) -> Program:
     """The program of an environment; one that is the same compiles no more."""
-    return _compiled(ByValue(env), discrete)
+    return _compiled(ByValue(env), discrete, truncate)
 
 
 def shared(size: int, dtype: Any) -> tuple[np.ndarray, jax.Array]:
@@ -70,19 +70,19 @@ def shared(size: int, dtype: Any) -> tuple[np.ndarray, jax.Array]:
 
 
 @functools.lru_cache(maxsize=64)
-def _compiled(same: ByValue, discrete: bool) -> Program:
+def _compiled(same: ByValue, discrete: bool, truncate: bool) -> Program:
     env = same.env
     layout = Layout(env.state_size, env.feature_size)
 
     def act(packed, action, signals):
         action = action[0].astype(int) if discrete else action
-        return _step(env, packed, action, signals)
+        return _step(env, packed, action, signals, truncate)
 
     def step(given, signals=NO_SIGNALS):
         return act(given[: layout.size], given[layout.size :], signals)
 
     start = functools.partial(_start, env)
-    start_batch = jax.vmap(start, in_axes=(0, None))
+    start_batch = jax.vmap(start)
     step_batch = functools.partial(_step_batch, act, start_batch)
     return Program(
         jax.jit(start),
@@ -109,9 +109,9 @@ def _start(env, key, state):
     return _packed(env, jnp.asarray(0), x, signals, 0, False, False, False), signals
 
 
-def _step(env, packed, action, signals):
+def _step(env, packed, action, signals, truncate):
     x, k = packed[: env.state_size], packed[STEP].astype(int)
-    x_next, *told = move(env, k, x, action, signals)
+    x_next, *told = move(env, k, x, action, signals, truncate)
     return _packed(env, k + 1, x_next, signals, *told)
 
 

@@ -1,19 +1,23 @@
 """A batch of environments with Gymnasium's vector interface."""
 
+from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.spaces import Discrete
+from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ..._check import check_count, check_finite
+from ..._check import check_count, check_finite, check_real
+from ..._fields import as_float_array
 from ...environments import Environment
 from ._program import FAILED, program, REWARD, TERMINATED, TRUNCATED
-from ._spaces import action_space, is_discrete, observation_space
+from ._spaces import action_space, is_discrete, observation_space, read_options
 
 
 class GymnasiumVectorEnv(VectorEnv):
@@ -34,8 +38,9 @@ class GymnasiumVectorEnv(VectorEnv):
     - `discrete`: whether actions are whole numbers, indices into `env.actions`; by
         default they are if there is such a table.
 
-    `reset(options={"state": x})` starts all at the state `x`; with
-    `options={"reset_mask": mask}` only some are reset.
+    `reset(options={"state": x})` starts all at the state `x`, or each at its own if `x`
+    has shape `(num_envs, state_size)`; with `options={"reset_mask": mask}` only some
+    are reset. Pictures are of one: [`delucax.interop.gymnasium.GymnasiumEnv`][].
 
     **Raises:** `ValueError` on a wrong argument. `step` raises
     `gymnasium.error.ResetNeeded` before `reset`, `gymnasium.error.InvalidAction` on
@@ -98,40 +103,26 @@ class GymnasiumVectorEnv(VectorEnv):
     def reset(
         self,
         *,
-        seed: int | None = None,
+        seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode in each.
 
         **Arguments:**
 
-        - `seed`: of all that is random from now on; by default it goes on as it was.
-        - `options`: `{"state": x}`, the state that all start at;
+        - `seed`: of all that is random from now on; by default it goes on as it was. A
+            list has one for each, which starts as
+            [`delucax.interop.gymnasium.GymnasiumEnv`][] with it does.
+        - `options`: `{"state": x}`, the state that all start at, or one for each;
             `{"reset_mask": mask}`, shape `(num_envs,)`, which are reset.
 
         **Returns:** the observations, and an empty dictionary.
         """
-        super().reset(seed=seed)
-        where, size = "GymnasiumVectorEnv", self.environment.state_size
-        options = dict(options or {})
-        state, mask = options.pop("state", None), options.pop("reset_mask", None)
-        if options:
-            raise ValueError(
-                f"{where}: options takes 'state' and 'reset_mask' alone, got "
-                f"{', '.join(map(repr, options))}."
-            )
-        if state is not None:
-            state = jnp.asarray(state, float)
-            if state.shape != (size,):
-                raise ValueError(
-                    f"{where}: state must have shape ({size},), got {state.shape}."
-                )
-            check_finite(state, "state", where)
-        key = jax.random.key(int(self.np_random.integers(2**32)))
-        self._key, use = jax.random.split(key)
-        keys = jax.random.split(use, self.num_envs)
-        made = self._program
-        packed, signals = made.start_batch(keys, state)
+        where = "GymnasiumVectorEnv"
+        state, mask = read_options(options, ("state", "reset_mask"), where)
+        state = self._as_states(state)
+        keys = self._seeded(seed)
+        packed, signals = self._program.start_batch(keys, state)
         if mask is not None:
             mask = np.asarray(mask)
             if mask.shape != (self.num_envs,) or mask.dtype != bool:
@@ -150,6 +141,51 @@ class GymnasiumVectorEnv(VectorEnv):
             )
         self._packed, self._signals = packed, signals
         return self._observations(np.asarray(packed)), {}
+
+    def _as_states(self, state: Any) -> jax.Array | None:
+        """A state for each, if any is given."""
+        if state is None:
+            return None
+        where, shape = "GymnasiumVectorEnv", (self.environment.state_size,)
+        each = (self.num_envs, *shape)
+        state = as_float_array(state)
+        if not eqx.is_inexact_array(state) or state.shape not in (shape, each):
+            got = f"shape {state.shape}" if eqx.is_array(state) else repr(state)
+            raise ValueError(
+                f"{where}: state must have shape {shape}, or {each} for one each, got "
+                f"{got}."
+            )
+        check_real(state, "state", where)
+        check_finite(state, "state", where)
+        return jnp.broadcast_to(state.astype(float), each)
+
+    def _seeded(self, seed: Any) -> jax.Array:
+        """A key for the start of each; and one for what starts later."""
+        own: Any = None
+        if not isinstance(seed, Sequence | np.ndarray):
+            super().reset(seed=seed)
+        else:
+            own = seed
+            whole = [
+                one is None or isinstance(one, int | np.integer) and one >= 0
+                for one in own
+            ]
+            if len(whole) != self.num_envs or not all(whole):
+                raise ValueError(
+                    f"GymnasiumVectorEnv: seed must be {self.num_envs} whole numbers "
+                    f"from 0, one for each, or one for all, got {seed!r}."
+                )
+            given = [int(one) for one in own if one is not None]
+            mixed = np.random.SeedSequence(given).generate_state(1)[0]
+            super().reset(seed=int(mixed) if given else None)
+        key = jax.random.key(int(self.np_random.integers(2**32)))
+        self._key, use = jax.random.split(key)
+        keys = jax.random.split(use, self.num_envs)
+        for i, one in enumerate(() if own is None else own):
+            if one is not None:
+                draw = np_random(int(one))[0].integers(2**32)
+                keys = keys.at[i].set(jax.random.key(int(draw)))
+        return keys
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One step of each.
@@ -188,6 +224,7 @@ class GymnasiumVectorEnv(VectorEnv):
             for i in np.flatnonzero(ended):
                 final[i] = observations[i]
             info = {"final_obs": final, "_final_obs": ended.copy()}
+            info |= {"final_info": {}, "_final_info": ended.copy()}
         rewards = packed[:, REWARD].astype(np.float64)
         return self._observations(packed), rewards, terminations, truncations, info
 
@@ -195,8 +232,14 @@ class GymnasiumVectorEnv(VectorEnv):
         return packed[:, self._program.layout.observation].astype(np.float32)
 
     def _checked(self, actions: Any) -> np.ndarray:
-        actions, where = np.asarray(actions), "GymnasiumVectorEnv"
-        space = self.single_action_space
+        where, space = "GymnasiumVectorEnv", self.single_action_space
+        try:
+            actions = np.asarray(actions)
+        except ValueError:  # ragged
+            raise InvalidAction(
+                f"{where}: actions must have the shape {self.action_space.shape}, got "
+                f"{actions!r}."
+            ) from None
         kinds = "iu" if isinstance(space, Discrete) else "iuf"
         shape = (self.num_envs, *(space.shape or ()))
         if actions.shape != shape or actions.dtype.kind not in kinds:

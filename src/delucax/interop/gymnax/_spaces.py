@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._check import is_concrete
+from ...environments._environment import LARGEST as LARGEST
 
 
 # A space has to end somewhere, and of an action space samples are drawn.
-LARGEST = float(np.finfo(np.float32).max)
 LARGEST_ACTION = 1e3
 
 
@@ -51,6 +51,26 @@ class Discrete:
 
     def __repr__(self):
         return f"Discrete({self.n})"
+
+
+def check_index(action: Array, n: int) -> None:
+    """Raise unless an action that can be looked at is one of `n`."""
+    if not is_concrete(action):
+        return
+    index = np.asarray(action).reshape(())
+    if not (index == np.round(index) and 0 <= index < n):
+        raise ValueError(
+            f"GymnaxEnv: action must be a whole number from 0 to {n - 1}, got {index}."
+        )
+
+
+def separates_ends() -> bool:
+    """Whether those who will step want two ends: gymnax since 1.0 does. rejax, which
+    imports any gymnax, wants one.
+    """
+    theirs = sys.modules.get("gymnax.environments.environment")
+    two = hasattr(getattr(theirs, "Environment", None), "is_truncated")
+    return two and "rejax" not in sys.modules
 
 
 def discrete_space(n: int) -> Any:

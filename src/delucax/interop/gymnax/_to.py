@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..._check import is_concrete
+from ..._check import check_bool, check_key, is_concrete
 from ..._fields import as_float_array
 from ...environments import Environment
 from .._by_value import ByValue
@@ -21,71 +21,15 @@ from .._episode import (
     Signals,
     split_key,
 )
-from ._spaces import box_space, discrete_space, LARGEST, LARGEST_ACTION
-
-
-class GymnaxParams(eqx.Module):
-    """The numbers of an environment, as the `params` of gymnax's protocol.
-
-    **Arguments:** `environment`: the environment.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        from delucax.interop.gymnax import GymnaxParams, to_gymnax
-
-        env = to_gymnax(dlx.make("pendulum"))
-        longer = GymnaxParams(dlx.make("pendulum", length=1.2))
-        env.action_space(longer)
-        ```
-    """
-
-    arrays: Any
-    static: Any = eqx.field(static=True)
-
-    def __init__(self, environment: Environment):
-        if not isinstance(environment, Environment):
-            raise ValueError(
-                "GymnaxParams: environment must be a delucax.Environment, got "
-                f"{type(environment).__name__}."
-            )
-        self.arrays, self.static = eqx.partition(environment, eqx.is_array)
-
-    @property
-    def environment(self) -> Environment:
-        """The environment."""
-        return eqx.combine(self.arrays, self.static)
-
-    @property
-    def max_steps_in_episode(self) -> int:
-        """The horizon."""
-        return self.environment.horizon
-
-
-class GymnaxState(eqx.Module):
-    """The state of an episode.
-
-    **Arguments:**
-
-    - `state`: of the environment, shape `(state_size,)`.
-    - `time`: steps since it began.
-    - `keys`: what the disturbances and the noise of the episode are drawn with; none if
-        nothing is drawn.
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax.interop.gymnax import GymnaxState
-
-        GymnaxState(jnp.array([0.5, 0.0]), jnp.asarray(0))
-        ```
-    """
-
-    state: Array
-    time: Array
-    keys: Any = None
+from ._params import GymnaxParams, GymnaxState
+from ._spaces import (
+    box_space,
+    check_index,
+    discrete_space,
+    LARGEST,
+    LARGEST_ACTION,
+    separates_ends,
+)
 
 
 class GymnaxEnv:
@@ -100,10 +44,12 @@ class GymnaxEnv:
     - `discrete`: whether actions are whole numbers, indices into `env.actions`. By
         default they are if there is such a table.
     - `separate_ends`: whether `step` returns `terminated` and `truncated`, as gymnax
-        does from 1.0 on, in place of `done`. False by default.
+        does from 1.0 on, in place of `done`; by default as
+        [`delucax.interop.gymnax.to_gymnax`][] says.
 
     **Raises:** `ValueError` on a wrong argument; in a step, on an action of the wrong
-    size.
+    size or kind, or one that is not in the table. One that is being traced cannot be
+    looked at: its fraction is cut off, and it is clamped to the table.
 
     !!! example
 
@@ -122,7 +68,7 @@ class GymnaxEnv:
         env: Environment,
         *,
         discrete: bool | None = None,
-        separate_ends: bool = False,
+        separate_ends: bool | None = None,
     ):
         where = "to_gymnax"
         if not isinstance(env, Environment):
@@ -136,13 +82,17 @@ class GymnaxEnv:
                 "jax.jit, jax.vmap or jax.grad); give traced numbers as params, "
                 "GymnaxParams(env)."
             )
+        for name, given in (("discrete", discrete), ("separate_ends", separate_ends)):
+            if given is not None:
+                check_bool(given, name, where)
         if discrete and env.actions is None:
             raise ValueError(
                 f"{where}: discrete needs a table of actions in the environment, which "
                 "has none."
             )
-        self.discrete = env.actions is not None if discrete is None else bool(discrete)
-        self.separate_ends = bool(separate_ends)
+        self.discrete = env.actions is not None if discrete is None else discrete
+        separate = separates_ends() if separate_ends is None else separate_ends
+        self.separate_ends = bool(separate)
         self._made = ByValue(env)
         self._identity = (self._made, self.discrete, self.separate_ends)
 
@@ -187,7 +137,6 @@ class GymnaxEnv:
         """
         return self.reset_env(key, params)
 
-    @functools.partial(jax.jit, static_argnames=("self",))
     def step(
         self,
         key: Any,
@@ -207,8 +156,14 @@ class GymnaxEnv:
         **Returns:** observation, state, reward, done and a dictionary; `terminated` and
         `truncated` in place of `done` with `separate_ends`. The dictionary has these
         two, `"final_observation"` (before the reset), `"discount"` (0 if terminated)
-        and `"failed"` (whether the solver did not converge).
+        and `"failed"` (whether the solver did not converge, or the action or the next
+        state is not finite: compiled code raises nothing, and NaN goes on as NaN).
         """
+        self._check_action(action)
+        return self._step(key, state, action, params)
+
+    @functools.partial(jax.jit, static_argnames=("self",))
+    def _step(self, key: Any, state: GymnaxState, action: Any, params: Any):
         seen, moved, reward, _, info = self.step_env(key, state, action, params)
         terminated, truncated = info["terminated"], info["truncated"]
         done = terminated | truncated
@@ -228,6 +183,7 @@ class GymnaxEnv:
 
         **Returns:** as `reset` does.
         """
+        check_key(key, "GymnaxEnv.reset")
         env = self._params(params).environment
         start_key, keys = split_key(key)
         x = env.reset(start_key)
@@ -252,15 +208,15 @@ class GymnaxEnv:
         del key
         env = self._params(params).environment
         signals = self._signals(env, state)
-        action = self._action(env, action)
-        moved = move(env, state.time, state.state, action, signals)
+        asked = self._check_action(action)
+        moved = move(env, state.time, state.state, self._action(env, asked), signals)
         after = GymnaxState(moved.state, state.time + 1, state.keys)
         seen = see(env, after.time, moved.state, signals)
         info = {
             "terminated": moved.terminated,
             "truncated": moved.truncated,
             "discount": 1 - moved.terminated.astype(moved.reward.dtype),
-            "failed": moved.failed,
+            "failed": moved.failed | ~jnp.all(jnp.isfinite(asked)),
         }
         ended = moved.terminated | moved.truncated
         done = moved.terminated if self.separate_ends else ended
@@ -329,16 +285,20 @@ class GymnaxEnv:
             )
         return params
 
-    def _action(self, env: Environment, action: Any) -> Array:
-        action = as_float_array(jnp.asarray(action))
-        size = 1 if self.discrete else env.control_size
-        if action.size != size:
-            raise ValueError(
-                f"GymnaxEnv: action must have {size} entries, got shape {action.shape}."
-            )
+    def _check_action(self, action: Any) -> Array:
+        asked, size = as_float_array(action), self._made.env.control_size
+        size = 1 if self.discrete else size
+        if not eqx.is_inexact_array(asked) or asked.size != size:
+            got = f"shape {asked.shape}" if eqx.is_array(asked) else repr(action)
+            raise ValueError(f"GymnaxEnv: action must have {size} entries, got {got}.")
         if self.discrete:
-            return action.reshape(()).astype(int)
-        return action.reshape(size)
+            check_index(asked, self.num_actions)
+        return asked
+
+    def _action(self, env: Environment, asked: Array) -> Array:
+        if not self.discrete:
+            return asked.reshape(env.control_size)
+        return jnp.clip(asked.reshape(()).astype(int), 0, self.num_actions - 1)
 
     def _signals(self, env: Environment, state: GymnaxState) -> Signals:
         if state.keys is None:
@@ -347,7 +307,10 @@ class GymnaxEnv:
 
 
 def to_gymnax(
-    env: Environment, *, discrete: bool | None = None, separate_ends: bool = False
+    env: Environment,
+    *,
+    discrete: bool | None = None,
+    separate_ends: bool | None = None,
 ) -> GymnaxEnv:
     """An environment in gymnax's protocol, without gymnax.
 
@@ -369,8 +332,9 @@ def to_gymnax(
     - `discrete`: whether actions are whole numbers, indices into `env.actions`. By
         default they are if there is such a table.
     - `separate_ends`: whether `step` returns `terminated` and `truncated`, as gymnax
-        does from 1.0 on, in place of `done`, which rejax and PureJaxRL want. False by
-        default.
+        does from 1.0 on, in place of `done`, which rejax and PureJaxRL want. By default
+        it does where gymnax 1.0 or later has been imported, whose wrappers want it, and
+        rejax has not.
 
     **Returns:** a [`delucax.interop.gymnax.GymnaxEnv`][].
 
