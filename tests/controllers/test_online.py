@@ -216,6 +216,21 @@ def test_best_in_hindsight():
     assert gain.trajectory.total_cost < cost(learner.loop.base.K)
 
 
+def test_hindsight_sees_the_noise_of_the_run():
+    plant, learner = partial()
+    noise = dlx.disturbances.Gaussian(1.0, size=1)
+    env = dlx.Environment(plant, COST, sensor_noise=noise, horizon=50)
+    options = dict(key=jax.random.key(5), x0=jnp.zeros(2), w=jnp.zeros((50, 2)))
+    played = dlx.rollout(env, learner.fixed(), **options)
+    found = c.best_in_hindsight(env, learner.fixed(), played)
+    again = dlx.rollout(env, found.controller, **options)
+    assert_close(found.trajectory.total_cost, again.total_cost, rtol=1e-9)
+    assert again.total_cost < played.total_cost
+    short = dlx.rollout(env, learner, keep=("states", "disturbances"), **options)
+    with user_error(match="trajectory must have its observations"):
+        c.best_in_hindsight(env, learner.fixed(), short)
+
+
 def switched():
     """A plant that becomes another one halfway."""
     first = np.arange(600)[:, None, None] < 300

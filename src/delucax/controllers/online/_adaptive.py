@@ -11,7 +11,6 @@ from jaxtyping import Array
 from ..._check import check_count, check_key, check_positive
 from ..._controller import AbstractController, AbstractLearner
 from ..._fields import parameter
-from ._learner import OnlineLearner
 
 
 class AdaptiveState(NamedTuple):
@@ -123,11 +122,7 @@ class Adaptive(AbstractController):
             base_key = key
         one = self.base.init(key=base_key)
         experts = jax.tree.map(
-            lambda leaf, axis: (
-                leaf if axis < 0 else jnp.broadcast_to(leaf, (self.slots, *leaf.shape))
-            ),
-            one,
-            self._axes(one),
+            lambda leaf: jnp.broadcast_to(leaf, (self.slots, *leaf.shape)), one
         )
         first = jnp.arange(self.slots) == 0
         zero = jnp.zeros(())
@@ -144,8 +139,7 @@ class Adaptive(AbstractController):
         )
 
     def __call__(self, t, y, state):
-        axes = self._vmapped(state.experts)
-        act = jax.vmap(self.base, in_axes=(None, None, axes), out_axes=(0, axes))
+        act = jax.vmap(self.base, in_axes=(None, None, 0))
         controls, experts = act(t, y, state.experts)
         if state.chosen is None:
             u = state.weights.astype(y.dtype) @ controls
@@ -155,27 +149,16 @@ class Adaptive(AbstractController):
         return u, state._replace(experts=experts, t=t)
 
     def applied(self, u, cost, state):
-        axes = self._vmapped(state.experts)
-        charged = jax.vmap(self.base.loss, in_axes=(None, axes))
-        losses = charged(state.t, state.experts)
+        losses = jax.vmap(self.base.loss, in_axes=(None, 0))(state.t, state.experts)
         state = self._judge(losses.astype(state.weights.dtype), state)
-        told = jax.vmap(self.base.applied, (None, None, axes), out_axes=axes)
+        told = jax.vmap(self.base.applied, in_axes=(None, None, 0))
         state = state._replace(
             experts=told(u, cost, state.experts), step=state.step + 1
         )
         return self._renew(state)
 
-    def _axes(self, expert: Any) -> Any:
-        """0 for what each expert has its own of, -1 for what is the same for all."""
-        if isinstance(self.base, OnlineLearner):
-            return self.base.own(expert)
-        return jax.tree.map(lambda _: 0, expert)
-
-    def _vmapped(self, experts: Any) -> Any:
-        return jax.tree.map(lambda axis: axis if axis == 0 else None, self._axes(experts))
-
     def _judge(self, losses: Array, state: AdaptiveState) -> AdaptiveState:
-        """New weights, and perhaps another choice, after the losses of a step."""
+        """New weights, up to a factor, and perhaps another choice, after a step."""
         old, alive = state.weights, state.weights > 0
         losses = jnp.where(alive, losses, 0)
         played = old @ losses
@@ -192,7 +175,7 @@ class Adaptive(AbstractController):
             best = jnp.min(jnp.where(alive, excess, jnp.inf))
             kept = jnp.exp(-self.rate * (excess[state.chosen] - best))
             state = self._choose(new, kept, state)
-        return state._replace(weights=new / jnp.sum(new))
+        return state._replace(weights=new)
 
     def _choose(self, weights: Array, kept: Array, state: AdaptiveState) -> Any:
         """Keep the expert that is followed with probability `kept`."""
@@ -210,14 +193,11 @@ class Adaptive(AbstractController):
         life = self.every * (4 * divisor + 1)
         newborn = born & (jnp.arange(self.slots) == slot)
         ends = jnp.where(newborn, step + life, ends)
-        axes = self._axes(state.experts)
-        old = jax.tree.map(
-            lambda leaf, axis: leaf if axis < 0 else leaf[slot], state.experts, axes
-        )
+        old = jax.tree.map(lambda leaf: leaf[slot], state.experts)
         new = self.base.fresh(old, None)
 
         def replaced(leaf, before, after):
-            # What a birth leaves as it is need not be written.
+            # What a birth leaves as it is is not written: most of the state.
             if after is before:
                 return leaf
             mask = newborn.reshape((-1,) + (1,) * (leaf.ndim - 1))

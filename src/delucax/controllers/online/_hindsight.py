@@ -13,6 +13,7 @@ from ..._check import check_count
 from ..._controller import AbstractController
 from ..._fields import marked_leaves
 from ..._results import choose, Result, RESULTS
+from ...disturbances import FromArray
 from ...environments import Environment
 from ...math._linear_solve import solve
 from ...simulation import rollout, Trajectory
@@ -66,8 +67,8 @@ def best_in_hindsight(
 
     with theta the trainable weights of `controller` (of a
     [`delucax.controllers.FixedPolicy`][] those of its policy, not of its base), from
-    the start and under the disturbances that `trajectory` recorded. It is found by
-    Newton's method with Levenberg's damping through the rollout, and is the global
+    the start and under the disturbances and sensor noise of `trajectory`. It is found
+    by Newton's method with Levenberg's damping through the rollout, and is the global
     minimum where the cost is convex in theta: of a disturbance-action policy on a
     linear plant with a convex cost it is, of a linear gain in general not.
 
@@ -88,8 +89,8 @@ def best_in_hindsight(
 
     **Returns:** [`delucax.controllers.Hindsight`][].
 
-    **Raises:** `ValueError` if the trajectory has no states or disturbances, or the
-    controller no trainable weights.
+    **Raises:** `ValueError` if the trajectory has no states or disturbances (or
+    observations, where they are noisy), or the controller no trainable weights.
 
     !!! example
 
@@ -122,6 +123,17 @@ def best_in_hindsight(
     iterations = check_count(iterations, "iterations", where)
     if tolerance is None:
         tolerance = float(jnp.finfo(states.dtype).eps ** 0.5)
+    if environment.sensor_noise is not None:
+        if trajectory.observations is None:
+            raise ValueError(
+                f"{where}: trajectory must have its observations, in an environment "
+                "with sensor noise."
+            )
+        seen = jax.vmap(environment.dynamics.observe)(
+            trajectory.times[:-1], states[:-1]
+        )
+        noise = FromArray(trajectory.observations - seen)
+        environment = eqx.tree_at(lambda e: e.sensor_noise, environment, noise)
     return _search(
         environment, controller, states[0], w, trajectory.steps, iterations, tolerance
     )

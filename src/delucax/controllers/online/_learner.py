@@ -123,17 +123,6 @@ class OnlineLearner(AbstractLearner):
         theta = self.policy.init()
         return state._replace(theta=theta, optimiser=self.optimiser.init(theta))
 
-    def own(self, state: LearnerState) -> LearnerState:
-        axes = jax.tree.map(lambda _: -1, state)
-        mine = lambda tree: jax.tree.map(lambda _: 0, tree)  # noqa: E731
-        return axes._replace(
-            theta=mine(state.theta),
-            optimiser=mine(state.optimiser),
-            loop=axes.loop._replace(
-                now=mine(state.loop.now), impulses=mine(state.loop.impulses)
-            ),
-        )
-
     def fixed(self, theta: Any = None) -> "FixedPolicy":
         """The same controller, no longer learning.
 
