@@ -162,6 +162,7 @@ def test_an_lqr_loop_has_the_margins_that_it_must():
     assert np.isinf(found.gain_margin)
 
 
+@thorough
 @pytest.mark.parametrize("discrete", [False, pytest.param(True, marks=thorough)])
 def test_gradients_are_central_differences_beside_an_unstable_loop(discrete):
     def loop(theta):
@@ -200,6 +201,7 @@ def test_gradients_are_central_differences_beside_an_unstable_loop(discrete):
     assert np.all(np.isfinite(slopes[7]))
 
 
+@thorough
 def test_disk_margins_of_several_channels():
     # A loop that is fragile only if both gains change at once (Seiler et al., 2020).
     A = jnp.array([[0.0, 10.0], [-10.0, 0.0]])

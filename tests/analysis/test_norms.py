@@ -132,6 +132,7 @@ def test_gradients_are_central_differences_beside_an_unstable_model(discrete):
     assert np.all(np.isfinite(slopes))
 
 
+@thorough
 def test_second_derivatives_are_central_differences():
     gain = lambda theta: an.hinf_norm(spring_chain(theta, False), throw=False).gain
 

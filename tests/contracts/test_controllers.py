@@ -172,8 +172,21 @@ CASES = {
     "BPC": Case(bandit),
     "Explore": Case(explorer),
 }
-# What differs from another case in its filters or its network alone.
-KIN = "SFC", "DSC", "NeuralGPC", "OutputFeedback of an unscented filter"
+# What differs little from another case, or compiles for long.
+KIN = (
+    "SFC",
+    "DSC",
+    "DRC",
+    "NeuralGPC",
+    "Explore",
+    "LQR that looks ahead",
+    "LQG from the start",
+    "HInfinity over a horizon",
+    "OutputFeedback of an unscented filter",
+    "PID on an index",
+    "MLP of features",
+    "Gaussian of PID",
+)
 every = pytest.mark.parametrize(
     "case",
     [

@@ -247,6 +247,7 @@ def noisy(log_levels, stiffness):
     return c.KalmanFilter(dynamics, q * jnp.eye(2), r * jnp.eye(1))
 
 
+@thorough
 @needs_x64
 def test_gradient_of_the_likelihood():
     @jax.jit

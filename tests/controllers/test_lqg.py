@@ -4,7 +4,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import assert_close, central_difference, needs_x64, tolerance, user_error
+from helpers import (
+    assert_close,
+    central_difference,
+    needs_x64,
+    thorough,
+    tolerance,
+    user_error,
+)
 
 import delucax as dlx
 
@@ -179,6 +186,7 @@ def test_output_feedback_of_anything(key):
     assert_close(run.controls, a.controls, atol=1e-4)
 
 
+@thorough
 @needs_x64
 def test_gradient_of_the_design():
     """Of the least average cost, with respect to the noise and to the physics."""

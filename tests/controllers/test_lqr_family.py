@@ -94,6 +94,7 @@ def test_finite_horizon_tracking_is_the_best_of_all_controls(key, parallel):
     assert_close(cost, minimum, rtol=1e-11)
 
 
+@thorough
 def test_a_planned_trajectory_needs_no_feed_forward(key):
     env = dlx.make("pendulum", solver=dlx.dynamics.RK4(), max_torque=10.0)
     controls = jnp.sin(0.3 * jnp.arange(15.0))[:, None]

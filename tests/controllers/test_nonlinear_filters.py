@@ -111,6 +111,7 @@ NOISE = STD_W**2 * jnp.eye(1), STD_V**2 * jnp.eye(2)
 START = dict(mean=jnp.array([1.0, 0.0]), covariance=0.3**2 * jnp.eye(2))
 
 
+@thorough
 def test_better_than_dead_reckoning(key):
     """On noisy swings the filter beats the model alone and the sensor alone, the
     smoother beats the filter, and both know how good they are."""
@@ -201,6 +202,7 @@ def test_angles_wrap(kind):
     assert np.max(angles[1]) < 3.5 and np.max(found.mean[0, :, 0]) > 3.2
 
 
+@thorough
 @pytest.mark.parametrize("kind", [EKF, pytest.param(UKF, marks=thorough)])
 def test_gradient_of_the_likelihood(kind):
     """With respect to a length and to noise levels."""

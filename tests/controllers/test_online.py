@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, needs_x64, user_error
+from helpers import assert_close, needs_x64, thorough, user_error
 
 import delucax as dlx
 
@@ -61,7 +61,13 @@ LEARNERS = {
 }
 
 
-@pytest.mark.parametrize("make", LEARNERS.values(), ids=LEARNERS)
+FEW = [
+    pytest.param(make, id=name, marks=() if name in ("GPC", "BPC") else thorough)
+    for name, make in LEARNERS.items()
+]
+
+
+@pytest.mark.parametrize("make", FEW)
 @pytest.mark.parametrize("dynamics", [PLANT, PENDULUM], ids=["linear", "pendulum"])
 def test_recovered_disturbances(dynamics, make):
     """Exactly zero where there are none, and else what they were, under saturation."""
@@ -216,6 +222,7 @@ def test_best_in_hindsight():
     assert gain.trajectory.total_cost < cost(learner.loop.base.K)
 
 
+@thorough
 def test_hindsight_sees_the_noise_of_the_run():
     plant, learner = partial()
     noise = dlx.disturbances.Gaussian(1.0, size=1)

@@ -106,6 +106,7 @@ def test_gradients_are_central_differences():
     assert_close(hessian.reshape(4, 4), numeric, rtol=1e-6, atol=1e-6)
 
 
+@thorough
 @needs_x64
 def test_tustin_is_differentiable():
     def loss(A):

@@ -9,6 +9,9 @@ from helpers import assert_close, needs_x64, thorough, tolerance, user_error
 import delucax as dlx
 
 
+pytestmark = needs_x64
+
+
 ilqr = dlx.planning.ilqr
 Constraints = dlx.planning.Constraints
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, user_error
+from helpers import assert_close, needs_x64, thorough, user_error
 
 import delucax as dlx
 
@@ -16,6 +16,7 @@ B, EYE = jnp.array([[0.0], [1.0]]), jnp.eye(2)
 RESULTS = dlx.RESULTS
 
 
+@thorough
 @pytest.mark.parametrize("name", ["dare", "care"])
 def test_gradients_beside_bad_members(name):
     good = np.array([[-0.9, 0.3], [0.1, -0.2]])

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import assert_close, needs_x64, tolerance, user_error
+from helpers import assert_close, needs_x64, thorough, tolerance, user_error
 
 import delucax as dlx
 
@@ -121,6 +121,7 @@ def test_one_bad_member_harms_no_other():
     assert_close(gradients[1], shared, rtol=1e-6)
 
 
+@thorough
 def test_complex_data():
     turn = np.diag(np.exp([0.3j, -0.4j]))
     plain = dlx.riccati.care(A, B, Q, R)

@@ -221,6 +221,7 @@ def assert_second_order(line, h):
     assert_close(second, (first_high - first_low) / (2 * h), rtol=1e-6)
 
 
+@thorough
 @pytest.mark.parametrize("parallel", [False, True])
 def test_derivatives_of_the_recursion(parallel):
     stages = random_stages(3, 3, 2, 1)

@@ -103,6 +103,7 @@ def test_least_level_is_the_norm_of_the_loop():
         assert_close(hinf_dare(*game, gamma=1.1 * gamma).X, X, rtol=1e-8, atol=1e-8)
 
 
+@thorough
 def test_continuous_game():
     for seed in range(4):
         game = random_game(seed)
@@ -288,10 +289,12 @@ def level_of(solve):
     return checked
 
 
+@thorough
 def test_derivative_of_the_least_level_over_a_horizon():
     level_of(GAMES["dre"])(*SMOOTH[:4])
 
 
+@thorough
 def test_derivative_of_the_least_level():
     level = level_of(hinf_dare)
     # A saddle point that goes as the disturbance wins within a step, and one that goes

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, user_error
+from helpers import assert_close, needs_x64, thorough, user_error
 from jaxtyping import Array
 
 import delucax as dlx
@@ -102,6 +102,7 @@ def test_forward_gradient():
     )
 
 
+@thorough
 @needs_x64
 @pytest.mark.parametrize(
     "controller, how",
@@ -123,6 +124,7 @@ def test_gradient_of_feedback(controller, how):
     assert_gradient(arguments, dt=0.05, **how)
 
 
+@thorough
 @needs_x64
 def test_gradient_with_respect_to_the_end():
     def f(t1):

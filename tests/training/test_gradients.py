@@ -9,6 +9,7 @@ from helpers import (
     assert_close,
     dtype,
     needs_x64,
+    thorough,
     tolerance,
     user_error,
 )
@@ -127,6 +128,7 @@ SCORED = (LikelihoodRatio(32), 4000)
 NO_BASELINE = (LikelihoodRatio(32, baseline=False), 16000)
 
 
+@thorough
 @pytest.mark.parametrize(
     "estimator", [ANALYTIC, SCORED, NO_BASELINE], ids=["analytic", "scored", "plain"]
 )

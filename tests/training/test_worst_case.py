@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, user_error
+from helpers import assert_close, needs_x64, thorough, user_error
 
 import delucax as dlx
 
@@ -45,6 +45,7 @@ def test_no_bounded_sequence_is_worse():
     assert_close(along, 0.5 * np.linalg.norm(g, axis=1), rtol=1e-3, atol=1e-2)
 
 
+@thorough
 def test_a_learner_under_attack():
     learner = dlx.controllers.GPC(PLANT, COST, memory=2)
     found = dlx.training.worst_case(

@@ -129,7 +129,7 @@ class Adaptive(AbstractController):
         return AdaptiveState(
             experts,
             weights=jnp.where(first, jnp.ones(()), 0),
-            ends=jnp.where(first, jnp.iinfo(jnp.int32).max, 0),
+            ends=jnp.where(first, jnp.iinfo(jnp.int32).max, 0).astype(jnp.int32),
             step=jnp.zeros((), jnp.int32),
             t=zero,
             mean=zero,
