@@ -146,6 +146,7 @@ def test_second_derivatives_are_central_differences():
     assert_close(curvatures[6], numeric, rtol=1e-6, atol=1e-6)
 
 
+@thorough
 def test_alike_channels_have_finite_gradients():
     def gain(a):
         system = LinearSystem(-a * jnp.eye(3), jnp.eye(3))

@@ -238,6 +238,7 @@ def test_points_of_a_singular_covariance():
         c.run_filter(spoilt, ys)
 
 
+@thorough
 @both
 def test_solver_that_fails(kind):
     """A step that is not solved is not passed off as a prediction."""

@@ -312,6 +312,7 @@ def final_angle(leaves, dynamics):
     return dlx.open_loop(dynamics, leaves[1:3], leaves[3:, None])[-1, 0]
 
 
+@thorough
 @needs_x64
 def test_backsolve_at_a_tight_tolerance():
     at = jnp.array([1.1, 1.0, -0.5, 0.7, -1.3])

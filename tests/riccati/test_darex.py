@@ -53,6 +53,7 @@ def test_published_systems(size):
         assert np.linalg.norm(solution.X - X) < 1e-9 * np.linalg.norm(X), name
 
 
+@thorough
 @needs_x64
 def test_families():
     systems = riccati_systems.darex_families(sizes=(4,))

@@ -146,6 +146,7 @@ def finite_game(seed):
     return [np.stack(parts) for parts in zip(*games, strict=True)]
 
 
+@thorough
 def test_finite_horizon_game():
     A, B, D, Q, R = finite_game(2)
     final = np.eye(2)
@@ -217,6 +218,7 @@ SMOOTH = (
 )
 
 
+@thorough
 @pytest.mark.parametrize(
     "solve",
     [

@@ -135,6 +135,7 @@ def test_gradient_with_respect_to_the_end():
     assert_close(jax.grad(f)(0.3), jnp.mean(CONTROLS), rtol=1e-12)
 
 
+@thorough
 def test_a_gradient_that_fails_is_loud():
     how = dict(stepsize_controller=LOOSE, adjoint=diffrax.BacksolveAdjoint(max_steps=1))
     f = lambda x0: dlx.simulate(

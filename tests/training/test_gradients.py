@@ -142,6 +142,7 @@ def test_the_gradient_of_a_random_closed_loop_is_unbiased(estimator):
     assert_mean(gradients, np.asarray(exact, float), power=0.25)
 
 
+@thorough
 def test_a_baseline_lowers_the_variance():
     loss = scored_cost(environment())
     _, scored = estimates(SCORED[0], loss, Recalling(), SCORED[1])
