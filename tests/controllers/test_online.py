@@ -360,6 +360,20 @@ def test_spectral_filters():
         assert np.linalg.norm(bank.T @ weights - wanted) < 2e-4
 
 
+class Twice(dlx.AbstractDynamics):
+    """As many outputs as states, which they are not."""
+
+    dt = jnp.ones(())
+    state_names = PLANT.state_names
+    control_names = PLANT.control_names
+
+    def advance(self, t, x, u, w):
+        return PLANT.advance(t, x, u, w)
+
+    def observe(self, t, x):
+        return 2 * x
+
+
 UNSTABLE = c.Linear(np.zeros((1, 2)))
 LOOSE = dlx.LinearDynamics(A, B, np.array([[1.0, 0.0]]))
 vector = lambda t, x, u: x
@@ -390,6 +404,10 @@ NO_POINT = dlx.Discretized(dlx.systems.Lorenz(), dt=0.01)
         (lambda: c.BPC(PLANT, c.LQR(PLANT, Q, R)).init(), "key must be one random"),
         (lambda: c.Adaptive(c.Zero(1)), "base must be an AbstractLearner"),
         (lambda: c.Adaptive(c.GPC(PLANT, COST), slots=1), "slots must be a whole"),
+        (lambda: c.Adaptive(c.GPC(PLANT, COST), share=0.0), "share must be positive"),
+        (lambda: c.Adaptive(c.GPC(PLANT, COST), share=2.0), "share must be between"),
+        (lambda: c.GPC(PLANT, COST, radius=[1.0, 2.0]), "radius must be a number"),
+        (lambda: c.GPC(Twice(), COST, base=c.LQR(PLANT, Q, R)), "not observed"),
         (lambda: c.Adaptive(c.GPC(PLANT, COST), play="both"), "'mix' or 'switch'"),
         (lambda: c.Explore(3, np.zeros((1, 2)), 100), "build must be a function"),
         (lambda: c.Explore(build, np.zeros((1, 2)), 3), "steps must be a whole"),

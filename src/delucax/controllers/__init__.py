@@ -7,6 +7,7 @@ from ._basic import (
     Sequence as Sequence,
     Zero as Zero,
 )
+from ._categorical import Categorical as Categorical, Likeliest as Likeliest
 from ._estimator import AbstractEstimator as AbstractEstimator, Belief as Belief
 from ._finite_horizon import FiniteHorizonLQR as FiniteHorizonLQR
 from ._gaussian import Gaussian as Gaussian
@@ -22,6 +23,7 @@ from ._nonlinear_filters import (
 )
 from ._output_feedback import OutputFeedback as OutputFeedback
 from ._pid import LeakyPID as LeakyPID, PID as PID
+from ._recurrent import GRU as GRU, History as History, Standardise as Standardise
 from ._sampled import lqrd as lqrd, sampled_weights as sampled_weights
 from ._scheduled import Scheduled as Scheduled
 from ._smoother import (

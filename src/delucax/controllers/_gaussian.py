@@ -124,6 +124,23 @@ class Gaussian(AbstractController):
         mean, _ = self._mean(t, y, state)
         return self._log_prob(mean, u)
 
+    def entropy(self, t: RealScalar, y: Array, state: PyTree) -> Array:
+        """The entropy of the normal draw, before the bounds,
+
+        `sum_i log std_i + log(2 pi e) / 2`.
+
+        **Arguments:**
+
+        - `t`: time, a scalar.
+        - `y`: observation, a vector.
+        - `state`: the controller's state, before the call.
+
+        **Returns:** a scalar.
+        """
+        mean, _ = self._mean(t, y, state)
+        each = jnp.broadcast_to(self.log_std, mean.shape)
+        return jnp.sum(each + 0.5 * jnp.log(2 * jnp.pi * jnp.e)).astype(mean.dtype)
+
     def _log_prob(self, mean, u):
         std = jnp.exp(self.log_std)
         z = (u - mean) / std

@@ -2,12 +2,12 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._check import as_matrix, check_positive
 from .._fields import parameter
 from ..math import matvec
+from ..math._norms import within_ball
 from ._base import AbstractDynamics
 
 
@@ -111,10 +111,7 @@ class WorstCase(AbstractDynamics):
         added = matvec(self.L, self.dynamics.difference(x, x_ref)).astype(x.dtype)
         if self.bound is None:
             return added
-        squared = jnp.sum(added**2)
-        over = squared > self.bound**2
-        norm = jnp.sqrt(jnp.where(over, squared, 1))
-        return jnp.where(over, self.bound / norm, 1).astype(x.dtype) * added
+        return within_ball(added, self.bound)
 
     def advance(self, t, x, u, w):
         added = self.attack(x)

@@ -29,3 +29,11 @@ def safe_norm(x: ArrayLike, axis: int | None = -1, keepdims: bool = False) -> Ar
     squared = jnp.sum(x * x, axis=axis, keepdims=keepdims)
     at_zero = squared == 0
     return jnp.where(at_zero, 0.0, jnp.sqrt(jnp.where(at_zero, 1.0, squared)))
+
+
+def within_ball(x: Array, radius: ArrayLike) -> Array:
+    """The nearest point of a ball in the Euclidean (Frobenius) norm, with a finite
+    gradient everywhere."""
+    norm = safe_norm(x, axis=None)
+    over = norm > radius
+    return jnp.where(over, radius / jnp.where(over, norm, 1), 1).astype(x.dtype) * x

@@ -14,6 +14,7 @@ from .._controller import AbstractController
 from .._fields import as_float_array
 from .._typing import PRNGKey
 from ..environments import Environment
+from ..math import safe_norm
 from ..simulation import rollout
 
 
@@ -138,7 +139,7 @@ def _attack(environment, controller, key, bound, x0, horizon, iterations, starts
         return rollout(environment, controller, w=w, **options).total_cost
 
     def on_sphere(g, old):
-        norm = jnp.sqrt(jnp.sum(g**2, axis=-1, keepdims=True))
+        norm = safe_norm(g, keepdims=True)
         moved = (norm > 0) & jnp.isfinite(norm)
         return jnp.where(moved, bound * g / jnp.where(moved, norm, 1), old)
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from ..._check import check_count, check_key, check_positive
+from ..._check import check_count, check_key, check_positive, check_range
 from ..._controller import AbstractController, AbstractLearner
 from ..._fields import parameter
 
@@ -61,7 +61,7 @@ class Adaptive(AbstractController):
     - `slots`: the number of experts alive at once, 8 by default.
     - `every`: steps between births, 64 by default.
     - `rate`: of the weights, 0.5 by default.
-    - `share`: dealt out evenly at each step, 0.02 by default.
+    - `share`: dealt out evenly at each step, above 0 and at most 1; 0.02 by default.
     - `play`: `"mix"` (default) or `"switch"`.
 
     **Raises:** `ValueError` if `base` is not a learner or a number is out of its range;
@@ -109,6 +109,8 @@ class Adaptive(AbstractController):
         if play not in ("mix", "switch"):
             raise ValueError(f"{where}: play must be 'mix' or 'switch', got {play!r}.")
         check_positive(rate, "rate", where)
+        check_positive(share, "share", where)
+        check_range(share, "share", where, 0, 1)
         self.base, self.play = base, play
         self.slots = check_count(slots, "slots", where, least=2)
         self.every = check_count(every, "every", where)

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..._check import check_positive, is_concrete
-from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics, LinearDynamics, linearize
 from .._lqg import LQG
 from .._lqr import LQR
@@ -26,8 +25,27 @@ RADIUS = 50.0
 """The largest policy, in the same units."""
 
 
-def checked_cost(dynamics: Any, cost: Any, where: str) -> Any:
-    """The cost, if it gives a scalar."""
+def loop_of(
+    dynamics: Any,
+    cost: Any,
+    base: Any,
+    horizon: int | None,
+    where: str,
+    *,
+    echoes: bool | None = None,
+) -> Loop:
+    """The loop of a learner, with the default base if none is given; it echoes by
+    default if the state is not observed."""
+    _check_cost(dynamics, cost, where)
+    if base is None:
+        base = _default_base(dynamics, cost, where)
+    if echoes is None:
+        echoes = not observes_state(dynamics)
+    return Loop(dynamics, base, horizon, where, echoes=echoes)
+
+
+def _check_cost(dynamics: Any, cost: Any, where: str) -> None:
+    """Raise unless the cost gives a scalar."""
     if not isinstance(dynamics, AbstractDynamics):
         raise ValueError(
             f"{where}: dynamics must be an AbstractDynamics, the model that it learns "
@@ -45,10 +63,9 @@ def checked_cost(dynamics: Any, cost: Any, where: str) -> Any:
         got = getattr(found, "shape", None)
         got = type(found).__name__ if got is None else f"an array of shape {got}"
         raise ValueError(f"{where}: cost must give a scalar, got {got}.")
-    return cost
 
 
-def default_base(dynamics: AbstractDynamics, cost: Any, where: str) -> Any:
+def _default_base(dynamics: AbstractDynamics, cost: Any, where: str) -> Any:
     """The regulator for the curvature of the cost at the operating point.
 
     For each time of time-varying dynamics it is the one that would be best if they
@@ -126,6 +143,10 @@ def scale(loop: Loop, given: Any, name: str, units: float, where: str) -> Any:
     """A step size or radius: as given, or in units of `1 / reach`."""
     if given is not None:
         check_positive(given, name, where)
+        if np.ndim(given):
+            raise ValueError(
+                f"{where}: {name} must be a number, got shape {np.shape(given)}."
+            )
         return given
     if loop.reach is None:
         raise ValueError(
@@ -133,10 +154,3 @@ def scale(loop: Loop, given: Any, name: str, units: float, where: str) -> Any:
         )
     reached = loop.reach > 0
     return jnp.where(reached, units / jnp.where(reached, loop.reach, 1), units)
-
-
-def as_base(
-    dynamics: AbstractDynamics, cost: Any, base: Any, where: str
-) -> AbstractController:
-    """The base controller that was given, or the default one."""
-    return default_base(dynamics, cost, where) if base is None else base

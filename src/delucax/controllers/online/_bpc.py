@@ -12,10 +12,10 @@ from ..._check import check_count, check_key
 from ..._controller import AbstractController
 from ..._fields import parameter, weight
 from ...dynamics import AbstractDynamics
+from ...math._norms import safe_norm, within_ball
 from ._base import RADIUS, scale
 from ._features import Features
 from ._loop import Loop, LoopState, observes_state, shift
-from ._policy import within
 from ._step_size import adagrad_norm
 
 
@@ -155,7 +155,7 @@ class BPC(AbstractController):
         signal = self.features.observe(loop, moved, state.signal)
         key, now = jr.split(state.key)
         direction = jr.normal(now, self.start.shape, loop.dtype)
-        direction = direction / jnp.sqrt(jnp.sum(direction**2))
+        direction = direction / safe_norm(direction, axis=None)
         v = (state.theta + self.delta * direction) @ self.features(signal)
         state = state._replace(
             loop=loop.linearised(v, before, moved),
@@ -175,7 +175,7 @@ class BPC(AbstractController):
         step: Any = gradient.astype(state.theta.dtype)
         step, optimiser = self.optimiser.update(step, state.optimiser, state.theta)
         theta = state.theta + self.learning_rate * step
-        theta = within(theta, self.radius).astype(state.theta.dtype)
+        theta = within_ball(theta, self.radius).astype(state.theta.dtype)
         return state._replace(
             loop=self.loop.applied(u, cost, state.loop),
             theta=theta,

@@ -9,10 +9,9 @@ from jaxtyping import Array
 from ..._check import check_count
 from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics
-from ._base import as_base, checked_cost, linear_learner
+from ._base import linear_learner, loop_of
 from ._features import Features
 from ._learner import OnlineLearner
-from ._loop import Loop
 
 
 def DRC(
@@ -88,9 +87,7 @@ def DRC(
         ```
     """
     where = "DRC"
-    cost = checked_cost(dynamics, cost, where)
-    base = as_base(dynamics, cost, base, where)
-    loop = Loop(dynamics, base, horizon, where, echoes=True)
+    loop = loop_of(dynamics, cost, base, horizon, where, echoes=True)
     memory = check_count(memory, "memory", where)
     features = Features(None, memory, dynamics.observation_size, nature=True)
     return linear_learner(loop, cost, features, learning_rate, optimiser, radius, where)

@@ -246,13 +246,12 @@ def check_control(
 
 def observes_state(dynamics: AbstractDynamics) -> bool:
     """Whether an observation is the state itself."""
-    n = dynamics.state_size
-    if not isinstance(dynamics, LinearDynamics):
-        return dynamics.observation_size == n
-    C = dynamics.C
-    if C is None:
+    x = jnp.zeros(dynamics.state_size)
+    traced = jax.make_jaxpr(dynamics.observe)(jnp.zeros(()), x).jaxpr
+    if list(traced.outvars) == [traced.invars[1]]:
         return True
-    return C.shape == (n, n) and is_concrete(C) and np.array_equal(C, np.eye(n))
+    C, eye = getattr(dynamics, "C", None), np.eye(len(x))
+    return C is not None and is_concrete(C) and np.array_equal(C, eye)
 
 
 def _vector(state: Any) -> tuple[Array, Any]:

@@ -14,10 +14,9 @@ from ..._controller import AbstractController
 from ..._fields import as_module
 from ..._typing import PRNGKey
 from ...dynamics import AbstractDynamics
-from ._base import as_base, checked_cost
+from ._base import loop_of
 from ._features import Features
 from ._learner import OnlineLearner
-from ._loop import Loop, observes_state
 from ._policy import NetworkPolicy
 from ._step_size import adagrad_norm
 
@@ -73,14 +72,11 @@ def NeuralGPC(
         ```
     """
     where = "NeuralGPC"
-    cost = checked_cost(dynamics, cost, where)
-    base = as_base(dynamics, cost, base, where)
-    echoes = not observes_state(dynamics)
-    loop = Loop(dynamics, base, horizon, where, echoes=echoes)
+    loop = loop_of(dynamics, cost, base, horizon, where)
     check_key(key, where)
     check_positive(learning_rate, "learning_rate", where)
     memory = check_count(memory, "memory", where)
-    features = Features(None, memory, dynamics.observation_size, nature=echoes)
+    features = Features(None, memory, dynamics.observation_size, nature=loop.echoes)
     network = eqx.nn.MLP(
         features.size,
         dynamics.control_size,

@@ -4,11 +4,10 @@ import abc
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..._fields import parameter, weight
+from ...math._norms import within_ball
 
 
 class AbstractPolicy(eqx.Module):
@@ -47,7 +46,7 @@ class LinearPolicy(AbstractPolicy):
         return theta @ features
 
     def project(self, theta):
-        return within(theta, self.radius)
+        return within_ball(theta, self.radius)
 
 
 class NetworkPolicy(AbstractPolicy):
@@ -66,17 +65,3 @@ class NetworkPolicy(AbstractPolicy):
 
     def project(self, theta):
         return theta
-
-
-def within(theta: Array, radius: Array) -> Array:
-    """The nearest point of a ball in the Frobenius norm."""
-    squared = jnp.sum(theta**2)
-    over = squared > radius**2
-    # The square root is taken where it has a derivative.
-    norm = jnp.sqrt(jnp.where(over, squared, 1))
-    return jnp.where(over, radius / norm, 1).astype(theta.dtype) * theta
-
-
-def squared_norm(tree: Any) -> Array:
-    """The sum of squares of all that a tree holds."""
-    return sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

@@ -13,10 +13,9 @@ from jaxtyping import Array
 from ..._check import check_count
 from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics
-from ._base import as_base, checked_cost, linear_learner
+from ._base import linear_learner, loop_of
 from ._features import Features
 from ._learner import OnlineLearner
-from ._loop import Loop, observes_state
 
 
 def SFC(
@@ -141,9 +140,7 @@ def DSC(
 def _learner(
     rows, dynamics, cost, base, horizon, learning_rate, optimiser, radius, where
 ):
-    cost = checked_cost(dynamics, cost, where)
-    base = as_base(dynamics, cost, base, where)
-    loop = Loop(dynamics, base, horizon, where, echoes=not observes_state(dynamics))
+    loop = loop_of(dynamics, cost, base, horizon, where)
     size = dynamics.observation_size
     features = Features(
         jnp.asarray(rows, loop.dtype), rows.shape[1], size, nature=loop.echoes

@@ -7,8 +7,6 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from ._policy import squared_norm
-
 
 class AdaGradNormState(NamedTuple):
     """The sum of the squared norms of all gradients so far."""
@@ -23,7 +21,7 @@ def _init(params: Any) -> Any:
 
 def _update(updates: Any, state: Any, params: Any = None) -> Any:
     del params
-    total = state.total + squared_norm(updates)
+    total = state.total + optax.tree.norm(updates, squared=True)
     some = total > 0
     scale = jnp.where(some, 1 / jnp.sqrt(jnp.where(some, total, 1)), 0)
     updates = jax.tree.map(lambda g: -scale.astype(g.dtype) * g, updates)
