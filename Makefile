@@ -53,7 +53,8 @@ test-float64: $(VENV)/.tests ## the tests in double precision; the docs' example
 		--ignore tests/test_docs.py $(PYTEST_ARGS)
 
 .PHONY: thorough
-thorough: $(VENV)/.tests ## the tests that `test` leaves out, for they compile for minutes
+thorough: $(VENV)/.tests ## the tests that `test` leaves out, for they compile for long
+	JAX_ENABLE_X64=0 $(pytest) -m thorough $(PYTEST_ARGS)
 	JAX_ENABLE_X64=1 $(pytest) -m thorough $(PYTEST_ARGS)
 
 .PHONY: notebooks

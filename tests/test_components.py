@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import assert_close, needs_x64, tolerance
+from helpers import assert_close, needs_x64, thorough, tolerance
 from jax.test_util import check_grads
 
 from delucax._components import by_components
@@ -55,6 +55,7 @@ def test_same_numbers(wrap):
     _leaves_close(found, expected)
 
 
+@thorough
 def test_same_derivatives():
     def scalar(f):
         return lambda *args: sum(jnp.sum(v) for v in jax.tree.leaves(f(*args)))
@@ -94,6 +95,7 @@ def test_the_gradient_does_not_pad():
     assert "pad[" not in program(by_components(loss))
 
 
+@thorough
 def test_check_grads():
     x, A, s = _arguments()
     f = jax.jit(by_components(lambda x: _everything(x, A, s)["n"]))

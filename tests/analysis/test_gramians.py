@@ -6,6 +6,7 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
+    thorough,
     tolerance,
     user_error,
 )
@@ -27,6 +28,7 @@ C = _RNG.normal(size=(3, 4))
 A_STEP = A / 6
 
 
+@thorough
 def test_infinite_gramians_are_scipys():
     system, dynamics = LinearSystem(A, B, C), dlx.LinearDynamics(A_STEP, B, C)
     close = tolerance(1e-5, 1e-13)

@@ -66,6 +66,7 @@ STEPS = {"servo": 0.2, "resonant": 0.2, "conditional": 0.05, "unstable plant": 0
 
 @pytest.mark.parametrize("name", LOOPS)
 @pytest.mark.parametrize("sampled", [False, True])
+@thorough
 def test_margins_are_controls(name, sampled):
     dt = STEPS[name] if sampled else None
     loop, theirs = loop_of(LOOPS[name], dt)

@@ -49,6 +49,7 @@ def swept(model, discrete):
 
 
 @pytest.mark.parametrize("shape, discrete", [((4, 2, 3), False), ((5, 2, 2), True)])
+@thorough
 def test_norms_are_controls_and_no_sweep_is_above(shape, discrete):
     for seed in (0, 1):
         model, theirs = random_model(seed, *shape, discrete)

@@ -7,6 +7,7 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
+    thorough,
     tolerance,
     user_error,
 )
@@ -51,6 +52,7 @@ def test_density():
     assert_close(found, expected, rtol=tolerance(1e-5, 1e-12))
 
 
+@thorough
 def test_clipped_probabilities_sum_to_one():
     policy = Gaussian(dlx.controllers.Constant(jnp.array([0.4])), -0.5, bounds=BOUNDS)
     state = policy.init(key=jax.random.key(0))
@@ -84,6 +86,7 @@ def test_infinite_bounds_are_none(key):
         assert_close(bounded, free, rtol=1e-6)
 
 
+@thorough
 def test_total_is_the_sum_over_the_run(key):
     env = lds(control_bounds=BOUNDS)
     policy = Gaussian(MEAN, -1.0, bounds=env.control_bounds)
@@ -154,6 +157,7 @@ def test_nothing_counts_after_termination(key):
 
 
 @needs_x64
+@thorough
 def test_gradient_of_the_total(key):
     env = lds(control_bounds=BOUNDS)
     policy = Gaussian(MEAN, -1.0, bounds=env.control_bounds)
@@ -180,6 +184,7 @@ def test_gradient_of_the_total(key):
     assert_close(again, gradient[2], rtol=1e-9)
 
 
+@thorough
 def test_score_function_gradient(key):
     """The score gives the gradient of the expected cost, clipped controls and all."""
     env = lds(control_bounds=BOUNDS)

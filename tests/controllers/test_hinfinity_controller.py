@@ -3,7 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, tolerance, user_error
+from helpers import assert_close, needs_x64, thorough, tolerance, user_error
 
 import delucax as dlx
 
@@ -29,6 +29,7 @@ def test_stationary():
 
 
 @pytest.mark.parametrize("horizon", [None, 30])
+@thorough
 def test_keeps_its_level_against_any_disturbance(horizon, key):
     E = jnp.array([[0.5], [1.0]])
     dynamics = dlx.LinearDynamics(A, B, E=E)
@@ -42,6 +43,7 @@ def test_keeps_its_level_against_any_disturbance(horizon, key):
         assert beyond.result != dlx.RESULTS.successful
 
 
+@thorough
 def test_holds_an_operating_point(key):
     # A cart against a constant headwind rests only under a constant push.
     def field(t, x, u, w):

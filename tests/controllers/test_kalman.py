@@ -151,6 +151,7 @@ def test_smoother_solves_the_whole_record_at_once(known_start):
     assert smoothed.result == dlx.RESULTS.successful
 
 
+@thorough
 def test_steady_state():
     transient, ys, us = problem(3, 2, k=3, T=60)
     dynamics, W, V = transient.dynamics, transient.W, transient.V
@@ -279,6 +280,7 @@ def test_gradient_of_the_smoother():
     assert_close(jax.grad(size)(kalman.W), numeric, rtol=1e-6, atol=1e-8)
 
 
+@thorough
 def test_batch_and_its_bad_member():
     """A member that fails says so, and harms neither the others nor the gradient."""
     ys = jnp.stack([YS, 2 * YS, YS])
@@ -327,6 +329,7 @@ def test_covariance_stays_semidefinite():
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(float, marks=needs_x64)])
+@thorough
 def test_precision_and_file(dtype, tmp_path):
     dynamics = dlx.LinearDynamics(A.astype(dtype), B.astype(dtype), C.astype(dtype))
     noise = W.astype(dtype), V.astype(dtype)
@@ -341,6 +344,7 @@ def test_precision_and_file(dtype, tmp_path):
         np.testing.assert_array_equal(again.mean, found.mean)
 
 
+@thorough
 def test_failures():
     dynamics = dlx.LinearDynamics(A, B, C)
     blind = c.KalmanFilter(dynamics, W, 0 * V, covariance=jnp.zeros((2, 2)))

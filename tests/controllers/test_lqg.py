@@ -111,6 +111,7 @@ def test_told_what_was_applied(key):
     assert_close(run.controls, expected, **close)
 
 
+@thorough
 def test_exact_sensor_is_state_feedback(key):
     dynamics = dlx.LinearDynamics(A, B)
     noise = dlx.disturbances.Gaussian(0.3, size=2)

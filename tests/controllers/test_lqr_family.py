@@ -205,6 +205,7 @@ def test_integral_does_not_wind_up(key):
     assert jnp.max(heard) < 12.5 < 15.0 < jnp.max(deaf)
 
 
+@thorough
 def test_hover_holds_a_quadrotor(key):
     def field(t, x, u, w):
         lift, roll = u[0] + u[1], 2.0 * (u[1] - u[0])

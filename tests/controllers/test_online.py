@@ -200,6 +200,7 @@ def test_published_setting():
         assert abs(ratio - published) < 0.02 * published
 
 
+@thorough
 def test_best_in_hindsight():
     """The least-squares solution for a policy; a stationary point for a gain."""
     w = np.random.default_rng(4).normal(size=(200, 2))
@@ -245,6 +246,7 @@ def switched():
     return dlx.LinearDynamics(A, np.where(first, [[0], [1.2]], [[0], [0.9]]))
 
 
+@thorough
 def test_adaptive_keeps_up():
     """The switching study in the setting that was published for it."""
     plant = switched()
@@ -311,6 +313,7 @@ def build(model):
     return c.GPC(model, COST, horizon=15)
 
 
+@thorough
 def test_explore_identifies():
     """From steps that an adversary disturbs, and then controls by what it found."""
     K = np.array([[0.2, 0.8]])
@@ -420,6 +423,7 @@ def test_bad_input(make, match):
         make()
 
 
+@thorough
 def test_traced_dynamics_need_a_horizon():
     def cost(b, **options):
         dynamics = dlx.LinearDynamics(A, b * B)

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64
+from helpers import assert_close, needs_x64, thorough
 from scipy.integrate import solve_ivp
 
 import delucax as dlx
@@ -40,6 +40,7 @@ def _exact(dt):
     ],
     ids=lambda value: type(value).__name__ if not isinstance(value, int) else None,
 )
+@thorough
 def test_order_under_switching_controls(solver, order, substeps):
     starts = jax.random.uniform(jax.random.key(0), (32, 2), minval=-3.0, maxval=3.0)
 

@@ -4,7 +4,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import assert_close, central_difference, needs_x64
+from helpers import assert_close, central_difference, needs_x64, thorough
 
 import delucax as dlx
 
@@ -84,6 +84,7 @@ def _cost(dynamics, checkpoint="step"):
 
 
 @pytest.mark.parametrize("name", CASES)
+@thorough
 def test_reverse_mode_is_central_differences(name):
     total, at = _cost(CASES[name]())
     both = jax.jit(jax.value_and_grad(total))
@@ -102,6 +103,7 @@ def test_checkpoints(checkpoint):
 
 
 @pytest.mark.parametrize("name", ["RK4", "Kvaerno3", "Euler-Maruyama"])
+@thorough
 def test_forward_mode_and_second_order(name):
     total, at = _cost(CASES[name]())
     slope = jax.jit(jax.grad(total))

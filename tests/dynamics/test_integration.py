@@ -323,6 +323,7 @@ def test_backsolve_at_a_tight_tolerance():
 
 
 @needs_x64
+@thorough
 def test_a_backward_solve_that_fails_is_loud():
     at = jnp.array([1.1, 1.0, -0.5, 0.7])
     with user_error(RuntimeError, match="maximum number of solver steps"):

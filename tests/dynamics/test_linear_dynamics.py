@@ -7,6 +7,7 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
+    thorough,
     tolerance,
     user_error,
 )
@@ -79,6 +80,7 @@ def test_linearize_is_central_differences():
         assert model.state_names == ("angle", "velocity")
 
 
+@thorough
 def test_linearize_keeps_the_operating_point():
     system = dlx.systems.Pendulum()
     model = dlx.linearize(system)

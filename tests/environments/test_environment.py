@@ -3,7 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, CountCalls, user_error
+from helpers import assert_close, CountCalls, thorough, user_error
 
 import delucax as dlx
 
@@ -56,6 +56,7 @@ def test_replace():
         dlx.replace(env, {"dynamics.dt.size": 1.0})
 
 
+@thorough
 def test_randomise_is_domain_randomisation_without_compiling(key):
     env = dlx.make("pendulum")
     ranges = {

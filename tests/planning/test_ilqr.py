@@ -114,6 +114,7 @@ def test_from_states_that_do_not_follow():
     assert_close(followed, plan.states, atol=1e-9)
 
 
+@thorough
 def test_a_plan_is_a_controller():
     dynamics, cost = pendulum()
     plan = swing()
@@ -226,6 +227,7 @@ def test_bounds_against_scipy(size):
 
 
 @needs_x64
+@thorough
 def test_the_box_minimum():
     """Of a few controls: the Karush-Kuhn-Tucker conditions."""
     from delucax.planning._lq import box_minimum
@@ -247,6 +249,7 @@ def test_the_box_minimum():
     assert jnp.max(off) < 1e-10 and jnp.max(slope) < 1e-10
 
 
+@thorough
 def test_a_concave_control_cost_is_regularised_and_it_shows():
     class Concave(dlx.AbstractCost):
         def __call__(self, t, x, u):
@@ -307,6 +310,7 @@ def test_no_descent():
 @pytest.mark.parametrize(
     "line_search", ["backtracking", pytest.param("parallel", marks=thorough)]
 )
+@thorough
 def test_a_bad_member_of_a_batch_harms_no_other(line_search):
     cost = dlx.costs.Quadratic([1.0], [0.1], final=[1.0])
     u = jnp.zeros((8, 1))

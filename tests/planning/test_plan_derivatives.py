@@ -65,6 +65,7 @@ def check(f, at, forward=True):
         pytest.param(dict(regularise="state"), marks=thorough),
     ],
 )
+@thorough
 def test_against_finite_differences(options):
     check(lambda theta: outcomes(theta, **options), AT, forward=not options)
 
@@ -120,6 +121,7 @@ def test_it_does_not_depend_on_the_guess():
     assert jax.grad(optimal)(1.0) == 0
 
 
+@thorough
 def test_an_unconverged_plan_is_not_detached():
     def asked(theta, keep):
         options = dict(max_iterations=1, throw=False)

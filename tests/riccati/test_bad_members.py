@@ -47,6 +47,7 @@ def test_asymmetry_that_cannot_be_seen():
     assert result(jnp.array([[1.0, 0.5], [0.0, 1.0]])) == RESULTS.ill_posed
 
 
+@thorough
 def test_as_close_as_rounding_allows():
     rng = np.random.default_rng(32)
     A, B = rng.normal(size=(30, 30)) / np.sqrt(30), rng.normal(size=(30, 2))

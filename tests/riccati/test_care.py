@@ -17,6 +17,7 @@ B = jnp.array([[0.0], [1.0]])
 Q, R = jnp.eye(2), jnp.eye(1)
 
 
+@thorough
 def test_double_integrator():
     solution = dlx.riccati.care(A, B, Q, R)
     root = np.sqrt(3)
@@ -30,6 +31,7 @@ def test_double_integrator():
     assert solution.residual < tolerance(1e-6, 1e-15)
 
 
+@thorough
 def test_cross_weight_and_descriptor():
     rng = np.random.default_rng(0)
     A, B = rng.normal(size=(3, 3)), rng.normal(size=(3, 2))
@@ -96,6 +98,7 @@ def test_ill_posed_where_it_cannot_be_seen():
     assert solve(A, -R) == ill_posed
 
 
+@thorough
 def test_one_bad_member_harms_no_other():
     As = np.stack([A, A - np.eye(2), A + 0.1 * np.eye(2)])
     spoilt = np.stack([As[0], np.diag([1.3, 0.2]), As[2]])

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import assert_close, needs_x64, tolerance, user_error
+from helpers import assert_close, needs_x64, thorough, tolerance, user_error
 
 import delucax as dlx
 
@@ -61,6 +61,7 @@ def test_matches_scipy(n, m):
 
 
 @needs_x64
+@thorough
 def test_descriptor_form():
     for seed in range(10):
         A, B, Q, R, S, E = random_problem(seed, 4, 2)
@@ -82,6 +83,7 @@ def test_descriptor_form():
 
 
 @needs_x64
+@thorough
 def test_single_precision():
     problem = random_problem(0, 4, 2)
     exact, _ = equation(*problem, np.zeros((4, 4)))
@@ -126,6 +128,7 @@ def test_no_stabilising_solution(A, B, Q, status):
         eqx.filter_jit(dlx.riccati.dare)(A, B, Q, R)
 
 
+@thorough
 def test_ill_posed_where_it_cannot_be_seen():
     solve = jax.jit(lambda A, R: dlx.riccati.dare(A, B, Q, R, throw=False).result)
     ill_posed = dlx.RESULTS.ill_posed
@@ -154,6 +157,7 @@ def test_free_control():
 
 
 @needs_x64
+@thorough
 def test_one_bad_member_harms_no_other():
     As = np.stack([A, 0.5 * A, 0.9 * A])
     spoilt = np.stack([A, np.diag([1.3, 0.2]), 0.9 * A])

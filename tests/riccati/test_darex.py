@@ -42,6 +42,7 @@ CASES = [pytest.param(size, marks=() if size in SOON else thorough) for size in 
     "size",
     [pytest.param(size, marks=() if size in SOON else thorough) for size in SIZES],
 )
+@thorough
 def test_published_systems(size):
     assert len(SYSTEMS) == 19
     for name, A, B, Q, R in (system for system in SYSTEMS if system[2].shape == size):

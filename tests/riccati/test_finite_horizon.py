@@ -71,6 +71,7 @@ def best_controls(stages, x0):
 
 
 @pytest.mark.parametrize("parallel", [False, True])
+@thorough
 def test_is_the_minimum_over_all_controls(parallel):
     stages = random_stages(7, 7, 3, 2)
     x0 = np.array([1.0, -2.0, 0.5])
@@ -93,6 +94,7 @@ def free_controls(stages):
 
 
 @pytest.mark.parametrize("T, n, m", [(1, 2, 1), (7, 3, 2), (9, 6, 6)])
+@thorough
 def test_in_parallel_as_in_sequence(T, n, m):
     problem = random_stages(T, T, n, m)
     for stages in [problem, free_controls(problem)] if n == m else [problem]:
@@ -239,6 +241,7 @@ def test_derivatives_of_the_recursion(parallel):
     assert_second_order(line, 1e-6)
 
 
+@thorough
 def test_differential_equation():
     rng = np.random.default_rng(0)
     n, m = 2, 2

@@ -124,6 +124,7 @@ def test_continuous_game():
         assert 0.5 * gamma < sweep < gamma and solution.residual < 1e-13
 
 
+@thorough
 def test_no_solution():
     for solve, unstable in ((hinf_dare, 1.2), (hinf_care, 0.2)):
         low = solve(A, B, None, Q, R, gamma=0.5, throw=False)
@@ -176,6 +177,7 @@ def test_finite_horizon_game():
     assert low.result == dlx.RESULTS.infeasible and np.all(np.isnan(low.X[0]))
 
 
+@thorough
 def test_long_horizons_are_stationary():
     long = hinf_dre(A, B, None, Q, R, horizon=T, final=Q)
     stationary = hinf_dare(A, B, None, Q, R)
@@ -188,6 +190,7 @@ def test_long_horizons_are_stationary():
     assert low.result == dlx.RESULTS.infeasible and np.all(np.isnan(low.X[0]))
 
 
+@thorough
 def test_continuous_horizon_in_closed_form():
     # dX/ds = 1 - (1 - gamma^-2) X^2 with gamma below 1 is tan(w s) / w, to its pole.
     # A second state has no part in it.
@@ -229,6 +232,7 @@ SMOOTH = (
     ],
     ids=["dare", "dre", "care", "cre"],
 )
+@thorough
 def test_derivatives_at_a_level(solve):
     rng = np.random.default_rng(0)
     direction = [rng.normal(size=M.shape) for M in (*SMOOTH, np.zeros(()))]

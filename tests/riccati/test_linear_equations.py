@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import assert_close, needs_x64, user_error
+from helpers import assert_close, needs_x64, thorough, user_error
 
 import delucax as dlx
 
@@ -90,6 +90,7 @@ def test_complex_data():
     assert_close(turned, turn @ plain @ turn.conj(), atol=1e-12)
 
 
+@thorough
 def test_one_bad_member_harms_no_other():
     eye = np.eye(2)
     As = np.stack([-eye, np.diag([1.0, -1]), -2 * eye, np.full((2, 2), np.nan)])

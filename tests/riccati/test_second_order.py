@@ -68,6 +68,7 @@ OTHERS = {"dlyap": (LEFT, SQUARE), "sylvester": (STABLE, RIGHT, TALL)}
         *(pytest.param(n, marks=thorough) for n in ("lyap", "dsylvester")),
     ],
 )
+@thorough
 def test_to_second_order(name):
     solve, pairs = getattr(dlx.riccati, name), PROBLEMS[name]
 
@@ -102,6 +103,7 @@ def test_forwards_over_backwards(name):
 
 
 @pytest.mark.parametrize("name", ["filter_dare", "filter_care"])
+@thorough
 def test_filter(name):
     solve = getattr(dlx.riccati, name)
     pairs = PLAIN[:1] + ((B.T, D_B.T),) + PLAIN[2:]

@@ -10,6 +10,7 @@ from helpers import (
     assert_close,
     dtype,
     needs_x64,
+    thorough,
     tolerance,
     user_error,
 )
@@ -159,6 +160,7 @@ def test_interval_of_a_step(count, t0, t1):
     ],
     ids=lambda solver: type(solver).__name__,
 )
+@thorough
 def test_fixed_steps_are_those_of_discretized(solver):
     controls = switching(40)
     run = dlx.simulate(PENDULUM, controls, 0.0, 2.0, HANGING, solver=solver, substeps=2)
@@ -189,6 +191,7 @@ def test_adaptive_steps_agree_with_scipy():
     assert_close(run.times, np.linspace(0.5, 1.5, 21), atol=tolerance(1e-6, 1e-14))
 
 
+@thorough
 def test_held_disturbances():
     controls, w = switching(10), switching(10, seed=1)
     run = dlx.simulate(SWITCHED, controls, 0.0, 1.0, jnp.ones(1), w=w)
@@ -211,6 +214,7 @@ def test_held_disturbances():
     [(FEEDBACK, {"stepsize_controller": ADAPTIVE}), (Told(), {"substeps": 2})],
     ids=["linear", "memory"],
 )
+@thorough
 def test_sampled_feedback_is_that_of_a_rollout(controller, how, key):
     run = dlx.simulate(PENDULUM, controller, 0.0, 1.0, UPRIGHT, dt=0.05, **how)
     dynamics = dlx.Discretized(PENDULUM, 0.05, diffrax.Tsit5(), substeps=8)
@@ -299,6 +303,7 @@ def test_what_a_trajectory_of_it_holds():
     assert list(table.columns[:4]) == ["time", "angle", "velocity", "torque"]
 
 
+@thorough
 def test_batches():
     controls, decay = switching(4), np.exp(-0.25)
     starts = jnp.array([[0.5], [1.0], [4.0]])

@@ -91,11 +91,13 @@ def assert_gradient(arguments, *, rtol=1e-6, forwards=False, **how):
     ],
     ids=["fixed", "direct", "adaptive", "backsolve"],
 )
+@thorough
 def test_gradient_of_open_loop(how):
     assert_gradient((PENDULUM, CONTROLS, HANGING), **how)
 
 
 @needs_x64
+@thorough
 def test_forward_gradient():
     assert_gradient(
         (PENDULUM, CONTROLS, HANGING), forwards=True, adjoint=diffrax.ForwardMode()
@@ -119,6 +121,7 @@ def test_forward_gradient():
     ],
     ids=["sampled", "continuous"],
 )
+@thorough
 def test_gradient_of_feedback(controller, how):
     arguments = (PENDULUM, controller, UPRIGHT)
     assert_gradient(arguments, dt=0.05, **how)

@@ -132,6 +132,7 @@ NO_BASELINE = (LikelihoodRatio(32, baseline=False), 16000)
 @pytest.mark.parametrize(
     "estimator", [ANALYTIC, SCORED, NO_BASELINE], ids=["analytic", "scored", "plain"]
 )
+@thorough
 def test_the_gradient_of_a_random_closed_loop_is_unbiased(estimator):
     estimator, count = estimator
     weights = jnp.array([0.8, 0.4, -1.0])
@@ -150,6 +151,7 @@ def test_a_baseline_lowers_the_variance():
     assert np.all(scored.var(0) < 0.5 * plain.var(0))
 
 
+@thorough
 def test_saturated_controls_are_scored_as_drawn():
     # The bounds cut most draws. The gradient through the clip is unbiased too.
     loss = scored_cost(environment(bound=0.3))
@@ -250,6 +252,7 @@ def test_a_loss_without_metrics_returns_a_scalar():
         assert_close(value, 2.0, rtol=1e-6)
 
 
+@thorough
 def test_the_likelihood_ratio_trains_a_policy():
     env = environment(bound=2.0)
     fitted = fit(
