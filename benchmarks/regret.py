@@ -114,7 +114,9 @@ def plants() -> dict[str, Plant]:
     learner = c.GPC(stable, both, horizon=15)
 
     def build(model):
-        return c.GPC(model, both, horizon=15)
+        # Newton's long steps follow the error of an estimated model; this is the
+        # published first-order learner.
+        return c.GPC(model, both, horizon=15, optimiser=c.adagrad_norm())
 
     found["unknown, stable"] = Plant(
         "Explore",

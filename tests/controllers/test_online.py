@@ -328,6 +328,58 @@ def test_explore_identifies():
     assert np.mean(costs[3500:]) < 0.3 * np.mean(run(c.Linear(K), w).costs[3500:])
 
 
+@needs_x64
+def test_online_newton_is_recursive_least_squares():
+    """Against the solution of the regularised normal equations."""
+    rng, d, k, prior = np.random.default_rng(0), 4, 2, 3.0
+    J, target = rng.normal(size=(20, k, d)), rng.normal(size=(20, k))
+    optimiser = c.online_newton(prior)
+    assert optimiser is c.online_newton(prior)
+    theta = jnp.zeros(d)
+    state = optimiser.init(theta)
+    found = []
+    for A, b in zip(J, target, strict=True):
+        step, state = optimiser.update(
+            jnp.asarray(A.T @ (A @ np.asarray(theta) - b)),
+            state,
+            curvature=lambda A=A: jnp.asarray(A.T),
+            # No step is too long.
+            learning_rate=1e3,
+        )
+        theta = theta + 1e3 * step
+        found.append(np.asarray(theta))
+    # While the prior follows the mean, all that was seen is rescaled with it.
+    sizes = np.sum(J**2, axis=(1, 2))
+    means = np.cumsum(sizes) / np.arange(1, 21)
+    weights = np.ones(20)
+    weights[0], weights[1] = means[2] / means[0], means[2] / means[1]
+    Lambda = prior * means[2] / d * np.eye(d)
+    Lambda = Lambda + np.einsum("t,tki,tkj->ij", weights, J, J)
+    assert_close(np.linalg.inv(Lambda), state.inverse, rtol=1e-9, atol=1e-12)
+    step = np.linalg.solve(Lambda, J[-1].T @ (J[-1] @ found[-2] - target[-1]))
+    assert_close(found[-1], found[-2] - step, rtol=1e-9, atol=1e-12)
+    capped, _ = optimiser.update(
+        jnp.ones(d), state, curvature=lambda: jnp.ones((d, 1)), learning_rate=1e-9
+    )
+    assert_close(np.linalg.norm(capped), 1.0, rtol=1e-12)
+    with user_error(match="must be given the curvature"):
+        optimiser.update(theta, state)
+    with user_error(match="prior must be positive"):
+        c.online_newton(0.0)
+
+
+@needs_x64
+def test_the_curvature_of_a_cost():
+    """A convex one in full, of another what is positive, of a flat one nothing."""
+    from delucax.controllers.online._newton import _root
+
+    A = np.random.default_rng(1).normal(size=(3, 3))
+    for H in (A @ A.T, np.diag([1.0, 0.0, 2.0]), np.zeros((3, 3))):
+        L = np.asarray(_root(jnp.asarray(H)))
+        assert_close(L @ L.T, H, atol=1e-12)
+    assert_close(_root(jnp.diag(jnp.array([4.0, -1.0]))), np.diag([2.0, 0.0]))
+
+
 def test_adagrad_norm():
     """Sums of squares over all leaves, and nothing before the first gradient."""
     optimiser = c.adagrad_norm()

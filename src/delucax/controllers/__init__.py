@@ -44,6 +44,7 @@ from .online import (
     GPC as GPC,
     Hindsight as Hindsight,
     NeuralGPC as NeuralGPC,
+    online_newton as online_newton,
     OnlineLearner as OnlineLearner,
     regret as regret,
     SFC as SFC,

@@ -13,5 +13,6 @@ from ._hindsight import (
 )
 from ._learner import OnlineLearner as OnlineLearner
 from ._neural import NeuralGPC as NeuralGPC
+from ._newton import online_newton as online_newton
 from ._spectral import DSC as DSC, SFC as SFC
 from ._step_size import adagrad_norm as adagrad_norm

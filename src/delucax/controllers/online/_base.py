@@ -15,14 +15,16 @@ from .._scheduled import Scheduled
 from ._features import Features
 from ._learner import OnlineLearner
 from ._loop import Loop, observes_state
+from ._newton import online_newton
 from ._policy import LinearPolicy
-from ._step_size import adagrad_norm
 
 
 STEP = 0.15
 """The step of a learner, in units of the control that undoes what it has observed."""
 RADIUS = 50.0
 """The largest policy, in the same units."""
+OF_DISTURBANCES, OF_OUTPUTS = 100.0, 4.0
+"""The prior of what is learned, in steps, by the features."""
 
 
 def loop_of(
@@ -135,8 +137,13 @@ def linear_learner(
         features,
         LinearPolicy(start, scale(loop, radius, "radius", RADIUS, where)),
         scale(loop, learning_rate, "learning_rate", STEP, where),
-        adagrad_norm() if optimiser is None else optimiser,
+        _newton(features) if optimiser is None else optimiser,
     )
+
+
+def _newton(features: Features) -> Any:
+    """Nature's outputs are much alike from step to step, disturbances are noise."""
+    return online_newton(OF_OUTPUTS if features.nature else OF_DISTURBANCES)
 
 
 def scale(loop: Loop, given: Any, name: str, units: float, where: str) -> Any:

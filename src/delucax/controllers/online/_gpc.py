@@ -51,9 +51,10 @@ def GPC(
     - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
         1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
         loop.
-    - `learning_rate`: scales the optimiser's step; by default `0.15 / |B|_F`, with
-        `|B|` the size of what a unit of control does to the state in a step.
-    - `optimiser`: an Optax transformation; [`delucax.controllers.adagrad_norm`][] by
+    - `learning_rate`: scales the optimiser's step, of the default optimiser the longest
+        step; by default `0.15 / |B|_F`, with `|B|` the size of what a unit of control
+        does to the state in a step.
+    - `optimiser`: an Optax transformation; [`delucax.controllers.online_newton`][] by
         default, which needs no scale of the cost.
     - `radius`: E is kept inside this ball in the Frobenius norm, `50 / |B|_F` by
         default.

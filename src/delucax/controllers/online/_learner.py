@@ -14,6 +14,7 @@ from ..._fields import function_field, parameter
 from ._features import Features
 from ._fixed import FixedPolicy
 from ._loop import Loop, LoopState, shift
+from ._newton import curvature_factor
 from ._policy import AbstractPolicy
 
 
@@ -64,7 +65,8 @@ class OnlineLearner(AbstractLearner):
     - `policy`: the family of policies; `policy.start`, the first theta, is trainable.
     - `learning_rate`: an array that scales the optimiser's step; it can be
         differentiated.
-    - `optimiser`: an Optax transformation.
+    - `optimiser`: an Optax transformation. It is given, as extra arguments, the
+        `learning_rate` and a function that returns the `curvature` of the loss.
 
     The state that `init` makes and a run carries along has `theta`, what has been
     learned, and `signal`, the last values of the signal, newest first.
@@ -135,11 +137,17 @@ class OnlineLearner(AbstractLearner):
         return FixedPolicy(self.loop, self.features, policy)
 
     def _learn(self, state):
-        gradient = jax.grad(self._loss)(state.theta, state)
-        direction, optimiser = self.optimiser.update(
-            gradient, state.optimiser, state.theta
-        )
         rate = self.learning_rate
+        gradient = jax.grad(self._loss)(state.theta, state)
+        optimiser = optax.with_extra_args_support(self.optimiser)
+        direction, optimiser = optimiser.update(
+            gradient,
+            state.optimiser,
+            state.theta,
+            # For those that ask.
+            curvature=lambda: self._curvature(state),
+            learning_rate=rate,
+        )
         theta = jax.tree.map(
             lambda old, step: old + (rate * step).astype(old.dtype),
             state.theta,
@@ -147,7 +155,17 @@ class OnlineLearner(AbstractLearner):
         )
         return self.policy.project(theta), optimiser
 
-    def _loss(self, theta, state):
+    def _outcome(self, theta, state):
         v = jax.vmap(self.policy, in_axes=(None, 0))(theta, state.features)
-        y, u = self.loop.counterfactual(v[0], v[1:], state.loop)
-        return self.cost(state.loop.t, y, u)
+        return self.loop.counterfactual(v[0], v[1:], state.loop)
+
+    def _loss(self, theta, state):
+        return self.cost(state.loop.t, *self._outcome(theta, state))
+
+    def _curvature(self, state):
+        p = state.loop.y.shape[0]
+        return curvature_factor(
+            lambda theta: jnp.concatenate(self._outcome(theta, state)),
+            lambda z: self.cost(state.loop.t, z[:p], z[p:]),
+            state.theta,
+        )

@@ -1,0 +1,148 @@
+"""Newton's step for an online learner."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import optax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from ..._check import check_positive
+
+
+class OnlineNewtonState(NamedTuple):
+    """The inverse of the curvature so far with its prior; the sum of the traces of what
+    was added to it, and how many times something was."""
+
+    inverse: Array
+    total: Array
+    count: Array
+
+
+def _init(params: Any) -> OnlineNewtonState:
+    flat, _ = ravel_pytree(params)
+    zero = jnp.zeros((), flat.dtype)
+    return OnlineNewtonState(jnp.zeros((flat.size, flat.size), flat.dtype), zero, zero)
+
+
+def _update(
+    prior: float,
+    updates: Any,
+    state: Any,
+    params: Any = None,
+    *,
+    curvature: Any = None,
+    learning_rate: Any = 1.0,
+    **others: Any,
+) -> tuple[Any, OnlineNewtonState]:
+    del params, others
+    if curvature is None:
+        raise ValueError(
+            "online_newton: update must be given the curvature of the loss, which "
+            "OnlineLearner knows and BPC, which sees the cost alone, does not."
+        )
+    gradient, unravel = ravel_pytree(updates)
+    factor = curvature()
+    inverse, total, count = state
+    size = jnp.sum(factor**2)
+    some = size > 0
+    new_total, new_count = total + size, count + some
+    # Until the prior is outweighed it is worth `prior` of the average step so far.
+    mean = lambda total, count: total / jnp.where(count > 0, count, 1)  # noqa: E731
+    first, early = some & (count == 0), some & (count > 0) & (count < prior)
+    fresh = jnp.eye(gradient.size, dtype=gradient.dtype)
+    fresh = gradient.size / (prior * jnp.where(first, size, 1)) * fresh
+    after = jnp.where(early, mean(new_total, new_count), 1)
+    scale = jnp.where(early, mean(total, count) / after, 1)
+    inverse = jnp.where(first, fresh, scale * inverse)
+
+    def rank_one(inverse, column):
+        moved = inverse @ column
+        return inverse - jnp.outer(moved, moved) / (1 + column @ moved), None
+
+    count_of = factor.shape[1]
+    inverse, _ = lax.scan(rank_one, inverse, factor.T, unroll=min(count_of, 8))
+    step = inverse @ gradient / learning_rate
+    squared = jnp.sum(step**2)
+    long = squared > 1
+    step = step * jnp.where(long, 1 / jnp.sqrt(jnp.where(long, squared, 1)), 1)
+    return unravel(-step), OnlineNewtonState(inverse, new_total, new_count)
+
+
+@functools.cache
+def _online_newton(prior: float) -> optax.GradientTransformationExtraArgs:
+    return optax.GradientTransformationExtraArgs(
+        _init, functools.partial(_update, prior)
+    )
+
+
+def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
+    r"""Newton's step with all the curvature so far,
+
+    `theta_next = theta - P_t g_t`, `P_t^-1 = prior c I + sum_{s <= t} J_s' H_s J_s`,
+
+    no longer than `learning_rate`, that of the learner. J_s is the derivative of the
+    observation and control of step s by theta, H_s the curvature of the cost at them
+    (its positive part, where the cost is not convex), and c the mean curvature of a
+    weight over the first `prior` steps that have any: so the prior weighs as much as
+    that many steps, whatever the scales of cost, disturbance and weights. With
+    quadratic costs it is recursive least squares, and its regret grows as `log(T)`.
+
+    Only an [`delucax.controllers.OnlineLearner`][] can use it: it hands the curvature
+    over. The state has a number for each pair of weights, and a step takes as many
+    operations.
+
+    **Arguments:** `prior`: steps, 100 by default. A small one learns fast where the
+    features are much alike, a large one keeps noise out of what is learned.
+
+    **Returns:** an `optax.GradientTransformationExtraArgs`, the same for the same
+    prior, so that two learners share what was compiled.
+
+    **Raises:** `ValueError` if `prior` is not positive; when it is used, if it is not
+    given the curvature.
+
+    Source: Simchowitz, 2020; Hazan, Agarwal and Kale, 2007.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("lds", key=jax.random.key(0))
+        optimiser = dlx.controllers.online_newton(prior=20.0)
+        learner = dlx.controllers.GPC(env.dynamics, env.cost, optimiser=optimiser)
+        dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
+        ```
+    """
+    check_positive(prior, "prior", "online_newton")
+    return _online_newton(float(prior))
+
+
+def curvature_factor(
+    outcome: Callable[[Any], Array], cost: Callable[[Array], Array], theta: Any
+) -> Array:
+    """`J' L`, shape (weights, outcomes), with J the derivative of the outcome by theta
+    and `L L'` the curvature of the cost there."""
+    flat, unravel = ravel_pytree(theta)
+    J = jax.jacrev(lambda flat: outcome(unravel(flat)))(flat)
+    return J.T @ _root(jax.hessian(cost)(outcome(theta)))
+
+
+def _root(H: Array) -> Array:
+    """The Cholesky factor of the positive part of a symmetric matrix; columns that
+    have no positive pivot are zero."""
+    slack = len(H) * jnp.finfo(H.dtype).eps * jnp.max(jnp.abs(jnp.diag(H)), initial=0)
+
+    def column(rest, j):
+        pivot = rest[j, j]
+        positive = pivot > slack
+        column = rest[:, j] / jnp.sqrt(jnp.where(positive, pivot, 1))
+        column = jnp.where(positive, column, 0)
+        return rest - jnp.outer(column, column), column
+
+    return lax.scan(column, H, jnp.arange(len(H)), unroll=min(len(H), 8))[1].T
