@@ -371,13 +371,13 @@ def test_online_newton_is_recursive_least_squares():
 @needs_x64
 def test_the_curvature_of_a_cost():
     """A convex one in full, of another what is positive, of a flat one nothing."""
-    from delucax.controllers.online._newton import _root
+    from delucax.controllers.online._newton import positive_root
 
     A = np.random.default_rng(1).normal(size=(3, 3))
     for H in (A @ A.T, np.diag([1.0, 0.0, 2.0]), np.zeros((3, 3))):
-        L = np.asarray(_root(jnp.asarray(H)))
+        L = np.asarray(positive_root(jnp.asarray(H)))
         assert_close(L @ L.T, H, atol=1e-12)
-    assert_close(_root(jnp.diag(jnp.array([4.0, -1.0]))), np.diag([2.0, 0.0]))
+    assert_close(positive_root(jnp.diag(jnp.array([4.0, -1.0]))), np.diag([2.0, 0.0]))
 
 
 def test_adagrad_norm():

@@ -17,14 +17,15 @@ from ._learner import OnlineLearner
 from ._loop import Loop, observes_state
 from ._newton import online_newton
 from ._policy import LinearPolicy
+from ._step_size import adagrad_norm
 
 
 STEP = 0.15
 """The step of a learner, in units of the control that undoes what it has observed."""
 RADIUS = 50.0
 """The largest policy, in the same units."""
-OF_DISTURBANCES, OF_OUTPUTS = 100.0, 4.0
-"""The prior of what is learned, in steps, by the features."""
+OF_OUTPUTS = 4.0
+"""The prior of what is learned from nature's outputs, in steps."""
 
 
 def loop_of(
@@ -137,13 +138,16 @@ def linear_learner(
         features,
         LinearPolicy(start, scale(loop, radius, "radius", RADIUS, where)),
         scale(loop, learning_rate, "learning_rate", STEP, where),
-        _newton(features) if optimiser is None else optimiser,
+        _optimiser(loop, features) if optimiser is None else optimiser,
     )
 
 
-def _newton(features: Features) -> Any:
-    """Nature's outputs are much alike from step to step, disturbances are noise."""
-    return online_newton(OF_OUTPUTS if features.nature else OF_DISTURBANCES)
+def _optimiser(loop: Loop, features: Features) -> Any:
+    """Newton's step where gradients alone are slow: nature's outputs are much alike
+    from step to step, and a response that changes points elsewhere each time."""
+    if features.nature:
+        return online_newton(OF_OUTPUTS)
+    return online_newton() if loop.response is None else adagrad_norm()
 
 
 def scale(loop: Loop, given: Any, name: str, units: float, where: str) -> Any:

@@ -53,9 +53,8 @@ def DRC(
     - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
         1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
         loop.
-    - `learning_rate`: scales the optimiser's step, of the default optimiser the longest
-        step; by default 0.15 over the size of the first response of the output to a
-        unit of control.
+    - `learning_rate`: scales the optimiser's step, of Newton's the longest; by default
+        0.15 over the size of the first response of the output to a unit of control.
     - `optimiser`: an Optax transformation; [`delucax.controllers.online_newton`][] with
         a prior of 4 steps by default.
     - `radius`: M is kept inside this ball in the Frobenius norm; by default 50 over the

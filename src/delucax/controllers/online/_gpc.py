@@ -51,11 +51,14 @@ def GPC(
     - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
         1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
         loop.
-    - `learning_rate`: scales the optimiser's step, of the default optimiser the longest
-        step; by default `0.15 / |B|_F`, with `|B|` the size of what a unit of control
-        does to the state in a step.
-    - `optimiser`: an Optax transformation; [`delucax.controllers.online_newton`][] by
-        default, which needs no scale of the cost.
+    - `learning_rate`: scales the optimiser's step, of Newton's the longest; by default
+        `0.15 / |B|_F`, with `|B|` the size of what a unit of control does to the state
+        in a step.
+    - `optimiser`: an Optax transformation; by default
+        [`delucax.controllers.adagrad_norm`][] where dynamics are linear and
+        time-invariant, and otherwise [`delucax.controllers.online_newton`][]. Neither
+        needs a scale of the cost; the second learns faster, and a step of it takes ten
+        times as long.
     - `radius`: E is kept inside this ball in the Frobenius norm, `50 / |B|_F` by
         default.
 

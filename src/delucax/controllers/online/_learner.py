@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
+from jax.interpreters import partial_eval
 from jaxtyping import Array
 
 from ..._controller import AbstractLearner
@@ -14,7 +15,7 @@ from ..._fields import function_field, parameter
 from ._features import Features
 from ._fixed import FixedPolicy
 from ._loop import Loop, LoopState, shift
-from ._newton import curvature_factor
+from ._newton import positive_root
 from ._policy import AbstractPolicy
 
 
@@ -26,6 +27,8 @@ class LearnerState(NamedTuple):
     - `features`: of this step and those of the roll-out before it, newest first.
     - `theta`: what has been learned.
     - `optimiser`: the state of the optimiser.
+    - `weighted`: the response weighted by the root of the curvature of the cost, where
+        it is the same at all times.
     """
 
     loop: LoopState
@@ -33,6 +36,7 @@ class LearnerState(NamedTuple):
     features: Array
     theta: Any
     optimiser: Any
+    weighted: Any
 
 
 class OnlineLearner(AbstractLearner):
@@ -93,12 +97,15 @@ class OnlineLearner(AbstractLearner):
     def init(self, *, key=None):
         loop, features = self.loop, self.features
         theta, dtype = self.policy.init(), loop.dtype
+        same = self._constant_root() if loop.response is not None else None
+        inner = loop.init(key, loop.horizon)
         return LearnerState(
-            loop.init(key, loop.horizon),
+            inner,
             signal=features.init(dtype),
             features=jnp.zeros((loop.horizon + 1, features.size), dtype),
             theta=theta,
             optimiser=self.optimiser.init(theta),
+            weighted=None if same is None else self._weighted(same, inner),
         )
 
     def __call__(self, t, y, state):
@@ -163,9 +170,33 @@ class OnlineLearner(AbstractLearner):
         return self.cost(state.loop.t, *self._outcome(theta, state))
 
     def _curvature(self, state):
-        p = state.loop.y.shape[0]
-        return curvature_factor(
-            lambda theta: jnp.concatenate(self._outcome(theta, state)),
-            lambda z: self.cost(state.loop.t, z[:p], z[p:]),
-            state.theta,
-        )
+        """`J' L`, with J the derivative of observation and control by theta, and `L L'`
+        the curvature of the cost."""
+        weighted = state.weighted
+        if weighted is None:
+            z = jnp.concatenate(self._outcome(state.theta, state))
+            weighted = self._weighted(self._root(state.loop.t, z), state.loop)
+        return self.policy.pull_back(state.theta, weighted, state.features).T
+
+    def _weighted(self, root, loop):
+        """`L'` times the response of observation and control to what is added now and
+        at each step of the roll-out, newest first, shape (horizon + 1, p + m, m)."""
+        past = self.loop.past(loop)
+        p, m = loop.y.shape[0], past.shape[2]
+        direct = jnp.eye(p + m, m, -p, past.dtype)
+        response = jnp.concatenate([direct[None], past])
+        return jnp.einsum("ok,hom->hkm", root, response)
+
+    def _root(self, t, z):
+        p = self.loop.dynamics.observation_size
+        cost = lambda z: self.cost(t, z[:p], z[p:])  # noqa: E731
+        return positive_root(jax.hessian(cost)(z))
+
+    def _constant_root(self):
+        """`None` if it depends on where or when it is taken."""
+        dynamics, dtype = self.loop.dynamics, self.loop.dtype
+        size = dynamics.observation_size + dynamics.control_size
+        here = jnp.zeros((), dtype), jnp.zeros(size, dtype)
+        traced = jax.make_jaxpr(self._root)(*here)
+        _, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
+        return None if any(used) else self._root(*here)

@@ -208,12 +208,16 @@ class Loop(eqx.Module):
     ) -> tuple[Array, Array]:
         """The observation and control of this step, had `v` been added at it and
         `v_past` at the steps of the roll-out before, newest first."""
-        response: Any = self.response
-        if response is None:
-            response = state.now.output @ state.impulses
-        change = jnp.einsum("hom,hm->o", response, v_past - state.added)
+        change = jnp.einsum("hom,hm->o", self.past(state), v_past - state.added)
         p = state.y.shape[0]
         return state.y + change[:p], state.u_base + change[p:] + v
+
+    def past(self, state: LoopState) -> Array:
+        """The response of observation and base's control to what was added at each step
+        of the roll-out, newest first, shape (horizon, p + m, m)."""
+        if self.response is not None:
+            return self.response
+        return state.now.output @ state.impulses
 
 
 def shift(new: Array, history: Array) -> Array:

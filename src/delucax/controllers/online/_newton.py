@@ -1,11 +1,8 @@
 """Newton's step for an online learner."""
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import jax.lax as lax
 import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
@@ -60,12 +57,9 @@ def _update(
     scale = jnp.where(early, mean(total, count) / after, 1)
     inverse = jnp.where(first, fresh, scale * inverse)
 
-    def rank_one(inverse, column):
+    for column in factor.T:
         moved = inverse @ column
-        return inverse - jnp.outer(moved, moved) / (1 + column @ moved), None
-
-    count_of = factor.shape[1]
-    inverse, _ = lax.scan(rank_one, inverse, factor.T, unroll=min(count_of, 8))
+        inverse = inverse - jnp.outer(moved, moved) / (1 + column @ moved)
     step = inverse @ gradient / learning_rate
     squared = jnp.sum(step**2)
     long = squared > 1
@@ -123,26 +117,16 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
     return _online_newton(float(prior))
 
 
-def curvature_factor(
-    outcome: Callable[[Any], Array], cost: Callable[[Array], Array], theta: Any
-) -> Array:
-    """`J' L`, shape (weights, outcomes), with J the derivative of the outcome by theta
-    and `L L'` the curvature of the cost there."""
-    flat, unravel = ravel_pytree(theta)
-    J = jax.jacrev(lambda flat: outcome(unravel(flat)))(flat)
-    return J.T @ _root(jax.hessian(cost)(outcome(theta)))
-
-
-def _root(H: Array) -> Array:
+def positive_root(H: Array) -> Array:
     """The Cholesky factor of the positive part of a symmetric matrix; columns that
     have no positive pivot are zero."""
     slack = len(H) * jnp.finfo(H.dtype).eps * jnp.max(jnp.abs(jnp.diag(H)), initial=0)
 
-    def column(rest, j):
-        pivot = rest[j, j]
+    columns = []
+    for j in range(len(H)):
+        pivot = H[j, j]
         positive = pivot > slack
-        column = rest[:, j] / jnp.sqrt(jnp.where(positive, pivot, 1))
-        column = jnp.where(positive, column, 0)
-        return rest - jnp.outer(column, column), column
-
-    return lax.scan(column, H, jnp.arange(len(H)), unroll=min(len(H), 8))[1].T
+        column = H[:, j] / jnp.sqrt(jnp.where(positive, pivot, 1))
+        columns.append(jnp.where(positive, column, 0))
+        H = H - jnp.outer(columns[-1], columns[-1])
+    return jnp.stack(columns, axis=1)

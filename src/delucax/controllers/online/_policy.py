@@ -4,10 +4,17 @@ import abc
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..._fields import parameter, weight
 from ...math._norms import within_ball
+
+
+_FUSED = 8192
+"""Products of up to so many terms are one loop, not a call of a library each step."""
 
 
 class AbstractPolicy(eqx.Module):
@@ -29,6 +36,17 @@ class AbstractPolicy(eqx.Module):
     def project(self, theta: Any) -> Any:
         """The nearest point of the set."""
 
+    def pull_back(self, theta: Any, response: Array, features: Array) -> Array:
+        """The derivative by theta, in one row, of `sum_h response_h v_h`, with `v_h`
+        the control for the features of step h; shape (outcomes, weights)."""
+        flat, unravel = ravel_pytree(theta)
+
+        def outcome(flat):
+            v = jax.vmap(self, in_axes=(None, 0))(unravel(flat), features)
+            return jnp.einsum("hom,hm->o", response, v)
+
+        return jax.jacrev(outcome)(flat)
+
 
 class LinearPolicy(AbstractPolicy):
     """`v = theta features`, with the Frobenius norm of `theta` at most `radius`."""
@@ -47,6 +65,14 @@ class LinearPolicy(AbstractPolicy):
 
     def project(self, theta):
         return within_ball(theta, self.radius)
+
+    def pull_back(self, theta, response, features):
+        h, o, m = response.shape
+        if h * o * m * features.shape[1] > _FUSED:
+            rows = jnp.einsum("hom,hf->omf", response, features)
+        else:
+            rows = jnp.sum(response[..., None] * features[:, None, None], axis=0)
+        return rows.reshape(o, theta.size)
 
 
 class NetworkPolicy(AbstractPolicy):
