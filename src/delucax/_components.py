@@ -113,7 +113,8 @@ def _of_components(primitive, params, shape, values):
     if name == "slice" and isinstance(first, _Components):
         (start,), (stop,) = params["start_indices"], params["limit_indices"]
         step = 1 if params["strides"] is None else params["strides"][0]
-        return _Components(first.entries[start:stop:step])
+        taken = first.entries[start:stop:step]
+        return _Components(taken) if taken else None
     if (
         name in ("squeeze", "reshape")
         and shape == ()

@@ -43,6 +43,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "time), and the equation is too large to be solved as one linear system."
     )
     not_converged = "The iteration did not converge within its step limit."
+    unexciting = (
+        "The data are too few, or excite too little, to tell all parameters: some "
+        "direction among them is not identifiable. With throw=False the fit is "
+        "returned, and says which."
+    )
     no_descent = (
         "No step lowered the cost, although the gradient is not zero: the problem may "
         "not be smooth there, or the tolerance may be below rounding."

@@ -79,6 +79,11 @@ def mlp(size, in_size=2, features=None):
     return c.MLP(in_size, 1, width=4, depth=2, **options)
 
 
+def choosing(size):
+    logits = c.MLP(2, 3, width=4, depth=1, key=jax.random.key(int(10 * size)))
+    return c.Categorical(logits, size * jnp.array([[-1.0], [0.0], [1.0]]))
+
+
 def learner(kind, size, **options):
     """As fast as it need be for its weights to matter."""
     dynamics = dlx.LinearDynamics(A, B, dt=DT)
@@ -120,6 +125,16 @@ def scheduled(size):
     return c.Scheduled(eqx.filter_vmap(lambda g: c.Linear(g * FEEDBACK))(gains), DT)
 
 
+def receding(size, **options):
+    cost = dlx.costs.Quadratic(size * jnp.eye(2), 0.1 * jnp.eye(1), final=jnp.eye(2))
+    return c.MPC(dlx.LinearDynamics(A, B, dt=DT), cost, 4, **options)
+
+
+def drawn(size):
+    options = dict(samples=8, iterations=1, temperature=size, scale=2.0)
+    return receding(size, planner=dlx.planning.mppi, **options)
+
+
 def features(y):
     return jnp.stack([y[0], y[1], y[0] * y[1]])
 
@@ -156,6 +171,10 @@ CASES = {
             c.PID(size, 2.0, dt=DT, output=[[1.0, 0.1]]), -1.0, bounds=(-9.0, 9.0)
         )
     ),
+    "GRU": Case(lambda size: c.GRU(2, 1, 3, key=jax.random.key(int(10 * size)))),
+    "History": Case(lambda size: c.History(mlp(size, 5), 2, 1)),
+    "Categorical": Case(choosing, reads_all=False),
+    "Likeliest": Case(lambda size: c.Likeliest(choosing(size)), reads_all=False),
     "Scheduled": Case(scheduled),
     "GPC": Case(lambda size: learner(c.GPC, size, memory=2)),
     "DRC": Case(lambda size: learner(c.DRC, size, memory=2)),
@@ -171,9 +190,13 @@ CASES = {
     ),
     "BPC": Case(bandit),
     "Explore": Case(explorer),
+    "MPC": Case(receding),
+    "MPC that samples": Case(drawn),
 }
 # What differs little from another case, or compiles for long.
 KIN = (
+    "MPC",
+    "MPC that samples",
     "SFC",
     "DSC",
     "DRC",

@@ -16,6 +16,7 @@ import delucax as dlx
 def _packages():
     names = [m.name for m in pkgutil.iter_modules(dlx.__path__)]
     public = [name for name in names if not name.startswith("_")]
+    public.append("training.sysid")
     return [dlx, *(importlib.import_module(f"delucax.{name}") for name in public)]
 
 

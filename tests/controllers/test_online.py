@@ -355,7 +355,9 @@ def test_online_newton_is_recursive_least_squares():
     weights[0], weights[1] = means[2] / means[0], means[2] / means[1]
     Lambda = prior * means[2] / d * np.eye(d)
     Lambda = Lambda + np.einsum("t,tki,tkj->ij", weights, J, J)
-    assert_close(np.linalg.inv(Lambda), state.inverse, rtol=1e-9, atol=1e-12)
+    assert_close(
+        np.linalg.inv(Lambda), state.root @ state.root.T, rtol=1e-9, atol=1e-12
+    )
     step = np.linalg.solve(Lambda, J[-1].T @ (J[-1] @ found[-2] - target[-1]))
     assert_close(found[-1], found[-2] - step, rtol=1e-9, atol=1e-12)
     capped, _ = optimiser.update(

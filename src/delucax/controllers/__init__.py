@@ -12,10 +12,13 @@ from ._estimator import AbstractEstimator as AbstractEstimator, Belief as Belief
 from ._finite_horizon import FiniteHorizonLQR as FiniteHorizonLQR
 from ._gaussian import Gaussian as Gaussian
 from ._hinfinity import HInfinity as HInfinity
+from ._igpc import iGPC as iGPC
+from ._ilc import ILC as ILC
 from ._kalman import KalmanFilter as KalmanFilter
 from ._lqg import LQG as LQG
 from ._lqi import LQI as LQI
 from ._lqr import LQR as LQR
+from ._mpc import MPC as MPC, MPCState as MPCState
 from ._network import Deep as Deep, MLP as MLP
 from ._nonlinear_filters import (
     ExtendedKalmanFilter as ExtendedKalmanFilter,

@@ -3,6 +3,7 @@ systems."""
 
 from ._base import AbstractDynamics as AbstractDynamics
 from ._d2c import d2c as d2c
+from ._delayed import Delayed as Delayed
 from ._discretized import Discretized as Discretized
 from ._linear import LinearDynamics as LinearDynamics
 from ._linearize import c2d as c2d, linearize as linearize

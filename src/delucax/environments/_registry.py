@@ -35,6 +35,16 @@ _REGISTRY: dict[str, str] = {
     "two_tank": "delucax.environments:two_tank",
     "permanent_magnet_motor": "delucax.environments:permanent_magnet_motor",
     "neural": "delucax.environments:neural",
+    "balloon_lung": "delucax.lung:balloon_lung",
+    "lung/balloon_lung": "delucax.lung:balloon_lung",
+    "delay_lung": "delucax.lung:delay_lung",
+    "lung/delay_lung": "delucax.lung:delay_lung",
+    "single_compartment": "delucax.lung:single_compartment",
+    "lung/single_compartment": "delucax.lung:single_compartment",
+    "double_compartment": "delucax.lung:double_compartment",
+    "lung/double_compartment": "delucax.lung:double_compartment",
+    "learned_lung": "delucax.lung:learned_lung",
+    "lung/learned_lung": "delucax.lung:learned_lung",
 }
 
 

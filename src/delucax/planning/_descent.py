@@ -29,6 +29,7 @@ class Options(eqx.Module):
     line_search: str = eqx.field(static=True)
     parallel: bool = eqx.field(static=True)
     max_iterations: int = eqx.field(static=True)
+    spacing: float | None = eqx.field(static=True, default=None)
 
 
 class Tolerances(NamedTuple):
@@ -154,7 +155,7 @@ def _iterate(
 ) -> _Progress:
     now, mu = before.now, before.mu
     about = problem, now.states, now.controls, now.gaps, options.second_order
-    stages = model(*about, before.curved)
+    stages = model(*about, before.curved, options.spacing)
     policy, residual, settled = directions(
         problem, stages, now.controls, mu, tolerance, options
     )

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_count, check_range, is_concrete
+from .._check import check_count, check_positive, check_range
 from .._fields import as_float_array
 from .._results import choose, RESULTS
 from ..costs import AbstractCost
@@ -23,7 +23,7 @@ from ._descent import (
     Tolerances,
 )
 from ._implicit import solution
-from ._plan import Plan
+from ._plan import checked, Plan
 from ._search import SEARCHES
 
 
@@ -42,6 +42,7 @@ def ilqr(
     regularise: str = "control",
     line_search: str = "backtracking",
     parallel: bool = False,
+    finite_difference: float | None = None,
     max_iterations: int = 500,
     tolerance: Any = None,
     constraint_tolerance: Any = None,
@@ -104,9 +105,14 @@ def ilqr(
         and no regularisation.
     - `parallel`: if true, the linear-quadratic problems are solved in parallel over
         time, for long horizons on accelerators; in sequence by default.
+    - `finite_difference`: the spacing of the central differences by which the dynamics
+        are linearised, two calls of them for each state and control, such as 1e-2; by
+        default they are differentiated. The derivatives of the plan are exact in both
+        cases, those of the cost too.
     - `max_iterations`: 500 by default.
-    - `tolerance`: the square root of the precision by default (1.5e-8 in float64). At 0
-        all iterations are taken.
+    - `tolerance`: the square root of the precision by default (1.5e-8 in float64), or
+        the square of `finite_difference` if that is larger. At 0 all iterations are
+        taken.
     - `constraint_tolerance`: by how much a constraint may be violated; the precision
         to the power 0.4 by default (5.5e-7 in float64).
     - `difference`: `(x, x_ref) -> deviation`, such as `system.difference`, which wraps
@@ -119,8 +125,9 @@ def ilqr(
     **Returns:** a [`delucax.planning.Plan`][].
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, or not finite, a
-    horizon of 0, a lower bound above an upper one, or `parallel` with `bounds` or
-    `regularise="state"`; an error at run time as `throw` says.
+    horizon of 0, a lower bound above an upper one, `parallel` with `bounds` or
+    `regularise="state"`, or `finite_difference` with `second_order`; an error at run
+    time as `throw` says.
 
     Source: Li and Todorov, 2004; Tassa, Erez and Todorov, 2012; Tassa, Mansard and
     Todorov, 2014 (bounds); Giftthaler et al., 2018 (multiple shooting); Howell, Jackson
@@ -176,24 +183,34 @@ def ilqr(
             "regularise='control'; solve in sequence otherwise."
         )
     eps = float(jnp.finfo(controls.dtype).eps)
-    tolerance = eps**0.5 if tolerance is None else tolerance
+    if tolerance is None:
+        # What differences leave over is no descent direction of the true cost.
+        tolerance = max(eps**0.5, (finite_difference or 0.0) ** 2)
     check_range(tolerance, "tolerance", where)
     feasible = eps**0.4 if constraint_tolerance is None else constraint_tolerance
     check_range(feasible, "constraint_tolerance", where)
+    if finite_difference is not None:
+        check_positive(finite_difference, "finite_difference", where)
+        finite_difference = float(finite_difference)
+    if finite_difference is not None and second_order:
+        raise ValueError(
+            f"{where}: finite_difference goes without second_order, got both."
+        )
     if second_order is None:
-        second_order = constraints is not None
+        second_order = constraints is not None and finite_difference is None
     options = Options(
         second_order=bool(second_order),
         on_state=regularise == "state",
         line_search=line_search,
         parallel=bool(parallel),
         max_iterations=check_count(max_iterations, "max_iterations", where),
+        spacing=finite_difference,
     )
     tolerances = (
         as_float_array(t).astype(controls.dtype) for t in (tolerance, feasible)
     )
     plan = _plan(problem, controls, guess, Tolerances(*tolerances), options)
-    return _checked(plan, where) if throw else plan
+    return checked(plan, where) if throw else plan
 
 
 @eqx.filter_jit
@@ -227,17 +244,3 @@ def _plan(
         high=problem.high,
         difference=problem.difference,
     )
-
-
-def _checked(plan: Plan, where: str) -> Plan:
-    """Raise unless the plan is a solution: now if it can be seen, else at run time."""
-    failed = plan.result != RESULTS.successful
-    if not is_concrete(failed):
-        return plan.result.error_if(plan, failed)
-    if failed:
-        raise RuntimeError(
-            f"{where}: {RESULTS[plan.result]} After {int(plan.iterations)} iterations "
-            f"the cost is {float(plan.cost):.6g} and the largest entry of its gradient "
-            f"{float(plan.residual):.2g}. Pass throw=False to look at the plan."
-        )
-    return plan

@@ -6,9 +6,10 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._check import is_concrete
 from .._controller import AbstractController, wrong_observation
 from .._fields import function_field, parameter, weight
-from .._results import Result
+from .._results import Result, RESULTS
 from ..math import matvec
 
 
@@ -18,7 +19,9 @@ class Plan(AbstractController):
     `u = controls[k] - gains[k] (y - states[k])` with `k = round((t - t0) / dt)`,
 
     between the bounds that it was planned with. Outside the horizon the control is NaN,
-    which a rollout reports. [`delucax.planning.ilqr`][] makes it.
+    which a rollout reports. [`delucax.planning.ilqr`][] makes it, and so do
+    [`delucax.planning.mppi`][] and [`delucax.planning.cem`][], without gains, and
+    [`delucax.controllers.ILC`][] and [`delucax.controllers.iGPC`][].
 
     **Arguments:**
 
@@ -31,7 +34,8 @@ class Plan(AbstractController):
         `(max_iterations + 1,)`; the last one repeated where there were fewer. With
         constraints, of the augmented Lagrangian.
     - `residual`: the largest entry of the gradient of the cost with respect to the
-        controls, of its projection where a bound holds.
+        controls, of its projection where a bound holds; of a planner that samples, the
+        largest change of a control in the last iteration.
     - `violation`: by how much a constraint is violated, or is inactive although its
         multiplier is not zero; 0 without constraints.
     - `result`: success, or why not; one of `delucax.RESULTS`.
@@ -91,3 +95,17 @@ class Plan(AbstractController):
         if self.low is not None and self.high is not None:
             u = jnp.minimum(jnp.maximum(u, self.low), self.high)
         return u.astype(y.dtype), state
+
+
+def checked(plan: Plan, where: str) -> Plan:
+    """Raise unless the plan is a solution: now if it can be seen, else at run time."""
+    failed = plan.result != RESULTS.successful
+    if not is_concrete(failed):
+        return plan.result.error_if(plan, failed)
+    if failed:
+        raise RuntimeError(
+            f"{where}: {RESULTS[plan.result]} After {int(plan.iterations)} iterations "
+            f"the cost is {float(plan.cost):.6g} and the residual "
+            f"{float(plan.residual):.2g}. Pass throw=False to look at the plan."
+        )
+    return plan

@@ -100,14 +100,15 @@ def roll_out(
     problem: Problem,
     states: Array,
     controls: Array,
-    K: Array,
-    k: Array,
-    length: Array,
+    K: Array | None,
+    k: Array | None,
+    length: Array | float,
     gaps: Array | None,
 ) -> tuple[Array, Array, Array]:
     """The trajectory under `u - length k - K (x - x_planned)`, and its cost.
 
-    `1 - length` of each gap is left. The cost is infinite if anything goes wrong.
+    Without `K` and `k` it is that of the controls. `1 - length` of each gap is left.
+    The cost is infinite if anything goes wrong.
     """
     size = problem.x0.shape[0]
 
@@ -115,7 +116,8 @@ def roll_out(
     def body(parts, inputs):
         t, planned, u, K, k, gap, w = inputs
         x = join_state(parts, size)
-        u = u - length * k - matvec(K, problem.deviation(x, planned))
+        if K is not None:
+            u = u - length * k - matvec(K, problem.deviation(x, planned))
         u = problem.clip(u)
         x_next, result = problem.dynamics.advance(t, x, u, w)
         x_next = x_next.astype(x.dtype)
@@ -148,11 +150,12 @@ def model(
     gaps: Array | None,
     second_order: bool,
     curved: Array | None = None,
+    spacing: float | None = None,
 ) -> Stages:
     """The linear-quadratic model of the problem about a trajectory.
 
     The second derivatives of dynamics and constraints are left out where `curved` is
-    false.
+    false. With a `spacing` the dynamics are linearised by central differences.
     """
     horizon, size = controls.shape[0], states.shape[1]
     times = problem.times(horizon)
@@ -176,7 +179,11 @@ def model(
 
     y = problem.stage_multipliers
     v = jax.grad(lambda x: problem.final(times[-1], x))(states[-1])
-    F = jax.vmap(jacobian(step))(z, times[:-1], problem.w)
+    if spacing is None:
+        slopes = jacobian(step)
+    else:
+        slopes = central(step, spacing, problem.deviation)
+    F = jax.vmap(slopes)(z, times[:-1], problem.w)
     h = jax.vmap(jax.grad(charged))(z, times[:-1], y)
     H = jax.vmap(bent)(z, times[:-1], y)
     V = jax.hessian(lambda x: problem.cost.final(times[-1], x))(states[-1])
@@ -232,6 +239,21 @@ def jacobian(f: Any) -> Any:
             if "everse-mode" not in str(error):
                 raise
             return jax.jacfwd(f)(*args)
+
+    return evaluate
+
+
+def central(f: Any, spacing: float, deviation: Any) -> Any:
+    """The Jacobian in the first argument by central differences: two calls for each
+    of its entries."""
+
+    def evaluate(z, *args):
+        def along(way):
+            change = spacing * way
+            return deviation(f(z + change, *args), f(z - change, *args))
+
+        ways = jnp.eye(z.shape[0], dtype=z.dtype)
+        return jax.vmap(along)(ways).T / (2 * spacing)
 
     return evaluate
 

@@ -46,6 +46,7 @@ def rollout(
     keep: Sequence[str] = KEEP,
     checkpoint: Checkpoint = "step",
     gradient_decay: Any = 1.0,
+    truncate: int | None = None,
     throw: bool = True,
 ) -> Trajectory:
     """Run a controller in an environment: the one closed loop of the library.
@@ -78,6 +79,8 @@ def rollout(
     - `gradient_decay`: the gradient passing back through the state is multiplied by it
         at each step. 1, the true gradient, by default; 0.9 damps the exploding
         gradients of a long unstable horizon.
+    - `truncate`: the gradient is cut before every `truncate`-th step, in the state and
+        in the memory of the controller: truncated back-propagation. Never by default.
     - `throw`: raise if a step fails or the states become NaN or infinite (default); if
         false, look at `trajectory.result`.
 
@@ -141,6 +144,8 @@ def rollout(
         decay = None
     else:
         decay = as_float_array(as_number(gradient_decay, "gradient_decay", where))
+    if truncate is not None:
+        truncate = check_count(truncate, "truncate", where)
     trajectory = _rollout(
         environment,
         controller,
@@ -148,6 +153,7 @@ def rollout(
         x0,
         w,
         decay,
+        truncate,
         horizon,
         tuple(name for name in KEEP if name in keep),
         checkpoint,
@@ -156,7 +162,7 @@ def rollout(
 
 
 @eqx.filter_jit
-def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
+def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkpoint):
     dynamics = env.dynamics
     start_key, w_key, noise_key, controller_key = jr.split(key, 4)
     if x0 is None:
@@ -184,6 +190,8 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
         x = join_state(parts, size)
         if decay is not None:
             x = lax.stop_gradient(x) + decay * (x - lax.stop_gradient(x))
+        if truncate is not None:
+            x, memory = _cut(k % truncate == 0, (x, memory))
         y = dynamics.observe(t, x)
         if not eqx.is_inexact_array(y) or y.ndim != 1:
             y = as_vector(y, env.observation_size, "observe(t, x)", "rollout")
@@ -282,6 +290,17 @@ def _rollout(env, controller, key, x0, w, decay, horizon, keep, checkpoint):
         state_units=dynamics.state_units,
         control_units=dynamics.control_units,
     )
+
+
+def _cut(now, tree):
+    """`tree` without its derivatives where `now` holds."""
+
+    def one(leaf):
+        if not eqx.is_inexact_array(leaf):
+            return leaf
+        return jnp.where(now, lax.stop_gradient(leaf), leaf)
+
+    return jax.tree.map(one, tree)
 
 
 def _scan(body, carry, inputs, horizon, checkpoint):

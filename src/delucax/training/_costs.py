@@ -28,6 +28,7 @@ class _ExpectedCost(eqx.Module):
     batch: int = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
     checkpoint: Checkpoint = eqx.field(static=True)
+    truncate: int | None = eqx.field(static=True)
 
     def __call__(self, controller, key):
         check_key(key, "expected_cost")
@@ -43,6 +44,7 @@ class _ExpectedCost(eqx.Module):
                 gradient_decay=(
                     1.0 if self.gradient_decay is None else self.gradient_decay
                 ),
+                truncate=self.truncate,
                 throw=False,
             )
             return _cost_or_nan(trajectory)
@@ -59,6 +61,7 @@ def expected_cost(
     horizon: int | None = None,
     checkpoint: Checkpoint = "step",
     gradient_decay: Any = 1.0,
+    truncate: int | None = None,
 ) -> Any:
     """The loss of a controller: its mean total cost over fresh starts.
 
@@ -76,12 +79,14 @@ def expected_cost(
         default.
     - `gradient_decay`: damping of the gradient through time, as in
         [`delucax.rollout`][]; 1, the true gradient, by default.
+    - `truncate`: steps after which the gradient is cut, as in [`delucax.rollout`][];
+        never by default.
 
     **Returns:** a function `loss(controller, key)` to a scalar.
 
-    **Raises:** `ValueError` if `batch` or `horizon` is below 1, `environment` is not an
-    environment, `checkpoint` is none of the above, or `gradient_decay` is not a finite
-    number.
+    **Raises:** `ValueError` if `batch`, `horizon` or `truncate` is below 1,
+    `environment` is not an environment, `checkpoint` is none of the above, or
+    `gradient_decay` is not a finite number.
 
     !!! example
 
@@ -118,6 +123,7 @@ def expected_cost(
             environment.horizon if horizon is None else horizon, "horizon", where
         ),
         checkpoint=checkpoint,
+        truncate=None if truncate is None else check_count(truncate, "truncate", where),
     )
 
 

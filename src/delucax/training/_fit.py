@@ -15,12 +15,13 @@ import optax
 from jaxtyping import PyTree
 
 from .._check import check_count, check_key, is_concrete
-from .._results import Result, RESULTS
+from .._results import choose, Result, RESULTS
 from .._typing import PRNGKey
 from ._analytic import analytic
 from ._checkpoint import check_replay, Checkpoint, describe, fingerprint, prepare
 from ._history import History, history_of
-from ._loop import CAPACITY, FAULTS, run_block
+from ._loop import CAPACITY, FAULTS, finished, first_memory, first_state, run_block
+from ._surrogate import AbstractSurrogate
 from ._trainable import strong, take_apart
 
 
@@ -97,19 +98,23 @@ def fit(
     checkpoint, on the same kind of machine, ends with the same bits. A second call with
     the same loss function, optimiser object and kind of model does not compile again;
     an optimiser is a pair of functions, so each new one does. Not for use under `jit`
-    or `vmap`: train an ensemble by `vmap` inside the loss.
+    or `vmap`; but a batch of keys trains a batch of models, all at once and each as if
+    it were alone.
 
     **Arguments:**
 
     - `loss`: `loss(model, key)`, or `loss(model, batch, key)` where there is `data`; to
         a scalar, or to a scalar and a dictionary of scalar metrics. If it is a module
         (as that of [`delucax.training.expected_cost`][] is), a change of its arrays
-        does not compile again.
-    - `model`: any pytree: a controller, an environment, a network, or several.
+        does not compile again. Or a [`delucax.training.AbstractSurrogate`][], such as
+        [`delucax.training.PPO`][], which has a memory.
+    - `model`: any pytree: a controller, an environment, a network, or several. With a
+        batch of keys every array has the axis of the batch in front, as
+        `eqx.filter_vmap(make)(keys)` gives it.
     - `optimiser`: an Optax optimiser, such as `optax.adam(1e-3)`. It sees a dictionary
         from the path of each trainable leaf to its unconstrained value.
     - `steps`: the number of steps, at least 1.
-    - `key`: a random key.
+    - `key`: a random key; or a batch of them, shape `(seeds,)`.
     - `data`: a pytree of arrays with a common leading axis; none by default.
     - `batch_size`: rows in a batch, drawn without replacement; each pass over the data
         has a new order, and leaves out the rows that do not fill a batch. All rows at
@@ -127,16 +132,18 @@ def fit(
         moves, callbacks are called and checkpoints are written after each.
     - `progress`: whether to show a bar with the loss; true by default.
     - `callbacks`: functions `(step, metrics)` called after each block, with the number
-        of steps done and a dictionary of the last step's numbers; none by default. The
-        way to TensorBoard and the like.
+        of steps done and a dictionary of the last step's numbers (their mean over a
+        batch); none by default. The way to TensorBoard and the like.
     - `checkpoint`: the path of a file to write the run to; none by default. If it is
         there, the run goes on from it.
     - `checkpoint_every`: steps between checkpoints, rounded up to whole blocks; 10
         blocks by default. The end of the run is always written.
     - `throw`: raise if the loss, its gradient or an update is NaN or infinite
-        (default); if false, stop there and look at `fitted.result`.
+        (default); if false, stop there and look at `fitted.result`. One of a batch
+        stays as it was, while the others go on.
 
-    **Returns:** a [`delucax.training.Fitted`][].
+    **Returns:** a [`delucax.training.Fitted`][]; of a batch, every array of the model,
+    every column of the history but `step` and `seconds`, and the result have its axis.
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, if nothing is
     trainable, or if the checkpoint is of another run; `RuntimeError` as `throw` says.
@@ -182,8 +189,13 @@ def fit(
     block = check_count(block, "block", _WHERE)
     if block > CAPACITY:
         raise ValueError(f"{_WHERE}: block must be at most {CAPACITY}, got {block}.")
-    check_key(key, _WHERE)
+    lanes = _checked_lanes(key)
     data, data_size, batch_size = _checked_data(data, batch_size)
+    if isinstance(loss, AbstractSurrogate) and data is not None:
+        raise ValueError(
+            f"{_WHERE}: data must be None where the loss is a surrogate, which makes "
+            "its own."
+        )
     _check_callbacks(callbacks)
     if not callable(gradient) or isinstance(gradient, type):
         raise ValueError(
@@ -194,12 +206,17 @@ def fit(
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((model, key, data))):
         raise ValueError(
             f"{_WHERE}: model, key and data must hold values; fit cannot be called "
-            "under jax.jit, jax.vmap or jax.grad. Train an ensemble by jax.vmap inside "
-            "the loss."
+            "under jax.jit, jax.vmap or jax.grad. Train an ensemble with a batch of "
+            "keys."
         )
+    _check_batched(model, lanes)
     assembly, values = take_apart(model, trainable, _WHERE)
-    state, static = eqx.partition(optimiser.init(values), eqx.is_array)
+    began_as = first_state(optimiser, values, lanes)
+    state, static = eqx.partition(began_as, eqx.is_array)
     state = jax.tree.map(strong, state)
+    memory = None
+    if isinstance(loss, AbstractSurrogate):
+        memory = first_memory(loss, model, key, lanes)
     history: dict[str, np.ndarray] = {}
     seconds = 0.0
     saved, found = None, None
@@ -207,7 +224,7 @@ def fit(
         run = _description(model, assembly, values, state, key, steps)
         run |= dict(batch_size=batch_size, data_size=data_size)
         saved = Checkpoint(prepare(checkpoint, _WHERE), run)
-        found = saved.resume((values, state), _WHERE)
+        found = saved.resume(_kept(values, state, memory), _WHERE)
     elif checkpoint_every is not None:
         raise ValueError(f"{_WHERE}: checkpoint_every needs checkpoint, a path.")
     every = 10 * block if checkpoint_every is None else checkpoint_every
@@ -215,52 +232,109 @@ def fit(
 
     order = None
     if batch_size is not None:
-        order = (jnp.zeros(data_size, jnp.int32), jnp.asarray(-1, jnp.int32))
+        shape = () if lanes is None else (lanes,)
+        order = (
+            jnp.zeros((*shape, data_size), jnp.int32),
+            jnp.full(shape, -1, jnp.int32),
+        )
     functions = (loss, gradient, optimiser, static, assembly)
-    carry = (values, state, order)
+    fault = jnp.zeros(() if lanes is None else (lanes,), jnp.int32)
+    carry: Any = (values, state, memory, order, fault)
+    options = ((key, data), batch_size, lanes)
+
+    def advanced(carry, first, stop):
+        span = np.asarray([first, stop], np.int32)
+        carry, outcome = run_block(functions, carry, options[0], span, *options[1:])
+        rows, count = jax.device_get(outcome)
+        return carry, rows, int(count)
+
     if found is not None:
-        (values, state), history, seconds = found
-        span = np.asarray([0, min(2, len(history["step"]))], np.int32)
-        _, (rows, *_) = run_block(functions, carry, (key, data), span, batch_size)
-        check_replay(checkpoint, history, jax.device_get(rows), int(span[1]), _WHERE)
-        carry = (values, state, order)
+        kept, history, seconds = found
+        count = min(2, len(history["step"]))
+        _, rows, _ = advanced(carry, 0, count)
+        check_replay(checkpoint, history, rows, count, _WHERE)
+        carry = (*kept, *(None,) * (3 - len(kept)), order, fault)
     done = written = len(history.get("step", ()))
-    fault, last, blocks = 0, {}, [history] if history else []
+    faults, last, blocks = np.zeros(fault.shape, int), {}, [history] if history else []
     began = time.perf_counter() - seconds
     with tqdm(total=steps, initial=done, disable=not progress, desc="fit") as bar:
-        while done < steps and not fault:
-            span = np.asarray([done, min(done + block, steps)], np.int32)
-            carry, outcome = run_block(functions, carry, (key, data), span, batch_size)
-            rows, count, fault = jax.device_get(outcome)
-            count, fault = int(count), int(fault)
+        while done < steps and not np.all(faults):
+            carry, rows, count = advanced(carry, done, min(done + block, steps))
+            faults = np.asarray(jax.device_get(carry[4]))
             seconds = time.perf_counter() - began
             rows = {name: column[:count] for name, column in rows.items()}
             rows["step"] = np.arange(done, done + count)
             rows["seconds"] = np.full(count, seconds)
             blocks.append(rows)
             done += count
-            last = {name: float(column[-1]) for name, column in rows.items()}
+            last = {name: float(np.mean(column[-1])) for name, column in rows.items()}
             bar.update(count)
             bar.set_postfix(loss=f"{last['loss']:.4g}", refresh=False)
             is_due = done == steps or done - written >= every
-            if saved is not None and is_due and not fault:
+            if saved is not None and is_due and not np.any(faults):
                 blocks = [_joined(blocks)]
-                saved.write(carry[:2], blocks[0], seconds)
+                saved.write(_kept(*carry[:3]), blocks[0], seconds)
                 written = done
             for callback in callbacks:
                 callback(done, last)
 
-    if fault and throw:
-        raise RuntimeError(
-            f"{_WHERE}: the {FAULTS[fault]} is not finite at step {done - 1} (loss "
-            f"{last['loss']:g}, gradient norm {last['gradient_norm']:g}). Pass "
-            "throw=False to get the model as it was before that step."
+    if np.any(faults) and throw:
+        raise RuntimeError(_said(faults, blocks[-1], done))
+    model = assembly(carry[0])
+    if memory is not None:
+        model = finished(loss, model, carry[2], lanes)
+    if lanes is None:
+        result = RESULTS.diverged if faults else RESULTS.successful
+    else:
+        result = jax.vmap(lambda d: choose(d, RESULTS.diverged, RESULTS.successful))(
+            faults > 0
         )
-    return Fitted(
-        model=assembly(carry[0]),
-        history=history_of(_joined(blocks)),
-        result=RESULTS.diverged if fault else RESULTS.successful,
+    return Fitted(model=model, history=history_of(_joined(blocks)), result=result)
+
+
+def _said(faults, rows, done) -> str:
+    """What went wrong, in words."""
+    remedy = "Pass throw=False to get the model as it was before that step."
+    if faults.ndim:
+        lane = int(np.argmax(faults > 0))
+        return (
+            f"{_WHERE}: the {FAULTS[faults[lane]]} of seed {lane} is not finite "
+            f"({int(np.sum(faults > 0))} of {len(faults)} seeds diverged by step "
+            f"{done - 1}). {remedy}"
+        )
+    return (
+        f"{_WHERE}: the {FAULTS[int(faults)]} is not finite at step {done - 1} (loss "
+        f"{float(rows['loss'][-1]):g}, gradient norm "
+        f"{float(rows['gradient_norm'][-1]):g}). {remedy}"
     )
+
+
+def _kept(values, state, memory):
+    """What a checkpoint holds."""
+    return (values, state) if memory is None else (values, state, memory)
+
+
+def _checked_lanes(key) -> int | None:
+    """The number of seeds in a batch of keys; `None` for one key."""
+    typed = eqx.is_array(key) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    raw = eqx.is_array(key) and key.dtype == jnp.uint32 and key.shape[1:] == (2,)
+    if typed and key.ndim == 1 or raw and key.ndim == 2:
+        return check_count(key.shape[0], "the number of keys", _WHERE)
+    check_key(key, _WHERE)
+    return None
+
+
+def _check_batched(model, lanes) -> None:
+    """Raise unless each array of a model has the axis of a batch of keys in front."""
+    if lanes is None:
+        return
+    for leaf in jax.tree.leaves(eqx.filter(model, eqx.is_array)):
+        if leaf.shape[:1] != (lanes,):
+            raise ValueError(
+                f"{_WHERE}: each array of model must have the axis of the {lanes} keys "
+                "in front, as equinox.filter_vmap(make)(keys) gives it, got one of "
+                f"shape {leaf.shape}."
+            )
 
 
 def _checked_data(data, batch_size):

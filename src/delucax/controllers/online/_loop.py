@@ -165,7 +165,10 @@ class Loop(eqx.Module):
     def disturbance(self, state: LoopState) -> Array:
         """What moved the state from where it was to be: the last disturbance."""
         off = self.dynamics.difference(state.y, state.predicted)
-        return jnp.where(state.begun, off, 0)
+        size = jnp.max(jnp.abs(state.y) + jnp.abs(state.predicted))
+        # Compiled twice, a step may round differently: of that nothing is learned.
+        seen = jnp.abs(off) > 4 * jnp.finfo(off.dtype).eps * size
+        return jnp.where(state.begun & seen, off, 0)
 
     def nature(self, state: LoopState) -> Array:
         """The observation, had nothing been added to the base's control."""

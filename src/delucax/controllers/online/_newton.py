@@ -12,10 +12,10 @@ from ..._check import check_positive
 
 
 class OnlineNewtonState(NamedTuple):
-    """The inverse of the curvature so far with its prior; the sum of the traces of what
-    was added to it, and how many times something was."""
+    """A root of the inverse of the curvature so far with its prior; the sum of the
+    traces of what was added to it, and how many times something was."""
 
-    inverse: Array
+    root: Array
     total: Array
     count: Array
 
@@ -44,27 +44,30 @@ def _update(
         )
     gradient, unravel = ravel_pytree(updates)
     factor = curvature()
-    inverse, total, count = state
+    root, total, count = state
     size = jnp.sum(factor**2)
-    some = size > 0
-    new_total, new_count = total + size, count + some
+    # Next to this step all that was seen before is rounding: begin anew.
+    first = size > total / jnp.sqrt(jnp.finfo(size.dtype).eps)
+    total, count = jnp.where(first, 0, total), jnp.where(first, 0, count)
+    new_total, new_count = total + size, count + (size > 0)
     # Until the prior is outweighed it is worth `prior` of the average step so far.
     mean = lambda total, count: total / jnp.where(count > 0, count, 1)  # noqa: E731
-    first, early = some & (count == 0), some & (count > 0) & (count < prior)
-    fresh = jnp.eye(gradient.size, dtype=gradient.dtype)
-    fresh = gradient.size / (prior * jnp.where(first, size, 1)) * fresh
+    early = (size > 0) & (count > 0) & (count < prior)
+    fresh = gradient.size / (prior * jnp.where(first, size, 1))
+    fresh = jnp.sqrt(fresh) * jnp.eye(gradient.size, dtype=gradient.dtype)
     after = jnp.where(early, mean(new_total, new_count), 1)
-    scale = jnp.where(early, mean(total, count) / after, 1)
-    inverse = jnp.where(first, fresh, scale * inverse)
-
+    scale = jnp.sqrt(jnp.where(early, mean(total, count) / after, 1))
+    root = jnp.where(first, fresh, scale * root)
+    # Potter's square-root form stays positive whatever the rounding.
     for column in factor.T:
-        moved = inverse @ column
-        inverse = inverse - jnp.outer(moved, moved) / (1 + column @ moved)
-    step = inverse @ gradient / learning_rate
+        along = column @ root
+        gain = 1 + along @ along
+        root = root - jnp.outer(root @ along, along) / (gain + jnp.sqrt(gain))
+    step = root @ (gradient @ root) / learning_rate
     squared = jnp.sum(step**2)
     long = squared > 1
     step = step * jnp.where(long, 1 / jnp.sqrt(jnp.where(long, squared, 1)), 1)
-    return unravel(-step), OnlineNewtonState(inverse, new_total, new_count)
+    return unravel(-step), OnlineNewtonState(root, new_total, new_count)
 
 
 @functools.cache
@@ -99,7 +102,7 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
     **Raises:** `ValueError` if `prior` is not positive; when it is used, if it is not
     given the curvature.
 
-    Source: Simchowitz, 2020; Hazan, Agarwal and Kale, 2007.
+    Source: Simchowitz, 2020; Hazan, Agarwal and Kale, 2007; Potter, 1963 (the form).
 
     !!! example
 

@@ -4,6 +4,7 @@ from . import (
     _arms as _arms,
     _cars as _cars,
     _cart_pole as _cart_pole,
+    _lung as _lung,
     _masses as _masses,
     _motor as _motor,
     _mountain_car as _mountain_car,

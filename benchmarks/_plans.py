@@ -1,0 +1,155 @@
+"""The planning problems of the benchmark, written once for JAX and for CasADi.
+
+Needs neither: each function takes the module whose `sin`, `cos`, `sqrt` and so on it is
+to use, and arrays of that module.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Plans:
+    """A problem: dynamics, costs, start, bounds."""
+
+    x0: tuple[float, ...]
+    controls: int
+    horizon: int
+    dt: float
+    step: Callable[..., Any]
+    stage: Callable[..., Any]
+    final: Callable[..., Any]
+    rest: float = 0.0  # the control to start from
+    bound: float | None = None
+    obstacle: Callable[..., Any] | None = None  # at most 0
+    arrival: tuple[float, ...] | None = None
+
+
+def stack(module: Any, entries: list[Any]) -> Any:
+    """A vector of the module."""
+    if hasattr(module, "vertcat"):
+        return module.vertcat(*entries)
+    return module.stack(entries)
+
+
+MASS, LENGTH, GRAVITY = 0.1, 0.2, 9.81
+HOVER = MASS * GRAVITY / 2
+
+
+def fly(module: Any, x: Any, u: Any) -> Any:
+    """Euler's step of the planar quadrotor."""
+    lift = (u[0] + u[1]) / MASS
+    rates = [
+        x[3],
+        x[4],
+        x[5],
+        -lift * module.sin(x[2]),
+        lift * module.cos(x[2]) - GRAVITY,
+        (u[1] - u[0]) / (MASS * LENGTH),
+    ]
+    return x + 0.05 * stack(module, rates)
+
+
+def squares(x: Any, count: int) -> Any:
+    """The sum of the squares of the entries."""
+    return sum(x[i] * x[i] for i in range(count))
+
+
+def hovering(module: Any, x: Any, u: Any) -> Any:
+    """`0.1 |x|^2 + 0.1 |u - hover|^2`."""
+    effort = (u[0] - HOVER) ** 2 + (u[1] - HOVER) ** 2
+    return 0.1 * squares(x, 6) + 0.1 * effort
+
+
+def swing(module: Any, x: Any, u: Any) -> Any:
+    """A pendulum of 1 kg and 1 m about the upright, semi-implicit Euler."""
+    rate = x[1] + 0.05 * (9.81 * module.sin(x[0]) + u[0])
+    return stack(module, [x[0] + 0.05 * rate, rate])
+
+
+def cart(module: Any, x: Any, u: Any) -> Any:
+    """A cart of 1 kg with a pole of 0.1 kg and 0.5 m, its angle from the upright."""
+    s, c = module.sin(x[1]), module.cos(x[1])
+    heavy, light, length = 1.0, 0.1, 0.5
+    force = u[0] + light * length * x[3] * x[3] * s
+    turn = (GRAVITY * s - c * force / (heavy + light)) / (
+        length * (4 / 3 - light * c * c / (heavy + light))
+    )
+    push = (force - light * length * turn * c) / (heavy + light)
+    return x + 0.05 * stack(module, [x[2], x[3], push, turn])
+
+
+def glide(module: Any, x: Any, u: Any) -> Any:
+    """A point of unit mass in the plane, held exactly."""
+    dt = 0.1
+    moved = [x[i] + dt * x[2 + i] + dt * dt / 2 * u[i] for i in range(2)]
+    return stack(module, [*moved, x[2] + dt * u[0], x[3] + dt * u[1]])
+
+
+def tip_cost(weight: float) -> Callable[..., Any]:
+    """`weight` times the height that is missing and the squares of the rates."""
+
+    def cost(module: Any, x: Any) -> Any:
+        return weight * (1 - module.cos(x[0]) + 0.1 * x[1] * x[1])
+
+    return cost
+
+
+def cart_cost(weight: float) -> Callable[..., Any]:
+    """Likewise for the cart, with its position."""
+
+    def cost(module: Any, x: Any) -> Any:
+        rates = 0.05 * (x[2] * x[2] + x[3] * x[3])
+        return weight * (1 - module.cos(x[1]) + 0.2 * x[0] * x[0] + rates)
+
+    return cost
+
+
+CASES = {
+    "quadrotor": Plans(
+        (1.0, 1.0, 0.0, 0.0, 0.0, 0.0),
+        2,
+        100,
+        0.05,
+        fly,
+        hovering,
+        lambda module, x: 10 * squares(x, 6),
+        rest=HOVER,
+    ),
+    "pendulum swing-up": Plans(
+        (math.pi, 0.0),
+        1,
+        100,
+        0.05,
+        swing,
+        lambda module, x, u: tip_cost(0.1)(module, x) + 0.01 * u[0] * u[0],
+        tip_cost(100.0),
+        bound=4.0,
+        rest=0.1,
+    ),
+    "cart-pole swing-up": Plans(
+        (0.0, math.pi, 0.0, 0.0),
+        1,
+        80,
+        0.05,
+        cart,
+        lambda module, x, u: cart_cost(0.1)(module, x) + 0.001 * u[0] * u[0],
+        cart_cost(100.0),
+        bound=10.0,
+        rest=0.1,
+    ),
+    "obstacle": Plans(
+        (-1.0, 0.05, 0.0, 0.0),
+        2,
+        40,
+        0.1,
+        glide,
+        lambda module, x, u: 0.01 * squares(x, 4) + 0.1 * squares(u, 2),
+        lambda module, x: 0.0 * x[0],
+        bound=2.5,
+        obstacle=lambda module, x: 0.16 - x[0] * x[0] - x[1] * x[1],
+        arrival=(1.0, 0.0, 0.0, 0.0),
+    ),
+}

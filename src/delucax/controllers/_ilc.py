@@ -1,0 +1,271 @@
+"""Iterative learning control."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import as_matrix, check_count, check_number, check_positive
+from .._fields import as_float_array
+from .._results import choose, RESULTS
+from ..costs import AbstractCost
+from ..dynamics import AbstractDynamics
+from ..planning import Plan
+from ..planning._lq import in_sequence, Policy
+from ..planning._plan import checked
+from ..planning._problem import model as local_model, Problem, roll_out
+
+
+class Trials(NamedTuple):
+    """What is fixed when an iterative learner is compiled."""
+
+    iterations: int
+    candidates: int  # of a search
+    strict: bool  # whether a trial must be better, not only as good
+    slower: float | None  # the learning rate is multiplied by it after a failed search
+
+
+def ILC(
+    plant: AbstractDynamics,
+    model: AbstractDynamics,
+    cost: AbstractCost,
+    plan: Plan,
+    *,
+    w: Any = None,
+    iterations: int = 40,
+    step: Any = 1.0,
+    throw: bool = True,
+) -> Plan:
+    """Iterative learning control: improve a plan by running it on the plant, and
+    learning from a model that is not the plant how to change it.
+
+    Each iteration linearises the model along the last run of the plant, solves the
+    linear-quadratic problem, and runs `u - a k - K (x - x_last)` on the plant, for
+    `a = 1.1 a_last 1.1^(-j^2)`, `j = 0, ..., 9`, until a run costs no more than the
+    last one. If none does, it ends. It is [`delucax.planning.ilqr`][] in which only the
+    derivatives come from the model, so it ends near the best for the plant, at a
+    distance that grows with how wrong those are.
+
+    **Arguments:**
+
+    - `plant`: the true dynamics, which are only run.
+    - `model`: the dynamics that are differentiated, of the same sizes.
+    - `cost`: the stage and final cost.
+    - `plan`: where to start: a [`delucax.planning.Plan`][] made with the model. Its
+        first state, time and bounds are those of each run, and the first run follows
+        its feedback.
+    - `w`: disturbances of the plant, the same in each run, of which the model does not
+        know, shape `(T, k)`; zero by default.
+    - `iterations`: 40 by default.
+    - `step`: the first `a`, 1 by default.
+    - `throw`: raise if the first run diverges (default); if false, look at the
+        `result`.
+
+    **Returns:** a [`delucax.planning.Plan`][]: the best run of the plant, and feedback
+    about it. Its `rollouts` are the runs, the first one included; its `trace` the costs
+    of the first run and after each iteration; its `residual` the gradient by the model.
+    Its `result` is success if all iterations were taken, `no_descent` if a search
+    failed before, and `diverged` if the first run did.
+
+    **Raises:** `ValueError` on an argument of the wrong kind or shape, or out of its
+    range; an error at run time as `throw` says.
+
+    Source: Abbeel, Quigley and Ng, 2006; Agarwal, Hazan, Majumdar and Singh, 2021.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        model = dlx.make("planar_quadrotor")
+        plant = dlx.make("planar_quadrotor", wind="dissipative", wind_strength=0.1)
+        start = jnp.tile(model.dynamics.equilibrium()[1], (30, 1))
+        x0 = model.initial_state
+        plan = dlx.planning.ilqr(model.dynamics, model.cost, x0, start)
+        learned = dlx.controllers.ILC(
+            plant.dynamics, model.dynamics, model.cost, plan, iterations=5
+        )
+        learned.trace
+        ```
+    """
+    where = "ILC"
+    true, known = as_problems(plant, model, cost, plan, w, where)
+    check_number(step, "step", where)
+    check_positive(step, "step", where)
+    iterations = check_count(iterations, "iterations", where)
+    out = _learn(true, known, plan, as_float_array(step), iterations)
+    return checked_run(out, where) if throw else out
+
+
+@eqx.filter_jit
+def _learn(
+    plant: Problem, model: Problem, plan: Plan, step: Array, iterations: int
+) -> Plan:
+    def run(states, controls, policy, length, rate):
+        del rate
+        return roll_out(plant, states, controls, policy.K, policy.k, length, None)
+
+    trials = Trials(iterations, candidates=10, strict=False, slower=None)
+    return learn(plant, model, plan, run, step, jnp.zeros(()), trials)
+
+
+class _Progress(NamedTuple):
+    states: Array
+    controls: Array
+    cost: Array
+    step: Array
+    rate: Array
+    runs: Array
+    trace: Array
+    iteration: Array
+    done: Array
+
+
+def learn(
+    plant: Problem,
+    model: Problem,
+    plan: Plan,
+    run: Callable[..., tuple[Array, Array, Array]],
+    step: Array,
+    rate: Array,
+    trials: Trials,
+) -> Plan:
+    """Iterate from the first run. `run(states, controls, policy, length, rate)` runs
+    the plant about the last run, and gives states, controls and cost."""
+    dtype = plan.controls.dtype
+    zero = jnp.zeros((), dtype)
+    about = plan.states.astype(dtype), plan.controls, plan.gains.astype(dtype)
+    nothing = jnp.zeros_like(plan.controls)
+    states, controls, cost = roll_out(plant, *about, nothing, zero, None)
+    lost = ~jnp.isfinite(cost)
+
+    def policy_of(states, controls) -> Policy:
+        stages = local_model(model, states, controls, None, False)
+        box = None
+        if model.low is not None and model.high is not None:
+            box = model.low - controls, model.high - controls
+        return in_sequence(stages, zero, False, box)
+
+    def trial(now, policy, tried):
+        shorter = jnp.asarray(1.1, dtype) ** (1.0 - tried.astype(dtype) ** 2)
+        length = now.step * shorter
+        found = run(now.states, now.controls, policy, length, now.rate)
+        good = found[2] < now.cost if trials.strict else found[2] <= now.cost
+        return length, found, good
+
+    def body(now):
+        policy = policy_of(now.states, now.controls)
+
+        def again(carry):
+            tried, *_ = carry
+            return tried + 1, *trial(now, policy, tried)
+
+        def going(carry):
+            tried, *_, good = carry
+            return ~good & (tried < trials.candidates)
+
+        last = now.states, now.controls, now.cost
+        first = jnp.asarray(0), now.step, last, jnp.asarray(False)
+        tried, length, found, good = lax.while_loop(going, again, first)
+        keep = lambda new, old: jnp.where(good, new, old)
+        states, controls, cost = jax.tree.map(keep, found, last)
+        iteration = now.iteration + 1
+        rate, ended = now.rate, iteration >= trials.iterations
+        if trials.slower is None:
+            ended = ended | ~good
+        else:
+            rate = keep(rate, trials.slower * rate)
+        trace = now.trace.at[iteration].set(cost)
+        step, runs = keep(length, now.step), now.runs + tried
+        return _Progress(
+            states, controls, cost, step, rate, runs, trace, iteration, ended
+        )
+
+    start = _Progress(
+        states,
+        controls,
+        cost,
+        jnp.asarray(step, dtype),
+        jnp.asarray(rate, dtype),
+        jnp.asarray(1),
+        jnp.full((trials.iterations + 1,), cost),
+        jnp.asarray(0),
+        lost,
+    )
+    last = lax.while_loop(lambda now: ~now.done, body, start)
+    policy = policy_of(last.states, last.controls)
+    reached = jnp.arange(trials.iterations + 1) <= last.iteration
+    result = choose(
+        last.iteration < trials.iterations, RESULTS.no_descent, RESULTS.successful
+    )
+    return Plan(
+        states=last.states,
+        controls=last.controls,
+        gains=policy.K,
+        cost=last.cost,
+        trace=jnp.where(reached, last.trace, last.cost),
+        residual=jnp.max(jnp.abs(policy.gradient)),
+        violation=zero,
+        result=choose(lost, RESULTS.diverged, result),
+        iterations=last.iteration,
+        rollouts=last.runs,
+        regularisation=zero,
+        t0=plan.t0,
+        dt=plant.dynamics.dt,
+        low=plan.low,
+        high=plan.high,
+        difference=plan.difference,
+    )
+
+
+def checked_run(plan: Plan, where: str) -> Plan:
+    """Raise if the first run diverged."""
+    fine = choose(plan.result == RESULTS.diverged, RESULTS.diverged, RESULTS.successful)
+    seen = eqx.tree_at(lambda p: p.result, plan, fine)
+    return eqx.tree_at(lambda p: p.result, checked(seen, where), plan.result)
+
+
+def as_problems(
+    plant: Any, model: Any, cost: Any, plan: Any, w: Any, where: str
+) -> tuple[Problem, Problem]:
+    """The problems of the plant and of its model, or an error."""
+    for name, dynamics in (("plant", plant), ("model", model)):
+        if not isinstance(dynamics, AbstractDynamics):
+            raise ValueError(
+                f"{where}: {name} must be an AbstractDynamics (for an environment, its "
+                f"`dynamics`), got {type(dynamics).__name__}."
+            )
+    if not isinstance(cost, AbstractCost):
+        raise ValueError(
+            f"{where}: cost must be an AbstractCost, got {type(cost).__name__}."
+        )
+    if not isinstance(plan, Plan):
+        raise ValueError(
+            f"{where}: plan must be a delucax.planning.Plan, such as ilqr makes, got "
+            f"{type(plan).__name__}."
+        )
+    T, m = plan.controls.shape
+    sizes = plan.states.shape[1], m
+    for name, dynamics in (("plant", plant), ("model", model)):
+        found = dynamics.state_size, dynamics.control_size
+        if found != sizes:
+            raise ValueError(
+                f"{where}: {name} must have the states and controls of plan, {sizes}, "
+                f"got {found}."
+            )
+    if w is not None:
+        w = as_matrix(w, "w", where)
+        if w.shape != (T, plant.disturbance_size):
+            raise ValueError(
+                f"{where}: w must have shape ({T}, {plant.disturbance_size}), got "
+                f"{w.shape}."
+            )
+    x0 = plan.states[0].astype(plan.controls.dtype)
+    rest = (plan.low, plan.high, plan.difference, None)
+    true = Problem(plant, cost, x0, plan.t0.astype(x0.dtype), w, *rest)
+    return true, Problem(model, cost, x0, plan.t0.astype(x0.dtype), None, *rest)

@@ -1,0 +1,248 @@
+"""Model predictive control."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._check import as_bounds, check_bool, check_count, check_finite, check_key
+from .._controller import AbstractController, wrong_observation
+from .._fields import as_float_array, as_module, function_field, parameter
+from .._results import Result, RESULTS
+from ..costs import AbstractCost
+from ..dynamics import AbstractDynamics
+from ..planning import ilqr
+
+
+_OURS = ("dynamics", "cost", "x0", "controls", "t0", "w", "bounds", "key", "throw")
+"""Arguments of a planner that `MPC` gives itself."""
+
+
+class MPCState(NamedTuple):
+    """What [`delucax.controllers.MPC`][] remembers.
+
+    **Attributes:** `controls`, from which the next plan starts, shape `(T, m)`;
+    `result`, that of the last plan; `failures`, how many plans did not succeed so far;
+    `iterations`, how many the last plan took; `key`, for planners that draw.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dynamics = dlx.LinearDynamics(jnp.eye(1), jnp.eye(1))
+        cost = dlx.costs.Quadratic([1.0], [1.0])
+        mpc = dlx.controllers.MPC(dynamics, cost, 5)
+        u, state = mpc(0.0, jnp.ones(1), mpc.init())
+        state.failures
+        ```
+    """
+
+    controls: Array
+    result: Result
+    failures: Array
+    iterations: Array
+    key: Any
+
+
+class MPC(AbstractController):
+    """Model predictive control: plan from where the plant is, apply the first control,
+    and plan again.
+
+    `u_k` is the first control of the plan over `T` steps from `y_k` at `t_k`. Each plan
+    starts from the one before, a step later, its last control held. It works with every
+    planner of [`delucax.planning`][delucax.planning.ilqr], and with a cost that depends
+    on time, such as a reference to follow.
+
+    What became of a plan is in the controller's state: `result`, and how often it was
+    no success, `failures`. A plan that ran out of iterations or found no descent is
+    used as it is, the best so far. Where there is none to use, since the start
+    diverges or the constraints cannot hold, `throw` says what happens.
+
+    Derivatives are those of the planner: of [`delucax.planning.ilqr`][] by the implicit
+    function theorem, NaN where a plan did not converge.
+
+    **Arguments:**
+
+    - `dynamics`: the model, which observes its state; around an estimator see
+        [`delucax.controllers.OutputFeedback`][].
+    - `cost`: the stage and final cost. A final cost that bounds what comes after the
+        horizon lets this be short.
+    - `horizon`: the steps `T` of a plan.
+    - `planner`: [`delucax.planning.ilqr`][] by default, [`delucax.planning.mppi`][],
+        [`delucax.planning.cem`][], or any function with their arguments.
+    - `bounds`: `(low, high)` of the controls, each a number or of shape `(m,)`; none by
+        default.
+    - `start`: controls for the first plan to start from, shape `(T, m)`; by default
+        those of the equilibrium if the dynamics name one, else zero.
+    - `throw`: raise at run time where there is no plan to use (default); if false, the
+        control that was planned a step before is applied, and the next plan starts
+        afresh.
+    - `**options`: other arguments of the planner, such as `max_iterations`, `samples`
+        or `constraints`. Floating-point numbers among them can be differentiated and
+        changed without compiling again.
+
+    **Raises:** `ValueError` on arguments of the wrong kind or shape, or options that
+    the planner does not have; an error at run time as `throw` says.
+
+    Source: Richalet, Rault, Testud and Papon, 1978; Diehl, Bock and Schloeder, 2005
+    (warm start).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum", dt=0.02)
+        cost = dlx.costs.Quadratic([1.0, 0.1], [0.1], final=[20.0, 5.0])
+        mpc = dlx.controllers.MPC(env.dynamics, cost, 20, bounds=(-2.0, 2.0))
+        x0 = jnp.array([0.3, 0.0])
+        run = dlx.rollout(env, mpc, key=jax.random.key(0), x0=x0, horizon=30)
+        run.total_cost
+        ```
+    """
+
+    dynamics: AbstractDynamics
+    cost: AbstractCost
+    start: Float[Array, "*batch T m"] = parameter()
+    low: Array | None = parameter()
+    high: Array | None = parameter()
+    planner: Callable[..., Any] = function_field()
+    options: dict[str, Any]
+    settings: tuple[tuple[str, Any], ...] = eqx.field(static=True)
+    draws: bool = eqx.field(static=True)
+    throw: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        dynamics: AbstractDynamics,
+        cost: AbstractCost,
+        horizon: int,
+        *,
+        planner: Callable[..., Any] = ilqr,
+        bounds: Any = None,
+        start: Any = None,
+        throw: bool = True,
+        **options: Any,
+    ):
+        where = "MPC"
+        if not isinstance(dynamics, AbstractDynamics):
+            raise ValueError(
+                f"{where}: dynamics must be an AbstractDynamics (for an environment, "
+                f"its `dynamics`), got {type(dynamics).__name__}."
+            )
+        if not isinstance(cost, AbstractCost):
+            raise ValueError(
+                f"{where}: cost must be an AbstractCost, got {type(cost).__name__}."
+            )
+        horizon = check_count(horizon, "horizon", where)
+        known = _arguments(planner, where)
+        for name in options:
+            if name not in known or name in _OURS:
+                raise ValueError(
+                    f"{where}: {name} is no option of the planner; it has "
+                    f"{', '.join(k for k in known if k not in _OURS)}."
+                )
+        ends = as_bounds(bounds, where)
+        m = dynamics.control_size
+        for end in ends or ():
+            if end.shape not in ((), (m,)):
+                raise ValueError(
+                    f"{where}: bounds must be numbers or vectors of {m} entries, one "
+                    f"for each control, got shape {end.shape}."
+                )
+        if start is None:
+            start = jnp.tile(_rest(dynamics), (horizon, 1))
+        start = as_float_array(start)
+        if not eqx.is_inexact_array(start) or start.shape != (horizon, m):
+            got = f"shape {start.shape}" if eqx.is_array(start) else repr(start)
+            raise ValueError(
+                f"{where}: start must have shape (horizon, controls) = "
+                f"({horizon}, {m}), got {got}."
+            )
+        check_finite(start, "start", where)
+        self.dynamics, self.cost, self.start = dynamics, cost, start
+        self.low, self.high = (None, None) if ends is None else ends
+        self.planner = planner
+        self.throw = check_bool(throw, "throw", where)
+        self.draws = "key" in known
+        kept, fixed = {}, []
+        for name, value in sorted(options.items()):
+            if isinstance(value, bool | int | str | None | np.integer):
+                fixed.append((name, value))
+            else:
+                kept[name] = as_module(as_float_array(value))
+        self.options, self.settings = kept, tuple(fixed)
+
+    def init(self, *, key=None):
+        if self.draws:
+            check_key(key, "MPC.init")
+        result = jax.tree.map(jnp.asarray, RESULTS.successful)
+        zero = jnp.zeros((), int)
+        return MPCState(self.start, result, zero, zero, key if self.draws else None)
+
+    def __call__(self, t, y, state):
+        size = self.dynamics.state_size
+        if y.shape != (size,):
+            raise wrong_observation(self, size, y)
+        options: dict[str, Any] = dict(self.options) | dict(self.settings)
+        key = state.key
+        if self.draws:
+            key, options["key"] = jr.split(key)
+        bounds = None if self.low is None else (self.low, self.high)
+        plan = self.planner(
+            self.dynamics,
+            self.cost,
+            y,
+            state.controls,
+            t0=t,
+            bounds=bounds,
+            throw=False,
+            **options,
+        )
+        lost = (plan.result == RESULTS.diverged) | (plan.result == RESULTS.infeasible)
+        lost = lost | ~jnp.all(jnp.isfinite(plan.controls))
+        before = state.controls
+        if self.low is not None and self.high is not None:
+            before = jnp.minimum(jnp.maximum(before, self.low), self.high)
+        u = jnp.where(lost, before[0], plan.controls[0])
+        if self.throw:
+            u = plan.result.error_if(u, lost)
+        later = jnp.concatenate([plan.controls[1:], plan.controls[-1:]])
+        later = jnp.where(lost, self.start, later).astype(before.dtype)
+        failed = plan.result != RESULTS.successful
+        after = MPCState(
+            later,
+            plan.result,
+            state.failures + failed,
+            jnp.asarray(plan.iterations, state.iterations.dtype),
+            key,
+        )
+        return u.astype(y.dtype), after
+
+
+def _arguments(planner: Any, where: str) -> tuple[str, ...]:
+    """The names of a planner's arguments."""
+    if not callable(planner):
+        raise ValueError(
+            f"{where}: planner must be a function such as delucax.planning.ilqr, got "
+            f"{planner!r}."
+        )
+    return tuple(inspect.signature(planner).parameters)
+
+
+def _rest(dynamics: AbstractDynamics) -> Array:
+    """The control of the equilibrium, or zero."""
+    try:
+        return dynamics.equilibrium()[1]
+    except ValueError:
+        return jnp.zeros(dynamics.control_size)

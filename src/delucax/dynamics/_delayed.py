@@ -1,0 +1,154 @@
+"""A plant behind dead times."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import as_vector, check_count
+from ._base import AbstractDynamics
+
+
+class Delayed(AbstractDynamics):
+    """Dynamics whose controls act, or whose sensor reads, some whole steps late,
+
+    `x_next = F(t, x, u[k - controls], w)`, `y = observe(t, x)[k - sensor]`.
+
+    What is under way is part of the state: `(x, u[k - 1], ..., u[k - controls],
+    y[k - 1], ..., y[k - sensor])`. It is a true transport delay, differentiable like
+    any other state; for the delay of a fraction of a step discretise a lag.
+
+    **Arguments:**
+
+    - `dynamics`: the plant.
+    - `controls`: steps until a control acts, 0 by default.
+    - `sensor`: steps until an observation is seen, 0 by default.
+
+    **Raises:** `ValueError` if `dynamics` are none, or a delay is not a whole number of
+    at least 0.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        plant = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        late = dlx.dynamics.Delayed(plant, controls=2)
+        x0 = late.filled(jnp.array([0.1, 0.0]))
+        dlx.open_loop(late, x0, jnp.ones((5, 1)))
+        ```
+    """
+
+    dynamics: AbstractDynamics
+    controls: int = eqx.field(static=True)
+    sensor: int = eqx.field(static=True)
+
+    def __init__(self, dynamics: AbstractDynamics, controls: int = 0, sensor: int = 0):
+        where = "Delayed"
+        if not isinstance(dynamics, AbstractDynamics):
+            raise ValueError(
+                f"{where}: dynamics must be an AbstractDynamics, got "
+                f"{type(dynamics).__name__}."
+            )
+        self.dynamics = dynamics
+        self.controls = check_count(controls, "controls", where, least=0)
+        self.sensor = check_count(sensor, "sensor", where, least=0)
+
+    @property
+    def dt(self):
+        return self.dynamics.dt
+
+    @property
+    def state_names(self):
+        inner = self.dynamics
+        late = [
+            f"{name}[-{k + 1}]"
+            for k in range(self.controls)
+            for name in inner.control_names
+        ]
+        seen = range(inner.observation_size if self.sensor else 0)
+        late += [f"y{i}[-{k + 1}]" for k in range(self.sensor) for i in seen]
+        return (*inner.state_names, *late)
+
+    @property
+    def control_names(self):
+        return self.dynamics.control_names
+
+    @property
+    def control_units(self):
+        return self.dynamics.control_units
+
+    @property
+    def disturbance_size(self):
+        return self.dynamics.disturbance_size
+
+    @property
+    def is_stochastic(self):
+        return self.dynamics.is_stochastic
+
+    def _cut(self, x: Array) -> tuple[Array, Array, Array]:
+        """The plant's own state, the controls and the observations under way."""
+        n = self.dynamics.state_size
+        m = n + self.controls * self.dynamics.control_size
+        return x[:n], x[n:m], x[m:]
+
+    def inner(self, x: Array) -> Array:
+        """The plant's own state.
+
+        **Arguments:** `x`: the state.
+
+        **Returns:** its first entries.
+        """
+        return self._cut(x)[0]
+
+    def filled(self, x: Any, u: Any = None) -> Array:
+        """The state of a plant that has rested.
+
+        **Arguments:**
+
+        - `x`: the plant's own state.
+        - `u`: the control that is under way, zero by default.
+
+        **Returns:** the state, with the control and what the sensor reads of `x` in
+        every place under way.
+
+        **Raises:** `ValueError` on a wrong shape.
+        """
+        inner, where = self.dynamics, "Delayed.filled"
+        x = as_vector(x, inner.state_size, "x", where)
+        u = jnp.zeros(inner.control_size) if u is None else u
+        u = as_vector(u, inner.control_size, "u", where)
+        y = inner.observe(0.0, x)
+        late = [jnp.tile(u, self.controls), jnp.tile(y, self.sensor)]
+        return jnp.concatenate([x, *late]).astype(x.dtype)
+
+    def advance(self, t, x, u, w):
+        own, controls, seen = self._cut(x)
+        acting, late = u, []
+        if self.controls:
+            m = u.shape[0]
+            acting = controls[-m:]
+            late = [u.astype(x.dtype)]
+            late += [controls[:-m]] if self.controls > 1 else []
+        if self.sensor:
+            y = self.dynamics.observe(t, own).astype(x.dtype)
+            late += [y, seen[: -y.shape[0]]] if self.sensor > 1 else [y]
+        after, result = self.dynamics.advance(t, own, acting, w)
+        return jnp.concatenate([after, *late]), result
+
+    def observe(self, t, x):
+        own, _, seen = self._cut(x)
+        if not self.sensor:
+            return self.dynamics.observe(t, own)
+        return seen[-(seen.shape[0] // self.sensor) :]
+
+    def difference(self, x, x_ref):
+        n = self.dynamics.state_size
+        own = self.dynamics.difference(x[:n], x_ref[:n])
+        return jnp.concatenate([own, x[n:] - x_ref[n:]])
+
+    def equilibrium(self):
+        x, u = self.dynamics.equilibrium()
+        return self.filled(x, u), u

@@ -1,0 +1,459 @@
+"""Experiments as pytest writes tests: a function, and what to call it with."""
+
+import dataclasses
+import difflib
+import inspect
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from ._axes import Axis, axis_of, hashes_of, Mark, Marks, Param, shown_values
+from ._hash import fingerprint
+from ._provenance import version
+from ._select import selector
+
+
+_SCOPES = ("case", "process")
+# Names that the table gives to columns of its own.
+RESERVED = (
+    "experiment",
+    "case",
+    "seed",
+    "status",
+    "error",
+    "traceback",
+    "compile_seconds",
+    "run_seconds",
+    "commit",
+    "dirty",
+    "date",
+    "device",
+    "dtype",
+    "hash",
+    "versions",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fixture:
+    """What cases need, made by a function; see `experiment.fixture`."""
+
+    function: Callable
+    scope: str
+    axis: Axis | None
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self.function(*args, **kwargs)
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One call of an experiment: a value of each axis, for all seeds."""
+
+    experiment: str
+    id: str
+    index: tuple[int, ...]
+    parameters: Mapping[str, Any]
+    shown: Mapping[str, Any]
+    marks: tuple[Mark, ...]
+    hash: str
+
+    def mark(self, name: str) -> Mark | None:
+        """The mark of that name, if it has it."""
+        return next((mark for mark in self.marks if mark.name == name), None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """A function and all that it is called with; made by
+    [`delucax.experiments.experiment`][].
+
+    Called as a function it is the function that it was made of.
+
+    **Arguments:**
+
+    - `function`: what to run, see [`delucax.experiments.experiment`][].
+    - `name`: the function's by default.
+    - `axes`: the parameters; none by default.
+    - `seeds`: the seeds; 0 alone by default.
+    - `marks`: of all cases; none by default.
+    - `fixtures`: by name, those that are not globals of the function; none by default.
+
+    !!! example
+
+        ```python
+        from delucax.experiments import experiment
+
+        @experiment.parametrize("x", [1.0, 2.0, 3.0])
+        def square(x):
+            return x**2
+
+        results = square.run(progress=False)
+        assert [row["value"] for row in results.rows] == [1.0, 4.0, 9.0]
+        ```
+    """
+
+    function: Callable
+    name: str = ""
+    axes: tuple[Axis, ...] = ()
+    seeds: tuple[int, ...] = (0,)
+    marks: tuple[Mark, ...] = ()
+    fixtures: Mapping[str, Fixture] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        if not callable(self.function):
+            raise ValueError(
+                f"experiment: function must be a function, got {self.function!r}."
+            )
+        if not self.name:
+            name = getattr(self.function, "__name__", type(self.function).__name__)
+            object.__setattr__(self, "name", name)
+        for name in ("__doc__", "__module__"):
+            object.__setattr__(self, name, getattr(self.function, name, None))
+        object.__setattr__(self, "__wrapped__", self.function)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """The function's own answer to `args` and `kwargs`."""
+        return self.function(*args, **kwargs)
+
+    @property
+    def arguments(self) -> Mapping[str, inspect.Parameter]:
+        """The arguments of the function."""
+        return inspect.signature(self.function).parameters
+
+    def needed(self) -> dict[str, Fixture]:
+        """The fixtures that it uses, directly or through others, by name."""
+        found: dict[str, Fixture] = {}
+        known = {**getattr(self.function, "__globals__", {}), **self.fixtures}
+        given = {name for axis in self.axes for name in axis.names}
+
+        def look(function: Callable, path: tuple[str, ...]) -> None:
+            for name in inspect.signature(function).parameters:
+                fixture = known.get(name)
+                if name in given or not isinstance(fixture, Fixture):
+                    continue
+                if name in path:
+                    loop = " -> ".join((*path, name))
+                    raise ValueError(f"{self.name}: fixtures need each other: {loop}.")
+                look(fixture.function, (*path, name))
+                found[name] = fixture
+
+        look(self.function, ())
+        return found
+
+    def all_axes(self) -> tuple[Axis, ...]:
+        """The axes, those of its fixtures last."""
+        own = [
+            dataclasses.replace(fixture.axis, names=(name,))
+            for name, fixture in self.needed().items()
+            if fixture.axis is not None
+        ]
+        return (*self.axes, *own)
+
+    def cases(
+        self, select: str = "", marks: str = "", slow: bool = False
+    ) -> tuple[Case, ...]:
+        """The cases that would run.
+
+        **Arguments:**
+
+        - `select`: words that occur in the case's name, joined by `and`, `or`, `not`
+            and parentheses; case does not matter. All by default.
+        - `marks`: likewise, of the names of its marks.
+        - `slow`: whether those marked `slow` are among them; not by default, unless
+            `marks` names the mark.
+
+        **Raises:** `ValueError` on a parameter that the function does not have, an
+        argument without a value, or a value that cannot be told from others by its
+        content.
+        """
+        self._check()
+        axes, where = self.all_axes(), self.name
+        chosen = selector(select, "select", where)
+        marked = selector(marks, "marks", where)
+        slow = slow or "slow" in marks.split()
+        code = self._code()
+        hashes = [hashes_of(axis, where) for axis in axes]
+        shown = [shown_values(axis) for axis in axes]
+        found, seen = [], set()
+        for index in itertools.product(*(range(len(axis.values)) for axis in axes)):
+            at = list(enumerate(index))
+            ids = "-".join(axes[i].ids[k] for i, k in at)
+            name = f"{self.name}[{ids}]" if axes else self.name
+            all_marks = self.marks + tuple(m for i, k in at for m in axes[i].marks[k])
+            if name in seen:
+                raise ValueError(
+                    f"{where}: two cases are called {name!r}; give other ids."
+                )
+            seen.add(name)
+            names = {mark.name for mark in all_marks}
+            low = name.lower()
+            if not chosen(lambda word, low=low: word.lower() in low):
+                continue
+            if not marked(lambda word, names=names: word in names):
+                continue
+            if "slow" in names and not slow:
+                continue
+            parameters: dict[str, Any] = {}
+            table: dict[str, Any] = {}
+            for i, k in at:
+                parameters.update(zip(axes[i].names, axes[i].values[k], strict=True))
+                table.update(shown[i][k])
+            content = "-".join([code, *(hashes[i][k] for i, k in at)])
+            case = Case(
+                experiment=self.name,
+                id=name,
+                index=index,
+                parameters=parameters,
+                shown=table,
+                marks=all_marks,
+                hash=fingerprint(content),
+            )
+            found.append(case)
+        return tuple(found)
+
+    def run(self, **options: Any) -> Any:
+        """Run it: [`delucax.experiments.run`][] of this experiment alone.
+
+        **Arguments:**
+
+        - `**options`: those of [`delucax.experiments.run`][].
+
+        **Returns:** the [`delucax.experiments.Results`][].
+        """
+        from ._run import run
+
+        return run(self, **options)
+
+    def _code(self) -> str:
+        """The hash of the code that all cases share."""
+        module = getattr(self.function, "__module__", None)
+        functions = [fixture.function for fixture in self.needed().values()]
+        precise = bool(jax.config.jax_enable_x64)
+        content = [self.function, functions, precise, version("delucax")]
+        return fingerprint(content, root=module)
+
+    def _check(self) -> None:
+        where, arguments, fixtures = self.name, self.arguments, self.needed()
+        taken = {*arguments}
+        for fixture in fixtures.values():
+            taken |= {*inspect.signature(fixture.function).parameters} - {"param"}
+        names = [name for axis in self.axes for name in axis.names]
+        for name in names:
+            if name in RESERVED or name in ("key", "versions"):
+                raise ValueError(f"{where}: no parameter can be called {name!r}.")
+            if name not in taken:
+                close = difflib.get_close_matches(name, taken, n=3) or sorted(taken)
+                raise ValueError(
+                    f"{where}: the function has no argument {name!r}; did you mean "
+                    f"{' or '.join(repr(n) for n in close) or 'none'}?"
+                )
+        given = {*names, *fixtures, "key", "seed"}
+        functions = [(self.function, where)]
+        functions += [(f.function, f"fixture {n}") for n, f in fixtures.items()]
+        for function, label in functions:
+            for name, p in inspect.signature(function).parameters.items():
+                open_ended = p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+                fixture = label.startswith("fixture ")
+                allowed = {*given, "param"} if fixture else given
+                if fixture and name in ("key", "seed"):
+                    raise ValueError(
+                        f"{where}: {label} cannot take {name!r}: it is made once for "
+                        "all seeds."
+                    )
+                if name not in allowed and p.default is p.empty and not open_ended:
+                    raise ValueError(
+                        f"{where}: the argument {name!r} of {label} has no value: "
+                        "parametrize it, make a fixture of that name, or give it a "
+                        "default."
+                    )
+        if {"key", "seed"} <= {*arguments}:
+            raise ValueError(f"{where}: the function takes both 'key' and 'seed'.")
+        if len(self.seeds) > 1 and not {"key", "seed"} & {*arguments}:
+            raise ValueError(
+                f"{where}: it has {len(self.seeds)} seeds, but the function takes "
+                "neither 'key' nor 'seed'."
+            )
+
+
+class experiment:  # noqa: N801
+    """Make an experiment of a function, with decorators in the manner of pytest.
+
+    The function is called once for each case, with its parameters and fixtures as
+    arguments, and returns a number, or a dictionary of names to numbers, strings or
+    arrays. How it is called follows from its arguments:
+
+    - with `key`: it is traced, compiled, and called for all seeds at once by `vmap`,
+      each with `jax.random.key(seed)`. Parameters that are arrays, modules' arrays or
+      numbers are traced, so that other values compile nothing again; where a number
+      must be known when it is traced (a horizon, a width), it is, found by trying.
+    - with `seed`: it is called as it is, once for each seed, with an integer. For code
+      that cannot be traced, such as `fit`.
+    - with neither: it is called as it is, once.
+
+    **Arguments:**
+
+    - `function`: the function.
+
+    **Returns:** an [`delucax.experiments.Experiment`][].
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        from delucax.experiments import experiment
+
+        @experiment.parametrize("length", [0.8, 1.0, 1.2])
+        @experiment.parametrize("gain", [10.0, 20.0], ids=["weak", "strong"])
+        @experiment.seeds(4)
+        def cost(length, gain, key):
+            env = dlx.make("pendulum", length=length)
+            controller = dlx.controllers.Linear(jnp.stack([jnp.stack([gain, 5.0])]))
+            return dlx.rollout(env, controller, key=key, horizon=10).total_cost
+
+        results = cost.run(progress=False)
+        assert len(results.rows) == 24
+        ```
+    """
+
+    mark = Marks()
+
+    def __new__(cls, function: Callable) -> Experiment:
+        return as_experiment(function)
+
+    @staticmethod
+    def parametrize(
+        names: str | Sequence[str],
+        values: Iterable,
+        *,
+        ids: Sequence[str] | Callable[[Any], str] | None = None,
+    ) -> Callable[[Any], Experiment]:
+        """Call the function with each of `values`; stacked, with all combinations.
+
+        **Arguments:**
+
+        - `names`: of the arguments, `"controller, environment"` or a sequence.
+        - `values`: one for each case; a tuple each if there are several names. Wrap one
+            in `experiment.param` to give it an id or marks.
+        - `ids`: what to call them, or a function from a value to that; by default
+            numbers and strings are their own, functions and classes their names.
+
+        **Raises:** `ValueError` on a name that is given twice, or if values or ids do
+        not fit the names.
+        """
+        axis = axis_of(names, values, ids)
+
+        def decorate(what: Any) -> Experiment:
+            made = as_experiment(what)
+            twice = {n for a in made.axes for n in a.names} & {*axis.names}
+            if twice:
+                raise ValueError(
+                    f"{made.name}: the parameter {sorted(twice)[0]!r} is given twice."
+                )
+            return dataclasses.replace(made, axes=(axis, *made.axes))
+
+        return decorate
+
+    @staticmethod
+    def seeds(seeds: int | Iterable[int]) -> Callable[[Any], Experiment]:
+        """Run each case with these seeds.
+
+        **Arguments:**
+
+        - `seeds`: how many, from 0 on; or which.
+
+        **Raises:** `ValueError` if they are no whole numbers, negative, or repeated.
+        """
+        found = as_seeds(seeds, "experiment.seeds")
+        return lambda what: dataclasses.replace(as_experiment(what), seeds=found)
+
+    @staticmethod
+    def fixture(
+        function: Callable | None = None,
+        *,
+        scope: str = "case",
+        params: Iterable | None = None,
+        ids: Sequence[str] | Callable[[Any], str] | None = None,
+    ) -> Any:
+        """Make a fixture: what a function returns, or yields once, is the argument of
+        its name in experiments of the same module, and in other fixtures.
+
+        What comes after the `yield` is run when the scope ends. Arguments of a fixture
+        are parameters of the experiment or other fixtures.
+
+        **Arguments:**
+
+        - `function`: what makes it.
+        - `scope`: `"case"` (default), made for each case; `"process"`, once in each
+            process for each value of the parameters that it takes.
+        - `params`: values to run every case with; the function takes them as `param`.
+        - `ids`: what to call `params`.
+
+        **Raises:** `ValueError` on another scope.
+        """
+        if scope not in _SCOPES:
+            raise ValueError(
+                f"experiment.fixture: scope must be {' or '.join(map(repr, _SCOPES))}, "
+                f"got {scope!r}."
+            )
+        axis = None if params is None else axis_of("param", params, ids)
+        make = lambda function: Fixture(function, scope, axis)
+        return make if function is None else make(function)
+
+    @staticmethod
+    def use(**fixtures: Fixture) -> Callable[[Any], Experiment]:
+        """Give an experiment fixtures that are not globals of its module.
+
+        **Arguments:**
+
+        - `**fixtures`: by the name of the argument.
+        """
+
+        def decorate(what: Any) -> Experiment:
+            made = as_experiment(what)
+            return dataclasses.replace(made, fixtures={**made.fixtures, **fixtures})
+
+        return decorate
+
+    @staticmethod
+    def param(
+        *values: Any, id: str | None = None, marks: Mark | Sequence[Mark] = ()
+    ) -> Param:
+        """One of the values of `parametrize`, with an id and marks.
+
+        **Arguments:**
+
+        - `*values`: one for each name.
+        - `id`: what to call it; as `parametrize` does by default.
+        - `marks`: one mark or several; none by default.
+        """
+        marks = (marks,) if isinstance(marks, Mark) else tuple(marks)
+        return Param(values, id, marks)
+
+
+def as_experiment(what: Any) -> Experiment:
+    """The experiment, or one made of a function."""
+    return what if isinstance(what, Experiment) else Experiment(what)
+
+
+def as_seeds(seeds: Any, where: str) -> tuple[int, ...]:
+    """Seeds from 0 on, or those given."""
+    found = range(seeds) if isinstance(seeds, int) else seeds
+    whole = isinstance(found, Iterable) and not isinstance(found, str | bytes)
+    found = tuple(found) if whole else ()
+    legal = all(
+        isinstance(s, int | np.integer) and not isinstance(s, bool) and 0 <= s < 2**31
+        for s in found
+    )
+    if isinstance(seeds, bool) or not found or not legal:
+        raise ValueError(
+            f"{where}: seeds must be how many, at least 1, or whole numbers from 0 to "
+            f"2**31 - 1, got {seeds!r}."
+        )
+    if len(set(found)) < len(found):
+        raise ValueError(f"{where}: seeds must differ, got {seeds!r}.")
+    return tuple(int(s) for s in found)

@@ -1,0 +1,65 @@
+"""What results were made with."""
+
+import datetime
+import functools
+import importlib.metadata
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import jax
+
+
+_PACKAGES = ("delucax", "jax", "jaxlib", "equinox", "diffrax", "numpy")
+
+
+@functools.cache
+def version(package: str) -> str | None:
+    """The version of an installed package; `None` if it is not."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def provenance(folder: Path) -> dict[str, Any]:
+    """Commit, versions, precision, processor and date of a run of code in `folder`."""
+    versions = {name: version(name) for name in _PACKAGES}
+    versions["python"] = platform.python_version()
+    commit, dirty = _git(folder)
+    return {
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "commit": commit,
+        "dirty": dirty,
+        "dtype": "float64" if jax.config.jax_enable_x64 else "float32",
+        "versions": versions,
+    }
+
+
+def device() -> str:
+    """The kind of device that JAX computes on by default, and how many there are."""
+    found = jax.devices()
+    kind = found[0].device_kind
+    return kind if len(found) == 1 else f"{len(found)} x {kind}"
+
+
+def _git(folder: Path) -> tuple[str | None, bool | None]:
+    """The commit and whether files differ from it; nothing outside a repository."""
+
+    def ask(*words: str) -> str:
+        done = subprocess.run(
+            ["git", *words],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=20,
+            check=True,
+        )
+        return done.stdout.strip()
+
+    try:
+        commit = ask("rev-parse", "HEAD")
+        return commit, bool(ask("status", "--porcelain", "--untracked-files=no"))
+    except (OSError, subprocess.SubprocessError):
+        return None, None

@@ -1,0 +1,200 @@
+"""Interquartile means, and comparisons of pairs."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from .._extras import extra
+from ._results import Results
+
+
+def interquartile_mean(values: Any, axis: int | None = None) -> Any:
+    """The mean of the middle half of some values.
+
+    It is as robust as the median and uses more of the data. Where a quarter of the
+    values is no whole number, the values at the edges count in part.
+
+    Source: Agarwal, Schwarzer, Castro, Courville and Bellemare, 2021.
+
+    **Arguments:**
+
+    - `values`: numbers; infinite ones may be among the outer quarters.
+    - `axis`: over which; all by default.
+
+    **Returns:** a number, or an array without that axis.
+
+    **Raises:** `ValueError` if there are none.
+
+    !!! example
+
+        ```python
+        from delucax import experiments
+
+        assert experiments.interquartile_mean([1.0, 2.0, 3.0, 1000.0]) == 2.5
+        ```
+    """
+    array = np.asarray(values, np.float64)
+    array = array.reshape(-1) if axis is None else np.moveaxis(array, axis, -1)
+    count = array.shape[-1] if array.ndim else 0
+    if count == 0:
+        raise ValueError("interquartile_mean: values must be one at least, got none.")
+    cut = count / 4
+    place = np.arange(count)
+    # How much of each sorted value lies between the quartiles.
+    weight = np.clip(place + 1 - cut, 0, 1) * np.clip(count - cut - place, 0, 1)
+    if count == 1:
+        weight = np.ones(1)
+    inside = weight > 0
+    ordered = np.sort(array, axis=-1)[..., inside]
+    mean = ordered @ weight[inside] / weight.sum()
+    return float(mean) if mean.ndim == 0 else mean
+
+
+def compare(
+    results: Results,
+    *,
+    by: str,
+    baseline: Any,
+    metric: str = "value",
+    ratio: bool = False,
+    confidence: float = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Any:
+    """Each value of a parameter against one of them, on the same cases and seeds.
+
+    Two values are compared where both passed: pairs that agree in all other parameters
+    and in the seed. Intervals are those of a bootstrap that draws pairs, seeds within
+    each case (within all cases, where a case has but one seed).
+
+    Source: Agarwal, Schwarzer, Castro, Courville and Bellemare, 2021.
+
+    **Arguments:**
+
+    - `results`: from [`delucax.experiments.run`][].
+    - `by`: the parameter, such as `"controller"`.
+    - `baseline`: the value to compare with, as the table shows it.
+    - `metric`: what to compare, `"value"` by default.
+    - `ratio`: the quotient of the interquartile means rather than the difference.
+    - `confidence`: of the intervals, 0.95 by default.
+    - `resamples`: how many, 2000 by default.
+    - `seed`: of the resampling.
+
+    **Returns:** a `pandas.DataFrame`, a row for each value: `iqm`, `low`, `high` of its
+    interquartile mean; `difference` (or `ratio`) to the baseline's over the common
+    pairs, its `difference_low`, `difference_high`; `below`, the part of the pairs that
+    are below the baseline's; and `pairs`.
+
+    **Raises:** `ValueError` if there is no such parameter, value or metric.
+
+    !!! example
+
+        ```python
+        from delucax import experiments
+        from delucax.experiments import experiment
+
+        @experiment.parametrize("method", ["a", "b"])
+        @experiment.seeds(10)
+        def cost(method, seed):
+            return seed + (1.0 if method == "b" else 0.0)
+
+        results = cost.run(progress=False)
+        table = experiments.compare(results, by="method", baseline="a")
+        assert table.loc["b", "difference"] == 1.0
+        ```
+    """
+    pd = extra("pandas", "tables")
+    where = "compare"
+    if by not in results.parameters:
+        names = ", ".join(results.parameters) or "none"
+        raise ValueError(f"{where}: by must be a parameter ({names}), got {by!r}.")
+    if metric not in results.metrics:
+        names = ", ".join(results.metrics) or "none"
+        raise ValueError(f"{where}: metric must be a result ({names}), got {metric!r}.")
+    if not 0 < confidence < 1:
+        raise ValueError(
+            f"{where}: confidence must be between 0 and 1, got {confidence}."
+        )
+    samples: dict[Any, dict[tuple, dict[int, float]]] = {}
+    for row in results.rows:
+        value = row.get(metric)
+        if row["status"] not in ("passed", "passed unexpectedly"):
+            continue
+        if not isinstance(value, bool | int | float):
+            raise ValueError(
+                f"{where}: metric {metric!r} must be a number in every row, got "
+                f"{value!r} in {row['case']}."
+            )
+        others = tuple(row.get(n) for n in results.parameters if n != by)
+        group = samples.setdefault(row[by], {}).setdefault(
+            (row["experiment"], others), {}
+        )
+        group[row["seed"]] = float(value)
+    if baseline not in samples:
+        raise ValueError(
+            f"{where}: baseline must be a value of {by!r} that passed "
+            f"({', '.join(map(repr, samples))}), got {baseline!r}."
+        )
+    draw = _Draw(confidence, resamples, seed)
+    rows = {}
+    for label, groups in samples.items():
+        own = [np.array(list(group.values())) for group in groups.values()]
+        pairs = []
+        for place, group in groups.items():
+            against = samples[baseline].get(place, {})
+            common = [s for s in group if s in against]
+            if common:
+                pairs.append(np.array([[group[s], against[s]] for s in common]))
+        row = dict(zip(("iqm", "low", "high"), draw.one(own), strict=True))
+        name = "ratio" if ratio else "difference"
+        names = (name, f"{name}_low", f"{name}_high")
+        row |= dict(zip(names, draw.two(pairs, ratio), strict=True))
+        flat = np.concatenate(pairs) if pairs else np.zeros((0, 2))
+        row["below"] = float(np.mean(flat[:, 0] < flat[:, 1])) if len(flat) else np.nan
+        row["pairs"] = len(flat)
+        rows[label] = row
+    return pd.DataFrame.from_dict(rows, orient="index").rename_axis(by)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Draw:
+    """The bootstrap: the same draws for both members of a pair."""
+
+    confidence: float
+    resamples: int
+    seed: int
+
+    def one(self, groups: list[np.ndarray]) -> tuple[float, float, float]:
+        drawn = self._drawn(groups)
+        found = interquartile_mean(np.concatenate(groups))
+        return found, *self._interval(interquartile_mean(drawn, axis=1))
+
+    def two(self, groups: list[np.ndarray], ratio: bool) -> tuple[float, float, float]:
+        if not groups:
+            return np.nan, np.nan, np.nan
+        drawn = self._drawn(groups)
+        flat = np.concatenate(groups)
+        of = np.divide if ratio else np.subtract
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = of(interquartile_mean(flat[:, 0]), interquartile_mean(flat[:, 1]))
+            again = of(
+                interquartile_mean(drawn[..., 0], axis=1),
+                interquartile_mean(drawn[..., 1], axis=1),
+            )
+        return float(found), *self._interval(again)
+
+    def _drawn(self, groups: list[np.ndarray]) -> np.ndarray:
+        rng = np.random.default_rng(self.seed)
+        if all(len(group) == 1 for group in groups):
+            groups = [np.concatenate(groups)]
+        parts = [
+            group[rng.integers(len(group), size=(self.resamples, len(group)))]
+            for group in groups
+        ]
+        return np.concatenate(parts, axis=1)
+
+    def _interval(self, again: np.ndarray) -> tuple[float, float]:
+        tail = (1 - self.confidence) / 2
+        low, high = np.quantile(again, [tail, 1 - tail])
+        return float(low), float(high)

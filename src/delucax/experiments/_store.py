@@ -1,0 +1,173 @@
+"""Results in a file, as they arrive: JSON, one line a case.
+
+The first line names the format; a line `run` says what the cases after it were made
+with; a line `case` holds a case for some of its seeds. A line is written by one call,
+and one that was cut short is dropped when the file is next opened, so that a process
+may be killed at any moment. Of what was run again the last line counts.
+"""
+
+import contextlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from .._check import as_path
+
+
+_FORMAT = "delucax-results"
+_VERSION = 1
+
+
+class Store:
+    """The lines of a results file, or of none: then they are kept in memory alone.
+
+    `cases` is by experiment and case; each holds `hash`, `order` and, by seed, the
+    line that counts.
+    """
+
+    def __init__(self, path: Any, where: str):
+        self.where = where
+        self.path = None if path is None else as_path(path, "store", where)
+        self.cases: dict[tuple[str, str], dict[str, Any]] = {}
+        self.runs: dict[int, dict[str, Any]] = {}
+        self._file: int | None = None
+        self._whole = 0
+        if self.path is not None and self.path.exists():
+            self._read(self.path)
+
+    def _read(self, path: Path) -> None:
+        if path.is_dir():
+            raise ValueError(f"{self.where}: '{path}' is a folder, not a results file.")
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise type(error)(f"{self.where}: '{path}' cannot be read: {error}") from (
+                error
+            )
+        lines = content.split(b"\n")
+        # A line without its end was cut short by the end of its process.
+        self._whole = len(content) - len(lines.pop())
+        for number, line in enumerate(lines, 1):
+            try:
+                record = json.loads(line)
+                if number == 1:
+                    self._check_format(record, path)
+                else:
+                    self._take(record)
+            except (ValueError, KeyError, TypeError, AttributeError) as error:
+                if isinstance(error, _OtherFormat) or number == 1:
+                    message = str(error)
+                    if not isinstance(error, _OtherFormat):
+                        message = (
+                            f"{self.where}: '{path}' is not a results file of delucax."
+                        )
+                    raise ValueError(message) from None
+                raise ValueError(
+                    f"{self.where}: line {number} of '{path}' is damaged; remove it "
+                    "to run its case again."
+                ) from error
+
+    def _check_format(self, record: Any, path: Path) -> None:
+        if not isinstance(record, dict) or record.get("format") != _FORMAT:
+            raise ValueError
+        if record["version"] != _VERSION:
+            raise _OtherFormat(
+                f"{self.where}: '{path}' has format {record['version']}, and this "
+                f"version of delucax reads and writes {_VERSION}; it is left as it is. "
+                "Write to another file, or use the delucax that wrote it."
+            )
+
+    def _take(self, record: dict[str, Any]) -> None:
+        if record["kind"] == "run":
+            self.runs[record["run"]] = record
+            return
+        key = record["experiment"], record["case"]
+        entry = self.cases.get(key)
+        if entry is None or entry["hash"] != record["hash"]:
+            entry = self.cases[key] = {"hash": record["hash"], "seeds": {}}
+        for column in record["values"].values():
+            if len(column) != len(record["seeds"]):
+                raise ValueError
+        entry["order"] = tuple(record["order"])
+        for name in ("run", "parameters", "status", "error", "device"):
+            if name not in record:
+                raise KeyError(name)
+        for place, seed in enumerate(record["seeds"]):
+            entry["seeds"][seed] = (record, place)
+
+    def open(self) -> None:
+        """Make ready to write: alone, after what is whole."""
+        if self.path is None or self._file is not None:
+            return
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = os.open(self.path, os.O_CREAT | os.O_RDWR | os.O_APPEND, 0o666)
+        except OSError as error:
+            raise self._unwritable(error) from error
+        try:
+            _lock(self._file)
+        except OSError as error:
+            self.close()
+            raise ValueError(
+                f"{self.where}: '{self.path}' is being written by another run."
+            ) from error
+        if os.fstat(self._file).st_size > self._whole:
+            os.ftruncate(self._file, self._whole)
+        if self._whole == 0:
+            self._write({"format": _FORMAT, "version": _VERSION})
+
+    def begin(self, provenance: dict[str, Any]) -> int:
+        """Note what the cases that follow are made with; its number."""
+        number = max(self.runs, default=-1) + 1
+        self.append({"kind": "run", "run": number, **provenance})
+        return number
+
+    def append(self, record: dict[str, Any]) -> None:
+        """Add a line."""
+        # What is read back is what counts, so that a fresh table and one that was read
+        # are the same.
+        if self.path is not None:
+            self._write(record)
+        self._take(record)
+
+    def _write(self, record: dict[str, Any]) -> None:
+        line = (json.dumps(record, separators=(",", ":")) + "\n").encode()
+        assert self._file is not None
+        try:
+            written = os.write(self._file, line)
+            while written < len(line):
+                written += os.write(self._file, line[written:])
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._file, self._whole)
+            raise self._unwritable(error) from error
+        self._whole += len(line)
+
+    def _unwritable(self, error: OSError) -> OSError:
+        kept = sum(len(entry["seeds"]) for entry in self.cases.values())
+        return type(error)(
+            error.errno,
+            f"{self.where}: '{self.path}' cannot be written ({error.strerror}); the "
+            f"{kept} results so far are kept, and the same call goes on from them",
+        )
+
+    def close(self) -> None:
+        """Let others write."""
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                os.fsync(self._file)
+            os.close(self._file)
+            self._file = None
+
+
+class _OtherFormat(ValueError):
+    pass
+
+
+def _lock(file: int) -> None:
+    try:
+        import fcntl
+    except ImportError:  # Windows: nobody watches that one run alone writes
+        return
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,0 +1,121 @@
+"""The first figure, right: the gradient through the rollout beside evolution
+strategies."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from ...controllers import Linear
+from ...environments import pendulum
+from ...training import analytic, EvolutionStrategies, expected_cost, fit
+from ._finding import Claim, Finding
+
+
+HORIZON, RATE, GOAL = 50, 0.01, 2.0
+TWICE = 2 * RATE
+
+
+def policy_gradient(small: bool = False) -> Finding:
+    """A linear policy of the pendulum, hanging at first, with torque up to 10."""
+    import matplotlib.pyplot as plt
+
+    env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
+    mean_cost = expected_cost(env, batch=1, horizon=HORIZON)
+
+    def loss(controller, key):
+        return mean_cost(controller, key) / HORIZON
+
+    steps, seeds = (400, 3) if small else (1500, 5)
+    scales, pairs = ((0.1,), (1, 16)) if small else ((0.05, 0.1, 0.3), (1, 4, 16, 64))
+    start = Linear(jnp.zeros((1, 2)))
+
+    def train(estimator, seed, rate=RATE):
+        key = jax.random.key(seed)
+        options: Any = dict(key=key, gradient=estimator, progress=False)
+        return np.asarray(
+            fit(loss, start, optax.sgd(rate), steps, **options).history.loss
+        )
+
+    exact = train(analytic, 0)
+    first, faster = _first(exact), _first(train(analytic, 0, TWICE))
+    rows = [
+        {
+            "gradient": "through the rollout",
+            "runs": 1,
+            "reach 2.0": int(first is not None),
+            "rollouts, median": first,
+            "cost at the end, median": exact[-1],
+        }
+    ]
+    curves, reached, total, fewest = {}, 0, 0, []
+    for scale in scales:
+        for count in pairs:
+            estimator = EvolutionStrategies(scale, 2 * count)
+            runs = [train(estimator, seed) for seed in range(seeds)]
+            when = [_first(run) for run in runs]
+            # The loss itself, which is one more rollout a step, is not charged.
+            cost = [2 * count * w for w in when if w is not None]
+            reached, total, fewest = reached + len(cost), total + seeds, fewest + cost
+            curves[scale, count] = runs
+            rows.append(
+                {
+                    "gradient": f"evolution strategies, sigma {scale}, {count} pairs",
+                    "runs": seeds,
+                    "reach 2.0": len(cost),
+                    "rollouts, median": float(np.median(cost)) if cost else None,
+                    "cost at the end, median": float(np.median([r[-1] for r in runs])),
+                }
+            )
+    least = min(fewest) if fewest else None
+    claims = [
+        Claim(
+            "Gradient descent through the rollout reaches cost 2.0 within 120 rollouts",
+            f"{first} rollouts at the paper's rate {RATE}, {faster} at {TWICE}",
+            min(first or np.inf, faster or np.inf) <= 120,
+        ),
+        Claim(
+            "Evolution strategies need more rollouts at every setting and seed",
+            f"{reached} of {total} runs get there"
+            + ("" if least is None else f", the fastest after {least:,} rollouts"),
+            least is None or (first is not None and least > first),
+        ),
+    ]
+    figure, ax = plt.subplots(figsize=(5.5, 3.4), layout="constrained")
+    for k, ((scale, count), runs) in enumerate(curves.items()):
+        x = 2 * count * np.arange(1, steps + 1)
+        label = f"ES, sigma {scale}, {count} pairs"
+        ax.plot(
+            x,
+            np.median(runs, axis=0),
+            lw=1,
+            color=f"C{1 + k % 9}",
+            label=label,
+            ls=("-", "--")[k // 9],
+        )
+    ax.plot(np.arange(1, steps + 1), exact, "k", lw=2, label="through the rollout")
+    ax.axhline(GOAL, color="0.5", lw=0.8, ls=":")
+    ax.set(xscale="log", xlabel="rollouts", ylabel="mean cost of a step")
+    ax.grid(alpha=0.25, lw=0.5)
+    ax.legend(frameon=False, fontsize=6, ncols=2)
+    notes = (
+        f"u = -K (angle, velocity), the angle not wrapped; {HORIZON} steps of 0.05 s "
+        f"from hanging at rest, torque at most 10; descent with rate {RATE} on the "
+        "mean cost of Gym (with the sum it sticks at once). Evolution strategies are "
+        f"antithetic, {seeds} seeds a setting, {steps} updates; lines are medians."
+    )
+    return Finding(
+        "Policy gradient of the pendulum",
+        claims,
+        {"Rollouts to cost 2.0": rows},
+        {"policy_gradient": figure},
+        notes,
+    )
+
+
+def _first(losses: np.ndarray) -> int | None:
+    """How many rollouts until the cost is at most the goal."""
+    below = np.flatnonzero(losses <= GOAL)
+    return int(below[0]) + 1 if below.size else None

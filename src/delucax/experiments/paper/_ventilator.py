@@ -1,0 +1,64 @@
+"""The ventilator figures: a learned lung, and a controller that learns in it."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from ...lung import lung_study
+from ._finding import Claim, Finding
+
+
+def ventilator(small: bool = False, out: Path = Path("lung")) -> Finding:
+    """What `python -m delucax lung` finds; its own figures lie beside its report."""
+    lung_study(out, small=small, say=lambda line: None)
+    found = json.loads((out / "summary.json").read_text())
+    simulators = found["simulators"]
+    worst = max(simulators["learned"].values())
+    relative = max(found["learned_over_wrong_physics"].values())
+    gains, shared = found["network_over_best_pid"], found["shared_over_best_pid"]
+    whole = {name: value for name, value in shared.items() if math.isfinite(value)}
+    claims = [
+        Claim(
+            "A simulator learned from breaths predicts open loop to 0.4 cmH2O on each "
+            "lung",
+            f"{worst:.3f} cmH2O at most",
+            bool(worst <= 0.4),
+        ),
+        Claim(
+            "Its error is at most half of that of physics that is not the lung's",
+            f"{relative:.2f} times at most",
+            bool(relative <= 0.5),
+        ),
+        Claim(
+            "A controller trained in the simulator errs at least 20% less than the "
+            "best PID on each lung, at pressures not trained on",
+            f"{max(gains.values()):.2f} times at most, "
+            f"{sum(gains.values()) / len(gains):.2f} on average",
+            bool(max(gains.values()) <= 0.8),
+        ),
+        Claim(
+            "One controller for all lungs errs at least 20% less than the best PID for "
+            "all",
+            ", ".join(f"{name}: {value:.2f} times" for name, value in whole.items()),
+            bool(max(whole.values()) <= 0.8),
+        ),
+        Claim(
+            f"No pressure is above {found['abort']:g} cmH2O",
+            f"{found['highest_pressure']:.1f} cmH2O",
+            bool(found["highest_pressure"] <= found["abort"]),
+        ),
+    ]
+    rows: list[dict[str, Any]] = [
+        {"lung": lung}
+        | {f"{kind}: open loop": errors[lung] for kind, errors in simulators.items()}
+        | {"network / best PID": gains[lung]}
+        for lung in gains
+    ]
+    notes = (
+        "Lungs of two compartments with valves that lag, a sensor that is two samples "
+        "late, and noise of 0.2 cmH2O. `python -m delucax lung` is the whole study."
+    )
+    return Finding(
+        "Ventilator control and simulator", claims, {"Lungs": rows}, {}, notes
+    )

@@ -1,0 +1,380 @@
+"""Breaths to learn from: exploration, segmentation, scales and splits."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array
+
+from .._check import check_count, check_key, check_positive, check_range
+from .._controller import AbstractController
+from .._fields import parameter, positive
+from .._typing import PRNGKey
+from ..controllers import LeakyPID
+from ..environments import Environment
+from ..math import clip
+from ..simulation import rollout
+from ._waveform import at_pip, BreathWaveform
+
+
+LENGTH = 29
+"""Samples of an inspiration that are learned from: 0.87 s."""
+PIPS = (10.0, 15.0, 20.0, 25.0, 30.0, 35.0)
+_GRID = (*(i / 10 for i in range(10)), *(float(i) for i in range(1, 11)))
+
+
+class Breaths(eqx.Module):
+    """Recorded breaths, `B` of them, each of `T` samples.
+
+    The pressure at a sample is what the sensor read before the control of that sample
+    acted.
+
+    **Arguments:**
+
+    - `u_in`: opening of the inspiratory valve [%], shape `(B, T)`.
+    - `u_out`: whether the expiratory valve was open, shape `(B, T)`.
+    - `pressure`: what the sensor read [cmH2O], shape `(B, T)`.
+    - `dt`: the time between samples [s].
+    - `resistance`: of the lung of each breath [cmH2O s/L], shape `(B,)`; not known by
+        default.
+    - `compliance`: of the lung of each breath [mL/cmH2O], shape `(B,)`; not known by
+        default.
+    - `truth`: what a sensor without noise would have read, shape `(B, T)`; not known by
+        default.
+
+    **Raises:** `ValueError` if shapes do not fit each other.
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax.lung import Breaths
+
+        zeros = jnp.zeros((4, 29))
+        len(Breaths(zeros, zeros, zeros + 5.0, dt=0.03))
+        ```
+    """
+
+    u_in: Array = parameter()
+    u_out: Array = parameter()
+    pressure: Array = parameter()
+    dt: Array = parameter(constraint=positive)
+    resistance: Array | None = parameter(None)
+    compliance: Array | None = parameter(None)
+    truth: Array | None = parameter(None)
+
+    def __check_init__(self):
+        shape = jnp.shape(self.pressure)
+        if len(shape) < 2:
+            raise ValueError(
+                f"Breaths: pressure must have shape (breaths, samples), got {shape}."
+            )
+        for name in ("u_in", "u_out", "truth"):
+            given = getattr(self, name)
+            if given is not None and jnp.shape(given) != shape:
+                raise ValueError(
+                    f"Breaths: {name} must have shape {shape} like pressure, got "
+                    f"{jnp.shape(given)}."
+                )
+        for name in ("resistance", "compliance"):
+            given = getattr(self, name)
+            if given is not None and jnp.shape(given) != shape[:-1]:
+                raise ValueError(
+                    f"Breaths: {name} must have shape {shape[:-1]}, an entry for each "
+                    f"breath, got {jnp.shape(given)}."
+                )
+
+    def __len__(self) -> int:
+        return self.pressure.shape[0]
+
+    def __getitem__(self, index: Any) -> "Breaths":
+        """The breaths of an index, a slice or booleans."""
+        dt = self.dt
+        rest = eqx.tree_at(lambda b: b.dt, self, None)
+        rest = jax.tree.map(lambda leaf: leaf[index], rest)
+        none = lambda x: x is None  # noqa: E731
+        return eqx.tree_at(lambda b: b.dt, rest, dt, is_leaf=none)
+
+
+class Explorer(AbstractController):
+    r"""A PID whose inspiratory control is disturbed, to learn a lung from.
+
+    Its control is `(clip(pid + bump(t), 0, 100), 0)`, and `(0, 1)` in the expiratory
+    phase. For each episode a bump is drawn: a triangle of a height between -30 and 30
+    and a width between 0.1 and 0.5 s somewhere in the inspiration; with probability
+    0.15 a ramp instead, which begins at a height between 0 and 100 and is gone within
+    0.05 to 0.3 s.
+
+    **Arguments:**
+
+    - `kp`, `ki`: the gains of a [`delucax.controllers.LeakyPID`][]. Drawn for each
+        episode from {0, 0.1, ..., 0.9, 1, 2, ..., 10} by default, times `scale`.
+    - `dt`: the control interval.
+    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
+    - `scale`: of the gains that are drawn, 1 by default.
+
+    Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
+    Zajdel, Schottdorf, Cohen and Hazan, 2021.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        from delucax import lung
+
+        env = dlx.make("lung/single_compartment")
+        explorer = lung.Explorer(dt=env.dt, waveform=env.cost.waveform)
+        dlx.rollout(env, explorer, key=jax.random.key(0), horizon=29).controls
+        ```
+    """
+
+    kp: Array | None = parameter()
+    ki: Array | None = parameter()
+    dt: Array = parameter(constraint=positive)
+    waveform: BreathWaveform
+    scale: Array = parameter()
+
+    def __init__(
+        self,
+        kp: Any = None,
+        ki: Any = None,
+        *,
+        dt: Any,
+        waveform: BreathWaveform,
+        scale: Any = 1.0,
+    ):
+        self.kp, self.ki, self.dt, self.scale = kp, ki, dt, scale
+        self.waveform = waveform
+
+    def _pid(self, gains: Array) -> LeakyPID:
+        return LeakyPID(gains[0], gains[1], dt=self.dt, reference=self.waveform)
+
+    def init(self, *, key=None):
+        key = jr.key(0) if key is None else key
+        keys = jr.split(key, 4)
+        gains = self.scale * jr.choice(keys[0], jnp.array(_GRID), (2,))
+        gains = jnp.stack(
+            [
+                drawn if given is None else given
+                for drawn, given in zip(gains, (self.kp, self.ki), strict=True)
+            ]
+        )
+        low = jnp.array([-30.0, 0.1, 0.0, 0.0, 0.05])
+        high = jnp.array([30.0, 0.5, 1.0, 100.0, 0.3])
+        bump = low + (high - low) * jr.uniform(keys[1], (5,))
+        is_ramp = jr.bernoulli(keys[2], 0.15)
+        return gains, bump, is_ramp, self._pid(gains).init()
+
+    def __call__(self, t, y, state):
+        gains, bump, is_ramp, memory = state
+        u, memory = self._pid(gains)(t, y, memory)
+        waveform = self.waveform
+        since = waveform.share(t) * waveform.period
+        inspiration = waveform.inspiration * waveform.period
+        half = bump[1] / 2
+        middle = half + bump[2] * (inspiration - bump[1])
+        triangle = bump[0] * jnp.maximum(0, 1 - jnp.abs(since - middle) / half)
+        ramp = bump[3] * jnp.maximum(0, 1 - since / bump[4])
+        u = clip(u[0] + jnp.where(is_ramp, ramp, triangle), 0, 100)
+        inhale = waveform.is_inspiration(t)
+        u = jnp.stack([jnp.where(inhale, u, 0), jnp.where(inhale, 0.0, 1.0)])
+        return u.astype(y.dtype), (gains, bump, is_ramp, memory)
+
+
+@eqx.filter_jit
+def _explored(env, explorer, pips, keys, length):
+    index = env.cost.index
+
+    def one(pip, key):
+        world, controller = at_pip((env, explorer), pip)
+        run: Any = rollout(world, controller, key=key, horizon=length, throw=False)
+        truth = jax.vmap(lambda x: env.dynamics.observe(0.0, x))(run.states[:-1])
+        highest = jnp.max(run.states[:, index])
+        u, y = run.controls, run.observations
+        return u[:, 0], u[:, 1], y[:, 0], truth[:, 0], highest
+
+    return jax.vmap(one)(pips, keys)
+
+
+def explore(
+    env: Environment,
+    breaths: int,
+    *,
+    key: PRNGKey,
+    length: int = LENGTH,
+    pips: Any = PIPS,
+    scale: Any = 1.0,
+    abort: Any = 70.0,
+    resistance: Any = None,
+    compliance: Any = None,
+) -> Breaths:
+    """Breaths of an [`delucax.lung.Explorer`][], each from the start of the task.
+
+    Those in which the pressure passes the abort limit are left out, as a rig would
+    never finish them, and others are drawn in their place.
+
+    **Arguments:**
+
+    - `env`: a task of a lung, such as `delucax.make("lung/double_compartment")`.
+    - `breaths`: how many.
+    - `key`: a random key.
+    - `length`: samples a breath, 29 by default.
+    - `pips`: the peak pressures to draw from, 10, 15, ..., 35 cmH2O by default.
+    - `scale`: of the PID gains that are drawn, 1 by default.
+    - `abort`: the abort limit [cmH2O], 70 by default.
+    - `resistance`, `compliance`: of the lung, to be written down; not by default.
+
+    **Returns:** a [`delucax.lung.Breaths`][], with `truth`.
+
+    **Raises:** `ValueError` if the arguments are illegal, or hardly a breath stays
+    below the limit.
+
+    Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
+    Zajdel, Schottdorf, Cohen and Hazan, 2021.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        from delucax import lung
+
+        env = dlx.make("lung/single_compartment", noise=0.2)
+        breaths = lung.explore(env, 8, key=jax.random.key(0), scale=0.3)
+        breaths.pressure.shape
+        ```
+    """
+    where = "explore"
+    breaths = check_count(breaths, "breaths", where)
+    length = check_count(length, "length", where)
+    check_key(key, where)
+    check_positive(abort, "abort", where)
+    explorer = Explorer(dt=env.dt, waveform=_waveform_of(env, where), scale=scale)
+    kept, count = [], 0
+    for attempt in range(50):
+        draw_key, run_key = jr.split(jr.fold_in(key, attempt))
+        drawn = jr.choice(draw_key, jnp.asarray(pips), (4 * breaths,))
+        keys = jr.split(run_key, 4 * breaths)
+        *columns, highest = _explored(env, explorer, drawn, keys, length)
+        fine = np.asarray(highest) <= float(abort)
+        kept.append([np.asarray(column)[fine] for column in columns])
+        count += int(fine.sum())
+        if count >= breaths:
+            break
+    else:
+        raise ValueError(
+            f"{where}: abort must be a limit that some breaths stay below, but of "
+            f"{200 * breaths} breaths only {count} stayed below {abort}: lower scale."
+        )
+    u_in, u_out, pressure, truth = (
+        jnp.asarray(np.concatenate(column)[:breaths])
+        for column in zip(*kept, strict=True)
+    )
+    known = {
+        name: None if value is None else jnp.full(breaths, float(value))
+        for name, value in (("resistance", resistance), ("compliance", compliance))
+    }
+    return Breaths(u_in, u_out, pressure, env.dt, truth=truth, **known)
+
+
+def _waveform_of(env: Any, where: str) -> BreathWaveform:
+    waveform = getattr(getattr(env, "cost", None), "waveform", None)
+    if not isinstance(env, Environment) or not isinstance(waveform, BreathWaveform):
+        raise ValueError(
+            f"{where}: env must be a task with a breath waveform, such as "
+            f"delucax.make('lung/double_compartment'), got {type(env).__name__}."
+        )
+    return waveform
+
+
+def segment(
+    u_in: Any, u_out: Any, pressure: Any, *, dt: Any, length: int = LENGTH
+) -> Breaths:
+    """The inspirations of a recording, cut out of it.
+
+    An inspiration is a longest stretch with the expiratory valve closed. Those shorter
+    than `length` are left out, and the others cut to it.
+
+    **Arguments:**
+
+    - `u_in`, `u_out`, `pressure`: the recording, vectors of one size.
+    - `dt`: the time between samples [s].
+    - `length`: samples an inspiration, 29 by default.
+
+    **Returns:** a [`delucax.lung.Breaths`][].
+
+    **Raises:** `ValueError` if sizes differ, or there is no inspiration as long.
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax.lung import segment
+
+        u_out = jnp.tile(jnp.repeat(jnp.array([0.0, 1.0]), 30), 3)
+        segment(0 * u_out, u_out, 0 * u_out, dt=0.03).pressure.shape
+        ```
+    """
+    where = "segment"
+    length = check_count(length, "length", where)
+    columns = [np.asarray(column, float) for column in (u_in, u_out, pressure)]
+    if columns[0].ndim != 1 or len({column.shape for column in columns}) != 1:
+        raise ValueError(
+            f"{where}: u_in, u_out and pressure must be vectors of one size, got "
+            f"shapes {[column.shape for column in columns]}."
+        )
+    closed = np.concatenate([[False], columns[1] < 0.5, [False]]).astype(int)
+    edges = np.diff(closed)
+    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    fits = starts[ends - starts >= length]
+    if not len(fits):
+        longest = int(np.max(ends - starts, initial=0))
+        raise ValueError(
+            f"{where}: u_out must be 0 for at least length = {length} samples in a "
+            f"row, but the longest inspiration of {len(starts)} has {longest}."
+        )
+    rows = fits[:, None] + np.arange(length)
+    return Breaths(*(jnp.asarray(column[rows]) for column in columns), dt=dt)
+
+
+def split(
+    breaths: Breaths, test: float = 0.1, *, key: PRNGKey
+) -> tuple[Breaths, Breaths]:
+    """Breaths to train on and breaths to test on, drawn at random.
+
+    **Arguments:**
+
+    - `breaths`: to divide.
+    - `test`: the share to test on, between 0 and 1; 0.1 by default.
+    - `key`: a random key.
+
+    **Returns:** `(train, test)`.
+
+    **Raises:** `ValueError` if either would be empty.
+
+    !!! example
+
+        ```python
+        import jax
+        import jax.numpy as jnp
+        from delucax import lung
+
+        zeros = jnp.zeros((10, 29))
+        breaths = lung.Breaths(zeros, zeros, zeros, dt=0.03)
+        train, test = lung.split(breaths, 0.2, key=jax.random.key(0))
+        ```
+    """
+    check_key(key, "split")
+    check_range(test, "test", "split", 0, 1)
+    cut = round(test * len(breaths))
+    if not 0 < cut < len(breaths):
+        raise ValueError(
+            f"split: test must leave breaths on both sides, got {test} of "
+            f"{len(breaths)} breaths."
+        )
+    order = jr.permutation(key, len(breaths))
+    return breaths[order[cut:]], breaths[order[:cut]]

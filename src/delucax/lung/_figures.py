@@ -1,0 +1,171 @@
+"""The figures of the study."""
+
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..environments import Environment
+from ..plotting import animate
+from ..plotting._figure import color_of, NEUTRAL, NotebookFigure, style_axes
+from ..simulation import rollout
+from ._policies import Breathing
+from ._train import unstack
+from ._waveform import at_pip, BreathWaveform
+
+
+_SIZE = 9.0
+_ORDER = ("best PID", "MLP", "MLP for all", "PID + feed-forward", "PID + MLP", "CNN")
+
+
+def _run(env: Environment, controller: Any, waveform: Any, pip: float) -> Any:
+    whole = Breathing(controller, waveform)
+    env, whole = at_pip((env, whole), pip)
+    return rollout(env, whole, key=jax.random.key(5), horizon=100)
+
+
+def tracking_figure(
+    envs: Environment,
+    shown: dict[str, Any],
+    names: list[str],
+    rows: list[dict[str, Any]],
+    waveform: BreathWaveform,
+    pip: float = 27.5,
+) -> NotebookFigure:
+    """Breaths of some lungs under several controllers, and all their errors."""
+    count = len(names)
+    lungs = sorted({0, count // 2, count - 1})
+    figure = NotebookFigure(figsize=(9.5, 6.2), layout="constrained")
+    axes = figure.subplots(2, len(lungs), squeeze=False, height_ratios=(1.15, 1))
+    worlds = unstack(envs)
+    cost: Any = envs.cost
+    index = cost.index
+    for ax, i in zip(axes[0], lungs, strict=True):
+        for k, (label, controllers) in enumerate(shown.items()):
+            run = _run(worlds[i], unstack(controllers)[i], waveform, pip)
+            pressure = np.asarray(run.states[:, index])
+            times = np.asarray(run.times)
+            ax.plot(times, pressure, color=_color(label, k), lw=1.5, label=label)
+        times = np.linspace(0, 2.99, 600)
+        target = np.asarray(at_pip(waveform, pip).pressure(times))
+        ax.plot(times, target, color="0.2", lw=1, ls=(0, (4, 2)), label="target")
+        ax.set_title(names[i], fontsize=_SIZE + 1)
+        ax.set_xlabel("time [s]", fontsize=_SIZE)
+        style_axes(ax, size=_SIZE)
+        ax.set_xlim(0, 1.6)
+    axes[0, 0].set_ylabel("pressure [cmH2O]", fontsize=_SIZE)
+    axes[0, -1].legend(fontsize=_SIZE - 1, frameon=False)
+    grid = axes[1, 0].get_gridspec()
+    for ax in axes[1]:
+        ax.remove()
+    ax = figure.add_subplot(grid[1, :])
+    labels = list(dict.fromkeys(row["controller"] for row in rows))
+    pids = [label for label in labels if "PID" in label and label != "PID + MLP"]
+    pids = [label for label in pids if "for all" not in label]
+    error = _errors(rows, names)
+    best = np.min([error[label] for label in pids if "forward" not in label], axis=0)
+    bars = {"best PID": best}
+    chosen = ("PID + feed-forward", "MLP for all", "PID + MLP", "CNN", "MLP")
+    chosen = (*chosen, "least error")
+    bars |= {label: error[label] for label in chosen if label in error}
+    width = 0.8 / len(bars)
+    for k, (label, values) in enumerate(bars.items()):
+        color = NEUTRAL if label == "least error" else _color(label, k)
+        place = np.arange(count) + (k - (len(bars) - 1) / 2) * width
+        ax.bar(place, values, width, color=color, label=label)
+    style_axes(ax, size=_SIZE)
+    ax.set_xticks(np.arange(count), names)
+    ax.set_ylabel("mean |error| [cmH2O]", fontsize=_SIZE)
+    ax.legend(fontsize=_SIZE - 1, frameon=False, ncols=len(bars), loc="upper center")
+    ax.set_ylim(0, 1.25 * float(np.max(list(bars.values()))))
+    return figure
+
+
+def _color(label: str, index: int) -> str:
+    """The same for a controller in all parts of the figure."""
+    return color_of(_ORDER.index(label) if label in _ORDER else index)
+
+
+def _errors(rows: list[dict[str, Any]], names: list[str]) -> dict[str, np.ndarray]:
+    """The error at unseen peak pressures, of each controller in each lung."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        if row["split"] == "unseen":
+            of = found.setdefault(row["controller"], {})
+            of.setdefault(row["lung"], []).append(row["mae"])
+    return {
+        label: np.array([np.mean(of[name]) for name in names])
+        for label, of in found.items()
+    }
+
+
+def simulator_figure(
+    test: Any,
+    models: dict[str, Any],
+    names: list[str],
+    table: list[dict[str, Any]],
+) -> NotebookFigure:
+    """A breath that was not learned from as simulators see it, and their errors."""
+    figure = NotebookFigure(figsize=(9.5, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1.5))
+    lung = len(names) // 2
+    # One that reaches a pressure that is often asked for.
+    breath = int(np.argmin(np.abs(np.max(test.pressure[lung], axis=-1) - 30)))
+    u = test.u_in[lung, breath]
+    times = float(np.ravel(test.dt)[0]) * np.arange(u.shape[0])
+    truth = test.pressure if test.truth is None else test.truth
+    read = np.asarray(test.pressure[lung, breath])
+    left.plot(times, read, ".", color=NEUTRAL, ms=4, label="read")
+    left.plot(times, np.asarray(truth[lung, breath]), color="0.2", lw=1, label="true")
+    for k, (label, model) in enumerate(models.items()):
+        if label not in ("learned", "single compartment", "balloon"):
+            continue
+        predicted = np.asarray(eqx.filter_jit(unstack(model)[lung].predict)(u))
+        left.plot(times, predicted, color=color_of(k), lw=1.5, label=label)
+    left.set_title(f"{names[lung]}, from its controls alone", fontsize=_SIZE + 1)
+    left.set_xlabel("time [s]", fontsize=_SIZE)
+    left.set_ylabel("pressure [cmH2O]", fontsize=_SIZE)
+    left.legend(fontsize=_SIZE - 1, frameon=False)
+    style_axes(left, size=_SIZE)
+    width = 0.8 / len(models)
+    for k, label in enumerate(models):
+        of = {r["lung"]: r["mae"] for r in table if r["simulator"] == label}
+        place = np.arange(len(names)) + (k - (len(models) - 1) / 2) * width
+        values = [of[name] for name in names]
+        right.bar(place, values, width, color=color_of(k), label=label)
+    style_axes(right, size=_SIZE)
+    right.set_yscale("log")
+    right.set_xticks(np.arange(len(names)), names, rotation=30)
+    right.set_ylabel("open-loop mean |error| [cmH2O]", fontsize=_SIZE)
+    right.set_ylim(top=4 * max(row["mae"] for row in table))
+    right.legend(fontsize=_SIZE - 1, frameon=False, ncols=3, loc="upper center")
+    return figure
+
+
+def draw_study(
+    out: Path,
+    envs: Environment,
+    shown: dict[str, Any],
+    names: list[str],
+    test: Any,
+    simulators: Any,
+    physics: dict[str, Any],
+    table: list[dict[str, Any]],
+    rows: list[dict[str, Any]],
+    waveform: BreathWaveform,
+) -> None:
+    """`controllers.png`, `simulators.png` and `breath.gif`."""
+    figure = tracking_figure(envs, shown, names, rows, waveform)
+    figure.savefig(out / "controllers.png", dpi=130)
+    models = {"learned": simulators, **physics}
+    figure = simulator_figure(test, models, names, table)
+    figure.savefig(out / "simulators.png", dpi=130)
+    middle = len(names) // 2
+    env = unstack(envs)[middle]
+    label = "MLP" if "MLP" in shown else next(iter(shown))
+    run = _run(env, unstack(shown[label])[middle], waveform, 27.5)
+    env = at_pip(env, jnp.asarray(27.5))
+    animate(env, run, path=out / "breath.gif", max_frames=60)

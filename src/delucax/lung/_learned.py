@@ -1,0 +1,274 @@
+"""A lung learned from breaths."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array
+
+from .._check import check_bool, check_count, check_key
+from .._fields import as_module, parameter, positive, weight
+from .._results import RESULTS
+from .._typing import PRNGKey
+from ..dynamics import AbstractDynamics
+from ._data import Breaths
+from ._networks import run_mlp
+
+
+class LearnedLung(AbstractDynamics):
+    r"""A lung learned from breaths: a network of the last controls and pressures, and
+    networks of their own for the first steps of an inspiration.
+
+    With `u` and `p` the normalised controls and pressures, step `k` of an inspiration
+    predicts
+
+    `p[k + 1] = p[k] + line . z + network(z) + output_k . tanh(hidden_k z_all)`,
+    `z = (v(u[k]), ..., v(u[k + 1 - u_window]), p[k], ..., p[k + 1 - p_window])`,
+
+    where `v`, a small network of one control, straightens the curve of the valve, and
+    `z_all` is the whole history; its term is there for `k < boundary`. Before an
+    inspiration the valve is closed and the pressure is that at which they start.
+
+    As published: `p[k + 1] = network(z)` of the controls as they are, for
+    `k < boundary` its last term instead, and the history is 0 before an inspiration.
+
+    The `boundary` networks are one stacked array, of which a step takes its slice.
+    While `u_out` is above 1/2 the lung is as before an inspiration. The state is (the
+    controls, the pressures, both newest first, and the count of steps), and the
+    observation is the pressure [cmH2O].
+
+    **Arguments:**
+
+    - `breaths`: a [`delucax.lung.Breaths`][], from which the scales and the pressure
+        before an inspiration are taken.
+    - `width`, `depth`: of the network, 24 and 1 by default.
+    - `boundary`: how many first steps have networks of their own, 5 by default.
+    - `boundary_width`: hidden units of each, 16 by default.
+    - `u_window`, `p_window`: how many controls and pressures the network is given, 6
+        and 3 by default.
+    - `published`: as published (see above); false by default.
+    - `key`: a random key, for the first weights.
+
+    **Attributes:** `line`, `valve`, `network`, `hidden` and `output`, trainable;
+    `u_mean`, `u_std`, `p_mean`, `p_std`, `start`.
+
+    **Raises:** `ValueError` if a size is below 1, or there are no breaths or no key.
+
+    Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
+    Zajdel, Schottdorf, Cohen and Hazan, 2021.
+
+    !!! example
+
+        ```python
+        import jax
+        import jax.numpy as jnp
+        from delucax.lung import Breaths, LearnedLung
+
+        u = jnp.linspace(0.0, 50.0, 290).reshape(10, 29)
+        breaths = Breaths(u, 0 * u, 5 + u / 2, dt=0.03)
+        lung = LearnedLung(breaths, key=jax.random.key(0))
+        lung.pressure(lung.resting())
+        ```
+    """
+
+    line: Array = weight()
+    valve: eqx.nn.MLP = weight()
+    network: eqx.nn.MLP = weight()
+    hidden: Array = weight()
+    output: Array = weight()
+    u_mean: Array = parameter()
+    u_std: Array = parameter(constraint=positive)
+    p_mean: Array = parameter()
+    p_std: Array = parameter(constraint=positive)
+    start: Array = parameter()
+    dt: Array = parameter(constraint=positive)
+    u_window: int = eqx.field(static=True)
+    p_window: int = eqx.field(static=True)
+    published: bool = eqx.field(static=True)
+
+    control_names = ("u_in", "u_out")
+
+    def __init__(
+        self,
+        breaths: Breaths,
+        width: int = 24,
+        depth: int = 1,
+        *,
+        boundary: int = 5,
+        boundary_width: int = 16,
+        u_window: int = 6,
+        p_window: int = 3,
+        published: bool = False,
+        key: PRNGKey,
+    ):
+        where = "LearnedLung"
+        if not isinstance(breaths, Breaths):
+            raise ValueError(
+                f"{where}: breaths must be Breaths, got {type(breaths).__name__}."
+            )
+        check_key(key, where)
+        counts = dict(
+            boundary=boundary,
+            boundary_width=boundary_width,
+            u_window=u_window,
+            p_window=p_window,
+        )
+        for name, value in counts.items():
+            check_count(value, name, where)
+        hidden_key, output_key, valve_key, key = jr.split(key, 4)
+        size = 2 * max(u_window, p_window, boundary)
+        shape = boundary, boundary_width
+        self.hidden = jr.normal(hidden_key, (*shape, size)) / size**0.5
+        self.output = 0.1 * jr.normal(output_key, shape) / boundary_width**0.5
+        self.line = jnp.zeros(u_window + p_window)
+        tanh, same = as_module(jnp.tanh), as_module(jax.nn.identity)
+        self.valve = eqx.nn.MLP("scalar", "scalar", 8, 1, tanh, same, key=valve_key)
+        self.network = eqx.nn.MLP(
+            u_window + p_window,
+            "scalar",
+            check_count(width, "width", where),
+            check_count(depth, "depth", where),
+            tanh,
+            same,
+            key=key,
+        )
+        closed = breaths.u_out < 0.5
+        count = jnp.sum(closed)
+        mean = lambda a: jnp.sum(jnp.where(closed, a, 0)) / count  # noqa: E731
+        self.u_mean, self.p_mean = mean(breaths.u_in), mean(breaths.pressure)
+        self.u_std = jnp.sqrt(mean((breaths.u_in - self.u_mean) ** 2)) + 1e-3
+        self.p_std = jnp.sqrt(mean((breaths.pressure - self.p_mean) ** 2)) + 1e-3
+        self.start = jnp.mean(breaths.pressure[..., 0])
+        self.dt = breaths.dt
+        self.u_window, self.p_window = u_window, p_window
+        self.published = check_bool(published, "published", where)
+
+    @property
+    def window(self) -> int:
+        """How many controls, and how many pressures, the state holds."""
+        return self.hidden.shape[-1] // 2
+
+    @property
+    def state_names(self):
+        n = self.window
+        controls = [f"u_in[-{i + 1}]" for i in range(n)]
+        pressures = ["pressure", *(f"pressure[-{i}]" for i in range(1, n))]
+        return (*controls, *pressures, "step")
+
+    def resting(self) -> Array:
+        """The state before an inspiration."""
+        n = self.window
+        first = (self.start - self.p_mean) / self.p_std
+        if self.published:
+            return jnp.zeros(2 * n + 1).at[n].set(first)
+        closed = jnp.full(n, -self.u_mean / self.u_std)
+        return jnp.concatenate([closed, jnp.full(n, first), jnp.zeros(1)])
+
+    def pressure(self, x: Array) -> Array:
+        """The pressure now.
+
+        **Arguments:** `x`: the state.
+
+        **Returns:** a scalar [cmH2O].
+        """
+        return self.p_mean + self.p_std * x[self.window]
+
+    def observe(self, t, x):
+        return jnp.reshape(self.pressure(x), (1,)).astype(x.dtype)
+
+    def _late(self, controls: Array, pressures: Array) -> Array:
+        """The next pressure, after the first steps."""
+        controls = controls[: self.u_window]
+        if self.published:
+            z = jnp.concatenate([controls, pressures[: self.p_window]])
+            return run_mlp(self.network, z)
+        valve = lambda u: run_mlp(self.valve, u[None])  # noqa: E731
+        straight = controls + jax.vmap(valve)(controls)
+        z = jnp.concatenate([straight, pressures[: self.p_window]])
+        return pressures[0] + jnp.sum(self.line * z) + run_mlp(self.network, z)
+
+    def _early(
+        self, controls: Array, pressures: Array, hidden: Array, output: Array
+    ) -> Array:
+        """The next pressure in one of the first steps."""
+        history = jnp.concatenate([controls, pressures])
+        own = jnp.sum(output * jnp.tanh(jnp.sum(hidden * history, axis=1)))
+        return own if self.published else own + self._late(controls, pressures)
+
+    def _bound(self, pressure: Array) -> Array:
+        # A control that makes no sense must not drive the state out of all bounds.
+        return 20 * jnp.tanh(pressure / 20)
+
+    def advance(self, t, x, u, w):
+        n = self.window
+        x = x if w is None else x + w
+        control = jnp.reshape((u[0] - self.u_mean) / self.u_std, (1,)).astype(x.dtype)
+        controls, pressures = jnp.concatenate([control, x[: n - 1]]), x[n : 2 * n]
+        step, first = x[2 * n], self.hidden.shape[0]
+        i = jnp.clip(jnp.round(step), 0, first - 1).astype(int)
+        early = self._early(controls, pressures, self.hidden[i], self.output[i])
+        late = self._late(controls, pressures)
+        predicted = self._bound(jnp.where(step < first - 0.5, early, late))
+        after = jnp.concatenate(
+            [
+                controls,
+                jnp.reshape(predicted, (1,)),
+                pressures[: n - 1],
+                jnp.reshape(step + 1, (1,)),
+            ]
+        )
+        after = jnp.where(u[1] > 0.5, self.resting(), after)
+        return after.astype(x.dtype), RESULTS.successful
+
+    def predict(self, u_in: Array) -> Array:
+        """The pressures of an inspiration under recorded controls: open loop.
+
+        **Arguments:** `u_in`: shape `(T,)` [%].
+
+        **Returns:** shape `(T,)` [cmH2O], the first before any control acted.
+        """
+        return self._predicted(u_in, None)
+
+    def one_step(self, u_in: Array, pressure: Array) -> Array:
+        """Each pressure predicted from the recorded ones before it.
+
+        **Arguments:** `u_in`, `pressure`: shape `(T,)`.
+
+        **Returns:** shape `(T,)` [cmH2O], the first before any control acted.
+        """
+        return self._predicted(u_in, (pressure - self.p_mean) / self.p_std)
+
+    def _predicted(self, u_in: Array, recorded: Array | None) -> Array:
+        """As `advance` would, step by step, but that the count of steps is known: so no
+        step of a batch has to gather weights, or to compute both kinds of networks."""
+        n, first = self.window, min(self.hidden.shape[0], u_in.shape[0] - 1)
+        x0 = self.resting().astype(u_in.dtype)
+        u = (u_in - self.u_mean) / self.u_std
+        before = jnp.zeros(n - 1) if self.published else x0[: n - 1]
+        u = jnp.concatenate([before.astype(u.dtype), u])
+        windows = jnp.stack([u[n - 1 - i : u.shape[0] - i] for i in range(n)], axis=1)
+
+        def step(pressures, inputs, predict):
+            controls, shown = inputs
+            if shown is not None:
+                pressures = jnp.concatenate([jnp.reshape(shown, (1,)), pressures[1:]])
+            after = self._bound(predict(controls, pressures))
+            return jnp.concatenate([jnp.reshape(after, (1,)), pressures[:-1]]), after
+
+        shown = [None, None]
+        if recorded is not None:
+            shown = [recorded[:first], recorded[first:-1]]
+
+        def begin(pressures, inputs):
+            *inputs, hidden, output = inputs
+            predict = lambda c, p: self._early(c, p, hidden, output)  # noqa: E731
+            return step(pressures, inputs, predict)
+
+        weights = self.hidden[:first], self.output[:first]
+        inputs = (windows[:first], shown[0], *weights)
+        pressures, early = jax.lax.scan(begin, x0[n : 2 * n], inputs)
+        inputs = windows[first : u_in.shape[0] - 1], shown[1]
+        go_on = lambda carry, inputs: step(carry, inputs, self._late)  # noqa: E731
+        _, late = jax.lax.scan(go_on, pressures, inputs)
+        found = jnp.concatenate([x0[n : n + 1], early, late])
+        return self.p_mean + self.p_std * found

@@ -1,0 +1,403 @@
+"""Lungs behind a ventilator, as differential equations."""
+
+import abc
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import is_concrete
+from .._fields import bounded, parameter, positive
+from ..systems import AbstractSystem
+from ._valves import Valves
+
+
+PER_ML = 1e-3
+
+
+class AbstractLung(AbstractSystem):
+    """A lung behind [`delucax.lung.Valves`][]; what its sensor reads is the pressure
+    of the airway.
+
+    The control is `(u_in, u_out)`: how far the inspiratory valve is to open, from 0 to
+    100 %, and whether the expiratory valve is to (0 or 1, and all between).
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax import lung
+
+        class Rigid(lung.AbstractLung):
+            state_names = ("pressure",)
+
+            def pressure(self, x):
+                return x[0]
+
+            def outflow(self, x):
+                return 0 * x[0]
+
+            def resting(self, pressure):
+                return jnp.reshape(pressure, (1,))
+
+            def vector_field(self, t, x, u, w):
+                return 0.1 * u[:1]
+
+        lung.LungModel(Rigid()).resting()
+        ```
+    """
+
+    control_names: ClassVar = ("u_in", "u_out")
+    control_units: ClassVar = ("%", "")
+
+    @abc.abstractmethod
+    def pressure(self, x: Array) -> Array:
+        """The pressure of the airway.
+
+        **Arguments:** `x`: state.
+
+        **Returns:** a scalar [cmH2O].
+        """
+
+    @abc.abstractmethod
+    def outflow(self, x: Array) -> Array:
+        """What leaves by the expiratory valve and the leak.
+
+        **Arguments:** `x`: state.
+
+        **Returns:** a scalar [L/s].
+        """
+
+    @abc.abstractmethod
+    def resting(self, pressure: Any) -> Array:
+        """The state of a lung that rests at a pressure, both valves closed.
+
+        **Arguments:** `pressure`: everywhere [cmH2O].
+
+        **Returns:** the state.
+        """
+
+    def observe(self, t, x):
+        del t
+        return jnp.reshape(self.pressure(x), (1,))
+
+
+class SingleCompartment(AbstractLung):
+    r"""One elastic compartment at the end of one resistance,
+
+    `dV/dt = (p - V / C) / R`,
+
+    where the pressure `p` of the airway balances the flows of the valves,
+    [`delucax.lung.Valves.airway_pressure`][]. The state is (inflow [L/s], opening,
+    volume [L]). Smooth everywhere.
+
+    With the inspiratory valve held and no way out but a leak `G`, the pressure settles
+    at `flow(u_in) / G`; with the expiratory valve open and no leak, at
+    `peep + flow(u_in) expiratory_resistance`.
+
+    **Arguments:**
+
+    - `resistance`: R [cmH2O s/L], 20 by default.
+    - `compliance`: C [mL/cmH2O], 20 by default.
+    - `valves`: a [`delucax.lung.Valves`][]; the default ones by default.
+
+    **Raises:** `ValueError` if a number is not positive.
+
+    Source: Bates, 2009 (the linear single-compartment model).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        from delucax.lung import SingleCompartment
+
+        lung = SingleCompartment(resistance=50.0, compliance=10.0)
+        dynamics = dlx.Discretized(lung, dt=0.03)
+        dlx.open_loop(dynamics, lung.resting(5.0), jnp.array([[30.0, 0.0]] * 5))
+        ```
+    """
+
+    resistance: Array = parameter(20.0, constraint=positive)
+    compliance: Array = parameter(20.0, constraint=positive)
+    valves: Valves = Valves()
+
+    state_names: ClassVar = ("inflow", "opening", "volume")
+    state_units: ClassVar = ("L/s", "", "L")
+
+    def pressure(self, x):
+        inside = x[2] / (PER_ML * self.compliance)
+        return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
+
+    def outflow(self, x):
+        return self.valves.outflow(x[1], self.pressure(x))
+
+    def resting(self, pressure):
+        volume = PER_ML * self.compliance * pressure
+        return jnp.stack([0 * volume, 0 * volume, volume])
+
+    def vector_field(self, t, x, u, w):
+        inflow, opening = self.valves.slopes(x[0], x[1], u)
+        inside = x[2] / (PER_ML * self.compliance)
+        filling = (self.pressure(x) - inside) / self.resistance
+        return jnp.stack([inflow, opening, filling])
+
+
+class DoubleCompartment(AbstractLung):
+    r"""Two elastic compartments side by side, a fast and a slow one,
+
+    `dV_i/dt = (p_c - V_i / C_i) / R_i`, `p_c = p - R_0 (dV_1/dt + dV_2/dt)`.
+
+    A share of the resistance is central, `R_0 = central R`; the rest is that of both
+    ways in parallel, `1 / (1 / R_1 + 1 / R_2) = (1 - central) R`, with
+    `R_2 = imbalance R_1`. The compliance is divided as `C_1 = share C` and
+    `C_2 = (1 - share) C`. So a flow that begins meets `R`, and slow breathing `C`. The
+    state is (inflow [L/s], opening, fast [L], slow [L]), the latter two volumes. Smooth
+    everywhere.
+
+    **Arguments:**
+
+    - `resistance`: R of the whole lung to a flow that begins [cmH2O s/L], 20 by
+        default.
+    - `compliance`: C of the whole lung [mL/cmH2O], 20 by default.
+    - `central`: the share of R that both have in common, 0.3 by default.
+    - `share`: of the fast compartment in C, 0.1 by default.
+    - `imbalance`: R_2 over R_1, 10 by default.
+    - `valves`: a [`delucax.lung.Valves`][]; the default ones by default.
+
+    **Raises:** `ValueError` if a number is not positive, or a share is not between 0
+    and 1.
+
+    Source: Otis, McKerrow, Bartlett, Mead, McIlroy, Selverstone and Radford, 1956.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        from delucax.lung import DoubleCompartment
+
+        lung = DoubleCompartment(resistance=50.0, compliance=10.0)
+        dynamics = dlx.Discretized(lung, dt=0.03)
+        dlx.open_loop(dynamics, lung.resting(5.0), jnp.array([[30.0, 0.0]] * 5))
+        ```
+    """
+
+    resistance: Array = parameter(20.0, constraint=positive)
+    compliance: Array = parameter(20.0, constraint=positive)
+    central: Array = parameter(0.3, constraint=bounded(0, 1))
+    share: Array = parameter(0.1, constraint=bounded(0, 1))
+    imbalance: Array = parameter(10.0, constraint=positive)
+    valves: Valves = Valves()
+
+    state_names: ClassVar = ("inflow", "opening", "fast", "slow")
+    state_units: ClassVar = ("L/s", "", "L", "L")
+
+    def _parts(self, x: Array) -> tuple[Array, Array, Array, Array]:
+        """The conductances of both ways, and the pressures at their ends."""
+        parallel = (1 - self.central) * self.resistance
+        fast = self.imbalance / ((1 + self.imbalance) * parallel)
+        slow = 1 / ((1 + self.imbalance) * parallel)
+        whole = PER_ML * self.compliance
+        return (
+            fast,
+            slow,
+            x[2] / (self.share * whole),
+            x[3] / ((1 - self.share) * whole),
+        )
+
+    def pressure(self, x):
+        fast, slow, p1, p2 = self._parts(x)
+        inside = (fast * p1 + slow * p2) / (fast + slow)
+        return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
+
+    def outflow(self, x):
+        return self.valves.outflow(x[1], self.pressure(x))
+
+    def resting(self, pressure):
+        volume = PER_ML * self.compliance * pressure
+        return jnp.stack(
+            [0 * volume, 0 * volume, self.share * volume, (1 - self.share) * volume]
+        )
+
+    def vector_field(self, t, x, u, w):
+        inflow, opening = self.valves.slopes(x[0], x[1], u)
+        fast, slow, p1, p2 = self._parts(x)
+        inside = (fast * p1 + slow * p2) / (fast + slow)
+        total = (self.pressure(x) - inside) / self.resistance
+        centre = inside + (1 - self.central) * self.resistance * total
+        return jnp.stack([inflow, opening, fast * (centre - p1), slow * (centre - p2)])
+
+
+def balloon_pressure(volume: Array, rest: Array, stiffness: Array) -> Array:
+    """The pressure in a balloon, `stiffness (1 - (r0 / r)^6) / (r0^2 r)`, its radius
+    being that of a sphere of its volume."""
+    radius = (3 * volume / (4 * jnp.pi)) ** (1 / 3)
+    unstretched = (3 * rest / (4 * jnp.pi)) ** (1 / 3)
+    return stiffness * (1 - (rest / volume) ** 2) / (unstretched**2 * radius)
+
+
+class BalloonLung(AbstractLung):
+    r"""A balloon at the end of a resistance,
+
+    `dV/dt = (p - P(V)) / R`, `P(V) = stiffness (1 - (r0 / r)^6) / (r0^2 r)`,
+
+    with `r` and `r0` the radii of spheres of the volumes `V` and `rest`. It is stiff at
+    first, gives way, and past `V = 2.65 rest` the pressure falls as it grows. The state
+    is (inflow [L/s], opening, volume [L]). Smooth where the volume is above a tenth of
+    `rest`, below which the pressure is held.
+
+    For the map of the original Deluca, with its constants, see
+    [`delucax.lung.OriginalBalloonLung`][].
+
+    **Arguments:**
+
+    - `resistance`: R [cmH2O s/L], 20 by default.
+    - `stiffness`: 40 by default, which with `rest` makes up to 69 cmH2O.
+    - `rest`: the volume without pressure [L], 1.5 by default.
+    - `valves`: a [`delucax.lung.Valves`][]; the default ones by default.
+
+    **Raises:** `ValueError` if a number is not positive.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        from delucax.lung import BalloonLung
+
+        lung = BalloonLung(resistance=10.0)
+        dynamics = dlx.Discretized(lung, dt=0.03)
+        dlx.open_loop(dynamics, lung.resting(5.0), jnp.array([[30.0, 0.0]] * 5))
+        ```
+    """
+
+    resistance: Array = parameter(20.0, constraint=positive)
+    stiffness: Array = parameter(40.0, constraint=positive)
+    rest: Array = parameter(1.5, constraint=positive)
+    valves: Valves = Valves()
+
+    state_names: ClassVar = ("inflow", "opening", "volume")
+    state_units: ClassVar = ("L/s", "", "L")
+
+    def elastic_pressure(self, volume: Array) -> Array:
+        """The pressure in the balloon.
+
+        **Arguments:** `volume`: [L].
+
+        **Returns:** [cmH2O].
+        """
+        volume = jnp.maximum(volume, 0.1 * self.rest)
+        return balloon_pressure(volume, self.rest, self.stiffness)
+
+    def pressure(self, x):
+        inside = self.elastic_pressure(x[2])
+        return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
+
+    def outflow(self, x):
+        return self.valves.outflow(x[1], self.pressure(x))
+
+    def resting(self, pressure):
+        volume = _stretched(self.rest, self.stiffness, pressure)
+        return jnp.stack([0 * volume, 0 * volume, volume])
+
+    def vector_field(self, t, x, u, w):
+        inflow, opening = self.valves.slopes(x[0], x[1], u)
+        inside = self.elastic_pressure(x[2])
+        filling = (self.pressure(x) - inside) / self.resistance
+        return jnp.stack([inflow, opening, filling])
+
+
+class DelayLung(AbstractLung):
+    r"""A balloon at the end of an elastic pipe,
+
+    `pipe dp/dt = inflow - (p - P(V)) / R - outflow`, `dV/dt = (p - P(V)) / R`,
+
+    with `P(V)` of [`delucax.lung.BalloonLung`][]. The pipe holds air, so that the
+    pressure in it, which the sensor reads, is a state. The state is (inflow [L/s],
+    opening, pipe [cmH2O], volume [L]). The transport delay is that of
+    [`delucax.dynamics.Delayed`][], which the task `lung/delay_lung` puts around it.
+
+    **Arguments:**
+
+    - `resistance`: R [cmH2O s/L], 20 by default.
+    - `stiffness`: 40 by default.
+    - `rest`: the volume without pressure [L], 1.5 by default.
+    - `pipe`: the compliance of the pipe [mL/cmH2O], 5 by default.
+    - `valves`: a [`delucax.lung.Valves`][]; the default ones by default.
+
+    **Raises:** `ValueError` if a number is not positive.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        from delucax.lung import DelayLung
+
+        lung = DelayLung()
+        late = dlx.dynamics.Delayed(dlx.Discretized(lung, dt=0.03), controls=5)
+        x0 = late.filled(lung.resting(5.0))
+        dlx.open_loop(late, x0, jnp.array([[30.0, 0.0]] * 8))
+        ```
+    """
+
+    resistance: Array = parameter(20.0, constraint=positive)
+    stiffness: Array = parameter(40.0, constraint=positive)
+    rest: Array = parameter(1.5, constraint=positive)
+    pipe: Array = parameter(5.0, constraint=positive)
+    valves: Valves = Valves()
+
+    state_names: ClassVar = ("inflow", "opening", "pipe", "volume")
+    state_units: ClassVar = ("L/s", "", "cmH2O", "L")
+
+    def pressure(self, x):
+        return x[2]
+
+    def outflow(self, x):
+        return self.valves.outflow(x[1], x[2])
+
+    def resting(self, pressure):
+        volume = _stretched(self.rest, self.stiffness, pressure)
+        return jnp.stack([0 * volume, 0 * volume, pressure + 0 * volume, volume])
+
+    def vector_field(self, t, x, u, w):
+        inflow, opening = self.valves.slopes(x[0], x[1], u)
+        volume = jnp.maximum(x[3], 0.1 * self.rest)
+        inside = balloon_pressure(volume, self.rest, self.stiffness)
+        filling = (x[2] - inside) / self.resistance
+        rise = (x[0] - filling - self.outflow(x)) / (PER_ML * self.pipe)
+        return jnp.stack([inflow, opening, rise, filling])
+
+
+# Where the pressure of a balloon is greatest: (v / v0)^2 = 7, its radius being the
+# cube root of its volume.
+_FULLEST = 7**0.5
+
+
+def _stretched(rest: Array, stiffness: Array, pressure: Any) -> Array:
+    """The volume at which a balloon has a pressure, on its way up.
+
+    **Raises:** `ValueError` if the pressure is above what it can hold.
+    """
+    pressure = jnp.asarray(pressure)
+    most = balloon_pressure(_FULLEST * rest, rest, stiffness)
+    if is_concrete(most) and is_concrete(pressure) and bool(jnp.any(pressure > most)):
+        raise ValueError(
+            f"resting: pressure must be at most the {float(most):g} cmH2O that the "
+            f"balloon can hold, got {pressure}."
+        )
+    unit = stiffness * (4 * jnp.pi / 3) / rest
+    # p / unit = (1 - s^-2) s^(-1/3) of the stretch s = v / v0 has no closed form.
+    # Newton's method from below converges as the left side is concave; in double
+    # precision six steps do for half of the greatest pressure.
+    ratio = pressure / unit
+    s = 1 + ratio / 2
+    for _ in range(12):
+        value = (1 - s**-2) * s ** (-1 / 3) - ratio
+        slope = 2 * s**-3 * s ** (-1 / 3) - (1 - s**-2) * s ** (-4 / 3) / 3
+        s = jnp.clip(s - value / jnp.maximum(slope, 1e-3), 1.0, _FULLEST)
+    return rest * s

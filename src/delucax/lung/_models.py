@@ -1,0 +1,269 @@
+"""Lungs of physics, of networks, and of both, as models to be fitted to breaths."""
+
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array
+
+from .._check import check_count, check_key, check_step
+from .._fields import as_module, parameter, positive, weight
+from .._typing import PRNGKey
+from ..dynamics import Discretized
+from ._environment import PressureSensor
+from ._lungs import AbstractLung, SingleCompartment
+from ._networks import run_mlp
+from ._valves import Valves
+
+
+class LungModel(eqx.Module):
+    """A lung as a differential equation, seen by a sensor: what is fitted to breaths.
+
+    **Arguments:**
+
+    - `system`: a [`delucax.lung.AbstractLung`][].
+    - `dt`: the time between samples [s], 0.03 by default.
+    - `sensor_delay`: steps until a pressure is seen, 2 by default.
+    - `peep`: the pressure at which it rests before an inspiration [cmH2O], 5 by
+        default.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+
+    **Raises:** `ValueError` if `system` is no lung or `dt` is not positive.
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax.lung import LungModel, SingleCompartment
+
+        model = LungModel(SingleCompartment(resistance=5.0))
+        model.predict(jnp.linspace(50.0, 0.0, 10))
+        ```
+    """
+
+    dynamics: PressureSensor
+    peep: Array = parameter()
+
+    def __init__(
+        self,
+        system: AbstractLung,
+        dt: Any = 0.03,
+        sensor_delay: int = 2,
+        peep: Any = 5.0,
+        solver: diffrax.AbstractSolver | None = None,
+    ):
+        where = "LungModel"
+        if not isinstance(system, AbstractLung):
+            raise ValueError(
+                f"{where}: system must be an AbstractLung, got {type(system).__name__}."
+            )
+        check_step(dt, where)
+        self.dynamics = PressureSensor(Discretized(system, dt, solver), sensor_delay)
+        self.peep = peep
+
+    @property
+    def system(self) -> Any:
+        """The lung."""
+        return self.dynamics.dynamics.system  # pyright: ignore[reportAttributeAccessIssue]
+
+    def resting(self) -> Array:
+        """The state of the dynamics before an inspiration."""
+        return self.dynamics.filled(self.system.resting(self.peep))
+
+    def predict(self, u_in: Array) -> Array:
+        """The pressures of an inspiration under recorded controls: open loop.
+
+        **Arguments:** `u_in`: shape `(T,)` [%].
+
+        **Returns:** shape `(T,)` [cmH2O], the first before any control acted.
+        """
+
+        @jax.checkpoint
+        def body(x, u):
+            after, _ = self.dynamics.advance(
+                0.0, x, jnp.stack([u, jnp.zeros_like(u)]), None
+            )
+            return after, self.dynamics.observe(0.0, x)[0]
+
+        x0 = self.resting().astype(u_in.dtype)
+        return jax.lax.scan(body, x0, u_in)[1]
+
+
+class NeuralLung(AbstractLung):
+    r"""A neural ODE: what a pressure does, and some states that are not seen,
+
+    `dz/dt = rate network(z, flow(u_in) / max_flow, u_out)`, `p = p_mean + p_std z[0]`.
+
+    While `u_out` is 0 nothing but the flow of the valve enters. Smooth everywhere.
+
+    **Arguments:**
+
+    - `hidden`: states that are not seen, 2 by default.
+    - `width`, `depth`: of the network, 24 and 1 by default.
+    - `p_mean`, `p_std`: the scale of the pressures [cmH2O], 20 and 10 by default.
+    - `rate`: the scale of the time derivatives [1/s], 10 by default.
+    - `valves`: whose curve of the flow is used; the default ones by default.
+    - `key`: a random key, for the first weights.
+
+    **Attributes:** `network`, trainable.
+
+    **Raises:** `ValueError` if a size is below 1, or there is no key.
+
+    Source: Chen, Rubanova, Bettencourt and Duvenaud, 2018.
+
+    !!! example
+
+        ```python
+        import jax
+        import jax.numpy as jnp
+        from delucax.lung import LungModel, NeuralLung
+
+        model = LungModel(NeuralLung(key=jax.random.key(0)))
+        model.predict(jnp.linspace(50.0, 0.0, 10))
+        ```
+    """
+
+    network: eqx.nn.MLP = weight()
+    p_mean: Array = parameter()
+    p_std: Array = parameter(constraint=positive)
+    rate: Array = parameter(constraint=positive)
+    valves: Valves
+    hidden: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        hidden: int = 2,
+        width: int = 24,
+        depth: int = 1,
+        *,
+        p_mean: Any = 20.0,
+        p_std: Any = 10.0,
+        rate: Any = 10.0,
+        valves: Valves | None = None,
+        key: PRNGKey,
+    ):
+        where = "NeuralLung"
+        self.hidden = check_count(hidden, "hidden", where)
+        self.network = eqx.nn.MLP(
+            self.hidden + 3,
+            self.hidden + 1,
+            check_count(width, "width", where),
+            check_count(depth, "depth", where),
+            as_module(jnp.tanh),
+            as_module(jax.nn.identity),
+            key=check_key(key, where),
+        )
+        self.p_mean, self.p_std, self.rate = p_mean, p_std, rate
+        self.valves = Valves() if valves is None else valves
+
+    @property
+    def state_names(self):
+        return ("pressure", *(f"hidden {i}" for i in range(self.hidden)))
+
+    def pressure(self, x):
+        return self.p_mean + self.p_std * x[0]
+
+    def outflow(self, x):
+        return 0 * x[0]
+
+    def resting(self, pressure):
+        first = jnp.reshape((pressure - self.p_mean) / self.p_std, (1,))
+        return jnp.concatenate([first, jnp.zeros(self.hidden)])
+
+    def vector_field(self, t, x, u, w):
+        flow = self.valves.flow(u[0]) / self.valves.max_flow
+        z = jnp.concatenate([x, jnp.stack([flow, u[1]]).astype(x.dtype)])
+        return (self.rate * self.network(z)).astype(x.dtype)
+
+
+class GreyBoxLung(AbstractLung):
+    r"""A single compartment, and networks for what it leaves out,
+
+    `p = p_single(x) + p_std network(inflow, V / C, h)`,
+    `dh/dt = rate memory(inflow, V / C, h)`,
+
+    with the state (inflow [L/s], opening, volume [L], memory h). The networks begin so
+    small that it begins as the physics. Smooth everywhere.
+
+    **Arguments:**
+
+    - `single`: a [`delucax.lung.SingleCompartment`][]; the default one by default.
+    - `width`: hidden units of both networks, 16 by default.
+    - `p_std`: the scale of the pressures [cmH2O], 10 by default.
+    - `rate`: the scale of the time derivative of h [1/s], 5 by default.
+    - `key`: a random key, for the first weights.
+
+    **Attributes:** `network` and `memory`, trainable.
+
+    **Raises:** `ValueError` if a size is below 1, or there is no key.
+
+    !!! example
+
+        ```python
+        import jax
+        import jax.numpy as jnp
+        from delucax.lung import GreyBoxLung, LungModel
+
+        model = LungModel(GreyBoxLung(key=jax.random.key(0)))
+        model.predict(jnp.linspace(50.0, 0.0, 10))
+        ```
+    """
+
+    single: SingleCompartment
+    network: eqx.nn.MLP = weight()
+    memory: eqx.nn.MLP = weight()
+    p_std: Array = parameter(constraint=positive)
+    rate: Array = parameter(constraint=positive)
+
+    state_names: ClassVar = ("inflow", "opening", "volume", "memory")
+    state_units: ClassVar = ("L/s", "", "L", "")
+
+    def __init__(
+        self,
+        single: SingleCompartment | None = None,
+        width: int = 16,
+        *,
+        p_std: Any = 10.0,
+        rate: Any = 5.0,
+        key: PRNGKey,
+    ):
+        where = "GreyBoxLung"
+        check_key(key, where)
+        width = check_count(width, "width", where)
+        self.single = SingleCompartment() if single is None else single
+        tanh, same = as_module(jnp.tanh), as_module(jax.nn.identity)
+        network, memory = (
+            eqx.nn.MLP(3, "scalar", width, 1, tanh, same, key=k) for k in jr.split(key)
+        )
+        last = lambda mlp: mlp.layers[-1].weight  # noqa: E731
+        self.network = eqx.tree_at(last, network, 0.1 * last(network))
+        self.memory = memory
+        self.p_std, self.rate = p_std, rate
+
+    @property
+    def valves(self) -> Valves:
+        """Those of the single compartment."""
+        return self.single.valves
+
+    def _inputs(self, x: Array) -> Array:
+        inside = x[2] / (1e-3 * self.single.compliance)
+        return jnp.stack([x[0], inside / self.p_std, x[3]])
+
+    def pressure(self, x):
+        rest = run_mlp(self.network, self._inputs(x))
+        return self.single.pressure(x[:3]) + self.p_std * rest
+
+    def outflow(self, x):
+        return self.single.outflow(x[:3])
+
+    def resting(self, pressure):
+        physical = self.single.resting(pressure)
+        return jnp.concatenate([physical, jnp.zeros(1)])
+
+    def vector_field(self, t, x, u, w):
+        physical = self.single.vector_field(t, x[:3], u, w)
+        memory = self.rate * run_mlp(self.memory, self._inputs(x))
+        return jnp.concatenate([physical, jnp.reshape(memory, (1,))])

@@ -1,0 +1,389 @@
+"""Controllers of a breath."""
+
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array
+
+from .._check import check_count, check_key, check_step
+from .._controller import AbstractController
+from .._fields import as_module, parameter, positive, weight
+from .._typing import PRNGKey
+from ..math import clip
+from ._networks import run_mlp
+from ._waveform import BreathWaveform
+
+
+def _check_waveform(waveform: Any, where: str) -> None:
+    if not isinstance(waveform, BreathWaveform):
+        raise ValueError(
+            f"{where}: waveform must be a BreathWaveform, got "
+            f"{type(waveform).__name__}."
+        )
+
+
+class ExpiratoryValve(AbstractController):
+    """Opens the expiratory valve in the expiratory phase: `u_out` is 0, then 1.
+
+    **Arguments:** `waveform`: a [`delucax.lung.BreathWaveform`][].
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax.lung import BreathWaveform, ExpiratoryValve
+
+        valve = ExpiratoryValve(BreathWaveform())
+        valve(1.2, jnp.array([20.0]), valve.init())
+        ```
+    """
+
+    waveform: BreathWaveform
+
+    def __call__(self, t, y, state):
+        closed = self.waveform.is_inspiration(t)
+        return jnp.reshape(jnp.where(closed, 0.0, 1.0), (1,)).astype(y.dtype), state
+
+
+class _Phases(NamedTuple):
+    inner: Any
+    valve: Any
+    inhaling: Array
+
+
+class Breathing(AbstractController):
+    r"""A controller of the inspiratory valve, made one of whole breaths.
+
+    In the inspiratory phase `u = (clip(inspiratory(y), 0, 100), valve(y))`. In the
+    expiratory phase the inspiratory valve is closed; or, with a `hold`, once half a
+    period has gone by it is opened to `hold (1 - exp(-5 s))`, `s` being the time since,
+    which keeps the airway open against a leak. The inspiratory controller begins each
+    breath as it began the first one, and sees none of the expiratory phase.
+
+    **Arguments:**
+
+    - `inspiratory`: any controller of one control, such as a
+        [`delucax.controllers.PID`][] whose reference is the waveform.
+    - `waveform`: a [`delucax.lung.BreathWaveform`][].
+    - `valve`: the controller of the expiratory valve, an
+        [`delucax.lung.ExpiratoryValve`][] by default.
+    - `hold`: [%], 0 by default; that of the original is 5.
+
+    **Raises:** `ValueError` if what is given is no controller, or no waveform.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        from delucax import lung
+
+        env = dlx.make("lung/single_compartment")
+        waveform = env.cost.waveform
+        pid = dlx.controllers.PID(1.0, 3.0, dt=env.dt, reference=waveform)
+        controller = lung.Breathing(pid, waveform)
+        dlx.rollout(env, controller, key=jax.random.key(0)).total_cost
+        ```
+    """
+
+    inspiratory: AbstractController
+    waveform: BreathWaveform
+    valve: AbstractController
+    hold: Array = parameter()
+
+    def __init__(
+        self,
+        inspiratory: AbstractController,
+        waveform: BreathWaveform,
+        valve: AbstractController | None = None,
+        hold: Any = 0.0,
+    ):
+        where = "Breathing"
+        _check_waveform(waveform, where)
+        valve = ExpiratoryValve(waveform) if valve is None else valve
+        for name, given in (("inspiratory", inspiratory), ("valve", valve)):
+            if not isinstance(given, AbstractController):
+                raise ValueError(
+                    f"{where}: {name} must be an AbstractController, got "
+                    f"{type(given).__name__}."
+                )
+        self.inspiratory, self.waveform = inspiratory, waveform
+        self.valve, self.hold = valve, hold
+
+    def init(self, *, key=None):
+        keys = (None, None) if key is None else jr.split(key)
+        inner = self.inspiratory.init(key=keys[0])
+        return _Phases(inner, self.valve.init(key=keys[1]), jnp.zeros((), bool))
+
+    def __call__(self, t, y, state):
+        inhale = self.waveform.is_inspiration(t)
+        begins = inhale & ~state.inhaling
+        choose = lambda yes, no: _where(begins, yes, no)  # noqa: E731
+        inner = jax.tree.map(choose, self.inspiratory.init(key=None), state.inner)
+        u_in, after = self.inspiratory(t, y, inner)
+        u_out, valve = self.valve(t, y, state.valve)
+        period = self.waveform.period
+        late = jnp.maximum(self.waveform.share(t) - 0.5, 0) * period
+        held = self.hold * (1 - jnp.exp(-5 * late))
+        u_in = jnp.where(inhale, clip(u_in[0], 0, 100), held)
+        after = jax.tree.map(lambda a, b: _where(inhale, a, b), after, inner)
+        u = jnp.stack([u_in, u_out[0]]).astype(y.dtype)
+        return u, _Phases(after, valve, inhale)
+
+    def applied(self, u, cost, state):
+        inner = self.inspiratory.applied(u[:1], cost, state.inner)
+        told = lambda a, b: _where(state.inhaling, a, b)  # noqa: E731
+        return state._replace(
+            inner=jax.tree.map(told, inner, state.inner),
+            valve=self.valve.applied(u[1:], cost, state.valve),
+        )
+
+
+def _where(condition: Array, yes: Any, no: Any) -> Any:
+    if not eqx.is_array(no) or jnp.issubdtype(no.dtype, jax.dtypes.prng_key):
+        return no
+    return jnp.where(condition, yes, no).astype(no.dtype)
+
+
+class BangBang(AbstractController):
+    """Fully open below the target, and closed above it.
+
+    **Arguments:**
+
+    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
+    - `high`: the control below it [%], 100 by default.
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax.lung import BangBang, BreathWaveform
+
+        bang = BangBang(BreathWaveform())
+        bang(0.1, jnp.array([20.0]), bang.init())
+        ```
+    """
+
+    waveform: BreathWaveform
+    high: Array = parameter(100.0)
+
+    def __call__(self, t, y, state):
+        return jnp.where(y > self.waveform(t), 0, self.high).astype(y.dtype), state
+
+
+class _Window(NamedTuple):
+    errors: Array
+    controls: Array
+
+
+class BreathPolicy(AbstractController):
+    r"""A network of the last errors, the targets to come, and the last controls,
+
+    `u = 100 sigmoid(network(e[k], ..., e[k + 1 - errors], r[k + 1], r[k + 2], r[k],
+    u[k - 1], ..., u[k - controls]) + shift)`,
+
+    all scaled; before the breath there are zeros. The sigmoid keeps the control within
+    the bounds of the valve and its gradient alive.
+
+    The kind `"mlp"` is a fully connected network. The kind `"cnn"` first takes the
+    means of the last 1, 2, ..., `errors` errors, and convolves them.
+
+    **Arguments:**
+
+    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
+    - `dt`: the control interval.
+    - `kind`: `"mlp"` (default) or `"cnn"`.
+    - `width`: hidden units, or channels, 32 by default.
+    - `depth`: hidden layers of the `"mlp"`, 2 by default.
+    - `errors`: how many errors it is given, 10 by default.
+    - `controls`: how many controls it is given, 4 by default; 0 for the published
+        inputs.
+    - `key`: a random key, for the first weights.
+
+    **Attributes:** `network`, trainable; `shift`, -2, so that it begins with the valve
+    a little open.
+
+    **Raises:** `ValueError` if a size is below 1, the kind is unknown or there is no
+    key.
+
+    Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
+    Zajdel, Schottdorf, Cohen and Hazan, 2021.
+
+    !!! example
+
+        ```python
+        import jax
+        import jax.numpy as jnp
+        from delucax.lung import BreathPolicy, BreathWaveform
+
+        policy = BreathPolicy(BreathWaveform(), 0.03, key=jax.random.key(0))
+        policy(0.0, jnp.array([5.0]), policy.init())
+        ```
+    """
+
+    network: eqx.nn.MLP = weight()
+    convolution: Array | None = weight()
+    waveform: BreathWaveform
+    dt: Array = parameter(constraint=positive)
+    shift: Array = parameter()
+    kind: Literal["mlp", "cnn"] = eqx.field(static=True)
+    errors: int = eqx.field(static=True)
+    controls: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        waveform: BreathWaveform,
+        dt: Any,
+        kind: Literal["mlp", "cnn"] = "mlp",
+        width: int = 32,
+        depth: int = 2,
+        *,
+        errors: int = 10,
+        controls: int = 4,
+        key: PRNGKey,
+    ):
+        where = "BreathPolicy"
+        _check_waveform(waveform, where)
+        check_step(dt, where)
+        if kind not in ("mlp", "cnn"):
+            raise ValueError(f"{where}: kind must be 'mlp' or 'cnn', got {kind!r}.")
+        key, filter_key = jr.split(check_key(key, where))
+        width = check_count(width, "width", where)
+        self.waveform, self.dt, self.kind = waveform, dt, kind
+        self.errors = check_count(errors, "errors", where, 5 if kind == "cnn" else 1)
+        self.controls = check_count(controls, "controls", where, least=0)
+        size = self.errors + 3 + self.controls
+        self.convolution = None
+        if kind == "cnn":
+            self.convolution = jr.normal(filter_key, (5, width)) / 5**0.5
+            size += (self.errors - 4) * width - self.errors
+            depth = 0
+        self.network = eqx.nn.MLP(
+            size,
+            "scalar",
+            width,
+            check_count(depth, "depth", where, least=0),
+            as_module(jnp.tanh),
+            as_module(jax.nn.identity),
+            key=key,
+        )
+        self.shift = -2.0  # pyright: ignore[reportAttributeAccessIssue]
+
+    def init(self, *, key=None):
+        zeros = lambda size: jnp.zeros(size, jnp.result_type(self.dt))  # noqa: E731
+        return _Window(zeros(self.errors), zeros(self.controls))
+
+    def __call__(self, t, y, state):
+        now = self.waveform.pressure(t)
+        error = ((now - y) / 10).astype(state.errors.dtype)
+        errors = jnp.concatenate([error, state.errors[:-1]])
+        ahead = [self.waveform.pressure(t + k * self.dt) for k in (1, 2)]
+        targets = (jnp.stack([*ahead, now]) - self.waveform.peep) / 15
+        seen = errors
+        if self.convolution is not None:
+            means = jnp.cumsum(errors) / jnp.arange(1, self.errors + 1)
+            windows = [means[i : self.errors - 4 + i] for i in range(5)]
+            seen = jnp.ravel(jnp.maximum(0, jnp.stack(windows, 1) @ self.convolution))
+        z = jnp.concatenate([seen, targets, state.controls]).astype(y.dtype)
+        u = 100 * jax.nn.sigmoid(run_mlp(self.network, z) + self.shift)
+        after = state._replace(errors=errors.astype(state.errors.dtype))
+        return jnp.reshape(u, (1,)).astype(y.dtype), after
+
+    def applied(self, u, cost, state):
+        if not self.controls:
+            return state
+        last = (u[:1] / 50).astype(state.controls.dtype)
+        return state._replace(controls=jnp.concatenate([last, state.controls[:-1]]))
+
+
+class Summed(AbstractController):
+    """The sum of two controllers, such as a PID and a network trained on top of it,
+
+    `u = first(y) + scale (second(y) - offset)`.
+
+    **Arguments:**
+
+    - `first`: any controller.
+    - `second`: another one of as many controls.
+    - `scale`: 1 by default.
+    - `offset`: 0 by default.
+
+    **Raises:** `ValueError` if what is given is no controller.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        from delucax import lung
+
+        waveform = lung.BreathWaveform()
+        pid = dlx.controllers.LeakyPID(dt=0.03, reference=waveform)
+        policy = lung.BreathPolicy(waveform, 0.03, key=jax.random.key(0))
+        controller = lung.Summed(pid, policy, offset=50.0)
+        ```
+    """
+
+    first: AbstractController
+    second: AbstractController
+    scale: Array = parameter(1.0)
+    offset: Array = parameter(0.0)
+
+    def __check_init__(self):
+        for name in ("first", "second"):
+            given = getattr(self, name)
+            if not isinstance(given, AbstractController):
+                raise ValueError(
+                    f"Summed: {name} must be an AbstractController, got "
+                    f"{type(given).__name__}."
+                )
+
+    def init(self, *, key=None):
+        keys = (None, None) if key is None else jr.split(key)
+        return self.first.init(key=keys[0]), self.second.init(key=keys[1])
+
+    def __call__(self, t, y, state):
+        u, first = self.first(t, y, state[0])
+        v, second = self.second(t, y, state[1])
+        return (u + self.scale * (v - self.offset)).astype(y.dtype), (first, second)
+
+    def applied(self, u, cost, state):
+        first = self.first.applied(u, cost, state[0])
+        return first, self.second.applied(u, cost, state[1])
+
+
+class FeedForward(AbstractController):
+    """A control that goes with the target, `u = gain (r(t) - peep) + offset`.
+
+    Add it to a PID with [`delucax.lung.Summed`][].
+
+    **Arguments:**
+
+    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
+    - `gain`: [%/cmH2O], 1 by default. Trainable.
+    - `offset`: [%], 0 by default. Trainable.
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax.lung import BreathWaveform, FeedForward
+
+        forward = FeedForward(BreathWaveform(), gain=0.5)
+        forward(0.1, jnp.array([5.0]), forward.init())
+        ```
+    """
+
+    waveform: BreathWaveform
+    gain: Array = weight(1.0)
+    offset: Array = weight(0.0)
+
+    def __call__(self, t, y, state):
+        u = self.gain * (self.waveform(t) - self.waveform.peep) + self.offset
+        return u.astype(y.dtype), state

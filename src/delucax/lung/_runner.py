@@ -1,0 +1,291 @@
+"""A controller at a ventilator, simulated or real, one step after the other."""
+
+import abc
+import time
+from typing import Any, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._check import check_bool, check_count, check_key, check_positive
+from .._controller import AbstractController
+from .._typing import PRNGKey
+from ..environments import Environment
+
+
+ABORT = 60.0
+"""The pressure at which a run is given up [cmH2O]."""
+
+
+@runtime_checkable
+class Runner(Protocol):
+    """What [`delucax.lung.run_breaths`][] needs of a ventilator.
+
+    Write one for a machine: none of it needs JAX, and any of it may block or raise.
+
+    **Attributes:** `physical`, whether there is a machine; `dt`, the time of a step.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        from delucax import lung
+
+        env = dlx.make("lung/single_compartment")
+        runner = lung.SimulatedRunner(env, key=jax.random.key(0))
+        isinstance(runner, lung.Runner)
+        ```
+    """
+
+    physical: bool
+    dt: float
+
+    @abc.abstractmethod
+    def observe(self) -> float:
+        """The pressure that the sensor reads now [cmH2O]."""
+        ...
+
+    @abc.abstractmethod
+    def actuate(self, u_in: float, u_out: float) -> None:
+        """Set both valves.
+
+        **Arguments:** `u_in`: from 0 to 100 %. `u_out`: from 0 to 1.
+        """
+        ...
+
+    @abc.abstractmethod
+    def wait(self) -> None:
+        """Return when the next step is due."""
+        ...
+
+    @abc.abstractmethod
+    def should_abort(self, pressure: float) -> bool:
+        """Whether to give the run up.
+
+        **Arguments:** `pressure`: what was read last [cmH2O].
+        """
+        ...
+
+    @abc.abstractmethod
+    def cleanup(self) -> None:
+        """Leave the machine safe; called once at the end, whatever happened."""
+        ...
+
+
+class SimulatedRunner:
+    """A [`delucax.lung.Runner`][] whose ventilator is a task.
+
+    **Arguments:**
+
+    - `environment`: a task of a lung.
+    - `key`: a random key, for the noise of the sensor.
+    - `abort`: the pressure at which the run is given up [cmH2O], 60 by default.
+    - `real_time`: whether `wait` waits, as at a machine; false by default.
+
+    **Raises:** `ValueError` if it is no task of a lung, or `abort` is not positive.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        from delucax import lung
+
+        env = dlx.make("lung/single_compartment")
+        runner = lung.SimulatedRunner(env, key=jax.random.key(0))
+        runner.actuate(50.0, 0.0)
+        runner.wait()
+        runner.observe()
+        ```
+    """
+
+    physical = False
+
+    def __init__(
+        self,
+        environment: Environment,
+        *,
+        key: PRNGKey,
+        abort: Any = ABORT,
+        real_time: bool = False,
+    ):
+        where = "SimulatedRunner"
+        fits = isinstance(environment, Environment) and environment.control_size == 2
+        if not fits or environment.observation_size != 1:
+            raise ValueError(
+                f"{where}: environment must be a task of a lung, with two controls and "
+                f"one observation, got {type(environment).__name__}."
+            )
+        check_key(key, where)
+        check_positive(abort, "abort", where)
+        self.environment, self.abort = environment, float(abort)
+        self.real_time = check_bool(real_time, "real_time", where)
+        self.dt = float(environment.dt)
+        start, self._key = jax.random.split(key)
+        self.state = environment.reset(start)
+        self.steps, self.controls, self.is_clean = 0, (0.0, 0.0), False
+        self._due = time.perf_counter()
+
+    def observe(self) -> float:
+        """The pressure that the sensor reads now [cmH2O]."""
+        y = self.environment.dynamics.observe(self.steps * self.dt, self.state)
+        noise = self.environment.sensor_noise
+        if noise is not None:
+            own = jax.random.fold_in(self._key, self.steps)
+            y = y + noise.sequence(own, jnp.zeros(1))[0]
+        return float(y[0])
+
+    def actuate(self, u_in: float, u_out: float) -> None:
+        """Set both valves.
+
+        **Arguments:** `u_in`: from 0 to 100 %. `u_out`: from 0 to 1.
+        """
+        self.controls = (float(u_in), float(u_out))
+
+    def wait(self) -> None:
+        """Let one step go by."""
+        if self.real_time:
+            self._due += self.dt
+            time.sleep(max(0.0, self._due - time.perf_counter()))
+        u = jnp.asarray(self.controls, self.state.dtype)
+        # As an array: a number would be part of the program, which compiled each step.
+        t = jnp.asarray(self.steps * self.dt)
+        self.state = _step(self.environment, t, self.state, u)
+        self.steps += 1
+
+    def should_abort(self, pressure: float) -> bool:
+        """Whether the pressure is above the limit, or no number.
+
+        **Arguments:** `pressure`: what was read last [cmH2O].
+        """
+        return not pressure <= self.abort
+
+    def cleanup(self) -> None:
+        """Close the inspiratory valve, let the air out for 3 s, and close the other."""
+        self.actuate(0.0, 1.0)
+        for _ in range(round(3.0 / self.dt)):
+            self.wait()
+        self.actuate(0.0, 0.0)
+        self.is_clean = True
+
+
+@eqx.filter_jit
+def _step(environment, t, x, u):
+    return environment.step(t, x, u).state
+
+
+class Recording(eqx.Module):
+    """What a run at a ventilator leaves behind, in NumPy arrays.
+
+    **Attributes:**
+
+    - `times` [s], `pressure` [cmH2O], `u_in` [%], `u_out`: an entry a step.
+    - `aborted`: whether the run was given up.
+
+    !!! example
+
+        ```python
+        import numpy as np
+        from delucax.lung import Recording
+
+        empty = np.zeros(0)
+        recording = Recording(empty, empty, empty, empty, aborted=False)
+        ```
+    """
+
+    times: np.ndarray
+    pressure: np.ndarray
+    u_in: np.ndarray
+    u_out: np.ndarray
+    aborted: bool = eqx.field(static=True)
+
+
+def run_breaths(
+    runner: Runner,
+    controller: AbstractController,
+    steps: int = 100,
+    *,
+    key: PRNGKey | None = None,
+) -> Recording:
+    """Run a controller at a ventilator.
+
+    Each step: read the pressure; give up if `runner.should_abort` says so; ask the
+    controller; set the valves; wait. At the end, and also after an error in any of it
+    or an interruption, `runner.cleanup()` is called, and the error goes on.
+
+    **Arguments:**
+
+    - `runner`: a [`delucax.lung.Runner`][].
+    - `controller`: of both valves, such as a [`delucax.lung.Breathing`][].
+    - `steps`: 100 by default.
+    - `key`: a random key for the controller; none by default.
+
+    **Returns:** a [`delucax.lung.Recording`][].
+
+    **Raises:** `ValueError` if what is given is no runner or no controller, or a
+        control is not finite.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        from delucax import lung
+
+        env = dlx.make("lung/single_compartment")
+        waveform = env.cost.waveform
+        pid = dlx.controllers.LeakyPID(1.0, 1.0, dt=env.dt, reference=waveform)
+        runner = lung.SimulatedRunner(env, key=jax.random.key(0))
+        lung.run_breaths(runner, lung.Breathing(pid, waveform), 5).pressure
+        ```
+    """
+    where = "run_breaths"
+    if not isinstance(runner, Runner):
+        raise ValueError(
+            f"{where}: runner must have physical, dt, observe, actuate, wait, "
+            f"should_abort and cleanup, got {type(runner).__name__}."
+        )
+    if not isinstance(controller, AbstractController):
+        raise ValueError(
+            f"{where}: controller must be an AbstractController, got "
+            f"{type(controller).__name__}."
+        )
+    steps = check_count(steps, "steps", where)
+    rows, aborted = [], False
+    try:
+        state = controller.init(key=key)
+        for k in range(steps):
+            pressure = float(runner.observe())
+            if runner.should_abort(pressure):
+                aborted = True
+                break
+            now = jnp.asarray(k * runner.dt)
+            u, state = _ask(controller, now, jnp.array([pressure]), state)
+            u_in, u_out = (float(value) for value in u)
+            if not (np.isfinite(u_in) and np.isfinite(u_out)):
+                raise ValueError(
+                    f"{where}: the controls must be finite, got ({u_in}, {u_out}) at "
+                    f"step {k}."
+                )
+            u_in, u_out = float(np.clip(u_in, 0, 100)), float(np.clip(u_out, 0, 1))
+            runner.actuate(u_in, u_out)
+            state = _tell(controller, jnp.array([u_in, u_out]), state)
+            rows.append((k * runner.dt, pressure, u_in, u_out))
+            runner.wait()
+    finally:
+        runner.cleanup()
+    columns = np.array(rows, float).reshape(-1, 4).T
+    return Recording(*columns, aborted=aborted)
+
+
+@eqx.filter_jit
+def _ask(controller, t, y, state):
+    return controller(t, y, state)
+
+
+@eqx.filter_jit
+def _tell(controller, u, state):
+    return controller.applied(u, jnp.zeros(()), state)

@@ -1,0 +1,319 @@
+"""The lungs by name."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import diffrax
+
+from .._check import check_count
+from .._serialise import load
+from ..dynamics import Delayed, Discretized
+from ..environments import Environment
+from ..environments._registry import finish
+from ._environment import ventilation
+from ._learned import LearnedLung
+from ._lungs import BalloonLung, DelayLung, DoubleCompartment, SingleCompartment
+from ._valves import Valves
+from ._waveform import BreathWaveform
+
+
+def balloon_lung(
+    resistance: Any = 20.0,
+    stiffness: Any = 40.0,
+    rest: Any = 1.5,
+    *,
+    valves: Valves | None = None,
+    waveform: BreathWaveform | None = None,
+    sensor_delay: int = 0,
+    noise: Any = 0.0,
+    dt: Any = 0.03,
+    horizon: int = 100,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **environment: Any,
+) -> Environment:
+    """Make a balloon breathe as a waveform says.
+
+    The controls are (u_in [%], u_out), the observation is the pressure of the airway
+    [cmH2O], and the state holds it too, see [`delucax.lung.PressureSensor`][]. Cost
+    `|p - r(t)|` a step of the inspiratory phase, [`delucax.lung.BreathCost`][]. Starts
+    at rest at PEEP. Never terminates.
+
+    **Arguments:**
+
+    - `resistance`, `stiffness`, `rest`, `valves`: of [`delucax.lung.BalloonLung`][].
+    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
+        minute, by default.
+    - `sensor_delay`: steps until a pressure is seen, 0 by default.
+    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
+    - `dt`: the control interval, 0.03 by default.
+    - `horizon`: steps an episode, 100 by default, which is one breath.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+    - `substeps`: solver steps an interval, 1 by default.
+    - `**environment`: other arguments of [`delucax.Environment`][].
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca), retuned.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("lung/balloon_lung", resistance=10.0)
+        ```
+    """
+    valves = Valves() if valves is None else valves
+    plant = BalloonLung(resistance, stiffness, rest, valves)
+    arguments = ventilation(
+        Discretized(plant, dt, solver, substeps),
+        waveform,
+        rest=plant.resting(valves.peep),
+        sensor_delay=sensor_delay,
+        noise=noise,
+        horizon=horizon,
+    )
+    return finish(balloon_lung, arguments, environment)
+
+
+def delay_lung(
+    resistance: Any = 20.0,
+    stiffness: Any = 40.0,
+    rest: Any = 1.5,
+    pipe: Any = 5.0,
+    *,
+    delay: int = 5,
+    valves: Valves | None = None,
+    waveform: BreathWaveform | None = None,
+    sensor_delay: int = 0,
+    noise: Any = 0.0,
+    dt: Any = 0.03,
+    horizon: int = 100,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 4,
+    **environment: Any,
+) -> Environment:
+    """Make a balloon breathe through a long pipe, which what is done must first pass.
+
+    As `lung/balloon_lung`, but that the controls act some steps late, and that the pipe
+    is elastic.
+
+    **Arguments:**
+
+    - `resistance`, `stiffness`, `rest`, `pipe`, `valves`: of
+        [`delucax.lung.DelayLung`][].
+    - `delay`: steps until a control acts, 5 by default.
+    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
+        minute, by default.
+    - `sensor_delay`: steps until a pressure is seen, 0 by default.
+    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
+    - `dt`: the control interval, 0.03 by default.
+    - `horizon`: steps an episode, 100 by default, which is one breath.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+    - `substeps`: solver steps an interval, 4 by default: air rushes out of the pipe in
+        some 25 ms.
+    - `**environment`: other arguments of [`delucax.Environment`][].
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca), as a differential equation and retuned.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("lung/delay_lung", delay=3)
+        ```
+    """
+    valves = Valves() if valves is None else valves
+    plant = DelayLung(resistance, stiffness, rest, pipe, valves)
+    delay = check_count(delay, "delay", "delay_lung", least=0)
+    dynamics = Delayed(Discretized(plant, dt, solver, substeps), controls=delay)
+    arguments = ventilation(
+        dynamics,
+        waveform,
+        rest=dynamics.filled(plant.resting(valves.peep)),
+        sensor_delay=sensor_delay,
+        noise=noise,
+        horizon=horizon,
+    )
+    return finish(delay_lung, arguments, environment)
+
+
+def single_compartment(
+    resistance: Any = 20.0,
+    compliance: Any = 20.0,
+    *,
+    valves: Valves | None = None,
+    waveform: BreathWaveform | None = None,
+    sensor_delay: int = 0,
+    noise: Any = 0.0,
+    dt: Any = 0.03,
+    horizon: int = 100,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **environment: Any,
+) -> Environment:
+    """Make a lung of one compartment breathe as a waveform says.
+
+    As `lung/balloon_lung`, with another lung.
+
+    **Arguments:**
+
+    - `resistance`, `compliance`, `valves`: of [`delucax.lung.SingleCompartment`][].
+    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
+        minute, by default.
+    - `sensor_delay`: steps until a pressure is seen, 0 by default.
+    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
+    - `dt`: the control interval, 0.03 by default.
+    - `horizon`: steps an episode, 100 by default, which is one breath.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+    - `substeps`: solver steps an interval, 1 by default.
+    - `**environment`: other arguments of [`delucax.Environment`][].
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("lung/single_compartment", resistance=50.0, compliance=10.0)
+        ```
+    """
+    valves = Valves() if valves is None else valves
+    plant = SingleCompartment(resistance, compliance, valves)
+    arguments = ventilation(
+        Discretized(plant, dt, solver, substeps),
+        waveform,
+        rest=plant.resting(valves.peep),
+        sensor_delay=sensor_delay,
+        noise=noise,
+        horizon=horizon,
+    )
+    return finish(single_compartment, arguments, environment)
+
+
+def double_compartment(
+    resistance: Any = 20.0,
+    compliance: Any = 20.0,
+    central: Any = 0.3,
+    share: Any = 0.1,
+    imbalance: Any = 10.0,
+    *,
+    valves: Valves | None = None,
+    waveform: BreathWaveform | None = None,
+    sensor_delay: int = 2,
+    noise: Any = 0.2,
+    dt: Any = 0.03,
+    horizon: int = 100,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **environment: Any,
+) -> Environment:
+    """Make a lung of a fast and a slow compartment breathe, seen late and with noise.
+
+    The plant of the ventilator study: as `lung/single_compartment`, with another lung
+    and a real sensor.
+
+    **Arguments:**
+
+    - `resistance`, `compliance`, `central`, `share`, `imbalance`, `valves`: of
+        [`delucax.lung.DoubleCompartment`][].
+    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
+        minute, by default.
+    - `sensor_delay`: steps until a pressure is seen, 2 by default.
+    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
+    - `dt`: the control interval, 0.03 by default.
+    - `horizon`: steps an episode, 100 by default, which is one breath.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+    - `substeps`: solver steps an interval, 1 by default.
+    - `**environment`: other arguments of [`delucax.Environment`][].
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("lung/double_compartment", resistance=50.0, compliance=10.0)
+        ```
+    """
+    valves = Valves() if valves is None else valves
+    plant = DoubleCompartment(resistance, compliance, central, share, imbalance, valves)
+    arguments = ventilation(
+        Discretized(plant, dt, solver, substeps),
+        waveform,
+        rest=plant.resting(valves.peep),
+        sensor_delay=sensor_delay,
+        noise=noise,
+        horizon=horizon,
+    )
+    return finish(double_compartment, arguments, environment)
+
+
+def learned_lung(
+    model: LearnedLung | None = None,
+    *,
+    waveform: BreathWaveform | None = None,
+    noise: Any = 0.0,
+    horizon: int = 100,
+    **environment: Any,
+) -> Environment:
+    """Make a lung breathe that was learned from breaths.
+
+    As `lung/balloon_lung`; its time step is that of the breaths.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.lung.LearnedLung`][]. By default the one that comes with the
+        library, learned from breaths of the task `lung/double_compartment`; its sensor
+        is two samples late, and so is its pressure.
+    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
+        minute, by default.
+    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
+    - `horizon`: steps an episode, 100 by default, which is one breath.
+    - `**environment`: other arguments of [`delucax.Environment`][].
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` if `model` is another one, or on illegal numbers.
+
+    Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
+    Zajdel, Schottdorf, Cohen and Hazan, 2021.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("lung/learned_lung")
+        ```
+    """
+    if model is None:
+        with warnings.catch_warnings():
+            # It is kept in double precision, and may be wanted in single.
+            warnings.simplefilter("ignore")
+            model = load(Path(__file__).with_name("learned_lung.dlx"))
+    if not isinstance(model, LearnedLung):
+        raise ValueError(
+            f"learned_lung: model must be a LearnedLung, got {type(model).__name__}."
+        )
+    arguments = ventilation(
+        model, waveform, rest=model.resting(), noise=noise, horizon=horizon
+    )
+    return finish(learned_lung, arguments, environment)

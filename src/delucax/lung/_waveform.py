@@ -1,0 +1,196 @@
+"""The pressure that a clinician asks for, breath by breath."""
+
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._check import check_number, check_positive, is_concrete
+from .._fields import as_float_array, parameter, positive
+
+
+_T = TypeVar("_T")
+# Of a period: what rounding of `k dt` may be off by.
+_SLACK = 1e-6
+
+
+class BreathWaveform(eqx.Module):
+    r"""The target pressure of pressure-controlled ventilation, a function of time.
+
+    With the share `s = (t mod period) / period` of a breath of `period = 60 / rate`
+    seconds: `r(t) = peep + (pip - peep) interp(s, keypoints, levels)`. A breath is in
+    its inspiratory phase while `s <= inspiration`. As the keypoints are shares of the
+    period, they scale with the rate.
+
+    It is a reference like any other, and its numbers are leaves.
+
+    **Arguments:**
+
+    - `pip`: the peak inspiratory pressure [cmH2O], 35 by default.
+    - `peep`: the positive end-expiratory pressure [cmH2O], 5 by default.
+    - `rate`: breaths a minute, 20 by default.
+    - `keypoints`: shares of a period, increasing, from 0 to 1; `(0, 1/3, 1/2, 1)` by
+        default. The pressure may jump from the end of a breath to the next one.
+    - `levels`: how far from PEEP (0) to PIP (1) the target is at each; `(1, 1, 0, 0)`
+        by default: PIP is asked for at once and held for 1 s, then falls to PEEP in
+        0.5 s.
+    - `inspiration`: the share of a period that is inspiratory, 1/3 by default.
+
+    **Raises:** `ValueError` if PIP is below PEEP, the rate is not positive, keypoints
+    do not increase from 0 to 1 or are not as many as the levels, or `inspiration` is
+    not between 0 and 1.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        from delucax.lung import BreathWaveform
+
+        waveform = BreathWaveform(pip=25.0, rate=15.0)
+        waveform(0.5), waveform.is_inspiration(0.5)
+        ```
+    """
+
+    pip: Array = parameter()
+    peep: Array = parameter()
+    rate: Array = parameter(constraint=positive)
+    keypoints: Array = parameter()
+    levels: Array = parameter()
+    inspiration: Array = parameter()
+
+    def __init__(
+        self,
+        pip: Any = 35.0,
+        peep: Any = 5.0,
+        rate: Any = 20.0,
+        keypoints: Any = (0.0, 1 / 3, 1 / 2, 1.0),
+        levels: Any = (1.0, 1.0, 0.0, 0.0),
+        inspiration: Any = 1 / 3,
+    ):
+        where = "BreathWaveform"
+        for name, value in (("pip", pip), ("peep", peep), ("inspiration", inspiration)):
+            check_number(value, name, where)
+        check_positive(rate, "rate", where)
+        self.pip, self.peep, self.rate = pip, peep, rate
+        self.keypoints, self.levels = keypoints, levels
+        self.inspiration = inspiration
+
+    def __check_init__(self):
+        where = "BreathWaveform"
+        keypoints, levels = self.keypoints, self.levels
+        shapes = jnp.shape(keypoints), jnp.shape(levels)
+        if len(shapes[0]) != 1 or shapes[0] != shapes[1] or shapes[0][0] < 2:
+            raise ValueError(
+                f"{where}: keypoints and levels must be vectors of one size, at least "
+                f"2, got shapes {shapes[0]} and {shapes[1]}."
+            )
+        if is_concrete(keypoints):
+            points = np.asarray(keypoints)
+            if points[0] != 0 or points[-1] != 1 or not np.all(np.diff(points) > 0):
+                raise ValueError(
+                    f"{where}: keypoints must increase from 0 to 1, got {points}."
+                )
+        if is_concrete(self.pip) and is_concrete(self.peep):
+            if np.any(np.asarray(self.pip) < np.asarray(self.peep)):
+                raise ValueError(
+                    f"{where}: pip must be at least peep = {self.peep}, got {self.pip}."
+                )
+        share = self.inspiration
+        if is_concrete(share) and not 0 < float(share) < 1:
+            raise ValueError(
+                f"{where}: inspiration must be between 0 and 1, got {share}."
+            )
+
+    @property
+    def period(self) -> Array:
+        """The time of a breath [s]."""
+        return 60 / self.rate
+
+    def share(self, t: Any) -> Array:
+        """How much of its breath has gone by at time `t`, from 0 to 1.
+
+        **Arguments:** `t`: time [s].
+
+        **Returns:** of the shape of `t`. A time that rounding put just before a breath
+        counts as its beginning.
+        """
+        breaths = as_float_array(t) / self.period
+        return jnp.maximum(breaths - jnp.floor(breaths + _SLACK), 0)
+
+    def is_inspiration(self, t: Any) -> Array:
+        """Whether time `t` is in an inspiratory phase.
+
+        **Arguments:** `t`: time [s].
+
+        **Returns:** booleans of the shape of `t`.
+        """
+        return self.share(t) <= self.inspiration + _SLACK
+
+    def pressure(self, t: Any) -> Array:
+        """The target pressure at time `t`.
+
+        **Arguments:** `t`: time [s].
+
+        **Returns:** [cmH2O], of the shape of `t`.
+        """
+        level = jnp.interp(self.share(t), self.keypoints, self.levels)
+        return self.peep + (self.pip - self.peep) * level
+
+    def __call__(self, t: Any) -> Array:
+        """The target pressure at time `t`, shape `(1,)`."""
+        return jnp.atleast_1d(self.pressure(t))
+
+
+def at_pip(tree: _T, pip: Any) -> _T:
+    """A copy in which every breath waveform has that peak pressure.
+
+    An environment and its controller each hold the waveform; under `jax.vmap` this
+    makes a batch of both over several pressures, which compiles once.
+
+    **Arguments:**
+
+    - `tree`: any pytree: an environment, a controller, or both.
+    - `pip`: the peak inspiratory pressure [cmH2O].
+
+    **Returns:** the copy.
+
+    **Raises:** `ValueError` if there is no [`delucax.lung.BreathWaveform`][] in it, or
+    `pip` is below PEEP.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        from delucax import lung
+
+        env = lung.at_pip(dlx.make("lung/single_compartment"), 20.0)
+        ```
+    """
+    found = 0
+    pip = as_float_array(pip)
+
+    def put(node):
+        nonlocal found
+        if not isinstance(node, BreathWaveform):
+            return node
+        found += 1
+        if is_concrete(pip) and is_concrete(node.peep):
+            if np.any(np.asarray(pip) < np.asarray(node.peep)):
+                raise ValueError(
+                    f"at_pip: pip must be at least peep = {node.peep}, got {pip}."
+                )
+        return eqx.tree_at(lambda w: w.pip, node, pip)
+
+    is_waveform = lambda node: isinstance(node, BreathWaveform)  # noqa: E731
+    tree = jax.tree.map(put, tree, is_leaf=is_waveform)
+    if not found:
+        raise ValueError(
+            f"at_pip: there is no BreathWaveform in the {type(tree).__name__}."
+        )
+    return tree

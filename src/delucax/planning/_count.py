@@ -1,0 +1,203 @@
+"""How often the dynamics are evaluated, counted as it happens."""
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+from ..dynamics import AbstractDynamics
+
+
+class Evaluations(NamedTuple):
+    """How often dynamics were evaluated, from [`delucax.planning.count_evaluations`][].
+
+    **Attributes:** `primal`, calls, of which the first pass of each derivative is one;
+    `tangent`, products of their Jacobian with a vector; `cotangent`, products of its
+    transpose with one.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        spring = dlx.LinearDynamics(jnp.eye(2), jnp.ones((2, 1)))
+        step = lambda dynamics: dynamics(0.0, jnp.ones(2), jnp.ones(1))
+        _, evaluations = dlx.planning.count_evaluations(step, spring)
+        evaluations.primal, evaluations.tangent, evaluations.cotangent
+        ```
+    """
+
+    primal: int
+    tangent: int
+    cotangent: int
+
+
+def count_evaluations(
+    function: Callable[[AbstractDynamics], Any], dynamics: AbstractDynamics
+) -> tuple[Any, Evaluations]:
+    """Run a function of dynamics, and count how often it evaluates them.
+
+    The dynamics that it is given report each evaluation to the host as it happens, in
+    compiled loops whose length only the data decide, too. Under `jax.vmap` each lane
+    counts. What XLA finds that nothing depends on is not evaluated, and not counted. It
+    is for counting, not for timing: each report takes microseconds, and each call
+    compiles anew.
+
+    **Arguments:**
+
+    - `function`: of the dynamics, such as a call of a planner.
+    - `dynamics`: the dynamics.
+
+    **Returns:** `(what the function returns, evaluations)`, the latter
+    [`delucax.planning.Evaluations`][].
+
+    **Raises:** `ValueError` if `dynamics` are none, or `function` is no function.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        x0, start = jnp.array([0.5, 0.0]), jnp.zeros((10, 1))
+        plan, evaluations = dlx.planning.count_evaluations(
+            lambda dynamics: dlx.planning.ilqr(dynamics, env.cost, x0, start),
+            env.dynamics,
+        )
+        evaluations
+        ```
+    """
+    where = "count_evaluations"
+    if not isinstance(dynamics, AbstractDynamics):
+        raise ValueError(
+            f"{where}: dynamics must be an AbstractDynamics, got "
+            f"{type(dynamics).__name__}."
+        )
+    if not callable(function):
+        raise ValueError(f"{where}: function must be a function, got {function!r}.")
+    tally = _Tally()
+    out = function(_Counted(dynamics, tally))
+    jax.block_until_ready(eqx.filter(out, eqx.is_array))
+    jax.effects_barrier()
+    found = tally.found
+    return out, Evaluations(found[PRIMAL], found[TANGENT], found[COTANGENT])
+
+
+PRIMAL, TANGENT, COTANGENT = "primal", "tangent", "cotangent"
+
+
+class _Tally:
+    """A count on the host. Compiled code calls it, from any thread."""
+
+    def __init__(self):
+        self.found: Counter[str] = Counter()
+        self.lock = threading.Lock()
+
+    def add(self, kind: str, lanes: int) -> None:
+        with self.lock:
+            self.found[kind] += lanes
+
+
+class _Counted(AbstractDynamics):
+    """Dynamics that report each evaluation."""
+
+    dynamics: AbstractDynamics
+    tally: _Tally = eqx.field(static=True)
+
+    state_units: ClassVar[Any] = ()
+    control_units: ClassVar[Any] = ()
+
+    @property
+    def dt(self):
+        return self.dynamics.dt
+
+    @property
+    def state_names(self):
+        return self.dynamics.state_names
+
+    @property
+    def control_names(self):
+        return self.dynamics.control_names
+
+    @property
+    def disturbance_size(self):
+        return self.dynamics.disturbance_size
+
+    @property
+    def is_stochastic(self):
+        return self.dynamics.is_stochastic
+
+    def advance(self, t, x, u, w):
+        x_next, result = self.dynamics.advance(t, x, u, w)
+        here = dict(tally=self.tally, kind=PRIMAL, lanes=1)
+        return _report.bind(x_next, jax.lax.stop_gradient(x_next), **here), result
+
+    def observe(self, t, x):
+        return self.dynamics.observe(t, x)
+
+    def difference(self, x, x_ref):
+        return self.dynamics.difference(x, x_ref)
+
+    def equilibrium(self):
+        return self.dynamics.equilibrium()
+
+
+_report = Primitive("report")
+"""Its first argument, reported. The second one is what the dynamics are at the point of
+the evaluation: a derivative is batched with it and repeated with it, and it needs it.
+
+Each transformation reports for itself: so an evaluation is counted where it is run, and
+only if it is."""
+
+
+def _called(x: Any, where: Any, *, tally: _Tally, kind: str, lanes: int) -> Array:
+    def count(x, where):
+        del where
+        tally.add(kind, lanes)
+        return np.asarray(x)
+
+    return jax.pure_callback(count, jax.ShapeDtypeStruct(x.shape, x.dtype), x, where)
+
+
+def _batch(values, dims, *, tally, kind, lanes):
+    x, where = values
+    size = next(v.shape[d] for v, d in zip(values, dims, strict=True) if d is not None)
+    if dims[0] is None:
+        x = jnp.broadcast_to(x, (size, *x.shape))
+    else:
+        x = jnp.moveaxis(x, dims[0], 0)
+    params = dict(tally=tally, kind=kind, lanes=lanes * size)
+    return _report.bind(x, where, **params), 0
+
+
+def _jvp(primals, tangents, **params):
+    out = _report.bind(*primals, **params)
+    if type(tangents[0]) is ad.Zero:
+        return out, tangents[0]
+    tangent = _report.bind(tangents[0], out, **(params | {"kind": TANGENT}))
+    return out, tangent
+
+
+def _transpose(cotangent, x, where, **params):
+    del x
+    if type(cotangent) is ad.Zero:
+        return cotangent, None
+    return _report.bind(cotangent, where, **(params | {"kind": COTANGENT})), None
+
+
+_report.def_impl(_called)
+_report.def_abstract_eval(lambda x, where, **params: x)
+batching.primitive_batchers[_report] = _batch
+ad.primitive_jvps[_report] = _jvp
+ad.primitive_transposes[_report] = _transpose
+mlir.register_lowering(_report, mlir.lower_fun(_called, multiple_results=False))

@@ -1,0 +1,156 @@
+"""What was identified, how well, and what the data do not tell."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtri
+from jaxtyping import Array, Bool, Float
+
+from ..._check import check_range
+from ..._fields import as_float_array
+from ..._results import choose, first_failure, promote, Result, RESULTS
+
+
+_LOADS = 0.02
+"""The share of an unknown direction in a parameter that makes the parameter unknown."""
+
+
+class Identified(eqx.Module):
+    """A model that was fitted to data, and how well the data determine it.
+
+    The directions are singular vectors of the sensitivity of the data to relative
+    changes of the parameters (to changes in units of the regressors' size, in a linear
+    fit). Along each there is a spread, the standard deviation of the estimate; where it
+    is as large as the parameter itself, or the data do not depend on it at all, the
+    direction is not identifiable: the parameters can be moved along it together, and
+    nothing is seen of it.
+
+    **Attributes:**
+
+    - `model`: the fitted dynamics, like any other.
+    - `names`: of the p parameters.
+    - `estimate`: their values, shape `(p,)`; in a linear fit `(outputs, p)`.
+    - `std`: their standard deviations, of the same shape; infinite for what is not
+        identifiable.
+    - `low`, `high`: the ends of their confidence intervals, of the same shape.
+    - `directions`: shape `(p, p)`, a unit vector in each row, least known first.
+    - `spread`: the standard deviation along each, shape `(p,)`.
+    - `identifiable`: of each direction, shape `(p,)`.
+    - `noise`: the standard deviation of what remains of each output.
+    - `result`: success; `RESULTS.unexciting` if a direction is not identifiable; or the
+        failure of the solver.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        controls = jax.random.normal(jax.random.key(0), (50, 1))
+        true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
+        states = dlx.open_loop(true, [0.0, 0.0], controls)
+        found = dlx.training.sysid.linear(states, controls)
+        print(found.report())
+        ```
+    """
+
+    model: Any
+    names: tuple[str, ...] = eqx.field(static=True)
+    estimate: Float[Array, "*outputs p"]
+    std: Float[Array, "*outputs p"]
+    low: Float[Array, "*outputs p"]
+    high: Float[Array, "*outputs p"]
+    directions: Float[Array, "p p"]
+    spread: Float[Array, " p"]
+    identifiable: Bool[Array, " p"]
+    noise: Float[Array, " y"]
+    result: Result
+
+    def report(self) -> str:
+        """A table of the parameters and of what is not identifiable, in words.
+
+        **Returns:** text of several lines.
+        """
+        lines = [f"{'parameter':<24}{'estimate':>12}{'low':>12}{'high':>12}"]
+        shape = self.estimate.shape
+        for index in np.ndindex(shape):
+            name = self.names[index[-1]]
+            label = name if len(shape) == 1 else f"output {index[0]}: {name}"
+            ends = [float(a[index]) for a in (self.estimate, self.low, self.high)]
+            lines.append(f"{label:<24}" + "".join(f"{end:>12.5g}" for end in ends))
+        for row, known in zip(
+            np.asarray(self.directions), np.asarray(self.identifiable), strict=True
+        ):
+            if not known:
+                parts = [
+                    f"{share:+.2f} {name}"
+                    for share, name in zip(row, self.names, strict=True)
+                    if abs(share) > _LOADS
+                ]
+                lines.append("not identifiable: " + " ".join(parts))
+        if np.all(self.identifiable):
+            lines.append("all directions are identifiable")
+        return "\n".join(lines)
+
+
+class Certainty(eqx.Module):
+    """What the sensitivity of the data says of an estimate."""
+
+    directions: Array
+    spread: Array
+    identifiable: Array
+    std: Array
+
+    @staticmethod
+    def of(sensitivity: Array, sigma: Array, worst: Any) -> "Certainty":
+        """Of scaled residuals with a standard deviation `sigma`.
+
+        `worst` is the spread from which on a direction counts as unknown.
+        """
+        rows, p = sensitivity.shape
+        if rows < p:
+            sensitivity = jnp.pad(sensitivity, ((0, p - rows), (0, 0)))
+        _, size, directions = jnp.linalg.svd(sensitivity, full_matrices=False)
+        eps = jnp.finfo(sensitivity.dtype).eps
+        seen = size > 10 * max(rows, p) * eps * size[0]
+        spread = jnp.where(seen, sigma / jnp.where(seen, size, 1), jnp.inf)
+        known = seen & (spread < worst)
+        share = jnp.abs(directions)
+        each = jnp.where(
+            known[:, None],
+            (share * jnp.where(known, spread, 0)[:, None]) ** 2,
+            jnp.where(share > _LOADS, jnp.inf, 0),
+        )
+        # A sign for each direction, so that it is the same whatever the solver.
+        largest = jnp.argmax(
+            share > 0.9 * jnp.max(share, axis=1, keepdims=True), axis=1
+        )
+        sign = jnp.sign(jnp.take_along_axis(directions, largest[:, None], axis=1))
+        return Certainty(
+            (directions * sign)[::-1],
+            spread[::-1],
+            known[::-1],
+            jnp.sqrt(jnp.sum(each, axis=0)),
+        )
+
+
+def outcome(known: Array, solver: Result, finite: Array) -> Result:
+    """The status of a fit."""
+    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
+    excited = choose(jnp.all(known), RESULTS.successful, RESULTS.unexciting)
+    return first_failure(promote(solver), first_failure(diverged, excited))
+
+
+def quantile(level: Any, where: str) -> Array:
+    """How many standard deviations a confidence interval reaches to either side."""
+    check_range(level, "level", where, 0, 1)
+    return ndtri((1 + as_float_array(level)) / 2)
+
+
+def raised(found: Identified, throw: bool) -> Identified:
+    """`found`, unless its result is a failure that is to be raised."""
+    if not throw:
+        return found
+    return found.result.error_if(found, found.result != RESULTS.successful)

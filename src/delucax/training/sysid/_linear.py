@@ -1,0 +1,266 @@
+"""Linear models by least squares."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array
+
+from ..._check import check_bool, check_count, check_finite, check_step
+from ..._fields import as_float_array
+from ...dynamics import LinearDynamics
+from ._identified import Certainty, Identified, outcome, quantile, raised
+
+
+def linear(
+    states: Any,
+    controls: Any,
+    *,
+    dt: Any = 1.0,
+    affine: bool = False,
+    level: Any = 0.95,
+    throw: bool = True,
+) -> Identified:
+    r"""Linear dynamics by least squares on the steps of a recorded run,
+
+    `min over A, B, c of sum_k |x_{k+1} - A x_k - B u_k - c|^2`.
+
+    The estimate is that of an errors-free state: noise in the recorded states biases
+    it. Intervals take what remains for independent noise, equal in all steps.
+
+    **Arguments:**
+
+    - `states`: shape `(T + 1, n)`, or runs of it, `(runs, T + 1, n)`.
+    - `controls`: shape `(T, m)`, or `(runs, T, m)`.
+    - `dt`: the step, 1 by default.
+    - `affine`: whether to estimate a constant c too; false by default.
+    - `level`: of the confidence intervals, 0.95 by default.
+    - `throw`: raise if the data do not tell all entries (default); if false, look at
+        `result`.
+
+    **Returns:** [`delucax.training.sysid.Identified`][]; its `model` is a
+    [`delucax.LinearDynamics`][], and row i of its `estimate` holds the entries of A, B
+    and c for the state i.
+
+    **Raises:** `ValueError` on arrays of the wrong shape or kind; an error at run time
+    as `throw` says.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        controls = jax.random.normal(jax.random.key(0), (50, 1))
+        true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
+        states = dlx.open_loop(true, [0.0, 0.0], controls)
+        found = dlx.training.sysid.linear(states, controls)
+        found.model.A, found.model.B, found.std
+        ```
+    """
+    where = "sysid.linear"
+    states, controls = runs_of(states, controls, "states", where)
+    check_step(dt, where)
+    affine = check_bool(affine, "affine", where)
+    reach = quantile(level, where)
+    n, m = states.shape[2], controls.shape[2]
+    names = [f"x{i}" for i in range(n)] + [f"u{i}" for i in range(m)]
+    names += ["1"] if affine else []
+    before = states[:, :-1]
+    parts = [before, controls]
+    parts += [jnp.ones((*before.shape[:2], 1), before.dtype)] if affine else []
+    regressors = jnp.concatenate(parts, axis=2).reshape(-1, len(names))
+    targets = states[:, 1:].reshape(-1, n)
+    fit = _least_squares(regressors, targets)
+    found = fit[0]
+    A, B = found[:, :n], found[:, n : n + m]
+    x_next = found[:, -1] if affine else None
+    model = LinearDynamics(A, B, dt=dt, x_next=x_next)
+    return raised(_identified(model, names, fit, reach), throw)
+
+
+def arx(
+    outputs: Any,
+    controls: Any,
+    *,
+    outputs_back: int,
+    controls_back: int,
+    delay: int = 1,
+    dt: Any = 1.0,
+    level: Any = 0.95,
+    throw: bool = True,
+) -> Identified:
+    r"""An autoregressive model with inputs (ARX) by least squares,
+
+    `y_k = sum_{i=1}^{a} A_i y_{k-i} + sum_{j=0}^{b-1} B_j u_{k-delay-j} + e_k`,
+
+    as linear dynamics whose state is the past `(y_k, ..., y_{k-a+1}, u_{k-1}, ...)` and
+    whose observation is `y_k`.
+
+    **Arguments:**
+
+    - `outputs`: shape `(T + 1, p)`, or runs of it, `(runs, T + 1, p)`; `outputs[k + 1]`
+        is the first that `controls[k]` may move.
+    - `controls`: shape `(T, m)`, or `(runs, T, m)`.
+    - `outputs_back`: a, the outputs looked back on.
+    - `controls_back`: b, the controls looked back on.
+    - `delay`: steps from a control to its first effect, 1 by default.
+    - `dt`: the step, 1 by default.
+    - `level`: of the confidence intervals, 0.95 by default.
+    - `throw`: raise if the data do not tell all entries (default); if false, look at
+        `result`.
+
+    **Returns:** [`delucax.training.sysid.Identified`][]; row i of its `estimate` holds
+    the entries of `A_1, ..., A_a, B_0, ..., B_{b-1}` for the output i. The state of the
+    model at step k is `[outputs[k], ..., outputs[k-a+1], controls[k-1], ...]`.
+
+    **Raises:** `ValueError` on arrays of the wrong shape or kind, counts below 1, or
+    fewer steps than are looked back on; an error at run time as `throw` says.
+
+    Source: Ljung, 1999.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        controls = jax.random.normal(jax.random.key(0), (50, 1))
+        true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
+        angles = dlx.open_loop(true, [0.0, 0.0], controls)[:, :1]
+        back = dict(outputs_back=2, controls_back=2)
+        found = dlx.training.sysid.arx(angles, controls, **back, throw=False)
+        found.estimate
+        ```
+    """
+    where = "sysid.arx"
+    outputs, controls = runs_of(outputs, controls, "outputs", where)
+    a = check_count(outputs_back, "outputs_back", where)
+    b = check_count(controls_back, "controls_back", where)
+    delay = check_count(delay, "delay", where)
+    check_step(dt, where)
+    reach = quantile(level, where)
+    p, m, steps = outputs.shape[2], controls.shape[2], controls.shape[1]
+    first = max(a, b + delay - 1)
+    if steps < first:
+        raise ValueError(
+            f"{where}: outputs must have more than the {first} steps that are looked "
+            f"back on, got {steps}."
+        )
+    # Output k is made of outputs k - i and of controls k - delay - j.
+    back = [outputs[:, first - i : steps + 1 - i] for i in range(1, a + 1)]
+    lags = range(delay, delay + b)
+    back += [controls[:, first - lag : steps + 1 - lag] for lag in lags]
+    names = [f"y{i}(k-{lag})" for lag in range(1, a + 1) for i in range(p)]
+    names += [f"u{i}(k-{lag})" for lag in lags for i in range(m)]
+    regressors = jnp.concatenate(back, axis=2).reshape(-1, len(names))
+    targets = outputs[:, first:].reshape(-1, p)
+    fit = _least_squares(regressors, targets)
+    model = _realised(fit[0], p, m, a, b, delay, dt)
+    return raised(_identified(model, names, fit, reach), throw)
+
+
+def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, Array]:
+    """Both with an axis of runs in front, checked."""
+    outputs, controls = as_float_array(outputs), as_float_array(controls)
+    for what, array in ((name, outputs), ("controls", controls)):
+        if not eqx.is_inexact_array(array) or array.ndim not in (2, 3):
+            got = f"shape {array.shape}" if eqx.is_array(array) else repr(array)
+            raise ValueError(
+                f"{where}: {what} must have shape (steps, size) or (runs, steps, "
+                f"size), got {got}."
+            )
+        check_finite(array, what, where)
+    fits = outputs.ndim == controls.ndim
+    if (
+        not fits
+        or outputs.shape[:-2] != controls.shape[:-2]
+        or (outputs.shape[-2] != controls.shape[-2] + 1 or controls.shape[-2] < 1)
+    ):
+        raise ValueError(
+            f"{where}: {name} must have one step more than controls, got shapes "
+            f"{outputs.shape} and {controls.shape}."
+        )
+    if outputs.ndim == 2:
+        outputs, controls = outputs[None], controls[None]
+    dtype = jnp.result_type(outputs, controls)
+    return outputs.astype(dtype), controls.astype(dtype)
+
+
+@jax.jit
+def _least_squares(regressors, targets):
+    """`(estimate, Certainty in regressors of size 1, scale, noise)`."""
+    rows, p = regressors.shape
+    size = jnp.sqrt(jnp.mean(regressors**2, axis=0))
+    scale = jnp.where(size > 0, size, 1)
+    scaled = regressors / scale
+    operator = lx.MatrixLinearOperator(scaled)
+    solver = lx.SVD(rcond=10 * max(rows, p) * float(jnp.finfo(scaled.dtype).eps))
+
+    def one(target):
+        return lx.linear_solve(operator, target, solver, throw=False).value
+
+    found = jax.vmap(one, in_axes=1)(targets)
+    rest = targets - scaled @ found.T
+    noise = jnp.sqrt(jnp.sum(rest**2, axis=0) / max(rows - p, 1))
+    # Unknown where its spread is the size of the outputs themselves.
+    typical = jnp.sqrt(jnp.mean(targets**2, axis=0))
+    typical = jnp.where(typical > 0, typical, 1)
+    certainty = Certainty.of(scaled, jnp.max(noise / typical), 1.0)
+    return found / scale, certainty, scale, noise, typical, rows
+
+
+def _identified(model, names, fit, reach) -> Identified:
+    estimate, certainty, scale, noise, typical, rows = fit
+    worst = jnp.max(noise / typical)
+    # All outputs share the regressors, and differ in their noise alone.
+    unit = certainty.std / jnp.where(worst > 0, worst, 1)
+    std = noise[:, None] * unit / scale
+    std = jnp.where(jnp.isinf(certainty.std), jnp.inf, jnp.where(worst > 0, std, 0))
+    known = certainty.identifiable & (rows >= len(names))
+    finite = jnp.all(jnp.isfinite(estimate))
+    return Identified(
+        model=model,
+        names=tuple(names),
+        estimate=estimate,
+        std=std,
+        low=estimate - reach * std,
+        high=estimate + reach * std,
+        directions=certainty.directions,
+        spread=certainty.spread,
+        identifiable=known,
+        noise=noise,
+        result=outcome(known, _SOLVED, finite),
+    )
+
+
+_SOLVED = lx.RESULTS.successful
+
+
+def _realised(found, p, m, a, b, delay, dt) -> LinearDynamics:
+    """The dynamics whose state holds what is looked back on."""
+    held = b + delay - 2
+    n = a * p + held * m
+    A, B = jnp.zeros((n, n), found.dtype), jnp.zeros((n, m), found.dtype)
+    A = A.at[:p, : a * p].set(found[:, : a * p])
+    for j in range(b):
+        block = found[:, a * p + j * m : a * p + (j + 1) * m]
+        lag = delay + j
+        if lag == 1:
+            B = B.at[:p].set(block)
+        else:
+            start = a * p + (lag - 2) * m
+            A = A.at[:p, start : start + m].set(block)
+    for i in range(1, a):
+        A = A.at[i * p : (i + 1) * p, (i - 1) * p : i * p].set(jnp.eye(p))
+    for j in range(held):
+        rows = slice(a * p + j * m, a * p + (j + 1) * m)
+        if j == 0:
+            B = B.at[rows].set(jnp.eye(m))
+        else:
+            before = slice(a * p + (j - 1) * m, a * p + j * m)
+            A = A.at[rows, before].set(jnp.eye(m))
+    C = jnp.eye(p, n, dtype=found.dtype)
+    return LinearDynamics(A, B, C, dt=dt)

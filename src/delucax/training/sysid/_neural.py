@@ -1,0 +1,246 @@
+"""Neural models, fitted to one step or to several."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._check import check_count, check_key, check_positive, check_step
+from ..._fields import as_float_array, as_module, parameter, positive, weight
+from ..._results import RESULTS
+from ..._typing import PRNGKey
+from ...dynamics import AbstractDynamics
+from ...systems._function import names_of
+from ._linear import runs_of
+
+
+class NeuralDynamics(AbstractDynamics):
+    """A discrete-time map that is a fully connected network,
+
+    `x_next = x + step_scale * network((x - x_mean) / x_scale, u / u_scale)`.
+
+    A neural ODE is [`delucax.Discretized`][] of a
+    [`delucax.systems.NeuralSystem`][]; both are fitted by the same losses.
+
+    **Arguments:**
+
+    - `states`, `controls`: their names, or how many there are.
+    - `width`: units in a hidden layer, 64 by default.
+    - `depth`: hidden layers, 2 by default.
+    - `dt`: the step, 1 by default.
+    - `x_mean`, `x_scale`: shape `(n,)` or a number; 0 and 1 by default.
+    - `u_scale`: shape `(m,)` or a number; 1 by default.
+    - `step_scale`: the size of a step, shape `(n,)` or a number; 1 by default.
+    - `activation`: of the hidden layers, `jnp.tanh` by default.
+    - `key`: a random key, for the first weights.
+
+    **Attributes:** `network`, an `eqx.nn.MLP`, trainable.
+
+    **Raises:** `ValueError` if a size is below 1, a scale is not positive, or there is
+    no key.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        Net = dlx.training.sysid.NeuralDynamics
+        dynamics = Net(2, 1, width=8, depth=1, dt=0.05, key=jax.random.key(0))
+        dynamics(0.0, jnp.ones(2), jnp.zeros(1))
+        ```
+    """
+
+    network: eqx.nn.MLP = weight()
+    dt: Array = parameter()
+    x_mean: Float[Array, "..."] = parameter()
+    x_scale: Float[Array, "..."] = parameter(constraint=positive)
+    u_scale: Float[Array, "..."] = parameter(constraint=positive)
+    step_scale: Float[Array, "..."] = parameter(constraint=positive)
+    state_names: tuple[str, ...] = eqx.field(static=True)
+    control_names: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        states: int | Sequence[str],
+        controls: int | Sequence[str],
+        width: int = 64,
+        depth: int = 2,
+        *,
+        dt: Any = 1.0,
+        x_mean: Any = 0.0,
+        x_scale: Any = 1.0,
+        u_scale: Any = 1.0,
+        step_scale: Any = 1.0,
+        activation: Callable[[Array], Array] = jnp.tanh,
+        key: PRNGKey,
+    ):
+        where = "NeuralDynamics"
+        check_key(key, where)
+        check_step(dt, where)
+        self.state_names = names_of(states, "x", "states", where)
+        self.control_names = names_of(controls, "u", "controls", where)
+        n, m = len(self.state_names), len(self.control_names)
+        self.network = eqx.nn.MLP(
+            n + m,
+            n,
+            check_count(width, "width", where),
+            check_count(depth, "depth", where, least=0),
+            as_module(activation),
+            as_module(jax.nn.identity),
+            key=key,
+        )
+        self.dt = as_float_array(dt)
+        for name, scale, size in (
+            ("x_mean", x_mean, n),
+            ("x_scale", x_scale, n),
+            ("u_scale", u_scale, m),
+            ("step_scale", step_scale, n),
+        ):
+            if name != "x_mean":
+                check_positive(scale, name, where)
+            array = as_float_array(scale)
+            if jnp.shape(array) not in ((), (size,)):
+                raise ValueError(
+                    f"{where}: {name} must be a number or have shape ({size},), got "
+                    f"shape {jnp.shape(array)}."
+                )
+            setattr(self, name, array)
+
+    def advance(self, t, x, u, w):
+        z = jnp.concatenate([(x - self.x_mean) / self.x_scale, u / self.u_scale])
+        x_next = x + self.step_scale * self.network(z)
+        if w is not None:
+            x_next = x_next + w
+        return x_next.astype(x.dtype), RESULTS.successful
+
+
+def windows(
+    states: Any, controls: Any, steps: int, *, dt: Any = 1.0, stride: int = 1
+) -> tuple[Array, Array, Array]:
+    """Stretches of recorded runs: the data of a multi-step fit.
+
+    **Arguments:**
+
+    - `states`: shape `(T + 1, n)`, or runs of it, `(runs, T + 1, n)`.
+    - `controls`: shape `(T, m)`, or `(runs, T, m)`.
+    - `steps`: of a stretch; 1 for a one-step fit.
+    - `dt`: the step, 1 by default.
+    - `stride`: steps between the beginnings of two stretches, 1 by default.
+
+    **Returns:** `(times, states, controls)` of shapes `(N,)`, `(N, steps + 1, n)` and
+    `(N, steps, m)`, for `data=` of [`delucax.training.fit`][].
+
+    **Raises:** `ValueError` on arrays of the wrong shape or kind, or if the runs are
+    shorter than a stretch.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        states, controls = jnp.zeros((101, 2)), jnp.zeros((100, 1))
+        data = dlx.training.sysid.windows(states, controls, 10, dt=0.05)
+        data[1].shape
+        ```
+    """
+    where = "sysid.windows"
+    states, controls = runs_of(states, controls, "states", where)
+    steps = check_count(steps, "steps", where)
+    stride = check_count(stride, "stride", where)
+    check_step(dt, where)
+    runs, total = controls.shape[:2]
+    if steps > total:
+        raise ValueError(
+            f"{where}: steps must be at most the {total} of a run, got {steps}."
+        )
+    begins = np.arange(0, total - steps + 1, stride)
+    inside = begins[:, None] + np.arange(steps + 1)
+    count = runs * len(begins)
+    return (
+        jnp.tile((jnp.asarray(begins) * dt).astype(states.dtype), runs),
+        states[:, inside].reshape(count, steps + 1, -1),
+        controls[:, inside[:, :-1]].reshape(count, steps, -1),
+    )
+
+
+class PredictionError(eqx.Module):
+    r"""The loss of a model of the dynamics: how far its predictions are off,
+
+    `1 / (N steps) sum over stretches and steps of |(x_k - xhat_k) / scale|^2`,
+
+    with `xhat` what the recorded controls lead to from the first state of a stretch, by
+    the model alone. A stretch of one step is a one-step fit; longer ones make the model
+    answer for its own errors. Angles are compared by `model.difference`.
+
+    **Arguments:** `scale`: of each state, a number or shape `(n,)`; 1 by default.
+
+    **Returns:** from a call `loss(model, batch, key)`, with `model` any dynamics and
+    `batch` as [`delucax.training.sysid.windows`][] makes it: a scalar.
+
+    **Raises:** `ValueError` if `scale` is not positive.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import optax
+
+        key = jax.random.key(0)
+        true = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        controls = jax.random.normal(key, (100, 1))
+        states = dlx.open_loop(true, [3.0, 0.0], controls)
+        field = dlx.systems.NeuralSystem(2, 1, width=8, depth=1, key=key)
+        fitted = dlx.training.fit(
+            dlx.training.sysid.PredictionError(),
+            dlx.Discretized(field, dt=0.05),
+            optax.adam(1e-2),
+            steps=20,
+            key=key,
+            data=dlx.training.sysid.windows(states, controls, 5, dt=0.05),
+            batch_size=32,
+        )
+        fitted.model.system
+        ```
+    """
+
+    scale: Float[Array, "..."] = parameter(1.0, constraint=positive)
+
+    def __check_init__(self):
+        check_positive(self.scale, "scale", "PredictionError")
+
+    def __call__(
+        self, model: AbstractDynamics, batch: tuple[Array, Array, Array], key: PRNGKey
+    ) -> Array:
+        """The loss.
+
+        **Arguments:** `model`: the dynamics. `batch`: stretches. `key`: not used.
+
+        **Returns:** a scalar.
+        """
+        del key
+        if not isinstance(model, AbstractDynamics):
+            raise ValueError(
+                "PredictionError: model must be an AbstractDynamics, got "
+                f"{type(model).__name__}."
+            )
+
+        def stretch(t, states, controls):
+            def step(x, inputs):
+                k, u, seen = inputs
+                x_next, _ = model.advance(t + k * model.dt, x, u, None)
+                off = model.difference(x_next, seen) / self.scale
+                return x_next.astype(x.dtype), jnp.sum(off**2)
+
+            inputs = (jnp.arange(controls.shape[0]), controls, states[1:])
+            return jnp.mean(lax.scan(jax.checkpoint(step), states[0], inputs)[1])
+
+        return jnp.mean(jax.vmap(stretch)(*batch))

@@ -1,0 +1,202 @@
+"""Iterative learning, on the paper's problems: published traces to all their digits."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x64, thorough, user_error
+
+import delucax as dlx
+from delucax.planning._lq import in_sequence
+from delucax.planning._problem import model, Problem, roll_out
+
+
+pytestmark = needs_x64
+ILC, iGPC = dlx.controllers.ILC, dlx.controllers.iGPC
+
+
+def problem(dynamics, cost, x0):
+    return Problem(dynamics, cost, x0, jnp.zeros(()), *(None,) * 5)
+
+
+@jax.jit
+def pass_back(problem, states, controls):
+    stages = model(problem, states, controls, None, False)
+    return in_sequence(stages, jnp.zeros(()), False)
+
+
+def printed(value, number):
+    """Whether a value agrees with a number to all its digits."""
+    digits = len(str(number).partition(".")[2])
+    return round(float(value), digits) == float(str(number))
+
+
+def run_with(plan, states, controls, policy):
+    """A plan whose first run takes the last step of the warm-up once more, as the
+    original did."""
+    where = lambda p: (p.states, p.controls, p.gains)
+    return eqx.tree_at(where, plan, (states, controls - policy.k, policy.K))
+
+
+@pytest.fixture(scope="module")
+def windy():
+    """The quadrotor, planned without wind, in a wind of 0.4."""
+    env = dlx.make("planar_quadrotor")
+    plant = dlx.make("planar_quadrotor", wind="dissipative", wind_strength=0.4)
+    x0, (_, hover) = env.initial_state, env.dynamics.equilibrium()
+    sim = problem(env.dynamics, env.cost, x0)
+
+    @jax.jit
+    def follow(states, controls, k, K, length):
+        return roll_out(sim, states, controls, K, k, length, None)
+
+    U = jnp.tile(hover, (100, 1))
+    X = dlx.open_loop(env.dynamics, x0, U)
+    plan = dlx.planning.ilqr(env.dynamics, env.cost, x0, U)
+    # Eight iterations of the original's warm-up, which lengthened its step by a tenth
+    # each time, and took the one before.
+    for i in range(8):
+        policy = pass_back(sim, X, U)
+        X, U, _ = follow(X, U, policy.k, policy.K, 0.5 * 1.1**i)
+    given = plant.dynamics, env.dynamics, env.cost
+    return *given, run_with(plan, X, U, policy)
+
+
+def test_learning_in_wind(windy):
+    run = ILC(*windy, step=0.2)
+    assert printed(run.trace[0], 4487.19)
+    assert printed(run.cost, 118.05) and run.rollouts == 57
+    assert run.result == dlx.RESULTS.successful and run.iterations == 40
+    assert jnp.all(jnp.diff(run.trace) <= 0)
+    # The plan is what the plant did, and a controller that does it again.
+    plant, _, cost, _ = windy
+    followed = dlx.open_loop(plant, run.states[0], run.controls)
+    assert_close(followed, run.states, atol=1e-6)
+    env = dlx.Environment(plant, cost, initial_state=run.states[0], horizon=100)
+    again = dlx.rollout(env, run, key=jax.random.key(0))
+    assert_close(again.total_cost, run.cost, rtol=1e-8)
+
+
+def test_learning_in_wind_and_online(windy):
+    options = dict(step=0.2, learning_rate=0.001)
+    run = iGPC(*windy, indices="deluca", **options)
+    assert printed(run.trace[0], 4487.19)
+    assert printed(run.cost, 100.72) and run.rollouts == 55
+    assert printed(run.trace[12], 414)  # after 15 runs
+    ours = iGPC(*windy, **options)
+    assert 100 < ours.cost < 104
+    # Without a rate it learns nothing online.
+    plain = iGPC(*windy, step=0.2, learning_rate=0, anneal=False, iterations=3)
+    same = ILC(*windy, step=0.2, iterations=3)
+    assert_close(plain.trace, same.trace, rtol=1e-9)
+
+
+class Arm(dlx.AbstractDynamics):
+    """The reacher with the offset of its tip among the states, as in the original."""
+
+    arm: dlx.AbstractDynamics
+    cost: dlx.AbstractCost
+    state_names = ("s", "e", "ds", "de", "x", "y")
+    control_names = ("s", "e")
+
+    @property
+    def dt(self):
+        return self.arm.dt
+
+    def advance(self, t, x, u, w):
+        angles, result = self.arm.advance(t, x[:4], u, None)
+        return self.seen(angles), result
+
+    def seen(self, angles):
+        return jnp.concatenate([angles, self.cost.offset(angles)])
+
+
+class ChargedNext(dlx.AbstractCost):
+    """Of the next state in place of this one, of which the original took the
+    derivatives all the same; less what the first state is charged."""
+
+    first: jax.Array
+
+    def __call__(self, t, x, u):
+        return x[4] ** 2 + x[5] ** 2 + 0.1 * (u @ u)
+
+    def final(self, t, x):
+        return jax.lax.stop_gradient(x[4] ** 2 + x[5] ** 2) - self.first
+
+
+@thorough
+def test_an_arm_under_gravity():
+    def arm(gravity):
+        env = dlx.make("reacher", gravity=gravity)
+        return Arm(env.dynamics, env.cost), env.initial_state
+
+    sim, start = arm(0.0)
+    plant, _ = arm(-10.0)
+    x0, U = sim.seen(start), jnp.zeros((200, 2))
+    cost = ChargedNext(x0[4] ** 2 + x0[5] ** 2)
+    options = dict(line_search="deluca", tolerance=0.0, throw=False)
+    plans = [
+        dlx.planning.ilqr(sim, cost, x0, U, max_iterations=n, **options) for n in (4, 5)
+    ]
+    trace = [29.7662, 11.2718, 11.1185, 11.1127, 11.1127, 11.1125]
+    np.testing.assert_array_equal(np.asarray(plans[1].trace).round(4), trace)
+    policy = pass_back(problem(sim, cost, x0), plans[0].states, plans[0].controls)
+    plan = run_with(plans[1], plans[1].states, plans[1].controls, policy)
+    learned = ILC(plant, sim, cost, plan, iterations=10)
+    assert printed(learned.trace[0], 2413.706)
+    assert printed(learned.cost, 782.81) and learned.rollouts == 16
+    options = dict(learning_rate=0.01, anneal=False, indices="deluca")
+    online = iGPC(plant, sim, cost, plan, iterations=10, **options)
+    assert printed(online.cost, "780.20") and online.rollouts == 15
+    # And no more can be learned: the search fails, and it says so.
+    rest = ILC(plant, sim, cost, plan)
+    assert rest.result == dlx.RESULTS.no_descent and rest.iterations < 40
+    assert_close(rest.cost, learned.cost, rtol=1e-7)
+
+
+@thorough
+def test_batches_of_winds(windy):
+    _, sim, cost, plan = windy
+
+    def learned(strength, learner):
+        plant = dlx.make("planar_quadrotor", wind="constant", wind_strength=strength)
+        return learner(plant.dynamics, sim, cost, plan, iterations=5, throw=False).trace
+
+    for learner in (ILC, iGPC):
+        winds = jnp.array([0.05, 0.1])
+        batch = jax.vmap(lambda s, learner=learner: learned(s, learner))(winds)
+        for i, wind in enumerate(winds):
+            assert_close(batch[i], learned(wind, learner), rtol=1e-8)
+
+
+@pytest.mark.parametrize("learner", [ILC, pytest.param(iGPC, marks=thorough)])
+def test_bounds_disturbances_and_what_diverges(learner):
+    sim = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+    plant = dlx.Discretized(dlx.systems.Pendulum(mass=1.2), dt=0.1)
+    cost = dlx.costs.Quadratic([1.0, 0.1], [0.1], final=[20.0, 2.0])
+    x0, U, bounds = jnp.array([1.3, 0.0]), jnp.zeros((12, 1)), (-4.0, 4.0)
+    plan = dlx.planning.ilqr(sim, cost, x0, U, bounds=bounds)
+    push = 0.02 * jnp.ones((12, 2))
+    run = learner(plant, sim, cost, plan, w=push, iterations=8)
+    assert run.cost < run.trace[0]
+    assert jnp.all(jnp.abs(run.controls) <= 4) and jnp.any(run.controls == -4)
+    followed = dlx.open_loop(plant, x0, run.controls, push)
+    assert_close(followed, run.states, atol=1e-8)
+    field = lambda t, x, u, w: jnp.stack([x[1], jnp.exp(100 * x[0]) + u[0]])
+    system = dlx.system(field, states=("angle", "rate"), controls=("u",))
+    wild = dlx.Discretized(system, dt=0.1)
+    lost = learner(wild, sim, cost, plan, throw=False)
+    assert lost.result == dlx.RESULTS.diverged and lost.iterations == 0
+    with pytest.raises(RuntimeError, match="NaN or infinite"):
+        learner(wild, sim, cost, plan)
+    with user_error(match="plan must be a delucax.planning.Plan"):
+        learner(plant, sim, cost, U)
+    with user_error(match="model must have the states and controls of plan"):
+        learner(plant, dlx.make("planar_quadrotor").dynamics, cost, plan)
+    with user_error(match="w must have shape"):
+        learner(plant, sim, cost, plan, w=push[:3])
+    with user_error(match="indices must be"):
+        iGPC(plant, sim, cost, plan, indices="late")
+    with user_error(match="learning_rate must be positive"):
+        iGPC(plant, sim, cost, plan, learning_rate=-1.0)

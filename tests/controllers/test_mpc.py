@@ -1,0 +1,161 @@
+"""Model predictive control over every planner; learning online around a plan."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x64, once, thorough, user_error
+
+import delucax as dlx
+
+
+MPC = dlx.controllers.MPC
+KEY = jax.random.key(0)
+A, B = jnp.array([[1.0, 0.1], [0.3, 0.98]]), jnp.array([[0.0], [0.1]])
+
+
+def regulated(**options):
+    dynamics = dlx.LinearDynamics(A, B, dt=0.1)
+    Q, R = jnp.eye(2), 0.1 * jnp.eye(1)
+    lqr = dlx.controllers.LQR(dynamics, Q, R)
+    X = dlx.riccati.dare(A, B, Q, R).X
+    cost = dlx.costs.Quadratic(Q, R, final=X)
+    start = dict(initial_state=jnp.array([0.5, -0.3]), horizon=12)
+    return dlx.Environment(dynamics, cost, **start, **options), lqr
+
+
+@needs_x64
+def test_without_bounds_it_is_the_regulator():
+    env, lqr = regulated(disturbance=dlx.disturbances.Gaussian(0.05, size=2))
+    mpc = MPC(env.dynamics, env.cost, 5)
+    run, known = (dlx.rollout(env, c, key=KEY) for c in (mpc, lqr))
+    assert_close(run.controls, known.controls, rtol=1e-3, atol=1e-5)
+
+
+@needs_x64
+def test_a_plan_starts_from_the_last_one():
+    env, _ = regulated()
+    mpc = MPC(env.dynamics, env.cost, 6, bounds=(-2.0, 2.0))
+    step = jax.jit(lambda t, y, state: mpc(t, y, state))
+    x, state = env.initial_state, mpc.init()
+    for k in range(3):
+        plan = dlx.planning.ilqr(
+            env.dynamics, env.cost, x, state.controls, bounds=(-2.0, 2.0)
+        )
+        u, state = step(0.1 * k, x, state)
+        assert_close(u, plan.controls[0], atol=1e-9)
+        later = jnp.concatenate([plan.controls[1:], plan.controls[-1:]])
+        assert_close(state.controls, later, atol=1e-9)
+        assert state.iterations == plan.iterations and state.failures == 0
+        x = env.dynamics(0.1 * k, x, u)
+    # Where the model is right it does what it planned, and finds nothing to change.
+    assert state.iterations <= 2
+
+
+@once
+@pytest.mark.parametrize(
+    "planner, options",
+    [
+        pytest.param(dlx.planning.ilqr, dict(max_iterations=5), marks=thorough),
+        (dlx.planning.mppi, dict(iterations=2, samples=64, temperature=0.1)),
+        (dlx.planning.cem, dict(iterations=3, samples=32, elites=8)),
+    ],
+    ids=["ilqr", "mppi", "cem"],
+)
+def test_every_planner_balances(planner, options):
+    env = dlx.make("pendulum", dt=0.02)
+    mpc = MPC(
+        env.dynamics, env.cost, 25, planner=planner, bounds=(-2.0, 2.0), **options
+    )
+    x0 = jnp.array([0.1, 0.0])
+    held = dlx.rollout(env, mpc, key=KEY, x0=x0, horizon=60)
+    fallen = dlx.rollout(env, dlx.controllers.Zero(1), key=KEY, x0=x0, horizon=60)
+    assert held.total_cost < 0.2 * fallen.total_cost
+    assert jnp.all(jnp.abs(held.controls) <= 2)
+
+
+class Tracked(dlx.AbstractCost):
+    def __call__(self, t, x, u):
+        return (x[0] - 0.1 * t) ** 2 + 1e-4 * u @ u
+
+
+@needs_x64
+def test_a_cost_that_depends_on_time():
+    env, _ = regulated()
+    env = dlx.Environment(env.dynamics, Tracked(), initial_state=jnp.zeros(2))
+    run = dlx.rollout(env, MPC(env.dynamics, Tracked(), 8), key=KEY, horizon=40)
+    assert_close(run.states[20:, 0], 0.1 * run.times[20:], atol=0.02)
+
+
+@needs_x64
+def test_a_plan_that_fails_is_seen():
+    field = lambda t, x, u, w: jnp.stack([x[0] ** 3 + u[0]])
+    system = dlx.system(field, states=("x",), controls=("u",))
+    dynamics = dlx.Discretized(system, dt=0.5)
+    cost = dlx.costs.Quadratic([1.0], [1.0])
+    calm = MPC(dynamics, cost, 12, bounds=(-1.0, 1.0), throw=False)
+    step = jax.jit(lambda y, state: calm(0.0, y, state))
+    u, state = step(jnp.array([0.1]), calm.init())
+    assert state.failures == 0 and state.result == dlx.RESULTS.successful
+    kept = state.controls
+    u, state = step(jnp.array([9.0]), state)
+    assert state.failures == 1 and state.result == dlx.RESULTS.diverged
+    # What was planned a step before; then a new beginning.
+    assert_close(u, kept[0])
+    assert_close(state.controls, calm.start)
+    u, state = step(jnp.array([0.1]), state)
+    assert state.failures == 1 and state.result == dlx.RESULTS.successful
+    loud = MPC(dynamics, cost, 12, bounds=(-1.0, 1.0))
+    with pytest.raises(Exception, match="NaN or infinite"):
+        jax.block_until_ready(loud(0.0, jnp.array([9.0]), loud.init())[0])
+    # Too few iterations are no failure of that kind, but are seen.
+    short = MPC(dynamics, cost, 12, max_iterations=1)
+    _, state = short(0.0, jnp.array([0.2]), short.init())
+    assert state.failures == 1 and state.result == dlx.RESULTS.not_converged
+
+
+@once
+def test_bad_arguments_are_named():
+    env, _ = regulated()
+    given = env.dynamics, env.cost
+    with user_error(match="dynamics must be an AbstractDynamics.*Environment"):
+        MPC(env, env.cost, 5)
+    with user_error(match="cost must be an AbstractCost"):
+        MPC(env.dynamics, lambda t, x, u: 0.0, 5)
+    with user_error(match="horizon must be a whole number"):
+        MPC(*given, 0)
+    with user_error(match="samples is no option of the planner; it has states"):
+        MPC(*given, 5, samples=3)
+    with user_error(match="x0 is no option"):
+        MPC(*given, 5, x0=0.0)
+    with user_error(match="planner must be a function"):
+        MPC(*given, 5, planner=3)
+    with user_error(match="bounds must be numbers or vectors of 1"):
+        MPC(*given, 5, bounds=(-jnp.ones(2), jnp.ones(2)))
+    with user_error(match="low <= high"):
+        MPC(*given, 5, bounds=(1.0, -1.0))
+    with user_error(match=r"start must have shape .* = \(5, 1\)"):
+        MPC(*given, 5, start=jnp.zeros((4, 1)))
+    with user_error(match="one random key"):
+        MPC(*given, 5, planner=dlx.planning.cem).init()
+
+
+@needs_x64
+def test_learning_online_around_a_plan():
+    """The gradient perturbation controller whose base is a plan: better than the plan
+    alone where the plant is pushed as the plan did not foresee."""
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+    cost = dlx.costs.Quadratic([1.0, 0.1], [0.1])
+    x0 = jnp.array([1.0, 0.0])
+    plan = dlx.planning.ilqr(dynamics, cost, x0, jnp.zeros((150, 1)))
+    learner = dlx.controllers.GPC(dynamics, cost, base=plan, memory=5, horizon=15)
+    times = jnp.arange(150.0)
+    shock = 0.2 * jnp.sin(times / (2 * jnp.pi))
+    w = jnp.stack([0 * shock, jnp.where(times > 50, shock, 0)], axis=1)
+    env = dlx.Environment(dynamics, cost, horizon=150)
+    run = lambda c, w: dlx.rollout(env, c, key=KEY, x0=x0, w=w)
+    alone, around = run(plan, w), run(learner, w)
+    assert around.total_cost < 0.9 * alone.total_cost
+    still = run(learner, 0 * w)
+    assert_close(still.controls, plan.controls, atol=1e-8)
+    np.testing.assert_allclose(still.total_cost, plan.cost, rtol=1e-9)

@@ -1,0 +1,570 @@
+"""The experiment tool, in one process."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from helpers import once, user_error
+
+import delucax as dlx
+from delucax import experiments
+from delucax.experiments import experiment, Results
+from delucax.experiments._results import TIMES
+
+
+pytestmark = once
+mark, param = experiment.mark, experiment.param
+
+
+def values(results):
+    return [row.get("value") for row in results.rows]
+
+
+def timeless(results):
+    """The rows without what differs between two runs of the same thing."""
+    return json.dumps(
+        [{k: v for k, v in row.items() if k not in TIMES} for row in results.rows]
+    )
+
+
+def quiet(made, **options):
+    return made.run(progress=False, **options)
+
+
+# What is parametrized
+
+
+@experiment.parametrize("a, b", [(1, 2), param(3, 4, id="big"), (5, None)])
+@experiment.parametrize("c", ["x", param("y", marks=mark.slow)], ids=str.upper)
+def product(a, b, c):
+    return f"{a}{b}{c}"
+
+
+def test_products_ids_and_values():
+    ids = [case.id for case in product.cases(slow=True)]
+    assert ids == [
+        *("product[1-2-X]", "product[1-2-Y]", "product[big-X]", "product[big-Y]"),
+        *("product[5-None-X]", "product[5-None-Y]"),
+    ]
+    results = quiet(product)
+    assert values(results) == ["12x", "34x", "5Nonex"]
+    assert results.parameters == ("a", "b", "c")
+    assert results.rows[1]["a"] == 3 and results.rows[2]["b"] is None
+    assert product(1, 2, "z") == "12z"
+
+
+@pytest.mark.parametrize(
+    "select, marks, count",
+    [
+        ("", "", 3),
+        ("BIG", "", 1),
+        ("not (big or none)", "", 1),
+        ("", "slow", 3),
+        ("big", "not slow", 1),
+        ("y and 1-2", "slow", 1),
+    ],
+)
+def test_selection(select, marks, count):
+    assert len(product.cases(select, marks)) == count
+
+
+@pytest.mark.parametrize("wrong", ["a and", "(a", "a b", "or a", ")", "not"])
+def test_an_expression_that_cannot_be_read(wrong):
+    with user_error(match="select must be words joined by and, or, not"):
+        product.cases(wrong)
+
+
+# Fixtures
+
+made = []
+
+
+@experiment.fixture(scope="process")
+def plant(length):
+    made.append(length)
+    yield {"length": length}
+    made.append(-length)
+
+
+@experiment.fixture
+def tool(plant):
+    made.append("tool")
+    yield plant["length"] + 1
+    made.append("done")
+
+
+@experiment.fixture(params=[10, 20], ids=["ten", "twenty"])
+def scale(param):
+    return 2 * param
+
+
+def test_fixtures_are_made_once_a_scope_and_let_go():
+    made.clear()
+
+    @experiment.parametrize("length", [1, 2])
+    def use(tool, scale):
+        return tool * scale
+
+    results = quiet(use)
+    assert [row["case"] for row in results.rows] == [
+        *("use[1-ten]", "use[1-twenty]", "use[2-ten]", "use[2-twenty]"),
+    ]
+    assert values(results) == [40, 80, 60, 120]
+    one, two = ["tool", "done"] * 2, ["tool", "done"] * 2
+    assert made == [1, *one, 2, *two, -2, -1]
+
+
+def test_a_fixture_given_by_name():
+    @experiment.fixture
+    def offset():
+        return 5
+
+    @experiment.use(offset=offset)
+    def shifted(offset):
+        return offset
+
+    assert values(quiet(shifted)) == [5]
+
+
+# How the function is called
+
+
+def test_numbers_are_traced_and_what_must_be_known_is_not():
+    traced = []
+
+    @experiment.parametrize("length", [0.9, 1.0, 1.1])
+    @experiment.parametrize("horizon", [3, 4])
+    @experiment.parametrize("kind", ["cost", "end"])
+    @experiment.seeds(2)
+    def cost(length, horizon, kind, key):
+        env = dlx.make("pendulum", length=length)
+        run = dlx.rollout(env, dlx.controllers.Zero(1), key=key, horizon=horizon)
+        traced.append(horizon)
+        return run.total_cost if kind == "cost" else run.final_state[0]
+
+    results = quiet(cost)
+    assert len(results.rows) == 24 and not results.failed
+    # Compiled for each horizon and kind, and for no length.
+    assert sorted(traced) == [3, 3, 4, 4]
+    keys = [jax.random.key(0), jax.random.key(1)]
+    env = dlx.make("pendulum", length=1.1)
+    for row, key in zip(
+        results.where(length=1.1, horizon=4, kind="cost").rows, keys, strict=True
+    ):
+        alone = dlx.rollout(env, dlx.controllers.Zero(1), key=key, horizon=4)
+        np.testing.assert_allclose(row["value"], alone.total_cost, rtol=1e-6)
+    first, again = results.rows[0], results.where(length=1.0).rows[0]
+    assert first["compile_seconds"] > 10 * again["compile_seconds"]
+    assert first["run_seconds"] > 0
+
+
+def test_modules_are_traced_by_their_arrays():
+    count = 0
+    gains = [dlx.controllers.Linear(k * jnp.ones((1, 2))) for k in (1.0, 2.0)]
+
+    @experiment.parametrize("controller", [*gains, dlx.controllers.Zero(1)])
+    def act(controller, key):
+        nonlocal count
+        count += 1
+        return controller(0.0, jnp.ones(2), controller.init())[0][0]
+
+    results = quiet(act)
+    assert values(results) == [-2.0, -4.0, 0.0] and count == 2
+    assert [row["controller"] for row in results.rows] == [
+        *("controller0", "controller1", "controller2"),
+    ]
+
+
+def test_with_a_seed_it_is_called_as_it_is():
+    @experiment.seeds([3, 1])
+    def plain(seed):
+        return {"twice": 2 * seed, "kind": type(seed).__name__, "path": np.ones(2)}
+
+    rows = quiet(plain).rows
+    assert [row["seed"] for row in rows] == [3, 1]
+    assert rows[0]["twice"] == 6 and rows[1]["path"] == [1.0, 1.0]
+    assert {row["kind"] for row in rows} == {"int"}
+
+
+def test_seeds_are_spread_over_a_mesh():
+    mesh = jax.make_mesh((jax.device_count(),), ("seeds",))
+
+    @experiment.seeds(2 * jax.device_count())
+    def draw(key):
+        return jax.random.normal(key)
+
+    assert values(quiet(draw, mesh=mesh)) == values(quiet(draw))
+
+
+# Failures
+
+
+def test_a_failing_case_harms_no_other():
+    @experiment.parametrize(
+        "n",
+        [
+            *(0, 1, 2, 3),
+            param(4, marks=mark.xfail("known")),
+            param(5, marks=mark.xfail),
+            param(6, marks=mark.skip("no")),
+        ],
+    )
+    def fragile(n):
+        if n == 1:
+            raise RuntimeError("one is bad")
+        if n == 2:
+            raise SystemExit(3)
+        if n == 3:
+            return object()
+        return 1 // (4 - n)
+
+    results = quiet(fragile)
+    assert [row["status"] for row in results.rows] == [
+        *("passed", "failed", "failed", "failed"),
+        *("failed as expected", "passed unexpectedly"),
+    ]
+    rows = results.rows
+    assert rows[1]["error"] == "RuntimeError: one is bad"
+    assert "in fragile" in rows[1]["traceback"]
+    assert "SystemExit" in rows[2]["error"] and "must be a number" in rows[3]["error"]
+    assert len(results.failed) == 4
+
+
+def test_what_cannot_be_traced_fails_with_its_own_error():
+    @experiment.parametrize("n", [1, 2])
+    def wrong(n, key):
+        raise ValueError(f"not {n}")
+
+    assert [row["error"] for row in quiet(wrong).rows] == [
+        *("ValueError: not 1", "ValueError: not 2"),
+    ]
+
+
+# The store
+
+
+calls = []
+
+
+@experiment.parametrize("x", [1.0, 2.0, 3.0])
+@experiment.seeds(2)
+def stored(x, seed):
+    calls.append((x, seed))
+    if x == 2.0:
+        raise ValueError("two")
+    return {"y": x / 3 + seed, "z": float("nan") if x == 3.0 else 1}
+
+
+def ran(made, path, **options):
+    calls.clear()
+    results = quiet(made, store=path, **options)
+    return results, list(calls)
+
+
+def test_only_what_is_missing_is_run(tmp_path):
+    path = tmp_path / "new" / "results.jsonl"
+    first, done = ran(stored, path)
+    assert len(done) == 5  # the second seed of what failed is not tried
+    again, done = ran(stored, path)
+    assert done == [] and timeless(again) == timeless(first)
+    assert timeless(Results.read(path)) == timeless(first)
+    _, done = ran(stored, path, retry=True)
+    assert done == [(2.0, 0)]
+    wider, done = ran(stored, path, seeds=3, select="not 2.0")
+    assert done == [(1.0, 2), (3.0, 2)] and len(wider.rows) == 6
+    _, done = ran(stored, path, fresh=True, select="1.0")
+    assert done == [(1.0, 0), (1.0, 1)]
+
+
+def test_a_change_of_code_or_values_runs_again(tmp_path):
+    path = tmp_path / "results.jsonl"
+
+    def build(factor, helper, values, fixture=1):
+        @experiment.fixture
+        def offset():
+            return fixture
+
+        @experiment.use(offset=offset)
+        @experiment.parametrize("x", values, ids=["a", "b"])
+        def changed(x, offset):
+            calls.append(x)
+            return factor * helper(x) + offset
+
+        return changed
+
+    def double(x):
+        return 2 * x
+
+    def triple(x):
+        return 3 * x
+
+    assert ran(build(1.0, double, [1, 2]), path)[1] == [1, 2]
+    assert ran(build(1.0, double, [1, 2]), path)[1] == []
+    assert ran(build(1.0, double, [1, 3]), path)[1] == [3]
+    assert ran(build(2.0, double, [1, 3]), path)[1] == [1, 3]
+    assert ran(build(2.0, triple, [1, 3]), path)[1] == [1, 3]
+    assert ran(build(2.0, triple, [1, 3], fixture=2), path)[1] == [1, 3]
+    results, done = ran(build(2.0, triple, [1, 3], fixture=2), path)
+    assert done == [] and values(results) == [8.0, 20.0]
+
+
+HASHES = """
+import jax, jax.numpy as jnp, optax, diffrax
+import delucax as dlx
+from delucax.experiments._hash import fingerprint
+odd = lambda x: x in {"a", "b", "c", "d"}
+things = [
+    {"b", "a", "d", "c"}, odd, optax.adam(0.1), jnp.sin, jnp.arange(3.0),
+    jax.random.key(3), diffrax.Tsit5(), dlx.controllers.Linear(jnp.ones((1, 2))),
+    [1, 1.0, True, None, "x", (1,), {"k": 2}], jax.jit(odd), dict,
+]
+assert len({fingerprint(thing) for thing in things}) == len(things) - 1  # jit(odd)
+print(*map(fingerprint, things))
+"""
+
+
+def test_the_hash_is_that_of_another_process(capsys):
+    exec(HASHES, {"__name__": "__main__"})
+    there = subprocess.run(
+        [sys.executable, "-c", HASHES],
+        env={**os.environ, "PYTHONHASHSEED": "1"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert capsys.readouterr().out == there.stdout
+
+
+def test_a_line_cut_short_is_run_again(tmp_path):
+    path = tmp_path / "results.jsonl"
+    whole, _ = ran(stored, path)
+    content = path.read_bytes()
+    # Anywhere at all, the header too.
+    for end in (0, 7, *range(200, len(content), 97)):
+        path.write_bytes(content[:end])
+        again, _ = ran(stored, path)
+        assert timeless(again) == timeless(whole)
+        assert path.read_bytes().count(b"\n") >= 4
+        json.loads(path.read_bytes().splitlines()[-1])
+
+
+def test_a_full_disk_keeps_what_was_done(tmp_path, monkeypatch):
+    path = tmp_path / "results.jsonl"
+    write, room = os.write, 1500
+
+    def full(file, content):
+        nonlocal room
+        if room <= 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written = write(file, content[:room])
+        room -= written
+        return written
+
+    monkeypatch.setattr(os, "write", full)
+    with user_error(OSError, match="No space left.*results so far are kept"):
+        ran(stored, path)
+    monkeypatch.undo()
+    kept = len(Results.read(path).rows)
+    assert 0 < kept < 6
+    results, done = ran(stored, path)
+    assert len(results.rows) == 6 and len(done) < 5
+
+
+def test_files_that_are_not_ours(tmp_path):
+    path = tmp_path / "results.jsonl"
+    path.write_text('{"format": "delucax-results", "version": 99}\n')
+    with user_error(match="has format 99, and this version of delucax reads"):
+        quiet(stored, store=path)
+    assert path.read_text().count("\n") == 1  # left as it is
+    path.write_text("x,y\n1,2\n")
+    with user_error(match="is not a results file of delucax"):
+        quiet(stored, store=path)
+    with user_error(match="is a folder"):
+        quiet(stored, store=tmp_path)
+    with user_error(FileNotFoundError, match="there is no file"):
+        Results.read(tmp_path / "none.jsonl")
+    path.unlink()
+    ran(stored, path)
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join([*lines[:2], lines[2][:40] + "\n", *lines[3:]]))
+    with user_error(match="line 3 of .* is damaged"):
+        quiet(stored, store=path)
+
+
+def test_two_runs_do_not_write_one_file(tmp_path):
+    path = tmp_path / "results.jsonl"
+
+    def nested():
+        with user_error(match="is being written by another run"):
+            ran(stored, path)
+        return 1
+
+    assert values(quiet(experiment(nested), store=path)) == [1]
+
+
+# Bad input
+
+
+def use_x(x):
+    return x
+
+
+def use_key(x, key):
+    return x
+
+
+WRONG = {
+    "a name twice": (
+        lambda: experiment.parametrize("x, x", [(1, 2)])(use_x),
+        "a name is given twice",
+    ),
+    "stacked twice": (
+        lambda: experiment.parametrize("x", [1])(
+            experiment.parametrize("x", [2])(use_x)
+        ),
+        "use_x: the parameter 'x' is given twice",
+    ),
+    "unknown": (
+        lambda: quiet(experiment.parametrize("xx", [1])(use_x)),
+        "has no argument 'xx'; did you mean 'x'",
+    ),
+    "without value": (
+        lambda: quiet(experiment(use_x)),
+        "the argument 'x' of use_x has no value: parametrize it",
+    ),
+    "wrong number": (
+        lambda: experiment.parametrize("x, y", [(1, 2), (3,)])(use_x),
+        "each value must have 2 parts, for x, y",
+    ),
+    "no values": (lambda: experiment.parametrize("x", [])(use_x), "must have a value"),
+    "a string": (lambda: experiment.parametrize("x", "ab")(use_x), "must be a list"),
+    "ids": (
+        lambda: experiment.parametrize("x", [1, 2], ids=["a"])(use_x),
+        "ids must be 2 strings",
+    ),
+    "the same id": (
+        lambda: experiment.parametrize("x", [1, 2], ids=["a", "a"])(use_x),
+        "the id 'a' is given twice",
+    ),
+    "no name": (lambda: experiment.parametrize("x-y", [1])(use_x), "names must be"),
+    "reserved": (
+        lambda: quiet(experiment.parametrize("seed", [1])(lambda seed: seed)),
+        "no parameter can be called 'seed'",
+    ),
+    "not to be told apart": (
+        lambda: quiet(experiment.parametrize("x", [(i for i in "ab")])(use_x)),
+        "the parameter 'x' of case .* cannot be written down",
+    ),
+    "seeds": (lambda: experiment.seeds(0)(use_x), "seeds must be how many"),
+    "seeds twice": (lambda: experiment.seeds([1, 1])(use_x), "seeds must differ"),
+    "seeds for nothing": (
+        lambda: quiet(
+            experiment.parametrize("x", [1])(experiment.seeds(2)(use_x)),
+        ),
+        "the function takes neither 'key' nor 'seed'",
+    ),
+    "scope": (
+        lambda: experiment.fixture(use_x, scope="module"),
+        "scope must be 'case' or 'process'",
+    ),
+    "no function": (lambda: experiment(3), "function must be a function"),
+    "workers": (lambda: quiet(stored, workers=0), "workers"),
+    "backend": (lambda: quiet(stored, backend="mpi"), "backend must be one of"),
+    "no experiment": (lambda: experiments.run(), "experiments must be one at least"),
+    "one name": (
+        lambda: experiments.run(stored, stored),
+        "must have different names",
+    ),
+    "metric": (
+        lambda: experiments.compare(quiet(stored), by="x", baseline=1.0),
+        r"metric must be a result \(y, z\)",
+    ),
+    "baseline": (
+        lambda: experiments.compare(quiet(stored), by="x", baseline=9, metric="y"),
+        "baseline must be a value of 'x'",
+    ),
+    "parameter": (
+        lambda: experiments.compare(quiet(stored), by="w", baseline=9, metric="y"),
+        "by must be a parameter",
+    ),
+    "ending": (lambda: quiet(stored).export("a.xls"), "to must end in .csv"),
+    "column": (
+        lambda: quiet(stored).export("csv", columns=["nope"]),
+        "there is no column 'nope'",
+    ),
+}
+
+
+@pytest.mark.parametrize("call, message", WRONG.values(), ids=WRONG)
+def test_wrong_arguments_are_named(call, message):
+    with user_error(match=message):
+        call()
+
+
+@pytest.mark.parametrize("name", ["x", "status", "error"])
+def test_a_result_that_would_hide_a_column_fails(name):
+    @experiment.parametrize("x", [1])
+    def clash(x):
+        return {name: 1.0}
+
+    assert f"cannot be called '{name}'" in quiet(clash).rows[0]["error"]
+
+
+# Tables and statistics
+
+
+def test_exports(tmp_path):
+    results = quiet(stored)
+    results.export(tmp_path / "a.csv")
+    frame = pd.read_csv(tmp_path / "a.csv")
+    assert len(frame) == 6 and frame["jax"].iloc[0] == jax.__version__
+    np.testing.assert_array_equal(frame["y"], results.table["y"])
+    results.export(tmp_path / "a.parquet")
+    pd.testing.assert_frame_equal(
+        pd.read_parquet(tmp_path / "a.parquet")[["x", "seed", "y"]],
+        results.table[["x", "seed", "y"]],
+    )
+    markdown = results.export("markdown", columns=["x", "y"])
+    assert markdown.splitlines()[2] == "| 1 | 0.3333 |"
+    latex = results.export(tmp_path / "a.tex", columns=["case", "y"])
+    assert r"stored[1.0] & 0.3333 \\" in latex and (tmp_path / "a.tex").exists()
+
+
+def test_interquartile_mean():
+    assert experiments.interquartile_mean(np.arange(8.0)) == 3.5
+    assert experiments.interquartile_mean([7.0]) == 7.0
+    # Of five, the second and fourth count by three quarters.
+    expected = (0.75 * 2 + 3 + 0.75 * 4) / 2.5
+    assert experiments.interquartile_mean([1, 2, 3, 4, np.inf]) == expected
+    with user_error(match="one at least"):
+        experiments.interquartile_mean([])
+
+
+def test_paired_comparison():
+    """Pairs share most of their noise, and the interval knows it."""
+    rng = np.random.default_rng(0)
+    noise, own = 10 * rng.normal(size=(3, 40)), rng.normal(size=(3, 40))
+
+    @experiment.parametrize("plant", [0, 1, 2])
+    @experiment.parametrize("method", ["a", "b"])
+    @experiment.seeds(40)
+    def cost(plant, method, seed):
+        extra = 1.0 + 0.5 * own[plant, seed] if method == "b" else 0.0
+        return 100 + noise[plant, seed] + extra
+
+    table = experiments.compare(quiet(cost), by="method", baseline="a")
+    b = table.loc["b"]
+    assert b["difference_low"] < b["difference"] < b["difference_high"]
+    assert 0.5 < b["difference_low"] and b["difference_high"] < 1.5
+    assert b["low"] < b["iqm"] < b["high"] and b["high"] - b["low"] > 1.5
+    assert b["pairs"] == 120 and b["below"] < 0.1
+    assert table.loc["a", "difference"] == 0
+    ratio = experiments.compare(quiet(cost), by="method", baseline="a", ratio=True)
+    assert abs(ratio.loc["b", "ratio"] - 1.01) < 0.005

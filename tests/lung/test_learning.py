@@ -1,0 +1,101 @@
+"""Lungs learned from breaths, and controllers learned in lungs."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, once, thorough, tolerance, user_error
+
+import delucax as dlx
+from delucax import lung
+
+
+pytestmark = once
+
+KEY = jax.random.key(0)
+
+
+@pytest.fixture(scope="module")
+def breaths():
+    env = lung.double_compartment(20.0, 20.0)
+    return lung.explore(env, 32, key=KEY, scale=0.3)
+
+
+@pytest.mark.parametrize("published", [False, pytest.param(True, marks=thorough)])
+def test_prediction_is_what_the_dynamics_do(breaths, published):
+    model = lung.LearnedLung(breaths, width=8, published=published, key=KEY)
+    u = breaths.u_in[0]
+    controls = jnp.stack([u, 0 * u], 1)
+    states = dlx.open_loop(model, model.resting(), controls)
+    expected = jax.vmap(model.pressure)(states)[:-1]
+    found = eqx.filter_jit(model.predict)(u)
+    assert_close(found, expected, rtol=tolerance(1e-4, 1e-10))
+    # Given its own predictions for the records, it predicts the same.
+    assert_close(model.one_step(u, found), found, rtol=tolerance(1e-4, 1e-10))
+    # The expiratory valve makes it forget.
+    after = model(0.0, states[7], jnp.array([30.0, 1.0]))
+    assert_close(after, model.resting())
+    assert len(model.state_names) == model.state_size
+
+
+def test_fitting_learns(breaths):
+    train, test = breaths[:24], breaths[24:]
+    model = lung.LearnedLung(train, width=8, boundary=2, key=KEY)
+    few = dict(teacher_steps=60, steps=40, batch_size=None, learning_rate=1e-2)
+    fitted = lung.fit_lungs(model, train, key=KEY, **few).model
+    error = eqx.filter_jit(lung.open_loop_error)
+    assert error(fitted, test) < 0.3 * error(model, test)
+
+
+def test_physics_is_found(breaths):
+    path = "dynamics.dynamics.system."
+    start = lung.LungModel(lung.DoubleCompartment(10.0, 30.0))
+    moved = {path + name: dlx.positive for name in ("resistance", "compliance")}
+    fitted = lung.fit_lungs(
+        start, breaths, key=KEY, steps=80, learning_rate=0.05, trainable=moved
+    ).model
+    assert_close(fitted.system.resistance, 20.0, rtol=0.03)
+    assert_close(fitted.system.compliance, 20.0, rtol=0.05)
+    assert fitted.system.valves.max_flow == start.system.valves.max_flow
+
+
+def test_controller_learns_and_the_grid_knows_the_best():
+    models = lung.stack(
+        [lung.LungModel(lung.SingleCompartment(R)) for R in (5.0, 50.0)]
+    )
+    forward = lung.FeedForward(lung.BreathWaveform(), gain=1.0)
+    start = lung.stack([lung.stack([forward, forward])])
+    few = dict(steps=30, pips=[15.0, 30.0], learning_rate=0.1, horizon=15)
+    fitted = lung.train_controllers(models, start, key=KEY, **few)
+    assert fitted.history.loss[-1] < 0.8 * fitted.history.loss[0]
+    gains = fitted.model.gain[0]
+    assert gains[0] > gains[1]  # the narrow lung needs less flow
+
+    envs = lung.stack([lung.single_compartment(R) for R in (5.0, 50.0)])
+    grid = lung.pid_grid(envs, key=KEY, kp=[0.0, 1.0], ki=[0.0, 3.0], pips=[20.0, 30.0])
+    assert grid.gains.shape == (4, 3) and grid.errors.shape == (2, 4)
+    worst = np.argmax(grid.errors, axis=1)
+    assert np.all(grid.gains[worst] == 0) and np.any(grid.best_of_all() > 0)
+    pid = dlx.controllers.LeakyPID(
+        *grid.best()[0], dt=0.03, reference=lung.BreathWaveform()
+    )
+    own = lung.breath_error(
+        lung.single_compartment(5.0), pid, key=KEY, pips=[20.0, 30.0]
+    )
+    assert_close(jnp.mean(own), jnp.min(grid.errors[0]), rtol=1e-4)
+    least = lung.least_error(lung.single_compartment(5.0), pips=[20.0], steps=150)
+    assert least[0] < own[0]
+
+
+def test_wrong_arguments(breaths):
+    with user_error(match="kind must be 'mlp' or 'cnn', got 'rnn'"):
+        lung.BreathPolicy(lung.BreathWaveform(), 0.03, "rnn", key=KEY)
+    with user_error(match="model must be a LearnedLung or a LungModel"):
+        lung.lung_environment(lung.SingleCompartment())
+    with user_error(match="env must be a task with a breath waveform"):
+        lung.explore(dlx.make("pendulum"), 3, key=KEY)
+    with user_error(match="system must be an AbstractLung"):
+        lung.LungModel(dlx.systems.Pendulum())
+    with user_error(match="trees must be of one structure"):
+        lung.stack([lung.SingleCompartment(), lung.BalloonLung()])

@@ -1,0 +1,86 @@
+"""A controller at a ventilator: what a machine needs, proved on a simulated one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, once, user_error
+
+import delucax as dlx
+from delucax import lung
+
+
+pytestmark = once
+
+KEY = jax.random.key(0)
+ENV = lung.single_compartment(50.0, 10.0)
+WAVEFORM = ENV.cost.waveform
+
+
+def breathing(kp):
+    pid = dlx.controllers.LeakyPID(kp, 3.0, dt=ENV.dt, reference=WAVEFORM)
+    return lung.Breathing(pid, WAVEFORM)
+
+
+def test_run_is_that_of_the_closed_loop():
+    runner = lung.SimulatedRunner(ENV, key=KEY)
+    found = lung.run_breaths(runner, breathing(0.5), 40)
+    run = dlx.rollout(ENV, breathing(0.5), key=KEY, horizon=40)
+    assert_close(found.pressure, run.observations[:, 0], rtol=1e-4)
+    assert_close(found.u_in, run.controls[:, 0], atol=1e-3)
+    assert not found.aborted and runner.is_clean
+    assert_close(found.u_out, run.controls[:, 1])
+
+
+def test_aborts_on_overpressure_and_cleans_up():
+    runner = lung.SimulatedRunner(ENV, key=KEY, abort=60.0)
+    found = lung.run_breaths(runner, breathing(10.0), 40)
+    assert found.aborted and runner.is_clean and len(found.times) < 40
+    assert np.all(found.pressure <= 60)
+    # The air has been let out, and both valves are closed.
+    assert runner.observe() < 5.5 and runner.controls == (0.0, 0.0)
+
+
+class Failing(dlx.AbstractController):
+    def __call__(self, t, y, state):
+        return jnp.full(2, jnp.nan), state
+
+
+class Broken(lung.SimulatedRunner):
+    def actuate(self, u_in, u_out):
+        if self.steps == 3:
+            self.steps += 1
+            raise OSError("the valve does not answer")
+        super().actuate(u_in, u_out)
+
+
+def test_cleans_up_after_an_error():
+    runner = lung.SimulatedRunner(ENV, key=KEY)
+    with user_error(match="controls must be finite, got .nan, nan. at step 0"):
+        lung.run_breaths(runner, Failing(), 5)
+    assert runner.is_clean
+    runner = Broken(ENV, key=KEY)
+    with pytest.raises(OSError, match="does not answer"):
+        lung.run_breaths(runner, breathing(0.5), 10)
+    assert runner.is_clean
+
+
+def test_wrong_arguments():
+    with user_error(match="runner must have physical"):
+        lung.run_breaths(object(), breathing(0.5))
+    with user_error(match="controller must be an AbstractController"):
+        lung.run_breaths(lung.SimulatedRunner(ENV, key=KEY), print)
+    with user_error(match="must be a task of a lung"):
+        lung.SimulatedRunner(dlx.make("pendulum"), key=KEY)
+
+
+def test_every_breath_begins_alike():
+    """The controller is fresh at each breath, and silent between them."""
+    run = dlx.rollout(ENV, breathing(0.5), key=KEY, horizon=134)
+    first, second = run.controls[:34], run.controls[100:]
+    assert_close(first[0], second[0], atol=0.1)
+    assert np.all(run.controls[34:100, 0] == 0) and np.all(run.controls[34:100, 1] == 1)
+    held = dlx.replace(breathing(0.5), {"hold": 5.0})
+    run = dlx.rollout(ENV, held, key=KEY, horizon=100)
+    times = np.arange(50, 100) * 0.03
+    assert_close(run.controls[50:, 0], 5 * (1 - np.exp(5 * (1.5 - times))), atol=1e-3)

@@ -1,0 +1,82 @@
+"""The study as a command: it goes on where it was, and refuses what it should."""
+
+import csv
+import json
+
+import jax
+import pytest
+from helpers import once, thorough, user_error
+
+import delucax as dlx
+from delucax import lung
+from delucax.__main__ import main
+from delucax.lung import _study
+
+
+pytestmark = once
+
+
+@pytest.fixture
+def begun(tmp_path, monkeypatch):
+    """A study that was cut off at once."""
+
+    def cut_off(size):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_study, "_explored", cut_off)
+    with pytest.raises(KeyboardInterrupt):
+        lung.lung_study(tmp_path, small=True, say=lambda line: None)
+    return tmp_path
+
+
+def test_other_settings_are_refused(begun):
+    with user_error(match="other settings: seeds is 1 there and 2 here"):
+        lung.lung_study(begun, small=True, seeds=2)
+    with user_error(match="seeds must be at least 1, got 0"):
+        lung.lung_study(begun, seeds=0)
+
+
+def test_damaged_files_are_refused(begun):
+    (begun / "breaths.dlx").write_bytes(b"delucax-file 1 0000\nnonsense")
+    with user_error(match=r"breaths.dlx' is damaged"):
+        lung.lung_study(begun, small=True)
+    (begun / "settings.json").write_text("{")
+    with user_error(match=r"settings.json' is damaged"):
+        lung.lung_study(begun, small=True)
+
+
+def test_wrong_data_are_named(tmp_path, capsys):
+    path = tmp_path / "train.csv"
+    path.write_text("id,breath_id,R,C,time_step,u_in,pressure\n")
+    assert main(["lung", "--data", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert "row 1: column u_out is missing" in capsys.readouterr().err
+
+
+@thorough
+@pytest.mark.parametrize("from_file", [False, True])
+def test_small_study(tmp_path, from_file):
+    data, out = None, tmp_path / "out"
+    if from_file:
+        data = tmp_path / "train.csv"
+        lung.write_example(data, 8, key=jax.random.key(0))
+    said = []
+    rows = lung.lung_study(out, small=True, data=data, say=said.append)
+    lungs = {row["lung"] for row in rows if row["split"] == "unseen"}
+    assert len(lungs) == (9 if from_file else 2)
+    with open(out / "report.csv") as file:
+        written = list(csv.DictReader(file))
+    assert len(written) == len(rows)
+    assert set(written[0]) >= {"lung", "controller", "seed", "split", "mae"}
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["highest_pressure"] < summary["abort"]
+    assert max(summary["learned_over_wrong_physics"].values()) < 1
+    controllers = sorted((out / "controllers").glob("mlp_R*.dlx"))
+    assert len(controllers) == len(lungs)
+    env = dlx.make("lung/double_compartment")
+    dlx.rollout(env, dlx.load(controllers[0]), key=jax.random.key(0), horizon=10)
+    for name in ("controllers.png", "simulators.png", "breath.gif"):
+        assert (out / name).stat().st_size > 1000
+    # A second time there is nothing left to do but the report.
+    said.clear()
+    again = lung.lung_study(out, small=True, data=data, say=said.append)
+    assert again == rows and sum("found" in line for line in said) >= 6

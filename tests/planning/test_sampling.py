@@ -1,0 +1,115 @@
+"""Planners that sample."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+from helpers import assert_close, needs_x64, once, thorough, user_error
+
+import delucax as dlx
+
+
+KEY = jax.random.key(0)
+X0 = jnp.array([0.5, -0.3])
+PLANNERS = {
+    "mppi": (dlx.planning.mppi, dict(temperature=0.01)),
+    "cem": (dlx.planning.cem, dict()),
+}
+each = pytest.mark.parametrize(
+    "planner, options", list(PLANNERS.values()), ids=list(PLANNERS)
+)
+
+
+def linear():
+    A, B = jnp.array([[1.0, 0.1], [0.3, 0.98]]), jnp.array([[0.0], [0.1]])
+    cost = dlx.costs.Quadratic(jnp.eye(2), 0.1 * jnp.eye(1), final=jnp.eye(2))
+    return dlx.LinearDynamics(A, B, dt=0.1), cost, X0, jnp.zeros((8, 1))
+
+
+@needs_x64
+@each
+def test_the_minimum_of_a_linear_problem(planner, options):
+    problem = linear()
+    best = dlx.planning.ilqr(*problem)
+    plan = planner(*problem, key=KEY, iterations=20, **options)
+    assert best.cost - 1e-5 <= plan.cost < 1.02 * best.cost < plan.trace[0]
+    assert plan.result == dlx.RESULTS.successful and jnp.all(plan.gains == 0)
+    assert plan.rollouts == 20 * 256 + 1 and plan.trace.shape == (21,)
+    assert jnp.all(jnp.diff(plan.trace) <= 0) and plan.trace[-1] == plan.cost
+    followed = dlx.open_loop(problem[0], X0, plan.controls)
+    assert_close(followed, plan.states, atol=1e-12)
+    # A warm start goes on; other keys draw others.
+    options = options | dict(iterations=1)
+    warm = planner(*problem[:3], plan.controls, key=KEY, **options)
+    assert warm.trace[0] == plan.cost and warm.cost <= plan.cost
+    other = planner(*problem, key=jax.random.key(1), **options)
+    assert other.cost != planner(*problem, key=KEY, **options).cost
+
+
+class Cliff(dlx.AbstractCost):
+    """Neither smooth nor finite everywhere."""
+
+    def __call__(self, t, x, u):
+        return jnp.where(u[0] > 0.5, jnp.nan, jnp.abs(jnp.round(4 * u[0]) - 1))
+
+
+@once
+@each
+def test_what_diverges_has_no_part_in_it(planner, options):
+    dynamics, _, x0, U = linear()
+    plan = planner(dynamics, Cliff(), x0, U, key=KEY, scale=0.2, **options)
+    assert jnp.all(jnp.isfinite(plan.controls)) and jnp.all(plan.controls <= 0.5)
+    assert 0 <= plan.cost < 8 == plan.trace[0]
+    grads = jax.grad(lambda x: planner(dynamics, Cliff(), x, U, key=KEY).cost)(x0)
+    assert jnp.all(jnp.isfinite(grads))
+    start = dict(key=KEY, scale=1e-3, iterations=2)
+    lost = planner(dynamics, Cliff(), x0, U + 1, throw=False, **start)
+    assert lost.result == dlx.RESULTS.diverged and jnp.isinf(lost.cost)
+    assert_close(lost.controls, U + 1)
+    with pytest.raises(RuntimeError, match="NaN or infinite"):
+        planner(dynamics, Cliff(), x0, U + 1, **start)
+
+
+@needs_x64
+@pytest.mark.parametrize(
+    "planner, options",
+    [PLANNERS["mppi"], pytest.param(*PLANNERS["cem"], marks=thorough)],
+    ids=list(PLANNERS),
+)
+def test_bounds_batches_and_derivatives(planner, options):
+    dynamics, cost, _, U = linear()
+    options = options | dict(bounds=(-0.2, [0.3]), correlation=0.5, samples=64)
+
+    def optimal(x, key):
+        plan = planner(dynamics, cost, x, U, key=key, **options)
+        return plan.cost, plan.controls
+
+    keys = jax.random.split(KEY, 2)
+    starts = jnp.stack([X0, -2 * X0])
+    costs, controls = jax.vmap(optimal)(starts, keys)
+    assert jnp.all((controls >= -0.2) & (controls <= 0.3))
+    assert jnp.min(controls) < -0.18 and jnp.max(controls) > 0.28
+    assert_close(costs[1], optimal(starts[1], keys[1])[0], rtol=1e-12)
+    slope = jax.grad(lambda x: optimal(x, KEY)[0])(X0)
+    for i, way in enumerate(jnp.eye(2)):
+        up, down = (optimal(X0 + h * way, KEY)[0] for h in (1e-6, -1e-6))
+        assert_close(slope[i], (up - down) / 2e-6, rtol=1e-5)
+
+
+@once
+def test_bad_arguments_are_named():
+    problem = linear()
+    mppi, cem = dlx.planning.mppi, dlx.planning.cem
+    for name, options in {
+        "samples": dict(samples=1),
+        "iterations": dict(iterations=0),
+        "scale must be positive": dict(scale=0.0),
+        "scale must be a number or a vector of 1": dict(scale=[1.0, 2.0]),
+        "correlation": dict(correlation=1.5),
+        "temperature": dict(temperature=0.0),
+        "one random key": dict(key=3),
+    }.items():
+        with user_error(match=f"mppi: .*{name}"):
+            mppi(*problem, **(dict(key=KEY) | options))
+    for name, wrong in (("elites", 300), ("momentum", 2.0)):
+        with user_error(match=f"cem: {name}"):
+            cem(*problem, key=KEY, **{name: wrong})

@@ -1,0 +1,354 @@
+"""PPO, SHAC, surrogates and batches of seeds."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optax
+import pytest
+from helpers import assert_close, needs_x64, once, thorough, user_error
+
+import delucax as dlx
+from delucax.experiments import holds_upright
+from delucax.training import (
+    actor_critic,
+    ActorCritic,
+    expected_cost,
+    fit,
+    PPO,
+    SHAC,
+)
+from delucax.training._actor_critic import (
+    advantages,
+    episode,
+    Moments,
+)
+
+
+A = np.array([[1.0, 0.3], [-0.2, 0.9]])
+B = np.array([[0.0], [0.5]])
+GAMMA, LAMBDA = 0.9, 0.8
+c = dlx.controllers
+
+
+class Grows(eqx.Module):
+    """Ends the episode."""
+
+    def __call__(self, t, x):
+        return x[0] > 1.2
+
+
+def environment(**options):
+    """A double integrator that ends where it has gone too far."""
+    given = dict(
+        cost=dlx.costs.Quadratic(np.eye(2), np.eye(1), final=3 * np.eye(2)),
+        control_bounds=(-1.0, 1.0),
+        initial_state=jnp.array([0.5, 0.4]),
+        horizon=6,
+    )
+    return dlx.Environment(dlx.LinearDynamics(A, B, dt=0.1), **(given | options))
+
+
+def model_of(policy=None, key=0):
+    base = c.MLP(2, 1, width=4, depth=1, key=jr.key(key)) if policy is None else policy
+    policy = c.Gaussian(base, -0.5, bounds=(-1.0, 1.0))
+    return ActorCritic(policy, c.MLP(2, 1, width=4, depth=1, key=jr.key(1)))
+
+
+@eqx.filter_jit
+def started(ppo, model):
+    """The memory of the first step."""
+    memory = ppo.init(model, jr.key(0))
+    return ppo.update(model, memory, jnp.asarray(0), jr.key(1))
+
+
+@eqx.filter_jit
+def gradient_of(surrogate, model, memory):
+    """Of the loss; the policy has not moved, so no divergence is to be seen."""
+
+    def loss(model):
+        value, metrics = surrogate(model, memory, jr.key(2))
+        return value, metrics
+
+    slope, metrics = eqx.filter_grad(loss, has_aux=True)(model)
+    moved = jnp.abs(metrics.get("kl", 0.0)) > 1e-13
+    return eqx.error_if(slope, moved, "the ratio is not 1")
+
+
+def by_hand(costs, values, ends_with, stops):
+    """Advantages by the definition: the weighted mean of the n-step estimates."""
+    n = len(costs)
+    follow = np.append(values[1:], ends_with)
+    delta = costs + GAMMA * follow - values
+    found = np.zeros(n)
+    for k in range(n):
+        found[k] = sum((GAMMA * LAMBDA) ** (i - k) * delta[i] for i in range(k, n))
+    assert stops == n
+    return found
+
+
+@needs_x64
+@pytest.mark.parametrize(
+    "ends, bootstrap", [(False, True), (False, False), (True, True)]
+)
+def test_advantages_know_an_end_from_a_cut(ends, bootstrap):
+    env = environment(terminated=Grows() if ends else None)
+    model = model_of()
+    options = dict(horizon=6, bootstrap=bootstrap)
+    run_episode = eqx.filter_jit(lambda *given: episode(*given, **options))
+    record, run = run_episode(env, model, jr.key(3))
+    length = int(run.length)
+    assert (length < 6) == ends
+    found = advantages(record, jnp.asarray(GAMMA), jnp.asarray(LAMBDA))
+    values = [float(v) for v in jax.vmap(lambda x: model.value(0.0, x))(run.states)]
+    cut = bootstrap and not ends
+    last = values[6] if cut else float(run.final_cost)
+    costs = np.asarray(run.costs)[:length]
+    expected = by_hand(costs, np.asarray(values[:length]), last, length)
+    assert_close(found[:length], expected, rtol=1e-12)
+    assert_close(record.valid, np.arange(6) < length)
+
+
+@needs_x64
+def test_gradient_of_ppo_is_the_policy_gradient_at_first():
+    """Where nothing has moved, the ratio is 1 and its gradient that of the score."""
+    env = environment()
+    model = model_of()
+    ppo = PPO(env, 5, epochs=1, minibatches=1, value_weight=0.0)
+    memory = started(ppo, model)
+    rows = memory.rows
+
+    def scored(model):
+        policy = model.policy
+        state = policy.init(key=jr.key(0))
+        one = lambda t, y, u: policy.log_prob(t, y, state, u)
+        flat = lambda a: a.reshape(-1, *a.shape[2:])
+        score = jax.vmap(one)(
+            *map(flat, (rows.times, rows.observations, rows.controls))
+        )
+        return jnp.mean(score * flat(rows.advantages))
+
+    slope = gradient_of(ppo, model, memory)
+    expected = eqx.filter_jit(eqx.filter_grad(scored))(model)
+    for a, b in zip(
+        jax.tree.leaves(slope.policy), jax.tree.leaves(expected.policy), strict=True
+    ):
+        assert_close(a, b, atol=1e-12)
+    assert_close(jnp.mean(rows.advantages), 0, atol=1e-12)
+
+
+@thorough
+@needs_x64
+def test_ppo_follows_the_memory_of_a_policy():
+    """What a recurrent policy is scored by is what it drew with."""
+    policy = c.GRU(2, 1, 3, key=jr.key(4))
+    model = model_of(policy)
+    ppo = PPO(environment(), 4, epochs=1, minibatches=1)
+    memory = started(ppo, model)
+    assert memory.rows.times.shape == (4, 6)
+    slope = gradient_of(ppo, model, memory)
+    assert float(jnp.max(jnp.abs(slope.policy.base.cell.weight_hh))) > 0
+
+
+@needs_x64
+def test_window_of_shac_is_the_whole_gradient_where_it_spans_the_horizon():
+    """With one window and no discount it is the gradient of the cost and its end."""
+    env = environment(control_bounds=None)
+    base = c.MLP(2, 1, width=4, depth=1, key=jr.key(0))
+    model = ActorCritic(base, c.MLP(2, 1, width=4, depth=1, key=jr.key(1)))
+    shac = SHAC(env, 1, window=6, discount=1.0, bootstrap=False, value_weight=0.0)
+    memory = eqx.filter_jit(shac.init)(model, jr.key(0))
+    slope = gradient_of(shac, model, memory)
+    total = expected_cost(env, batch=1)
+    expected = eqx.filter_grad(total)(base, jr.key(5))
+    scale = 6 * memory.seen.targets.std
+    for a, b in zip(
+        jax.tree.leaves(slope.policy), jax.tree.leaves(expected), strict=True
+    ):
+        assert_close(a * scale, b, rtol=1e-9, atol=1e-12)
+
+
+@needs_x64
+def test_gradient_is_cut_between_windows():
+    """A cut rollout has the gradient of its stretches, each from a start held fixed."""
+    env = environment(control_bounds=None)
+    gain = jnp.array([[0.3, -0.2]])
+
+    def total(K, **options):
+        run = dlx.rollout(env, c.Linear(K), key=jr.key(0), **options)
+        return run.total_cost
+
+    states = dlx.rollout(env, c.Linear(gain), key=jr.key(0)).states
+
+    def stretches(K):
+        own = environment(control_bounds=None, cost=_without_end(env.cost))
+        first = dlx.rollout(own, c.Linear(K), key=jr.key(0), x0=states[0], horizon=4)
+        last = dlx.rollout(env, c.Linear(K), key=jr.key(0), x0=states[4], horizon=2)
+        return first.total_cost + last.total_cost
+
+    found = jax.grad(lambda K: total(K, truncate=4))(gain)
+    assert_close(found, jax.grad(stretches)(gain), rtol=1e-12)
+    assert_close(total(gain, truncate=4), total(gain), rtol=1e-14)
+    assert float(jnp.max(jnp.abs(found - jax.grad(total)(gain)))) > 1e-3
+
+
+def _without_end(cost):
+    return dlx.costs.Quadratic(cost.Q, cost.R)
+
+
+@needs_x64
+def test_moments_are_those_of_all_rows():
+    rows = jr.normal(jr.key(0), (20, 3)) * 4 + 2
+    valid = jnp.arange(20) % 3 > 0
+    moments = Moments.none(jnp.zeros(3))
+    for part in (slice(0, 7), slice(7, 20)):
+        moments = moments.joined(rows[part], valid[part])
+    assert_close(moments.mean, jnp.mean(rows[valid], axis=0), rtol=1e-12)
+    assert_close(moments.std, jnp.std(rows[valid], axis=0), rtol=1e-12)
+
+
+@thorough
+@once
+def test_batch_of_keys_trains_each_by_ppo_as_if_alone():
+    env = environment()
+    keys = jr.split(jr.key(0), 2)
+    make = lambda key: actor_critic(env, width=4, depth=1, key=key)
+    models = eqx.filter_vmap(make)(keys)
+    ppo = PPO(env, 2, epochs=2, minibatches=2)
+    optimiser = optax.chain(optax.clip_by_global_norm(0.1), optax.adam(1e-2))
+    both = fit(ppo, models, optimiser, 6, key=keys, progress=False)
+    one = jax.tree.map(lambda a: a[1] if eqx.is_array(a) else a, models)
+    alone = fit(ppo, one, optimiser, 6, key=keys[1], progress=False)
+    assert both.history.loss.shape == (6, 2)
+    assert_close(both.history.loss[:, 1], alone.history.loss, rtol=1e-4, atol=1e-5)
+    for a, b in zip(
+        jax.tree.leaves(eqx.filter(both.model, eqx.is_inexact_array)),
+        jax.tree.leaves(eqx.filter(alone.model, eqx.is_inexact_array)),
+        strict=True,
+    ):
+        assert_close(a[1], b, rtol=1e-3, atol=1e-4)
+
+
+@once
+def test_one_seed_that_diverges_leaves_the_others():
+    class Trap(dlx.training.AbstractSurrogate):
+        def init(self, model, key):
+            return jnp.zeros((), int)
+
+        def update(self, model, memory, step, key):
+            return memory + 1
+
+        def __call__(self, model, memory, key):
+            gone = (memory > 3) & (model.K[0, 0] < 0)
+            return jnp.sum((model.K - 5) ** 2) + jnp.where(gone, jnp.nan, 0.0)
+
+        def finished(self, model, memory):
+            return eqx.tree_at(lambda m: m.K, model, model.K + memory)
+
+    models = eqx.filter_vmap(c.Linear)(jnp.array([[[1.0]], [[-9.0]]]))
+    keys = jr.split(jr.key(0), 2)
+    options = dict(key=keys, progress=False, throw=False)
+    found = fit(Trap(), models, optax.sgd(0.01), 8, **options)
+    assert (found.result == dlx.RESULTS.diverged).tolist() == [False, True]
+    step = lambda k, n: 5 + (k - 5) * 0.98**n
+    assert_close(found.model.K.ravel(), [step(1, 8) + 8, step(-9, 3) + 3], rtol=1e-5)
+    with pytest.raises(RuntimeError, match="seed 1 is not finite"):
+        fit(Trap(), models, optax.sgd(0.01), 8, key=keys, progress=False)
+
+
+class Drawn(dlx.training.AbstractSurrogate):
+    """Descends to a target that is drawn every third step."""
+
+    def init(self, model, key):
+        return jnp.zeros_like(model.K), jnp.zeros((), int)
+
+    def update(self, model, memory, step, key):
+        target, count = memory
+        fresh = model.K + jr.normal(key, model.K.shape)
+        return jnp.where(step % 3 == 0, fresh, target), count + 1
+
+    def __call__(self, model, memory, key):
+        loss = jnp.sum((model.K - memory[0] + 0.1 * jr.normal(key)) ** 2)
+        return loss, {"count": memory[1]}
+
+
+@once
+def test_batch_of_keys_trains_each_as_if_alone():
+    keys = jr.split(jr.key(0), 3)
+    models = eqx.filter_vmap(c.Linear)(jr.normal(jr.key(1), (3, 1, 2)))
+    # The norm that is clipped is that of each seed.
+    optimiser = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(0.1))
+    both = fit(Drawn(), models, optimiser, 10, key=keys, progress=False)
+    one = c.Linear(models.K[1])
+    alone = fit(Drawn(), one, optimiser, 10, key=keys[1], progress=False)
+    assert both.history["count"].tolist() == [[k] * 3 for k in range(1, 11)]
+    assert_close(both.history.loss[:, 1], alone.history.loss, rtol=1e-5)
+    assert_close(both.model.K[1], alone.model.K, rtol=1e-5)
+
+
+@once
+def test_surrogate_goes_on_from_a_checkpoint(tmp_path):
+    drawn, model = Drawn(), c.Linear(jnp.ones((1, 2)))
+    optimiser = optax.adam(1e-2)
+    path = tmp_path / "run"
+
+    class Stop(Exception):
+        pass
+
+    def stop(step, metrics):
+        if step == 6:
+            raise Stop
+
+    options = dict(key=jr.key(1), progress=False, block=3)
+    whole = fit(drawn, model, optimiser, 9, **options)
+    kept = dict(checkpoint=path, checkpoint_every=3)
+    with pytest.raises(Stop):
+        fit(drawn, model, optimiser, 9, **options, **kept, callbacks=[stop])
+    again = fit(drawn, model, optimiser, 9, **options, **kept)
+    assert np.array_equal(whole.history.loss, again.history.loss)
+
+
+@once
+def test_bad_input():
+    env = environment()
+    model = model_of()
+    with user_error(match="batch must be a whole number"):
+        PPO(env, 0)
+    with user_error(match="discount must be between 0 and 1"):
+        SHAC(env, 2, discount=1.5)
+    with user_error(match="model must be an ActorCritic, got Linear"):
+        fit(PPO(env, 2), c.Linear([[1.0, 0.0]]), optax.sgd(0.1), 1, key=jr.key(0))
+    free = ActorCritic(c.Gaussian(c.Linear([[1.0, 0.0]]), 0.0), model.critic)
+    with user_error(match="must have the bounds of the environment"):
+        fit(PPO(env, 2), free, optax.sgd(0.1), 1, key=jr.key(0))
+    with user_error(match="minibatches must be at most the 12 rows"):
+        fit(PPO(env, 2, minibatches=13), model, optax.sgd(0.1), 1, key=jr.key(0))
+    with user_error(match="data must be None"):
+        data = jnp.ones(3)
+        fit(PPO(env, 2), model, optax.sgd(0.1), 1, key=jr.key(0), data=data)
+    with user_error(match="axis of the 3 keys in front"):
+        fit(PPO(env, 2), model, optax.sgd(0.1), 1, key=jr.split(jr.key(0), 3))
+    with user_error(match="critic must have no memory"):
+        ActorCritic(model.policy, c.GRU(2, 1, key=jr.key(0)))
+    with user_error(match="must have a table of actions"):
+        actor_critic(env, head="categorical", key=jr.key(0))
+
+
+@thorough
+@once
+def test_ppo_swings_up():
+    env = dlx.make("pendulum")
+    corner = np.array([np.pi, 8.0])
+    spread = {"initial_state.low": -corner, "initial_state.high": corner}
+    ppo = PPO(
+        dlx.replace(env, spread), 64, 100, discount=0.95, epochs=10, minibatches=8
+    )
+    model = actor_critic(env, 32, 1, key=jr.key(0))
+    optimiser = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(3e-3))
+    fitted = fit(ppo, model, optimiser, 3200, key=jr.key(1), progress=False)
+    starts = jax.vmap(env.reset)(jr.split(jr.key(2), 100))
+    run = lambda x0: dlx.rollout(
+        env, fitted.model.policy.base, key=jr.key(0), x0=x0, horizon=400
+    )
+    assert int(jnp.sum(holds_upright(jax.vmap(run)(starts)))) >= 95
