@@ -82,7 +82,7 @@ class Size(NamedTuple):
 FULL = Size(
     breaths=480,
     teacher_steps=1000,
-    simulator_steps=800,
+    simulator_steps=1200,
     physics_steps=200,
     controller_steps=400,
     shared_steps=500,
