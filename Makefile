@@ -55,7 +55,8 @@ test-float64: $(VENV)/.tests ## the tests in double precision; the docs' example
 .PHONY: thorough
 thorough: $(VENV)/.tests ## the tests that `test` leaves out, for they compile for long
 	JAX_ENABLE_X64=0 $(pytest) -m thorough $(PYTEST_ARGS)
-	JAX_ENABLE_X64=1 $(pytest) -m thorough $(PYTEST_ARGS)
+	JAX_ENABLE_X64=1 $(pytest) -m thorough --ignore tests/contracts/test_public.py \
+		--ignore tests/test_docs.py $(PYTEST_ARGS)
 
 .PHONY: notebooks
 notebooks: $(VENV)/.tests ## run every notebook from top to bottom

@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 
 import pytest
-from helpers import as_a_user
+from helpers import as_a_user, thorough
 
 
 ROOT = Path(__file__).parents[1]
@@ -47,7 +47,27 @@ def test_pages_are_found():
     assert {"index.md", "first_system.md", "gradients.md", "errors.md"} <= names
 
 
-@pytest.mark.parametrize("page", RUNNABLE, ids=lambda page: page.name)
+LONG = {
+    "experiments.md",
+    "gradients.md",
+    "identification.md",
+    "jit_vmap.md",
+    "linear_analysis.md",
+    "online_control.md",
+    "planning.md",
+    "policies.md",
+    "regulators.md",
+}
+"""Pages whose blocks compile for long."""
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(p, id=p.name, marks=thorough if p.name in LONG else ())
+        for p in RUNNABLE
+    ],
+)
 def test_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")

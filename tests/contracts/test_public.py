@@ -9,6 +9,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from helpers import thorough
 
 import delucax as dlx
 
@@ -107,7 +108,37 @@ def _examples(doc):
     return [textwrap.dedent(code) for _, code in blocks]
 
 
-@pytest.mark.parametrize("name, value", CALLABLES, ids=IDS)
+LONG = {
+    f"delucax.{name}"
+    for name in """
+    AbstractDisturbance Discretized analysis.DiskMargin analysis.Margins
+    analysis.disk_margin analysis.hinf_norm analysis.margins controllers.Adaptive
+    controllers.DRC controllers.Explore controllers.HInfinity controllers.Hindsight
+    controllers.ILC controllers.OutputFeedback controllers.Scheduled
+    controllers.Standardise controllers.UnscentedKalmanFilter
+    controllers.best_in_hindsight controllers.iGPC controllers.regret
+    controllers.run_filter controllers.smooth d2c environments.cartpole
+    experiments.train_swing_up lung.LearnedLung lung.ShootingMPC lung.explore
+    lung.fit_lungs lung.least_error lung.pid_grid lung.train_controllers
+    lung.write_example planning.Constraints planning.Plan planning.cem planning.ilqr
+    riccati.ContinuousGameSolution riccati.ContinuousHorizonSolution riccati.dre
+    riccati.hinf_care riccati.hinf_cre riccati.hinf_dre simulate
+    training.EvolutionStrategies training.PPO training.SHAC training.analytic
+    training.expected_cost training.fit training.scored_cost
+    training.sysid.Identified training.sysid.PredictionError training.sysid.arx
+    training.sysid.physical training.worst_case
+    """.split()
+}
+"""Examples that compile for long."""
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        pytest.param(*case, id=id, marks=thorough if id in LONG else ())
+        for case, id in zip(CALLABLES, IDS, strict=True)
+    ],
+)
 def test_example_runs(name, value, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     if _is_marker(value) or value is dlx.experiments.demo:  # a test of the demo runs it

@@ -334,7 +334,7 @@ def test_online_newton_is_recursive_least_squares():
     rng, d, k, prior = np.random.default_rng(0), 4, 2, 3.0
     J, target = rng.normal(size=(20, k, d)), rng.normal(size=(20, k))
     optimiser = c.online_newton(prior)
-    assert optimiser is c.online_newton(prior)
+    assert optimiser == c.online_newton(prior)
     theta = jnp.zeros(d)
     state = optimiser.init(theta)
     found = []

@@ -67,6 +67,7 @@ def file(tmp_path, monkeypatch):
     sys.path[:] = [place for place in sys.path if place != str(tmp_path)]
 
 
+@thorough
 def test_workers_give_the_same_and_their_death_harms_no_other(file, capfd):
     """With two processes, one of which a case kills, the rows are those of one."""
     assert main(["run", file, "--quiet"]) == 1

@@ -39,6 +39,7 @@ def test_prediction_is_what_the_dynamics_do(breaths, published):
     assert len(model.state_names) == model.state_size
 
 
+@thorough
 def test_fitting_learns(breaths):
     train, test = breaths[:24], breaths[24:]
     model = lung.LearnedLung(train, width=8, boundary=2, key=KEY)
@@ -48,6 +49,7 @@ def test_fitting_learns(breaths):
     assert error(fitted, test) < 0.3 * error(model, test)
 
 
+@thorough
 def test_physics_is_found(breaths):
     path = "dynamics.dynamics.system."
     start = lung.LungModel(lung.DoubleCompartment(10.0, 30.0))
@@ -60,6 +62,7 @@ def test_physics_is_found(breaths):
     assert fitted.system.valves.max_flow == start.system.valves.max_flow
 
 
+@thorough
 def test_controller_learns_and_the_grid_knows_the_best():
     models = lung.stack(
         [lung.LungModel(lung.SingleCompartment(R)) for R in (5.0, 50.0)]

@@ -1,8 +1,8 @@
 """Newton's step for an online learner."""
 
-import functools
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
@@ -26,55 +26,53 @@ def _init(params: Any) -> OnlineNewtonState:
     return OnlineNewtonState(jnp.zeros((flat.size, flat.size), flat.dtype), zero, zero)
 
 
-def _update(
-    prior: float,
-    updates: Any,
-    state: Any,
-    params: Any = None,
-    *,
-    curvature: Any = None,
-    learning_rate: Any = 1.0,
-    **others: Any,
-) -> tuple[Any, OnlineNewtonState]:
-    del params, others
-    if curvature is None:
-        raise ValueError(
-            "online_newton: update must be given the curvature of the loss, which "
-            "OnlineLearner knows and BPC, which sees the cost alone, does not."
-        )
-    gradient, unravel = ravel_pytree(updates)
-    factor = curvature()
-    root, total, count = state
-    size = jnp.sum(factor**2)
-    # Next to this step all that was seen before is rounding: begin anew.
-    first = size > total / jnp.sqrt(jnp.finfo(size.dtype).eps)
-    total, count = jnp.where(first, 0, total), jnp.where(first, 0, count)
-    new_total, new_count = total + size, count + (size > 0)
-    # Until the prior is outweighed it is worth `prior` of the average step so far.
-    mean = lambda total, count: total / jnp.where(count > 0, count, 1)  # noqa: E731
-    early = (size > 0) & (count > 0) & (count < prior)
-    fresh = gradient.size / (prior * jnp.where(first, size, 1))
-    fresh = jnp.sqrt(fresh) * jnp.eye(gradient.size, dtype=gradient.dtype)
-    after = jnp.where(early, mean(new_total, new_count), 1)
-    scale = jnp.sqrt(jnp.where(early, mean(total, count) / after, 1))
-    root = jnp.where(first, fresh, scale * root)
-    # Potter's square-root form stays positive whatever the rounding.
-    for column in factor.T:
-        along = column @ root
-        gain = 1 + along @ along
-        root = root - jnp.outer(root @ along, along) / (gain + jnp.sqrt(gain))
-    step = root @ (gradient @ root) / learning_rate
-    squared = jnp.sum(step**2)
-    long = squared > 1
-    step = step * jnp.where(long, 1 / jnp.sqrt(jnp.where(long, squared, 1)), 1)
-    return unravel(-step), OnlineNewtonState(root, new_total, new_count)
+class _Update(eqx.Module):
+    """A module, so that it can be saved and two for one prior are equal."""
 
+    prior: float = eqx.field(static=True)
 
-@functools.cache
-def _online_newton(prior: float) -> optax.GradientTransformationExtraArgs:
-    return optax.GradientTransformationExtraArgs(
-        _init, functools.partial(_update, prior)
-    )
+    def __call__(
+        self,
+        updates: Any,
+        state: Any,
+        params: Any = None,
+        *,
+        curvature: Any = None,
+        learning_rate: Any = 1.0,
+        **others: Any,
+    ) -> tuple[Any, OnlineNewtonState]:
+        del params, others
+        if curvature is None:
+            raise ValueError(
+                "online_newton: update must be given the curvature of the loss, which "
+                "OnlineLearner knows and BPC, which sees the cost alone, does not."
+            )
+        gradient, unravel = ravel_pytree(updates)
+        factor = curvature()
+        root, total, count = state
+        size = jnp.sum(factor**2)
+        # Next to this step all that was seen before is rounding: begin anew.
+        first = size > total / jnp.sqrt(jnp.finfo(size.dtype).eps)
+        total, count = jnp.where(first, 0, total), jnp.where(first, 0, count)
+        new_total, new_count = total + size, count + (size > 0)
+        # Until the prior is outweighed it is worth `prior` of the average step so far.
+        mean = lambda total, count: total / jnp.where(count > 0, count, 1)  # noqa: E731
+        early = (size > 0) & (count > 0) & (count < self.prior)
+        fresh = gradient.size / (self.prior * jnp.where(first, size, 1))
+        fresh = jnp.sqrt(fresh) * jnp.eye(gradient.size, dtype=gradient.dtype)
+        after = jnp.where(early, mean(new_total, new_count), 1)
+        scale = jnp.sqrt(jnp.where(early, mean(total, count) / after, 1))
+        root = jnp.where(first, fresh, scale * root)
+        # Potter's square-root form stays positive whatever the rounding.
+        for column in factor.T:
+            along = column @ root
+            gain = 1 + along @ along
+            root = root - jnp.outer(root @ along, along) / (gain + jnp.sqrt(gain))
+        step = root @ (gradient @ root) / learning_rate
+        squared = jnp.sum(step**2)
+        long = squared > 1
+        step = step * jnp.where(long, 1 / jnp.sqrt(jnp.where(long, squared, 1)), 1)
+        return unravel(-step), OnlineNewtonState(root, new_total, new_count)
 
 
 def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
@@ -96,8 +94,8 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
     **Arguments:** `prior`: steps, 100 by default. A small one learns fast where the
     features are much alike, a large one keeps noise out of what is learned.
 
-    **Returns:** an `optax.GradientTransformationExtraArgs`, the same for the same
-    prior, so that two learners share what was compiled.
+    **Returns:** an `optax.GradientTransformationExtraArgs`; those of one prior are
+    equal, so that two learners share what was compiled.
 
     **Raises:** `ValueError` if `prior` is not positive; when it is used, if it is not
     given the curvature.
@@ -117,7 +115,7 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
         ```
     """
     check_positive(prior, "prior", "online_newton")
-    return _online_newton(float(prior))
+    return optax.GradientTransformationExtraArgs(_init, _Update(float(prior)))
 
 
 def positive_root(H: Array) -> Array:
