@@ -95,6 +95,7 @@ def test_margins_are_controls(name, sampled):
 
 @pytest.mark.filterwarnings("ignore:Setting the shape:DeprecationWarning")
 @pytest.mark.parametrize("name", ["servo", "resonant", "conditional"])
+@thorough
 def test_disk_margins_are_controls_on_a_fine_grid(name):
     loop, theirs = loop_of(LOOPS[name])
     found = an.margins(loop)

@@ -195,6 +195,17 @@ CASES = {
 }
 # What differs little from another case, or compiles for long.
 KIN = (
+    "BPC",
+    "Constant",
+    "DRC along the way",
+    "FiniteHorizonLQR",
+    "GPC, fixed",
+    "GRU",
+    "History",
+    "LeakyPID",
+    "Likeliest",
+    "LQI",
+    "OutputFeedback",
     "MPC",
     "MPC that samples",
     "SFC",
@@ -344,10 +355,9 @@ def test_grad(case, key):
         assert abs(exact - numeric) < 1e-5 * max(1.0, abs(exact)), path
 
 
+@needs_x64
 @every
-@pytest.mark.parametrize(
-    "dtype", [jnp.float32, pytest.param(jnp.float64, marks=needs_x64)]
-)
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_precision(case, key, dtype):
     """Controls have the precision of the observation."""
     env, controller = environment(dtype), case.make(1.0)

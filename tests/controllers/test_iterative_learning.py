@@ -78,6 +78,7 @@ def test_learning_in_wind(windy):
     assert_close(again.total_cost, run.cost, rtol=1e-8)
 
 
+@thorough
 def test_learning_in_wind_and_online(windy):
     options = dict(step=0.2, learning_rate=0.001)
     run = iGPC(*windy, indices="deluca", **options)
@@ -171,6 +172,7 @@ def test_batches_of_winds(windy):
 
 
 @pytest.mark.parametrize("learner", [ILC, pytest.param(iGPC, marks=thorough)])
+@thorough
 def test_bounds_disturbances_and_what_diverges(learner):
     sim = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
     plant = dlx.Discretized(dlx.systems.Pendulum(mass=1.2), dt=0.1)
