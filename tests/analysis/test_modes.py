@@ -9,6 +9,9 @@ import delucax as dlx
 from delucax.systems import LinearSystem
 
 
+pytestmark = needs_x64
+
+
 an = dlx.analysis
 
 

@@ -60,6 +60,7 @@ def test_holds_an_operating_point(key):
     assert_close(run.controls[-1], u, atol=1e-2)
 
 
+@thorough
 def test_time_varying_about_a_path():
     # Double steps every other time, along a path at constant speed.
     As = jnp.stack([A, A @ A] * 3)

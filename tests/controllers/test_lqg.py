@@ -16,6 +16,9 @@ from helpers import (
 import delucax as dlx
 
 
+pytestmark = needs_x64
+
+
 c = dlx.controllers
 A = jnp.array([[1.0, 0.2], [0.1, 0.9]])
 B = jnp.array([[0.0], [0.2]])

@@ -141,6 +141,7 @@ def test_bad_arguments_are_named():
 
 
 @needs_x64
+@thorough
 def test_learning_online_around_a_plan():
     """The gradient perturbation controller whose base is a plan: better than the plan
     alone where the plant is pushed as the plan did not foresee."""

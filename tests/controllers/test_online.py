@@ -95,6 +95,7 @@ def partial(base=None):
     return plant, c.DRC(plant, dlx.costs.Quadratic(R, R), base=base, memory=3)
 
 
+@thorough
 def test_natures_output():
     """It is what the base alone would have shown, whatever was added."""
     plant, learner = partial()

@@ -63,6 +63,7 @@ def test_time_varying_is_indexed_by_rounding():
 
 
 @needs_x64
+@thorough
 def test_linearize_is_central_differences():
     system = dlx.systems.Pendulum(length=1.3, damping=0.1)
     x, u, w = jnp.array([0.4, -0.3]), jnp.array([0.2]), jnp.zeros(2)

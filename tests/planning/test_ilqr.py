@@ -10,6 +10,9 @@ from helpers import assert_close, needs_x64, thorough, tolerance, user_error
 import delucax as dlx
 
 
+pytestmark = needs_x64
+
+
 ilqr = dlx.planning.ilqr
 START = jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
 
@@ -181,6 +184,7 @@ def test_known_disturbances_and_time():
     assert plan.cost < end + cost.final(0.0, unaware[-1])
 
 
+@thorough
 def test_bounds_hold_and_their_gains_are_zero():
     free, plan = swing(), swing(bounds=(-4.0, [5.0]))
     assert jnp.min(free.controls) < -4.0

@@ -75,6 +75,7 @@ def test_what_diverges_has_no_part_in_it(planner, options):
     [PLANNERS["mppi"], pytest.param(*PLANNERS["cem"], marks=thorough)],
     ids=list(PLANNERS),
 )
+@thorough
 def test_bounds_batches_and_derivatives(planner, options):
     dynamics, cost, _, U = linear()
     options = options | dict(bounds=(-0.2, [0.3]), correlation=0.5, samples=64)

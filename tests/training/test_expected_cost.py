@@ -4,11 +4,14 @@ import jax.random as jr
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, CountCalls, tolerance, user_error
+from helpers import assert_close, CountCalls, needs_x64, tolerance, user_error
 from jaxtyping import Array
 
 import delucax as dlx
 from delucax.training import analytic, expected_cost, fit, scored_cost
+
+
+pytestmark = needs_x64
 
 
 def pendulum(**kwargs):

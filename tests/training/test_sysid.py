@@ -5,7 +5,7 @@ import jax.random as jr
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, needs_x64, user_error
+from helpers import assert_close, needs_x64, thorough, user_error
 
 import delucax as dlx
 from delucax.training import fit, sysid
@@ -112,6 +112,7 @@ def test_arx_is_the_dynamics_that_it_came_from():
     assert_close(again, outputs[2:], atol=1e-9)
 
 
+@thorough
 def test_neural_fits_predict():
     states, controls, _ = recorded(noise=1e-3)
     spread = jnp.std(states, axis=0)
