@@ -129,13 +129,18 @@ LONG = {
     training.sysid.physical training.worst_case
     """.split()
 }
-"""Examples that compile for long."""
+"""Examples that compile for long, beside those of whole packages that do."""
+HEAVY = tuple(
+    f"delucax.{name}." for name in "analysis lung planning riccati training".split()
+)
 
 
 @pytest.mark.parametrize(
     "name, value",
     [
-        pytest.param(*case, id=id, marks=thorough if id in LONG else ())
+        pytest.param(
+            *case, id=id, marks=thorough if id in LONG or id.startswith(HEAVY) else ()
+        )
         for case, id in zip(CALLABLES, IDS, strict=True)
     ],
 )
