@@ -97,7 +97,9 @@ class OnlineLearner(AbstractLearner):
     def init(self, *, key=None):
         loop, features = self.loop, self.features
         theta, dtype = self.policy.init(), loop.dtype
-        same = self._constant_root() if loop.response is not None else None
+        asks = isinstance(self.optimiser, optax.GradientTransformationExtraArgs)
+        known = asks and loop.response is not None
+        same = self._constant_root() if known else None
         inner = loop.init(key, loop.horizon)
         return LearnerState(
             inner,
