@@ -8,9 +8,10 @@ from jaxtyping import Array
 
 from .._check import as_vector, check_count
 from ._base import AbstractDynamics
+from ._wrapper import AbstractWrapper
 
 
-class Delayed(AbstractDynamics):
+class Delayed(AbstractWrapper):
     """Dynamics whose controls act, or whose sensor reads, some whole steps late,
 
     `x_next = F(t, x, u[k - controls], w)`, `y = observe(t, x)[k - sensor]`.
@@ -57,10 +58,6 @@ class Delayed(AbstractDynamics):
         self.sensor = check_count(sensor, "sensor", where, least=0)
 
     @property
-    def dt(self):
-        return self.dynamics.dt
-
-    @property
     def state_names(self):
         inner = self.dynamics
         late = [
@@ -71,22 +68,6 @@ class Delayed(AbstractDynamics):
         seen = range(inner.observation_size if self.sensor else 0)
         late += [f"y{i}[-{k + 1}]" for k in range(self.sensor) for i in seen]
         return (*inner.state_names, *late)
-
-    @property
-    def control_names(self):
-        return self.dynamics.control_names
-
-    @property
-    def control_units(self):
-        return self.dynamics.control_units
-
-    @property
-    def disturbance_size(self):
-        return self.dynamics.disturbance_size
-
-    @property
-    def is_stochastic(self):
-        return self.dynamics.is_stochastic
 
     def _cut(self, x: Array) -> tuple[Array, Array, Array]:
         """The plant's own state, the controls and the observations under way."""

@@ -9,9 +9,10 @@ from .._fields import parameter
 from ..math import matvec
 from ..math._norms import within_ball
 from ._base import AbstractDynamics
+from ._wrapper import AbstractWrapper
 
 
-class WorstCase(AbstractDynamics):
+class WorstCase(AbstractWrapper):
     """Dynamics with an adversary who sees the state and adds to the disturbance,
 
     `x_next = F(t, x, u, w + L difference(x, x_ref))`,
@@ -73,32 +74,8 @@ class WorstCase(AbstractDynamics):
         self.dynamics, self.bound = dynamics, bound
 
     @property
-    def dt(self):
-        return self.dynamics.dt
-
-    @property
-    def state_names(self):
-        return self.dynamics.state_names
-
-    @property
-    def control_names(self):
-        return self.dynamics.control_names
-
-    @property
     def state_units(self):
         return self.dynamics.state_units
-
-    @property
-    def control_units(self):
-        return self.dynamics.control_units
-
-    @property
-    def disturbance_size(self):
-        return self.dynamics.disturbance_size
-
-    @property
-    def is_stochastic(self):
-        return self.dynamics.is_stochastic
 
     def attack(self, x: Array) -> Array:
         """What the adversary adds to the disturbance.
@@ -116,12 +93,3 @@ class WorstCase(AbstractDynamics):
     def advance(self, t, x, u, w):
         added = self.attack(x)
         return self.dynamics.advance(t, x, u, added if w is None else w + added)
-
-    def observe(self, t, x):
-        return self.dynamics.observe(t, x)
-
-    def difference(self, x, x_ref):
-        return self.dynamics.difference(x, x_ref)
-
-    def equilibrium(self):
-        return self.dynamics.equilibrium()

@@ -11,10 +11,11 @@ from .._fields import parameter
 from ..costs import AbstractCost
 from ..disturbances import Gaussian
 from ..dynamics import AbstractDynamics
+from ..dynamics._wrapper import AbstractWrapper
 from ._waveform import BreathWaveform
 
 
-class PressureSensor(AbstractDynamics):
+class PressureSensor(AbstractWrapper):
     """Dynamics whose observation, a pressure, is kept and seen some steps late.
 
     The state is that of the dynamics, then the pressure now, then the last `delay` of
@@ -62,29 +63,9 @@ class PressureSensor(AbstractDynamics):
         self.delay = check_count(delay, "delay", where, least=0)
 
     @property
-    def dt(self):
-        return self.dynamics.dt
-
-    @property
     def state_names(self):
         late = [f"pressure[-{k + 1}]" for k in range(self.delay)]
         return (*self.dynamics.state_names, "sensed pressure", *late)
-
-    @property
-    def control_names(self):
-        return self.dynamics.control_names
-
-    @property
-    def control_units(self):
-        return self.dynamics.control_units
-
-    @property
-    def disturbance_size(self):
-        return self.dynamics.disturbance_size
-
-    @property
-    def is_stochastic(self):
-        return self.dynamics.is_stochastic
 
     def filled(self, x: Any) -> Array:
         """The state of a lung that has rested.

@@ -3,7 +3,7 @@
 import threading
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 from ..dynamics import AbstractDynamics
+from ..dynamics._wrapper import AbstractWrapper
 
 
 class Evaluations(NamedTuple):
@@ -108,48 +109,16 @@ class _Tally:
             self.found[kind] += lanes
 
 
-class _Counted(AbstractDynamics):
+class _Counted(AbstractWrapper):
     """Dynamics that report each evaluation."""
 
     dynamics: AbstractDynamics
     tally: _Tally = eqx.field(static=True)
 
-    state_units: ClassVar[Any] = ()
-    control_units: ClassVar[Any] = ()
-
-    @property
-    def dt(self):
-        return self.dynamics.dt
-
-    @property
-    def state_names(self):
-        return self.dynamics.state_names
-
-    @property
-    def control_names(self):
-        return self.dynamics.control_names
-
-    @property
-    def disturbance_size(self):
-        return self.dynamics.disturbance_size
-
-    @property
-    def is_stochastic(self):
-        return self.dynamics.is_stochastic
-
     def advance(self, t, x, u, w):
         x_next, result = self.dynamics.advance(t, x, u, w)
         here = dict(tally=self.tally, kind=PRIMAL, lanes=1)
         return _report.bind(x_next, jax.lax.stop_gradient(x_next), **here), result
-
-    def observe(self, t, x):
-        return self.dynamics.observe(t, x)
-
-    def difference(self, x, x_ref):
-        return self.dynamics.difference(x, x_ref)
-
-    def equilibrium(self):
-        return self.dynamics.equilibrium()
 
 
 _report = Primitive("report")
