@@ -103,9 +103,9 @@ def oracle_complexity(small: bool = False) -> Finding:
         f"origin, from hovering. Central differences have the spacing {SPACING:g}; the "
         "formula printed in the paper has a plus where the difference needs a minus. "
         "Samples: evolution strategies in place of the Jacobian, the mean of rise "
-        "times direction over antithetic Gaussian perturbations of the same size, drawn "
-        f"anew at each point; at most {limit['max_iterations']} iterations. Calls are those "
-        "of the whole solve, line search included."
+        "times direction over antithetic Gaussian perturbations of the same size, "
+        f"drawn anew at each point; at most {limit['max_iterations']} iterations. "
+        "Calls are those of the whole solve, line search included."
     )
     return Finding(
         "Dynamics calls of model-based planning",
