@@ -1,5 +1,6 @@
 """Precision comes from JAX_ENABLE_X64; both are run."""
 
+import gc
 import sys
 from pathlib import Path
 
@@ -8,6 +9,10 @@ import pytest
 
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+# Tracing makes many objects that live on, and each collection looks at all of them: an
+# eighth of the time of the tests with Python's own threshold.
+gc.set_threshold(200_000, 50, 100)
 
 
 @pytest.fixture

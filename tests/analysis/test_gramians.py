@@ -89,7 +89,11 @@ def test_disturbances_enter_through_E():
 @needs_x64
 @pytest.mark.parametrize(
     "make, horizon",
-    [(LinearSystem, None), (LinearSystem, 0.7), (dlx.LinearDynamics, None)],
+    [
+        (LinearSystem, None),
+        pytest.param(LinearSystem, 0.7, marks=thorough),
+        pytest.param(dlx.LinearDynamics, None, marks=thorough),
+    ],
 )
 def test_gradients_are_central_differences(make, horizon):
     start = jnp.asarray((A if make is LinearSystem else A_STEP)[:2, :2])

@@ -112,6 +112,7 @@ def test_disk_margins_are_controls_on_a_fine_grid(name):
         assert_close(20 * np.log10(ours), gain, rtol=close)
 
 
+@thorough
 def test_each_margin_puts_a_pole_on_the_boundary():
     loop, _ = loop_of(LOOPS["resonant"])
     found = an.margins(loop)

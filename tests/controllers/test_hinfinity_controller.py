@@ -82,6 +82,7 @@ def test_time_varying_about_a_path():
         HInfinity(stray, Q, R, gamma=50.0)
 
 
+@thorough
 def test_angles_wrap():
     env = dlx.make("pendulum")
     upright = dlx.linearize(env.dynamics)

@@ -175,6 +175,7 @@ def test_steady_state():
     assert_close(*densities, **CLOSE)
 
 
+@thorough
 def test_steady_smoother_is_that_of_the_stationary_start():
     transient, ys, us = problem(2, 1, T=6)
     dynamics, W, V = transient.dynamics, transient.W, transient.V

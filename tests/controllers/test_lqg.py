@@ -159,6 +159,7 @@ def test_holds_an_operating_point(key):
     assert abs(run.final_state[0] - 0.3) > 0.01
 
 
+@thorough
 def test_output_feedback_of_anything(key):
     """With the parts of an LQG it is that LQG; each part may be another one."""
     env = environment(horizon=10)

@@ -3,7 +3,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, central_difference, needs_x64, tolerance, user_error
+from helpers import (
+    assert_close,
+    central_difference,
+    needs_x64,
+    thorough,
+    tolerance,
+    user_error,
+)
 
 import delucax as dlx
 
@@ -91,6 +98,7 @@ def test_inside_jit_and_vmap(key):
     assert_close(costs(lengths)[1], alone, rtol=tolerance(1e-4, 1e-11))
 
 
+@thorough
 @needs_x64
 def test_gradient_through_the_design(key):
     env = dlx.make("lds", A=A, B=B)

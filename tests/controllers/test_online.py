@@ -68,7 +68,13 @@ FEW = [
 
 
 @pytest.mark.parametrize("make", FEW)
-@pytest.mark.parametrize("dynamics", [PLANT, PENDULUM], ids=["linear", "pendulum"])
+@pytest.mark.parametrize(
+    "dynamics",
+    [
+        pytest.param(PLANT, id="linear"),
+        pytest.param(PENDULUM, id="pendulum", marks=thorough),
+    ],
+)
 def test_recovered_disturbances(dynamics, make):
     """Exactly zero where there are none, and else what they were, under saturation."""
     env = dlx.Environment(dynamics, COST, control_bounds=(-0.4, 0.4))

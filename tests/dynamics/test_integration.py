@@ -86,6 +86,7 @@ class Hidden(dlx.AbstractSystem):
 # What a step is.
 
 
+@thorough
 def test_substeps_are_shorter_steps():
     for solver in (diffrax.Tsit5(), diffrax.ImplicitEuler()):
         x = X

@@ -34,6 +34,7 @@ def arrived(t, x):
     return x - jnp.array([1.0, 0.0, 0.0, 0.0])
 
 
+@thorough
 @needs_x64
 def test_an_obstacle_and_an_end_against_scipy():
     optimize = pytest.importorskip("scipy.optimize")

@@ -2,14 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-from helpers import assert_close, needs_x64, user_error
+from helpers import assert_close, needs_x64, once, thorough, user_error
 
 import delucax as dlx
 from delucax.planning import count_evaluations
 from delucax.planning._problem import model, Problem
 
 
-pytestmark = needs_x64
 T = 30
 
 
@@ -22,6 +21,7 @@ def quadrotor():
     return env.dynamics, cost, env.initial_state, jnp.tile(hover, (T, 1))
 
 
+@needs_x64
 def test_a_linearisation():
     """16 calls a knot by central differences; one, and a product for each state, by
     reverse mode."""
@@ -45,6 +45,8 @@ def test_a_linearisation():
     assert_close(near, exact, atol=1e-4)
 
 
+@thorough
+@needs_x64
 def test_a_whole_plan():
     """What the planner says of itself is what it did: each roll-out is T calls, and
     each iteration, and the last look, one linearisation."""
@@ -62,6 +64,7 @@ def test_a_whole_plan():
     assert_close(near.controls, exact.controls, atol=1e-3)
 
 
+@needs_x64
 def test_modes_and_batches():
     dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
     x, u = jnp.ones(2), jnp.zeros(1)
@@ -83,8 +86,20 @@ def test_modes_and_batches():
         count_evaluations(3, dynamics)
 
 
+@needs_x64
 def test_differences_and_second_order():
     with user_error(match="finite_difference goes without second_order"):
         dlx.planning.ilqr(*quadrotor(), finite_difference=1e-2, second_order=True)
     with user_error(match="finite_difference must be positive"):
         dlx.planning.ilqr(*quadrotor(), finite_difference=0.0)
+
+
+@once
+def test_another_precision_than_that_of_the_session():
+    with jax.enable_x64(True):
+        spring = dlx.LinearDynamics(jnp.eye(2), jnp.ones((2, 1)))
+        step = lambda dynamics: dynamics(0.0, jnp.full(2, 0.1), jnp.ones(1))
+        found, evaluations = count_evaluations(step, spring)
+        assert found.dtype == jnp.float64
+        assert_close(found, [1.1, 1.1], rtol=1e-15)
+    assert evaluations == (1, 0, 0)

@@ -89,6 +89,7 @@ def test_least_energy():
     assert_close(moved, [-2, -1.5], rtol=tolerance(1e-3, 1e-9))
 
 
+@thorough
 def test_ill_posed_where_it_cannot_be_seen():
     solve = jax.jit(lambda A, R: dlx.riccati.care(A, B, Q, R, throw=False).result)
     ill_posed = dlx.RESULTS.ill_posed

@@ -194,6 +194,7 @@ def test_complex_data():
     assert_close(turned.K, plain.K @ turn.conj(), atol=tolerance(1e-4, 1e-12))
 
 
+@thorough
 @needs_x64
 def test_dead_beat_loop_has_a_gradient():
     nilpotent = jnp.array([[0.0, 1.0], [0.0, 0.0]])

@@ -272,6 +272,7 @@ def test_differential_equation():
         assert_close(long.X[0], X, rtol=1e-11)
 
 
+@thorough
 def test_stiff_differential_equation():
     # Rates of 1e5 and 1 over a time of 3, where an exponential would overflow.
     rates = np.array([1e5, 1.0])
@@ -284,6 +285,7 @@ def test_stiff_differential_equation():
     assert_close(solution.X[0, 1, 1], exact, rtol=1e-12)
 
 
+@thorough
 def test_escape_in_finite_time():
     # dX/ds = X^2 (-1) - 1 from 0 is -tan s, which is beyond its pole at 2 and at 10:
     # there, the first interval goes past two poles.

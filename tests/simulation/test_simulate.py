@@ -251,6 +251,7 @@ def test_continuous_feedback_agrees_with_scipy():
     assert_close(run.controls[:, 0], -4 * seen, atol=tolerance(5e-5, 1e-9))
 
 
+@thorough
 def test_a_function_of_time():
     signal = lambda t: jnp.stack([jnp.cos(t)])
     exact = np.sin(np.linspace(0, 1, 11))

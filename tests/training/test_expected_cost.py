@@ -4,7 +4,7 @@ import jax.random as jr
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, CountCalls, needs_x64, tolerance, user_error
+from helpers import assert_close, CountCalls, needs_x64, thorough, tolerance, user_error
 from jaxtyping import Array
 
 import delucax as dlx
@@ -33,6 +33,7 @@ def test_it_is_the_mean_of_rollouts():
     assert_close(one(CONTROLLER, jr.key(0)), cost, rtol=1e-6)
 
 
+@thorough
 def test_what_the_gradient_stores_does_not_change_it():
     gradients = [
         analytic(

@@ -110,6 +110,7 @@ def test_advantages_know_an_end_from_a_cut(ends, bootstrap):
     assert_close(record.valid, np.arange(6) < length)
 
 
+@thorough
 @needs_x64
 def test_gradient_of_ppo_is_the_policy_gradient_at_first():
     """Where nothing has moved, the ratio is 1 and its gradient that of the score."""
@@ -169,6 +170,7 @@ def test_window_of_shac_is_the_whole_gradient_where_it_spans_the_horizon():
         assert_close(a * scale, b, rtol=1e-9, atol=1e-12)
 
 
+@thorough
 @needs_x64
 def test_gradient_is_cut_between_windows():
     """A cut rollout has the gradient of its stretches, each from a start held fixed."""

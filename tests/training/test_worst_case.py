@@ -26,6 +26,7 @@ def cost(w):
     return run.total_cost
 
 
+@thorough
 def test_no_bounded_sequence_is_worse():
     options = dict(key=KEY, bound=0.5, x0=np.zeros(2))
     found = dlx.training.worst_case(ENV, LQR, **options)
