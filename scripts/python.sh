@@ -1,5 +1,6 @@
 #!/bin/sh
-# Print the path of the newest Python on this machine that can run delucax.
+# Print the path of the newest Python on this machine that can run delucax, or with the
+# argument `oldest` that of the oldest one.
 #
 # A candidate counts only once it has been run: a pyenv shim may sit on PATH and fail for
 # a version that is not selected, and some systems ship a Python without `venv`. Every
@@ -9,6 +10,7 @@
 set -u
 
 MINIMUM=11 # 3.11, as requires-python in pyproject.toml
+order=${1:-newest}
 NEWEST=14  # 3.14, the newest version with wheels of every dependency
 
 # Print the minor version of a usable CPython 3, or nothing.
@@ -29,8 +31,14 @@ consider() {
     minor=$(minor_version "$1") || return 0
     case $minor in '' | *[!0-9]*) return 0 ;; esac
     [ "$minor" -ge "$MINIMUM" ] || return 0
-    # Known versions first, newest first; a newer one only where there is nothing else.
-    if [ "$minor" -le "$NEWEST" ]; then rank=$minor; else rank=0; fi
+    # Known versions first; a newer one only where there is nothing else.
+    if [ "$minor" -gt "$NEWEST" ]; then
+        rank=0
+    elif [ "$order" = oldest ]; then
+        rank=$((100 - minor))
+    else
+        rank=$minor
+    fi
     if [ "$rank" -gt "$best_rank" ]; then
         best=$1
         best_rank=$rank

@@ -222,14 +222,18 @@ KIN = (
     "MLP of features",
     "Gaussian of PID",
 )
-every = pytest.mark.parametrize(
-    "case",
-    [
+
+
+def over(cases):
+    parameters = [
         pytest.param(case, id=name, marks=thorough if name in KIN else ())
-        for name, case in CASES.items()
-    ],
-)
-PARTICULAR = {name: case for name, case in CASES.items() if case.reads_all}
+        for name, case in cases.items()
+    ]
+    return pytest.mark.parametrize("case", parameters)
+
+
+every = over(CASES)
+particular = over({name: case for name, case in CASES.items() if case.reads_all})
 
 
 def environment(dtype=None):
@@ -374,7 +378,7 @@ def test_precision(case, key):
 
 
 @once
-@pytest.mark.parametrize("case", PARTICULAR.values(), ids=PARTICULAR)
+@particular
 def test_wrong_observation(case, key):
     """An observation of another size is an error that names both sizes."""
     controller = case.make(1.0)

@@ -104,6 +104,7 @@ def test_total_is_the_sum_over_the_run(key):
     assert_close(totals[1], policy.total_log_prob(batch[1]), rtol=1e-5)
 
 
+@thorough
 def test_follows_the_state_of_its_base(key):
     env = lds(control_bounds=BOUNDS)
     pid = dlx.controllers.PID(1.0, 2.0, 0.3, dt=1.0, output=0)

@@ -81,6 +81,7 @@ def test_angles_wrap():
     assert abs(plain(0.0, far, None)[0][0] - u[0]) > 10
 
 
+@thorough
 def test_inside_jit_and_vmap(key):
     env = dlx.make("pendulum")
     x0 = jnp.array([0.2, 0.0])

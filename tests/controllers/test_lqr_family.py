@@ -274,6 +274,7 @@ def test_sampled_regulator_charges_the_continuous_cost():
     assert_close(total, x0 @ controller.P @ x0, rtol=1e-10)
 
 
+@thorough
 def test_sampled_regulator_of_short_steps_is_the_continuous_one():
     controller = dlx.controllers.lqrd(STIFF, Q3, R, 1e-3)
     A_, B_ = np.asarray(STIFF.A, float), np.asarray(STIFF.B, float)

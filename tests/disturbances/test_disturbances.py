@@ -3,7 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, user_error
+from helpers import assert_close, once, user_error
 
 import delucax as dlx
 
@@ -26,6 +26,7 @@ ALL = {
 }
 
 
+@once
 @pytest.mark.parametrize("name", ALL)
 def test_contract(name, key):
     disturbance = ALL[name]

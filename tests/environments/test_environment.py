@@ -3,7 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, CountCalls, thorough, user_error
+from helpers import assert_close, CountCalls, once, thorough, user_error
 
 import delucax as dlx
 
@@ -12,6 +12,7 @@ DYNAMICS = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
 COST = dlx.costs.PendulumCost()
 
 
+@once
 @pytest.mark.parametrize("name", dlx.environments.registered())
 def test_every_task(name, key):
     arguments = {"key": key} if name in ("lds", "neural") else {}

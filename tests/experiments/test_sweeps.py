@@ -194,6 +194,7 @@ print("equal")
 """
 
 
+@thorough
 def test_eight_devices_agree_with_one():
     """A batch of rollouts, its gradient, and an experiment's seeds."""
     flags = "--xla_force_host_platform_device_count=8"

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import once, user_error
+from helpers import once, thorough, user_error
 
 import delucax as dlx
 from delucax import experiments
@@ -330,6 +330,7 @@ print(*map(fingerprint, things))
 """
 
 
+@thorough
 def test_the_hash_is_that_of_another_process(capsys):
     exec(HASHES, {"__name__": "__main__"})
     there = subprocess.run(

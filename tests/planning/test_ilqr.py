@@ -141,6 +141,7 @@ def test_a_plan_is_a_controller():
         plan(0.0, jnp.zeros(3), None)
 
 
+@thorough
 @pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=thorough)])
 def test_gains_are_those_of_the_regulator_of_a_linear_problem(parallel):
     A, B = jnp.array([[1.0, 0.1], [0.3, 0.9]]), jnp.array([[0.0], [0.1]])
@@ -228,6 +229,20 @@ def test_bounds_against_scipy(size):
     assert_close(plan.cost, found.fun, rtol=1e-8)
     assert_close(plan.controls.ravel(), found.x, atol=1e-4)
     assert plan.residual < 1e-6
+
+
+def test_a_bound_that_is_far_is_not_taken_for_met():
+    """The second derivatives about hovering make the problem concave, and its slopes
+    grow without limit back in time."""
+    dynamics, _, _, hover = regulated()
+    weights = jnp.array([0.2, 0.2, 0.1, 0.1, 0.1, 0.1]), 0.1 * jnp.ones(2)
+    ends = jnp.array([50.0, 50.0, 5.0, 5.0, 5.0, 5.0])
+    cost = dlx.costs.Quadratic(*weights, final=ends, control_target=hover[0])
+    x0 = jnp.array([-2.5, 0.3, 0.0, 0.0, 0.0, 0.0])
+    options = dict(bounds=(0.0, 1.0), second_order=True, throw=False)
+    plan = ilqr(dynamics, cost, x0, hover[:80], **options)
+    assert plan.iterations > 5 and plan.residual < 1e-6
+    assert plan.cost < 0.1 * plan.trace[0]
 
 
 @needs_x64

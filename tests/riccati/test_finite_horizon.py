@@ -192,6 +192,7 @@ def test_no_minimum(parallel):
     assert nothing.result == dlx.RESULTS.infeasible
 
 
+@thorough
 @pytest.mark.parametrize("parallel", [False, True])
 def test_one_bad_member_harms_no_other(parallel):
     def total(R):

@@ -323,6 +323,7 @@ def test_a_disturbance_without_effect():
     assert_close(solution.L, np.zeros((2, 2)))
 
 
+@thorough
 @pytest.mark.parametrize("solve", [GAMES["dare"], GAMES["dre"]], ids=["dare", "dre"])
 def test_the_least_level_has_first_derivatives_only(solve):
     level = lambda A: solve(A, *SMOOTH[1:], throw=False).gamma

@@ -264,6 +264,7 @@ def test_a_function_of_time():
     assert_close(held.controls[:, 0], np.cos(0.1 * np.arange(10)), atol=1e-6)
 
 
+@thorough
 def test_a_controller_that_draws(key):
     noise = dlx.controllers.Random(jnp.ones(1))
     run = dlx.simulate(INTEGRATOR, noise, 0.0, 1.0, jnp.zeros(1), dt=0.1, key=key)
