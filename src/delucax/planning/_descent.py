@@ -226,11 +226,17 @@ def directions(
     if stages.d is not None:
         slope, bent = promised(stages, policy.K, policy.k)
         policy = policy._replace(slope=slope, curvature=bent)
-    slope = policy.gradient
-    if box is not None:
-        slope = jnp.minimum(jnp.maximum(-slope, box[0]), box[1])
-    residual = jnp.max(jnp.abs(slope))
-    return policy, residual, residual <= tolerance * (1 + policy.scale)
+    slope, enough = policy.gradient, tolerance * (1 + policy.scale)
+    if box is None:
+        residual = jnp.max(jnp.abs(slope))
+        return policy, residual, residual <= enough
+    # Where a bound is met the gradient may be of any size, and how near the bound is
+    # has nothing to do with that size.
+    room = jnp.where(slope > 0, -box[0], box[1])
+    small = jnp.abs(slope) <= enough
+    met = room <= tolerance * (1 + jnp.abs(controls))
+    step = jnp.minimum(jnp.maximum(-slope, box[0]), box[1])
+    return policy, jnp.max(jnp.abs(step)), jnp.all(small | met)
 
 
 def _penalty(before: Array, now: Found, policy: Policy) -> Array:

@@ -73,8 +73,9 @@ def ilqr(
     of nothing, such as that of a lane that a batch masks, stays zero). It does not
     depend on `controls` and `states`, from which the iteration only starts.
 
-    Many starts on a CPU are planned faster one after the other, by `jax.lax.map`, than
-    by `jax.vmap`, under which each iteration waits for the longest line search.
+    Under `jax.vmap` on CPU the plans of a batch are made one after the other, which is
+    up to six times as fast as together, where each iteration would wait for the longest
+    line search and the last plan; accelerators make them together.
 
     **Arguments:**
 

@@ -4,6 +4,7 @@ At a solution the gradient of the Lagrangian is zero. So the change of the solut
 the problem solves one linear-quadratic problem, with the exact second derivatives.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,6 +23,7 @@ from ._constraints import (
     stage_values,
 )
 from ._descent import CONVERGED, Options, Outcome, Tolerances
+from ._lanes import by_lanes
 from ._lq import apply, in_parallel, in_sequence, product, solve_free, Stages
 from ._poison import poison
 from ._problem import costates_of, model, Problem
@@ -43,7 +45,8 @@ def solution(
     options: Options,
 ) -> Outcome:
     """What the iteration ends with; differentiable with respect to the problem."""
-    return with_constraints(problem, controls, guess, tolerances, options)
+    run = functools.partial(with_constraints, options=options)
+    return by_lanes(run, problem, controls, guess, tolerances)
 
 
 @solution.def_jvp
