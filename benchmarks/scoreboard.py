@@ -88,7 +88,7 @@ def tables(results: Results) -> str:
         scores.append(line)
         raw.append(numbers)
         speed.append(times)
-    names = ["zero", "LQR", "H∞", "GPC", "MLP", "plan"]
+    names = ["zero", "PID", "LQR", "H∞", "GPC", "MLP", "plan"]
     parts = [
         "Score: 0 is the floor, 1 the best known.\n",
         _markdown(["task", "floor", *names[:-1]], [row[:-1] for row in scores], 2),

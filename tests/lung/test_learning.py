@@ -9,6 +9,7 @@ from helpers import assert_close, once, thorough, tolerance, user_error
 
 import delucax as dlx
 from delucax import lung
+from delucax.lung._train import _Careful
 
 
 pytestmark = once
@@ -89,6 +90,47 @@ def test_controller_learns_and_the_grid_knows_the_best():
     assert_close(jnp.mean(own), jnp.min(grid.errors[0]), rtol=1e-4)
     least = lung.least_error(lung.single_compartment(5.0), pips=[20.0], steps=150)
     assert least[0] < own[0]
+
+
+def test_a_learned_lung_is_drawn_to_what_is_read(breaths):
+    model = lung.LearnedLung(breaths, width=2, boundary=1, key=KEY)
+    before = model.resting()
+    after = model.drawn(before, 15.0, 0.3)
+    expected = 0.7 * model.pressure(before) + 0.3 * 15.0
+    assert_close(model.pressure(after), expected, rtol=tolerance(1e-5, 1e-12))
+    assert np.sum(np.asarray(after != before)) == 1
+
+
+def test_an_alarm_costs_more_than_an_error():
+    cost = _Careful(lung.BreathCost(lung.BreathWaveform(), index=2), jnp.asarray(45.0))
+    u = jnp.zeros(2)
+    assert_close(cost(0.5, jnp.array([0.0, 0.0, 44.0]), u), 9.0)
+    assert_close(cost(0.5, jnp.array([0.0, 0.0, 47.0]), u), 12.0 + 20.0)
+    lower = lung.at_pip(cost, 20.0)
+    assert_close(lower(0.5, jnp.array([0.0, 0.0, 44.0]), u), 24.0)
+
+
+def test_stacks_come_apart():
+    lungs = [lung.SingleCompartment(R) for R in (5.0, 20.0)]
+    both = lung.stack(lungs)
+    assert_close(both.resistance, [5.0, 20.0])
+    assert_close(lung.unstack(both)[1].resistance, 20.0)
+    traced = jax.jit(lambda r: lung.stack([lungs[0].resistance, r]))(jnp.asarray(7.0))
+    assert_close(traced, [5.0, 7.0])
+    keys = lung.stack([jax.random.key(0), jax.random.key(1)])
+    assert jax.random.bits(lung.unstack(keys)[1]) == jax.random.bits(jax.random.key(1))
+    with user_error(match="trees must not be empty"):
+        lung.stack([])
+
+
+def test_a_damaged_checkpoint_is_refused(breaths, tmp_path):
+    path = tmp_path / "lungs.fit"
+    path.write_bytes(b"delucax-file 1 0000\nnonsense")
+    model = lung.LearnedLung(breaths, width=2, boundary=1, key=KEY)
+    with user_error(match="lungs.fit' must be a file that fit has written"):
+        lung.fit_lungs(
+            model, breaths, key=KEY, teacher_steps=0, steps=1, checkpoint=path
+        )
 
 
 def test_wrong_arguments(breaths):

@@ -165,6 +165,15 @@ def test_rests_where_it_says(name):
     assert_close(plant.vector_field(0.0, x, jnp.zeros(2), None), 0.0, atol=1e-12)
 
 
+def test_the_quickest_lung_rests_while_its_valve_is_open():
+    """What rounding moves comes to rest again: the steps are short enough."""
+    env = lung.double_compartment(5.0, 10.0, noise=0.0)
+    x0 = env.initial_state.at[2].multiply(1.01)
+    controls = jnp.tile(jnp.array([0.0, 1.0]), (200, 1))
+    states = dlx.open_loop(env.dynamics, x0, controls)
+    assert_close(env.dynamics.pressure(states[-1]), 5.0, rtol=1e-5)
+
+
 def test_balloon_has_a_greatest_pressure():
     with user_error(match="pressure must be at most the 69.* that the balloon"):
         lung.BalloonLung().resting(80.0)

@@ -4,13 +4,15 @@ import csv
 import json
 
 import jax
+import jax.numpy as jnp
 import pytest
-from helpers import once, thorough, user_error
+from helpers import assert_close, once, thorough, user_error
 
 import delucax as dlx
 from delucax import lung
 from delucax.__main__ import main
 from delucax.lung import _study
+from delucax.lung._stages import Stages
 
 
 pytestmark = once
@@ -23,10 +25,34 @@ def begun(tmp_path, monkeypatch):
     def cut_off(size):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_study, "_explored", cut_off)
+    monkeypatch.setattr(_study, "explored", cut_off)
     with pytest.raises(KeyboardInterrupt):
         lung.lung_study(tmp_path, small=True, say=lambda line: None)
     return tmp_path
+
+
+def test_goes_on_where_it_was_cut_off(tmp_path):
+    made, said = [], []
+
+    def first():
+        made.append("first")
+        return jnp.arange(3.0)
+
+    def cut_off():
+        stages.fit_file("second").write_text("half of it")
+        raise KeyboardInterrupt
+
+    stages = Stages(tmp_path, {"seeds": 1}, said.append)
+    stages.stage("first", "One", first)
+    with pytest.raises(KeyboardInterrupt):
+        stages.stage("second", "Two", cut_off)
+    again = Stages(tmp_path, {"seeds": 1}, said.append)
+    assert_close(again.stage("first", "One", first), [0.0, 1.0, 2.0])
+    assert made == ["first"] and said[-1].startswith("One: found")
+    # What is left of its training is there to go on from, and gone at its end.
+    assert again.fit_file("second").read_text() == "half of it"
+    assert again.stage("second", "Two", lambda: 5.0) == 5.0
+    assert not again.fit_file("second").exists()
 
 
 def test_other_settings_are_refused(begun):

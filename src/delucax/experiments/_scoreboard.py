@@ -14,17 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from ..controllers import Deep, GPC, HInfinity, LQR, Sequence, Zero
+from ..controllers import Deep, GPC, HInfinity, LeakyPID, LQR, Sequence, Zero
 from ..disturbances import Gaussian
 from ..dynamics import linearize
 from ..environments import Environment, make, registered, UniformState
+from ..lung import Breathing
 from ..planning import ilqr
 from ..simulation import rollout
 from ..training import expected_cost, fit
 from ._experiment import experiment
 
 
-METHODS = ("zero", "LQR", "H-infinity", "GPC", "MLP", "plan")
+METHODS = ("zero", "PID", "LQR", "H-infinity", "GPC", "MLP", "plan")
 TRAINING_STEPS = 200
 # Seeds that are run, and timed, in one batch.
 BATCH = 8
@@ -69,6 +70,8 @@ def _agent(name: str, method: str) -> Any:
         return Zero(env.control_size)
     if method == "MLP":
         return _trained(env)
+    if method == "PID":
+        return _following(env)
     try:
         model, Q, R = _local(name)
         options: dict[str, Any] = {"difference": env.dynamics.difference}
@@ -80,6 +83,14 @@ def _agent(name: str, method: str) -> Any:
         return GPC(env.dynamics, env.cost, base=regulator)
     except (ValueError, RuntimeError) as error:
         raise Unsuitable(str(error)) from error
+
+
+def _following(env: Environment) -> Any:
+    """A PID on the waveform that a lung is to breathe as."""
+    waveform = getattr(env.cost, "waveform", None)
+    if waveform is None:
+        raise Unsuitable("the cost follows no waveform")
+    return Breathing(LeakyPID(dt=env.dt, reference=waveform), waveform)
 
 
 @functools.cache

@@ -17,6 +17,7 @@ from ._environment import (
     PressureSensor as PressureSensor,
     ventilation as ventilation,
 )
+from ._fitting import fit_lungs as fit_lungs, open_loop_error as open_loop_error
 from ._grid import (
     least_error as least_error,
     pid_grid as pid_grid,
@@ -56,6 +57,7 @@ from ._runner import (
     SimulatedRunner as SimulatedRunner,
 )
 from ._shooting import ShootingMPC as ShootingMPC
+from ._stacking import stack as stack, unstack as unstack
 from ._study import lung_study as lung_study
 from ._tasks import (
     balloon_lung as balloon_lung,
@@ -66,12 +68,8 @@ from ._tasks import (
 )
 from ._train import (
     breath_error as breath_error,
-    fit_lungs as fit_lungs,
     lung_environment as lung_environment,
-    open_loop_error as open_loop_error,
-    stack as stack,
     train_controllers as train_controllers,
-    unstack as unstack,
 )
 from ._valves import Valves as Valves
 from ._waveform import at_pip as at_pip, BreathWaveform as BreathWaveform

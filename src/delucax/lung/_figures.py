@@ -4,27 +4,19 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..environments import Environment
 from ..plotting import animate
 from ..plotting._figure import color_of, NEUTRAL, NotebookFigure, style_axes
-from ..simulation import rollout
-from ._policies import Breathing
-from ._train import unstack
-from ._waveform import at_pip, BreathWaveform
+from ._report import PID_ROWS
+from ._size import SHOWN
+from ._stacking import unstack
+from ._waveform import at_pip
 
 
 _SIZE = 9.0
-_ORDER = ("best PID", "MLP", "MLP for all", "PID + feed-forward", "PID + MLP", "CNN")
-
-
-def _run(env: Environment, controller: Any, waveform: Any, pip: float) -> Any:
-    whole = Breathing(controller, waveform)
-    env, whole = at_pip((env, whole), pip)
-    return rollout(env, whole, key=jax.random.key(5), horizon=100)
+_ORDER = ("best PID", "MLP", "MLP for all", "MPC", "PID + MLP", "CNN")
 
 
 def tracking_figure(
@@ -32,25 +24,21 @@ def tracking_figure(
     shown: dict[str, Any],
     names: list[str],
     rows: list[dict[str, Any]],
-    waveform: BreathWaveform,
-    pip: float = 27.5,
 ) -> NotebookFigure:
     """Breaths of some lungs under several controllers, and all their errors."""
     count = len(names)
     lungs = sorted({0, count // 2, count - 1})
     figure = NotebookFigure(figsize=(9.5, 6.2), layout="constrained")
     axes = figure.subplots(2, len(lungs), squeeze=False, height_ratios=(1.15, 1))
-    worlds = unstack(envs)
-    cost: Any = envs.cost
+    cost: Any = unstack(envs)[0].cost
     index = cost.index
     for ax, i in zip(axes[0], lungs, strict=True):
-        for k, (label, controllers) in enumerate(shown.items()):
-            run = _run(worlds[i], unstack(controllers)[i], waveform, pip)
-            pressure = np.asarray(run.states[:, index])
-            times = np.asarray(run.times)
+        for k, (label, runs) in enumerate(shown.items()):
+            pressure = np.asarray(runs.states[i, :, index])
+            times = float(envs.dt[i]) * np.arange(len(pressure))
             ax.plot(times, pressure, color=_color(label, k), lw=1.5, label=label)
         times = np.linspace(0, 2.99, 600)
-        target = np.asarray(at_pip(waveform, pip).pressure(times))
+        target = np.asarray(at_pip(cost.waveform, SHOWN).pressure(times))
         ax.plot(times, target, color="0.2", lw=1, ls=(0, (4, 2)), label="target")
         ax.set_title(names[i], fontsize=_SIZE + 1)
         ax.set_xlabel("time [s]", fontsize=_SIZE)
@@ -62,14 +50,10 @@ def tracking_figure(
     for ax in axes[1]:
         ax.remove()
     ax = figure.add_subplot(grid[1, :])
-    labels = list(dict.fromkeys(row["controller"] for row in rows))
-    pids = [label for label in labels if "PID" in label and label != "PID + MLP"]
-    pids = [label for label in pids if "for all" not in label]
     error = _errors(rows, names)
-    best = np.min([error[label] for label in pids if "forward" not in label], axis=0)
-    bars = {"best PID": best}
-    chosen = ("PID + feed-forward", "MLP for all", "PID + MLP", "CNN", "MLP")
-    chosen = (*chosen, "least error")
+    pids = [error[label] for label in PID_ROWS if label in error]
+    bars = {"best PID": np.min(pids, axis=0)}
+    chosen = ("MLP for all", "MPC", "CNN", "PID + MLP", "MLP", "least error")
     bars |= {label: error[label] for label in chosen if label in error}
     width = 0.8 / len(bars)
     for k, (label, values) in enumerate(bars.items()):
@@ -151,21 +135,16 @@ def draw_study(
     shown: dict[str, Any],
     names: list[str],
     test: Any,
-    simulators: Any,
-    physics: dict[str, Any],
+    models: dict[str, Any],
     table: list[dict[str, Any]],
     rows: list[dict[str, Any]],
-    waveform: BreathWaveform,
 ) -> None:
     """`controllers.png`, `simulators.png` and `breath.gif`."""
-    figure = tracking_figure(envs, shown, names, rows, waveform)
+    figure = tracking_figure(envs, shown, names, rows)
     figure.savefig(out / "controllers.png", dpi=130)
-    models = {"learned": simulators, **physics}
     figure = simulator_figure(test, models, names, table)
     figure.savefig(out / "simulators.png", dpi=130)
     middle = len(names) // 2
-    env = unstack(envs)[middle]
-    label = "MLP" if "MLP" in shown else next(iter(shown))
-    run = _run(env, unstack(shown[label])[middle], waveform, 27.5)
-    env = at_pip(env, jnp.asarray(27.5))
+    env = at_pip(unstack(envs)[middle], SHOWN)
+    run = unstack(shown["MLP"])[middle]
     animate(env, run, path=out / "breath.gif", max_frames=60)

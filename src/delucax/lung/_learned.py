@@ -1,5 +1,7 @@
 """A lung learned from breaths."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -44,8 +46,8 @@ class LearnedLung(AbstractDynamics):
     - `width`, `depth`: of the network, 24 and 1 by default.
     - `boundary`: how many first steps have networks of their own, 5 by default.
     - `boundary_width`: hidden units of each, 16 by default.
-    - `u_window`, `p_window`: how many controls and pressures the network is given, 6
-        and 3 by default.
+    - `u_window`, `p_window`: how many controls and pressures the network is given, 8
+        and 6 by default.
     - `published`: as published (see above); false by default.
     - `key`: a random key, for the first weights.
 
@@ -96,8 +98,8 @@ class LearnedLung(AbstractDynamics):
         *,
         boundary: int = 5,
         boundary_width: int = 16,
-        u_window: int = 6,
-        p_window: int = 3,
+        u_window: int = 8,
+        p_window: int = 6,
         published: bool = False,
         key: PRNGKey,
     ):
@@ -173,6 +175,17 @@ class LearnedLung(AbstractDynamics):
         """
         return self.p_mean + self.p_std * x[self.window]
 
+    def drawn(self, x: Array, pressure: Any, share: Any) -> Array:
+        """The state with its newest pressure drawn to another one.
+
+        **Arguments:** `x`: the state. `pressure`: such as what a sensor read [cmH2O].
+        `share`: how far it is drawn there, from 0 to 1.
+
+        **Returns:** the state.
+        """
+        surplus = (pressure - self.pressure(x)) / self.p_std
+        return x.at[self.window].add((share * surplus).astype(x.dtype))
+
     def observe(self, t, x):
         return jnp.reshape(self.pressure(x), (1,)).astype(x.dtype)
 
@@ -187,13 +200,10 @@ class LearnedLung(AbstractDynamics):
         z = jnp.concatenate([straight, pressures[: self.p_window]])
         return pressures[0] + jnp.sum(self.line * z) + run_mlp(self.network, z)
 
-    def _early(
-        self, controls: Array, pressures: Array, hidden: Array, output: Array
-    ) -> Array:
-        """The next pressure in one of the first steps."""
-        history = jnp.concatenate([controls, pressures])
+    def _early(self, history: Array, late: Any, hidden: Array, output: Array) -> Array:
+        """The next pressure in one of the first steps; `late` is that afterwards."""
         own = jnp.sum(output * jnp.tanh(jnp.sum(hidden * history, axis=1)))
-        return own if self.published else own + self._late(controls, pressures)
+        return own if self.published else own + late
 
     def _bound(self, pressure: Array) -> Array:
         # A control that makes no sense must not drive the state out of all bounds.
@@ -206,8 +216,9 @@ class LearnedLung(AbstractDynamics):
         controls, pressures = jnp.concatenate([control, x[: n - 1]]), x[n : 2 * n]
         step, first = x[2 * n], self.hidden.shape[0]
         i = jnp.clip(jnp.round(step), 0, first - 1).astype(int)
-        early = self._early(controls, pressures, self.hidden[i], self.output[i])
         late = self._late(controls, pressures)
+        history = jnp.concatenate([controls, pressures])
+        early = self._early(history, late, self.hidden[i], self.output[i])
         predicted = self._bound(jnp.where(step < first - 0.5, early, late))
         after = jnp.concatenate(
             [
@@ -261,7 +272,12 @@ class LearnedLung(AbstractDynamics):
 
         def begin(pressures, inputs):
             *inputs, hidden, output = inputs
-            predict = lambda c, p: self._early(c, p, hidden, output)  # noqa: E731
+
+            def predict(controls, pressures):
+                late = 0.0 if self.published else self._late(controls, pressures)
+                history = jnp.concatenate([controls, pressures])
+                return self._early(history, late, hidden, output)
+
             return step(pressures, inputs, predict)
 
         weights = self.hidden[:first], self.output[:first]

@@ -19,16 +19,15 @@ from ._waveform import BreathWaveform
 class _Shooting(NamedTuple):
     lung: Array
     plan: Array
-    offset: Array
 
 
 class ShootingMPC(AbstractController):
     r"""Plans the next controls in a learned lung, at every step anew.
 
-    The learned lung runs beside the true one under the same controls. What the sensor
-    reads beyond its prediction is averaged, and added to what it foresees. The plan is
-    improved by some steps of Adam on the error to the target, and its first control is
-    used. With `u = 100 sigmoid(z)` it keeps the bounds of the valve.
+    The learned lung runs beside the true one under the same controls, and is drawn to
+    what the sensor reads. The plan is improved by some steps of Adam on the error to
+    the target, and its first control is used. With `u = 100 sigmoid(z)` it keeps the
+    bounds of the valve.
 
     **Arguments:**
 
@@ -36,8 +35,9 @@ class ShootingMPC(AbstractController):
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `horizon`: steps of a plan, 10 by default.
     - `iterations`: of Adam, 30 by default.
-    - `learning_rate`: of Adam, 0.3 by default.
-    - `memory`: how much of the average offset is kept at a step, 0.7 by default.
+    - `learning_rate`: of Adam, 0.1 by default.
+    - `memory`: how much of its own prediction the learned lung keeps when a pressure is
+        read, 0.7 by default.
 
     **Raises:** `ValueError` if `model` is no learned lung, `waveform` none, or a count
     is below 1.
@@ -71,7 +71,7 @@ class ShootingMPC(AbstractController):
         waveform: BreathWaveform,
         horizon: int = 10,
         iterations: int = 30,
-        learning_rate: Any = 0.3,
+        learning_rate: Any = 0.1,
         memory: Any = 0.7,
     ):
         where = "ShootingMPC"
@@ -87,14 +87,13 @@ class ShootingMPC(AbstractController):
 
     def init(self, *, key=None):
         lung = self.model.resting()
-        return _Shooting(lung, jnp.full(self.horizon, -2.0, lung.dtype), 0 * lung[0])
+        return _Shooting(lung, jnp.full(self.horizon, -2.0, lung.dtype))
 
     def __call__(self, t, y, state):
         model = self.model
-        surplus = y[0] - model.pressure(state.lung)
-        offset = self.memory * state.offset + (1 - self.memory) * surplus
-        ahead = t + self.model.dt * jnp.arange(1, self.horizon + 1)
-        target = self.waveform.pressure(ahead) - offset
+        lung = model.drawn(state.lung, y[0], 1 - self.memory)
+        ahead = t + model.dt * jnp.arange(1, self.horizon + 1)
+        target = self.waveform.pressure(ahead)
 
         def error(plan):
             def body(x, z):
@@ -102,7 +101,7 @@ class ShootingMPC(AbstractController):
                 after, _ = model.advance(0.0, x, u, None)
                 return after, model.pressure(after)
 
-            return jnp.mean(jnp.abs(jax.lax.scan(body, state.lung, plan)[1] - target))
+            return jnp.mean(jnp.abs(jax.lax.scan(body, lung, plan)[1] - target))
 
         optimiser = optax.adam(self.learning_rate)
 
@@ -115,8 +114,7 @@ class ShootingMPC(AbstractController):
         first = start, optimiser.init(start)
         (plan, _), _ = jax.lax.scan(improve, first, None, self.iterations)
         u = 100 * jax.nn.sigmoid(plan[:1])
-        offset = offset.astype(state.offset.dtype)
-        return u.astype(y.dtype), _Shooting(state.lung, plan, offset)
+        return u.astype(y.dtype), _Shooting(lung, plan)
 
     def applied(self, u, cost, state):
         u = jnp.stack([u[0], jnp.zeros_like(u[0])])

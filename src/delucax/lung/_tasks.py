@@ -1,6 +1,7 @@
 """The lungs by name."""
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,20 @@ from ._learned import LearnedLung
 from ._lungs import BalloonLung, DelayLung, DoubleCompartment, SingleCompartment
 from ._valves import Valves
 from ._waveform import BreathWaveform
+
+
+def _task(
+    task: Callable[..., Environment],
+    plant: Any,
+    dynamics: Discretized | Delayed,
+    environment: dict[str, Any],
+    **breath: Any,
+) -> Environment:
+    """A lung that rests at PEEP and is to breathe; see `ventilation`."""
+    rest = plant.resting(plant.valves.peep)
+    if isinstance(dynamics, Delayed):
+        rest = dynamics.filled(rest)
+    return finish(task, ventilation(dynamics, rest=rest, **breath), environment)
 
 
 def balloon_lung(
@@ -68,17 +83,17 @@ def balloon_lung(
         env = dlx.make("lung/balloon_lung", resistance=10.0)
         ```
     """
-    valves = Valves() if valves is None else valves
-    plant = BalloonLung(resistance, stiffness, rest, valves)
-    arguments = ventilation(
+    plant = BalloonLung(resistance, stiffness, rest, valves or Valves())
+    return _task(
+        balloon_lung,
+        plant,
         Discretized(plant, dt, solver, substeps),
-        waveform,
-        rest=plant.resting(valves.peep),
+        environment,
+        waveform=waveform,
         sensor_delay=sensor_delay,
         noise=noise,
         horizon=horizon,
     )
-    return finish(balloon_lung, arguments, environment)
 
 
 def delay_lung(
@@ -134,19 +149,18 @@ def delay_lung(
         env = dlx.make("lung/delay_lung", delay=3)
         ```
     """
-    valves = Valves() if valves is None else valves
-    plant = DelayLung(resistance, stiffness, rest, pipe, valves)
+    plant = DelayLung(resistance, stiffness, rest, pipe, valves or Valves())
     delay = check_count(delay, "delay", "delay_lung", least=0)
-    dynamics = Delayed(Discretized(plant, dt, solver, substeps), controls=delay)
-    arguments = ventilation(
-        dynamics,
-        waveform,
-        rest=dynamics.filled(plant.resting(valves.peep)),
+    return _task(
+        delay_lung,
+        plant,
+        Delayed(Discretized(plant, dt, solver, substeps), controls=delay),
+        environment,
+        waveform=waveform,
         sensor_delay=sensor_delay,
         noise=noise,
         horizon=horizon,
     )
-    return finish(delay_lung, arguments, environment)
 
 
 def single_compartment(
@@ -192,17 +206,17 @@ def single_compartment(
         env = dlx.make("lung/single_compartment", resistance=50.0, compliance=10.0)
         ```
     """
-    valves = Valves() if valves is None else valves
-    plant = SingleCompartment(resistance, compliance, valves)
-    arguments = ventilation(
+    plant = SingleCompartment(resistance, compliance, valves or Valves())
+    return _task(
+        single_compartment,
+        plant,
         Discretized(plant, dt, solver, substeps),
-        waveform,
-        rest=plant.resting(valves.peep),
+        environment,
+        waveform=waveform,
         sensor_delay=sensor_delay,
         noise=noise,
         horizon=horizon,
     )
-    return finish(single_compartment, arguments, environment)
 
 
 def double_compartment(
@@ -219,7 +233,7 @@ def double_compartment(
     dt: Any = 0.03,
     horizon: int = 100,
     solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
+    substeps: int = 2,
     **environment: Any,
 ) -> Environment:
     """Make a lung of a fast and a slow compartment breathe, seen late and with noise.
@@ -238,7 +252,8 @@ def double_compartment(
     - `dt`: the control interval, 0.03 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 1 by default.
+    - `substeps`: solver steps an interval, 2 by default: with the expiratory valve open
+        the fast compartment of a narrow lung is empty within some 10 ms.
     - `**environment`: other arguments of [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
@@ -253,17 +268,19 @@ def double_compartment(
         env = dlx.make("lung/double_compartment", resistance=50.0, compliance=10.0)
         ```
     """
-    valves = Valves() if valves is None else valves
-    plant = DoubleCompartment(resistance, compliance, central, share, imbalance, valves)
-    arguments = ventilation(
+    plant = DoubleCompartment(
+        resistance, compliance, central, share, imbalance, valves or Valves()
+    )
+    return _task(
+        double_compartment,
+        plant,
         Discretized(plant, dt, solver, substeps),
-        waveform,
-        rest=plant.resting(valves.peep),
+        environment,
+        waveform=waveform,
         sensor_delay=sensor_delay,
         noise=noise,
         horizon=horizon,
     )
-    return finish(double_compartment, arguments, environment)
 
 
 def learned_lung(

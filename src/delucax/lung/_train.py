@@ -1,6 +1,5 @@
-"""Fitting lungs to breaths, and training controllers in them."""
+"""Training controllers in fitted lungs."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,231 +10,19 @@ from jaxtyping import Array
 
 from .._check import check_count, check_key
 from .._controller import AbstractController
+from .._fields import parameter
 from .._typing import PRNGKey
+from ..costs import AbstractCost
 from ..environments import Environment
 from ..simulation import rollout
 from ..training import analytic, fit, Fitted
-from ._data import Breaths, LENGTH, PIPS
-from ._environment import ventilation
+from ._data import LENGTH, PIPS
+from ._environment import BreathCost, ventilation
+from ._fitting import kept_at
 from ._learned import LearnedLung
 from ._models import LungModel
 from ._policies import Breathing
 from ._waveform import at_pip, BreathWaveform
-
-
-class _Simulation(eqx.Module):
-    """The error of a batch of lungs over breaths, relative to the scale of each."""
-
-    scale: Array
-    teacher: bool = eqx.field(static=True)
-
-    def __call__(self, models, batch, key):
-        del key
-        u_in, pressure = (jnp.swapaxes(column, 0, 1) for column in batch)
-
-        def one(model, u_in, pressure):
-            if self.teacher:
-                found = jax.vmap(model.one_step)(u_in, pressure)
-            else:
-                found = jax.vmap(model.predict)(u_in)
-            return jnp.mean(jnp.abs(found - pressure))
-
-        errors = eqx.filter_vmap(one)(models, u_in, pressure)
-        return jnp.mean(errors / self.scale)
-
-
-def _kept(checkpoint: Any, ending: str = "") -> dict[str, Any]:
-    """Where `fit` writes its checkpoints, and how often."""
-    if checkpoint is None:
-        return {}
-    return dict(checkpoint=f"{checkpoint}{ending}", checkpoint_every=100)
-
-
-def stack(trees: Sequence[Any]) -> Any:
-    """Modules of one structure as one, each array with a leading axis over them.
-
-    **Arguments:** `trees`: the modules.
-
-    **Returns:** the stacked module.
-
-    **Raises:** `ValueError` if there are none, or their structures differ.
-
-    !!! example
-
-        ```python
-        from delucax.lung import SingleCompartment, stack
-
-        stack([SingleCompartment(r) for r in (5.0, 20.0, 50.0)]).resistance
-        ```
-    """
-    trees = list(trees)
-    if not trees:
-        raise ValueError("stack: trees must not be empty.")
-    structures = {jax.tree.structure(eqx.filter(tree, eqx.is_array)) for tree in trees}
-    if len(structures) > 1:
-        raise ValueError("stack: trees must be of one structure.")
-
-    def joined(*leaves):
-        return jnp.stack(leaves) if eqx.is_array(leaves[0]) else leaves[0]
-
-    return jax.tree.map(joined, *trees)
-
-
-def unstack(tree: Any) -> list[Any]:
-    """The modules that [`delucax.lung.stack`][] made one of.
-
-    **Arguments:** `tree`: the stacked module.
-
-    **Returns:** a list of modules.
-
-    !!! example
-
-        ```python
-        from delucax.lung import SingleCompartment, stack, unstack
-
-        unstack(stack([SingleCompartment(r) for r in (5.0, 20.0)]))[1].resistance
-        ```
-    """
-    arrays, rest = eqx.partition(tree, eqx.is_array)
-    count = jax.tree.leaves(arrays)[0].shape[0]
-    return [
-        eqx.combine(jax.tree.map(lambda a, i=i: a[i], arrays), rest)
-        for i in range(count)
-    ]
-
-
-def fit_lungs(
-    models: Any,
-    breaths: Breaths,
-    *,
-    key: PRNGKey,
-    teacher_steps: int = 1000,
-    steps: int = 800,
-    learning_rate: float = 5e-3,
-    batch_size: int | None = 64,
-    trainable: Any = None,
-    progress: bool = False,
-    checkpoint: Any = None,
-) -> Fitted:
-    """Fit lungs to breaths, each to its own: many at once.
-
-    First, where the model can (a [`delucax.lung.LearnedLung`][]), each pressure is
-    predicted from the recorded ones before it, as published; then the whole breath from
-    its controls alone, which the noise of the sensor does not bias. The loss is the
-    mean absolute error, relative to the standard deviation of the pressures; Adam with
-    a learning rate that falls to 0 along a cosine.
-
-    **Arguments:**
-
-    - `models`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][], or
-        several as [`delucax.lung.stack`][] makes one of them.
-    - `breaths`: [`delucax.lung.Breaths`][] of shape `(B, T)`; of `(models, B, T)` for
-        several.
-    - `key`: a random key, for the batches.
-    - `teacher_steps`: of the first part, 1000 by default.
-    - `steps`: of the second part, 800 by default.
-    - `learning_rate`: 5e-3 by default, and twice that in the first part.
-    - `batch_size`: breaths of each lung in a step, 64 by default; `None` for all.
-    - `trainable`: what moves, as in [`delucax.training.fit`][]; the weights by default.
-    - `progress`: whether to show a bar, false by default.
-    - `checkpoint`: the path of a file from which a run that was cut off goes on
-        (beside it, with `.first` added, that of the first part); none by default.
-
-    **Returns:** a [`delucax.training.Fitted`][], that of the last part.
-
-    **Raises:** `ValueError` if the arguments are illegal, `RuntimeError` if it
-    diverges.
-
-    Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
-    Zajdel, Schottdorf, Cohen and Hazan, 2021 (the first part).
-
-    !!! example
-
-        ```python
-        import jax
-        import jax.numpy as jnp
-        from delucax import lung
-
-        u = jnp.linspace(0.0, 50.0, 40).reshape(10, 4)
-        breaths = lung.Breaths(u, 0 * u, 5 + u / 2, dt=0.03)
-        model = lung.LearnedLung(breaths, width=2, boundary=1, key=jax.random.key(1))
-        few = dict(teacher_steps=0, steps=5, batch_size=None)
-        fitted = lung.fit_lungs(model, breaths, key=jax.random.key(2), **few)
-        ```
-    """
-    where = "fit_lungs"
-    check_key(key, where)
-    if not isinstance(breaths, Breaths):
-        raise ValueError(
-            f"{where}: breaths must be Breaths, got {type(breaths).__name__}."
-        )
-    single = breaths.pressure.ndim == 2
-    u_in, pressure = breaths.u_in, breaths.pressure
-    if single:
-        arrays, rest = eqx.partition(models, eqx.is_array)
-        models = eqx.combine(jax.tree.map(lambda a: a[None], arrays), rest)
-        u_in, pressure = u_in[None], pressure[None]
-    data = jnp.swapaxes(u_in, 0, 1), jnp.swapaxes(pressure, 0, 1)
-    size = data[0].shape[0]
-    batch_size = None if batch_size is None or batch_size >= size else batch_size
-    scale = jnp.std(pressure, axis=(1, 2))
-    learned = isinstance(models, LearnedLung)
-    parts = [(True, teacher_steps, 2 * learning_rate)] if learned else []
-    parts += [(False, steps, learning_rate)]
-    fitted = None
-    for teacher, count, rate in parts:
-        if count == 0:
-            continue
-        schedule = optax.cosine_decay_schedule(rate, check_count(count, "steps", where))
-        fitted = fit(
-            _Simulation(scale, teacher),
-            models,
-            optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule)),
-            count,
-            key=jax.random.fold_in(key, int(teacher)),
-            data=data,
-            batch_size=batch_size,
-            trainable=trainable,
-            progress=progress,
-            **_kept(checkpoint, ".first" if teacher else ""),
-        )
-        models = fitted.model
-    if fitted is None:
-        raise ValueError(f"{where}: steps must not all be 0.")
-    if single:
-        arrays, rest = eqx.partition(models, eqx.is_array)
-        model = eqx.combine(jax.tree.map(lambda a: a[0], arrays), rest)
-        fitted = Fitted(model, fitted.history, fitted.result)
-    return fitted
-
-
-def open_loop_error(model: Any, breaths: Breaths) -> Array:
-    """The mean absolute error of a lung that is given the recorded controls alone.
-
-    Against the truth of the breaths where it is known, else against what the sensor
-    read.
-
-    **Arguments:**
-
-    - `model`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][].
-    - `breaths`: [`delucax.lung.Breaths`][], shape `(B, T)`.
-
-    **Returns:** a scalar [cmH2O].
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax import lung
-
-        model = lung.LungModel(lung.SingleCompartment())
-        u = 20.0 * jnp.ones((2, 10))
-        breaths = lung.Breaths(u, 0 * u, 5 + 0 * u, dt=0.03)
-        lung.open_loop_error(model, breaths)
-        ```
-    """
-    truth = breaths.pressure if breaths.truth is None else breaths.truth
-    return jnp.mean(jnp.abs(jax.vmap(model.predict)(breaths.u_in) - truth))
 
 
 def lung_environment(
@@ -335,6 +122,22 @@ def breath_error(
     return jax.vmap(one)(pips, jax.random.split(key, pips.shape[0]))
 
 
+class _Careful(AbstractCost):
+    """A cost of breaths, and ten times what the pressure is above a limit."""
+
+    inner: BreathCost
+    limit: Array = parameter()
+
+    @property
+    def waveform(self) -> BreathWaveform:
+        """That of the cost."""
+        return self.inner.waveform
+
+    def __call__(self, t, x, u):
+        excess = jnp.maximum(x[self.inner.index] - self.limit, 0)
+        return (self.inner(t, x, u) + 10 * excess).astype(x.dtype)
+
+
 class _Ventilated(eqx.Module):
     """The mean error of a batch of controllers, each in its own lungs."""
 
@@ -342,6 +145,7 @@ class _Ventilated(eqx.Module):
     waveform: BreathWaveform
     pips: Array
     noise: Array
+    limit: Array | None
     horizon: int = eqx.field(static=True)
     shared: bool = eqx.field(static=True)
 
@@ -350,6 +154,10 @@ class _Ventilated(eqx.Module):
             env = lung_environment(
                 model, self.waveform, noise=self.noise, horizon=self.horizon
             )
+            if self.limit is not None:
+                cost: Any = env.cost
+                careful = _Careful(cost, self.limit)
+                env = eqx.tree_at(lambda env: env.cost, env, careful)
             pips = self.pips
             options: Any = dict(pips=pips, horizon=self.horizon, key=key)
             return jnp.mean(breath_error(env, controller, **options))
@@ -380,6 +188,7 @@ def train_controllers(
     pips: Any = PIPS,
     noise: Any = 0.2,
     horizon: int = LENGTH,
+    limit: Any = None,
     trainable: Any = None,
     gradient: Any = None,
     progress: bool = False,
@@ -405,6 +214,8 @@ def train_controllers(
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
     - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
     - `horizon`: steps an episode, 29 by default.
+    - `limit`: a pressure above which each cmH2O counts ten times more, as an alarm is
+        worse than an error [cmH2O]; none by default.
     - `trainable`, `gradient`, `progress`, `checkpoint`: of [`delucax.training.fit`][];
         the weights, the analytic gradient, no bar and no file by default.
 
@@ -438,6 +249,7 @@ def train_controllers(
         waveform,
         jnp.asarray(pips, float),
         jnp.asarray(noise, float),
+        None if limit is None else jnp.asarray(limit, float),
         check_count(horizon, "horizon", where),
         shared,
     )
@@ -450,5 +262,5 @@ def train_controllers(
         trainable=trainable,
         gradient=analytic if gradient is None else gradient,
         progress=progress,
-        **_kept(checkpoint),
+        **kept_at(checkpoint),
     )

@@ -1,0 +1,176 @@
+"""Fitting lungs to breaths."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array
+
+from .._check import check_count, check_key
+from .._typing import PRNGKey
+from ..training import fit, Fitted
+from ._data import Breaths
+from ._learned import LearnedLung
+from ._stacking import stack, unstack
+
+
+class _Simulation(eqx.Module):
+    """The error of a batch of lungs over breaths, relative to the scale of each."""
+
+    scale: Array
+    teacher: bool = eqx.field(static=True)
+
+    def __call__(self, models, batch, key):
+        del key
+        u_in, pressure = (jnp.swapaxes(column, 0, 1) for column in batch)
+
+        def one(model, u_in, pressure):
+            if self.teacher:
+                found = jax.vmap(model.one_step)(u_in, pressure)
+            else:
+                found = jax.vmap(model.predict)(u_in)
+            return jnp.mean(jnp.abs(found - pressure))
+
+        errors = eqx.filter_vmap(one)(models, u_in, pressure)
+        return jnp.mean(errors / self.scale)
+
+
+def kept_at(checkpoint: Any, ending: str = "") -> dict[str, Any]:
+    """Where `fit` writes its checkpoints, and how often."""
+    if checkpoint is None:
+        return {}
+    return dict(checkpoint=f"{checkpoint}{ending}", checkpoint_every=100)
+
+
+def fit_lungs(
+    models: Any,
+    breaths: Breaths,
+    *,
+    key: PRNGKey,
+    teacher_steps: int = 1000,
+    steps: int = 800,
+    learning_rate: float = 5e-3,
+    batch_size: int | None = 64,
+    trainable: Any = None,
+    progress: bool = False,
+    checkpoint: Any = None,
+) -> Fitted:
+    """Fit lungs to breaths, each to its own: many at once.
+
+    First, where the model can (a [`delucax.lung.LearnedLung`][]), each pressure is
+    predicted from the recorded ones before it, as published; then the whole breath from
+    its controls alone, which the noise of the sensor does not bias. The loss is the
+    mean absolute error, relative to the standard deviation of the pressures; Adam with
+    a learning rate that falls to 0 along a cosine.
+
+    **Arguments:**
+
+    - `models`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][], or
+        several as [`delucax.lung.stack`][] makes one of them.
+    - `breaths`: [`delucax.lung.Breaths`][] of shape `(B, T)`; of `(models, B, T)` for
+        several.
+    - `key`: a random key, for the batches.
+    - `teacher_steps`: of the first part, 1000 by default.
+    - `steps`: of the second part, 800 by default.
+    - `learning_rate`: 5e-3 by default, and twice that in the first part.
+    - `batch_size`: breaths of each lung in a step, 64 by default; `None` for all.
+    - `trainable`: what moves, as in [`delucax.training.fit`][]; the weights by default.
+    - `progress`: whether to show a bar, false by default.
+    - `checkpoint`: the path of a file from which a run that was cut off goes on
+        (beside it, with `.first` added, that of the first part); none by default.
+
+    **Returns:** a [`delucax.training.Fitted`][], that of the last part.
+
+    **Raises:** `ValueError` if the arguments are illegal, `RuntimeError` if it
+    diverges.
+
+    Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
+    Zajdel, Schottdorf, Cohen and Hazan, 2021 (the first part).
+
+    !!! example
+
+        ```python
+        import jax
+        import jax.numpy as jnp
+        from delucax import lung
+
+        u = jnp.linspace(0.0, 50.0, 40).reshape(10, 4)
+        breaths = lung.Breaths(u, 0 * u, 5 + u / 2, dt=0.03)
+        model = lung.LearnedLung(breaths, width=2, boundary=1, key=jax.random.key(1))
+        few = dict(teacher_steps=0, steps=5, batch_size=None)
+        fitted = lung.fit_lungs(model, breaths, key=jax.random.key(2), **few)
+        ```
+    """
+    where = "fit_lungs"
+    check_key(key, where)
+    if not isinstance(breaths, Breaths):
+        raise ValueError(
+            f"{where}: breaths must be Breaths, got {type(breaths).__name__}."
+        )
+    single = breaths.pressure.ndim == 2
+    u_in, pressure = breaths.u_in, breaths.pressure
+    if single:
+        models = stack([models])
+        u_in, pressure = u_in[None], pressure[None]
+    data = jnp.swapaxes(u_in, 0, 1), jnp.swapaxes(pressure, 0, 1)
+    size = data[0].shape[0]
+    batch_size = None if batch_size is None or batch_size >= size else batch_size
+    scale = jnp.std(pressure, axis=(1, 2))
+    learned = isinstance(models, LearnedLung)
+    parts = [(True, teacher_steps, 2 * learning_rate)] if learned else []
+    parts += [(False, steps, learning_rate)]
+    fitted = None
+    for teacher, count, rate in parts:
+        if count == 0:
+            continue
+        schedule = optax.cosine_decay_schedule(rate, check_count(count, "steps", where))
+        fitted = fit(
+            _Simulation(scale, teacher),
+            models,
+            optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule)),
+            count,
+            key=jax.random.fold_in(key, int(teacher)),
+            data=data,
+            batch_size=batch_size,
+            trainable=trainable,
+            progress=progress,
+            **kept_at(checkpoint, ".first" if teacher else ""),
+        )
+        models = fitted.model
+    if fitted is None:
+        raise ValueError(f"{where}: steps must not all be 0.")
+    if single:
+        (model,) = unstack(fitted.model)
+        fitted = Fitted(model, fitted.history, fitted.result)
+    return fitted
+
+
+def open_loop_error(model: Any, breaths: Breaths) -> Array:
+    """The mean absolute error of a lung that is given the recorded controls alone.
+
+    Against the truth of the breaths where it is known, else against what the sensor
+    read.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][].
+    - `breaths`: [`delucax.lung.Breaths`][], shape `(B, T)`.
+
+    **Returns:** a scalar [cmH2O].
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax import lung
+
+        model = lung.LungModel(lung.SingleCompartment())
+        u = 20.0 * jnp.ones((2, 10))
+        breaths = lung.Breaths(u, 0 * u, 5 + 0 * u, dt=0.03)
+        lung.open_loop_error(model, breaths)
+        ```
+    """
+    truth = breaths.pressure if breaths.truth is None else breaths.truth
+    return jnp.mean(jnp.abs(jax.vmap(model.predict)(breaths.u_in) - truth))

@@ -1,0 +1,84 @@
+"""How large the study is, and of which lungs and peak pressures."""
+
+from typing import NamedTuple
+
+from ._csv import COMPLIANCES, RESISTANCES
+from ._data import PIPS
+
+
+SEEN = PIPS
+"""Peak pressures that controllers are trained at."""
+UNSEEN = (12.5, 17.5, 22.5, 27.5, 32.5)
+SHOWN = 27.5
+"""The peak pressure of the breaths in the figures, one of those."""
+BREATH = 100
+"""Steps of a whole breath."""
+BETWEEN = ((10.0, 15.0), (10.0, 35.0), (35.0, 15.0), (35.0, 35.0))
+"""Lungs between those that are trained on, (R, C)."""
+PHYSICS = (
+    "single compartment",
+    "balloon",
+    "double compartment",
+    "neural ODE",
+    "grey box",
+)
+
+
+class Size(NamedTuple):
+    """How much of everything.
+
+    `shared_network` are hidden units of the network for all lungs, and how many
+    controls it is given; `extras` are those rows that the claims do not need.
+    """
+
+    breaths: int
+    teacher_steps: int
+    simulator_steps: int
+    physics_steps: int
+    controller_steps: int
+    shared_steps: int
+    shared_network: tuple[int, int]
+    pid_steps: int
+    bound_steps: int
+    seeds: int
+    noises: int
+    lungs: tuple[tuple[float, float], ...]
+    between: tuple[tuple[float, float], ...]
+    physics: tuple[str, ...]
+    extras: bool
+
+
+FULL = Size(
+    breaths=480,
+    teacher_steps=1000,
+    simulator_steps=1200,
+    physics_steps=200,
+    controller_steps=400,
+    shared_steps=500,
+    shared_network=(48, 6),
+    pid_steps=150,
+    bound_steps=500,
+    seeds=3,
+    noises=5,
+    lungs=tuple((R, C) for R in RESISTANCES for C in COMPLIANCES),
+    between=BETWEEN,
+    physics=PHYSICS,
+    extras=True,
+)
+SMALL = Size(
+    breaths=96,
+    teacher_steps=0,
+    simulator_steps=250,
+    physics_steps=40,
+    controller_steps=100,
+    shared_steps=250,
+    shared_network=(32, 4),
+    pid_steps=20,
+    bound_steps=0,
+    seeds=1,
+    noises=2,
+    lungs=((5.0, 20.0), (50.0, 20.0)),
+    between=BETWEEN[2:3],
+    physics=("single compartment",),
+    extras=False,
+)

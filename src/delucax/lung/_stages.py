@@ -1,0 +1,98 @@
+"""A study in stages: each is written when it is done, and found the next time."""
+
+import csv
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from .._serialise import load, save
+
+
+class Stages:
+    """A folder that a study is written to, and how far it is.
+
+    **Arguments:**
+
+    - `out`: the folder.
+    - `settings`: what the study is of; a folder holds one study.
+    - `say`: what to do with a line of text.
+
+    **Raises:** `ValueError` if the folder holds a study with other settings, or one
+        whose settings are damaged.
+    """
+
+    def __init__(self, out: Path, settings: dict[str, Any], say: Callable[[str], Any]):
+        self.out, self.say = out, say
+        self.began = time.perf_counter()
+        self.seconds: dict[str, float] = {}
+        known = out / "settings.json"
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "controllers").mkdir(exist_ok=True)
+        if known.exists():
+            _check_settings(known, settings)
+        else:
+            _put(known, json.dumps(settings, indent=1) + "\n")
+
+    def fit_file(self, name: str) -> Path:
+        """Where the training of a stage is kept until it is done."""
+        return self.out / f"{name}.fit"
+
+    def stage(self, name: str, words: str, make: Callable[[], Any]) -> Any:
+        """What `make` returns, or what it returned before, from its file."""
+        path = self.out / f"{name}.dlx"
+        if path.exists():
+            found = load(path)
+            self.seconds[name] = float(found["seconds"])
+            self.say(f"{words}: found ({self.seconds[name]:.0f} s then)")
+            return found["value"]
+        began = time.perf_counter()
+        value = make()
+        self.seconds[name] = time.perf_counter() - began
+        save(path, {"value": value, "seconds": self.seconds[name]})
+        for left in self.out.glob(f"{name}.fit*"):
+            left.unlink()
+        self.say(f"{words}: {self.seconds[name]:.0f} s")
+        return value
+
+    def write_table(self, name: str, rows: list[dict[str, Any]]) -> None:
+        """Write rows to a file of comma-separated values."""
+        path = self.out / name
+        beside = path.with_suffix(".tmp")
+        with open(beside, "w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0].keys())
+            writer.writeheader()
+            writer.writerows(rows)
+        beside.replace(path)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since it began."""
+        return time.perf_counter() - self.began
+
+
+def _put(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    beside = path.with_suffix(".tmp")
+    beside.write_text(text)
+    beside.replace(path)
+
+
+def _check_settings(known: Path, settings: dict[str, Any]) -> None:
+    """Raise unless a study was begun with the same settings."""
+    try:
+        there = json.loads(known.read_text())
+    except ValueError as error:
+        raise ValueError(
+            f"lung: '{known}' is damaged ({error}); delete the folder, or name "
+            "another one with out."
+        ) from None
+    here = json.loads(json.dumps(settings))
+    for name in sorted(here.keys() | there.keys()):
+        if here.get(name) != there.get(name):
+            raise ValueError(
+                f"lung: '{known.parent}' holds a study with other settings: {name} is "
+                f"{there.get(name)} there and {here.get(name)} here. Delete the "
+                "folder, or name another one with out."
+            )
