@@ -1,18 +1,20 @@
-"""`python -m benchmarks.policies`: gradients through the simulator beside the others.
+"""`python -m benchmarks.policies`: training by the gradient, by PPO and by SHAC.
 
-Four parts, each written to `benchmarks/results/policies.json` when it is done:
+Three parts, each written to `benchmarks/results/policies.json` when it is done:
 
-- `figure`: the paper's first figure, right: a linear policy of the pendulum by the
-  gradient of the rollout and by Gaussian evolution strategies;
-- `variance`: of the estimators against the number of parameters, at equal calls of the
-  dynamics, and of the analytic one against the horizon;
-- `swing-up`: PPO on ten seeds, with the steps and the seconds it takes;
-- `learning`: PPO, SHAC and the analytic gradient at equal steps of the environment.
+- `swing-up`: the analytic gradient and PPO, ten seeds each, with the steps and the
+  seconds that they take;
+- `tuning`: eight settings of each method, on seeds that are not among those reported;
+- `learning`: PPO, SHAC and the analytic gradient at equal steps of the environment, 30
+  seeds, with the best of these; draws `docs/assets/learning.svg`. `--steps 40000` runs
+  one of the budgets.
 
-Settings were chosen on seeds that are not among those reported.
+How the estimators compare is in the paper's studies: `python -m delucax reproduce
+policy-gradient` and `estimator-variance`.
 """
 
 import argparse
+import itertools
 import json
 import time
 from pathlib import Path
@@ -20,7 +22,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -29,24 +30,29 @@ import pandas as pd
 
 import delucax as dlx
 from benchmarks._machine import describe, limit_cores
-from delucax.experiments import holds_upright
+from benchmarks._paired import middle, spread
+from benchmarks._results import updated
+from delucax.experiments import holds_upright, train_swing_up
 from delucax.training import (
     actor_critic,
-    analytic,
-    EvolutionStrategies,
     expected_cost,
     fit,
-    LikelihoodRatio,
     PPO,
-    scored_cost,
     SHAC,
 )
 
 
 RESULTS = Path(__file__).parent / "results" / "policies.json"
-PARTS = ("figure", "variance", "swing-up", "learning")
+FIGURE = Path(__file__).parents[1] / "docs" / "assets" / "learning.svg"
+PARTS = ("swing-up", "tuning", "learning")
+BUDGETS = (40_000, 80_000, 160_000, 320_000)
+"""Steps of the environment that a seed is trained for."""
+STARTS = 100
+LIMITS = {"analytic, seeds of 10": 10, "analytic, s a seed": 15, "PPO, seeds of 10": 8}
+"""Seeds that hold 95 of 100 starts: at least these. Seconds: at most."""
 FIRST_SEED = 1000
 CORNER = np.array([np.pi, 8.0])
+QUIETLY: Any = dict(throw=False, block=400, progress=False)
 SPREAD = {"initial_state.low": -CORNER, "initial_state.high": CORNER}
 
 
@@ -58,203 +64,29 @@ def shown(rows: list[dict[str, Any]], title: str) -> list[dict[str, Any]]:
     return rows
 
 
-def figure(small: bool) -> dict[str, Any]:
-    """Rollouts until the mean cost of the pendulum is at most 2.0."""
-    env = dlx.make("pendulum", max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
-    total = expected_cost(env, batch=1, horizon=50)
-    policy = dlx.controllers.Linear(jnp.zeros((1, 2)))
-    # Plain descent with the paper's step reaches 2.0 later; the step is the same for
-    # all, and the gradient alone is shown at the paper's own too.
-    optimiser = optax.sgd(0.02)
-
-    def loss(controller, key):
-        return total(controller, key) / 50
-
-    steps = 200 if small else 1500
-    options: Any = dict(progress=False, throw=False, block=500)
-    own = fit(loss, policy, optimiser, steps, key=jr.key(0), **options)
-    costs = own.history.loss
-    first = int(np.argmax(costs <= 2.0)) if np.any(costs <= 2.0) else None
-    rows = [
-        {
-            "estimator": "analytic",
-            "rollouts to 2.0, median": first,
-            "seeds that get there": "1 of 1" if first is not None else "0 of 1",
-            "best cost": float(np.min(costs)),
-        }
-    ]
-    slow = fit(loss, policy, optax.sgd(0.01), steps, key=jr.key(0), **options)
-    below = np.flatnonzero(slow.history.loss <= 2.0)
-    rows.append(
-        {
-            "estimator": "analytic, half the step",
-            "rollouts to 2.0, median": int(below[0]) if len(below) else None,
-            "seeds that get there": f"{int(len(below) > 0)} of 1",
-            "best cost": float(np.min(slow.history.loss)),
-        }
-    )
-    seeds = 5
-    keys = jr.split(jr.key(FIRST_SEED), seeds)
-    models = eqx.filter_vmap(lambda _: policy, axis_size=seeds)(keys)
-    curves = {"analytic": costs.tolist()}
-    scales = (0.1,) if small else (0.05, 0.1, 0.3)
-    pairs = (4,) if small else (1, 4, 16, 64)
-    for sigma in scales:
-        for n in pairs:
-            estimator = EvolutionStrategies(sigma=sigma, samples=2 * n)
-            found = fit(
-                loss,
-                models,
-                optimiser,
-                steps,
-                key=keys,
-                gradient=estimator,
-                **options,
-            ).history.loss
-            there = [np.argmax(c <= 2.0) for c in found.T if np.any(c <= 2.0)]
-            rows.append(
-                {
-                    "estimator": f"ES, sigma {sigma}, {n} pairs",
-                    "rollouts to 2.0, median": (
-                        float(np.median(there)) * 2 * n if there else None
-                    ),
-                    "seeds that get there": f"{len(there)} of {seeds}",
-                    "best cost": float(np.nanmin(found)),
-                }
-            )
-            print(f"  {rows[-1]}", flush=True)
-    shown(rows, f"Rollouts until the mean cost is 2.0, of {steps} iterations")
-    return {"rows": rows, "analytic": curves["analytic"]}
-
-
-def relative_variance(estimator, loss, model, truth, keys) -> float:
-    """`E |g - E g|^2 / |truth|^2`, over keys."""
-    draw = jax.jit(
-        jax.vmap(
-            lambda key: jax.flatten_util.ravel_pytree(estimator(loss, model, key)[1])[0]
-        )
-    )
-    found = np.asarray(draw(keys))
-    return float(np.sum(np.var(found, axis=0, ddof=1)) / np.sum(truth**2))
-
-
-def flat(tree) -> np.ndarray:
-    return np.asarray(jax.flatten_util.ravel_pytree(tree)[0])
-
-
-def variance(small: bool) -> dict[str, Any]:
-    """Linear feedback `n x n` of a random stable plant, 64 rollouts an estimate."""
-    rollouts, draws, horizon = 64, 64 if small else 256, 20
-    rows = []
-    for n in (2, 4) if small else (1, 2, 4, 8, 16):
-        key, start = jr.split(jr.key(FIRST_SEED + n))
-        # A rotation that decays, and noise of a spectral norm that is the same for all
-        # sizes: no draw comes near instability.
-        A = 0.7 * np.linalg.qr(np.asarray(jr.normal(key, (n, n))))[0]
-        std = 0.03 / np.sqrt(n)
-        env = dlx.environments.lds(
-            A,
-            np.eye(n),
-            initial_state=lambda key, n=n: jr.normal(key, (n,)) / np.sqrt(n),
-            horizon=horizon,
-        )
-        base = dlx.controllers.Linear(jnp.zeros((n, n)))
-        noisy = dlx.controllers.Gaussian(base, jnp.full(n, np.log(std)))
-        many = expected_cost(env, batch=2**12)
-        truth = flat(jax.jit(lambda m, k, f=many: analytic(f, m, k)[1])(base, start))
-        one = expected_cost(env, batch=1)
-        estimators = {
-            "analytic": (analytic, expected_cost(env, batch=rollouts), base),
-            "ES, antithetic": (EvolutionStrategies(std, rollouts), one, base),
-            "ES, one-sided": (EvolutionStrategies(std, rollouts, False), one, base),
-        }
-        keys = jr.split(jr.key(FIRST_SEED), draws)
-        row: dict[str, Any] = {"parameters": n * n}
-        for name, (estimator, loss, model) in estimators.items():
-            row[name] = relative_variance(estimator, loss, model, truth, keys)
-
-        score = scored_cost(env)
-
-        def scored(K, key, noisy=noisy, score=score):
-            return score(eqx.tree_at(lambda m: m.base.K, noisy, K), key)
-
-        for name, baseline in (("REINFORCE, baseline", True), ("REINFORCE", False)):
-            estimator = LikelihoodRatio(rollouts, baseline)
-            row[name] = relative_variance(estimator, scored, base.K, truth, keys)
-        rows.append(row)
-        print(f"  {row}", flush=True)
-    shown(rows, f"Variance / |gradient|^2, {rollouts} rollouts an estimate")
-
-    env = dlx.replace(dlx.make("pendulum"), SPREAD)
-    policy = dlx.controllers.Deep(env, width=32, depth=1, key=jr.key(FIRST_SEED))
-    noisy = dlx.controllers.Gaussian(policy, -1.0, bounds=env.control_bounds)
-    over = []
-    for horizon in (10, 50) if small else (10, 25, 50, 100, 200, 400):
-        loss = expected_cost(env, batch=1, horizon=horizon)
-        draw = jax.jit(
-            jax.vmap(
-                lambda key, loss=loss: jax.flatten_util.ravel_pytree(
-                    analytic(loss, policy, key)[1]
-                )[0]
-            )
-        )
-        found = np.asarray(draw(jr.split(jr.key(FIRST_SEED), 512)))
-        mean = np.mean(found, axis=0)
-        norms = np.linalg.norm(found, axis=1)
-        score = scored_cost(env, horizon=horizon)
-
-        def scored(base, key, score=score):
-            return score(eqx.tree_at(lambda m: m.base, noisy, base), key)
-
-        keys = jr.split(jr.key(FIRST_SEED), 64)
-        estimator = LikelihoodRatio(8)
-        over.append(
-            {
-                "horizon": horizon,
-                "|mean gradient|": float(np.linalg.norm(mean)),
-                "median |gradient|": float(np.median(norms)),
-                "largest |gradient|": float(np.max(norms)),
-                "analytic, variance / |mean|^2": float(
-                    np.sum(np.var(found, axis=0, ddof=1)) / np.sum(mean**2)
-                ),
-                "REINFORCE, 8 rollouts, variance": relative_variance(
-                    estimator, scored, policy, np.ones(1), keys
-                ),
-                "analytic, 8 rollouts, variance": float(
-                    np.sum(np.var(found, axis=0, ddof=1)) / 8
-                ),
-            }
-        )
-        print(f"  {over[-1]}", flush=True)
-    shown(over, "The pendulum, an MLP: the gradient of the total cost")
-    return {"parameters": rows, "horizon": over}
-
-
-STARTS = 100
-
-
 @eqx.filter_jit
-def evaluated(env, policies) -> tuple[Any, Any]:
+def evaluated(env: Any, policies: Any) -> tuple[Any, Any]:
     """`(starts of 100 held upright, mean cost of 200 steps)` of each of a batch."""
     starts = jax.vmap(env.reset)(jr.split(jr.key(2**20), STARTS))
 
     def one(policy):
         options: Any = dict(key=jr.key(0), horizon=400, throw=False)
         run = jax.vmap(lambda x0: dlx.rollout(env, policy, x0=x0, **options))(starts)
-        return jnp.sum(holds_upright(run)), jnp.mean(jnp.sum(run.costs[:, :200], 1))
+        costs = jnp.asarray(run.costs)
+        return jnp.sum(holds_upright(run)), jnp.mean(jnp.sum(costs[:, :200], 1))
 
     return eqx.filter_vmap(one)(policies)
 
 
-def by_ppo(env, keys, steps, width=32, depth=1, rate=3e-3):
+def by_ppo(env, keys, steps, width=32, depth=1, rate=3e-3, discount=0.95, epochs=10):
     """`(policies, steps of the environment that each seed took)`."""
-    batch, horizon, epochs, minibatches = 32, 50, 10, 8
+    batch, horizon, minibatches = 32, 50, 8
     rounds = max(1, round(steps / (batch * horizon)) - 1)
     ppo = PPO(
         dlx.replace(env, SPREAD),
         batch,
         horizon,
-        discount=0.95,
+        discount=discount,
         epochs=epochs,
         minibatches=minibatches,
     )
@@ -263,90 +95,149 @@ def by_ppo(env, keys, steps, width=32, depth=1, rate=3e-3):
     optimiser = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(schedule))
     make = lambda key: actor_critic(env, width, depth, key=key)
     models = eqx.filter_vmap(make)(keys)
-    found = fit(ppo, models, optimiser, count, key=keys, throw=False, block=400)
+    found = fit(ppo, models, optimiser, count, key=keys, **QUIETLY)
     return found.model.policy.base, batch * horizon * (rounds + 1)
 
 
-def by_shac(env, keys, steps):
+def by_shac(env, keys, steps, batch=16, window=10, rate=1e-2):
     """The same by the short-horizon actor-critic."""
-    batch, horizon = 16, 50
+    horizon = 50
     # Every tenth step runs a second batch for the scales, and the start runs two.
     count = max(1, round((steps / (batch * horizon) - 2) / 1.1))
-    shac = SHAC(dlx.replace(env, SPREAD), batch, horizon, window=10, discount=0.95)
-    schedule = optax.linear_schedule(1e-2, 1e-3, count)
+    shac = SHAC(dlx.replace(env, SPREAD), batch, horizon, window=window, discount=0.95)
+    schedule = optax.linear_schedule(rate, rate / 10, count)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
     models = eqx.filter_vmap(lambda key: actor_critic(env, 32, 1, key=key))(keys)
-    found = fit(shac, models, optimiser, count, key=keys, throw=False, block=400)
+    found = fit(shac, models, optimiser, count, key=keys, **QUIETLY)
     used = batch * horizon * (count + (count - 1) // 10 + 2)
     return found.model.policy.base, used
 
 
-def by_gradient(env, keys, steps):
+def by_gradient(env, keys, steps, batch=8, horizon=100, rate=1e-2):
     """The same by the gradient of the rollout, damped by 0.92 a step."""
-    batch, horizon = 16, 100
     count = max(1, round(steps / (batch * horizon)))
     loss = expected_cost(
         dlx.replace(env, SPREAD), batch=batch, horizon=horizon, gradient_decay=0.92
     )
-    optimiser = optax.adam(optax.cosine_decay_schedule(0.01, count))
+    optimiser = optax.adam(optax.cosine_decay_schedule(rate, count))
     make = lambda key: dlx.controllers.Deep(env, width=32, depth=1, key=key)
     models = eqx.filter_vmap(make)(keys)
-    found = fit(loss, models, optimiser, count, key=keys, throw=False, block=400)
+    found = fit(loss, models, optimiser, count, key=keys, **QUIETLY)
     return found.model, batch * horizon * count
 
 
-def swing_up(small: bool) -> dict[str, Any]:
-    """PPO on ten seeds: at least 95 of 100 starts on at least 8 of them."""
+METHODS = {"PPO": by_ppo, "SHAC": by_shac, "analytic": by_gradient}
+
+
+def product(**values: tuple[Any, ...]) -> list[dict[str, Any]]:
+    """Every choice of one of each."""
+    each = itertools.product(*values.values())
+    return [dict(zip(values, chosen, strict=True)) for chosen in each]
+
+
+SPACE = {
+    "PPO": product(rate=(1e-3, 3e-3), discount=(0.9, 0.95), epochs=(5, 10)),
+    "SHAC": product(batch=(4, 16), window=(10, 25), rate=(3e-3, 1e-2)),
+    "analytic": product(batch=(2, 8), horizon=(50, 100), rate=(3e-3, 1e-2)),
+}
+"""What was tried, eight settings a method, at `TUNED_AT` steps on five other seeds."""
+TUNED_AT = 160_000
+
+
+def tuning(options: argparse.Namespace) -> dict[str, Any]:
+    """The cost of each setting, and the best one of each method."""
+    env, found = dlx.make("pendulum"), {}
+    keys = jr.split(jr.key(FIRST_SEED + 2), 2 if options.small else 5)
+    for name, train in METHODS.items():
+        rows = []
+        for setting in SPACE[name]:
+            steps = 16_000 if options.small else TUNED_AT
+            policies, _ = train(env, keys, steps, **setting)
+            cost = np.asarray(evaluated(env, policies)[1])
+            rows.append(setting | {"cost": middle(np.where(cost < 1e9, cost, 1e9))})
+            print(f"  {name}: {rows[-1]}", flush=True)
+        found[name] = rows
+    return found
+
+
+def best(found: dict[str, Any], name: str) -> dict[str, Any]:
+    """The setting that was best."""
+    costs = [row["cost"] for row in found[name]]
+    return SPACE[name][int(np.argmin(costs))]
+
+
+def held_by(env: Any, policies: Any) -> np.ndarray:
+    """Starts of 100 held upright, of each of a batch of policies."""
+    return np.asarray(evaluated(env, policies)[0])
+
+
+def swing_up(options: argparse.Namespace) -> dict[str, Any]:
+    """The analytic gradient and PPO on ten seeds: at least 95 of 100 starts."""
     env = dlx.make("pendulum")
-    seeds = 2 if small else 10
-    begin = time.perf_counter()
-    keys = jr.split(jr.key(FIRST_SEED), seeds)
-    policies, used = by_ppo(env, keys, 16_000 if small else 161_600, 64, 2, 1e-3)
-    jax.block_until_ready(jax.tree.leaves(eqx.filter(policies, eqx.is_array)))
-    seconds = time.perf_counter() - begin
-    held = np.asarray(evaluated(env, policies)[0])
-    reached = f"{int(np.sum(held >= 95))} of {seeds}"
+    seeds = 2 if options.small else 10
+    found, taken = [], []
+    for seed in range(seeds):
+        begin = time.perf_counter()
+        key = jr.key(FIRST_SEED + seed)
+        model = train_swing_up(env, key=key, progress=False).model
+        found.append(jax.block_until_ready(model))
+        taken.append(time.perf_counter() - begin)
+    held = [int(held_by(env, jax.tree.map(one_more, m))[0]) for m in found]
+    # The first one compiles.
     rows = [
         {
-            "environment steps a seed": used,
-            "seconds for all seeds, compile included": seconds,
-            "seeds with 95 of 100": reached,
-            "held of 100": held.tolist(),
+            "method": "analytic",
+            "steps a seed": 800 * 128 * 100,
+            "seeds with 95 of 100": int(np.sum(np.array(held) >= 95)),
+            "seconds": taken,
+            "held of 100": held,
         }
     ]
-    shown(rows, "PPO swings the pendulum up")
-    return rows[0]
+    begin = time.perf_counter()
+    keys = jr.split(jr.key(FIRST_SEED), seeds)
+    steps = 16_000 if options.small else 161_600
+    policies, used = by_ppo(env, keys, steps, 64, 2, 1e-3)
+    jax.block_until_ready(jax.tree.leaves(eqx.filter(policies, eqx.is_array)))
+    seconds = time.perf_counter() - begin
+    held = held_by(env, policies).tolist()
+    rows.append(
+        {
+            "method": "PPO, all seeds at once",
+            "steps a seed": used,
+            "seeds with 95 of 100": int(np.sum(np.array(held) >= 95)),
+            "seconds": [seconds],
+            "held of 100": held,
+        }
+    )
+    shown(rows, f"The pendulum is swung up, {seeds} seeds")
+    return {"limits": LIMITS, "seeds": seeds, "rows": rows}
 
 
-def interquartile(values: np.ndarray, key: int = 0) -> list[float]:
-    """The interquartile mean, and the ends of its 95% interval by the bootstrap."""
-
-    def mean(values):
-        cut = np.sort(values, axis=-1)
-        n = cut.shape[-1]
-        return cut[..., n // 4 : n - n // 4].mean(axis=-1)
-
-    rng = np.random.default_rng(key)
-    again = rng.choice(values, (2000, len(values)))
-    return [float(mean(values)), *map(float, np.quantile(mean(again), [0.025, 0.975]))]
+def one_more(leaf: Any) -> Any:
+    """With an axis in front."""
+    return leaf[None] if eqx.is_array(leaf) else leaf
 
 
-def learning(small: bool) -> dict[str, Any]:
+def learning(options: argparse.Namespace) -> dict[str, Any]:
     """The cost of 200 steps from the starts of Gym, after so many steps of training."""
+    chosen = json.loads(RESULTS.read_text())["tuning"]
     env = dlx.make("pendulum")
-    seeds = 3 if small else 30
+    seeds = 3 if options.small else 30
     keys = jr.split(jr.key(FIRST_SEED + 1), seeds)
-    methods = {"PPO": by_ppo, "SHAC": by_shac, "analytic": by_gradient}
-    rows = []
-    for steps in (16_000,) if small else (40_000, 80_000, 160_000, 320_000):
-        for name, train in methods.items():
+    budgets = (16_000,) if options.small else BUDGETS
+    if options.steps is not None:
+        budgets = (options.steps,)
+    rows: list[dict[str, Any]] = []
+    for budget in budgets:
+        for name, train in METHODS.items():
             begin = time.perf_counter()
-            policies, used = train(env, keys, steps)
+            policies, used = train(env, keys, budget, **best(chosen, name))
             held, cost = (np.asarray(a) for a in evaluated(env, policies))
             seconds = time.perf_counter() - begin
-            mean, low, high = interquartile(cost)
+            mean, low, high = spread(cost)
             rows.append(
                 {
+                    "budget": budget,
                     "method": name,
                     "steps": used,
                     "cost, IQM": mean,
@@ -358,32 +249,73 @@ def learning(small: bool) -> dict[str, Any]:
                 }
             )
             print(f"  {rows[-1]}", flush=True)
-    zero = eqx.filter_vmap(lambda _: dlx.controllers.Constant([0.0]), axis_size=1)(
-        jnp.zeros(1)
-    )
-    held, cost = evaluated(env, zero)
-    rows.append({"method": "zero control", "cost, IQM": float(cost[0])})
+    still = jax.tree.map(one_more, dlx.controllers.Constant(jnp.zeros(1)))
+    _, cost = evaluated(env, still)
+    rows.append({"budget": 0, "method": "zero control", "cost, IQM": float(cost[0])})
     shown(rows, f"Swing-up at equal steps of the environment, {seeds} seeds")
-    return {"seeds": seeds, "rows": rows}
+    settings = {name: best(chosen, name) for name in METHODS}
+    return {"seeds": seeds, "settings": settings, "rows": rows}
+
+
+def draw(rows: list[dict[str, Any]]) -> None:
+    """Cost against steps."""
+    import matplotlib.pyplot as plt
+
+    plt.rcParams["svg.hashsalt"] = "delucax"
+    figure, ax = plt.subplots(figsize=(5.5, 3.2), layout="constrained")
+    table = pd.DataFrame(rows)
+    for name, found in table[table["budget"] > 0].groupby("method", sort=False):
+        off = [found["cost, IQM"] - found["low"], found["high"] - found["cost, IQM"]]
+        ax.errorbar(
+            found["steps"],
+            found["cost, IQM"],
+            off,
+            fmt="o-",
+            ms=3,
+            capsize=3,
+            label=name,
+        )
+    zero = table.loc[table["budget"] == 0, "cost, IQM"].iloc[0]
+    ax.axhline(zero, color="0.5", ls=":", label="zero control")
+    ax.set(xlabel="steps of the environment", ylabel="cost of 200 steps", xscale="log")
+    ax.grid(alpha=0.25, lw=0.5)
+    ax.legend(frameon=False)
+    figure.savefig(FIGURE, metadata={"Date": None})
 
 
 def main() -> None:
     """Run the parts that are named."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.policies")
     parser.add_argument("--part", choices=PARTS, action="append")
+    parser.add_argument("--steps", type=int, choices=BUDGETS, help="one budget, again")
     parser.add_argument("--small", action="store_true", help="to try it; not written")
-    arguments = parser.parse_args()
-    runs = dict(zip(PARTS, (figure, variance, swing_up, learning), strict=True))
-    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    results["machine"] = describe()
-    for part in arguments.part or PARTS:
+    options = parser.parse_args()
+    about = {"machine": describe()}
+    runs = {"swing-up": swing_up, "tuning": tuning, "learning": learning}
+    for part in options.part or PARTS:
         print(f"\n== {part}", flush=True)
-        begin = time.perf_counter()
-        found = runs[part](arguments.small)
-        found["seconds"] = time.perf_counter() - begin
-        results[part] = found
-        if not arguments.small:
-            RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+        found = runs[part](options)
+        if options.small:
+            continue
+        if part != "learning":
+            updated(RESULTS, lambda old, p=part, f=found: about | {p: f})
+            continue
+        content = updated(
+            RESULTS, lambda old, f=found: about | {"learning": both(old, f)}
+        )
+        draw(content["learning"]["rows"])
+
+
+def both(content: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
+    """What was found, with the budgets that were run before."""
+    ran = {row["budget"] for row in found["rows"]}
+    old = [
+        row
+        for row in content.get("learning", {}).get("rows", [])
+        if row["budget"] not in ran
+    ]
+    rows = sorted([*old, *found["rows"]], key=lambda row: row["budget"])
+    return found | {"rows": rows}
 
 
 if __name__ == "__main__":

@@ -157,6 +157,17 @@ def test_an_arm_under_gravity():
 
 
 @thorough
+def test_where_the_problem_is_not_convex():
+    """The distance of the tip is concave in the angles somewhere on the way: without
+    regularisation there is no step."""
+    env, plant = dlx.make("reacher"), dlx.make("reacher", gravity=-8.0)
+    start = env.initial_state, jnp.zeros((200, 2))
+    plan = dlx.planning.ilqr(env.dynamics, env.cost, *start)
+    run = ILC(plant.dynamics, env.dynamics, env.cost, plan)
+    assert run.cost < 0.8 * run.trace[0] and jnp.all(jnp.diff(run.trace) <= 0)
+
+
+@thorough
 def test_batches_of_winds(windy):
     _, sim, cost, plan = windy
 

@@ -46,6 +46,7 @@ def test_length_and_mass_within_one_percent():
     assert inside >= 16
 
 
+@thorough
 def test_direction_that_is_not_identifiable_is_reported():
     states, controls, _ = recorded()
     paths = ("system.gravity", "system.length", "system.mass")
@@ -74,6 +75,25 @@ def test_data_that_say_nothing_say_so():
     assert np.all(np.isfinite(found.estimate))
 
 
+def test_too_little_data_say_so():
+    states, controls, _ = recorded()
+    few = dict(states=states[:3], controls=controls[:2], throw=False)
+    found = sysid.linear(**few)
+    assert found.result == dlx.RESULTS.unexciting
+    assert not np.all(found.identifiable) and np.all(np.isfinite(found.estimate))
+    with pytest.raises(Exception, match="is not identifiable"):
+        sysid.linear(states[:3], controls[:2])
+
+
+@thorough
+def test_two_observations_do_not_tell_two_parameters():
+    # They are four numbers, two of which tell where it starts.
+    states, controls, _ = recorded()
+    both = "system.mass", "system.length"
+    found = sysid.physical(GUESS, states[:2], controls[:1], both, throw=False)
+    assert found.result == dlx.RESULTS.unexciting
+
+
 def test_linear_models():
     true = dlx.LinearDynamics(A, B, dt=0.1)
     controls = jr.normal(jr.key(0), (400, 1))
@@ -99,6 +119,7 @@ def test_linear_models():
     assert closed.identifiable.tolist() == [False, True, True]
 
 
+@thorough
 def test_arx_is_the_dynamics_that_it_came_from():
     true = dlx.LinearDynamics(A, B)
     controls = jr.normal(jr.key(0), (200, 1))

@@ -15,9 +15,14 @@ from .._results import choose, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..planning import Plan
+from ..planning._descent import LEAST_MU, MOST_MU
 from ..planning._lq import in_sequence, Policy
 from ..planning._plan import checked
 from ..planning._problem import model as local_model, Problem, roll_out
+
+
+GROWTH = 10.0
+"""Of the regularisation, from pass to pass, until the problem is convex."""
 
 
 class Trials(NamedTuple):
@@ -48,7 +53,8 @@ def ILC(
     `a = 1.1 a_last 1.1^(-j^2)`, `j = 0, ..., 9`, until a run costs no more than the
     last one. If none does, it ends. It is [`delucax.planning.ilqr`][] in which only the
     derivatives come from the model, so it ends near the best for the plant, at a
-    distance that grows with how wrong those are.
+    distance that grows with how wrong those are. Where the problem is not convex, the
+    control Hessian is regularised as much as that takes.
 
     **Arguments:**
 
@@ -144,12 +150,21 @@ def learn(
     states, controls, cost = roll_out(plant, *about, nothing, zero, None)
     lost = ~jnp.isfinite(cost)
 
-    def policy_of(states, controls) -> Policy:
+    def policy_of(states, controls) -> tuple[Array, Policy]:
         stages = local_model(model, states, controls, None, False)
         box = None
         if model.low is not None and model.high is not None:
             box = model.low - controls, model.high - controls
-        return in_sequence(stages, zero, False, box)
+
+        def more(tried):
+            mu = jnp.maximum(LEAST_MU, GROWTH * tried[0])
+            return mu, in_sequence(stages, mu, False, box)
+
+        def concave(tried):
+            return ~tried[1].ok & (tried[0] < MOST_MU)
+
+        first = zero, in_sequence(stages, zero, False, box)
+        return lax.while_loop(concave, more, first)
 
     def trial(now, policy, tried):
         shorter = jnp.asarray(1.1, dtype) ** (1.0 - tried.astype(dtype) ** 2)
@@ -159,7 +174,7 @@ def learn(
         return length, found, good
 
     def body(now):
-        policy = policy_of(now.states, now.controls)
+        _, policy = policy_of(now.states, now.controls)
 
         def again(carry):
             tried, *_ = carry
@@ -198,7 +213,7 @@ def learn(
         lost,
     )
     last = lax.while_loop(lambda now: ~now.done, body, start)
-    policy = policy_of(last.states, last.controls)
+    mu, policy = policy_of(last.states, last.controls)
     reached = jnp.arange(trials.iterations + 1) <= last.iteration
     result = choose(
         last.iteration < trials.iterations, RESULTS.no_descent, RESULTS.successful
@@ -214,7 +229,7 @@ def learn(
         result=choose(lost, RESULTS.diverged, result),
         iterations=last.iteration,
         rollouts=last.runs,
-        regularisation=zero,
+        regularisation=mu,
         t0=plan.t0,
         dt=plant.dynamics.dt,
         low=plan.low,

@@ -1,4 +1,5 @@
-"""Section 2: the variance of gradient estimators against the number of parameters."""
+"""Section 2: the variance of gradient estimators against the number of parameters, and
+of the analytic one against the horizon."""
 
 from typing import Any
 
@@ -8,10 +9,17 @@ import jax.random as jr
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ...controllers import Gaussian, MLP
+from ..._paths import replace
+from ...controllers import Deep, Gaussian, MLP
 from ...environments import pendulum
 from ...simulation import rollout
-from ...training import analytic, EvolutionStrategies, LikelihoodRatio, scored_cost
+from ...training import (
+    analytic,
+    EvolutionStrategies,
+    expected_cost,
+    LikelihoodRatio,
+    scored_cost,
+)
 from ._finding import Claim, Finding
 
 
@@ -19,6 +27,9 @@ BUDGET, HORIZON = 128, 20
 """Rollouts in one estimate, and steps in a rollout."""
 ON_WEIGHTS, ON_CONTROLS = 0.01, 0.1
 """Standard deviations of the noise."""
+LONGER = (10, 25, 50, 100, 200, 400)
+DRAWN = 8
+"""Rollouts in one estimate where the start is drawn."""
 
 
 def estimator_variance(small: bool = False) -> Finding:
@@ -33,7 +44,8 @@ def estimator_variance(small: bool = False) -> Finding:
     def loss(controller, key):
         return rollout(env, controller, key=key, keep=(), throw=False).total_cost
 
-    names = ("analytic", "ES, antithetic", "ES, one-sided", "REINFORCE")
+    bare = "REINFORCE, no baseline"
+    names = ("analytic", "ES, antithetic", "ES, one-sided", "REINFORCE", bare)
     found: dict[str, list[float]] = {name: [] for name in names}
     rows, sizes = [], []
     for width in widths:
@@ -51,6 +63,7 @@ def estimator_variance(small: bool = False) -> Finding:
                 policy,
             ),
             "REINFORCE": (LikelihoodRatio(BUDGET), score, noisy),
+            bare: (LikelihoodRatio(BUDGET, baseline=False), score, noisy),
         }
         row: dict[str, Any] = {"parameters": size}
         for name, (estimator, objective, model) in estimators.items():
@@ -66,6 +79,9 @@ def estimator_variance(small: bool = False) -> Finding:
         for name, values in found.items()
         if min(values) > 0
     }
+    over = [_at_horizon(T, draws) for T in (LONGER[::2] if small else LONGER)]
+    exploding = over[-1]["analytic"] / over[0]["analytic"]
+    lost = [row["horizon"] for row in over if row["analytic"] > row["REINFORCE"]]
     claims = [
         Claim(
             "The analytic gradient has no variance in a deterministic system (below "
@@ -86,27 +102,71 @@ def estimator_variance(small: bool = False) -> Finding:
             "squared gradient",
             bool(abs(slope["REINFORCE"]) <= 0.2 and found["REINFORCE"][-1] > 0),
         ),
+        Claim(
+            "Over a long horizon, with starts at random, the analytic gradient loses: "
+            "its variance grows above that of REINFORCE at as many rollouts",
+            f"{exploding:.1e} times from {over[0]['horizon']} to {over[-1]['horizon']} "
+            f"steps; above from {lost[0]} steps on"
+            if lost
+            else "below everywhere",
+            bool(lost),
+        ),
     ]
-    figure, ax = plt.subplots(figsize=(5.5, 3.4), layout="constrained")
+    figure, (ax, long) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
     for name, values in found.items():
         if min(values) > 0:
             ax.loglog(sizes, values, "o-", ms=3, label=name)
     ax.set(xlabel="parameters", ylabel="variance / squared gradient")
+    ax.xaxis.set_minor_formatter("")
     ax.grid(alpha=0.25, lw=0.5)
-    ax.legend(frameon=False)
+    ax.legend(frameon=False, fontsize=8)
+    for name in ("analytic", "REINFORCE"):
+        each = [row[name] for row in over]
+        long.loglog([row["horizon"] for row in over], each, "o-", ms=3, label=name)
+    long.set(xlabel="horizon, steps", ylabel="variance")
+    long.grid(alpha=0.25, lw=0.5)
+    long.legend(frameon=False, fontsize=8)
     notes = (
         f"Networks of one layer, {widths[0]} to {widths[-1]} wide, for the pendulum, "
         f"{HORIZON} steps; {BUDGET} rollouts in an estimate, {draws} estimates; noise "
         f"of {ON_WEIGHTS} on the weights, or {ON_CONTROLS} on the control. The "
-        "variance is the trace of the covariance."
+        "variance is the trace of the covariance. Against the horizon: a network of "
+        f"width 32, starts at any angle and speed, {DRAWN} rollouts an estimate; the "
+        "norms are those of single rollouts."
     )
     return Finding(
         "Variance of gradient estimators",
         claims,
-        {"Variance / squared gradient": rows},
+        {"Variance / squared gradient": rows, "Against the horizon": over},
         {"estimator_variance": figure},
         notes,
     )
+
+
+def _at_horizon(horizon: int, draws: int) -> dict[str, Any]:
+    """Variances over a horizon, the start drawn, and how large the gradient is."""
+    corner = np.array([np.pi, 8.0])
+    env = replace(
+        pendulum(), {"initial_state.low": -corner, "initial_state.high": corner}
+    )
+    policy = Deep(env, width=32, depth=1, key=jr.key(0))
+    noisy = Gaussian(policy, -1.0, bounds=env.control_bounds)
+    one = expected_cost(env, batch=1, horizon=horizon)
+    score = scored_cost(env, horizon=horizon)
+    keys = jr.split(jr.key(1), draws)
+    exact = jax.jit(lambda key: _flat(analytic(one, policy, key)[1]))
+    drawn = LikelihoodRatio(DRAWN)
+    guess = jax.jit(lambda key: _flat(drawn(score, noisy, key)[1]))
+    # Of single rollouts, so that norms are those of one, and the variance an eighth.
+    each, guesses = (np.asarray(jax.lax.map(f, keys)) for f in (exact, guess))
+    norms = np.linalg.norm(each, axis=1)
+    return {
+        "horizon": horizon,
+        "analytic": float(np.sum(np.var(each, axis=0))) / DRAWN,
+        "REINFORCE": float(np.sum(np.var(guesses, axis=0))),
+        "norm, median": float(np.median(norms)),
+        "norm, largest": float(np.max(norms)),
+    }
 
 
 def _flat(gradient: Any) -> Any:

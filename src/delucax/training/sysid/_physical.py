@@ -162,6 +162,8 @@ def physical(
     finite = jnp.all(jnp.isfinite(legal))
     few = size * int(np.sum(counts)) <= len(names) + guesses.size
     known = certainty.identifiable & (not few)
+    # Where many values fit as well the iteration wanders: the data are to be blamed.
+    solver = RESULTS.successful if few else solved.result
     found = Identified(
         model=assembly(values),
         names=tuple(names),
@@ -173,7 +175,7 @@ def physical(
         spread=certainty.spread,
         identifiable=known,
         noise=solved.noise,
-        result=outcome(known, solved.result, finite),
+        result=outcome(known, solver, finite),
     )
     return raised(found, throw)
 
