@@ -20,7 +20,16 @@ pip := $(bin)/python -m pip --disable-pip-version-check -qq
 # The tests run one process a core, so that each process keeps to one thread.
 one_thread := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
 	XLA_FLAGS="--xla_cpu_multi_thread_eigen=false $$XLA_FLAGS"
+# Most of the time goes to LLVM's optimiser, for programs that run for milliseconds: only
+# the tests in double precision compile as a user does.
+lightly := XLA_FLAGS="--xla_backend_optimization_level=0 \
+	--xla_llvm_disable_expensive_passes=true $$XLA_FLAGS"; export XLA_FLAGS;
 pytest := $(one_thread) $(bin)/python -m pytest -n logical --maxprocesses=8
+
+# Each package's own use of what it depends on.
+oldest_tests := tests/contracts/test_systems.py tests/contracts/test_tasks.py \
+	tests/dynamics tests/experiments tests/interop tests/plotting tests/simulation \
+	tests/test_serialise.py
 
 ##@ Use
 
@@ -45,7 +54,7 @@ test: test-float32 test-float64 notebooks ## all tests in both precisions, then 
 
 .PHONY: test-float32
 test-float32: $(VENV)/.tests ## the tests in single precision
-	JAX_ENABLE_X64=0 $(pytest) $(PYTEST_ARGS)
+	$(lightly) JAX_ENABLE_X64=0 $(pytest) $(PYTEST_ARGS)
 
 .PHONY: test-float64
 test-float64: $(VENV)/.tests ## the tests in double precision; the docs' examples ran before
@@ -58,16 +67,27 @@ thorough: $(VENV)/.tests ## the tests that `test` leaves out, for they compile f
 	JAX_ENABLE_X64=1 $(pytest) -m thorough --ignore tests/contracts/test_public.py \
 		--ignore tests/test_docs.py $(PYTEST_ARGS)
 
+.PHONY: test-oldest
+test-oldest: $(VENV)-oldest/.tests ## part of the tests: oldest Python and dependencies allowed
+	$(lightly) JAX_ENABLE_X64=0 $(one_thread) $(VENV)-oldest/bin/python -m pytest \
+		-n logical --maxprocesses=8 -W default $(oldest_tests) $(PYTEST_ARGS)
+
 .PHONY: notebooks
-notebooks: $(VENV)/.tests ## run every notebook from top to bottom
-	CI=1 MPLBACKEND=agg $(pytest) -o addopts= -W default \
+notebooks: $(VENV)/.tests ## run every notebook from top to bottom, with little of everything
+	$(lightly) CI=1 MPLBACKEND=agg $(pytest) -o addopts= -W default \
 		--nbmake --nbmake-timeout=600 notebooks
 
+.PHONY: notebooks-full
+notebooks-full: $(VENV)/.tests ## run every notebook as it is shown
+	CI= MPLBACKEND=agg $(pytest) -o addopts= -W default \
+		--nbmake --nbmake-timeout=1800 notebooks
+
 .PHONY: lint
-lint: $(VENV)/.dev ## style, formatting and the import rules between the floors
+lint: $(VENV)/.dev ## style, formatting, the imports between the floors, the ledger of claims
 	$(bin)/ruff check
 	$(bin)/ruff format --check
 	$(bin)/lint-imports --no-cache --no-logo
+	$(bin)/python scripts/claims.py
 
 .PHONY: format
 format: $(VENV)/.dev ## apply style and formatting
@@ -99,7 +119,7 @@ clean: ## remove what the other targets wrote, but not the environment
 
 .PHONY: distclean
 distclean: clean ## remove the environment too
-	rm -rf $(VENV)
+	rm -rf $(VENV) $(VENV)-oldest
 
 # A stamp is renewed when pyproject.toml changes; with nothing to do a target starts at
 # once. The group `dev` holds `tests` and `docs`, so that its stamp renews theirs.
@@ -112,6 +132,16 @@ $(VENV)/.pip:
 		"$$python" -m venv --clear $(VENV); \
 	fi
 	@$(pip) install --upgrade 'pip>=25.1'
+	@touch $@
+
+# uv finds the oldest versions that go together; pip finds only the newest.
+$(VENV)-oldest/.tests: pyproject.toml
+	@python=$$(sh scripts/python.sh oldest) || exit 1; \
+		echo "making $(@D) with $$("$$python" --version) and the oldest dependencies"; \
+		"$$python" -m venv --clear $(@D)
+	@$(@D)/bin/python -m pip --disable-pip-version-check -qq install uv
+	@$(@D)/bin/uv pip install --quiet --python $(@D)/bin/python \
+		--resolution lowest-direct --editable '.[all]' --group tests
 	@touch $@
 
 $(VENV)/.demo: $(VENV)/.pip pyproject.toml

@@ -5,14 +5,18 @@ each into MathML here, which browsers show by themselves. The site therefore nee
 neither JavaScript for its mathematics nor a network, and the sources stay plain `$...$`
 and `$$...$$`. An equation that cannot be converted is a warning, hence an error in a
 strict build.
+
+The page of claims is written from the ledger.
 """
 
 import html
 import logging
 import re
+import tomllib
 import unicodedata
 from typing import Any
 
+import claims  # pyright: ignore[reportMissingImports]
 from latex2mathml.converter import convert
 
 
@@ -52,6 +56,33 @@ def to_mathml(latex: str, display: bool) -> str:
 def _symbol(match: re.Match[str]) -> str:
     kind = unicodedata.category(html.unescape(match.group(1)))
     return f"<mo>{match.group(1)}</mo>" if kind[0] in "PS" else match.group()
+
+
+def on_page_markdown(markdown: str, /, *, page: Any, **_: Any) -> str:
+    """Put the ledger of claims into its page."""
+    mark = "<!-- ledger -->"
+    return markdown.replace(mark, ledger()) if mark in markdown else markdown
+
+
+def ledger() -> str:
+    """What is measured, page by page, as Markdown."""
+    root = claims.ROOT
+    entries = tomllib.loads((root / claims.LEDGER).read_text(encoding="utf-8"))
+    found: dict[str, list[str]] = {}
+    for entry in [*entries["claim"], *entries["table"]]:
+        text = (root / entry["page"]).read_text(encoding="utf-8")
+        match = claims.pattern(entry.get("text", entry.get("after"))).search(text)
+        said = " ".join(match.group().split()).strip("| ") if match else ""
+        said = re.sub(r"[`*]", "", said).replace("|", ": ")
+        said = said if "text" in entry else f"the table after “{said}”"
+        made = entry.get("command", entry.get("test"))
+        file = f"`{entry['results']}`" if "results" in entry else ""
+        found.setdefault(entry["page"], []).append(f"| {said} | `{made}` | {file} |\n")
+    head = "| | made by | stands in |\n|---|---|---|\n"
+    return "\n".join(
+        f"## {page.removeprefix('docs/')}\n\n{head}{''.join(lines)}"
+        for page, lines in found.items()
+    )
 
 
 def on_page_content(html_text: str, /, *, page: Any, **_: Any) -> str:

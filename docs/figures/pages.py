@@ -1,12 +1,18 @@
 """The pictures of the pages, drawn by the code that the pages show.
 
 `python docs/figures/pages.py` runs the Python blocks of the pages below and
-puts what they draw, in fewer colours, into `docs/assets/`, in a few minutes.
+puts what they draw, in fewer colours, into `docs/assets/`, in a few minutes. The
+numbers that they print go to `pages.json` beside this file, by page and by the word
+that the line begins with.
 """
 
+import contextlib
+import io
+import json
 import os
 import re
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
 
 from PIL import Image
@@ -18,23 +24,38 @@ PICTURES = {
     "first_system.md": ["first_system.png"],
     "linear_analysis.md": ["bode.png", "nyquist.png", "root_locus.png"],
 }
+NUMBERS = DOCS / "figures" / "pages.json"
 
 
 def run(page, folder):
-    """Run the blocks of a page in `folder`, in one namespace."""
+    """Run the blocks of a page in `folder`, in one namespace; what they print."""
     fenced = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
     os.chdir(folder)
     namespace = {"__name__": "page"}
-    for block in fenced.findall(page.read_text()):
-        exec(compile(block, str(page), "exec"), namespace)
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        for block in fenced.findall(page.read_text()):
+            exec(compile(block, str(page), "exec"), namespace)
+    return printed.getvalue()
+
+
+def numbers(printed):
+    """The numbers of each line that begins with a word."""
+    lines = re.findall(r"^([A-Za-z]\w*):? (.*)$", printed, re.MULTILINE)
+    return {
+        word: [float(n) for n in re.findall(r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?", rest)]
+        for word, rest in lines
+    }
 
 
 if __name__ == "__main__":
+    found = {}
     for name, pictures in PICTURES.items():
         with tempfile.TemporaryDirectory() as folder:
-            run(DOCS / name, folder)
+            found[name] = numbers(run(DOCS / name, folder))
             for picture in pictures:
                 drawn = Image.open(Path(folder) / picture).convert("RGB")
                 small = drawn.quantize(128, dither=Image.Dither.NONE)
                 small.save(DOCS / "assets" / picture, optimize=True)
             os.chdir(DOCS)
+    made = {"versions": {name: version(name) for name in ("delucax", "jax")}}
+    NUMBERS.write_text(json.dumps(made | {"printed": found}, indent=2) + "\n")

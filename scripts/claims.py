@@ -1,0 +1,393 @@
+"""Check that each measured number in the README and the docs is what was measured.
+
+`docs/claims.toml` says for each number which command makes it and where it stands in
+the committed results. `python scripts/claims.py` fails where
+
+- a page has a number with a unit, with "times" or with "%", or a table a cell that is a
+  number, and nothing in the ledger covers it;
+- a number is not that of the results, at the digits that are printed;
+- the results were made by an older minor version of delucax than this one;
+- an entry is not on its page, or its command, test or results file does not exist.
+
+The ledger has three kinds of entries. A `claim` is a piece of a page in which `{}` is
+a number, and `values` say where these are in `results`; where a test proves the claim,
+`test` names it in place of `results`. A `table` is the one that follows the text
+`after`, or begins with it; `columns` has for each column where its numbers are, with
+`{}` for the first cell of the row, or for what `rows` has in its place, and `{2}` for
+the second. What is `given` was chosen, or is somebody else's number.
+
+A place in the results is written `[<= ][TAKE of ]STEP > STEP > ...[ * FACTOR]`. A step
+is the key of an object, the number of a member of a list, or `KEY=VALUE & KEY=VALUE`:
+those members that have these values. TAKE (`first`, `min`, `max`, `sum`, `median`,
+`mean`, `iqm`, `count`) makes one number of several. With `<=` the number may be less
+than is printed, with `>=` more. A number stands for itself.
+"""
+
+import json
+import math
+import operator
+import re
+import statistics
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+
+ROOT = Path(__file__).parents[1]
+LEDGER = "docs/claims.toml"
+
+_NUMBER = r"[-+−]?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[-+]?\d+)?"
+_WORD = r"\b(?:two|three|four|five|six|seven|eight|nine|ten|twenty|a hundred)"
+_UNIT = (
+    r"times|x\b|%|(?:ns|us|µs|ms|s|min|h|[kMG]B|cmH2O|seconds?|minutes?|hours?|"
+    r"(?:nano|micro|milli)seconds?|bytes)\b"
+)
+_MEASURED = re.compile(
+    rf"(?<![\w.\[-]){_NUMBER}\s?(?:{_UNIT})|"
+    rf"{_WORD}\s(?:times|seconds|minutes|hours|milliseconds|microseconds)\b"
+)
+_NUMERIC_CELL = re.compile(rf"[*<>=~≤≥ ]*{_NUMBER}")
+_ROW = re.compile(r"^\|.*\|[ ]*$", re.MULTILINE)
+_HEAD = re.compile(r"^\|.*\|[ ]*\n\|[ :|-]+\|[ ]*$", re.MULTILINE)
+# What no reader takes for a statement: code, comments, equations, addresses.
+_SILENT = [
+    re.compile(r"^( *)```[^`]*?^\1``` *$", re.MULTILINE),
+    re.compile(r"<!--.*?-->", re.DOTALL),
+    re.compile(r"`[^`\n]*`|\$[^$]*\$|\]\([^)\n]*\)|\{ *width[^}]*\}"),
+]
+
+
+def pages(root: Path) -> list[str]:
+    """The pages that are held to the ledger."""
+    found = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+    return [str(path.relative_to(root)) for path in found]
+
+
+def problems(root: Path = ROOT) -> list[str]:
+    """What is wrong, a line each."""
+    ledger = tomllib.loads((root / LEDGER).read_text(encoding="utf-8"))
+    texts = {name: (root / name).read_text(encoding="utf-8") for name in pages(root)}
+    covered: dict[str, list[tuple[int, int]]] = {name: [] for name in texts}
+    found = []
+    sources: dict[str, Any] = {}
+    for kind in ledger:
+        if kind not in ("claim", "table", "given"):
+            found.append(f"{LEDGER}: unknown kind of entry {kind!r}")
+    for kind, check in (("claim", _claim), ("table", _table), ("given", _given)):
+        for entry in ledger.get(kind, []):
+            page = entry.get("page")
+            if page not in texts:
+                found.append(f"{LEDGER}: no page {page!r}")
+                continue
+            if kind != "given":
+                found += _origin(root, entry, sources)
+            said = check(texts[page], entry, sources, covered[page])
+            try:
+                found += [f"{page}{line}" for line in said]
+            except ValueError as error:
+                found.append(str(error))
+    for name, text in texts.items():
+        for start, end in _measured(text):
+            if not any(a <= start and end <= b for a, b in covered[name]):
+                words = " ".join(text[start:end].split())
+                found.append(
+                    f"{name}:{_line(text, start)}: {words!r} is not in {LEDGER}"
+                )
+    return found
+
+
+def _measured(text: str) -> Iterator[tuple[int, int]]:
+    """Where the measured numbers of a page are."""
+    plain = text
+    for silent in _SILENT:
+        plain = silent.sub(lambda m: re.sub(r"[^\n|]", " ", m.group()), plain)
+    plain = _HEAD.sub(lambda m: re.sub(r"[^\n|]", " ", m.group()), plain)
+    for row in _ROW.finditer(plain):
+        for cell in re.finditer(r"[^|]+", row.group()):
+            if _NUMERIC_CELL.match(cell.group()):
+                start = row.start() + cell.start()
+                for number in re.finditer(_NUMBER, cell.group()):
+                    yield start + number.start(), start + number.end()
+    for match in _MEASURED.finditer(plain):
+        yield match.span()
+
+
+def _claim(
+    text: str, entry: dict, sources: dict, covered: list[tuple[int, int]]
+) -> Iterator[str]:
+    match = pattern(entry["text"]).search(text)
+    if match is None:
+        yield f": no {entry['text']!r}"
+        return
+    covered.append(match.span())
+    if "results" not in entry:
+        return
+    values = entry["values"]
+    if len(values) != len(match.groups()):
+        yield f": {len(values)} values for {entry['text']!r}"
+        return
+    for k, place in enumerate(values, 1):
+        said = _differs(match.group(k), sources.get(entry["results"]), place)
+        if said:
+            yield f":{_line(text, match.start(k))}: {said}"
+
+
+def _table(
+    text: str, entry: dict, sources: dict, covered: list[tuple[int, int]]
+) -> Iterator[str]:
+    found = pattern(entry["after"]).search(text)
+    start = found.end() if found else len(text)
+    line = text.rfind("\n", 0, start) + 1
+    rows = list(_ROW.finditer(text, line if text[line:].startswith("|") else start))
+    if not rows:
+        yield f": no table after {entry['after']!r}"
+        return
+    last = rows[0].start()
+    for number, row in enumerate(rows):
+        if text[last : row.start()].strip(" \n") or row.start() - last > 1:
+            break
+        last = row.end()
+        covered.append(row.span())
+        if number < 2:
+            continue
+        line = _line(text, row.start())
+        cells = [cell.strip() for cell in row.group().strip(" ")[1:-1].split("|")]
+        if "columns" not in entry:
+            continue
+        if len(cells) != len(entry["columns"]):
+            yield f":{line}: {len(entry['columns'])} columns in {LEDGER}"
+            continue
+        label = re.sub(r"[`*]", "", cells[0])
+        label = entry.get("rows", {}).get(label, label)
+        for cell, places in zip(cells, entry["columns"], strict=True):
+            names = {"{}": label, "{2}": cells[1]}
+            places = [places] if isinstance(places, str) else places
+            places = [_filled(place, names) for place in places if place]
+            for said in _cell(cell, places, sources.get(entry["results"])):
+                yield f":{line}: {said}"
+
+
+def _filled(place: str, names: dict[str, str]) -> str:
+    for mark, name in names.items():
+        place = place.replace(mark, name)
+    return place
+
+
+def _cell(cell: str, places: list[str], source: Any) -> Iterator[str]:
+    """Compare the numbers, or the text, of one cell."""
+    printed = re.findall(_NUMBER, cell)
+    if not places:
+        return
+    if len(places) == 1 and (not printed or isinstance(_look(source, places[0]), str)):
+        value = _look(source, places[0])
+        missing = value is None or (isinstance(value, float) and not value < math.inf)
+        same = value in cell if isinstance(value, str) else missing
+        if not same:
+            yield f"{cell!r}, but {places[0]!r} is {value!r}"
+        return
+    if len(printed) > len(places):
+        yield f"{len(places)} places in the ledger for {cell!r}"
+        return
+    for number, place in zip(printed, places, strict=False):
+        said = _differs(number, source, place)
+        if said:
+            yield said
+
+
+def _given(
+    text: str, entry: dict, sources: dict, covered: list[tuple[int, int]]
+) -> Iterator[str]:
+    for part in entry["texts"]:
+        matches = list(pattern(part).finditer(text))
+        if not matches:
+            yield f": no {part!r}"
+        covered += [match.span() for match in matches]
+
+
+def _origin(root: Path, entry: dict, sources: dict) -> Iterator[str]:
+    """Check the command or the test, and read the results."""
+    what = entry.get("text") or entry.get("after")
+    if "test" in entry:
+        path, _, name = entry["test"].partition("::")
+        file = root / path
+        if not file.is_file() or f"def {name}(" not in file.read_text(encoding="utf-8"):
+            yield f"{LEDGER}: no test {entry['test']!r}"
+    if not _is_command(root, entry.get("command", "")) and "test" not in entry:
+        yield f"{LEDGER}: {what!r} has no command that is there"
+    name = entry.get("results")
+    if name is None:
+        if "test" not in entry:
+            yield f"{LEDGER}: {what!r} has neither results nor a test"
+        return
+    if name in sources:
+        return
+    file = root / name
+    if not file.is_file():
+        yield f"{LEDGER}: no file {name!r}"
+        sources[name] = None
+        return
+    content = file.read_text(encoding="utf-8")
+    if name.endswith(".jsonl"):
+        lines = [json.loads(line) for line in content.splitlines()]
+        # A case that was run again counts as it was last.
+        cases = {line["case"]: line for line in lines if line.get("kind") == "case"}
+        runs = {line["run"]: line for line in lines if line.get("kind") == "run"}
+        used = {case["run"] for case in cases.values()}
+        sources[name] = [*cases.values(), *(runs[run] for run in sorted(used))]
+    else:
+        sources[name] = json.loads(content)
+    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))
+    now = project["project"]["version"]
+    made = set(_versions(sources[name]))
+    if not made:
+        yield f"{name}: no version of delucax"
+    for version in sorted(made):
+        if _minor(version) < _minor(now):
+            yield f"{name}: made by delucax {version}, and this is {now}"
+
+
+def _is_command(root: Path, command: str) -> bool:
+    words = command.split()
+    if words[:2] == ["python", "-m"] and len(words) > 2:
+        path = root.joinpath(*words[2].split("."))
+        if words[2] == "delucax":
+            return (root / "src" / "delucax" / "__main__.py").is_file()
+        return path.with_suffix(".py").is_file() or (path / "__main__.py").is_file()
+    if words[:1] == ["make"] and len(words) > 1:
+        makefile = (root / "Makefile").read_text(encoding="utf-8")
+        return (
+            re.search(rf"^{re.escape(words[1])}:", makefile, re.MULTILINE) is not None
+        )
+    return words[:1] == ["python"] and len(words) > 1 and (root / words[1]).is_file()
+
+
+def _versions(content: Any) -> Iterator[str]:
+    if isinstance(content, dict):
+        versions = content.get("versions")
+        if isinstance(versions, dict) and versions.get("delucax"):
+            yield versions["delucax"]
+        content = list(content.values())
+    if isinstance(content, list):
+        for value in content:
+            yield from _versions(value)
+
+
+def _minor(version: str) -> tuple[int, int]:
+    major, minor = version.split(".")[:2]
+    return int(major), int(minor)
+
+
+def _look(source: Any, place: str) -> Any:
+    """What stands at a place of the results; `None` where nothing does."""
+    if re.fullmatch(_NUMBER, place):
+        return float(place)
+    takes = "|".join(_TAKES)
+    parts = re.fullmatch(rf"(?:({takes}) of )?(.*?)(?: \* ([-\d.e+]+))?", place)
+    assert parts is not None
+    take, path, factor = parts.groups()
+    found = [source]
+    for step in path.split(" > "):
+        pairs = [pair.partition("=") for pair in step.split(" & ")]
+        wanted = [(key, text) for key, _, text in pairs]
+        following = []
+        for value in found:
+            if isinstance(value, list) and all(text for _, text in wanted):
+                members = [m for m in value if isinstance(m, dict)]
+                following += [m for m in members if _has(m, wanted)]
+            elif isinstance(value, list) and step.isdigit():
+                following += value[int(step) : int(step) + 1]
+            elif isinstance(value, list):
+                following += [m[step] for m in value if _holds(m, step)]
+            elif _holds(value, step):
+                following.append(value[step])
+        found = following
+    if take is not None:
+        spread = [v for f in found for v in (f if isinstance(f, list) else [f])]
+        spread = [v for v in spread if v is not None and v == v]
+        found = [_TAKES[take](spread)] if spread else []
+    if len(found) > 1:
+        raise ValueError(f"{LEDGER}: {place!r} is {len(found)} numbers, not one.")
+    value = found[0] if found else None
+    if isinstance(value, int | float) and factor is not None:
+        return value * float(factor)
+    return value
+
+
+def _holds(value: Any, key: str) -> bool:
+    return isinstance(value, dict) and key in value
+
+
+def _has(member: dict, wanted: list[tuple[str, str]]) -> bool:
+    """Whether a member has these values; `a.b` is the key `b` of what `a` holds."""
+    for key, text in wanted:
+        value: Any = member
+        for part in [key] if key in member else key.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        if str(value) != text:
+            return False
+    return True
+
+
+def _interquartile_mean(values: list[float]) -> float:
+    cut = len(values) // 4
+    return statistics.fmean(sorted(values)[cut : len(values) - cut])
+
+
+_TAKES = {
+    "first": operator.itemgetter(0),
+    "min": min,
+    "max": max,
+    "sum": sum,
+    "median": statistics.median,
+    "mean": statistics.fmean,
+    "iqm": _interquartile_mean,
+    "count": len,
+}
+
+
+def _differs(printed: str, source: Any, place: str) -> str | None:
+    """How a number that is printed differs from that of the results, if it does."""
+    bound = place[:2] if place[:3] in ("<= ", ">= ") else ""
+    value = _look(source, place.removeprefix(bound).lstrip())
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        return f"{printed!r}, but {place!r} is {value!r}"
+    number = float(printed.replace(",", "").replace("−", "-"))
+    if abs(number - value) <= _half_a_digit(printed) * (1 + 1e-6):
+        return None
+    if (bound == "<=" and value < number) or (bound == ">=" and value > number):
+        return None
+    return f"{printed!r}, but {place!r} is {value:.6g}"
+
+
+def _half_a_digit(printed: str) -> float:
+    """Half of the last digit that is printed.
+
+    Zeros at the end of a whole number are digits from the second one on: 18,000 may be
+    17,953, and 200 not 247.
+    """
+    mantissa, _, power = printed.replace(",", "").lstrip("+-−").partition("e")
+    _, _, decimals = mantissa.partition(".")
+    if decimals:
+        last = -len(decimals)
+    else:
+        zeros = len(mantissa) - len(mantissa.rstrip("0"))
+        last = min(zeros, max(len(mantissa) - 2, 0))
+    return 0.5 * 10.0 ** (last + int(power or 0))
+
+
+def pattern(text: str) -> re.Pattern[str]:
+    """A piece of a page, wherever its lines break; `{}` is a number."""
+    words = [re.escape(word).replace(r"\{\}", f"({_NUMBER})") for word in text.split()]
+    return re.compile(r"\s+".join(words))
+
+
+def _line(text: str, at: int) -> int:
+    return text.count("\n", 0, at) + 1
+
+
+if __name__ == "__main__":
+    wrong = problems()
+    print("\n".join(wrong) or "every measured number has its origin")
+    sys.exit(bool(wrong))

@@ -1,0 +1,251 @@
+"""The ledger of claims catches what it is there for, and finds nothing in this tree."""
+
+import importlib
+import importlib.util
+import json
+import shutil
+import tomllib
+from pathlib import Path
+
+import pytest
+from helpers import once, thorough
+
+
+pytestmark = once
+
+ROOT = Path(__file__).parents[1]
+_spec = importlib.util.spec_from_file_location("claims", ROOT / "scripts/claims.py")
+assert _spec is not None and _spec.loader is not None
+claims = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(claims)
+
+README = """# A library
+
+It is 12.3 times as fast, with 1.5 MB. Seeds take three seconds, as chosen.
+
+Results:
+
+| task | cost | result |
+|---|---|---|
+| `a` | 18,000 (17,000 to 18,900) | good |
+| `b` | 0.25 (0.2 to 0.3) | - |
+
+`10 times` in code is nothing, and so is version 3.11.
+"""
+
+LEDGER = """
+[[claim]]
+page = "README.md"
+text = "It is {} times as fast, with {} MB."
+command = "python -m benchmarks.speed"
+results = "benchmarks/results/speed.json"
+values = ["rows > name=ours & kind=x > ratio", "max of rows > bytes * 1e-6"]
+
+[[table]]
+page = "README.md"
+after = "Results:"
+command = "python -m benchmarks.speed"
+results = "benchmarks/results/speed.json"
+columns = [
+    "",
+    ["tasks > {} > cost", "tasks > {} > low", "tasks > {} > high"],
+    "tasks > {} > result",
+]
+
+[[given]]
+page = "README.md"
+texts = ["Seeds take three seconds"]
+"""
+
+RESULTS = {
+    "machine": {"versions": {"delucax": "0.2.1"}},
+    "rows": [
+        {"name": "ours", "kind": "x", "ratio": 12.34, "bytes": 9e5},
+        {"name": "ours", "kind": "y", "ratio": 1.0, "bytes": 1.52e6},
+    ],
+    "tasks": {
+        "a": {"cost": 17953.0, "low": 17044.0, "high": 18851.0, "result": "good"},
+        "b": {"cost": 0.2512, "low": 0.21, "high": 0.296, "result": None},
+    },
+}
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """A small tree that is in order."""
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "benchmarks/results").mkdir(parents=True)
+    (tmp_path / "README.md").write_text(README)
+    (tmp_path / "docs/claims.toml").write_text(LEDGER)
+    (tmp_path / "benchmarks/speed.py").write_text("")
+    (tmp_path / "benchmarks/results/speed.json").write_text(json.dumps(RESULTS))
+    (tmp_path / "pyproject.toml").write_text('[project]\nversion = "0.2.0"\n')
+    (tmp_path / "Makefile").write_text("all:\n")
+    return tmp_path
+
+
+def change(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def test_a_tree_in_order(tree):
+    assert claims.problems(tree) == []
+
+
+@pytest.mark.parametrize(
+    "old, new, said",
+    [
+        ("12.3 times", "12.4 times", "README.md:3: '12.4', but"),
+        ("12.3 times", "12.30 times", "README.md:3: '12.30', but"),
+        ("1.5 MB", "1.6 MB", "README.md:3: '1.6', but"),
+        ("18,000", "17,900", "README.md:9: '17,900', but"),
+        ("0.2 to 0.3", "0.2 to 0.4", "README.md:10: '0.4', but"),
+        ("| good |", "| bad |", "README.md:9: 'bad', but"),
+        ("| - |", "| 7 |", "README.md:10: '7', but"),
+        ("0.2 to 0.3)", "0.2 to 0.3, 9)", "README.md:10: 3 places"),
+        ("| `b` |", "| `c` |", "README.md:10: '0.25', but"),
+        ("as chosen.", "as chosen, and half of 5 ms.", "README.md:3: '5 ms' is not"),
+        ("as chosen.", "as chosen, 20% more.", "README.md:3: '20%' is not"),
+        ("as chosen.", "as chosen, ten times more.", "README.md:3: 'ten times' is"),
+        ("as fast", "as quick", "README.md: no 'It is {}"),
+        ("as chosen.", "as chosen.\n\n| | x |\n|---|---|\n| a | 4 |\n", "'4' is not"),
+    ],
+)
+def test_a_page_that_is_wrong(tree, old, new, said):
+    change(tree / "README.md", old, new)
+    assert any(said in line for line in claims.problems(tree))
+
+
+@pytest.mark.parametrize(
+    "file, old, new, said",
+    [
+        (
+            "pyproject.toml",
+            "0.2.0",
+            "0.3.0",
+            "made by delucax 0.2.1, and this is 0.3.0",
+        ),
+        ("docs/claims.toml", "-m benchmarks.speed", "-m benchmarks.sped", "no command"),
+        ("docs/claims.toml", "speed.json", "sped.json", "no file"),
+        ("docs/claims.toml", "max of rows", "rows", "2 numbers, not one"),
+        ("docs/claims.toml", "[[given]]", "[[gifen]]", "unknown kind"),
+        ("docs/claims.toml", 'page = "README.md"', 'page = "READ.md"', "no page"),
+        ("benchmarks/results/speed.json", "delucax", "jax", "no version of delucax"),
+        ("benchmarks/results/speed.json", "12.34", "null", "is None"),
+        ("benchmarks/results/speed.json", "12.34", "NaN", "is nan"),
+    ],
+)
+def test_an_origin_that_is_wrong(tree, file, old, new, said):
+    change(tree / file, old, new)
+    assert any(said in line for line in claims.problems(tree))
+
+
+def test_a_patch_does_not_make_results_stale(tree):
+    change(tree / "pyproject.toml", "0.2.0", "0.2.9")
+    assert claims.problems(tree) == []
+
+
+def test_a_claim_that_a_test_proves(tree):
+    change(tree / "README.md", "as chosen.", "as chosen. It takes 3 ms.")
+    proven = '\n[[claim]]\npage = "README.md"\ntext = "It takes {} ms."\ntest = '
+    ledger = tree / "docs/claims.toml"
+    ledger.write_text(LEDGER + proven + '"tests/test_speed.py::test_speed"\n')
+    assert any("no test" in line for line in claims.problems(tree))
+    (tree / "tests").mkdir()
+    (tree / "tests/test_speed.py").write_text("def test_speed():\n    pass\n")
+    assert claims.problems(tree) == []
+
+
+def test_lines_of_cases(tree):
+    """What was run again counts as it was last, and so does the version it ran with."""
+    runs = [
+        {"kind": "run", "run": run, "versions": {"delucax": version}}
+        for run, version in enumerate(["0.1.0", "0.2.0"])
+    ]
+    cases = [
+        {"kind": "case", "run": run, "case": "a", "values": {"cost": cost}}
+        for run, cost in enumerate([[1.0, 1.0], [2.0, 4.0]])
+    ]
+    lines = [{"format": "x"}, *runs[:1], *cases[:1], *runs[1:], *cases[1:]]
+    store = tree / "benchmarks/results/store.jsonl"
+    store.write_text("\n".join(map(json.dumps, lines)))
+    change(tree / "README.md", "as chosen.", "as chosen. A run costs 3 s.")
+    ledger = LEDGER + (
+        '\n[[claim]]\npage = "README.md"\ntext = "A run costs {} s."\n'
+        'command = "python -m benchmarks.speed"\n'
+        'results = "benchmarks/results/store.jsonl"\n'
+        'values = ["mean of case=a > values > cost"]\n'
+    )
+    (tree / "docs/claims.toml").write_text(ledger)
+    assert claims.problems(tree) == []
+    store.write_text("\n".join(map(json.dumps, lines[:3])))
+    found = claims.problems(tree)
+    assert any("'3', but" in line for line in found)
+    assert any("made by delucax 0.1.0" in line for line in found)
+
+
+@pytest.mark.parametrize(
+    "printed, half",
+    [
+        ("7", 0.5),
+        ("0.40", 0.005),
+        ("247", 0.5),
+        ("200", 5),
+        ("18,000", 500),
+        ("18,010", 5),
+        ("-4e-16", 5e-17),
+        ("3.1e+09", 5e7),
+    ],
+)
+def test_digits(printed, half):
+    assert claims._half_a_digit(printed) == pytest.approx(half)
+
+
+def test_this_tree():
+    assert claims.problems() == []
+
+
+def test_no_entry_of_this_tree_would_let_another_number_pass():
+    ledger = tomllib.loads((ROOT / "docs/claims.toml").read_text())
+    sources = {}
+    for entry in ledger["claim"]:
+        if "results" not in entry:
+            continue
+        assert not list(claims._origin(ROOT, entry, sources))
+        text = (ROOT / entry["page"]).read_text()
+        match = claims.pattern(entry["text"]).search(text)
+        for k, place in enumerate(entry["values"], 1):
+            if place.startswith(("<=", ">=")):
+                continue
+            printed = match.group(k).replace(",", "").replace("−", "-")
+            mantissa, _, power = printed.partition("e")
+            decimals = len(mantissa.partition(".")[2])
+            wrong = float(printed) + 4 * claims._half_a_digit(printed)
+            wrong = f"{wrong:.{decimals}{'e' if power else 'f'}}"
+            altered = text[: match.start(k)] + wrong + text[match.end(k) :]
+            said = list(claims._claim(altered, entry, sources, []))
+            assert any(repr(wrong) in line for line in said), entry["text"]
+
+
+def test_ventilator(monkeypatch):
+    """The tables of the page are those of what is stored."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    made = importlib.import_module("benchmarks._ventilator_page")
+    stored = ROOT / "benchmarks/results/ventilator.json"
+    page = (ROOT / "docs/ventilator.md").read_text()
+    for table in made.tables(json.loads(stored.read_text())).values():
+        assert table in page
+
+
+@thorough
+def test_scoreboard(tmp_path, monkeypatch):
+    """The tables of the page are those of what is stored."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    board = pytest.importorskip("benchmarks.scoreboard")
+    shutil.copy(board.STORE, tmp_path / "scoreboard.jsonl")
+    made = board.tables(board.Results.read(tmp_path / "scoreboard.jsonl"))
+    page = (ROOT / "docs/scoreboard.md").read_text()
+    tables, _, _ = made.rpartition("Float32, ")
+    assert tables.strip() in page

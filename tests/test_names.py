@@ -1,0 +1,52 @@
+"""Each name of ours that a page writes in its text exists."""
+
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+from helpers import once
+
+
+pytestmark = once
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md"])
+NAME = re.compile(r"\b(?:dlx|delucax)((?:\.[A-Za-z_]\w*)+)")
+CODE = re.compile(r"^( *)```.*?^\1``` *$", re.DOTALL | re.MULTILINE)
+
+
+def _names(text):
+    """The dotted names in backticks or in links to the reference."""
+    plain = CODE.sub("", text)
+    marked = re.findall(r"`([^`\n]+)`|\]\[([\w.]+)\]", plain)
+    return {m for pair in marked for part in pair for m in NAME.findall(part)}
+
+
+def _exists(dotted):
+    found = importlib.import_module("delucax")
+    path = "delucax"
+    for part in dotted.strip(".").split("."):
+        path = f"{path}.{part}"
+        if not hasattr(found, part):
+            try:
+                found = importlib.import_module(path)
+                continue
+            except ModuleNotFoundError:
+                return False
+        found = getattr(found, part)
+    return True
+
+
+def test_what_is_looked_for():
+    text = "`dlx.riccati.dare(A, B)` and [`x`][delucax.nothing]\n```\ndlx.hidden\n```\n"
+    assert _names(text) == {".riccati.dare", ".nothing"}
+    assert _exists(".riccati.dare") and not _exists(".nothing")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
+def test_names_exist(page):
+    missing = sorted(
+        f"delucax{name}" for name in _names(page.read_text()) if not _exists(name)
+    )
+    assert not missing
