@@ -50,7 +50,7 @@ bench: $(VENV)/.bench ## speed against other libraries
 ##@ Check
 
 .PHONY: test
-test: test-float32 test-float64 notebooks ## all tests in both precisions, then the notebooks
+test: test-float32 test-float64 notebooks ## the tests in both precisions, then the notebooks
 
 .PHONY: test-float32
 test-float32: $(VENV)/.tests ## the tests in single precision

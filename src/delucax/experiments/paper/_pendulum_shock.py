@@ -67,15 +67,12 @@ def pendulum_shock(small: bool = False) -> Finding:
     for name, make in contenders.items():
 
         @jax.jit
-        def costs(plans, starts, w, name=name, make=make):
+        def costs(plans, starts, w, make=make):
             def one(plan, x0, w):
                 options: Any = dict(key=jr.key(0), horizon=steps, throw=False)
                 run = rollout(env, make(plan), x0=x0, w=w, keep=("costs",), **options)
                 return run.costs
 
-            if name == "MPC":
-                # As a batch it would wait at every step for the slowest of its plans.
-                return jax.lax.map(lambda given: one(*given), (plans, starts, w))
             return jax.vmap(one)(plans, starts, w)
 
         for world, w in worlds.items():
