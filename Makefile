@@ -20,11 +20,11 @@ pip := $(bin)/python -m pip --disable-pip-version-check -qq
 # The tests run one process a core, so that each process keeps to one thread.
 one_thread := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
 	XLA_FLAGS="--xla_cpu_multi_thread_eigen=false $$XLA_FLAGS"
-# Most of the time goes to LLVM's optimiser, for programs that run for milliseconds: only
-# the tests in double precision compile as a user does.
+# LLVM's optimiser takes a fifth of the time, for programs that run for milliseconds: only
+# the thorough tests compile as a user does.
 lightly := XLA_FLAGS="--xla_backend_optimization_level=0 \
 	--xla_llvm_disable_expensive_passes=true $$XLA_FLAGS"; export XLA_FLAGS;
-pytest := $(one_thread) $(bin)/python -m pytest -n logical --maxprocesses=8
+pytest := $(one_thread) $(bin)/python -m pytest -n logical --maxprocesses=8 --dist worksteal
 
 # Each package's own use of what it depends on.
 oldest_tests := tests/contracts/test_systems.py tests/contracts/test_tasks.py \
@@ -58,7 +58,7 @@ test-float32: $(VENV)/.tests ## the tests in single precision
 
 .PHONY: test-float64
 test-float64: $(VENV)/.tests ## the tests in double precision; the docs' examples ran before
-	JAX_ENABLE_X64=1 $(pytest) --ignore tests/contracts/test_public.py \
+	$(lightly) JAX_ENABLE_X64=1 $(pytest) --ignore tests/contracts/test_public.py \
 		--ignore tests/test_docs.py $(PYTEST_ARGS)
 
 .PHONY: thorough
@@ -70,7 +70,7 @@ thorough: $(VENV)/.tests ## the tests that `test` leaves out, for they compile f
 .PHONY: test-oldest
 test-oldest: $(VENV)-oldest/.tests ## part of the tests: oldest Python and dependencies allowed
 	$(lightly) JAX_ENABLE_X64=0 $(one_thread) $(VENV)-oldest/bin/python -m pytest \
-		-n logical --maxprocesses=8 -W default $(oldest_tests) $(PYTEST_ARGS)
+		-n logical --maxprocesses=8 --dist worksteal -W default $(oldest_tests) $(PYTEST_ARGS)
 
 .PHONY: notebooks
 notebooks: $(VENV)/.tests ## run every notebook from top to bottom, with little of everything

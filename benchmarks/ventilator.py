@@ -34,7 +34,7 @@ LIMITS = {
     "network / best PID, worst lung": 0.8,
     "network for all / best PID for all": 0.8,
     "network for all / best PID for all, lungs between": 0.8,
-    "highest pressure, cmH2O": 60.0,
+    "highest pressure with what was learned, cmH2O": 60.0,
     "simulator of one lung, s": 60.0,
     "controller of one lung, s": 60.0,
     "PID grid over six pressures and nine lungs, s": 5.0,
@@ -137,7 +137,7 @@ def assembled(
         "network / best PID, worst lung": max(high for _, _, high in own.values()),
         "network for all / best PID for all": every["unseen"][2],
         "network for all / best PID for all, lungs between": every["between"][2],
-        "highest pressure, cmH2O": summary["highest_pressure"],
+        "highest pressure with what was learned, cmH2O": summary["highest_pressure"],
         **seconds,
     }
     return {

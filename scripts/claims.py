@@ -11,7 +11,8 @@ the committed results. `python scripts/claims.py` fails where
 
 The ledger has three kinds of entries. A `claim` is a piece of a page in which `{}` is
 a number, and `values` say where these are in `results`; where a test proves the claim,
-`test` names it in place of `results`. A `table` is the one that follows the text
+`test` names it in place of `results`, and `true` lists what must be true in
+these. A `table` is the one that follows the text
 `after`, or begins with it; `columns` has for each column where its numbers are, with
 `{}` for the first cell of the row, or for what `rows` has in its place, and `{2}` for
 the second. What is `given` was chosen, or is somebody else's number.
@@ -124,6 +125,9 @@ def _claim(
     covered.append(match.span())
     if "results" not in entry:
         return
+    for place in entry.get("true", []):
+        if _look(sources[entry["results"]], place) is not True:
+            yield f": {entry['text']!r} needs {place!r} to be true"
     values = entry["values"]
     if len(values) != len(match.groups()):
         yield f": {len(values)} values for {entry['text']!r}"

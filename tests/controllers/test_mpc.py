@@ -25,9 +25,10 @@ def regulated(**options):
 
 
 @needs_x64
-def test_without_bounds_it_is_the_regulator():
+@pytest.mark.parametrize("options", [{}, {"finite_difference": 1e-2}])
+def test_without_bounds_it_is_the_regulator(options):
     env, lqr = regulated(disturbance=dlx.disturbances.Gaussian(0.05, size=2))
-    mpc = MPC(env.dynamics, env.cost, 5)
+    mpc = MPC(env.dynamics, env.cost, 5, **options)
     run, known = (dlx.rollout(env, c, key=KEY) for c in (mpc, lqr))
     assert_close(run.controls, known.controls, rtol=1e-3, atol=1e-5)
 

@@ -315,6 +315,38 @@ def test_a_change_of_code_or_values_runs_again(tmp_path):
     assert done == [] and values(results) == [8.0, 20.0]
 
 
+def test_what_a_class_inherits_and_a_module_imports_is_code_too(tmp_path):
+    first = {
+        "deep": "def factor():\n    return 1\n",
+        "base": "import deep\n\nclass Base:\n    def f(self):\n"
+        "        return deep.factor()\n",
+        "case": "from base import Base\n\nclass Mine(Base):\n    pass\n\n"
+        "def run():\n    return Mine().f()\n",
+    }
+    look = "import case; from delucax.experiments._hash import fingerprint\n"
+    look += "print(fingerprint(case.run))"
+    found = []
+    for change in (
+        None,
+        None,
+        ("deep", "return 1", "return 2"),
+        ("base", "()", "() + 1"),
+    ):
+        for name, text in first.items():
+            if change is not None and change[0] == name:
+                text = text.replace(*change[1:])
+            (tmp_path / f"{name}.py").write_text(text)
+        done = subprocess.run(
+            [sys.executable, "-B", "-c", look],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        found.append(done.stdout)
+    assert found[0] == found[1] and len(set(found)) == 3
+
+
 HASHES = """
 import jax, jax.numpy as jnp, optax, diffrax
 import delucax as dlx
@@ -384,9 +416,11 @@ def test_files_that_are_not_ours(tmp_path):
     with user_error(match="has format 99, and this version of delucax reads"):
         quiet(stored, store=path)
     assert path.read_text().count("\n") == 1  # left as it is
-    path.write_text("x,y\n1,2\n")
-    with user_error(match="is not a results file of delucax"):
-        quiet(stored, store=path)
+    for other in ("x,y\n1,2\n", '{"mine": 1}'):
+        path.write_text(other)
+        with user_error(match="is not a results file of delucax"):
+            quiet(stored, store=path)
+        assert path.read_text() == other
     with user_error(match="is a folder"):
         quiet(stored, store=tmp_path)
     with user_error(FileNotFoundError, match="there is no file"):
@@ -477,6 +511,10 @@ WRONG = {
     ),
     "no function": (lambda: experiment(3), "function must be a function"),
     "workers": (lambda: quiet(stored, workers=0), "workers"),
+    "mesh": (
+        lambda: quiet(stored, mesh=jax.make_mesh((jax.device_count(),), ("seeds",))),
+        "mesh spreads what takes a key",
+    ),
     "backend": (lambda: quiet(stored, backend="mpi"), "backend must be one of"),
     "no experiment": (lambda: experiments.run(), "experiments must be one at least"),
     "one name": (

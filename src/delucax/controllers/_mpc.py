@@ -177,7 +177,9 @@ class MPC(AbstractController):
         self.draws = "key" in known
         kept, fixed = {}, []
         for name, value in sorted(options.items()):
-            if isinstance(value, bool | int | str | None | np.integer):
+            # The spacing of differences is part of the planner's program.
+            whole = isinstance(value, bool | int | str | None | np.integer)
+            if whole or name == "finite_difference":
                 fixed.append((name, value))
             else:
                 kept[name] = as_module(as_float_array(value))

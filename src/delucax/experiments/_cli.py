@@ -50,6 +50,10 @@ def run_command(
     found = load(file)
     place = Path("results") / f"{Path(file).stem}.jsonl" if store is None else store
     results = run(*found, store=place, **options)
+    if not results.rows:
+        raise ValueError(
+            f"run: no case of '{file}' is selected (-k, -m, or marked skip or slow)."
+        )
     show(results)
     bad = {row["case"]: row for row in results.failed}
     for case, row in bad.items():

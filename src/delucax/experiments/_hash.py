@@ -159,12 +159,23 @@ class _Hasher:
         if self.own(cls.__module__) and id(cls) not in self.seen:
             self.seen.add(id(cls))
             try:
-                self.word(_plain(inspect.getsource(cls)))
+                source = _plain(inspect.getsource(cls))
             except (OSError, TypeError, SyntaxError):
                 for name, member in sorted(vars(cls).items()):
                     if isinstance(member, types.FunctionType):
                         self.word(name)
                         self.function(member)
+            else:
+                self.word(source)
+                # What its methods name; they may be wrapped, and are read as text.
+                scope = vars(sys.modules[cls.__module__])
+                nodes = ast.walk(ast.parse(source))
+                named = {node.id for node in nodes if isinstance(node, ast.Name)}
+                for name in sorted(named & scope.keys()):
+                    self.word(name)
+                    self.lenient(scope[name])
+            for base in cls.__bases__:
+                self.type(base)
 
     def module(self, module: types.ModuleType) -> None:
         self.word("module", module.__name__)
@@ -174,6 +185,12 @@ class _Hasher:
                 self.word(_plain(inspect.getsource(module)))
             except (OSError, TypeError, SyntaxError):
                 self.word("no source")
+            # What its code uses of other modules of the user.
+            for member in vars(module).values():
+                if isinstance(member, types.ModuleType):
+                    self.module(member)
+                elif isinstance(member, types.FunctionType | type):
+                    self.lenient(member)
 
     def other(self, value: Any) -> None:
         if isinstance(value, Iterator):

@@ -117,6 +117,11 @@ def run(
     for one in made:
         wanted = one.seeds if chosen is None else chosen
         wanted = wanted if {"key", "seed"} & {*one.arguments} else wanted[:1]
+        if mesh is not None and "key" not in one.arguments:
+            raise ValueError(
+                f"{where}: mesh spreads what takes a key, and {one.name} has no "
+                "argument `key`."
+            )
         if mesh is not None and len(wanted) % mesh.devices.shape[0]:
             raise ValueError(
                 f"{where}: mesh has {mesh.devices.shape[0]} devices on its first axis, "

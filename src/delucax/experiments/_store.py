@@ -17,6 +17,7 @@ from .._check import as_path
 
 _FORMAT = "delucax-results"
 _VERSION = 1
+_HEADER = {"format": _FORMAT, "version": _VERSION}
 
 
 class Store:
@@ -48,6 +49,10 @@ class Store:
         lines = content.split(b"\n")
         # A line without its end was cut short by the end of its process.
         self._whole = len(content) - len(lines.pop())
+        if self._whole == 0 and not _line(_HEADER).startswith(content):
+            raise ValueError(
+                f"{self.where}: '{path}' is not a results file of delucax."
+            )
         for number, line in enumerate(lines, 1):
             try:
                 record = json.loads(line)
@@ -115,7 +120,7 @@ class Store:
         if os.fstat(self._file).st_size > self._whole:
             os.ftruncate(self._file, self._whole)
         if self._whole == 0:
-            self._write({"format": _FORMAT, "version": _VERSION})
+            self._write(_HEADER)
 
     def begin(self, provenance: dict[str, Any]) -> int:
         """Note what the cases that follow are made with; its number."""
@@ -132,7 +137,7 @@ class Store:
         self._take(record)
 
     def _write(self, record: dict[str, Any]) -> None:
-        line = (json.dumps(record, separators=(",", ":")) + "\n").encode()
+        line = _line(record)
         assert self._file is not None
         try:
             written = os.write(self._file, line)
@@ -163,6 +168,10 @@ class Store:
 
 class _OtherFormat(ValueError):
     pass
+
+
+def _line(record: dict[str, Any]) -> bytes:
+    return (json.dumps(record, separators=(",", ":")) + "\n").encode()
 
 
 def _lock(file: int) -> None:

@@ -1,5 +1,7 @@
 """The whole study in one command: breaths, simulators, PIDs, controllers, a report."""
 
+import hashlib
+import importlib.metadata
 import importlib.util
 import json
 from collections.abc import Callable
@@ -104,7 +106,11 @@ def lung_study(
     if size.seeds < 1:
         raise ValueError(f"lung: seeds must be at least 1, got {seeds}.")
     recorded = None if data is None else read_breaths(data)
-    settings = dict(size._asdict(), data=None if data is None else str(data))
+    settings = dict(
+        size._asdict(),
+        data=None if data is None else _named(Path(data)),
+        version=importlib.metadata.version("delucax"),
+    )
     stages = Stages(Path(out), settings, say)
     waveform, key = BreathWaveform(), jr.key(0)
 
@@ -166,6 +172,11 @@ def lung_study(
     _draw(stages, envs, shown, names, test, models, table, rows)
     say(f"Written to {stages.out}/ in {stages.elapsed:.0f} s.")
     return rows
+
+
+def _named(path: Path) -> str:
+    """A file by its name and its content: with another content it is another study."""
+    return f"{path}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}"
 
 
 def _lung_name(resistance: float, compliance: float) -> str:

@@ -123,7 +123,9 @@ def ilqr(
         constraints hold, or `diverged` if the start itself diverges: the plan is then
         the best iterate.
 
-    **Returns:** a [`delucax.planning.Plan`][].
+    **Returns:** a [`delucax.planning.Plan`][]. Converged is stationary: where the
+        control Hessian is not positive definite, `plan.regularisation` says what was
+        added to it, and its derivatives are NaN.
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, or not finite, a
     horizon of 0, a lower bound above an upper one, `parallel` with `bounds` or

@@ -76,7 +76,7 @@ def reproduce(
     pd = extra("pandas", "reproduce")
     extra("matplotlib", "reproduce").use("agg")
     chosen = [names] if isinstance(names, str) else list(names)
-    chosen = list(STUDIES) if chosen == ["all"] else chosen
+    chosen = list(STUDIES) if "all" in chosen else chosen
     for name in chosen:
         if name not in STUDIES:
             raise ValueError(
