@@ -83,23 +83,23 @@ def policy_gradient(small: bool = False) -> Finding:
             least is None or (first is not None and least > first),
         ),
     ]
-    figure, ax = plt.subplots(figsize=(5.5, 3.4), layout="constrained")
-    for k, ((scale, count), runs) in enumerate(curves.items()):
+    figure, ax = plt.subplots(figsize=(7.5, 3.4), layout="constrained")
+    ax.plot(np.arange(1, steps + 1), exact, "k", lw=2, label="through the rollout")
+    for (scale, count), runs in curves.items():
         x = 2 * count * np.arange(1, steps + 1)
         label = f"ES, sigma {scale}, {count} pairs"
         ax.plot(
             x,
             np.median(runs, axis=0),
             lw=1,
-            color=f"C{1 + k % 9}",
+            color=f"C{scales.index(scale)}",
+            alpha=1 - 0.2 * pairs.index(count),
             label=label,
-            ls=("-", "--")[k // 9],
         )
-    ax.plot(np.arange(1, steps + 1), exact, "k", lw=2, label="through the rollout")
     ax.axhline(GOAL, color="0.5", lw=0.8, ls=":")
     ax.set(xscale="log", xlabel="rollouts", ylabel="mean cost of a step")
     ax.grid(alpha=0.25, lw=0.5)
-    ax.legend(frameon=False, fontsize=6, ncols=2)
+    figure.legend(frameon=False, fontsize=7, loc="outside right center")
     notes = (
         f"u = -K (angle, velocity), the angle not wrapped; {HORIZON} steps of 0.05 s "
         f"from hanging at rest, torque at most 10; descent with rate {RATE} on the "
