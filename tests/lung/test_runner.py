@@ -36,7 +36,8 @@ def test_aborts_on_overpressure_and_cleans_up():
     runner = lung.SimulatedRunner(ENV, key=KEY, abort=60.0)
     found = lung.run_breaths(runner, breathing(10.0), 40)
     assert found.aborted and runner.is_clean and len(found.times) < 40
-    assert np.all(found.pressure <= 60)
+    assert np.all(found.pressure[:-1] <= 60) and found.pressure[-1] > 60
+    assert (found.u_in[-1], found.u_out[-1]) == (0.0, 1.0)
     # The air has been let out, and both valves are closed.
     assert runner.observe() < 5.5 and runner.controls == (0.0, 0.0)
 

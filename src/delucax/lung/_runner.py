@@ -183,7 +183,8 @@ class Recording(eqx.Module):
     **Attributes:**
 
     - `times` [s], `pressure` [cmH2O], `u_in` [%], `u_out`: an entry a step.
-    - `aborted`: whether the run was given up.
+    - `aborted`: whether the run was given up; the last entry is then the reading that
+        was too high, and the controls of the clean-up.
 
     !!! example
 
@@ -261,6 +262,7 @@ def run_breaths(
             pressure = float(runner.observe())
             if runner.should_abort(pressure):
                 aborted = True
+                rows.append((k * runner.dt, pressure, 0.0, 1.0))
                 break
             now = jnp.asarray(k * runner.dt)
             u, state = _ask(controller, now, jnp.array([pressure]), state)
