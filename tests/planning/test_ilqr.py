@@ -397,3 +397,20 @@ def test_it_compiles_once():
     second = plan(jnp.asarray(2.0), jnp.array([0.5, 0.0]))
     assert second.cost != first.cost
     assert first.states.dtype == jnp.zeros(()).dtype
+
+
+@needs_x64
+def test_a_batch_over_what_a_cost_closes_over():
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+    x0, start = jnp.array([0.2, 0.1]), jnp.zeros((5, 1))
+
+    def total(weight):
+        class Weighted(dlx.AbstractCost):
+            def __call__(self, t, x, u):
+                return weight * x[0] ** 2 + 0.1 * x[1] ** 2 + 0.1 * u[0] ** 2
+
+        return dlx.planning.ilqr(dynamics, Weighted(), x0, start, throw=False).cost
+
+    weights = jnp.array([1.0, 2.0])
+    alone = [total(weight) for weight in weights]
+    assert_close(jax.vmap(total)(weights), alone, rtol=1e-12)
