@@ -6,32 +6,28 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from delucax.experiments import compare, interquartile_mean, Results
+from delucax.experiments import interquartile_mean
+from delucax.experiments._statistics import Bootstrap
 
 
 def paired(values: Mapping[str, Any], baseline: str) -> pd.DataFrame:
     """A row for each method: `iqm` with its 95% interval, and the ratio to the
     baseline's with that of the pairs."""
-    rows = [
-        {
-            "experiment": "study",
-            "case": f"{name}, {seed}",
-            "method": name,
-            "seed": seed,
-            "status": "passed",
-            "value": float(value),
-        }
+    columns = ("iqm", "low", "high", "ratio", "ratio_low", "ratio_high")
+    pairs = {
+        name: np.stack([found, values[baseline]], axis=1, dtype=float)
         for name, found in values.items()
-        for seed, value in enumerate(np.asarray(found))
-    ]
-    results = Results(rows, metrics=("value",), parameters=("method",))
-    return compare(results, by="method", baseline=baseline, ratio=True)
+    }
+    rows = {
+        name: (*spread(pair[:, 0]), *Bootstrap().two([pair], ratio=True))
+        for name, pair in pairs.items()
+    }
+    return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
 
 
-def spread(values: Any) -> list[float]:
+def spread(values: Any) -> tuple[float, float, float]:
     """The interquartile mean, and the ends of its 95% interval by the bootstrap."""
-    table = paired({"all": values}, "all")
-    return [float(table.loc["all", name]) for name in ("iqm", "low", "high")]
+    return Bootstrap().one([np.asarray(values, float)])
 
 
 def middle(values: Any) -> float:

@@ -54,10 +54,10 @@ def _add_demo(commands: Any) -> None:
 
         demo(options.out, seeds=options.seeds)
 
-    help = "design, train, compare and show controllers for the pendulum"
+    help = "swing the pendulum up, then the paper in small; under two minutes"
     demo = _command(commands, "demo", call, help)
     demo.add_argument("--out", default="demo", help="folder to write to")
-    demo.add_argument("--seeds", type=int, default=5, help="how many MLPs to train")
+    demo.add_argument("--seeds", type=int, default=2, help="how many MLPs to train")
 
 
 def _add_reproduce(commands: Any) -> None:

@@ -8,13 +8,23 @@ from PIL import Image
 import delucax as dlx
 from delucax import experiments
 from delucax.__main__ import main
+from delucax.experiments.paper import STUDIES
+from delucax.experiments.paper._finding import Claim, Finding
 
 
 pytestmark = once
 
 
 @thorough
-def test_the_demo_writes_what_it_says(tmp_path):
+def test_the_demo_writes_what_it_says(tmp_path, monkeypatch):
+    def study(small):
+        assert small
+        claims = [Claim("It runs", "it did", True), Claim("It flies", "0 m", False)]
+        return Finding("A study", claims)
+
+    for name in STUDIES.keys() - {"ventilator"}:
+        monkeypatch.delitem(STUDIES, name)
+    monkeypatch.setitem(STUDIES, "study", study)
     lines = []
     out = tmp_path / "new" / "demo"
     table = experiments.demo(out, seeds=1, steps=20, say=lines.append)
@@ -30,10 +40,15 @@ def test_the_demo_writes_what_it_says(tmp_path):
     assert u.shape == (1,) and abs(u[0]) <= 2
     text = "\n".join(lines)
     assert "times as fast" in text and "million steps" in text
+    derivative = next(line for line in lines if line.startswith("d(cost)"))
     exact, numeric = (
-        float(part.rstrip(".").split()[-1]) for part in lines[-1].split(";")
+        float(part.rstrip(".").split()[-1]) for part in derivative.split(";")
     )
     assert abs(exact - numeric) < 1e-6 * abs(exact) + 1e-8
+    assert "study       2     1" in text
+    assert "Does not hold: It flies (0 m)." in text and "It runs (" not in text
+    assert "python -m delucax reproduce all" in lines[-1]
+    assert (out / "paper" / "report.html").is_file()
 
 
 def test_an_unwritable_folder_is_an_error_before_any_work(tmp_path, capsys):

@@ -1,4 +1,5 @@
-"""The main job: from the pendulum's ODE to a trained controller, in one command."""
+"""The main job in one command: from the pendulum's ODE to a trained controller; and the
+paper, in small."""
 
 import time
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from ..environments import Environment, pendulum
 from ..simulation import rollout, Trajectory
 from ..training import expected_cost, fit
 from ._swing_up import BATCH, holds_upright, HORIZON, STEPS, train_swing_up
+from .paper import reproduce, STUDIES
 
 
 EVALUATION_STEPS = 400
@@ -33,25 +35,28 @@ _SHOCK = Shock(np.array([0.0, 0.3]), start=10.0, duration=0.5)
 def demo(
     out: str | Path = "demo",
     *,
-    seeds: int = 5,
+    seeds: int = 2,
     steps: int = STEPS,
     say: Callable[[str], Any] = print,
 ) -> Any:
-    """Design, train, compare and show controllers for Gym's pendulum.
+    """Design, train, compare and show controllers for Gym's pendulum; then the studies
+    of the Deluca paper, small, with what holds of its claims.
 
     Takes the pendulum's ODE; designs an LQR about the upright; trains the linear policy
     of the Deluca paper (Section 4) and an MLP by differentiating the rollout; runs them
     and zero control from the same 100 starts, without and with a shock in the middle;
-    and writes a table, the controller, a figure and an animation.
+    and writes a table, the controller, a figure and an animation. Then it is
+    [`delucax.experiments.reproduce`][] with `small`, of all but the ventilator, in the
+    folder `paper` beside them.
 
     **Arguments:**
 
     - `out`: the folder to write to, `"demo"` by default.
-    - `seeds`: how many MLPs to train, 5 by default; the first is the one shown.
+    - `seeds`: how many MLPs to train, 2 by default; the first is the one shown.
     - `steps`: optimiser steps for each, 800 by default.
     - `say`: what to do with a line of text; `print` by default.
 
-    **Returns:** the table, a `pandas.DataFrame`.
+    **Returns:** the table of the pendulum, a `pandas.DataFrame`.
 
     **Raises:** `OSError` if the folder cannot be written; `ValueError` if `seeds` is
     below 1.
@@ -147,7 +152,23 @@ def demo(
     )
     say(_beside_gymnasium(trained / usual))
     say(_derivative())
+    say("\nThe Deluca paper, study by study, with few seeds and steps\n")
+    names = [name for name in STUDIES if name != "ventilator"]
+    _say_held(reproduce(names, out / "paper", small=True, say=say), say)
     return table
+
+
+def _say_held(claims: list[dict[str, Any]], say: Callable[[str], Any]) -> None:
+    """How many claims of each study hold, and which do not."""
+    pd = extra("pandas", "demo")
+    found = pd.DataFrame(claims).astype({"holds": int}).groupby("study", sort=False)
+    table = found["holds"].agg(claims="count", hold="sum").reset_index()
+    say(f"\n{table.to_string(index=False)}\n")
+    for claim in claims:
+        if not claim["holds"]:
+            say(f"Does not hold: {claim['claim']} ({claim['measured']}).")
+    say("\nThe ventilator, in a minute: python -m delucax lung --small")
+    say("All of it, with more seeds and steps: python -m delucax reproduce all")
 
 
 def _writable(out: Path) -> Path:

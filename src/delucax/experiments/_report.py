@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ._results import Results, shown
-from ._statistics import interquartile_mean
+from ._statistics import Bootstrap, interquartile_mean
 
 
 _STYLE = """
@@ -31,7 +31,7 @@ th[aria-sort=ascending] button::after { content: " \\25B2"; }
 th[aria-sort=descending] button::after { content: " \\25BC"; }
 .bad { color: var(--bad); }
 figure { margin: 1rem 0; background: #fff; display: inline-block; max-width: 100%; }
-figure svg { max-width: 100%; height: auto; display: block; }
+figure svg, figure img { max-width: 100%; height: auto; display: block; }
 pre { overflow-x: auto; font-size: 12px; }
 """
 
@@ -149,11 +149,9 @@ def diff(first: Results, second: Results, *, resamples: int = 2000) -> dict[str,
     common seeds, the difference with a paired 95% interval, and the seeds; `same`, how
     many cases agree to the last bit; `only_first`, `only_second`, `status`: names.
     """
-    from ._statistics import _Draw
-
     a, b = _by_case(first), _by_case(second)
     changed, status, same = [], [], 0
-    draw = _Draw(0.95, resamples, 0)
+    draw = Bootstrap(resamples=resamples)
     for key in a:
         if key not in b:
             continue

@@ -1,6 +1,7 @@
 """Interquartile means, and comparisons of pairs."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -136,7 +137,7 @@ def compare(
             f"{where}: baseline must be a value of {by!r} that passed "
             f"({', '.join(map(repr, samples))}), got {baseline!r}."
         )
-    draw = _Draw(confidence, resamples, seed)
+    draw = Bootstrap(confidence, resamples, seed)
     rows = {}
     for label, groups in samples.items():
         own = [np.array(list(group.values())) for group in groups.values()]
@@ -157,31 +158,42 @@ def compare(
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis(by)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Draw:
-    """The bootstrap: the same draws for both members of a pair."""
+def mean_and_half_width(values: np.ndarray) -> tuple[float, float]:
+    """The mean, and half of its 95% interval."""
+    half = 1.96 * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+    return float(values.mean()), float(half)
 
-    confidence: float
-    resamples: int
-    seed: int
+
+def paired_ratio(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
+    """The ratio of the means over the same seeds, and its 95% interval."""
+    return Bootstrap(middle=np.mean).two([np.stack([one, other], axis=1)], ratio=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Bootstrap:
+    """The middle of groups of values and of what two have between them, with intervals;
+    the same draws for both members of a pair."""
+
+    confidence: float = 0.95
+    resamples: int = 2000
+    seed: int = 0
+    middle: Callable[..., Any] = interquartile_mean
 
     def one(self, groups: list[np.ndarray]) -> tuple[float, float, float]:
-        drawn = self._drawn(groups)
-        found = interquartile_mean(np.concatenate(groups))
-        return found, *self._interval(interquartile_mean(drawn, axis=1))
+        """Of groups of values."""
+        found = self.middle(np.concatenate(groups))
+        return float(found), *self._interval(self.middle(self._drawn(groups), axis=1))
 
     def two(self, groups: list[np.ndarray], ratio: bool) -> tuple[float, float, float]:
+        """The difference, or the ratio, of groups of pairs, each of shape `(count, 2)`;
+        NaN if there are none."""
         if not groups:
             return np.nan, np.nan, np.nan
-        drawn = self._drawn(groups)
-        flat = np.concatenate(groups)
+        drawn, flat = self._drawn(groups), np.concatenate(groups)
         of = np.divide if ratio else np.subtract
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = of(interquartile_mean(flat[:, 0]), interquartile_mean(flat[:, 1]))
-            again = of(
-                interquartile_mean(drawn[..., 0], axis=1),
-                interquartile_mean(drawn[..., 1], axis=1),
-            )
+            found = of(*self.middle(flat, axis=0))
+            again = of(*self.middle(drawn, axis=1).T)
         return float(found), *self._interval(again)
 
     def _drawn(self, groups: list[np.ndarray]) -> np.ndarray:

@@ -21,8 +21,8 @@ class Claim:
 @dataclass(frozen=True)
 class Finding:
     """The claims of one study, its tables (by title, rows as dictionaries) and its
-    figures (by file name, Matplotlib figures); `notes` say what was done and what is
-    not as the paper has it."""
+    figures (by file name, those of Matplotlib or paths of images); `notes` say what was
+    done and what is not as the paper has it."""
 
     title: str
     claims: list[Claim]

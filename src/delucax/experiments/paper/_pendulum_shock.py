@@ -16,8 +16,8 @@ from ...environments import Environment
 from ...planning import ilqr
 from ...simulation import rollout
 from ...systems import Pendulum
+from .._statistics import mean_and_half_width, paired_ratio
 from ._finding import Claim, Finding
-from ._statistics import mean_and_half_width, paired_ratio
 
 
 DT, STEPS, BOUND, AHEAD = 0.05, 600, 10.0, 20

@@ -1,5 +1,6 @@
 """The paper from one command."""
 
+import base64
 import html
 import io
 import time
@@ -51,7 +52,8 @@ def reproduce(
         `estimator-variance`, `wall-clock`, `ventilator`, `pendulum-shock` and
         `lq-perturbations`.
     - `out`: the folder to write to, `"paper"` by default: `report.html`, `claims.csv`,
-        and the figures.
+        the figures, and in `lung` or `lung-small` what
+        [`delucax.lung.lung_study`][] writes, which goes on there if it was cut off.
     - `small`: fewer seeds and steps; false by default.
     - `say`: what to do with a line of text; `print` by default.
 
@@ -85,11 +87,14 @@ def reproduce(
             )
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    findings, rows, begun = {}, [], time.perf_counter()
+    sections, rows, begun = [], [], time.perf_counter()
     for k, name in enumerate(chosen):
         say(f"[{k + 1}/{len(chosen)}] {name}")
         start = time.perf_counter()
-        options = {"out": out / "lung"} if name == "ventilator" else {}
+        options = {}
+        if name == "ventilator":
+            folder = out / ("lung-small" if small else "lung")
+            options = {"out": folder, "say": say}
         try:
             found = STUDIES[name](small, **options)
         except Exception as error:
@@ -108,10 +113,11 @@ def reproduce(
                 }
             )
         for title, figure in found.figures.items():
-            figure.savefig(out / f"{title}.png", dpi=150)
-        findings[name] = found
+            if not isinstance(figure, Path):
+                figure.savefig(out / f"{title}.png", dpi=150)
+        sections.append(_section(found))
         pd.DataFrame(rows).to_csv(out / "claims.csv", index=False)
-        (out / "report.html").write_text(_page(findings, rows))
+        (out / "report.html").write_text(_page(sections, rows))
         say(f"  {time.perf_counter() - start:.0f} s")
     held = sum(row["holds"] for row in rows)
     say(
@@ -121,32 +127,36 @@ def reproduce(
     return rows
 
 
-def _page(findings: dict[str, Finding], rows: list[dict[str, Any]]) -> str:
+def _page(sections: list[str], rows: list[dict[str, Any]]) -> str:
     found = provenance(Path())
     versions = ", ".join(f"{k} {v}" for k, v in found["versions"].items() if v)
     made = f"{found['date'][:10]}; commit {found['commit']}; {device()}; {versions}"
     held = sum(row["holds"] for row in rows)
-    body = [
-        f"<p>{held} of {len(rows)} claims hold.</p>",
-    ]
-    for found in findings.values():
-        body.append(f"<h2>{html.escape(found.title)}</h2>")
-        for claim in found.claims:
-            word = "holds" if claim.holds else "does not hold"
-            kind = "" if claim.holds else " class='bad'"
-            body.append(
-                f"<p><b{kind}>{word}</b>: {html.escape(claim.statement)}. Measured: "
-                f"{html.escape(claim.measured)}.</p>"
-            )
-        for figure in found.figures.values():
-            body.append(f"<figure>{_svg(figure)}</figure>")
-        for title, table in found.tables.items():
-            columns = list(table[0])
-            values = [[row.get(column) for column in columns] for row in table]
-            body += [f"<h3>{html.escape(title)}</h3>", _table(columns, values)]
-        body.append(f"<p class='made'>{html.escape(found.notes)}</p>")
-    body.append(f"<p class='made'>{html.escape(made)}</p>")
-    return _document("The Deluca paper, reproduced", body)
+    title = "The Deluca paper, reproduced"
+    body = [f"<h1>{title}</h1>", f"<p>{held} of {len(rows)} claims hold.</p>"]
+    body += [*sections, f"<p class='made'>{html.escape(made)}</p>"]
+    return _document(title, body)
+
+
+def _section(found: Finding) -> str:
+    """What a study found, drawn once: figures take as long as some studies."""
+    body = [f"<h2>{html.escape(found.title)}</h2>"]
+    for claim in found.claims:
+        word = "holds" if claim.holds else "does not hold"
+        kind = "" if claim.holds else " class='bad'"
+        body.append(
+            f"<p><b{kind}>{word}</b>: {html.escape(claim.statement)}. Measured: "
+            f"{html.escape(claim.measured)}.</p>"
+        )
+    for figure in found.figures.values():
+        drawn = _image if isinstance(figure, Path) else _svg
+        body.append(f"<figure>{drawn(figure)}</figure>")
+    for title, table in found.tables.items():
+        columns = list(table[0])
+        values = [[row.get(column) for column in columns] for row in table]
+        body += [f"<h3>{html.escape(title)}</h3>", _table(columns, values)]
+    body.append(f"<p class='made'>{html.escape(found.notes)}</p>")
+    return "\n".join(body)
 
 
 def _svg(figure: Any) -> str:
@@ -156,3 +166,9 @@ def _svg(figure: Any) -> str:
     figure.savefig(text, format="svg")
     plt.close(figure)
     return text.getvalue()[text.getvalue().index("<svg") :]
+
+
+def _image(path: Path) -> str:
+    content = base64.b64encode(path.read_bytes()).decode()
+    kind = path.suffix.removeprefix(".")
+    return f'<img src="data:image/{kind};base64,{content}" alt="{path.stem}">'

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,9 @@ from ...lung import lung_study
 from ._finding import Claim, Finding
 
 
-def ventilator(small: bool = False, out: Path = Path("lung")) -> Finding:
-    """What `python -m delucax lung` finds; its own figures lie beside its report."""
-    lung_study(out, small=small, say=lambda line: None)
+def ventilator(small: bool, out: Path, say: Callable[[str], Any]) -> Finding:
+    """What `python -m delucax lung` finds, in the folder that it writes to."""
+    lung_study(out, small=small, say=lambda line: say(f"  {line}"))
     found = json.loads((out / "summary.json").read_text())
     simulators = found["simulators"]
     worst = max(simulators["learned"].values())
@@ -57,8 +58,14 @@ def ventilator(small: bool = False, out: Path = Path("lung")) -> Finding:
     ]
     notes = (
         "Lungs of two compartments with valves that lag, a sensor that is two samples "
-        "late, and noise of 0.2 cmH2O. `python -m delucax lung` is the whole study."
+        "late, and noise of 0.2 cmH2O. breath.gif, the other images, the learned lungs "
+        f"and the controllers are in {out}/, as `python -m delucax lung` writes them."
     )
+    images = ("simulators.png", "controllers.png", "breath.gif")
     return Finding(
-        "Ventilator control and simulator", claims, {"Lungs": rows}, {}, notes
+        "Ventilator control and simulator",
+        claims,
+        {"Lungs": rows},
+        {name: out / name for name in images},
+        notes,
     )

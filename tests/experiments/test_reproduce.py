@@ -1,0 +1,71 @@
+"""The report of the paper, from studies that take no time."""
+
+import csv
+
+import pytest
+from helpers import once, user_error
+from matplotlib.figure import Figure
+
+from delucax import experiments
+from delucax.experiments.paper import _reproduce, STUDIES
+from delucax.experiments.paper._finding import Claim, Finding
+
+
+pytestmark = once
+
+
+def drawn(small):
+    figure = Figure(figsize=(1, 1))
+    figure.add_subplot().plot([0, 1])
+    claims = [Claim("One is < two", f"1, small is {small}", True)]
+    rows = [{"method": "a", "cost": 1.5}, {"method": "b"}]
+    return Finding("Drawn", claims, {"Costs": rows}, {"line": figure}, "Done at once.")
+
+
+def ventilator(small, out, say):
+    say("  Breaths: 1 s")
+    out.mkdir()
+    (out / "breath.gif").write_bytes(b"GIF89a")
+    claims = [Claim("It breathes", "not", False)]
+    return Finding("Lungs", claims, {}, {"breath.gif": out / "breath.gif"})
+
+
+def broken(small):
+    raise RuntimeError("no <plant>")
+
+
+@pytest.fixture
+def studies(monkeypatch):
+    made = {"drawn": drawn, "ventilator": ventilator, "broken": broken}
+    monkeypatch.setattr(_reproduce, "STUDIES", made)
+
+
+def test_the_report_holds_claims_tables_and_images(tmp_path, studies):
+    lines = []
+    rows = experiments.reproduce("all", tmp_path, small=True, say=lines.append)
+    assert [row["holds"] for row in rows] == [True, False, False]
+    with open(tmp_path / "claims.csv", newline="") as file:
+        assert [row["study"] for row in csv.DictReader(file)] == [
+            "drawn",
+            "ventilator",
+            "broken",
+        ]
+    page = (tmp_path / "report.html").read_text()
+    assert "1 of 3 claims hold" in page
+    assert "One is &lt; two. Measured: 1, small is True" in page
+    assert page.count("<svg") == 1 and (tmp_path / "line.png").is_file()
+    assert '<img src="data:image/gif;base64,R0lGODlh" alt="breath">' in page
+    assert "RuntimeError: no &lt;plant&gt;" in page
+    assert "no <plant>" in (tmp_path / "broken.txt").read_text()
+    assert "  Breaths: 1 s" in lines and "1 of 3 claims hold" in lines[-1]
+
+
+def test_small_and_full_lungs_are_apart(tmp_path, studies):
+    for small in (True, False):
+        experiments.reproduce("ventilator", tmp_path, small=small, say=len)
+    assert {path.name for path in tmp_path.glob("lung*")} == {"lung", "lung-small"}
+
+
+def test_unknown_studies_are_named(tmp_path):
+    with user_error(match=f"among {', '.join(STUDIES)}; got 'lungs'"):
+        experiments.reproduce("lungs", tmp_path)
