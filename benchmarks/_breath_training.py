@@ -167,7 +167,7 @@ def _by_ppo(error: Error, keys: Any, times: float) -> Any:
     optimiser = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(1e-3))
     models = eqx.filter_vmap(make)(keys)
     taken, errors, done = [], [], 0
-    for target in np.unique(np.geomspace(4, batches, 10).round().astype(int)):
+    for target in np.unique(np.geomspace(4, batches, 20).round().astype(int)):
         # Adam's memory begins anew with each piece, which are long.
         pieces = int(target) - done
         steps = pieces * EPOCHS * MINIBATCHES

@@ -32,24 +32,28 @@ def tables(results: dict[str, Any]) -> dict[str, str]:
     closed = summary["simulators_closed_loop"]
     names = list(simulators["learned"])
     kinds = list(simulators)
+    published = results["learned lung as published, open loop"]
     simulated = [
         [
             _lung(name),
             *(f"{simulators[k][name]:.2f} ({closed[k][name]:.2f})" for k in kinds),
+            f"{published[name]:.2f}",
         ]
         for name in names
     ]
     return {
-        "simulators": _markdown(["R, C", *kinds], simulated),
+        "simulators": _markdown(["R, C", *kinds, "learned, as published"], simulated),
         "networks": _networks(results, names),
         "controllers": _controllers(rows),
         "training": _training(results),
         "limits": _limits(results),
+        "tasks": _tasks(results),
     }
 
 
 def _networks(results: dict[str, Any], names: list[str]) -> str:
     rows = results["report"]
+    alike = results["network for all / best PID for all, lung by lung"]
     body = []
     for name in names:
         errors = {label: _mean(rows, label, "unseen", name) for label in PID_ROWS}
@@ -62,9 +66,24 @@ def _networks(results: dict[str, Any], names: list[str]) -> str:
                 f"{_mean(rows, 'MLP', 'unseen', name):.2f}",
                 f"{mean:.2f} [{low:.2f}, {high:.2f}]",
                 f"{_mean(rows, 'least error', 'unseen', name):.2f}",
+                f"{alike[name][0]:.2f}",
             ]
         )
     head = ["R, C", "best PID", "network", "network / best PID", "least error"]
+    head.append("for all: network / best PID")
+    return _markdown(head, body)
+
+
+def _tasks(results: dict[str, Any]) -> str:
+    body = [
+        [
+            f"`{row['task']}`",
+            f"{row['least error']:.2f}",
+            f"{row['before a control']:.2f}",
+        ]
+        for row in results["least error of other tasks at 35 cmH2O"]
+    ]
+    head = ["task", "least error", "of it before any control can act"]
     return _markdown(head, body)
 
 

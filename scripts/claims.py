@@ -3,8 +3,9 @@
 `docs/claims.toml` says for each number which command makes it and where it stands in
 the committed results. `python scripts/claims.py` fails where
 
-- a page has a number with a unit, with "times" or with "%", or a table a cell that is a
-  number, and nothing in the ledger covers it;
+- a page has a number with a unit, with "times" or with "%", one "of" another, that of a
+  slope, ratio, residual or speed-up, or a table a cell that is a number, and nothing in
+  the ledger covers it;
 - a number is not that of the results, at the digits that are printed;
 - the results were made by an older minor version of delucax than this one;
 - an entry is not on its page, or its command, test or results file does not exist.
@@ -47,7 +48,9 @@ _UNIT = (
 )
 _MEASURED = re.compile(
     rf"(?<![\w.\[-]){_NUMBER}\s?(?:{_UNIT})|"
-    rf"{_WORD}\s(?:times|seconds|minutes|hours|milliseconds|microseconds)\b"
+    rf"{_WORD}\s(?:times|seconds|minutes|hours|milliseconds|microseconds)\b|"
+    rf"(?<![\w.\[-]){_NUMBER}\s(?:out\s)?of\s(?:all\s|the\s)?{_NUMBER}|"
+    rf"\b(?:slope|ratio|residual|speed-?up)s?\s(?:[a-z]+\s){{0,2}}{_NUMBER}"
 )
 _NUMERIC_CELL = re.compile(rf"[*<>=~≤≥ ]*{_NUMBER}")
 _ROW = re.compile(r"^\|.*\|[ ]*$", re.MULTILINE)

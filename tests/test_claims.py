@@ -109,6 +109,8 @@ def test_a_tree_in_order(tree):
         ("as chosen.", "as chosen, and half of 5 ms.", "README.md:3: '5 ms' is not"),
         ("as chosen.", "as chosen, 20% more.", "README.md:3: '20%' is not"),
         ("as chosen.", "as chosen, ten times more.", "README.md:3: 'ten times' is"),
+        ("as chosen.", "as chosen, 14 of 15 seeds.", "README.md:3: '14 of 15' is"),
+        ("as chosen.", "as chosen, a slope of 0.4.", "README.md:3: 'slope of 0.4' is"),
         ("as fast", "as quick", "README.md: no 'It is {}"),
         ("as chosen.", "as chosen.\n\n| | x |\n|---|---|\n| a | 4 |\n", "'4' is not"),
     ],

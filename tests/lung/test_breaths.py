@@ -89,6 +89,17 @@ def test_file_comes_back(breaths, lines, tmp_path):
     assert_close(half.u_in[:, 1::2], again.u_in[:, :28], atol=1e-4)
 
 
+def test_quoted_numbers_and_blank_lines(lines, tmp_path):
+    path, plain = tmp_path / "quoted.csv", tmp_path / "plain.csv"
+    plain.write_text("\n".join(lines))
+    quoted = [",".join(f'"{cell}"' for cell in line.split(",")) for line in lines]
+    quoted = [*quoted[:50], "", *quoted[50:], ""]
+    path.write_bytes("\r\n".join(quoted).encode("utf-8-sig"))
+    found, expected = lung.read_breaths(path), lung.read_breaths(plain)
+    assert_close(found.pressure, expected.pressure)
+    assert_close(found.u_in, expected.u_in)
+
+
 def edited(lines, row, column, text):
     header = lines[0].split(",")
     cells = lines[row - 1].split(",")
@@ -116,7 +127,22 @@ def without(lines, name):
         (lambda s: edited(s, 5, "time_step", "0"), "row 5, column time_step: must inc"),
         (lambda s: edited(s, 5, "u_out", "1"), "row 2, column u_out: .* too short"),
         (lambda s: [*s, *s[1:41]], "row 482, column breath_id: .* follow each other"),
+        (
+            lambda s: edited([*s, *s[1:2]], 482, "breath_id", "99"),
+            "row 482, .* got 1 of breath 99",
+        ),
+        (lambda s: edited(s, 7, "u_in", "500"), "row 7, column u_in: .* 100, got 500"),
+        (lambda s: edited(s, 7, "u_in", "-20"), "row 7, column u_in: .* 0 and 100"),
+        (lambda s: edited(s, 9, "u_out", "2"), "row 9, column u_out: .* one of 0, 1"),
+        (lambda s: edited(s, 9, "time_step", "nan"), "row 9, column time_step: .* fin"),
+        (lambda s: edited(s, 9, "id", "#9"), "row 9, column id: .* got '#9'"),
+        (lambda s: [*s, "# the end"], "row 482, column id: .* got '# the end'"),
+        (lambda s: edited(s, 9, "R", "2_0"), "row 9, column R: .* got '2_0'"),
+        # A blank line is passed over, and is a line of the file all the same.
+        (lambda s: edited([*s[:3], "", *s[3:]], 8, "R", "7"), "row 8, column R"),
+        (lambda s: edited([*s[:3], "", *s[3:]], 8, "R", "x"), "row 8, column R"),
         (lambda s: s[:1], "must have rows"),
+        (lambda s: [*s[:1], "", ""], "must have rows"),
         (lambda s: [], "row 1: column id, breath_id"),
     ],
 )

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from helpers import assert_close, once, thorough, tolerance, user_error
 
@@ -48,6 +49,18 @@ def test_fitting_learns(breaths):
     fitted = lung.fit_lungs(model, train, key=KEY, **few).model
     error = eqx.filter_jit(lung.open_loop_error)
     assert error(fitted, test) < 0.3 * error(model, test)
+
+
+def test_another_optimiser(breaths):
+    few = breaths[:4]
+    moved = {"dynamics.dynamics.system.resistance": dlx.positive}
+    start = lung.LungModel(lung.SingleCompartment(10.0, 30.0))
+    options = dict(steps=2, optimiser=optax.sgd(0.0), trainable=moved)
+    fitted = lung.fit_lungs(start, few, key=KEY, **options).model
+    assert_close(fitted.system.resistance, 10.0)  # Adam would have moved it
+    learned = lung.LearnedLung(few, width=2, boundary=1, key=KEY)
+    with user_error(ValueError, match="teacher_steps must be"):
+        lung.fit_lungs(learned, few, key=KEY, teacher_steps=-1)
 
 
 @thorough

@@ -1,6 +1,5 @@
 """The controllers of the study: designed, searched for, or trained in simulators."""
 
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -109,7 +108,7 @@ def searched_pids(envs: Environment, trainer: Trainer, key: Any) -> dict[str, An
 
 
 def trained_pids(
-    pids: dict[str, Any], trainer: Trainer, size: Size, key: Any, file: Path
+    pids: dict[str, Any], trainer: Trainer, size: Size, key: Any, options: Any
 ) -> dict[str, Any]:
     """Those PIDs trained on, by themselves and with a feed-forward."""
     weak: Any = 0.3
@@ -131,7 +130,8 @@ def trained_pids(
                 jr.fold_in(key, 6),
                 learning_rate=0.05,
                 shared=name.endswith("for all"),
-                checkpoint=f"{file}.{name.replace(' ', '_')}",
+                checkpoint=f"{options['checkpoint']}.{name.replace(' ', '_')}",
+                progress=options["progress"],
             )
         )[0]
     return found
@@ -148,7 +148,7 @@ def pid_contenders(pids: dict[str, Any], trainer: Trainer) -> list[Contender]:
 
 
 def networks(
-    trainer: Trainer, size: Size, key: Any, file: Path, kind: Any = "mlp"
+    trainer: Trainer, size: Size, key: Any, options: Any, kind: Any = "mlp"
 ) -> Any:
     """A network for each lung, of shape `(seeds, lungs)`."""
     keys = jr.split(jr.fold_in(key, 7), (size.seeds, trainer.count))
@@ -157,11 +157,11 @@ def networks(
         trainer.waveform, trainer.dt, kind, width, key=key
     )
     start = stack([stack([make(k) for k in row]) for row in keys])
-    return trainer(start, size.controller_steps, jr.fold_in(key, 8), checkpoint=file)
+    return trainer(start, size.controller_steps, jr.fold_in(key, 8), **options)
 
 
 def networks_on_pids(
-    pids: dict[str, Any], trainer: Trainer, size: Size, key: Any, file: Path
+    pids: dict[str, Any], trainer: Trainer, size: Size, key: Any, options: Any
 ) -> Any:
     """A PID and a network on top of it for each lung, of shape `(1, lungs)`."""
     keys = jr.split(jr.fold_in(key, 9), trainer.count)
@@ -170,10 +170,10 @@ def networks_on_pids(
     offset = 100 * jax.nn.sigmoid(jnp.asarray(-2.0))
     make = lambda a, b: Summed(a, b, offset=offset)  # noqa: E731
     start = stack([eqx.filter_vmap(make)(pids["leaky PID"], policies)])
-    return trainer(start, size.controller_steps, jr.fold_in(key, 10), checkpoint=file)
+    return trainer(start, size.controller_steps, jr.fold_in(key, 10), **options)
 
 
-def networks_for_all(trainer: Trainer, size: Size, key: Any, file: Path) -> Any:
+def networks_for_all(trainer: Trainer, size: Size, key: Any, options: Any) -> Any:
     """A network for all lungs, of shape `(seeds,)`."""
     keys = jr.split(jr.fold_in(key, 11), size.seeds)
     width, controls = size.shared_network
@@ -187,7 +187,7 @@ def networks_for_all(trainer: Trainer, size: Size, key: Any, file: Path) -> Any:
         jr.fold_in(key, 12),
         shared=True,
         limit=_CAREFUL,
-        checkpoint=file,
+        **options,
     )
 
 

@@ -1,9 +1,11 @@
 """The public data set of a ventilator, as a file of comma-separated values."""
 
 import csv
+import itertools
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -34,10 +36,12 @@ def read_breaths(
     Prediction" data set.
 
     The columns are `id`, `breath_id`, `R` [cmH2O s/L], `C` [mL/cmH2O], `time_step` [s],
-    `u_in` [%], `u_out` (0 or 1) and `pressure` [cmH2O], in any order, and the rows of a
-    breath follow each other. An inspiration is what is before `u_out` is first 1. As
-    the steps of the file are not even, it is sampled anew every `dt`: the pressure
-    along a line, the controls held.
+    `u_in` (0 to 100 %), `u_out` (0 or 1) and `pressure` [cmH2O], in any order, and the
+    rows of a breath follow each other. An inspiration is what is before `u_out` is
+    first 1. As the steps of the file are not even, it is sampled anew every `dt`: the
+    pressure along a line, the controls held.
+
+    Numbers may be quoted, blank lines are passed over, and there are no comments.
 
     **Arguments:**
 
@@ -50,10 +54,12 @@ def read_breaths(
     **Returns:** a [`delucax.lung.Breaths`][], with the resistance and compliance of
         each.
 
-    **Raises:** `ValueError` that names the row (the line of the file) and the column
-        where a column is missing, a value is not a number, `R`, `C` or `u_out` is none
-        of those there may be or changes within a breath, time does not go on, or a
-        breath is too short; `OSError` if the file cannot be read.
+    **Raises:** `ValueError` that names the column and the row, which is the line of the
+        file as an editor counts it (the header is in row 1, and blank lines count),
+        where a column is missing, a value is not a finite number, `u_in` is out of its
+        bounds, `R`, `C` or `u_out` is none of those there may be, `R` or `C` changes
+        within a breath, time does not go on, or a breath is too short; `OSError` if the
+        file cannot be read.
 
     Source: Google Brain, 2021 (the data set); Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu,
     Singh, Zhang, Minasyan, LaChance, Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -80,49 +86,13 @@ def read_breaths(
     if dt is not None:
         check_positive(dt, "dt", _WHERE)
     table = _table(path)
-    for name, allowed in (
-        ("R", resistances),
-        ("C", compliances),
-        ("u_out", (0.0, 1.0)),
-    ):
-        bad = ~np.isin(table[name], np.asarray(allowed, float))
-        if bad.any():
-            row = int(np.argmax(bad))
-            known = ", ".join(f"{value:g}" for value in allowed)
-            raise ValueError(
-                f"{_WHERE}: '{path}' row {row + 2}, column {name}: must be one of "
-                f"{known}, got {table[name][row]:g}."
-            )
-    number, time = table["breath_id"], table["time_step"]
-    starts = np.flatnonzero(np.diff(number, prepend=np.nan) != 0)
-    ends = np.append(starts[1:], len(number))
-    again = _repeated(number[starts])
-    if again is not None:
-        row = int(starts[again])
-        raise ValueError(
-            f"{_WHERE}: '{path}' row {row + 2}, column breath_id: the rows of a breath "
-            f"must follow each other, but breath {number[row]:g} was before."
-        )
-    inner = np.ones(len(number), bool)
-    inner[starts] = False
-    back = inner & (np.diff(time, prepend=0.0) <= 0)
-    if back.any():
-        row = int(np.argmax(back))
-        raise ValueError(
-            f"{_WHERE}: '{path}' row {row + 2}, column time_step: must increase within "
-            f"a breath, got {time[row]:g} after {time[row - 1]:g}."
-        )
-    for name in ("R", "C"):
-        changed = inner & (np.diff(table[name], prepend=table[name][0]) != 0)
-        if changed.any():
-            row = int(np.argmax(changed))
-            raise ValueError(
-                f"{_WHERE}: '{path}' row {row + 2}, column {name}: must be the same "
-                f"for all of breath {number[row]:g}, got {table[name][row]:g} after "
-                f"{table[name][row - 1]:g}."
-            )
+    _check_values(path, table, dict(R=resistances, C=compliances, u_out=(0.0, 1.0)))
+    starts, ends = _breaths(path, table)
+    time = table["time_step"]
     if dt is None:
-        dt = float(np.median(np.diff(time)[inner[1:]]))
+        steps = np.diff(time)
+        steps[starts[1:] - 1] = np.nan  # from one breath to the next
+        dt = float(np.nanmedian(steps))
     kept = {name: [] for name in ("u_in", "pressure", "R", "C")}
     grid = dt * np.arange(length)
     for start, end in zip(starts, ends, strict=True):
@@ -131,11 +101,13 @@ def read_breaths(
         t = time[start:stop] - time[start]
         # The last sample may be up to half a step after the last row.
         if stop == start or t[-1] + 0.5 * dt < grid[-1]:
-            raise ValueError(
-                f"{_WHERE}: '{path}' row {start + 2}, column u_out: breath "
-                f"{number[start]:g} has an inspiration of {stop - start} rows and "
-                f"{t[-1] if len(t) else 0:.3g} s, too short for length = {length} "
-                f"samples of {dt:.3g} s."
+            raise _wrong(
+                path,
+                start,
+                "u_out",
+                f"breath {table['breath_id'][start]:g} has an inspiration of "
+                f"{stop - start} rows and {t[-1] if len(t) else 0:.3g} s, too short "
+                f"for length = {length} samples of {dt:.3g} s",
             )
         rows = slice(start, stop)
         held = np.clip(np.searchsorted(t, grid + 1e-9) - 1, 0, None)
@@ -154,56 +126,119 @@ def read_breaths(
     )
 
 
-def _repeated(numbers: np.ndarray) -> int | None:
-    """The first place at which a number is there for the second time."""
-    _, first = np.unique(numbers, return_index=True)
-    rest = np.setdiff1d(np.arange(len(numbers)), first)
-    return int(rest[0]) if len(rest) else None
+def _check_values(
+    path: Path, table: dict[str, np.ndarray], known: dict[str, Sequence[float]]
+) -> None:
+    """Raise unless each value is one that there may be."""
+    for name, allowed in known.items():
+        bad = ~np.isin(table[name], np.asarray(allowed, float))
+        if bad.any():
+            row = int(np.argmax(bad))
+            words = ", ".join(f"{value:g}" for value in allowed)
+            got = f"must be one of {words}, got {table[name][row]:g}"
+            raise _wrong(path, row, name, got)
+    bad = (table["u_in"] < 0) | (table["u_in"] > 100)
+    if bad.any():
+        row = int(np.argmax(bad))
+        got = f"must be between 0 and 100, got {table['u_in'][row]:g}"
+        raise _wrong(path, row, "u_in", got)
 
 
-def _table(path: Any) -> dict[str, np.ndarray]:
-    """The columns that are used, as numbers."""
-    with open(path, newline="") as file:
+def _breaths(path: Path, table: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Where each breath begins and ends, if each is one breath of one lung."""
+    number, time = table["breath_id"], table["time_step"]
+    starts = np.flatnonzero(np.diff(number, prepend=np.nan) != 0)
+    ends = np.append(starts[1:], len(number))
+    _, first = np.unique(number[starts], return_index=True)
+    again = np.setdiff1d(np.arange(len(starts)), first)
+    if len(again):
+        row = int(starts[again[0]])
+        got = f"must follow each other, but breath {number[row]:g} was before"
+        raise _wrong(path, row, "breath_id", f"the rows of a breath {got}")
+    alone = np.flatnonzero(ends - starts < 2)
+    if len(alone):
+        row = int(starts[alone[0]])
+        got = f"must have at least 2 rows, got 1 of breath {number[row]:g}"
+        raise _wrong(path, row, "breath_id", f"a breath {got}")
+    inner = np.ones(len(number), bool)
+    inner[starts] = False
+    back = inner & (np.diff(time, prepend=0.0) <= 0)
+    if back.any():
+        row = int(np.argmax(back))
+        got = f"must increase within a breath, got {time[row]:g} after"
+        raise _wrong(path, row, "time_step", f"{got} {time[row - 1]:g}")
+    for name in ("R", "C"):
+        values = table[name]
+        changed = inner & (np.diff(values, prepend=values[0]) != 0)
+        if changed.any():
+            row = int(np.argmax(changed))
+            got = f"must be the same for all of breath {number[row]:g}, got"
+            words = f"{got} {values[row]:g} after {values[row - 1]:g}"
+            raise _wrong(path, row, name, words)
+    return starts, ends
+
+
+def _open(path: Path) -> Any:
+    # What is no text is a value like any other that is no number.
+    return open(path, newline="", encoding="utf-8-sig", errors="replace")
+
+
+def _table(path: Path) -> dict[str, np.ndarray]:
+    """The columns by name, as numbers."""
+    with _open(path) as file:
         header = [name.strip() for name in next(csv.reader(file), [])]
         missing = [name for name in COLUMNS if name not in header]
         if missing:
             raise ValueError(
                 f"{_WHERE}: '{path}' row 1: column {', '.join(missing)} is missing; "
                 f"there must be {', '.join(COLUMNS)}, got "
-                f"{', '.join(header) or 'nothing'}."
+                f"{', '.join(header)[:200] or 'nothing'}."
             )
-        place = {name: header.index(name) for name in COLUMNS[1:]}
+        place = {name: header.index(name) for name in COLUMNS}
         columns = list(place.values())
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # that there are no rows
-                rows = np.loadtxt(file, delimiter=",", usecols=columns, ndmin=2)
+                form: Any = dict(delimiter=",", quotechar='"', comments=None)
+                rows = np.loadtxt(file, usecols=columns, ndmin=2, **form)
         except ValueError:
             rows = None
-    if rows is not None and rows.size:
-        bad = ~np.isfinite(rows)
-        if not bad.any():
-            return dict(zip(place, rows.T, strict=True))
-    raise _first_bad_value(path, place)
+    if rows is not None and not rows.size:
+        raise ValueError(f"{_WHERE}: '{path}' must have rows after its header.")
+    if rows is None or not np.all(np.isfinite(rows)):
+        raise _first_bad_value(path, place)
+    return dict(zip(place, rows.T, strict=True))
 
 
-def _first_bad_value(path: Any, place: dict[str, int]) -> ValueError:
-    with open(path, newline="") as file:
-        rows = csv.reader(file)
-        next(rows)
-        for line, row in enumerate(rows, start=2):
-            for name, i in place.items():
-                text = row[i] if i < len(row) else ""
-                try:
-                    fine = np.isfinite(float(text))
-                except ValueError:
-                    fine = False
-                if not fine:
-                    return ValueError(
-                        f"{_WHERE}: '{path}' row {line}, column {name}: must be a "
-                        f"finite number, got {text!r}."
-                    )
-    return ValueError(f"{_WHERE}: '{path}' must have rows after its header.")
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """The rows after the header that are not blank, each with its line."""
+    with _open(path) as file:
+        reader = csv.reader(file)
+        next(reader)
+        last = reader.line_num
+        for row in reader:
+            if row:
+                yield last + 1, row
+            last = reader.line_num
+
+
+def _wrong(path: Path, row: int, column: str, words: str) -> ValueError:
+    line, _ = next(itertools.islice(_rows(path), row, None))
+    return ValueError(f"{_WHERE}: '{path}' row {line}, column {column}: {words}.")
+
+
+def _first_bad_value(path: Path, place: dict[str, int]) -> ValueError:
+    for i, (_, row) in enumerate(_rows(path)):
+        for name, j in place.items():
+            text = row[j] if j < len(row) else ""
+            try:
+                # Python takes 1_000 for a number; no other reader of the file would.
+                fine = np.isfinite(float(text)) and "_" not in text
+            except ValueError:
+                fine = False
+            if not fine:
+                return _wrong(path, i, name, f"must be a finite number, got {text!r}")
+    return ValueError(f"{_WHERE}: '{path}' must be rows of numbers.")
 
 
 def write_breaths(path: str | os.PathLike, breaths: Breaths) -> None:

@@ -9,15 +9,21 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_count, check_key, check_positive, check_range
+from .._check import (
+    check_count,
+    check_finite,
+    check_key,
+    check_positive,
+    check_range,
+)
 from .._controller import AbstractController
-from .._fields import parameter, positive
+from .._fields import check_parameters, parameter, positive
 from .._typing import PRNGKey
 from ..controllers import LeakyPID
 from ..environments import Environment
 from ..math import clip
 from ..simulation import rollout
-from ._waveform import at_pip, BreathWaveform
+from ._waveform import as_pips, at_pip, BreathWaveform, check_waveform
 
 
 LENGTH = 29
@@ -45,7 +51,8 @@ class Breaths(eqx.Module):
     - `truth`: what a sensor without noise would have read, shape `(B, T)`; not known by
         default.
 
-    **Raises:** `ValueError` if shapes do not fit each other.
+    **Raises:** `ValueError` if shapes do not fit each other, a value is not finite, or
+    `dt` is not positive.
 
     !!! example
 
@@ -67,6 +74,7 @@ class Breaths(eqx.Module):
     truth: Array | None = parameter(None)
 
     def __check_init__(self):
+        check_parameters(self)
         shape = jnp.shape(self.pressure)
         if len(shape) < 2:
             raise ValueError(
@@ -116,6 +124,9 @@ class Explorer(AbstractController):
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `scale`: of the gains that are drawn, 1 by default.
 
+    **Raises:** `ValueError` if a number is none or not finite, `dt` is not positive, or
+    `waveform` is none.
+
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
 
@@ -147,6 +158,7 @@ class Explorer(AbstractController):
         waveform: BreathWaveform,
         scale: Any = 1.0,
     ):
+        check_waveform(waveform, "Explorer")
         self.kp, self.ki, self.dt, self.scale = kp, ki, dt, scale
         self.waveform = waveform
 
@@ -230,8 +242,8 @@ def explore(
 
     **Returns:** a [`delucax.lung.Breaths`][], with `truth`.
 
-    **Raises:** `ValueError` if the arguments are illegal, or hardly a breath stays
-    below the limit.
+    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    say), or hardly a breath stays below the limit.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -253,11 +265,12 @@ def explore(
     length = check_count(length, "length", where)
     check_key(key, where)
     check_positive(abort, "abort", where)
+    pips = as_pips(pips, _waveform_of(env, where), where)
     explorer = Explorer(dt=env.dt, waveform=_waveform_of(env, where), scale=scale)
     kept, count = [], 0
     for attempt in range(50):
         draw_key, run_key = jr.split(jr.fold_in(key, attempt))
-        drawn = jr.choice(draw_key, jnp.asarray(pips), (4 * breaths,))
+        drawn = jr.choice(draw_key, pips, (4 * breaths,))
         keys = jr.split(run_key, 4 * breaths)
         *columns, highest = _explored(env, explorer, drawn, keys, length)
         fine = np.asarray(highest) <= float(abort)
@@ -281,12 +294,18 @@ def explore(
     return Breaths(u_in, u_out, pressure, env.dt, truth=truth, **known)
 
 
-def _waveform_of(env: Any, where: str) -> BreathWaveform:
+def _waveform_of(env: Any, where: str, *, stacked: bool = False) -> BreathWaveform:
+    """The waveform of a task of a lung, or of several that are stacked."""
     waveform = getattr(getattr(env, "cost", None), "waveform", None)
     if not isinstance(env, Environment) or not isinstance(waveform, BreathWaveform):
         raise ValueError(
             f"{where}: env must be a task with a breath waveform, such as "
             f"delucax.make('lung/double_compartment'), got {type(env).__name__}."
+        )
+    if not stacked and jnp.ndim(env.dt):
+        raise ValueError(
+            f"{where}: env must be one task, got {jnp.shape(env.dt)[0]} that are "
+            "stacked: map over them with equinox.filter_vmap."
         )
     return waveform
 
@@ -307,7 +326,8 @@ def segment(
 
     **Returns:** a [`delucax.lung.Breaths`][].
 
-    **Raises:** `ValueError` if sizes differ, or there is no inspiration as long.
+    **Raises:** `ValueError` if sizes differ, a value is not finite, or there is no
+    inspiration as long.
 
     !!! example
 
@@ -327,6 +347,8 @@ def segment(
             f"{where}: u_in, u_out and pressure must be vectors of one size, got "
             f"shapes {[column.shape for column in columns]}."
         )
+    for name, column in zip(("u_in", "u_out", "pressure"), columns, strict=True):
+        check_finite(column, name, where)
     closed = np.concatenate([[False], columns[1] < 0.5, [False]]).astype(int)
     edges = np.diff(closed)
     starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)

@@ -12,7 +12,7 @@ from ..costs import AbstractCost
 from ..disturbances import Gaussian
 from ..dynamics import AbstractDynamics
 from ..dynamics._wrapper import AbstractWrapper
-from ._waveform import BreathWaveform
+from ._waveform import BreathWaveform, check_waveform
 
 
 class PressureSensor(AbstractWrapper):
@@ -121,6 +121,8 @@ class BreathCost(AbstractCost):
     - `index`: the place of the pressure in the state.
     - `expiration`: 0 by default.
 
+    **Raises:** `ValueError` if `waveform` is none.
+
     !!! example
 
         ```python
@@ -135,6 +137,9 @@ class BreathCost(AbstractCost):
     waveform: BreathWaveform
     index: int = eqx.field(static=True)
     expiration: Array = parameter(0.0)
+
+    def __check_init__(self):
+        check_waveform(self.waveform, "BreathCost")
 
     def __call__(self, t, x, u):
         error = jnp.abs(x[self.index] - self.waveform.pressure(t))
@@ -170,7 +175,7 @@ def ventilation(
 
     **Returns:** a dictionary.
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or if `waveform` is none.
 
     !!! example
 

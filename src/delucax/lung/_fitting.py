@@ -52,6 +52,7 @@ def fit_lungs(
     teacher_steps: int = 1000,
     steps: int = 800,
     learning_rate: float = 5e-3,
+    optimiser: optax.GradientTransformation | None = None,
     batch_size: int | None = 64,
     trainable: Any = None,
     progress: bool = False,
@@ -75,6 +76,8 @@ def fit_lungs(
     - `teacher_steps`: of the first part, 1000 by default.
     - `steps`: of the second part, 800 by default.
     - `learning_rate`: 5e-3 by default, and twice that in the first part.
+    - `optimiser`: an Optax optimiser of both parts instead of Adam, with a learning
+        rate of its own; none by default.
     - `batch_size`: breaths of each lung in a step, 64 by default; `None` for all.
     - `trainable`: what moves, as in [`delucax.training.fit`][]; the weights by default.
     - `progress`: whether to show a bar, false by default.
@@ -119,17 +122,16 @@ def fit_lungs(
     batch_size = None if batch_size is None or batch_size >= size else batch_size
     scale = jnp.std(pressure, axis=(1, 2))
     learned = isinstance(models, LearnedLung)
-    parts = [(True, teacher_steps, 2 * learning_rate)] if learned else []
-    parts += [(False, steps, learning_rate)]
+    parts = [(True, teacher_steps, "teacher_steps", 2)] if learned else []
+    parts += [(False, steps, "steps", 1)]
     fitted = None
-    for teacher, count, rate in parts:
-        if count == 0:
+    for teacher, count, name, times in parts:
+        if check_count(count, name, where, least=0) == 0:
             continue
-        schedule = optax.cosine_decay_schedule(rate, check_count(count, "steps", where))
         fitted = fit(
             _Simulation(scale, teacher),
             models,
-            optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule)),
+            _adam(times * learning_rate, count) if optimiser is None else optimiser,
             count,
             key=jax.random.fold_in(key, int(teacher)),
             data=data,
@@ -145,6 +147,11 @@ def fit_lungs(
         (model,) = unstack(fitted.model)
         fitted = Fitted(model, fitted.history, fitted.result)
     return fitted
+
+
+def _adam(rate: float, steps: int) -> optax.GradientTransformation:
+    schedule = optax.cosine_decay_schedule(rate, steps)
+    return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
 
 
 def open_loop_error(model: Any, breaths: Breaths) -> Array:

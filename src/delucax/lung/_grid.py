@@ -5,17 +5,18 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jaxtyping import Array
 
-from .._check import check_count, check_key
+from .._check import check_count, check_finite, check_key
+from .._fields import as_float_array
 from .._typing import PRNGKey
 from ..controllers import LeakyPID, PID
 from ..environments import Environment
 from ._data import _waveform_of, LENGTH, PIPS
+from ._stacking import stack
 from ._train import breath_error
-from ._waveform import at_pip
+from ._waveform import as_pips, at_pip
 
 
 GAINS = (*(i / 10 for i in range(10)), *(float(i) for i in range(1, 11)))
@@ -89,7 +90,8 @@ def pid_grid(
 
     **Arguments:**
 
-    - `envs`: tasks of lungs, as [`delucax.lung.stack`][] makes one of them.
+    - `envs`: tasks of lungs, as [`delucax.lung.stack`][] makes one of them, or a
+        single task.
     - `key`: a random key, for the noise of the sensor, which is the same for all.
     - `kind`: `"leaky"` for [`delucax.controllers.LeakyPID`][], which is that of the
         original (default); `"true"` for [`delucax.controllers.PID`][].
@@ -97,9 +99,10 @@ def pid_grid(
         0.9, 1, 2, ..., 10 for the first two and 0 for the last by default.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
 
-    **Returns:** a [`delucax.lung.PIDGrid`][].
+    **Returns:** a [`delucax.lung.PIDGrid`][], that of one lung for a single task.
 
-    **Raises:** `ValueError` if the arguments are illegal.
+    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    say).
 
     !!! example
 
@@ -113,13 +116,19 @@ def pid_grid(
         ```
     """
     where = "pid_grid"
-    _waveform_of(envs, where)
+    pips = as_pips(pips, _waveform_of(envs, where, stacked=True), where)
     check_key(key, where)
     if kind not in ("leaky", "true"):
         raise ValueError(f"{where}: kind must be 'leaky' or 'true', got {kind!r}.")
-    lists = [np.asarray(values, float).ravel() for values in (kp, ki, kd)]
-    gains = jnp.asarray(np.stack(np.meshgrid(*lists, indexing="ij"), -1).reshape(-1, 3))
-    pips = jnp.asarray(pips, float)
+    lists = []
+    for name, values in (("kp", kp), ("ki", ki), ("kd", kd)):
+        array = as_float_array(values)
+        if not eqx.is_inexact_array(array) or not array.size:
+            raise ValueError(f"{where}: {name} must be numbers, got {values!r}.")
+        check_finite(array, name, where)
+        lists.append(jnp.ravel(array).astype(float))
+    gains = jnp.stack(jnp.meshgrid(*lists, indexing="ij"), -1).reshape(-1, 3)
+    envs = envs if jnp.ndim(envs.dt) else stack([envs])
     return PIDGrid(gains, _errors(envs, gains, pips, key, kind), kind)
 
 
@@ -141,7 +150,8 @@ def least_error(
 
     **Returns:** the mean error at each of the pressures, shape `(pips,)` [cmH2O].
 
-    **Raises:** `ValueError` if the arguments are illegal.
+    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    say).
 
     !!! example
 
@@ -153,8 +163,10 @@ def least_error(
         lung.least_error(env, pips=[20.0], steps=20, horizon=10)
         ```
     """
-    _waveform_of(env, "least_error")
-    steps = check_count(steps, "steps", "least_error")
+    where = "least_error"
+    pips = as_pips(pips, _waveform_of(env, where), where)
+    steps = check_count(steps, "steps", where)
+    horizon = check_count(horizon, "horizon", where)
     schedule = optax.cosine_decay_schedule(0.3, steps)
     optimiser = optax.adam(schedule)
 
@@ -184,4 +196,4 @@ def least_error(
         (_, _, least), _ = jax.lax.scan(descend, start, None, steps)
         return least
 
-    return eqx.filter_jit(jax.vmap(of))(jnp.asarray(pips, float))
+    return eqx.filter_jit(jax.vmap(of))(pips)

@@ -14,21 +14,15 @@ from .._fields import as_module, parameter, positive, weight
 from .._typing import PRNGKey
 from ..math import clip
 from ._networks import run_mlp
-from ._waveform import BreathWaveform
-
-
-def _check_waveform(waveform: Any, where: str) -> None:
-    if not isinstance(waveform, BreathWaveform):
-        raise ValueError(
-            f"{where}: waveform must be a BreathWaveform, got "
-            f"{type(waveform).__name__}."
-        )
+from ._waveform import BreathWaveform, check_waveform
 
 
 class ExpiratoryValve(AbstractController):
     """Opens the expiratory valve in the expiratory phase: `u_out` is 0, then 1.
 
     **Arguments:** `waveform`: a [`delucax.lung.BreathWaveform`][].
+
+    **Raises:** `ValueError` if it is none.
 
     !!! example
 
@@ -42,6 +36,9 @@ class ExpiratoryValve(AbstractController):
     """
 
     waveform: BreathWaveform
+
+    def __check_init__(self):
+        check_waveform(self.waveform, "ExpiratoryValve")
 
     def __call__(self, t, y, state):
         closed = self.waveform.is_inspiration(t)
@@ -105,7 +102,7 @@ class Breathing(AbstractController):
         hold: Any = 0.0,
     ):
         where = "Breathing"
-        _check_waveform(waveform, where)
+        check_waveform(waveform, where)
         valve = ExpiratoryValve(waveform) if valve is None else valve
         for name, given in (("inspiratory", inspiratory), ("valve", valve)):
             if not isinstance(given, AbstractController):
@@ -159,6 +156,8 @@ class BangBang(AbstractController):
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `high`: the control below it [%], 100 by default.
 
+    **Raises:** `ValueError` if `waveform` is none.
+
     !!! example
 
         ```python
@@ -172,6 +171,9 @@ class BangBang(AbstractController):
 
     waveform: BreathWaveform
     high: Array = parameter(100.0)
+
+    def __check_init__(self):
+        check_waveform(self.waveform, "BangBang")
 
     def __call__(self, t, y, state):
         return jnp.where(y > self.waveform(t), 0, self.high).astype(y.dtype), state
@@ -200,17 +202,19 @@ class BreathPolicy(AbstractController):
     - `dt`: the control interval.
     - `kind`: `"mlp"` (default) or `"cnn"`.
     - `width`: hidden units, or channels, 32 by default.
-    - `depth`: hidden layers of the `"mlp"`, 2 by default.
-    - `errors`: how many errors it is given, 10 by default.
-    - `controls`: how many controls it is given, 4 by default; 0 for the published
-        inputs.
+    - `depth`: hidden layers of the `"mlp"`, 2 by default; may be 0. The `"cnn"` has
+        none.
+    - `errors`: how many errors it is given, 10 by default, and at least 5 of them for a
+        `"cnn"`.
+    - `controls`: how many controls it is given, 4 by default; may be 0. The published
+        networks were given no controls, and not `r[k]`, which this one always is.
     - `key`: a random key, for the first weights.
 
     **Attributes:** `network`, trainable; `shift`, -2, so that it begins with the valve
     a little open.
 
-    **Raises:** `ValueError` if a size is below 1, the kind is unknown or there is no
-    key.
+    **Raises:** `ValueError` if a size is below its least, the kind is unknown,
+    `waveform` is none or there is no key.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -249,7 +253,7 @@ class BreathPolicy(AbstractController):
         key: PRNGKey,
     ):
         where = "BreathPolicy"
-        _check_waveform(waveform, where)
+        check_waveform(waveform, where)
         check_step(dt, where)
         if kind not in ("mlp", "cnn"):
             raise ValueError(f"{where}: kind must be 'mlp' or 'cnn', got {kind!r}.")
@@ -369,6 +373,8 @@ class FeedForward(AbstractController):
     - `gain`: [%/cmH2O], 1 by default. Trainable.
     - `offset`: [%], 0 by default. Trainable.
 
+    **Raises:** `ValueError` if `waveform` is none.
+
     !!! example
 
         ```python
@@ -383,6 +389,9 @@ class FeedForward(AbstractController):
     waveform: BreathWaveform
     gain: Array = weight(1.0)
     offset: Array = weight(0.0)
+
+    def __check_init__(self):
+        check_waveform(self.waveform, "FeedForward")
 
     def __call__(self, t, y, state):
         u = self.gain * (self.waveform(t) - self.waveform.peep) + self.offset

@@ -119,20 +119,36 @@ def _rows(names, label, seed, part, mae, highest) -> Rows:
 
 
 def save_controllers(
-    folder: Path, contenders: list[Contender], names: list[str], waveform: Any
-) -> None:
-    """Each as a controller of both valves, ready for a task."""
+    folder: Path,
+    contenders: list[Contender],
+    names: list[str],
+    waveform: Any,
+    rows: Rows,
+) -> list[str]:
+    """Each as a controller of both valves, ready for a task; returned are the names of
+    those that are not saved, for a pressure of theirs passed the abort limit."""
+    unsafe = []
     for label, seed, controllers, shared in contenders:
         if label in FLOORS:
             continue
         stem = label.lower().replace(" + ", "_").replace(" ", "_").replace("-", "_")
         alone = unstack(controllers)
-        files = [(f"{stem}_{seed}.dlx", alone[0])]
+        made = [(stem, alone[0], None)]
         if not shared:
-            places = [f"{stem}_{name}_{seed}.dlx" for name in names]
-            files = list(zip(places, alone, strict=True))
-        for place, controller in files:
-            save(folder / place, Breathing(controller, waveform))
+            each = zip(names, alone, strict=True)
+            made = [(f"{stem}_{name}", controller, name) for name, controller in each]
+        for place, controller, name in made:
+            runs = [
+                row for row in rows if (row["controller"], row["seed"]) == (label, seed)
+            ]
+            runs = [row for row in runs if name in (None, row["lung"])]
+            file = folder / f"{place}_{seed}.dlx"
+            if max(row["highest"] for row in runs) <= ABORT:
+                save(file, Breathing(controller, waveform))
+            else:
+                file.unlink(missing_ok=True)
+                unsafe.append(file.stem)
+    return unsafe
 
 
 def mean_error(rows: Rows, label: str, part: str, lung: str | None = None) -> float:
@@ -168,8 +184,17 @@ def _by_kind(table: Rows, column: str) -> dict[str, dict[str, float]]:
     return found
 
 
-def summarise(rows: Rows, table: Rows, seconds: dict[str, float]) -> dict[str, Any]:
-    """The figures that the study is about, and sentences of them."""
+def summarise(
+    rows: Rows,
+    table: Rows,
+    seconds: dict[str, float],
+    judge: str,
+    unsafe: list[str],
+) -> dict[str, Any]:
+    """The figures that the study is about, and sentences of them.
+
+    `judge` says what the controllers were run in, and `unsafe` names those that were
+    not saved."""
     names = list(dict.fromkeys(row["lung"] for row in table))
     simulators = _by_kind(table, "mae")
     learned = simulators["learned"]
@@ -201,7 +226,10 @@ def summarise(rows: Rows, table: Rows, seconds: dict[str, float]) -> dict[str, A
         f"on the lungs of the training, {shared['between']:.2f} on lungs between.",
         f"The highest pressure with what was learned: {highest:.1f} cmH2O; the limit "
         f"is {ABORT:g}.",
+        f"Controllers were judged in {judge}.",
     ]
+    if unsafe:
+        words.append(f"Not saved, for they passed the limit: {', '.join(unsafe)}.")
     return dict(
         simulators=simulators,
         simulators_closed_loop=_by_kind(table, "closed_loop_mae"),
@@ -211,6 +239,8 @@ def summarise(rows: Rows, table: Rows, seconds: dict[str, float]) -> dict[str, A
         shared_over_best_pid=shared,
         highest_pressure=highest,
         abort=ABORT,
+        judged_in=judge,
+        not_saved=unsafe,
         seconds=seconds,
         words=words,
     )

@@ -12,8 +12,7 @@ from .._check import check_count
 from .._controller import AbstractController
 from .._fields import parameter, positive
 from ._learned import LearnedLung
-from ._policies import _check_waveform
-from ._waveform import BreathWaveform
+from ._waveform import BreathWaveform, check_waveform
 
 
 class _Shooting(NamedTuple):
@@ -79,7 +78,7 @@ class ShootingMPC(AbstractController):
             raise ValueError(
                 f"{where}: model must be a LearnedLung, got {type(model).__name__}."
             )
-        _check_waveform(waveform, where)
+        check_waveform(waveform, where)
         self.model, self.waveform = model, waveform
         self.horizon = check_count(horizon, "horizon", where)
         self.iterations = check_count(iterations, "iterations", where)

@@ -1,6 +1,5 @@
 """The breaths of the study, and the simulators that are fitted to them."""
 
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -46,7 +45,7 @@ def explored(size: Size) -> Breaths:
 
 
 def grouped(breaths: Breaths) -> Any:
-    """The lungs of a file, and the breaths of each."""
+    """The lungs of a file, and as many breaths of each (see `left_out`)."""
     R, C = np.asarray(breaths.resistance), np.asarray(breaths.compliance)
     lungs = sorted(set(zip(R.tolist(), C.tolist(), strict=True)))
     parts = [breaths[np.flatnonzero((R == r) & (C == c))] for r, c in lungs]
@@ -60,8 +59,22 @@ def grouped(breaths: Breaths) -> Any:
     return np.asarray(lungs), stack_breaths(parts)
 
 
+def left_out(recorded: Breaths, breaths: Breaths) -> str:
+    """What there is to say of recorded breaths that are not among those of each lung,
+    nothing if all are."""
+    lungs, each = breaths.pressure.shape[:2]
+    count = len(recorded) - lungs * each
+    if not count:
+        return ""
+    return (
+        f"{count} of the {len(recorded)} breaths are left out: each of the {lungs} "
+        f"lungs has {each}, as many as there are of the one with the fewest."
+    )
+
+
 def stack_breaths(parts: list[Breaths]) -> Breaths:
-    """Breaths of several lungs as one, the fewest of each."""
+    """Breaths of several lungs as one: the first of each, as many as there are of the
+    one with the fewest."""
     fewest = min(len(part) for part in parts)
     return stack([part[:fewest] for part in parts])
 
@@ -73,7 +86,7 @@ def divided(breaths: Breaths, key: Any) -> tuple[Breaths, Breaths]:
     return train, test
 
 
-def learned(train: Breaths, size: Size, key: Any, file: Path) -> Any:
+def learned(train: Breaths, size: Size, key: Any, options: Any) -> Any:
     """A learned lung of each lung, stacked."""
     keys = jr.split(jr.fold_in(key, 2), train.pressure.shape[0])
     parts = zip(unstack(train), keys, strict=True)
@@ -84,11 +97,11 @@ def learned(train: Breaths, size: Size, key: Any, file: Path) -> Any:
         key=jr.fold_in(key, 3),
         teacher_steps=size.teacher_steps,
         steps=size.simulator_steps,
-        checkpoint=file,
+        **options,
     ).model
 
 
-def fitted(kind: str, train: Breaths, size: Size, key: Any, file: Path) -> Any:
+def fitted(kind: str, train: Breaths, size: Size, key: Any, options: Any) -> Any:
     """Models of a kind, stacked, fitted to the breaths of each lung."""
     models, moved = _models(kind, train, jr.fold_in(key, 4))
     is_network = kind in ("neural ODE", "grey box")
@@ -101,7 +114,7 @@ def fitted(kind: str, train: Breaths, size: Size, key: Any, file: Path) -> Any:
         learning_rate=1e-2 if is_network else 0.05,
         batch_size=32,
         trainable=moved,
-        checkpoint=file,
+        **options,
     ).model
 
 

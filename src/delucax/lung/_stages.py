@@ -18,13 +18,20 @@ class Stages:
     - `out`: the folder.
     - `settings`: what the study is of; a folder holds one study.
     - `say`: what to do with a line of text.
+    - `progress`: whether trainings show a bar.
 
     **Raises:** `ValueError` if the folder holds a study with other settings, or one
         whose settings are damaged.
     """
 
-    def __init__(self, out: Path, settings: dict[str, Any], say: Callable[[str], Any]):
-        self.out, self.say = out, say
+    def __init__(
+        self,
+        out: Path,
+        settings: dict[str, Any],
+        say: Callable[[str], Any],
+        progress: bool,
+    ):
+        self.out, self.say, self.progress = out, say, progress
         self.began = time.perf_counter()
         self.seconds: dict[str, float] = {}
         known = out / "settings.json"
@@ -35,9 +42,9 @@ class Stages:
         else:
             _put(known, json.dumps(settings, indent=1) + "\n")
 
-    def fit_file(self, name: str) -> Path:
-        """Where the training of a stage is kept until it is done."""
-        return self.out / f"{name}.fit"
+    def fitting(self, name: str) -> dict[str, Any]:
+        """Options of the training of a stage, which is kept until it is done."""
+        return dict(checkpoint=self.out / f"{name}.fit", progress=self.progress)
 
     def stage(self, name: str, words: str, make: Callable[[], Any]) -> Any:
         """What `make` returns, or what it returned before, from its file."""
@@ -48,12 +55,13 @@ class Stages:
             self.say(f"{words}: found ({self.seconds[name]:.0f} s then)")
             return found["value"]
         began = time.perf_counter()
+        self.say(f"{words} ...")
         value = make()
         self.seconds[name] = time.perf_counter() - began
         save(path, {"value": value, "seconds": self.seconds[name]})
         for left in self.out.glob(f"{name}.fit*"):
             left.unlink()
-        self.say(f"{words}: {self.seconds[name]:.0f} s")
+        self.say(f"  {self.seconds[name]:.0f} s")
         return value
 
     def write_table(self, name: str, rows: list[dict[str, Any]]) -> None:

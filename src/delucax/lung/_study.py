@@ -45,6 +45,7 @@ from ._simulators import (
     fitted,
     grouped,
     learned,
+    left_out,
     open_loop_rows,
 )
 from ._size import BREATH, FULL, SEEN, Size, SMALL, UNSEEN
@@ -62,6 +63,7 @@ def lung_study(
     data: str | Path | None = None,
     seeds: int | None = None,
     say: Callable[[str], Any] = print,
+    progress: bool = True,
 ) -> list[dict[str, Any]]:
     """Learn simulators of lungs from breaths, and controllers in the simulators; show
     how they do at the lungs themselves, beside the best PIDs.
@@ -79,14 +81,15 @@ def lung_study(
 
     - `out`: the folder to write to, `"lung"` by default. In it: `report.csv`,
         `simulators.csv`, `summary.json`, figures, `breath.gif`, the learned lungs
-        (`simulators.dlx`) and the trained controllers (`controllers/*.dlx`), which
-        `delucax.load` reads.
+        (`simulators.dlx`) and those controllers that stayed below the abort limit
+        (`controllers/*.dlx`), which `delucax.load` reads.
     - `small`: two lungs and little of everything, in less than a minute; false by
         default.
     - `data`: a file that [`delucax.lung.read_breaths`][] reads; none by default.
     - `seeds`: how many controllers of each kind are trained; 3 by default, and 1 if
         `small`.
     - `say`: what to do with a line of text; `print` by default.
+    - `progress`: whether trainings show a bar; true by default.
 
     **Returns:** the rows of the report, dictionaries.
 
@@ -111,7 +114,7 @@ def lung_study(
         data=None if data is None else _named(Path(data)),
         version=importlib.metadata.version("delucax"),
     )
-    stages = Stages(Path(out), settings, say)
+    stages = Stages(Path(out), settings, say, progress)
     waveform, key = BreathWaveform(), jr.key(0)
 
     if recorded is None:
@@ -119,6 +122,8 @@ def lung_study(
         breaths = stages.stage("breaths", "Breaths", lambda: explored(size))
     else:
         lungs, breaths = stages.stage("breaths", "Breaths", lambda: grouped(recorded))
+        if words := left_out(recorded, breaths):
+            say(words)
         kinds = dict.fromkeys((*size.physics, "grey box"))
         size = size._replace(physics=tuple(kinds), between=())
     names = [_lung_name(*lung) for lung in lungs]
@@ -132,6 +137,7 @@ def lung_study(
         around = [size.between[i % len(size.between)] for i in range(len(lungs))]
         others = stack([double_compartment(*lung) for lung in around])
         between = others, [_lung_name(*lung) for lung in size.between]
+        judge = "the lungs themselves"
     else:
         # What no controller was trained in stands in for the lungs.
         made = [
@@ -139,6 +145,7 @@ def lung_study(
             for model in unstack(models["grey box"])
         ]
         envs = stack(made)
+        judge = "grey-box lungs fitted to the same breaths, for want of the lungs"
     trainer = Trainer(models["learned"], waveform)
     contenders = _contenders(stages, envs, train, trainer, size, key)
     if size.extras and recorded is None:
@@ -162,8 +169,9 @@ def lung_study(
         )
         rows += bound_rows(names, np.asarray(bound))
     stages.write_table("report.csv", rows)
-    save_controllers(stages.out / "controllers", contenders, names, waveform)
-    summary = summarise(rows, table, stages.seconds)
+    place = stages.out / "controllers"
+    unsafe = save_controllers(place, contenders, names, waveform, rows)
+    summary = summarise(rows, table, stages.seconds, judge, unsafe)
     (stages.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     for line in summary["words"]:
         say(line)
@@ -191,7 +199,7 @@ def _simulators(stages: Stages, train: Breaths, size: Size, key: Any) -> dict[st
         "learned": stages.stage(
             "simulators",
             f"Learned lungs, {count}",
-            lambda: learned(train, size, key, stages.fit_file("simulators")),
+            lambda: learned(train, size, key, stages.fitting("simulators")),
         )
     }
     for kind in size.physics:
@@ -200,7 +208,7 @@ def _simulators(stages: Stages, train: Breaths, size: Size, key: Any) -> dict[st
             name,
             f"Fitted {kind}, {count}",
             lambda kind=kind, name=name: fitted(
-                kind, train, size, key, stages.fit_file(name)
+                kind, train, size, key, stages.fitting(name)
             ),
         )
     return models
@@ -216,37 +224,37 @@ def _contenders(
 ) -> list[Contender]:
     """All controllers, in the order of the report."""
 
-    def trained(name: str, words: str, train: Callable[[Path], Any]) -> Any:
-        return stages.stage(name, words, lambda: train(stages.fit_file(name)))
+    def trained(name: str, words: str, train: Callable[[dict[str, Any]], Any]) -> Any:
+        return stages.stage(name, words, lambda: train(stages.fitting(name)))
 
     pids = stages.stage("pids", "PID grids", lambda: searched_pids(envs, trainer, key))
     found = [zero(trainer), *pid_contenders(pids, trainer)]
     own = trained(
         "own",
         f"A network for each lung, {size.seeds} seeds at once",
-        lambda file: networks(trainer, size, key, file),
+        lambda options: networks(trainer, size, key, options),
     )
     shared = trained(
         "shared",
         f"A network for all lungs, {size.seeds} seeds at once",
-        lambda file: networks_for_all(trainer, size, key, file),
+        lambda options: networks_for_all(trainer, size, key, options),
     )
     if size.extras:
         one = size._replace(seeds=1)
         more = trained(
             "trained_pids",
             "PIDs trained on",
-            lambda file: trained_pids(pids, trainer, size, key, file),
+            lambda options: trained_pids(pids, trainer, size, key, options),
         )
         convolved = trained(
             "own_cnn",
             "A convolutional network for each lung",
-            lambda file: networks(trainer, one, key, file, "cnn"),
+            lambda options: networks(trainer, one, key, options, "cnn"),
         )
         residual = trained(
             "residual",
             "A PID and a network for each lung",
-            lambda file: networks_on_pids(pids, trainer, size, key, file),
+            lambda options: networks_on_pids(pids, trainer, size, key, options),
         )
         online = stages.stage(
             "online",

@@ -8,21 +8,28 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from .._check import check_count, check_key
+from .._check import (
+    check_bool,
+    check_count,
+    check_key,
+    check_positive,
+    check_range,
+)
 from .._controller import AbstractController
 from .._fields import parameter
 from .._typing import PRNGKey
 from ..costs import AbstractCost
+from ..dynamics import AbstractDynamics
 from ..environments import Environment
 from ..simulation import rollout
 from ..training import analytic, fit, Fitted
-from ._data import LENGTH, PIPS
+from ._data import _waveform_of, LENGTH, PIPS
 from ._environment import BreathCost, ventilation
 from ._fitting import kept_at
 from ._learned import LearnedLung
 from ._models import LungModel
 from ._policies import Breathing
-from ._waveform import at_pip, BreathWaveform
+from ._waveform import as_pips, at_pip, BreathWaveform, check_waveform
 
 
 def lung_environment(
@@ -44,7 +51,7 @@ def lung_environment(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if it is no such model.
+    **Raises:** `ValueError` if it is no such model, or `waveform` is none.
 
     !!! example
 
@@ -93,6 +100,9 @@ def breath_error(
     **Returns:** the mean of `|p - r|` over the steps of each episode, shape `(pips,)`
         [cmH2O]. NaN where a run failed.
 
+    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    say).
+
     !!! example
 
         ```python
@@ -106,7 +116,15 @@ def breath_error(
         lung.breath_error(env, pid, key=jax.random.key(0), pips=[20.0, 30.0])
         ```
     """
-    waveform = env.cost.waveform  # pyright: ignore[reportAttributeAccessIssue]
+    where = "breath_error"
+    waveform = _waveform_of(env, where)
+    if not isinstance(controller, AbstractController):
+        raise ValueError(
+            f"{where}: controller must be an AbstractController, got "
+            f"{type(controller).__name__}."
+        )
+    pips = as_pips(pips, (waveform, controller), where)
+    horizon = check_count(horizon, "horizon", where)
     whole = controller
     if not isinstance(controller, Breathing):
         whole = Breathing(controller, waveform)
@@ -118,8 +136,8 @@ def breath_error(
         )
         return jnp.mean(run.costs)
 
-    pips = jnp.asarray(pips, float)
-    return jax.vmap(one)(pips, jax.random.split(key, pips.shape[0]))
+    keys = jax.random.split(check_key(key, where), pips.shape[0])
+    return jax.vmap(one)(pips, keys)
 
 
 class _Careful(AbstractCost):
@@ -221,8 +239,8 @@ def train_controllers(
 
     **Returns:** a [`delucax.training.Fitted`][].
 
-    **Raises:** `ValueError` if the arguments are illegal, `RuntimeError` if it
-    diverges.
+    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    say), `RuntimeError` if it diverges.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -242,16 +260,27 @@ def train_controllers(
         ```
     """
     where = "train_controllers"
+    dynamics = models.dynamics if isinstance(models, LungModel) else models
+    if not isinstance(dynamics, AbstractDynamics) or jnp.ndim(dynamics.dt) != 1:
+        raise ValueError(
+            f"{where}: models must be LearnedLungs or LungModels that "
+            f"delucax.lung.stack made one of, got one {type(models).__name__}."
+        )
     waveform = BreathWaveform() if waveform is None else waveform
+    check_waveform(waveform, where)
     steps = check_count(steps, "steps", where)
+    check_positive(learning_rate, "learning_rate", where)
+    check_range(noise, "noise", where)
+    if limit is not None:
+        check_positive(limit, "limit", where)
     loss = _Ventilated(
         models,
         waveform,
-        jnp.asarray(pips, float),
+        as_pips(pips, (waveform, controllers), where),
         jnp.asarray(noise, float),
         None if limit is None else jnp.asarray(limit, float),
         check_count(horizon, "horizon", where),
-        shared,
+        check_bool(shared, "shared", where),
     )
     return fit(
         loss,

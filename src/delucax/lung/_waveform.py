@@ -8,8 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_number, check_positive, is_concrete
-from .._fields import as_float_array, parameter, positive
+from .._check import (
+    check_finite,
+    check_number,
+    check_positive,
+    check_real,
+    is_concrete,
+)
+from .._fields import as_float_array, check_parameters, parameter, positive
 
 
 _T = TypeVar("_T")
@@ -39,9 +45,9 @@ class BreathWaveform(eqx.Module):
         0.5 s.
     - `inspiration`: the share of a period that is inspiratory, 1/3 by default.
 
-    **Raises:** `ValueError` if PIP is below PEEP, the rate is not positive, keypoints
-    do not increase from 0 to 1 or are not as many as the levels, or `inspiration` is
-    not between 0 and 1.
+    **Raises:** `ValueError` if a number is not finite, PIP is below PEEP, the rate is
+    not positive, keypoints do not increase from 0 to 1 or are not as many as the
+    levels, or `inspiration` is not between 0 and 1.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca).
@@ -83,6 +89,7 @@ class BreathWaveform(eqx.Module):
 
     def __check_init__(self):
         where = "BreathWaveform"
+        check_parameters(self)
         keypoints, levels = self.keypoints, self.levels
         shapes = jnp.shape(keypoints), jnp.shape(levels)
         if len(shapes[0]) != 1 or shapes[0] != shapes[1] or shapes[0][0] < 2:
@@ -97,7 +104,7 @@ class BreathWaveform(eqx.Module):
                     f"{where}: keypoints must increase from 0 to 1, got {points}."
                 )
         if is_concrete(self.pip) and is_concrete(self.peep):
-            if np.any(np.asarray(self.pip) < np.asarray(self.peep)):
+            if not np.all(np.asarray(self.pip) >= np.asarray(self.peep)):
                 raise ValueError(
                     f"{where}: pip must be at least peep = {self.peep}, got {self.pip}."
                 )
@@ -147,6 +154,46 @@ class BreathWaveform(eqx.Module):
         return jnp.atleast_1d(self.pressure(t))
 
 
+def check_waveform(waveform: Any, where: str) -> None:
+    """Raise unless it is a breath waveform."""
+    if not isinstance(waveform, BreathWaveform):
+        raise ValueError(
+            f"{where}: waveform must be a BreathWaveform, got "
+            f"{type(waveform).__name__}."
+        )
+
+
+def as_pips(pips: Any, tree: Any, where: str) -> Array:
+    """`pips` as a vector of peak pressures, or an error: none may be below the PEEP of
+    a waveform in a pytree.
+
+    Under `jax.vmap` over them, which is what they are for, they could not be looked at.
+    """
+    array = as_float_array(pips)
+    if not eqx.is_inexact_array(array) or array.ndim != 1 or not array.size:
+        got = f"shape {array.shape}" if eqx.is_array(array) else repr(pips)
+        raise ValueError(f"{where}: pips must be a vector of pressures, got {got}.")
+    check_real(array, "pips", where)
+    for node in jax.tree.leaves(tree, is_leaf=_is_waveform):
+        if _is_waveform(node) and is_concrete(node.peep):
+            _check_pip(array, np.max(np.asarray(node.peep)), "pips", where)
+    return jnp.asarray(array, float)
+
+
+def _is_waveform(node: Any) -> bool:
+    return isinstance(node, BreathWaveform)
+
+
+def _check_pip(pip: Array, peep: Any, name: str, where: str) -> None:
+    """Raise unless a peak pressure is at least PEEP, as far as can be seen."""
+    check_finite(pip, name, where)
+    if is_concrete(pip) and is_concrete(peep):
+        if not np.all(np.asarray(pip) >= np.asarray(peep)):
+            raise ValueError(
+                f"{where}: {name} must be at least peep = {peep}, got {pip}."
+            )
+
+
 def at_pip(tree: _T, pip: Any) -> _T:
     """A copy in which every breath waveform has that peak pressure.
 
@@ -174,21 +221,18 @@ def at_pip(tree: _T, pip: Any) -> _T:
     """
     found = 0
     pip = as_float_array(pip)
+    if not eqx.is_inexact_array(pip):
+        raise ValueError(f"at_pip: pip must be a number, got {pip!r}.")
 
     def put(node):
         nonlocal found
-        if not isinstance(node, BreathWaveform):
+        if not _is_waveform(node):
             return node
         found += 1
-        if is_concrete(pip) and is_concrete(node.peep):
-            if np.any(np.asarray(pip) < np.asarray(node.peep)):
-                raise ValueError(
-                    f"at_pip: pip must be at least peep = {node.peep}, got {pip}."
-                )
+        _check_pip(pip, node.peep, "pip", "at_pip")
         return eqx.tree_at(lambda w: w.pip, node, pip)
 
-    is_waveform = lambda node: isinstance(node, BreathWaveform)  # noqa: E731
-    tree = jax.tree.map(put, tree, is_leaf=is_waveform)
+    tree = jax.tree.map(put, tree, is_leaf=_is_waveform)
     if not found:
         raise ValueError(
             f"at_pip: there is no BreathWaveform in the {type(tree).__name__}."

@@ -1,0 +1,131 @@
+"""What a peak pressure, a waveform and a stack of lungs may be, wherever they go."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, tolerance, user_error
+
+import delucax as dlx
+from delucax import lung
+
+
+KEY = jax.random.key(0)
+ENV = lung.single_compartment(20.0)
+WAVEFORM = ENV.cost.waveform
+PID = dlx.controllers.LeakyPID(0.5, 1.0, dt=ENV.dt, reference=WAVEFORM)
+MODELS = lung.stack([lung.LungModel(lung.SingleCompartment())])
+
+
+def trained(**options):
+    forward = lung.stack([lung.stack([lung.FeedForward(WAVEFORM)])])
+    return lung.train_controllers(MODELS, forward, key=KEY, steps=1, **options)
+
+
+WITH_PIPS = {
+    "explore": lambda pips: lung.explore(ENV, 1, key=KEY, pips=pips),
+    "breath_error": lambda pips: lung.breath_error(ENV, PID, key=KEY, pips=pips),
+    "pid_grid": lambda pips: lung.pid_grid(ENV, key=KEY, pips=pips),
+    "least_error": lambda pips: lung.least_error(ENV, pips=pips),
+    "train_controllers": lambda pips: trained(pips=pips),
+}
+
+
+@pytest.mark.parametrize("name", WITH_PIPS)
+def test_wrong_peak_pressures_are_named(name):
+    take = WITH_PIPS[name]
+    with user_error(match=rf"{name}: pips must be at least peep = 5.0, got .*3"):
+        take([20.0, 3.0])
+    with user_error(match=f"{name}: pips must be finite"):
+        take([20.0, np.nan])
+    for pips in (20.0, [], "high", [[20.0]]):
+        with user_error(match=f"{name}: pips must be a vector of pressures, got"):
+            take(pips)
+
+
+def test_the_peep_of_every_waveform_counts():
+    high = lung.at_pip(lung.BreathWaveform(peep=12.0), 30.0)
+    pid = dlx.controllers.LeakyPID(0.5, 1.0, dt=ENV.dt, reference=high)
+    with user_error(match="breath_error: pips must be at least peep = 12.0, got .*10"):
+        lung.breath_error(ENV, pid, key=KEY, pips=[10.0])
+    other = lung.single_compartment(waveform=high)
+    with user_error(match="pid_grid: pips must be at least peep = 12.0, got .*10"):
+        lung.pid_grid(lung.stack([ENV, other]), key=KEY, pips=[10.0])
+    for pip in (np.nan, "high"):
+        with user_error(match="at_pip: pip must be"):
+            lung.at_pip(ENV, pip)
+
+
+def test_traced_waveforms_are_taken():
+    def error(peep, pips):
+        env = eqx.tree_at(lambda e: e.cost.waveform.peep, ENV, peep)
+        few = dict(key=KEY, pips=pips, horizon=2)
+        return lung.breath_error(env, dlx.controllers.Zero(1), **few)
+
+    found = jax.jit(error)(jnp.array(4.0), jnp.array([20.0, 30.0]))
+    # At rest at 5 cmH2O with the valve closed.
+    assert_close(found, [15.0, 25.0], atol=tolerance(1e-4, 1e-10))
+
+
+def test_grid_of_a_single_task():
+    few = dict(key=KEY, kp=[0.0, 1.0], ki=[1.0], pips=[20.0])
+    one = lung.pid_grid(ENV, **few)
+    both = lung.pid_grid(lung.stack([ENV]), **few)
+    assert one.errors.shape == (1, 2) and one.best().shape == (1, 3)
+    assert_close(one.errors, both.errors)
+    assert one.gains.tolist() == [[0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]
+
+
+def test_a_stack_is_not_one_task():
+    envs = lung.stack([ENV, ENV])
+    for name, call in {
+        "breath_error": lambda: lung.breath_error(envs, PID, key=KEY),
+        "least_error": lambda: lung.least_error(envs),
+        "explore": lambda: lung.explore(envs, 1, key=KEY),
+    }.items():
+        with user_error(match=f"{name}: env must be one task, got 2 that are stacked"):
+            call()
+
+
+@pytest.mark.parametrize(
+    "kind, make",
+    {
+        "ExpiratoryValve": lung.ExpiratoryValve,
+        "BangBang": lung.BangBang,
+        "FeedForward": lung.FeedForward,
+        "BreathCost": lambda w: lung.BreathCost(w, index=0),
+        "Breathing": lambda w: lung.Breathing(PID, w),
+        "Explorer": lambda w: lung.Explorer(dt=0.03, waveform=w),
+        "BreathPolicy": lambda w: lung.BreathPolicy(w, 0.03, key=KEY),
+        "train_controllers": lambda w: trained(waveform=w),
+        "BreathCost: ": lambda w: lung.single_compartment(waveform=w),
+    }.items(),
+)
+def test_a_waveform_is_one(kind, make):
+    with user_error(match=f"{kind}.*waveform must be a BreathWaveform, got int"):
+        make(3)
+
+
+def test_wrong_numbers_are_named():
+    with user_error(match="levels must be finite"):
+        lung.BreathWaveform(levels=(1.0, 1.0, np.nan, 0.0))
+    with user_error(match="keypoints must be finite"):
+        lung.BreathWaveform(keypoints=(0.0, np.nan, 0.5, 1.0))
+    with user_error(match="kp must be finite"):
+        lung.pid_grid(ENV, key=KEY, kp=[1.0, np.nan])
+    with user_error(match="ki must be numbers, got .."):
+        lung.pid_grid(ENV, key=KEY, ki=[])
+    with user_error(match="noise must be at least 0, got -1"):
+        trained(noise=-1.0)
+    with user_error(match="be LearnedLungs or LungModels that .*stack made"):
+        lung.train_controllers(lung.unstack(MODELS)[0], PID, key=KEY)
+    with user_error(match="breath_error: controller must be an AbstractController"):
+        lung.breath_error(ENV, print, key=KEY)
+    with user_error(match="breath_error: env must be a task with a breath waveform"):
+        lung.breath_error(dlx.make("pendulum"), PID, key=KEY)
+    zeros = np.zeros(40)
+    with user_error(match="u_out must be finite"):
+        lung.segment(zeros, np.where(np.arange(40) == 9, np.nan, 0), zeros, dt=0.03)
+    with user_error(match="dt must be positive"):
+        lung.Breaths(zeros[None], zeros[None], zeros[None], dt=-1.0)
