@@ -13,8 +13,6 @@ Prints tables, writes `benchmarks/results/flight.json` and draws
 written before the first run, and nothing was tuned on these draws.
 """
 
-import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -27,9 +25,8 @@ import pandas as pd
 from jaxtyping import Array
 
 import delucax as dlx
-from benchmarks._machine import describe, limit_cores
 from benchmarks._paired import paired
-from benchmarks._results import updated
+from benchmarks._results import run_in_parts
 
 
 RESULTS = Path(__file__).parent / "results" / "flight.json"
@@ -415,25 +412,7 @@ PARTS = {"figure-eight": figure_eight, "obstacles": obstacles}
 
 def main() -> None:
     """Run, print, write and draw."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.flight")
-    parser.add_argument("--quick", action="store_true", help="small sizes, no file")
-    parser.add_argument("--draw", action="store_true", help="the figure alone, again")
-    parser.add_argument("--part", choices=tuple(PARTS), help="one part alone, again")
-    options = parser.parse_args()
-    if options.draw:
-        draw(json.loads(RESULTS.read_text()))
-        return
-    limit_cores(1)
-    jax.config.update("jax_enable_x64", True)
-    about = {"machine": describe(), "limits": LIMITS}
-    content: dict[str, Any] = {}
-    for name in [options.part] if options.part else list(PARTS):
-        found = {name: PARTS[name](options.quick)}
-        if not options.quick:
-            content = updated(RESULTS, lambda before, found=found: about | found)
-    if all(name in content for name in PARTS):
-        draw(content)
-        print(f"\nwritten: {RESULTS}, {FIGURE}")
+    run_in_parts("flight", PARTS, {"limits": LIMITS}, RESULTS, draw)
 
 
 if __name__ == "__main__":

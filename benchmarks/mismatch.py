@@ -12,9 +12,7 @@ among those reported; the defaults are shown beside them. The limits were writte
 the first run.
 """
 
-import argparse
 import functools
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,9 +27,8 @@ import numpy as np
 import pandas as pd
 
 import delucax as dlx
-from benchmarks._machine import describe, limit_cores
 from benchmarks._paired import middle, paired
-from benchmarks._results import updated
+from benchmarks._results import run_in_parts
 
 
 RESULTS = Path(__file__).parent / "results" / "mismatch.json"
@@ -380,25 +377,9 @@ def draw(content: dict[str, Any]) -> None:
 
 def main() -> None:
     """Run, print, write and draw."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.mismatch")
-    parser.add_argument("--quick", action="store_true", help="small sizes, no file")
-    parser.add_argument("--draw", action="store_true", help="the figure alone, again")
-    parser.add_argument("--part", choices=tuple(LIMITS), help="one task alone, again")
-    options = parser.parse_args()
-    if options.draw:
-        draw(json.loads(RESULTS.read_text()))
-        return
-    limit_cores(1)
-    jax.config.update("jax_enable_x64", True)
-    about = {"machine": describe(), "limits": LIMITS, "settings": SETTINGS}
-    content: dict[str, Any] = {}
-    for name in [options.part] if options.part else list(LIMITS):
-        found = {name: study(name, options.quick)}
-        if not options.quick:
-            content = updated(RESULTS, lambda before, found=found: about | found)
-    if all(name in content for name in LIMITS):
-        draw(content)
-        print(f"\nwritten: {RESULTS}, {FIGURE}")
+    parts = {name: functools.partial(study, name) for name in LIMITS}
+    about = {"limits": LIMITS, "settings": SETTINGS}
+    run_in_parts("mismatch", parts, about, RESULTS, draw)
 
 
 if __name__ == "__main__":
