@@ -168,9 +168,11 @@ def main() -> None:
         write_page(json.loads(RESULTS.read_text()))
         return
     out = Path(options.out)
+    out.mkdir(parents=True, exist_ok=True)
+    # First, for what the study has compiled would take no time.
+    seconds = kept(out / "parts.json", parts)
     rows = lung.lung_study(out, seeds=options.seeds)
     summary = json.loads((out / "summary.json").read_text())
-    seconds = kept(out / "parts.json", parts)
     trained = {
         name: kept(out / f"{name}.json".replace(" ", "_"), lambda way=way: way(5))
         for name, way in WAYS.items()

@@ -241,6 +241,14 @@ def test_ventilator(monkeypatch):
         assert table in page
 
 
+def test_paper(monkeypatch):
+    """The table of the page is that of what is stored."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    made = importlib.import_module("benchmarks.paper")
+    stored = json.loads(made.RESULTS.read_text())
+    assert made.table(stored["claims"]) in made.PAGE.read_text()
+
+
 @thorough
 def test_scoreboard(tmp_path, monkeypatch):
     """The tables of the page are those of what is stored."""

@@ -47,7 +47,7 @@ def _leaves_close(a, b):
         assert_close(p, q, rtol=tolerance(1e-4, 1e-10), atol=tolerance(1e-3, 1e-10))
 
 
-@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit])
+@pytest.mark.parametrize("wrap", [pytest.param(lambda f: f, marks=thorough), jax.jit])
 def test_same_numbers(wrap):
     expected = _everything(*_arguments())
     found = wrap(by_components(_everything))(*_arguments())

@@ -14,7 +14,7 @@ import lineax as lx
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, needs_x32, needs_x64, once, user_error
+from helpers import assert_close, needs_x32, needs_x64, once, thorough, user_error
 from jaxtyping import Array
 
 import delucax as dlx
@@ -157,7 +157,11 @@ def assert_same_leaf(a, b):
         assert a == b
 
 
-@pytest.mark.parametrize("name", THINGS)
+@pytest.mark.parametrize(
+    "name",
+    # A simulated trajectory is one of another making, dear to make.
+    [pytest.param(n, marks=thorough if "simulated" in n else ()) for n in THINGS],
+)
 def test_round_trip_is_exact(name, tmp_path):
     thing = THINGS[name]()
     dlx.save(tmp_path / "thing.dlx", thing)
@@ -168,6 +172,7 @@ def test_round_trip_is_exact(name, tmp_path):
         assert_same_leaf(a, b)
 
 
+@once
 def test_functools_partial(tmp_path):
     dlx.save(tmp_path / "f", functools.partial(jnp.add, jnp.ones(2)))
     again = dlx.load(tmp_path / "f")
@@ -175,6 +180,7 @@ def test_functools_partial(tmp_path):
     assert_close(again(1.0), 2 * np.ones(2))
 
 
+@once
 def test_what_was_loaded_does_not_compile_again(tmp_path):
     traced = []
 
@@ -193,6 +199,7 @@ def test_what_was_loaded_does_not_compile_again(tmp_path):
     assert len(traced) == 2
 
 
+@once
 def test_a_loaded_environment_still_takes_other_parameters(tmp_path):
     dlx.save(tmp_path / "env", ENV)
     longer = dlx.replace(dlx.load(tmp_path / "env"), {"dynamics.system.length": 1.5})
@@ -201,6 +208,7 @@ def test_a_loaded_environment_still_takes_other_parameters(tmp_path):
         dlx.replace(longer, {"dynamics.system.length": -1.0})
 
 
+@once
 def test_static_fields(tmp_path):
     static = Static({"a": (1, "b", None), "f": [double, jnp.tanh, Damper]})
     dlx.save(tmp_path / "static", static)
@@ -209,12 +217,14 @@ def test_static_fields(tmp_path):
     assert jax.tree.structure(again) == jax.tree.structure(static)
 
 
+@once
 def test_compiled_functions(tmp_path):
     """What `eqx.filter_jit` makes of a function is found by its name."""
     dlx.save(tmp_path / "f", compiled)
     assert dlx.load(tmp_path / "f", trust=__name__) is compiled
 
 
+@once
 def test_public_names_are_preferred(tmp_path):
     dlx.save(tmp_path / "f", (PENDULUM, jax.nn.relu, diffrax.Tsit5()))
     text = (tmp_path / "f").read_bytes().decode(errors="replace")
@@ -239,6 +249,7 @@ def renamed_method():
     return Other().applied
 
 
+@once
 @pytest.mark.parametrize(
     "thing, place, remedy",
     [
@@ -258,6 +269,7 @@ def test_what_has_no_name_fails_at_the_save(thing, place, remedy, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@once
 def test_a_name_that_means_another_thing_is_not_written(tmp_path, monkeypatch):
     old = double
     monkeypatch.setattr(sys.modules[__name__], "double", abs)
@@ -265,11 +277,13 @@ def test_a_name_that_means_another_thing_is_not_written(tmp_path, monkeypatch):
         dlx.save(tmp_path / "f", old)
 
 
+@once
 def test_a_lambda_with_a_name_of_its_own(tmp_path):
     dlx.save(tmp_path / "f", halve)
     assert dlx.load(tmp_path / "f", trust=__name__) is halve
 
 
+@once
 def test_traced_values_are_refused(tmp_path):
     def f(x):
         dlx.save(tmp_path / "f", {"x": x})
@@ -282,6 +296,7 @@ def test_traced_values_are_refused(tmp_path):
 # Trust.
 
 
+@once
 def test_own_classes_need_trust(tmp_path):
     dlx.save(tmp_path / "f", Damper(2.0))
     package = __name__.partition(".")[0]
@@ -293,6 +308,7 @@ def test_own_classes_need_trust(tmp_path):
         dlx.load(tmp_path / "f", trust=package[:-1])
 
 
+@once
 def test_what_the_script_defines_is_found(tmp_path, monkeypatch):
     main = sys.modules["__main__"]
     for thing in (double, Damper):
@@ -315,6 +331,7 @@ def forge(path, tree, arrays=()):
     return path
 
 
+@once
 @pytest.mark.parametrize(
     "name",
     [
@@ -338,6 +355,7 @@ def test_a_file_cannot_reach_beyond_what_is_trusted(name, tmp_path):
         dlx.load(forge(tmp_path / "f", {"name": name}))
 
 
+@once
 def test_a_package_that_is_not_trusted_is_not_imported(tmp_path, monkeypatch):
     (tmp_path / "never_imported.py").write_text("raise RuntimeError('imported')")
     monkeypatch.syspath_prepend(tmp_path)
@@ -348,6 +366,7 @@ def test_a_package_that_is_not_trusted_is_not_imported(tmp_path, monkeypatch):
         dlx.load(path, trust="never_imported")
 
 
+@once
 @pytest.mark.parametrize(
     "tree",
     [
@@ -369,6 +388,7 @@ def test_a_forged_structure_is_refused(tree, tmp_path):
 # Versions.
 
 
+@once
 def test_a_class_that_has_changed(tmp_path, monkeypatch):
     module = types.ModuleType("changing_module")
     monkeypatch.setitem(sys.modules, "changing_module", module)
@@ -390,6 +410,7 @@ def test_a_class_that_has_changed(tmp_path, monkeypatch):
         dlx.load(tmp_path / "f", trust=trust)
 
 
+@once
 def test_results_are_kept_by_name(tmp_path):
     """Their numbers change as Diffrax, Lineax and Optimistix add items."""
     dlx.save(tmp_path / "f", dlx.RESULTS.diverged)
@@ -405,6 +426,7 @@ def test_results_are_kept_by_name(tmp_path):
     assert dlx.load(tmp_path / "f") == dlx.RESULTS.diverged
 
 
+@once
 def test_a_newer_version(tmp_path):
     dlx.save(tmp_path / "f", 1)
     content = (
@@ -418,6 +440,7 @@ def test_a_newer_version(tmp_path):
 # Damage.
 
 
+@once
 def test_every_flipped_byte_is_noticed(tmp_path):
     dlx.save(tmp_path / "f", {"x": jnp.arange(3.0)})
     content = (tmp_path / "f").read_bytes()
@@ -429,6 +452,7 @@ def test_every_flipped_byte_is_noticed(tmp_path):
             dlx.load(tmp_path / "f")
 
 
+@once
 @pytest.mark.parametrize("content", [b"", b"\n", b"\x89PNG\r\n", b"delucax-file 1"])
 def test_foreign_files(content, tmp_path):
     (tmp_path / "f").write_bytes(content)
@@ -436,6 +460,7 @@ def test_foreign_files(content, tmp_path):
         dlx.load(tmp_path / "f")
 
 
+@once
 def test_truncated_files(tmp_path):
     dlx.save(tmp_path / "f", jnp.ones(100))
     content = (tmp_path / "f").read_bytes()
@@ -445,6 +470,7 @@ def test_truncated_files(tmp_path):
             dlx.load(tmp_path / "f")
 
 
+@once
 def test_paths(tmp_path):
     with user_error(FileNotFoundError, match=str(tmp_path / "missing")):
         dlx.load(tmp_path / "missing")
@@ -469,6 +495,7 @@ def test_a_folder_that_cannot_be_written_to(tmp_path):
         dlx.save(folder / "f", 1)
 
 
+@once
 def test_the_old_file_survives_a_failed_write(tmp_path, monkeypatch):
     dlx.save(tmp_path / "f", 1)
 
@@ -482,6 +509,7 @@ def test_the_old_file_survives_a_failed_write(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["f"]
 
 
+@once
 def test_the_file_is_readable_as_any_other(tmp_path):
     (tmp_path / "other").touch()
     dlx.save(tmp_path / "f", 1)

@@ -111,22 +111,28 @@ def _examples(doc):
 LONG = {
     f"delucax.{name}"
     for name in """
-    AbstractDisturbance Discretized analysis.DiskMargin analysis.Margins
-    analysis.disk_margin analysis.hinf_norm analysis.margins controllers.Adaptive
-    controllers.DRC controllers.Explore controllers.HInfinity controllers.Hindsight
-    controllers.ILC controllers.OutputFeedback controllers.Scheduled
-    controllers.Standardise controllers.UnscentedKalmanFilter
-    controllers.best_in_hindsight controllers.iGPC controllers.regret
-    controllers.run_filter controllers.smooth d2c environments.cartpole
-    experiments.train_swing_up lung.LearnedLung lung.ShootingMPC lung.explore
-    lung.fit_lungs lung.least_error lung.pid_grid lung.train_controllers
-    lung.write_example planning.Constraints planning.Plan planning.cem planning.ilqr
-    riccati.ContinuousGameSolution riccati.ContinuousHorizonSolution riccati.dre
-    riccati.hinf_care riccati.hinf_cre riccati.hinf_dre simulate
-    training.EvolutionStrategies training.PPO training.SHAC training.analytic
-    training.expected_cost training.fit training.scored_cost
-    training.sysid.Identified training.sysid.PredictionError training.sysid.arx
-    training.sysid.physical training.worst_case
+    AbstractDisturbance analysis.disk_margin analysis.DiskMargin analysis.hinf_norm
+    analysis.Margins analysis.margins c2d controllers.Adaptive
+    controllers.best_in_hindsight controllers.BPC controllers.Categorical
+    controllers.DRC controllers.Explore controllers.ExtendedKalmanFilter
+    controllers.Filtered controllers.FiniteHorizonLQR controllers.FixedPolicy
+    controllers.Gaussian controllers.GPC controllers.Hindsight controllers.HInfinity
+    controllers.iGPC controllers.ILC controllers.KalmanFilter controllers.Linear
+    controllers.LQG controllers.LQI controllers.LQR controllers.lqrd controllers.MLP
+    controllers.MPC controllers.MPCState controllers.online_newton
+    controllers.OutputFeedback controllers.regret controllers.run_filter
+    controllers.Scheduled controllers.smooth controllers.Standardise
+    controllers.UnscentedKalmanFilter d2c Discretized dynamics.WorstCase
+    environments.cartpole environments.cartpole_linear experiments.reproduce
+    experiments.train_swing_up lung.explore lung.fit_lungs lung.LearnedLung
+    lung.least_error lung.pid_grid lung.ShootingMPC lung.train_controllers
+    lung.write_example planning.cem planning.Constraints planning.ilqr planning.Plan
+    plotting.phase_portrait randomise riccati.ContinuousGameSolution
+    riccati.ContinuousHorizonSolution riccati.dre riccati.hinf_care riccati.hinf_cre
+    riccati.hinf_dre simulate training.analytic training.EvolutionStrategies
+    training.expected_cost training.fit training.PPO training.scored_cost
+    training.SHAC training.sysid.arx training.sysid.Identified
+    training.sysid.physical training.sysid.PredictionError training.worst_case
     """.split()
 }
 """Examples that compile for long, beside those of whole packages that do."""

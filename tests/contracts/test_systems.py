@@ -17,7 +17,11 @@ from systems_catalogue import CONSERVED, sample, SYSTEMS
 import delucax as dlx
 
 
-every = pytest.mark.parametrize("name", SYSTEMS)
+every = pytest.mark.parametrize(
+    "name",
+    # "Quadrotor by its wrench" is another form of the same class.
+    [pytest.param(n, marks=thorough if " " in n else ()) for n in SYSTEMS],
+)
 
 
 @functools.cache
@@ -133,14 +137,12 @@ def test_linearisation_is_the_central_difference(name):
     assert_close(model.dx_ref, dx, rtol=1e-12)
 
 
-def resting():
-    for name in SYSTEMS:
-        system = system_of(name)
-        if type(system).equilibrium is not dlx.AbstractSystem.equilibrium:
-            yield name
+# The others rest somewhere.
+NEVER_STILL = ("FunctionSystem", "NeuralSystem")
 
 
-@pytest.mark.parametrize("name", list(resting()))
+@needs_x64
+@pytest.mark.parametrize("name", [n for n in SYSTEMS if n not in NEVER_STILL])
 def test_equilibria_rest(name):
     system = system_of(name)
     x, u = system.equilibrium()
@@ -182,7 +184,7 @@ def gradient_on(name, steps):
     assert_close(ours, theirs, rtol=1e-6)
 
 
-GRADIENTS = ["Reacher", "TwoTank"]
+GRADIENTS = ["TwoTank"]
 
 
 @needs_x64

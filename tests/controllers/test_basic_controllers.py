@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, user_error
+from helpers import assert_close, once, user_error
 
 import delucax as dlx
 
@@ -31,6 +31,7 @@ def test_random_controls(key):
     assert_close(u.std(0), [0.5, 2.0], rtol=0.05)
 
 
+@once
 @pytest.mark.parametrize(
     "make, match",
     [

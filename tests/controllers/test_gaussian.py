@@ -79,7 +79,8 @@ def test_infinite_bounds_are_none(key):
     def both(bounds):
         policy = Gaussian(MEAN, 0.0, bounds=bounds)
         score = lambda p: p.log_prob(0.0, y, state, u)
-        value, gradient = eqx.filter_value_and_grad(score)(policy)
+        slope = eqx.filter_jit(eqx.filter_value_and_grad(score))
+        value, gradient = slope(policy)
         return value, gradient.base.K, gradient.log_std
 
     for bounded, free in zip(both((-jnp.inf, jnp.inf)), both(None), strict=True):
@@ -148,6 +149,7 @@ def test_follows_the_state_of_its_base(key):
     assert_close(policy.total_log_prob(run), total, rtol=tolerance(1e-4, 1e-10))
 
 
+@thorough
 def test_nothing_counts_after_termination(key):
     env = lds(terminated=lambda t, x: t > 4.5)
     policy = Gaussian(MEAN, -1.0)
@@ -217,6 +219,7 @@ def test_score_function_gradient(key):
     assert_close(scored(base.log_std), expected, rtol=0.1)
 
 
+@thorough
 def test_with_the_likelihood_ratio_estimator(key):
     env = lds(control_bounds=BOUNDS)
     policy = Gaussian(MEAN, -0.5, bounds=env.control_bounds)

@@ -53,7 +53,9 @@ def windy():
 
     U = jnp.tile(hover, (100, 1))
     X = dlx.open_loop(env.dynamics, x0, U)
-    plan = dlx.planning.ilqr(env.dynamics, env.cost, x0, U)
+    # A plan of which all that matters is put in below.
+    shape = eqx.filter_eval_shape(dlx.planning.ilqr, env.dynamics, env.cost, x0, U)
+    plan = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
     # Eight iterations of the original's warm-up, which lengthened its step by a tenth
     # each time, and took the one before.
     for i in range(8):

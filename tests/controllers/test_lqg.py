@@ -130,6 +130,7 @@ def test_exact_sensor_is_state_feedback(key):
         assert (lqg.average_cost is None) == (not steady_state)
 
 
+@thorough
 def test_holds_an_operating_point(key):
     """A pendulum leant against a constant torque, its bob seen from the side."""
 

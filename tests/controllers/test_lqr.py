@@ -7,6 +7,7 @@ from helpers import (
     assert_close,
     central_difference,
     needs_x64,
+    once,
     thorough,
     tolerance,
     user_error,
@@ -29,6 +30,7 @@ def test_gain_and_cost_to_go(key):
     assert_close(run.total_cost, x0 @ regulator.P @ x0, rtol=tolerance(1e-5, 1e-12))
 
 
+@needs_x64
 def test_no_neighbouring_gain_is_better(key):
     env = dlx.make("lds", A=A, B=B)
     regulator = dlx.controllers.LQR(env.dynamics, Q, R)
@@ -68,6 +70,7 @@ def test_holds_an_operating_point(key):
     assert_close(run.controls[-1], u, atol=1e-3)
 
 
+@once
 def test_angles_wrap():
     env = dlx.make("pendulum")
     upright = dlx.linearize(env.dynamics)
@@ -114,6 +117,7 @@ def test_gradient_through_the_design(key):
     assert_close(jax.grad(cost)(q), central_difference(cost, q), rtol=1e-6)
 
 
+@once
 def test_no_stabilising_gain():
     unstable = dlx.LinearDynamics(2 * jnp.eye(2), B)
     with pytest.raises(RuntimeError, match="stabilis"):
@@ -123,6 +127,7 @@ def test_no_stabilising_gain():
         eqx.filter_jit(design)(unstable.A)
 
 
+@once
 def test_wrong_arguments():
     dynamics = dlx.LinearDynamics(A, B)
     LQR = dlx.controllers.LQR
@@ -146,6 +151,7 @@ def test_wrong_arguments():
         LQR(dynamics, Q, R)(0.0, jnp.zeros(3), None)
 
 
+@once
 def test_traced_point_that_moves():
     def gain(x_next):
         dynamics = dlx.LinearDynamics(A, B, x_ref=jnp.ones(2), x_next=x_next)

@@ -63,7 +63,7 @@ def _dense_minimum(x0, T, r, v_r, w, final):
     return controls, np.sum((rows @ controls - right) ** 2)
 
 
-@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=thorough)])
 def test_finite_horizon_tracking_is_the_best_of_all_controls(key, parallel):
     T, x0 = 12, jnp.array([1.0, -0.5])
     push = lambda t: 0.2 * jnp.cos(t)[None]
@@ -120,6 +120,7 @@ def test_a_planned_trajectory_needs_no_feed_forward(key):
     assert np.isnan(shorter(10.0, states[0], None)[0])
 
 
+@thorough
 def test_a_long_finite_horizon_is_the_infinite_one():
     long = FiniteHorizonLQR(DYNAMICS, Q, R, S, horizon=150)
     steady = LQR(DYNAMICS, Q, R, S)
@@ -143,6 +144,7 @@ def test_infinite_horizon_feed_forward(preview):
         assert_close(found, expected, rtol=1e-9)
 
 
+@thorough
 def test_feed_forward_helps(key):
     env = dlx.Environment(
         DYNAMICS,
@@ -253,6 +255,7 @@ def test_sampled_weights_are_the_integral():
     assert_close(found, expected, atol=1e-12)
 
 
+@thorough
 def test_sampled_regulator_charges_the_continuous_cost():
     dt, x0 = 0.3, np.array([1.0, -0.4, 0.2])
     controller = dlx.controllers.lqrd(STIFF, Q3, R, dt, S3)

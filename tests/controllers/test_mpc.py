@@ -25,7 +25,9 @@ def regulated(**options):
 
 
 @needs_x64
-@pytest.mark.parametrize("options", [{}, {"finite_difference": 1e-2}])
+@pytest.mark.parametrize(
+    "options", [{}, pytest.param({"finite_difference": 1e-2}, marks=thorough)]
+)
 def test_without_bounds_it_is_the_regulator(options):
     env, lqr = regulated(disturbance=dlx.disturbances.Gaussian(0.05, size=2))
     mpc = MPC(env.dynamics, env.cost, 5, **options)
@@ -59,7 +61,11 @@ def test_a_plan_starts_from_the_last_one():
     [
         pytest.param(dlx.planning.ilqr, dict(max_iterations=5), marks=thorough),
         (dlx.planning.mppi, dict(iterations=2, samples=64, temperature=0.1)),
-        (dlx.planning.cem, dict(iterations=3, samples=32, elites=8)),
+        pytest.param(
+            dlx.planning.cem,
+            dict(iterations=3, samples=32, elites=8),
+            marks=thorough,
+        ),
     ],
     ids=["ilqr", "mppi", "cem"],
 )
@@ -88,12 +94,16 @@ def test_a_cost_that_depends_on_time():
     assert_close(run.states[20:, 0], 0.1 * run.times[20:], atol=0.02)
 
 
-@needs_x64
-def test_a_plan_that_fails_is_seen():
+def explosive():
     field = lambda t, x, u, w: jnp.stack([x[0] ** 3 + u[0]])
     system = dlx.system(field, states=("x",), controls=("u",))
     dynamics = dlx.Discretized(system, dt=0.5)
-    cost = dlx.costs.Quadratic([1.0], [1.0])
+    return dynamics, dlx.costs.Quadratic([1.0], [1.0])
+
+
+@needs_x64
+def test_a_plan_that_fails_is_seen():
+    dynamics, cost = explosive()
     calm = MPC(dynamics, cost, 12, bounds=(-1.0, 1.0), throw=False)
     step = jax.jit(lambda y, state: calm(0.0, y, state))
     u, state = step(jnp.array([0.1]), calm.init())
@@ -106,6 +116,12 @@ def test_a_plan_that_fails_is_seen():
     assert_close(state.controls, calm.start)
     u, state = step(jnp.array([0.1]), state)
     assert state.failures == 1 and state.result == dlx.RESULTS.successful
+
+
+@thorough
+@needs_x64
+def test_a_plan_that_fails_is_an_error():
+    dynamics, cost = explosive()
     loud = MPC(dynamics, cost, 12, bounds=(-1.0, 1.0))
     with pytest.raises(Exception, match="NaN or infinite"):
         jax.block_until_ready(loud(0.0, jnp.array([9.0]), loud.init())[0])

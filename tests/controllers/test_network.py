@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, user_error
+from helpers import assert_close, once, user_error
 
 import delucax as dlx
 
@@ -12,6 +12,7 @@ import delucax as dlx
 MLP, Deep = dlx.controllers.MLP, dlx.controllers.Deep
 
 
+@once
 def test_arithmetic(key):
     policy = MLP(3, 2, width=5, depth=1, key=key)
     y = jnp.array([0.3, -1.0, 2.0])
@@ -37,6 +38,7 @@ def test_squashed_into_bounds(key):
     assert_close(act(1.0), [50.0, -2.0])
 
 
+@once
 def test_deep_fits_the_environment(key):
     env = dlx.make("pendulum")
     policy = Deep(env, width=8, depth=3, key=key)
@@ -50,6 +52,7 @@ def test_deep_fits_the_environment(key):
     assert np.all(np.abs(run.controls) < 2)
 
 
+@once
 def test_deep_heads(key):
     env = dlx.make("pendulum")
     policy = Deep(env, width=8, head="gaussian", key=key)
@@ -70,6 +73,7 @@ def test_deep_heads(key):
     assert np.isfinite(policy.total_log_prob(run))
 
 
+@once
 def test_deep_learns_what_lqr_knows(key):
     A, B = jnp.array([[0.9, 0.3], [0.0, 0.6]]), jnp.array([[0.0], [0.5]])
     env = dlx.make("lds", A=A, B=B, initial_state=jnp.array([1.0, 0.0]))
@@ -81,6 +85,7 @@ def test_deep_learns_what_lqr_knows(key):
     assert loss(fitted.model, key) < 1.01 * best
 
 
+@once
 def test_wrong_arguments(key):
     with user_error(match="in_size must be a whole number of at least 1"):
         MLP(0, 1, key=key)
@@ -100,6 +105,7 @@ def test_wrong_arguments(key):
         Deep(dlx.make("pendulum"), head="softmax", key=key)
 
 
+@once
 @pytest.mark.parametrize("depth", [True, 1.0])
 def test_depth_is_a_whole_number(key, depth):
     with user_error(match="depth must be a whole number"):

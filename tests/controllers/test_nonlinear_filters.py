@@ -24,6 +24,8 @@ c = dlx.controllers
 EKF, UKF = c.ExtendedKalmanFilter, c.UnscentedKalmanFilter
 CLOSE = dict(rtol=1e-10, atol=1e-11)
 both = pytest.mark.parametrize("kind", [EKF, UKF])
+# The extended one is a Kalman filter, whose own tests say the same.
+light = pytest.mark.parametrize("kind", [pytest.param(EKF, marks=thorough), UKF])
 
 
 @pytest.mark.parametrize(
@@ -31,7 +33,7 @@ both = pytest.mark.parametrize("kind", [EKF, UKF])
     [
         (EKF, {}),
         (UKF, {}),
-        (UKF, {"alpha": 0.5, "beta": 1.0, "kappa": 1.0}),
+        pytest.param(UKF, {"alpha": 0.5, "beta": 1.0, "kappa": 1.0}, marks=thorough),
     ],
 )
 def test_is_the_kalman_filter_of_linear_dynamics(kind, options):
@@ -177,7 +179,7 @@ class Wrapped(dlx.AbstractSystem):
         return self.pendulum.difference(x, x_ref)
 
 
-@both
+@light
 def test_angles_wrap(kind):
     """Over the top, the spread of the points and of the record is over the circle."""
     pendulum = dlx.systems.Pendulum()
@@ -255,7 +257,7 @@ def test_solver_that_fails(kind):
     assert np.all(np.isnan(found.predicted.mean[1:]))
 
 
-@both
+@light
 def test_precision_batch_and_file(kind, tmp_path):
     ys = jnp.ones((2, 4, 2), jnp.float32)
     pendulum = dlx.systems.Pendulum()

@@ -170,6 +170,7 @@ def hindsight_policy(A, B, K, w, memory):
     return np.sum((rows @ theta + right) ** 2)
 
 
+@thorough
 def test_defaults_reach_what_is_possible():
     """Under noise, a slow sine and a constant, in any units of cost and disturbance."""
     learner, base = c.GPC(PLANT, COST), c.LQR(PLANT, Q, R)
@@ -298,6 +299,7 @@ def test_births_and_deaths():
         assert np.isclose(weights.sum(), 1)
 
 
+@thorough
 def test_switching_follows_one():
     w = np.random.default_rng(6).normal(size=(100, 2))
     learner = c.Adaptive(c.GPC(PLANT, COST, memory=2), every=5, play="switch")

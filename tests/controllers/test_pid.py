@@ -3,7 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, tolerance, user_error
+from helpers import assert_close, once, tolerance, user_error
 
 import delucax as dlx
 
@@ -69,6 +69,7 @@ def test_integral_removes_the_offset(key):
     assert_close(level(PID(2.0, dt=DT, reference=1.5)), 2.3 / 3, atol=1e-4)
 
 
+@once
 @pytest.mark.parametrize("whose", ["environment", "controller"])
 def test_anti_windup(key, whose):
     # For 10 time units the reference is out of reach, then it is not.
@@ -106,6 +107,7 @@ def test_no_integral_is_wound_by_saturation():
         assert_close(controls[:, 0], [1.0, 1.0, 0.4], rtol=1e-5)
 
 
+@once
 def test_loops_and_outputs():
     y = jnp.array([1.0, 2.0, 3.0])
     u = lambda **options: PID(jnp.array([1.0, 10.0]), dt=DT, **options)
@@ -121,6 +123,7 @@ def test_loops_and_outputs():
     assert_close(act(PID(1.0, dt=DT, output=(0, 1, 2))), [-1.0, -2.0, -3.0])
 
 
+@once
 def test_gains_are_weights(key):
     env = dlx.make("pendulum")
     pid = PID(25.0, 5.0, 5.0, dt=env.dt, output=0)
@@ -178,6 +181,7 @@ def test_leaky_pid_on_the_original_lung():
     assert_close(total, -170.7004493227582, rtol=tolerance(1e-6, 1e-12))
 
 
+@once
 @pytest.mark.parametrize("kind", [PID, LeakyPID])
 def test_wrong_arguments(kind):
     with user_error(match="one entry a loop; got kp of size 2, kd of size 3"):
@@ -213,6 +217,7 @@ def test_wrong_arguments(kind):
         pid(0.0, y, pid.init())
 
 
+@once
 def test_wrong_times():
     with user_error(match="derivative_time_constant must not be negative, got -1"):
         PID(1.0, dt=DT, derivative_time_constant=-1.0)

@@ -1,7 +1,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import assert_close, user_error
+from helpers import assert_close, once, user_error
 
 import delucax as dlx
 
@@ -74,6 +74,7 @@ def test_weights_are_differentiable():
     assert_close(jax.jit(jax.grad(value))(3.0), 2.0)
 
 
+@once
 @pytest.mark.parametrize(
     "make, match",
     [

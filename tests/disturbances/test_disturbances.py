@@ -52,6 +52,7 @@ def test_every_public_disturbance_is_listed():
     assert public <= kinds
 
 
+@once
 def test_deterministic_values():
     t = jnp.array([0.0, 0.25, 0.5, 1.0])
     sine = d.Sinusoid(2.0, frequency=1.0, size=1).sequence(None, t)
@@ -64,6 +65,7 @@ def test_deterministic_values():
     assert_close(recorded[:, 0], [0, 1, 2, 3])
 
 
+@once
 def test_moments(key):
     normal = ALL["gaussian"].sequence(key, TIMES)
     assert_close(normal.mean(axis=0), [0.05, 0.05], atol=0.015)
@@ -77,18 +79,21 @@ def test_moments(key):
     assert np.all(np.abs(walk) <= 1) and np.max(np.abs(np.diff(walk, axis=0))) < 1.5
 
 
+@once
 def test_sum_draws_each_with_its_own_key(key):
     one = d.Gaussian(1.0, size=1)
     both = (one + one).sequence(key, TIMES)
     assert_close(both.std(), np.sqrt(2), rtol=0.05)
 
 
+@once
 @pytest.mark.parametrize("name", ["gaussian", "uniform", "walk", "brownian", "sum"])
 def test_a_seed_for_a_key(name):
     with user_error(match="key must be one random key.*got 0"):
         ALL[name].sequence(0, TIMES)
 
 
+@once
 def test_ends_that_meet_are_legal(key):
     times = TIMES[:3]
     for still in (d.Gaussian(0.0, size=1), d.Uniform(0.0, 0.0, size=1)):
@@ -97,6 +102,7 @@ def test_ends_that_meet_are_legal(key):
     assert np.all(moved == 0)
 
 
+@once
 @pytest.mark.parametrize(
     "make, match",
     [

@@ -88,8 +88,8 @@ class Geometric(dlx.AbstractSystem):
 @pytest.mark.parametrize(
     "solver, stratonovich, order",
     [
-        (diffrax.Euler(), False, 0.5),
-        (diffrax.ItoMilstein(), False, 1.0),
+        pytest.param(diffrax.Euler(), False, 0.5, marks=thorough),
+        pytest.param(diffrax.ItoMilstein(), False, 1.0, marks=thorough),
         (diffrax.StratonovichMilstein(), True, 1.0),
     ],
     ids=["Euler-Maruyama", "Itô-Milstein", "Stratonovich-Milstein"],

@@ -94,7 +94,7 @@ def test_reverse_mode_is_central_differences(name):
     assert_close(found / scale, expected / scale, atol=1e-6)
 
 
-@pytest.mark.parametrize("checkpoint", ["sqrt", None])
+@pytest.mark.parametrize("checkpoint", ["sqrt", pytest.param(None, marks=thorough)])
 def test_checkpoints(checkpoint):
     total, at = _cost(CASES["RK4"](), checkpoint)
     both = jax.jit(jax.value_and_grad(total))

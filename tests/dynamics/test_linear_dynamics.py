@@ -116,6 +116,7 @@ def test_c2d_is_scipys(ours, scipys):
     assert_close(model.B, Bd, atol=tolerance(1e-5, 1e-13))
 
 
+@thorough
 def test_zoh_of_a_linearised_system_is_a_fine_integration():
     system = dlx.systems.Pendulum()
     x, u = jnp.array([0.5, 0.1]), jnp.array([0.3])

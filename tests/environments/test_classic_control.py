@@ -5,7 +5,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, dtype, once, thorough, tolerance, user_error
+from helpers import (
+    assert_close,
+    dtype,
+    needs_x64,
+    once,
+    thorough,
+    tolerance,
+    user_error,
+)
 
 import delucax as dlx
 
@@ -37,6 +45,7 @@ def mountain_car_energy(s, x):
     return (x[1] ** 2 / 2 + s.gravity * jnp.sin(3 * x[0]) / 3) * 3 / s.gravity
 
 
+@needs_x64
 @pytest.mark.parametrize(
     "task, arguments, energy, start, dt",
     [
@@ -74,6 +83,7 @@ def test_energy_is_kept_under_a_solver(task, arguments, energy, start, dt):
     assert_close(found, jnp.full(61, found[0]), atol=tolerance(5e-5, 1e-8))
 
 
+@needs_x64
 def test_the_papers_form_does_not_keep_energy():
     x = jnp.array([1.0, 0.7, 2.0, -1.0])
 
@@ -86,6 +96,7 @@ def test_the_papers_form_does_not_keep_energy():
     assert abs(gain("nips")) > 0.1
 
 
+@needs_x64
 @pytest.mark.parametrize("task", TASKS)
 def test_the_equilibrium_rests(task):
     for env in (dlx.make(task), dlx.make(task, solver=diffrax.Heun())):
@@ -94,6 +105,7 @@ def test_the_equilibrium_rests(task):
         assert_close(moved, jnp.zeros_like(x), atol=tolerance(1e-6, 1e-14))
 
 
+@needs_x64
 @pytest.mark.parametrize("task", TASKS)
 def test_angles_wrap_in_differences(task):
     system = dlx.make(task).dynamics.system
@@ -104,6 +116,7 @@ def test_angles_wrap_in_differences(task):
     )
 
 
+@once
 def test_arguments_reach_the_physics():
     acrobot = dlx.environments.acrobot(
         1.1, 1.2, 1.3, 0.4, 0.6, 0.7, 0.8, 9.0, "nips", dt=0.1, max_velocity_2=5.0
@@ -129,6 +142,7 @@ def test_arguments_reach_the_physics():
         assert_close(found, [0.002, 0.003, 0.1, -2.0, 1.0], rtol=1e-6)
 
 
+@once
 def test_integers_and_numbers_are_actions():
     for task, forces in (("acrobot", [-1, 0, 1]), ("cartpole", [-10, 10])):
         env = dlx.make(task)
@@ -142,6 +156,7 @@ def test_integers_and_numbers_are_actions():
     assert between.control == 3
 
 
+@needs_x64
 def test_linear_cartpole_is_the_papers():
     env = dlx.make("cartpole_linear", cart_mass=2.0, pole_mass=0.5, length=0.8)
     A, B = np.asarray(env.dynamics.A), np.asarray(env.dynamics.B)
@@ -155,6 +170,7 @@ def test_linear_cartpole_is_the_papers():
     assert_close(slope(0.1)[2, 1], 0.02 * 9.81, rtol=1e-6)
 
 
+@once
 def test_linear_cartpole_is_the_nonlinear_one_of_a_point_mass():
     """A rod has 4/3 of the moment of inertia of a point mass at its middle."""
     heavy = 1e6  # so that the cart does not move
@@ -174,6 +190,7 @@ def test_an_lqr_of_the_linearisation_holds_the_pole(key):
     assert np.max(np.abs(run.states[-1])) < 1e-2
 
 
+@needs_x64
 def test_height_cost_has_its_minimum_upright():
     cost = dlx.costs.AcrobotHeight(0.1, 0.2, 3.0)
     u = jnp.zeros(1)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, tolerance
+from helpers import assert_close, needs_x64, once, thorough, tolerance
 
 import delucax as dlx
 
@@ -17,10 +17,10 @@ def gym():
 
 
 @needs_x64
-def test_one_step_agrees_on_many_states(gym):
+@pytest.mark.parametrize("n", [10_000, pytest.param(100_000, marks=thorough)])
+def test_one_step_agrees_on_many_states(gym, n):
     env = dlx.make("pendulum")
     rng = np.random.default_rng(0)
-    n = 100_000
     states = np.stack([rng.uniform(-10, 10, n), rng.uniform(-8, 8, n)], axis=1)
     actions = rng.uniform(-3, 3, (n, 1))
     step = jax.jit(jax.vmap(lambda x, u: env.step(0.0, x, u)))(states, actions)
@@ -40,11 +40,12 @@ def test_one_step_agrees_on_many_states(gym):
 
 
 @needs_x64
-def test_whole_episodes_agree(gym):
+@pytest.mark.parametrize("count", [20, pytest.param(100, marks=thorough)])
+def test_whole_episodes_agree(gym, count):
     env = dlx.make("pendulum")
-    actions = np.random.default_rng(1).uniform(-2, 2, (100, 200, 1))
-    states, totals = np.empty((100, 201, 2)), np.zeros(100)
-    for seed in range(100):
+    actions = np.random.default_rng(1).uniform(-2, 2, (count, 200, 1))
+    states, totals = np.empty((count, 201, 2)), np.zeros(count)
+    for seed in range(count):
         gym.reset(seed=seed)
         states[seed, 0] = gym.state
         for k, u in enumerate(actions[seed]):
@@ -62,6 +63,7 @@ def test_whole_episodes_agree(gym):
     assert_close(runs.total_cost, totals, rtol=1e-6)
 
 
+@once
 def test_start_is_gyms(key):
     env = dlx.make("classic/pendulum")
     x0 = jax.vmap(env.reset)(jax.random.split(key, 2000))
@@ -84,6 +86,7 @@ def test_observation_bounds_are_gyms(gym):
     assert own.observation_bounds[1] == 9
 
 
+@once
 def test_bounds_and_cost(key):
     env = dlx.make("pendulum")
     push = dlx.controllers.Constant(jnp.array([5.0]))
@@ -92,6 +95,7 @@ def test_bounds_and_cost(key):
     assert_close(run.costs[0], 0.25 + 0.001 * 4, rtol=1e-6)
 
 
+@once
 def test_arguments_reach_the_physics():
     env = dlx.environments.pendulum(
         2.0, 1.5, 9.81, 0.1, dt=0.02, horizon=7, max_torque=3.0, max_speed=4.0
@@ -106,6 +110,7 @@ def test_arguments_reach_the_physics():
     assert fast.state[1] == 4.0
 
 
+@needs_x64
 def test_a_solver_swaps_the_arithmetic():
     env = dlx.make("pendulum", solver=diffrax.Tsit5(), substeps=4)
     system = env.dynamics.system
@@ -119,6 +124,7 @@ def test_a_solver_swaps_the_arithmetic():
         dlx.make("pendulum", substeps=2)
 
 
+@once
 @pytest.mark.parametrize(
     "arguments, match",
     [

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import as_a_user, assert_close, tolerance, user_error
+from helpers import as_a_user, assert_close, needs_x64, tolerance, user_error
 
 import delucax as dlx
 from delucax.interop import from_control, to_control
@@ -72,6 +72,7 @@ def test_a_step_that_is_not_given_is_one():
     assert isinstance(model, dlx.LinearDynamics) and model.dt == 1
 
 
+@needs_x64
 def test_the_response_is_the_same():
     model = LinearSystem(A, B, C)
     omegas = np.logspace(-1, 1, 5)

@@ -12,7 +12,14 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from helpers import assert_close, central_difference, needs_x64, once, user_error
+from helpers import (
+    assert_close,
+    central_difference,
+    needs_x64,
+    once,
+    thorough,
+    user_error,
+)
 
 import delucax as dlx
 import delucax.interop.gymnax as interop
@@ -302,6 +309,7 @@ class TestFromGymnax:
         assert_close(jax.grad(total)(at), central_difference(total, at), rtol=1e-6)
 
     @once
+    @thorough
     def test_there_and_back(self):
         example = run_example(from_gymnax)
         env, key = example["env"], KEY

@@ -4,8 +4,8 @@ import csv
 import json
 
 import jax
-import numpy as np
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from helpers import assert_close, once, thorough, user_error
 

@@ -70,6 +70,7 @@ def test_the_published_trace():
     assert plan.rollouts == 33
 
 
+@thorough
 @needs_x64
 def test_the_trace_with_short_steps():
     env, hover = quadrotor()
@@ -89,7 +90,7 @@ def test_the_trace_with_short_steps():
 @pytest.mark.parametrize(
     "options",
     [
-        dict(line_search="parallel"),
+        pytest.param(dict(line_search="parallel"), marks=thorough),
         dict(second_order=True),
         pytest.param(dict(regularise="state"), marks=thorough),
         pytest.param(dict(parallel=True), marks=thorough),

@@ -14,9 +14,6 @@ PLANNERS = {
     "mppi": (dlx.planning.mppi, dict(temperature=0.01)),
     "cem": (dlx.planning.cem, dict()),
 }
-each = pytest.mark.parametrize(
-    "planner, options", list(PLANNERS.values()), ids=list(PLANNERS)
-)
 
 
 def linear():
@@ -26,7 +23,11 @@ def linear():
 
 
 @needs_x64
-@each
+@pytest.mark.parametrize(
+    "planner, options",
+    [PLANNERS["mppi"], pytest.param(*PLANNERS["cem"], marks=thorough)],
+    ids=list(PLANNERS),
+)
 def test_the_minimum_of_a_linear_problem(planner, options):
     problem = linear()
     best = dlx.planning.ilqr(*problem)
@@ -53,7 +54,11 @@ class Cliff(dlx.AbstractCost):
 
 
 @once
-@each
+@pytest.mark.parametrize(
+    "planner, options",
+    [pytest.param(*PLANNERS["mppi"], marks=thorough), PLANNERS["cem"]],
+    ids=list(PLANNERS),
+)
 def test_what_diverges_has_no_part_in_it(planner, options):
     dynamics, _, x0, U = linear()
     plan = planner(dynamics, Cliff(), x0, U, key=KEY, scale=0.2, **options)

@@ -42,10 +42,10 @@ def test_import_loads_no_matplotlib_and_drawing_no_pyplot():
     """)
 
 
-def test_missing_matplotlib_says_how_to_get_it():
+def test_what_is_missing_says_how_to_get_it():
     python("""
         import sys
-        sys.modules["matplotlib"] = None
+        sys.modules["matplotlib"] = sys.modules["pandas"] = None
         import delucax as dlx
 
         for name in ("animate", "plot", "plotting"):
@@ -55,14 +55,7 @@ def test_missing_matplotlib_says_how_to_get_it():
                 assert 'pip install "delucax[plot]"' in str(error), error
             else:
                 raise AssertionError(f"{name} was found")
-    """)
 
-
-def test_missing_pandas_says_how_to_get_it():
-    python("""
-        import sys
-        sys.modules["pandas"] = None
-        import delucax as dlx
         import jax
 
         env, zero = dlx.make("pendulum"), dlx.controllers.Zero(1)

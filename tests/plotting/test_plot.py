@@ -75,6 +75,13 @@ def batch(env, linear):
 
 
 @pytest.fixture(scope="module")
+def drone():
+    low = jnp.array([-1.0, -2.0, -jnp.inf])
+    env = environment_of(Drone(), control_bounds=(low, 3.0))
+    return env, dlx.rollout(env, dlx.controllers.Zero(3), key=jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
 def ending():
     """A batch whose members terminate at different times, each with its length."""
     env = environment_of(
@@ -136,18 +143,15 @@ def test_bounds_are_dashed_where_an_environment_is_given(env, trajectory):
     assert dashed(dlx.plot(trajectory, environment=env)) == [-2.0, 2.0]
 
 
-def test_bounds_of_each_control_of_a_panel(key):
-    low = jnp.array([-1.0, -2.0, -jnp.inf])
-    env = environment_of(Drone(), control_bounds=(low, 3.0))
-    run = dlx.rollout(env, dlx.controllers.Zero(3), key=key)
+def test_bounds_of_each_control_of_a_panel(drone):
+    env, run = drone
     lines = dlx.plot(run, environment=env, show="controls").axes[0].get_lines()
     found = sorted(l.get_ydata()[0] for l in lines if l.get_linestyle() == "--")
     assert found == [-2.0, -1.0, 3.0, 3.0, 3.0]
 
 
-def test_states_that_share_a_unit_share_a_panel(key):
-    run = dlx.rollout(environment_of(Drone()), dlx.controllers.Zero(3), key=key)
-    figure = dlx.plot(run)
+def test_states_that_share_a_unit_share_a_panel(drone):
+    figure = dlx.plot(drone[1])
     assert len(figure.axes) == 6
     for i, unit in enumerate(("[m]", "[rad]", "[m/s]", "[rad/s]", "[N]")):
         ax = figure.axes[i]
@@ -197,9 +201,8 @@ def test_comparison_overlays_with_a_legend(env, trajectory, key):
     assert handles[1].get_color() == data_lines(figure.axes[0])[1].get_color()
 
 
-def test_comparison_has_a_panel_for_each_state(key):
-    run = dlx.rollout(environment_of(Drone()), dlx.controllers.Zero(3), key=key)
-    figure = dlx.plot([run, run])
+def test_comparison_has_a_panel_for_each_state(drone):
+    figure = dlx.plot([drone[1]] * 2)
     assert len(figure.axes) == 12 + 3 + 1
     assert figure.axes[3].get_ylabel() == "angle_x [rad]"
     assert figure.get_supxlabel() == "time [s]"

@@ -1,6 +1,6 @@
 import jax
 import jax.numpy as jnp
-from helpers import assert_close, user_error
+from helpers import assert_close, once, user_error
 
 import delucax as dlx
 
@@ -19,6 +19,7 @@ def test_signals():
     assert_close(eight(1.0), [1 + 2**0.5, 4], atol=1e-5)
 
 
+@once
 def test_bad_arguments():
     with user_error(match="value must be a vector"):
         dlx.references.Constant(1.0)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import assert_close, needs_x64, thorough, tolerance, user_error
+from helpers import assert_close, needs_x64, once, thorough, tolerance, user_error
 
 import delucax as dlx
 
@@ -48,7 +48,7 @@ def test_double_integrator():
 
 
 @needs_x64
-@pytest.mark.parametrize("n, m", [(1, 1), (4, 2)])
+@pytest.mark.parametrize("n, m", [pytest.param(1, 1, marks=thorough), (4, 2)])
 def test_matches_scipy(n, m):
     for seed in range(10):
         A, B, Q, R, S, _ = random_problem(seed, n, m)
@@ -148,6 +148,7 @@ def test_least_energy():
     assert_close(moved, [1 / 2, 1 / 1.5], rtol=tolerance(1e-4, 1e-9))
 
 
+@needs_x64
 def test_free_control():
     # R = 0: one-step dead-beat control of what B reaches.
     solution = dlx.riccati.dare(2 * jnp.eye(2), jnp.eye(2), Q, jnp.zeros((2, 2)))
@@ -185,6 +186,7 @@ def test_one_bad_member_harms_no_other():
     assert_close(shared_beside, shared, rtol=1e-6)
 
 
+@needs_x64
 def test_complex_data():
     turn = np.diag(np.exp([0.3j, -0.4j]))
     plain = dlx.riccati.dare(A, B, Q, R)
@@ -205,6 +207,7 @@ def test_dead_beat_loop_has_a_gradient():
     assert_close(gradient, [[2.0, 2.0], [0.0, 0.0]], atol=1e-12)
 
 
+@once
 @pytest.mark.parametrize(
     "change, match",
     [

@@ -166,7 +166,7 @@ def test_tracks_a_reference():
         x = A @ x + B @ (-K[t] @ x - k[t])
 
 
-@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=thorough)])
 def test_no_minimum(parallel):
     # R + B'XB is negative from the third step back on: 1 - 2, and 1 and 1 before it.
     weights = np.array([1.0, 1.0, -2.0, 1.0, 1.0]).reshape(5, 1, 1)

@@ -56,6 +56,7 @@ def test_dsylvester(a, b):
     assert np.linalg.norm(rest) < 1e-10 * np.linalg.norm(C)
 
 
+@thorough
 def test_large_and_wide():
     rng = np.random.default_rng(1)
     n = 60
@@ -80,6 +81,7 @@ def test_honest_where_it_cannot_be_done():
         solve(both, np.eye(60))
 
 
+@thorough
 def test_complex_data():
     turn = np.diag(np.exp(1j * np.arange(3)))
     stable, weight = A[:3, :3] - 2 * np.eye(3), Q[:3, :3]

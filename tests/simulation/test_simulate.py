@@ -98,7 +98,10 @@ class Told(dlx.AbstractController):
     [
         {"solver": diffrax.Heun(), "substeps": 3},
         {"stepsize_controller": LOOSE},
-        {"stepsize_controller": diffrax.PIDController(1e-4, 1e-6, dtmax=0.006)},
+        pytest.param(
+            {"stepsize_controller": diffrax.PIDController(1e-4, 1e-6, dtmax=0.006)},
+            marks=thorough,
+        ),
     ],
     ids=["fixed", "adaptive", "short steps"],
 )
@@ -114,8 +117,10 @@ def test_switches_are_exact(how):
         assert_close(run.controls, controls)
 
 
-@pytest.mark.parametrize("count", [1, 200])
-@pytest.mark.parametrize("t0, t1", [(0.0, 10.0), (100.0, 101.7), (-0.3, 0.1)])
+@pytest.mark.parametrize(
+    "count, t0, t1",
+    [(1, -0.3, 0.1), (200, 0.0, 10.0), (200, 100.0, 101.7), (200, -0.3, 0.1)],
+)
 def test_interval_of_a_step(count, t0, t1):
     grid = np.linspace(t0, t1, count + 1).astype(dtype())
     switches = jnp.asarray(grid)
@@ -353,7 +358,12 @@ def test_progress_meter(capfd):
     "how, words, at",
     [
         ({}, "NaN or infinite", 0.3),
-        ({"stepsize_controller": LOOSE}, "maximum number of solver steps", None),
+        pytest.param(
+            {"stepsize_controller": LOOSE},
+            "maximum number of solver steps",
+            None,
+            marks=thorough,
+        ),
     ],
 )
 def test_a_failed_solve_raises(how, words, at):

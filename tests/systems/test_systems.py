@@ -3,7 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, dtype, user_error
+from helpers import assert_close, dtype, once, user_error
 
 import delucax as dlx
 
@@ -37,6 +37,7 @@ def test_parameters_are_leaves():
     assert_close(jax.vmap(field)(batch)[:, 1], [-1, -2])
 
 
+@once
 def test_illegal_parameters():
     with user_error(match="Spring: stiffness must be positive, got -1"):
         Spring(-1.0)

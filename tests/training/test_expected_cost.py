@@ -48,6 +48,7 @@ def test_what_the_gradient_stores_does_not_change_it():
         assert_close(gradient, gradients[0], rtol=tolerance(1e-4, 1e-10))
 
 
+@thorough
 def test_a_decay_damps_the_gradient_and_not_the_cost():
     full = analytic(expected_cost(pendulum(), batch=2), CONTROLLER, jr.key(0))
     none = analytic(
@@ -97,6 +98,7 @@ def test_divergence_is_reported_with_its_step():
         )
 
 
+@thorough
 def test_a_failed_solve_makes_the_cost_nan():
     import diffrax
 

@@ -7,7 +7,15 @@ import jax.random as jr
 import numpy as np
 import optax
 import pytest
-from helpers import assert_close, CountCalls, dtype, needs_x64, tolerance, user_error
+from helpers import (
+    assert_close,
+    CountCalls,
+    dtype,
+    needs_x64,
+    once,
+    tolerance,
+    user_error,
+)
 from jaxtyping import Array
 
 import delucax as dlx
@@ -56,10 +64,12 @@ def test_gradient_descent_is_what_is_written_down():
     assert fitted.result == dlx.RESULTS.successful
 
 
+@once
 def test_only_weights_move_by_default():
     assert train(lambda m, key: (m(1.0) - 5.0) ** 2).model.scale == 2.0
 
 
+@once
 def test_the_result_does_not_depend_on_the_block():
     def loss(model, key):
         return (model(jr.normal(key)) - 1.0) ** 2, {"drawn": jr.normal(key)}
@@ -74,6 +84,7 @@ def test_the_result_does_not_depend_on_the_block():
     np.testing.assert_array_equal(runs[0].history["drawn"], np.stack(drawn))
 
 
+@once
 def test_a_second_fit_does_not_compile_again():
     calls = CountCalls()
 
@@ -148,6 +159,7 @@ def test_half_precision_gradients_do_not_overflow_the_norm():
     assert_close(fitted.history.gradient_norm[0], 600.0, rtol=1e-3)
 
 
+@once
 def test_rows_are_drawn_without_replacement():
     data = jnp.arange(10)
 
@@ -163,6 +175,7 @@ def test_rows_are_drawn_without_replacement():
     assert len({tuple(row) for row in counts}) > 3  # another order in each pass
 
 
+@once
 def test_all_rows_without_a_batch_size():
     x = np.linspace(-1, 1, 9)
 
@@ -174,6 +187,7 @@ def test_all_rows_without_a_batch_size():
     assert_close(fitted.model(1.0), 2.0, atol=1e-3)
 
 
+@once
 def test_a_network_with_numpy_leaves_trains():
     model = (eqx.nn.MLP(1, 1, 8, 1, key=jr.key(0)), {"bias": np.zeros(1)})
 
@@ -189,6 +203,7 @@ def test_a_network_with_numpy_leaves_trains():
     assert isinstance(fitted.model[1]["bias"], jax.Array)
 
 
+@once
 @pytest.mark.parametrize(
     "loss,optimiser,what,step",
     [
@@ -215,6 +230,7 @@ def test_what_is_not_finite_stops_the_run(loss, optimiser, what, step):
         assert same_bits(before.model, fitted.model)
 
 
+@once
 def test_callbacks_are_told_of_each_block():
     heard = []
     train(
@@ -233,6 +249,7 @@ def test_callbacks_are_told_of_each_block():
     assert_close(metrics["loss"], 1 + 0.8**18, rtol=1e-5)
 
 
+@once
 def test_the_bar_ticks_once_a_block(capsys):
     train(steps=10, block=5, progress=True)
     assert "10/10" in capsys.readouterr().err
@@ -240,6 +257,7 @@ def test_the_bar_ticks_once_a_block(capsys):
     assert capsys.readouterr().err == ""
 
 
+@once
 def test_the_history_is_a_table():
     history = train(lambda m, key: (m.slope**2, {"x": m.slope}), steps=5).history
     assert len(history) == 5
@@ -258,6 +276,7 @@ def test_optimisers_that_ask_for_the_loss_get_it():
     assert_close(fitted.model.slope, 1.0, atol=tolerance(1e-3, 1e-6))
 
 
+@once
 def test_the_optimiser_sees_values_by_path():
     optimiser = optax.multi_transform(
         {"fast": optax.sgd(0.4), "still": optax.set_to_zero()},
@@ -268,6 +287,7 @@ def test_the_optimiser_sees_values_by_path():
     assert fitted.model.offset == 0.0
 
 
+@once
 def test_any_function_may_be_the_gradient():
     def signs(loss, values, key):
         value, gradient = dlx.training.analytic(loss, values, key)
@@ -279,6 +299,7 @@ def test_any_function_may_be_the_gradient():
         train(gradient=lambda loss, values, key: (jnp.zeros(()), 1.0))
 
 
+@once
 def test_evolution_strategies_train():
     estimator = dlx.training.EvolutionStrategies(0.1, samples=16)
     fitted = train(
@@ -291,6 +312,7 @@ def test_evolution_strategies_train():
     assert_close(fitted.model.offset, -2.0, atol=0.1)
 
 
+@once
 def test_wrong_arguments_are_named():
     data = jnp.ones((4, 2))
     for match, change in (
@@ -312,6 +334,7 @@ def test_wrong_arguments_are_named():
             train(**change)
 
 
+@once
 def test_a_loss_must_return_a_scalar():
     for match, loss in (
         (r"loss must return a scalar, got shape \(2,\)", lambda m, k: jnp.ones(2)),
@@ -328,6 +351,7 @@ def test_a_loss_must_return_a_scalar():
             train(loss)
 
 
+@once
 def test_under_a_transformation_there_is_an_error():
     def trained(slope):
         return train(model=Line(slope=slope)).model.slope
@@ -336,6 +360,7 @@ def test_under_a_transformation_there_is_an_error():
         jax.grad(trained)(1.0)
 
 
+@once
 def test_a_whole_policy_trains_under_fit():
     env = dlx.environments.lds(
         jnp.array([[1.0, 0.1], [0.0, 1.0]]),

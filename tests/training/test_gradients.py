@@ -187,7 +187,7 @@ WEIGHTS = {"b": jnp.asarray(2.0), "w": jnp.array([-1.0, 0.5])}
 EXACT = np.array([6 * 1.5 - 1.0, -4.0 + 2.0, -2.0])  # b, w0, w1
 
 
-@pytest.mark.parametrize("antithetic", [True, False])
+@pytest.mark.parametrize("antithetic", [True, pytest.param(False, marks=thorough)])
 def test_evolution_strategies_are_unbiased_on_a_quadratic(antithetic):
     estimator = EvolutionStrategies(0.5, samples=64, antithetic=antithetic)
     costs, gradients = estimates(estimator, quadratic, WEIGHTS, 4000)

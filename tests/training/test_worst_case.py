@@ -1,5 +1,7 @@
 """Adversaries: one that searches, and one that sees the state."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,19 +19,23 @@ Q, R = np.eye(2), np.eye(1)
 PLANT = dlx.LinearDynamics(A, B)
 COST = dlx.costs.Quadratic(Q, R)
 ENV = dlx.Environment(PLANT, COST, horizon=30)
-LQR = dlx.controllers.LQR(PLANT, Q, R)
 KEY = jax.random.key(0)
 
 
+@functools.cache
+def lqr():
+    return dlx.controllers.LQR(PLANT, Q, R)
+
+
 def cost(w):
-    run = dlx.rollout(ENV, LQR, key=KEY, x0=jnp.zeros(2), w=w, keep=())
+    run = dlx.rollout(ENV, lqr(), key=KEY, x0=jnp.zeros(2), w=w, keep=())
     return run.total_cost
 
 
 @thorough
 def test_no_bounded_sequence_is_worse():
     options = dict(key=KEY, bound=0.5, x0=np.zeros(2))
-    found = dlx.training.worst_case(ENV, LQR, **options)
+    found = dlx.training.worst_case(ENV, lqr(), **options)
     assert_close(np.linalg.norm(found.w, axis=1), 0.5, rtol=1e-12)
     assert np.all(np.diff(found.costs) > -1e-9)
     assert_close(found.total_cost, cost(found.w), rtol=1e-12)
@@ -86,7 +92,7 @@ def test_the_value_of_the_game():
             "bound must be positive",
         ),
         (
-            lambda: dlx.training.worst_case(ENV, LQR, key=KEY, bound=-1.0),
+            lambda: dlx.training.worst_case(ENV, lqr(), key=KEY, bound=-1.0),
             "worst_case: bound must be positive",
         ),
         (
@@ -94,7 +100,7 @@ def test_the_value_of_the_game():
             "controller must be an AbstractController",
         ),
         (
-            lambda: dlx.training.worst_case(ENV, LQR, key=KEY, bound=1.0, x0=[1.0]),
+            lambda: dlx.training.worst_case(ENV, lqr(), key=KEY, bound=1.0, x0=[1.0]),
             r"x0 must have shape \(2,\)",
         ),
     ],

@@ -65,7 +65,11 @@ def make_pid(gains: Any, kind: str, dt: Any, waveform: Any) -> LeakyPID | PID:
 
 
 @eqx.filter_jit
-def _errors(envs, gains, pips, key, kind):
+def _searched(envs, lists, pips, key, kind):
+    """All combinations of the lists of gains, and the error of each in each lung."""
+    lists = [jnp.ravel(values).astype(float) for values in lists]
+    gains = jnp.stack(jnp.meshgrid(*lists, indexing="ij"), -1).reshape(-1, 3)
+
     def in_lung(env):
         def one(gains):
             pid = make_pid(gains, kind, env.dt, env.cost.waveform)
@@ -73,7 +77,7 @@ def _errors(envs, gains, pips, key, kind):
 
         return jax.vmap(one)(gains)
 
-    return eqx.filter_vmap(in_lung)(envs)
+    return gains, eqx.filter_vmap(in_lung)(envs)
 
 
 def pid_grid(
@@ -126,10 +130,9 @@ def pid_grid(
         if not eqx.is_inexact_array(array) or not array.size:
             raise ValueError(f"{where}: {name} must be numbers, got {values!r}.")
         check_finite(array, name, where)
-        lists.append(jnp.ravel(array).astype(float))
-    gains = jnp.stack(jnp.meshgrid(*lists, indexing="ij"), -1).reshape(-1, 3)
+        lists.append(array)
     envs = envs if jnp.ndim(envs.dt) else stack([envs])
-    return PIDGrid(gains, _errors(envs, gains, pips, key, kind), kind)
+    return PIDGrid(*_searched(envs, lists, pips, key, kind), kind)
 
 
 def least_error(
