@@ -14,7 +14,6 @@ from .._results import RESULTS
 from .._typing import PRNGKey
 from ..dynamics import AbstractDynamics
 from ._data import Breaths
-from ._networks import run_mlp
 
 
 class LearnedLung(AbstractDynamics):
@@ -189,20 +188,23 @@ class LearnedLung(AbstractDynamics):
     def observe(self, t, x):
         return jnp.reshape(self.pressure(x), (1,)).astype(x.dtype)
 
-    def _late(self, controls: Array, pressures: Array) -> Array:
-        """The next pressure, after the first steps."""
-        controls = controls[: self.u_window]
+    def _straight(self, controls: Array) -> Array:
+        """Controls as the network of the later steps is given them."""
         if self.published:
-            z = jnp.concatenate([controls, pressures[: self.p_window]])
-            return run_mlp(self.network, z)
-        valve = lambda u: run_mlp(self.valve, u[None])  # noqa: E731
-        straight = controls + jax.vmap(valve)(controls)
+            return controls
+        return controls + jax.vmap(self.valve)(controls)
+
+    def _late(self, straight: Array, pressures: Array) -> Array:
+        """The next pressure, after the first steps."""
         z = jnp.concatenate([straight, pressures[: self.p_window]])
-        return pressures[0] + jnp.sum(self.line * z) + run_mlp(self.network, z)
+        found = self.network(z)
+        if self.published:
+            return found
+        return pressures[0] + self.line @ z + found
 
     def _early(self, history: Array, late: Any, hidden: Array, output: Array) -> Array:
         """The next pressure in one of the first steps; `late` is that afterwards."""
-        own = jnp.sum(output * jnp.tanh(jnp.sum(hidden * history, axis=1)))
+        own = output @ jnp.tanh(hidden @ history)
         return own if self.published else own + late
 
     def _bound(self, pressure: Array) -> Array:
@@ -216,7 +218,7 @@ class LearnedLung(AbstractDynamics):
         controls, pressures = jnp.concatenate([control, x[: n - 1]]), x[n : 2 * n]
         step, first = x[2 * n], self.hidden.shape[0]
         i = jnp.clip(jnp.round(step), 0, first - 1).astype(int)
-        late = self._late(controls, pressures)
+        late = self._late(self._straight(controls[: self.u_window]), pressures)
         history = jnp.concatenate([controls, pressures])
         early = self._early(history, late, self.hidden[i], self.output[i])
         predicted = self._bound(jnp.where(step < first - 0.5, early, late))
@@ -250,41 +252,51 @@ class LearnedLung(AbstractDynamics):
         return self._predicted(u_in, (pressure - self.p_mean) / self.p_std)
 
     def _predicted(self, u_in: Array, recorded: Array | None) -> Array:
-        """As `advance` would, step by step, but that the count of steps is known: so no
-        step of a batch has to gather weights, or to compute both kinds of networks."""
-        n, first = self.window, min(self.hidden.shape[0], u_in.shape[0] - 1)
+        """As `advance` would, but all that is known before is computed at once: the
+        windows of controls, which network a step takes, and with records every step."""
+        n, last = self.window, u_in.shape[0] - 1
+        first = min(self.hidden.shape[0], last)
         x0 = self.resting().astype(u_in.dtype)
         u = (u_in - self.u_mean) / self.u_std
         before = jnp.zeros(n - 1) if self.published else x0[: n - 1]
         u = jnp.concatenate([before.astype(u.dtype), u])
-        windows = jnp.stack([u[n - 1 - i : u.shape[0] - i] for i in range(n)], axis=1)
-
-        def step(pressures, inputs, predict):
-            controls, shown = inputs
-            if shown is not None:
-                pressures = jnp.concatenate([jnp.reshape(shown, (1,)), pressures[1:]])
-            after = self._bound(predict(controls, pressures))
-            return jnp.concatenate([jnp.reshape(after, (1,)), pressures[:-1]]), after
-
-        shown = [None, None]
-        if recorded is not None:
-            shown = [recorded[:first], recorded[first:-1]]
+        controls = _windows(u, n)[:-1]
+        straight = _windows(self._straight(u), n)[:-1, : self.u_window]
+        weights = self.hidden[:first], self.output[:first]
 
         def begin(pressures, inputs):
-            *inputs, hidden, output = inputs
+            controls, straight, hidden, output = inputs
+            late = 0.0 if self.published else self._late(straight, pressures)
+            history = jnp.concatenate([controls, pressures])
+            return self._bound(self._early(history, late, hidden, output))
 
-            def predict(controls, pressures):
-                late = 0.0 if self.published else self._late(controls, pressures)
-                history = jnp.concatenate([controls, pressures])
-                return self._early(history, late, hidden, output)
+        def go_on(pressures, straight):
+            return self._bound(self._late(straight, pressures))
 
-            return step(pressures, inputs, predict)
+        inputs = controls[:first], straight[:first], *weights
+        start = x0[n : 2 * n]
+        if recorded is None:
 
-        weights = self.hidden[:first], self.output[:first]
-        inputs = (windows[:first], shown[0], *weights)
-        pressures, early = jax.lax.scan(begin, x0[n : 2 * n], inputs)
-        inputs = windows[first : u_in.shape[0] - 1], shown[1]
-        go_on = lambda carry, inputs: step(carry, inputs, self._late)  # noqa: E731
-        _, late = jax.lax.scan(go_on, pressures, inputs)
-        found = jnp.concatenate([x0[n : n + 1], early, late])
+            def scan(step, pressures, inputs):
+                def body(pressures, inputs):
+                    after = step(pressures, inputs)
+                    return jnp.append(after, pressures[:-1]), after
+
+                return jax.lax.scan(body, pressures, inputs)
+
+            pressures, early = scan(begin, start, inputs)
+            _, late = scan(go_on, pressures, straight[first:])
+        else:
+            known = _windows(jnp.append(start[:0:-1], recorded), n)[:-1]
+            early = jax.vmap(begin)(known[:first], inputs)
+            late = jax.vmap(go_on)(known[first:], straight[first:])
+        found = jnp.concatenate([start[:1], early, late])
         return self.p_mean + self.p_std * found
+
+
+def _windows(values: Array, size: int) -> Array:
+    """The last so many values at each of the times that have as many before them,
+    newest first."""
+    count = values.shape[0] - size + 1
+    shifts = [values[size - 1 - i : size - 1 - i + count] for i in range(size)]
+    return jnp.stack(shifts, axis=1)

@@ -15,7 +15,6 @@ from .._typing import PRNGKey
 from ..dynamics import Discretized
 from ._environment import PressureSensor
 from ._lungs import AbstractLung, SingleCompartment
-from ._networks import run_mlp
 from ._valves import Valves
 
 
@@ -253,7 +252,7 @@ class GreyBoxLung(AbstractLung):
         return jnp.stack([x[0], inside / self.p_std, x[3]])
 
     def pressure(self, x):
-        rest = run_mlp(self.network, self._inputs(x))
+        rest = self.network(self._inputs(x))
         return self.single.pressure(x[:3]) + self.p_std * rest
 
     def outflow(self, x):
@@ -265,5 +264,5 @@ class GreyBoxLung(AbstractLung):
 
     def vector_field(self, t, x, u, w):
         physical = self.single.vector_field(t, x[:3], u, w)
-        memory = self.rate * run_mlp(self.memory, self._inputs(x))
+        memory = self.rate * self.memory(self._inputs(x))
         return jnp.concatenate([physical, jnp.reshape(memory, (1,))])

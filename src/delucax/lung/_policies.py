@@ -13,7 +13,6 @@ from .._controller import AbstractController
 from .._fields import as_module, parameter, positive, weight
 from .._typing import PRNGKey
 from ..math import clip
-from ._networks import run_mlp
 from ._waveform import BreathWaveform, check_waveform
 
 
@@ -295,7 +294,7 @@ class BreathPolicy(AbstractController):
             windows = [means[i : self.errors - 4 + i] for i in range(5)]
             seen = jnp.ravel(jnp.maximum(0, jnp.stack(windows, 1) @ self.convolution))
         z = jnp.concatenate([seen, targets, state.controls]).astype(y.dtype)
-        u = 100 * jax.nn.sigmoid(run_mlp(self.network, z) + self.shift)
+        u = 100 * jax.nn.sigmoid(self.network(z) + self.shift)
         after = state._replace(errors=errors.astype(state.errors.dtype))
         return jnp.reshape(u, (1,)).astype(y.dtype), after
 
