@@ -7,7 +7,7 @@ from helpers import once, user_error
 from matplotlib.figure import Figure
 
 from delucax import experiments
-from delucax.experiments.paper import _reproduce, STUDIES
+from delucax.experiments.paper import _policy_gradient, _reproduce, STUDIES
 from delucax.experiments.paper._finding import Claim, Finding
 
 
@@ -69,3 +69,14 @@ def test_small_and_full_lungs_are_apart(tmp_path, studies):
 def test_unknown_studies_are_named(tmp_path):
     with user_error(match=f"among {', '.join(STUDIES)}; got 'lungs'"):
         experiments.reproduce("lungs", tmp_path)
+    with user_error(match="got 'nope'"):  # before all of them are begun
+        experiments.reproduce(["all", "nope"], tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_paper_is_judged_at_its_own_rate():
+    claim = _policy_gradient.descent_claim(182, 108)
+    assert not claim.holds
+    assert claim.measured == "182 rollouts at the paper's rate 0.01 (108 at 0.02)"
+    assert _policy_gradient.descent_claim(120, None).holds
+    assert not _policy_gradient.descent_claim(None, 90).holds

@@ -71,11 +71,7 @@ def policy_gradient(small: bool = False) -> Finding:
             )
     least = min(fewest) if fewest else None
     claims = [
-        Claim(
-            "Gradient descent through the rollout reaches cost 2.0 within 120 rollouts",
-            f"{first} rollouts at the paper's rate {RATE}, {faster} at {TWICE}",
-            min(first or np.inf, faster or np.inf) <= 120,
-        ),
+        descent_claim(first, faster),
         Claim(
             "Evolution strategies need more rollouts at every setting and seed",
             f"{reached} of {total} runs get there"
@@ -112,6 +108,16 @@ def policy_gradient(small: bool = False) -> Finding:
         {"Rollouts to cost 2.0": rows},
         {"policy_gradient": figure},
         notes,
+    )
+
+
+def descent_claim(first: int | None, faster: int | None) -> Claim:
+    """Judged at the paper's rate; what twice the rate brings is said beside it."""
+    return Claim(
+        "Gradient descent through the rollout reaches cost 2.0 within 120 rollouts",
+        f"{first or 'Never, in'} rollouts at the paper's rate {RATE} "
+        f"({faster or 'never'} at {TWICE})",
+        first is not None and first <= 120,
     )
 
 

@@ -78,13 +78,13 @@ def reproduce(
     pd = extra("pandas", "reproduce")
     extra("matplotlib", "reproduce").use("agg")
     chosen = [names] if isinstance(names, str) else list(names)
-    chosen = list(STUDIES) if "all" in chosen else chosen
     for name in chosen:
-        if name not in STUDIES:
+        if name != "all" and name not in STUDIES:
             raise ValueError(
                 f"reproduce: names must be 'all' or among {', '.join(STUDIES)}; got "
                 f"{name!r}."
             )
+    chosen = list(STUDIES) if "all" in chosen else chosen
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     sections, rows, begun = [], [], time.perf_counter()
