@@ -87,6 +87,28 @@ def test_workers_give_the_same_and_their_death_harms_no_other(file, capfd):
     assert "8 cases in both.jsonl" in out.out
 
 
+@thorough
+def test_fixtures_of_workers_are_let_go_with_the_run(tmp_path):
+    folder = str(tmp_path)
+
+    @experiment.fixture(scope="process")
+    def camera(place):
+        yield place
+        Path(folder, place).write_text(str(os.getpid()))
+        raise OSError("no such camera")
+
+    @experiment.use(camera=camera)
+    @experiment.parametrize("place", ["here", "there"])
+    def look(camera):
+        return os.getpid()
+
+    for _ in range(2):  # and the next run finds workers again
+        found = look.run(workers=2, progress=False)
+        gone = {path.name: int(path.read_text()) for path in tmp_path.iterdir()}
+        assert gone == {row["place"]: row["value"] for row in found.rows}
+        assert os.getpid() not in gone.values()
+
+
 def test_what_cannot_be_sent_is_an_error():
     lock = __import__("threading").Lock()
 
@@ -263,14 +285,20 @@ def test_two_processes_agree_with_one():
 
 DASK = """
 import os, signal, threading, time
+from pathlib import Path
 from dask.distributed import Client, LocalCluster
 from delucax import experiments
 from delucax.experiments import experiment
 
+@experiment.fixture(scope="process")
+def power():
+    yield 2
+    Path(f"{os.getpid()} let go").touch()
+
 @experiment.parametrize("n", range(60))
-def work(n):
+def work(n, power):
     time.sleep(0.05)
-    return n * n
+    return n ** power
 
 if __name__ == "__main__":
     with LocalCluster(
@@ -283,6 +311,7 @@ if __name__ == "__main__":
         threading.Thread(target=kill, daemon=True).start()
         options = dict(workers=2, backend="dask", progress=False)
         found = work.run(store="dask.jsonl", **options)
+        assert list(Path().glob("* let go"))
     assert [row["value"] for row in found.rows] == [n * n for n in range(60)]
     lines = open("dask.jsonl").read().count('"kind":"case"')
     print(lines)

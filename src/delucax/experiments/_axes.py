@@ -126,9 +126,9 @@ def _ids(found: list[Param], names: tuple, ids: Any, where: str) -> tuple[str, .
         )
         labels.append(value.id or (ids[k] if ids is not None else auto))
     if len(set(labels)) < len(labels):
-        repeated = next(label for label in labels if labels.count(label) > 1)
-        if ids is not None:
-            raise ValueError(f"{where}: the id {repeated!r} is given twice.")
+        for label, value in zip(labels, found, strict=True):
+            if labels.count(label) > 1 and (ids is not None or value.id is not None):
+                raise ValueError(f"{where}: the id {label!r} is given twice.")
         labels = [
             f"{label}{labels[:k].count(label)}" if labels.count(label) > 1 else label
             for k, label in enumerate(labels)

@@ -7,6 +7,7 @@ import os
 import threading
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -92,9 +93,18 @@ class Runner:
         )
 
     def close(self) -> None:
-        """Let the fixtures of the process go."""
-        self.closing.close()
+        """Let the fixtures of the process go; one that fails harms no result."""
         self.shared.clear()
+        try:
+            self.closing.close()
+        except KeyboardInterrupt:
+            raise
+        except BaseException as raised:
+            warnings.warn(
+                f"{self.plan.name}: a fixture of the process could not be let go: "
+                f"{type(raised).__name__}: {raised}",
+                stacklevel=2,
+            )
 
     def _arguments(self, index: tuple[int, ...], stack: Any) -> dict[str, Any]:
         given: dict[str, Any] = {}

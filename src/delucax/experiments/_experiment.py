@@ -13,7 +13,7 @@ import numpy as np
 from ._axes import Axis, axis_of, hashes_of, Mark, Marks, Param, shown_values
 from ._hash import fingerprint
 from ._provenance import version
-from ._select import selector
+from ._select import selector, words
 
 
 _SCOPES = ("case", "process")
@@ -174,7 +174,7 @@ class Experiment:
         axes, where = self.all_axes(), self.name
         chosen = selector(select, "select", where)
         marked = selector(marks, "marks", where)
-        slow = slow or "slow" in marks.split()
+        slow = slow or "slow" in words(marks)
         code = self._code()
         hashes = [hashes_of(axis, where) for axis in axes]
         shown = [shown_values(axis) for axis in axes]
@@ -242,10 +242,11 @@ class Experiment:
         for fixture in fixtures.values():
             taken |= {*inspect.signature(fixture.function).parameters} - {"param"}
         names = [name for axis in self.axes for name in axis.names]
+        any_name = any(p.kind is p.VAR_KEYWORD for p in arguments.values())
         for name in names:
             if name in RESERVED or name in ("key", "versions"):
                 raise ValueError(f"{where}: no parameter can be called {name!r}.")
-            if name not in taken:
+            if name not in taken and not any_name:
                 close = difflib.get_close_matches(name, taken, n=3) or sorted(taken)
                 raise ValueError(
                     f"{where}: the function has no argument {name!r}; did you mean "

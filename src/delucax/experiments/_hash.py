@@ -1,13 +1,13 @@
 """What a case depends on, in one hash: its code and the values of its parameters."""
 
 import ast
+import copyreg
 import dataclasses
 import enum
 import functools
 import hashlib
 import inspect
 import os
-import pickle
 import re
 import sys
 import sysconfig
@@ -30,8 +30,8 @@ def fingerprint(value: Any, *, root: str | None = None) -> str:
 
     A function is its source without comments, docstring and decorators, what it closes
     over, and the functions, classes and values that it names, as long as they are the
-    user's own: libraries count by their names alone. `root` is a module whose code
-    counts although it is a library's.
+    user's own: libraries count by their names alone. An object is what it holds and the
+    code of its class. `root` is a module whose code counts although it is a library's.
 
     **Raises:** `TypeError` if something in it has no content to tell it by.
     """
@@ -52,6 +52,11 @@ def is_library(module: str | None) -> bool:
     file = getattr(loaded, "__file__", None)
     if file is None:
         return True
+    return _installed(file)
+
+
+@functools.cache
+def _installed(file: str) -> bool:
     file = os.path.realpath(file)
     return "site-packages" in file or file.startswith(_STANDARD + os.sep)
 
@@ -60,7 +65,15 @@ class _Hasher:
     def __init__(self, root: str | None):
         self.sha = hashlib.sha256()
         self.root = root
-        self.seen: set[int] = set()
+        # What was met, with its number; held, so that no other gets its id.
+        self.seen: dict[int, tuple[int, Any]] = {}
+
+    def meet(self, thing: Any) -> bool:
+        """Whether it is met for the first time."""
+        if id(thing) in self.seen:
+            return False
+        self.seen[id(thing)] = len(self.seen), thing
+        return True
 
     def own(self, module: str | None) -> bool:
         return module == self.root or not is_library(module)
@@ -74,20 +87,29 @@ class _Hasher:
         kind = type(value)
         if value is None or kind in (bool, int, float, complex, str, bytes, range):
             self.word(kind.__name__, repr(value))
-        elif isinstance(value, jax.Array | np.ndarray | np.generic):
+            return
+        # One of the user's is more than the list or the mapping that it also is.
+        own = self.own(kind.__module__)
+        if isinstance(value, jax.Array | np.ndarray | np.generic):
             self.array(value)
-        elif isinstance(value, Mapping):
+        elif isinstance(value, enum.Enum):
+            self.type(kind)
+            self.word(value.name)
+            self.lenient(value.value)
+        elif isinstance(value, Mapping) and not own:
             self.word("mapping", len(value))
             for _, key in sorted((repr(key), key) for key in value):
                 self.feed(key)
                 self.feed(value[key])
         elif isinstance(value, set | frozenset):
+            if own:
+                self.type(kind)
             self.word("set", *sorted(fingerprint(member) for member in value))
-        elif isinstance(value, list | tuple):
+        elif isinstance(value, list | tuple) and not own:
             self.word(kind.__name__, len(value))
             for member in value:
                 self.feed(member)
-        elif isinstance(value, enum.Enum | np.dtype | os.PathLike):
+        elif isinstance(value, np.dtype | os.PathLike) and not own:
             self.word(kind.__qualname__, value)
         elif isinstance(value, functools.partial):
             self.word("partial")
@@ -102,8 +124,8 @@ class _Hasher:
             self.type(value)
         elif isinstance(value, types.ModuleType):
             self.module(value)
-        elif hasattr(value, "__wrapped__"):
-            self.feed(value.__wrapped__)
+        elif not own and hasattr(value, "__wrapped__"):
+            self.feed(value.__wrapped__)  # type: ignore
         elif dataclasses.is_dataclass(value):
             self.feed(kind)
             for field in dataclasses.fields(value):
@@ -118,14 +140,15 @@ class _Hasher:
             value = jax.random.key_data(value)
         content = np.asarray(value)
         if content.dtype == object:
-            raise TypeError("an array of objects")
+            self.word("objects", content.shape)
+            self.feed(content.ravel().tolist())
+            return
         self.word("array", content.dtype, content.shape, content.tobytes())
 
     def function(self, f: types.FunctionType) -> None:
         self.word("function", f.__qualname__)
-        if id(f) in self.seen:
+        if not self.meet(f):
             return
-        self.seen.add(id(f))
         names: set[str] = set()
         if self.own(f.__module__):
             self.word(source_of(f))
@@ -133,38 +156,47 @@ class _Hasher:
         else:
             self.word(f.__module__)
         self.feed([f.__defaults__, f.__kwdefaults__])
-        for cell in f.__closure__ or ():
-            try:
-                self.lenient(cell.cell_contents)
-            except ValueError:  # not yet set
-                self.word("empty")
+        self.closure(f)
         for name in sorted(names):
             if name in f.__globals__:
                 self.word(name)
                 self.lenient(f.__globals__[name])
 
+    def closure(self, f: types.FunctionType) -> None:
+        for cell in f.__closure__ or ():
+            try:
+                self.lenient(cell.cell_contents)
+            except ValueError:  # not yet set
+                self.word("empty")
+
     def lenient(self, value: Any) -> None:
         """A value that the code names: one without content counts by its type."""
         if id(value) in self.seen:
             return
-        before = self.sha.copy()
+        before, met = self.sha.copy(), len(self.seen)
         try:
             self.feed(value)
         except (TypeError, RecursionError):
             self.sha = before
+            while len(self.seen) > met:
+                self.seen.popitem()
             self.word("thing", type(value).__qualname__)
+            if self.own(type(value).__module__):
+                self.type(type(value))
 
     def type(self, cls: type) -> None:
         self.word("type", cls.__module__, cls.__qualname__)
-        if self.own(cls.__module__) and id(cls) not in self.seen:
-            self.seen.add(id(cls))
+        if self.own(cls.__module__) and self.meet(cls):
             try:
                 source = _plain(inspect.getsource(cls))
+                if not source.startswith(f"class {cls.__name__}"):
+                    raise OSError("another piece of the file")
             except (OSError, TypeError, SyntaxError):
                 for name, member in sorted(vars(cls).items()):
-                    if isinstance(member, types.FunctionType):
+                    code = _functions(member)
+                    if code or not name.startswith("__"):
                         self.word(name)
-                        self.function(member)
+                        self.lenient(code or member)
             else:
                 self.word(source)
                 # What its methods name; they may be wrapped, and are read as text.
@@ -174,13 +206,15 @@ class _Hasher:
                 for name in sorted(named & scope.keys()):
                     self.word(name)
                     self.lenient(scope[name])
+                for member in vars(cls).values():
+                    for f in _functions(member):
+                        self.closure(f)
             for base in cls.__bases__:
                 self.type(base)
 
     def module(self, module: types.ModuleType) -> None:
         self.word("module", module.__name__)
-        if self.own(module.__name__) and id(module) not in self.seen:
-            self.seen.add(id(module))
+        if self.own(module.__name__) and self.meet(module):
             try:
                 self.word(_plain(inspect.getsource(module)))
             except (OSError, TypeError, SyntaxError):
@@ -198,13 +232,49 @@ class _Hasher:
         leaves, structure = jax.tree.flatten(value)
         if not (len(leaves) == 1 and leaves[0] is value):
             self.word("tree", _ADDRESS.sub("", str(structure)))
+            self.nodes(structure)
             self.feed(leaves)
             return
+        kind = type(value)
+        if not self.meet(value):
+            self.word("again", self.seen[id(value)][0])
+            return
+        # What pickle would write, and the code of whatever is in there.
+        reduce = copyreg.dispatch_table.get(kind)
         try:
-            content = pickle.dumps(value, protocol=4)
+            parts: Any = value.__reduce_ex__(4) if reduce is None else reduce(value)
         except Exception as error:
-            raise TypeError(f"a {type(value).__name__}, which {error}") from error
-        self.word(type(value).__qualname__, content)
+            raise TypeError(f"a {kind.__name__}, which {error}") from error
+        self.type(kind)
+        if isinstance(parts, str):
+            self.word(parts)
+            return
+        for k, part in enumerate(parts):
+            # The fourth and fifth run over members of lists and of dictionaries.
+            self.feed(list(part) if k in (3, 4) and part is not None else part)
+
+    def nodes(self, structure: Any) -> None:
+        """The classes of the nodes of a tree, and what these hold beside leaves."""
+        found = structure.node_data()
+        if found is not None:
+            kind, beside = found
+            if isinstance(kind, type) and self.own(kind.__module__):
+                self.type(kind)
+                self.lenient(beside)
+        for child in structure.children():
+            self.nodes(child)
+
+
+def _functions(member: Any) -> list[types.FunctionType]:
+    """The functions of a member of a class: a method, a property or the like."""
+    if isinstance(member, staticmethod | classmethod):
+        member = member.__func__
+    found = [member]
+    if isinstance(member, property):
+        found = [member.fget, member.fset, member.fdel]
+    elif isinstance(member, functools.cached_property):
+        found = [member.func]
+    return [f for f in found if isinstance(f, types.FunctionType)]
 
 
 def source_of(f: types.FunctionType) -> str:

@@ -45,7 +45,8 @@ def device() -> str:
 
 
 def _git(folder: Path) -> tuple[str | None, bool | None]:
-    """The commit and whether files differ from it; nothing outside a repository."""
+    """The commit, and whether files differ from it or Python files are not in it at
+    all; nothing outside a repository. Other new files may be what a run wrote."""
 
     def ask(*words: str) -> str:
         done = subprocess.run(
@@ -60,6 +61,9 @@ def _git(folder: Path) -> tuple[str | None, bool | None]:
 
     try:
         commit = ask("rev-parse", "HEAD")
-        return commit, bool(ask("status", "--porcelain", "--untracked-files=no"))
+        found = ask("status", "--porcelain", "--untracked-files=all").splitlines()
+        code = (".py", ".ipynb", '.py"', '.ipynb"')  # a name with blanks is quoted
+        dirty = any(not line.startswith("??") or line.endswith(code) for line in found)
+        return commit, dirty
     except (OSError, subprocess.SubprocessError):
         return None, None

@@ -15,6 +15,10 @@ from .._extras import extra
 from ._store import Store
 
 
+_OF_A_CASE = (
+    *("error", "traceback", "compile_seconds", "run_seconds"),
+    *("device", "hash"),
+)
 _MADE_WITH = ("date", "commit", "dirty", "dtype")
 # Columns that differ between two runs of the same thing.
 TIMES = ("compile_seconds", "run_seconds", "date")
@@ -25,10 +29,11 @@ class Results:
     """The results of experiments, a row for each case and seed.
 
     A row holds `experiment`, `case`, the parameters, `seed`, `status` (`"passed"`,
-    `"failed"`, `"failed as expected"`, `"passed unexpectedly"`), what the function
-    returned (a single number under the name `value`), `error`, `traceback`,
-    `compile_seconds` and `run_seconds` (of the case, all its seeds together), and what
-    it was made with: `date`, `commit`, `dirty`, `dtype`, `device`, `versions`, `hash`.
+    `"failed"`, `"failed as expected"`, `"passed unexpectedly"`; `"skipped"`, which is
+    not stored), what the function returned (a single number under the name `value`),
+    `error`, `traceback`, `compile_seconds` and `run_seconds` (of the case, all its
+    seeds together), and what it was made with: `date`, `commit`, `dirty`, `dtype`,
+    `device`, `versions`, `hash`.
 
     **Arguments:**
 
@@ -73,13 +78,23 @@ class Results:
         names = list(dict.fromkeys(name for name, _ in book.cases))
         keys = sorted(book.cases, key=lambda k: (names.index(k[0]), _order(book, k)))
         return cls._from(
-            book, [(key, sorted(book.cases[key]["seeds"])) for key in keys]
+            book, [(key, sorted(book.cases[key]["seeds"].items())) for key in keys]
         )
 
     @classmethod
     def _of(cls, book: Store, asked: Iterable) -> "Results":
         """Those of the cases and seeds asked for."""
-        return cls._from(book, [((c.experiment, c.id), seeds) for c, seeds in asked])
+        found = []
+        for case, seeds in asked:
+            key = case.experiment, case.id
+            if case.mark("skip"):
+                record = dict.fromkeys(_OF_A_CASE) | {"values": {}, "status": "skipped"}
+                record |= {"parameters": case.shown, "hash": case.hash}
+                found.append((key, [(seed, (record, 0)) for seed in seeds]))
+            else:
+                stored = book.cases[key]["seeds"]
+                found.append((key, [(seed, stored[seed]) for seed in seeds]))
+        return cls._from(book, found)
 
     @classmethod
     def _from(cls, book: Store, asked: list) -> "Results":
@@ -87,12 +102,11 @@ class Results:
         metrics: dict[str, None] = {}
         parameters: dict[str, None] = {}
         for key, seeds in asked:
-            for seed in seeds:
-                record, place = book.cases[key]["seeds"][seed]
+            for seed, (record, place) in seeds:
                 values = {name: v[place] for name, v in record["values"].items()}
                 metrics |= dict.fromkeys(values)
                 parameters |= dict.fromkeys(record["parameters"])
-                run = book.runs.get(record["run"], {})
+                run = book.runs.get(record.get("run"), {})
                 row = {
                     "experiment": key[0],
                     "case": key[1],
@@ -100,12 +114,7 @@ class Results:
                     "seed": seed,
                     "status": record["status"],
                     **values,
-                    "error": record["error"],
-                    "traceback": record["traceback"],
-                    "compile_seconds": record["compile_seconds"],
-                    "run_seconds": record["run_seconds"],
-                    "device": record["device"],
-                    "hash": record["hash"],
+                    **{name: record[name] for name in _OF_A_CASE},
                     **{name: run.get(name) for name in _MADE_WITH},
                     "versions": run.get("versions", {}),
                 }
@@ -141,7 +150,11 @@ class Results:
         **Arguments:**
 
         - `**values`: by the name of the column.
+
+        **Raises:** `ValueError` if there is no such column.
         """
+        known = {*self.columns, *self._versions(), "traceback", "versions"}
+        self._check_columns(values, known, "Results.where")
         rows = [
             row
             for row in self.rows
@@ -188,15 +201,13 @@ class Results:
             columns = full if form in ("csv", "parquet") else short
         flat = self._flat()
         known = {*self.columns, *self._versions()}
-        unknown = [name for name in columns if name not in known]
-        if unknown:
-            raise ValueError(
-                f"Results.export: there is no column {unknown[0]!r}; there are "
-                f"{', '.join(self.columns)}."
-            )
+        self._check_columns(columns, known, "Results.export")
         if form == "parquet":
             pd, _ = extra("pandas", "experiments"), extra("pyarrow", "experiments")
-            pd.DataFrame(flat, columns=list(columns)).to_parquet(to, index=False)
+            kept = {
+                name: _one_kind([row.get(name) for row in flat]) for name in columns
+            }
+            pd.DataFrame(kept).to_parquet(to, index=False)
             return ""
         body = [[row.get(name) for name in columns] for row in flat]
         text = _text(form, list(columns), body, digits)
@@ -218,6 +229,14 @@ class Results:
 
         Path(path).write_text(page(self, title), encoding="utf-8")
 
+    def _check_columns(self, names: Iterable[str], known: set, where: str) -> None:
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            raise ValueError(
+                f"{where}: there is no column {unknown[0]!r}; there are "
+                f"{', '.join(self.columns)}."
+            )
+
     def _versions(self) -> tuple[str, ...]:
         return tuple(
             dict.fromkeys(name for row in self.rows for name in row["versions"])
@@ -233,6 +252,14 @@ class Results:
                     flat[name] = json.dumps(flat[name])
             found.append({**flat, **row["versions"]})
         return found
+
+
+def _one_kind(column: list) -> list:
+    """A column as it is if a file of typed columns can hold it, or as text."""
+    kinds = {type(value) for value in column if value is not None}
+    if len(kinds) < 2 or kinds == {int, float}:
+        return column
+    return [value if value is None else str(value) for value in column]
 
 
 def _order(book: Store, key: tuple[str, str]) -> tuple:

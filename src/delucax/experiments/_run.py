@@ -1,35 +1,22 @@
 """Run experiments: here, on all cores, or on a cluster."""
 
 import contextlib
-import hashlib
 import inspect
 import os
-import tempfile
-import threading
-import traceback
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import jax
+from typing import Any
 
 from .._check import check_count
-from .._extras import extra
-from ._execute import Outcome, Plan, precision, Runner
+from ._execute import Outcome, Plan, Runner
 from ._experiment import as_experiment, as_seeds, Case, Experiment
 from ._provenance import provenance
 from ._results import Results
 from ._store import Store
+from ._workers import elsewhere, Job
 
 
 BACKENDS = ("loky", "dask")
-
-
-class _Job(NamedTuple):
-    number: int
-    made: Experiment
-    case: Case
-    seeds: tuple[int, ...]
 
 
 def run(
@@ -70,7 +57,7 @@ def run(
     - `mesh`: a `jax.sharding.Mesh` over whose first axis the seeds of each case are
         spread; none by default. With one worker only.
     - `fresh`: run also what is in the store; not by default.
-    - `retry`: run again what failed; not by default.
+    - `retry`: run again what raised an error, expected or not; not by default.
     - `progress`: show progress, for the whole and for each worker; shown by default.
 
     **Returns:** the [`delucax.experiments.Results`][] of the cases asked for.
@@ -113,7 +100,7 @@ def run(
         raise ValueError(f"{where}: mesh needs workers=1, got {workers} {backend}.")
     chosen = None if seeds is None else as_seeds(seeds, where)
     book = Store(store, where)
-    jobs, asked = [], []
+    jobs, asked, judged = [], [], []
     for one in made:
         wanted = one.seeds if chosen is None else chosen
         wanted = wanted if {"key", "seed"} & {*one.arguments} else wanted[:1]
@@ -128,15 +115,19 @@ def run(
                 f"which do not divide the {len(wanted)} seeds of {one.name}."
             )
         for case in one.cases(select, marks, slow):
+            asked.append((case, wanted))
             if case.mark("skip"):
                 continue
-            asked.append((case, wanted))
             missing = _missing(book, case, wanted, fresh, retry)
             if missing:
-                jobs.append(_Job(len(jobs), one, case, missing))
-    if jobs:
+                jobs.append(Job(len(jobs), one, case, missing))
+            kept = [seed for seed in wanted if seed not in missing]
+            judged += _judged_again(book, case, kept)
+    if jobs or judged:
         book.open()
     try:
+        for record in judged:
+            book.append(record)
         if jobs:
             _work_off(jobs, book, made, workers, backend, mesh, progress)
     finally:
@@ -149,11 +140,11 @@ def _work_off(jobs, book, made, workers, backend, mesh, progress) -> None:
     outcomes = (
         _here(jobs, mesh)
         if workers == 1 and backend == "loky"
-        else _elsewhere(jobs, workers, backend)
+        else elsewhere(jobs, workers, backend)
     )
     with _Progress(len(jobs), workers, progress) as bars, contextlib.closing(outcomes):
         for job, outcome in outcomes:
-            status = _status(job.case, outcome)
+            status = _status(job.case, outcome.error)
             record = {
                 "kind": "case",
                 "run": number,
@@ -182,15 +173,36 @@ def _missing(book, case, wanted, fresh, retry) -> tuple[int, ...]:
     done = {
         seed
         for seed, (record, _) in entry["seeds"].items()
-        if not (retry and record["status"] == "failed")
+        if not (retry and record["error"] is not None)
     }
     return tuple(seed for seed in wanted if seed not in done)
 
 
-def _status(case: Case, outcome: Outcome) -> str:
+def _judged_again(book, case, kept) -> list[dict[str, Any]]:
+    """Lines for what is not run again, where a mark came or went since."""
+    found: dict[int, tuple[dict[str, Any], list[tuple[int, int]]]] = {}
+    for seed in kept:
+        record, place = book.cases[case.experiment, case.id]["seeds"][seed]
+        if record["status"] != _status(case, record["error"]):
+            found.setdefault(id(record), (record, []))[1].append((seed, place))
+    return [
+        {
+            **record,
+            "seeds": [seed for seed, _ in places],
+            "status": _status(case, record["error"]),
+            "values": {
+                name: [column[place] for _, place in places]
+                for name, column in record["values"].items()
+            },
+        }
+        for record, places in found.values()
+    ]
+
+
+def _status(case: Case, error: str | None) -> str:
     if case.mark("xfail"):
-        return "passed unexpectedly" if outcome.error is None else "failed as expected"
-    return "passed" if outcome.error is None else "failed"
+        return "passed unexpectedly" if error is None else "failed as expected"
+    return "passed" if error is None else "failed"
 
 
 def _folder(made: Experiment) -> Path:
@@ -207,7 +219,7 @@ def _workers(workers: Any, where: str) -> int:
     return check_count(workers, "workers", where)
 
 
-def _here(jobs: list[_Job], mesh: Any) -> Generator[tuple[_Job, Outcome], None, None]:
+def _here(jobs: list[Job], mesh: Any) -> Generator[tuple[Job, Outcome], None, None]:
     runner = None
     plan_of = None
     try:
@@ -221,135 +233,6 @@ def _here(jobs: list[_Job], mesh: Any) -> Generator[tuple[_Job, Outcome], None, 
     finally:
         if runner is not None:
             runner.close()
-
-
-def _elsewhere(
-    jobs: list[_Job], workers: int, backend: str
-) -> Generator[tuple[_Job, Outcome], None, None]:
-    """By joblib. If a worker dies, those that were under way are run one by one, so
-    that the one that kills it is known."""
-    joblib = extra("joblib", "experiments")
-    if backend == "dask":
-        extra("distributed", "dask")
-    pending = {job.number: job for job in jobs}
-    plans = {job.made.name: _packed(job.made) for job in jobs}
-    with tempfile.TemporaryDirectory() as folder, _one_thread():
-        while pending:
-            marks = folder if backend == "loky" else None
-            try:
-                for number, outcome in _parallel(
-                    joblib, list(pending.values()), plans, workers, backend, marks
-                ):
-                    yield pending.pop(number), outcome
-            except Exception as error:
-                if not _died(error):
-                    raise
-                begun = [n for n in pending if Path(folder, str(n)).exists()]
-                for n in begun if marks else list(pending):
-                    job = pending.pop(n)
-                    yield job, _alone(joblib, job, plans, backend)
-
-
-def _parallel(joblib, jobs, plans, workers, backend, marks) -> Iterator:
-    precise = bool(jax.config.jax_enable_x64)
-    task = joblib.delayed(work)
-    with joblib.parallel_config(backend=backend, n_jobs=workers):
-        parallel = joblib.Parallel(return_as="generator_unordered")
-        yield from parallel(
-            task(
-                *plans[job.made.name],
-                job.number,
-                job.case.index,
-                job.seeds,
-                precise,
-                marks,
-            )
-            for job in jobs
-        )
-
-
-def _alone(joblib, job: _Job, plans, backend) -> Outcome:
-    try:
-        # Two workers, for joblib runs a single one in this process.
-        ((_, outcome),) = _parallel(joblib, [job], plans, 2, backend, None)
-        return outcome
-    except Exception as error:
-        if not _died(error):
-            raise
-        message = "WorkerDied: the process that ran the case was killed, or crashed."
-        trace = "".join(traceback.format_exception(error))
-        return Outcome({}, message, trace, 0.0, 0.0, None, 0)
-
-
-def _died(error: Exception) -> bool:
-    return type(error).__name__ in (
-        "TerminatedWorkerError",
-        "BrokenProcessPool",
-        "KilledWorker",
-    )
-
-
-def _packed(made: Experiment) -> tuple[str, bytes]:
-    """The plan as bytes that any process can read, and their hash."""
-    cloudpickle = extra("cloudpickle", "experiments")
-    try:
-        content = cloudpickle.dumps(Plan.of(made))
-    except Exception as error:
-        raise ValueError(
-            f"run: {made.name} cannot be sent to another process: {error}. Make what "
-            "cannot be sent in the function or in a fixture."
-        ) from error
-    name = hashlib.sha256(content).hexdigest()
-    # As bytes: an array would be put on one worker of a cluster, and die with it.
-    return name, content
-
-
-_local = threading.local()
-
-
-def work(
-    name: str,
-    content: bytes,
-    number: int,
-    index: tuple[int, ...],
-    seeds: tuple[int, ...],
-    precise: bool,
-    marks: str | None,
-) -> tuple[int, Outcome]:
-    """What a worker does: one case. It keeps the runner for the next one."""
-    import cloudpickle
-
-    with precision(precise):
-        runners = _local.__dict__.setdefault("runners", {})
-        if (name, precise) not in runners:
-            for old in runners.values():
-                old.close()
-            runners.clear()
-            plan = cloudpickle.loads(content)
-            runners[name, precise] = Runner(plan)
-        if marks is not None:
-            Path(marks, str(number)).touch()
-        return number, runners[name, precise].run(index, seeds, None)
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Processes that are started meanwhile compute with one thread each."""
-    flag = "--xla_cpu_multi_thread_eigen=false"
-    flags = os.environ.get("XLA_FLAGS", "")
-    wanted = {"XLA_FLAGS": flags if flag in flags else f"{flags} {flag}".strip()}
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        wanted[name] = "1"
-    before = {name: os.environ.get(name) for name in wanted}
-    os.environ.update(wanted)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 class _Progress:

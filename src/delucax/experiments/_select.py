@@ -70,6 +70,11 @@ def selector(
     return found
 
 
+def words(expression: str) -> list[str]:
+    """What an expression is made of, without its parentheses."""
+    return [word for _, word in _TOKEN.findall(expression) if word]
+
+
 def _tokens(expression: str, argument: str, where: str) -> list[str]:
     if not isinstance(expression, str):
         raise ValueError(

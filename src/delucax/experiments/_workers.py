@@ -1,0 +1,188 @@
+"""Cases in other processes."""
+
+import atexit
+import contextlib
+import hashlib
+import inspect
+import os
+import tempfile
+import threading
+import traceback
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+
+from .._extras import extra
+from ._execute import Outcome, Plan, precision, Runner
+from ._experiment import Case, Experiment
+
+
+class Job(NamedTuple):
+    """A case and the seeds to run it with."""
+
+    number: int
+    made: Experiment
+    case: Case
+    seeds: tuple[int, ...]
+
+
+def elsewhere(
+    jobs: list[Job], workers: int, backend: str
+) -> Generator[tuple[Job, Outcome], None, None]:
+    """By joblib. If a worker dies, those that were under way are run one by one, so
+    that the one that kills it is known. If there are fixtures to let go, the workers
+    end with the run."""
+    joblib = extra("joblib", "experiments")
+    if backend == "dask":
+        extra("distributed", "dask")
+    pending = {job.number: job for job in jobs}
+    plans = {job.made.name: _packed(job.made) for job in jobs}
+    with tempfile.TemporaryDirectory() as folder, _one_thread():
+        while pending:
+            marks = folder if backend == "loky" else None
+            try:
+                for number, outcome in _parallel(
+                    joblib, list(pending.values()), plans, workers, backend, marks
+                ):
+                    yield pending.pop(number), outcome
+            except Exception as error:
+                if not _died(error):
+                    raise
+                begun = [n for n in pending if Path(folder, str(n)).exists()]
+                for n in begun if marks else list(pending):
+                    job = pending.pop(n)
+                    yield job, _alone(joblib, job, plans, backend)
+        if any(_stays_open(job.made) for job in jobs):
+            _end(backend)
+
+
+def _stays_open(made: Experiment) -> bool:
+    """Whether something is to be done when its fixtures of a process are let go."""
+    return any(
+        fixture.scope == "process" and inspect.isgeneratorfunction(fixture.function)
+        for fixture in made.needed().values()
+    )
+
+
+def _end(backend: str) -> None:
+    """Let the fixtures of idle workers go: those of loky do so as they end."""
+    if backend == "dask":
+        client = extra("distributed", "dask").default_client()
+        client.run(_let_go, on_error="ignore")
+    else:
+        loky = extra("joblib.externals.loky", "experiments")
+        loky.get_reusable_executor(reuse=True).shutdown(wait=True)
+
+
+def _parallel(joblib, jobs, plans, workers, backend, marks) -> Iterator:
+    precise = bool(jax.config.jax_enable_x64)
+    task = joblib.delayed(work)
+    with joblib.parallel_config(backend=backend, n_jobs=workers):
+        parallel = joblib.Parallel(return_as="generator_unordered")
+        yield from parallel(
+            task(
+                *plans[job.made.name],
+                job.number,
+                job.case.index,
+                job.seeds,
+                precise,
+                marks,
+            )
+            for job in jobs
+        )
+
+
+def _alone(joblib, job: Job, plans, backend) -> Outcome:
+    try:
+        # Two workers, for joblib runs a single one in this process.
+        ((_, outcome),) = _parallel(joblib, [job], plans, 2, backend, None)
+        return outcome
+    except Exception as error:
+        if not _died(error):
+            raise
+        message = "WorkerDied: the process that ran the case was killed, or crashed."
+        trace = "".join(traceback.format_exception(error))
+        return Outcome({}, message, trace, 0.0, 0.0, None, 0)
+
+
+def _died(error: Exception) -> bool:
+    return type(error).__name__ in (
+        "TerminatedWorkerError",
+        "BrokenProcessPool",
+        "KilledWorker",
+    )
+
+
+def _packed(made: Experiment) -> tuple[str, bytes]:
+    """The plan as bytes that any process can read, and their hash."""
+    cloudpickle = extra("cloudpickle", "experiments")
+    try:
+        content = cloudpickle.dumps(Plan.of(made))
+    except Exception as error:
+        raise ValueError(
+            f"run: {made.name} cannot be sent to another process: {error}. Make what "
+            "cannot be sent in the function or in a fixture."
+        ) from error
+    name = hashlib.sha256(content).hexdigest()
+    # As bytes: an array would be put on one worker of a cluster, and die with it.
+    return name, content
+
+
+_local = threading.local()
+# All that this process holds, in whatever thread.
+_held: set[Runner] = set()
+
+
+@atexit.register
+def _let_go() -> None:
+    while _held:
+        _held.pop().close()
+
+
+def work(
+    name: str,
+    content: bytes,
+    number: int,
+    index: tuple[int, ...],
+    seeds: tuple[int, ...],
+    precise: bool,
+    marks: str | None,
+) -> tuple[int, Outcome]:
+    """What a worker does: one case. It keeps the runner for the next one."""
+    import cloudpickle
+
+    with precision(precise):
+        runners = _local.__dict__.setdefault("runners", {})
+        if (name, precise) not in runners:
+            for old in runners.values():
+                old.close()
+                _held.discard(old)
+            runners.clear()
+            plan = cloudpickle.loads(content)
+            runners[name, precise] = Runner(plan)
+        _held.add(runners[name, precise])
+        if marks is not None:
+            Path(marks, str(number)).touch()
+        return number, runners[name, precise].run(index, seeds, None)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Processes that are started meanwhile compute with one thread each."""
+    flag = "--xla_cpu_multi_thread_eigen=false"
+    flags = os.environ.get("XLA_FLAGS", "")
+    wanted = {"XLA_FLAGS": flags if flag in flags else f"{flags} {flag}".strip()}
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        wanted[name] = "1"
+    before = {name: os.environ.get(name) for name in wanted}
+    os.environ.update(wanted)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
