@@ -114,14 +114,19 @@ def _training(results: dict[str, Any]) -> str:
                 continue
             if steps is None:
                 most = results["training"][way]["steps"][-1]
-                ratio = "" if first is None else f" (over {most / first:.0f} times)"
+                ratio = "" if first is None else f" (over {_below(most / first)} times)"
                 line.append(f"not in {most:,}{ratio}")
                 continue
-            ratio = "" if way == "gradient" else f" ({steps / first:.0f} times)"
+            ratio = "" if way == "gradient" else f" ({steps / first:.2g} times)"
             line.append(f"{steps:,}{ratio}")
         body.append(line)
     ways = [name for name in results["training"]]
     return _markdown(["error, cmH2O", *ways], body)
+
+
+def _below(ratio: float) -> str:
+    """Two digits, rounded down."""
+    return f"{np.floor(ratio * 10) / 10:g}" if ratio < 10 else f"{np.floor(ratio):g}"
 
 
 def _limits(results: dict[str, Any]) -> str:

@@ -26,6 +26,7 @@ from benchmarks._machine import describe
 from benchmarks._ventilator_page import write_page
 from delucax import lung
 from delucax.lung._report import PID_ROWS
+from delucax.lung._size import FULL
 
 
 RESULTS = Path(__file__).parent / "results" / "ventilator.json"
@@ -53,7 +54,8 @@ def parts() -> dict[str, float]:
 
     begin = time.perf_counter()
     model = lung.LearnedLung(breaths, key=jax.random.key(1))
-    model = lung.fit_lungs(model, breaths, key=jax.random.key(2)).model
+    steps = dict(teacher_steps=FULL.teacher_steps, steps=FULL.simulator_steps)
+    model = lung.fit_lungs(model, breaths, key=jax.random.key(2), **steps).model
     found["simulator of one lung, s"] = time.perf_counter() - begin
 
     begin = time.perf_counter()

@@ -100,6 +100,13 @@ def test_quoted_numbers_and_blank_lines(lines, tmp_path):
     assert_close(found.u_in, expected.u_in)
 
 
+def test_a_column_is_there_once(lines, tmp_path):
+    path = tmp_path / "twice.csv"
+    path.write_text("\n".join([f"{lines[0]},R", *(f"{line},20" for line in lines[1:])]))
+    with user_error(match="must have each column once, but has R more often"):
+        lung.read_breaths(path)
+
+
 def edited(lines, row, column, text):
     header = lines[0].split(",")
     cells = lines[row - 1].split(",")

@@ -1,10 +1,12 @@
 """A controller at a ventilator: what a machine needs, proved on a simulated one."""
 
+import time
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, once, user_error
+from helpers import assert_close, CountCalls, once, user_error
 
 import delucax as dlx
 from delucax import lung
@@ -40,6 +42,39 @@ def test_aborts_on_overpressure_and_cleans_up():
     assert (found.u_in[-1], found.u_out[-1]) == (0.0, 1.0)
     # The air has been let out, and both valves are closed.
     assert runner.observe() < 5.5 and runner.controls == (0.0, 0.0)
+
+
+TRACED = CountCalls()
+
+
+class Counted(dlx.AbstractController):
+    def __call__(self, t, y, state):
+        TRACED()
+        return jnp.stack([0 * y[0], 1 + 0 * y[0]]), state
+
+
+class Watched(lung.SimulatedRunner):
+    seen = ()
+
+    def observe(self):
+        self.seen = (*self.seen, TRACED.count)
+        return super().observe()
+
+
+def test_nothing_compiles_while_a_valve_is_open():
+    runner = Watched(ENV, key=KEY)
+    lung.run_breaths(runner, Counted(), 3)
+    assert runner.seen == (1, 1, 1)
+
+
+def test_a_late_step_is_not_caught_up_with():
+    runner = lung.SimulatedRunner(ENV, key=KEY, real_time=True)
+    runner.wait()
+    time.sleep(3 * runner.dt)
+    runner.wait()
+    begin = time.perf_counter()
+    runner.wait()
+    assert time.perf_counter() - begin > 0.9 * runner.dt
 
 
 class Failing(dlx.AbstractController):

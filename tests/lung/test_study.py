@@ -13,6 +13,8 @@ import delucax as dlx
 from delucax import lung
 from delucax.__main__ import main
 from delucax.lung import _study
+from delucax.lung._contenders import Contender
+from delucax.lung._report import save_controllers
 from delucax.lung._simulators import grouped, left_out
 from delucax.lung._stages import Stages
 
@@ -101,6 +103,20 @@ def test_breaths_that_are_left_out_are_said(tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             lung.lung_study(tmp_path / "out", data=data, say=said.append)
         assert "2 of the 16 breaths are left out: each of the 2 lungs has 7" in said[-1]
+
+
+def test_what_passed_the_limit_is_not_saved(tmp_path):
+    waveform = lung.BreathWaveform()
+    forward = lung.stack([lung.FeedForward(waveform)])
+    highest = (30.0, 61.0, float("nan"))
+    contenders = [Contender("A", seed, forward, True) for seed in range(3)]
+    rows = [
+        dict(controller="A", seed=seed, lung="x", highest=value)
+        for seed, value in enumerate(highest)
+    ]
+    unsafe = save_controllers(tmp_path, contenders, ["x"], waveform, rows)
+    assert unsafe == ["a_1", "a_2"]
+    assert [path.name for path in tmp_path.iterdir()] == ["a_0.dlx"]
 
 
 @thorough

@@ -188,6 +188,12 @@ def _table(path: Path) -> dict[str, np.ndarray]:
     with _open(path) as file:
         header = [name.strip() for name in next(csv.reader(file), [])]
         missing = [name for name in COLUMNS if name not in header]
+        twice = [name for name in COLUMNS if header.count(name) > 1]
+        if twice:
+            raise ValueError(
+                f"{_WHERE}: '{path}' must have each column once, but has "
+                f"{', '.join(twice)} more often."
+            )
         if missing:
             raise ValueError(
                 f"{_WHERE}: '{path}' row 1: column {', '.join(missing)} is missing; "

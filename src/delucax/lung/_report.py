@@ -29,6 +29,8 @@ PID_ROWS = (
     "trained leaky PID",
     "trained PID",
     "PID + feed-forward",
+    "tuned PID + feed-forward",
+    "tuned leaky PID + feed-forward",
 )
 FLOORS = ("zero", "bang-bang")
 LEARNED = ("MLP", "MLP for all", "CNN", "PID + MLP", "GPC", "MPC")
@@ -143,7 +145,8 @@ def save_controllers(
             ]
             runs = [row for row in runs if name in (None, row["lung"])]
             file = folder / f"{place}_{seed}.dlx"
-            if max(row["highest"] for row in runs) <= ABORT:
+            # NaN is not below the limit.
+            if np.max([row["highest"] for row in runs]) <= ABORT:
                 save(file, Breathing(controller, waveform))
             else:
                 file.unlink(missing_ok=True)
@@ -214,7 +217,8 @@ def summarise(
         labels = [f"{label} for all" for label in PID_ROWS]
         pid = _least(mean_error(rows, label, part) for label in labels)
         shared[part] = mean_error(rows, "MLP for all", part) / pid
-    highest = max(row["highest"] for row in rows if row["controller"] in LEARNED)
+    reached = [row["highest"] for row in rows if row["controller"] in LEARNED]
+    highest = float(np.max(reached))
     words = [
         f"Learned lungs: open-loop error {np.mean(list(learned.values())):.3f} cmH2O "
         f"on average, {max(learned.values()):.3f} at most; relative to the better of "

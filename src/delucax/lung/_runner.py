@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._check import check_bool, check_count, check_key, check_positive
 from .._controller import AbstractController
@@ -127,6 +128,9 @@ class SimulatedRunner:
         start, self._key = jax.random.split(key)
         self.state = environment.reset(start)
         self.steps, self.controls, self.is_clean = 0, (0.0, 0.0), False
+        if self.real_time:
+            # Compiled now, and not within the first interval.
+            self._advanced()
         self._due = time.perf_counter()
 
     def observe(self) -> float:
@@ -148,13 +152,18 @@ class SimulatedRunner:
     def wait(self) -> None:
         """Let one step go by."""
         if self.real_time:
-            self._due += self.dt
+            # What was missed is not caught up with: no step is shorter than it should.
+            self._due = max(self._due + self.dt, time.perf_counter())
             time.sleep(max(0.0, self._due - time.perf_counter()))
+        self.state = self._advanced()
+        self.steps += 1
+
+    def _advanced(self) -> Array:
+        """The state one step on."""
         u = jnp.asarray(self.controls, self.state.dtype)
         # As an array: a number would be part of the program, which compiled each step.
         t = jnp.asarray(self.steps * self.dt)
-        self.state = _step(self.environment, t, self.state, u)
-        self.steps += 1
+        return _step(self.environment, t, self.state, u)
 
     def should_abort(self, pressure: float) -> bool:
         """Whether the pressure is above the limit, or no number.
@@ -258,6 +267,9 @@ def run_breaths(
     rows, aborted = [], False
     try:
         state = controller.init(key=key)
+        # Compiled now, and not while a valve stands open.
+        u, _ = _ask(controller, jnp.asarray(0.0), jnp.array([0.0]), state)
+        _tell(controller, jnp.array([0.0, 0.0]), state)
         for k in range(steps):
             pressure = float(runner.observe())
             if runner.should_abort(pressure):

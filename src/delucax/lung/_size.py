@@ -28,7 +28,8 @@ class Size(NamedTuple):
     """How much of everything.
 
     `shared_network` are hidden units of the network for all lungs, and how many
-    controls it is given; `extras` are those rows that the claims do not need.
+    controls it is given; `tuned` is how many PIDs with feed-forward are drawn;
+    `extras` are those rows that the claims do not need.
     """
 
     breaths: int
@@ -39,6 +40,7 @@ class Size(NamedTuple):
     shared_steps: int
     shared_network: tuple[int, int]
     pid_steps: int
+    tuned: int
     bound_steps: int
     seeds: int
     noises: int
@@ -57,6 +59,7 @@ FULL = Size(
     shared_steps=500,
     shared_network=(48, 6),
     pid_steps=150,
+    tuned=2000,
     bound_steps=500,
     seeds=3,
     noises=5,
@@ -74,6 +77,7 @@ SMALL = Size(
     shared_steps=250,
     shared_network=(32, 4),
     pid_steps=20,
+    tuned=0,
     bound_steps=0,
     seeds=1,
     noises=2,

@@ -53,6 +53,7 @@ from ._stacking import repeat, stack, unstack
 from ._stages import Stages
 from ._tasks import double_compartment
 from ._train import lung_environment
+from ._tuned import tuned_pids
 from ._waveform import BreathWaveform
 
 
@@ -239,6 +240,13 @@ def _contenders(
         f"A network for all lungs, {size.seeds} seeds at once",
         lambda options: networks_for_all(trainer, size, key, options),
     )
+    if size.tuned:
+        tuned = trained(
+            "tuned_pids",
+            "PIDs with feed-forward tuned on the lungs",
+            lambda options: tuned_pids(envs, trainer.waveform, size, key, options),
+        )
+        found += pid_contenders(tuned, trainer)
     if size.extras:
         one = size._replace(seeds=1)
         more = trained(

@@ -169,9 +169,11 @@ class _Ventilated(eqx.Module):
 
     def __call__(self, controllers, key):
         def one(model, controller, key):
-            env = lung_environment(
-                model, self.waveform, noise=self.noise, horizon=self.horizon
-            )
+            env = model
+            if not isinstance(model, Environment):
+                env = lung_environment(
+                    model, self.waveform, noise=self.noise, horizon=self.horizon
+                )
             if self.limit is not None:
                 cost: Any = env.cost
                 careful = _Careful(cost, self.limit)
@@ -220,7 +222,8 @@ def train_controllers(
 
     **Arguments:**
 
-    - `models`: lungs, stacked by [`delucax.lung.stack`][].
+    - `models`: lungs, stacked by [`delucax.lung.stack`][]; or tasks of lungs, stacked,
+        with a waveform and a noise of their own.
     - `controllers`: of the inspiratory valve, stacked over seeds, and within a seed
         over the lungs: leaves of shape `(seeds, lungs, ...)`. With `shared`, of shape
         `(seeds, ...)`.
@@ -260,10 +263,11 @@ def train_controllers(
         ```
     """
     where = "train_controllers"
-    dynamics = models.dynamics if isinstance(models, LungModel) else models
+    one_of = LungModel | Environment
+    dynamics = models.dynamics if isinstance(models, one_of) else models
     if not isinstance(dynamics, AbstractDynamics) or jnp.ndim(dynamics.dt) != 1:
         raise ValueError(
-            f"{where}: models must be LearnedLungs or LungModels that "
+            f"{where}: models must be LearnedLungs, LungModels or tasks of lungs that "
             f"delucax.lung.stack made one of, got one {type(models).__name__}."
         )
     waveform = BreathWaveform() if waveform is None else waveform
