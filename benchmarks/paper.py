@@ -53,6 +53,7 @@ def write_page(claims: list[dict[str, Any]]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", default="build/paper", help="folder of the studies")
+    parser.add_argument("--study", choices=STUDIES, help="one study alone, again")
     parser.add_argument("--page", action="store_true", help="from what is stored")
     options = parser.parse_args()
     if not options.page:
@@ -60,6 +61,10 @@ def main() -> None:
         rows = read(out / "claims.csv")
         if {row["study"] for row in rows} != set(STUDIES):
             rows = experiments.reproduce("all", out)
+        elif options.study is not None:
+            again = experiments.reproduce(options.study, out / "again")
+            rows = [row for row in rows if row["study"] != options.study] + again
+            rows.sort(key=lambda row: list(STUDIES).index(row["study"]))
         content = {"machine": describe(), "claims": rows}
         RESULTS.write_text(json.dumps(content, indent=1) + "\n")
         FIGURES.mkdir(parents=True, exist_ok=True)

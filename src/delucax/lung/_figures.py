@@ -147,4 +147,4 @@ def draw_study(
     middle = len(names) // 2
     env = at_pip(unstack(envs)[middle], SHOWN)
     run = unstack(shown["MLP"])[middle]
-    animate(env, run, path=out / "breath.gif", max_frames=60)
+    animate(env, run, path=out / "breath.gif", max_frames=40)
