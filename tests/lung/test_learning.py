@@ -10,7 +10,9 @@ from helpers import assert_close, once, thorough, tolerance, user_error
 
 import delucax as dlx
 from delucax import lung
+from delucax.lung._size import FULL
 from delucax.lung._train import _Careful
+from delucax.lung._tuned import tuned_pids
 
 
 pytestmark = once
@@ -157,3 +159,18 @@ def test_wrong_arguments(breaths):
         lung.LungModel(dlx.systems.Pendulum())
     with user_error(match="trees must be of one structure"):
         lung.stack([lung.SingleCompartment(), lung.BalloonLung()])
+
+
+@thorough
+def test_tuned_pids_are_the_best_that_were_tried(tmp_path):
+    waveform = lung.BreathWaveform()
+    envs = lung.stack([lung.single_compartment(R) for R in (5.0, 50.0)])
+    size = FULL._replace(tuned=20, pid_steps=3)
+    options = dict(checkpoint=tmp_path / "tuned.fit", progress=False)
+    found = tuned_pids(envs, waveform, size, KEY, options)
+    assert len(found) == 4
+    error = lambda env, pid: jnp.mean(lung.breath_error(env, pid, key=KEY))
+    own = eqx.filter_vmap(error)(envs, found["tuned PID + feed-forward"])
+    shared = found["tuned PID + feed-forward for all"]
+    alike = eqx.filter_vmap(error, in_axes=(eqx.if_array(0), None))(envs, shared)
+    assert jnp.all(own <= alike + 1e-3) and jnp.all(own < 10)

@@ -118,7 +118,7 @@ def test_wrong_numbers_are_named():
         lung.pid_grid(ENV, key=KEY, ki=[])
     with user_error(match="noise must be at least 0, got -1"):
         trained(noise=-1.0)
-    with user_error(match="be LearnedLungs or LungModels that .*stack made"):
+    with user_error(match="be LearnedLungs, LungModels or tasks .*stack made"):
         lung.train_controllers(lung.unstack(MODELS)[0], PID, key=KEY)
     with user_error(match="breath_error: controller must be an AbstractController"):
         lung.breath_error(ENV, print, key=KEY)
