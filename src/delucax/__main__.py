@@ -54,7 +54,7 @@ def _add_demo(commands: Any) -> None:
 
         demo(options.out, seeds=options.seeds)
 
-    help = "swing the pendulum up, then the paper in small; under two minutes"
+    help = "swing the pendulum up, then the paper in small; in about two minutes"
     demo = _command(commands, "demo", call, help)
     demo.add_argument("--out", default="demo", help="folder to write to")
     demo.add_argument("--seeds", type=int, default=2, help="how many MLPs to train")
