@@ -1,0 +1,254 @@
+"""The controllers of the scoreboard: one recipe for each, the same for every task."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from ..controllers import (
+    Adaptive,
+    BPC,
+    Deep,
+    DRC,
+    DSC,
+    FiniteHorizonLQR,
+    GPC,
+    GRU,
+    HInfinity,
+    LeakyPID,
+    LQR,
+    MPC,
+    NeuralGPC,
+    SFC,
+    Zero,
+)
+from ..disturbances import Gaussian
+from ..dynamics import linearize
+from ..environments import Environment, make, UniformState
+from ..lung import Breathing
+from ..planning import cem, ilqr, mppi
+from ..training import actor_critic, expected_cost, fit, PPO, SHAC
+
+
+# Of every training: steps of the optimiser on the gradient, episodes a step, and the
+# most steps of an episode. PPO and SHAC are given as many steps of the environment.
+TRAINING_STEPS, EPISODES, LONGEST = 200, 32, 100
+# Of a plan in MPC.
+LOOKAHEAD = 30
+
+
+class Unsuitable(Exception):
+    """A controller is not made for such a task."""
+
+
+@functools.cache
+def task_of(name: str) -> Environment:
+    """The task, with what it needs drawn from a fixed key."""
+    if name == "neural":
+        return make(name, width=8, key=jax.random.key(0))
+    if name != "lds":
+        return make(name)
+    box = UniformState(-jnp.ones(4), jnp.ones(4))
+    return make(
+        name,
+        key=jax.random.key(0),
+        states=4,
+        controls=2,
+        spectral_radius=1.05,
+        initial_state=box,
+        disturbance=Gaussian(0.1, size=4),
+    )
+
+
+@functools.cache
+def _local(name: str) -> tuple[Any, Any, Any]:
+    """The linear model at the equilibrium and the curvature of the cost there, with
+    what a design needs added where it is flat."""
+    env = task_of(name)
+    x, u = env.dynamics.equilibrium()
+    model = linearize(env.dynamics, jnp.zeros(()), x, u)
+    n = x.shape[0]
+
+    def charged(z: Any) -> Any:
+        return env.cost(jnp.zeros(()), x + z[:n], u + z[n:])
+
+    H = np.asarray(jax.hessian(charged)(jnp.zeros(n + u.shape[0]))) / 2
+    if not np.all(np.isfinite(H)):
+        raise Unsuitable("the cost has no curvature at the equilibrium")
+    values, vectors = np.linalg.eigh(H)
+    scale = max(values.max(), 1e-3)
+    H = vectors * np.clip(values, 1e-4 * scale, None) @ vectors.T
+    return model, jnp.asarray(H[:n, :n]), jnp.asarray(H[n:, n:])
+
+
+def _regulator(design: Callable[..., Any]) -> Callable[[str], Any]:
+    def made(name: str) -> Any:
+        return design(*_local(name), difference=task_of(name).dynamics.difference)
+
+    return made
+
+
+def _finite(name: str) -> Any:
+    horizon = task_of(name).horizon
+    return _regulator(functools.partial(FiniteHorizonLQR, horizon=horizon))(name)
+
+
+_lqr = _regulator(LQR)
+
+
+def _following(name: str) -> Any:
+    """A PID on the waveform that a lung is to breathe as."""
+    env = task_of(name)
+    waveform = getattr(env.cost, "waveform", None)
+    if waveform is None:
+        raise Unsuitable("the cost follows no waveform")
+    return Breathing(LeakyPID(dt=env.dt, reference=waveform), waveform)
+
+
+def _learning(learner: Callable[..., Any], **options: Any) -> Callable[[str], Any]:
+    """An online learner on top of the LQR."""
+
+    def made(name: str) -> Any:
+        env = task_of(name)
+        return learner(env.dynamics, env.cost, base=_lqr(name), **options)
+
+    return made
+
+
+def _neural(name: str) -> Any:
+    return _learning(NeuralGPC, key=jax.random.key(0))(name)
+
+
+def _bandit(name: str) -> Any:
+    return BPC(task_of(name).dynamics, _lqr(name))
+
+
+def _adaptive(name: str) -> Any:
+    return Adaptive(_learning(GPC)(name))
+
+
+def _receding(planner: Callable[..., Any], **options: Any) -> Callable[[str], Any]:
+    """MPC with the model and the cost of the task."""
+
+    def made(name: str) -> Any:
+        env = task_of(name)
+        if env.dynamics.observation_size != env.dynamics.state_size:
+            raise Unsuitable("the state is not observed")
+        bounds, more = env.control_bounds, dict(options)
+        if planner is not ilqr and bounds is not None:
+            low, high = (np.asarray(bound, float) for bound in bounds)
+            width = high - low
+            more["scale"] = np.where(np.isfinite(width), width / 4, 1.0)
+        options_ = {"planner": planner, "bounds": bounds, "throw": False}
+        return MPC(env.dynamics, env.cost, LOOKAHEAD, **options_, **more)
+
+    return made
+
+
+def _by_gradient(network: Callable[..., Any]) -> Callable[[str], Any]:
+    """A network, by gradient descent through the rollout."""
+
+    def made(name: str) -> Any:
+        env = task_of(name)
+        first, key = jax.random.split(jax.random.key(1))
+        horizon = min(env.horizon, LONGEST)
+        loss = expected_cost(env, batch=EPISODES, horizon=horizon, gradient_decay=0.95)
+        options = {"key": key, "progress": False, "throw": False}
+        start = network(env, key=first)
+        return fit(loss, start, _adam(TRAINING_STEPS), TRAINING_STEPS, **options).model
+
+    return made
+
+
+def _mlp(env: Environment, key: Any) -> Any:
+    return Deep(env, width=32, depth=1, key=key)
+
+
+def _gru(env: Environment, key: Any) -> Any:
+    sizes = env.feature_size, env.control_size
+    bounds = env.control_bounds
+    if bounds is not None and not np.all(np.isfinite(bounds)):
+        bounds = None
+    return GRU(*sizes, 32, features=env.encode, bounds=bounds, key=key)
+
+
+def _affine(env: Environment, key: Any) -> Any:
+    return Deep(env, width=1, depth=0, key=key)
+
+
+def _by_actor_critic(method: type[PPO] | type[SHAC]) -> Callable[[str], Any]:
+    """The MLP by reinforcement learning."""
+
+    def made(name: str) -> Any:
+        env, head = task_of(name), "gaussian" if method is PPO else "deterministic"
+        if method is PPO and env.control_bounds is None:
+            raise Unsuitable("the controls have no bounds")
+        first, key = jax.random.split(jax.random.key(1))
+        model = actor_critic(env, width=32, depth=1, head=head, key=first)
+        loss = method(env, EPISODES, min(env.horizon, LONGEST), discount=0.95)
+        steps = TRAINING_STEPS
+        if isinstance(loss, PPO):
+            steps *= loss.epochs * loss.minibatches
+        options = {"key": key, "progress": False, "throw": False}
+        fitted = fit(loss, model, _adam(steps), steps, **options)
+        policy = fitted.model.policy
+        return policy.base if method is PPO else policy
+
+    return made
+
+
+def _adam(steps: int) -> optax.GradientTransformation:
+    return optax.chain(
+        optax.clip_by_global_norm(1.0),
+        optax.adam(optax.cosine_decay_schedule(0.01, steps)),
+    )
+
+
+FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
+    "Feedback": {
+        "zero": lambda name: Zero(task_of(name).control_size),
+        "PID": _following,
+        "LQR": _lqr,
+        "FiniteHorizonLQR": _finite,
+        "HInfinity": _regulator(HInfinity),
+    },
+    "Online learning": {
+        "GPC": _learning(GPC),
+        "Adaptive": _adaptive,
+        "NeuralGPC": _neural,
+        "DRC": _learning(DRC),
+        "SFC": _learning(SFC),
+        "DSC": _learning(DSC),
+        "BPC": _bandit,
+    },
+    "Planning": {
+        "MPC": _receding(ilqr, max_iterations=8),
+        "MPPI": _receding(mppi, samples=128, iterations=3),
+        "CEM": _receding(cem, samples=128, iterations=3),
+    },
+    "Training": {
+        "affine": _by_gradient(_affine),
+        "MLP": _by_gradient(_mlp),
+        "GRU": _by_gradient(_gru),
+        "SHAC": _by_actor_critic(SHAC),
+        "PPO": _by_actor_critic(PPO),
+    },
+}
+"""What is compared: how each controller is made for the task of a name."""
+
+
+@functools.cache
+def agent_of(name: str, method: str) -> Any:
+    """The controller, designed at the equilibrium or trained.
+
+    **Raises:** `Unsuitable` if it needs what the task has not got.
+    """
+    makers = {key: make for family in FAMILIES.values() for key, make in family.items()}
+    try:
+        return makers[method](name)
+    except (ValueError, RuntimeError) as error:
+        raise Unsuitable(str(error)) from error
