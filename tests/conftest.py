@@ -15,6 +15,16 @@ sys.path.insert(0, str(Path(__file__).parent))
 gc.set_threshold(200_000, 50, 100)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def room():
+    """Thousands of programs are compiled."""
+    # Not before the tests' import hook is there.
+    from delucax.experiments._room import make_room
+
+    yield
+    make_room()
+
+
 @pytest.fixture
 def key():
     return jax.random.key(0)

@@ -20,6 +20,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from ._axes import Axis
 from ._experiment import Experiment, Fixture, RESERVED
 from ._provenance import device
+from ._room import make_room
 
 
 # Programs that are kept compiled. A sweep over something static would fill the memory.
@@ -88,6 +89,8 @@ class Runner:
             error = f"{type(raised).__name__}: {raised}".strip()[:_LONGEST]
             trace = "".join(traceback.format_exception(raised))[-_LONGEST:]
             values = {}
+        if clock.compiling:
+            make_room()
         return Outcome(
             values, error, trace, clock.compiling, clock.running, where, os.getpid()
         )

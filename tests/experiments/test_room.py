@@ -1,0 +1,45 @@
+"""A long sweep does not run out of what a compiled program takes."""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import pytest
+from helpers import once
+
+from delucax.experiments import _execute, _room, experiment
+from delucax.experiments._room import make_room
+
+
+pytestmark = [
+    once,
+    pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts the maps"),
+]
+
+
+def test_programs_go_when_they_take_too_much():
+    program = jax.jit(lambda x: x + 1)
+    program(1.0)
+    assert not make_room() and program._cache_size() == 1
+    assert make_room(limit=1) and program._cache_size() == 0
+    assert program(1.0) == 2.0
+
+
+def test_elsewhere_nothing_is_done(monkeypatch, tmp_path):
+    monkeypatch.setattr(_room, "_TAKEN", tmp_path / "none")
+    assert not make_room(limit=1)
+
+
+def test_a_sweep_makes_room_and_keeps_its_results(monkeypatch):
+    """Every case that compiled may be the one that leaves too little."""
+    seen = []
+    monkeypatch.setattr(_execute, "make_room", lambda: seen.append(make_room(limit=1)))
+
+    @experiment.parametrize("n", [2, 3, 4])
+    @experiment.seeds(2)
+    def total(n, key):
+        return jnp.sum(jnp.arange(n)) + 0 * jax.random.normal(key)
+
+    results = total.run(progress=False)
+    assert [row["value"] for row in results.rows] == [1, 1, 3, 3, 6, 6]
+    assert seen and all(seen)
