@@ -1,4 +1,4 @@
-"""Check that each measured number in the README and the docs is what was measured.
+"""Check that each number of README, docs and notebooks is what was measured.
 
 `docs/claims.toml` says for each number which command makes it and where it stands in
 the committed results. `python scripts/claims.py` fails where
@@ -12,11 +12,14 @@ the committed results. `python scripts/claims.py` fails where
 
 The ledger has three kinds of entries. A `claim` is a piece of a page in which `{}` is
 a number, and `values` say where these are in `results`; where a test proves the claim,
-`test` names it in place of `results`, and `true` lists what must be true in
-these. A `table` is the one that follows the text
-`after`, or begins with it; `columns` has for each column where its numbers are, with
-`{}` for the first cell of the row, or for what `rows` has in its place, and `{2}` for
-the second. What is `given` was chosen, or is somebody else's number.
+`test` names it in place of `results`, and `true` lists what must be true in these. A
+`table` is the one that follows the text `after`, or begins with it; `columns` has for
+each column where its numbers are, with `{}` for the first cell of the row, or for what
+`rows` has in its place, and `{2}` for the second. What is `given` was chosen, or is
+somebody else's number.
+
+Of a notebook only the Markdown is read: an output is what the run shows. A message
+gives the line of a page, but the cell of a notebook, where cells of code count too.
 
 A place in the results is written `[<= ][TAKE of ]STEP > STEP > ...[ * FACTOR]`. A step
 is the key of an object, the number of a member of a list, or `KEY=VALUE & KEY=VALUE`:
@@ -39,6 +42,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 LEDGER = "docs/claims.toml"
+_CELL_END = "\n\f\n"
 
 _NUMBER = r"[-+−]?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[-+]?\d+)?"
 _WORD = r"\b(?:two|three|four|five|six|seven|eight|nine|ten|twenty|a hundred)"
@@ -59,20 +63,31 @@ _HEAD = re.compile(r"^\|.*\|[ ]*\n\|[ :|-]+\|[ ]*$", re.MULTILINE)
 _SILENT = [
     re.compile(r"^( *)```[^`]*?^\1``` *$", re.MULTILINE),
     re.compile(r"<!--.*?-->", re.DOTALL),
-    re.compile(r"`[^`\n]*`|\$[^$]*\$|\]\([^)\n]*\)|\{ *width[^}]*\}"),
+    re.compile(r"`[^`\n]*`|\$[^$\f]*\$|\]\([^)\n]*\)|\{ *width[^}]*\}"),
 ]
 
 
 def pages(root: Path) -> list[str]:
     """The pages that are held to the ledger."""
     found = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+    found += sorted((root / "notebooks").glob("*.ipynb"))
     return [str(path.relative_to(root)) for path in found]
+
+
+def read(root: Path, page: str) -> str:
+    """The text of a page; of a notebook the Markdown, with a mark after each cell."""
+    text = (root / page).read_text(encoding="utf-8")
+    if page.endswith(".ipynb"):
+        cells = json.loads(text)["cells"]
+        said = [c["source"] if c["cell_type"] == "markdown" else "" for c in cells]
+        text = "".join("".join(source) + _CELL_END for source in said)
+    return text
 
 
 def problems(root: Path = ROOT) -> list[str]:
     """What is wrong, a line each."""
     ledger = tomllib.loads((root / LEDGER).read_text(encoding="utf-8"))
-    texts = {name: (root / name).read_text(encoding="utf-8") for name in pages(root)}
+    texts = {name: read(root, name) for name in pages(root)}
     covered: dict[str, list[tuple[int, int]]] = {name: [] for name in texts}
     found = []
     sources: dict[str, Any] = {}
@@ -390,8 +405,10 @@ def pattern(text: str) -> re.Pattern[str]:
     return re.compile(r"\s+".join(words))
 
 
-def _line(text: str, at: int) -> int:
-    return text.count("\n", 0, at) + 1
+def _line(text: str, at: int) -> str:
+    if _CELL_END in text:
+        return f"cell {text.count(_CELL_END, 0, at) + 1}"
+    return str(text.count("\n", 0, at) + 1)
 
 
 if __name__ == "__main__":

@@ -70,7 +70,7 @@ def ledger() -> str:
     entries = tomllib.loads((root / claims.LEDGER).read_text(encoding="utf-8"))
     found: dict[str, list[str]] = {}
     for entry in [*entries["claim"], *entries["table"]]:
-        text = (root / entry["page"]).read_text(encoding="utf-8")
+        text = claims.read(root, entry["page"])
         match = claims.pattern(entry.get("text", entry.get("after"))).search(text)
         said = " ".join(match.group().split()).strip("| ") if match else ""
         said = re.sub(r"[`*]", "", said).replace("|", ": ")

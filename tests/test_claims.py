@@ -144,6 +144,37 @@ def test_an_origin_that_is_wrong(tree, file, old, new, said):
     assert any(said in line for line in claims.problems(tree))
 
 
+def test_the_markdown_of_a_notebook_is_a_page(tree):
+    """A number is found by its cell; code and what it prints are not read."""
+    printed = {"output_type": "stream", "name": "stdout", "text": "It takes 5 ms."}
+    cells = [
+        {"cell_type": "markdown", "source": ["# Speed\n", "\n", "It is fast."]},
+        {"cell_type": "code", "source": ["# 4 times"], "outputs": [printed]},
+        {"cell_type": "markdown", "source": ["In all,\n", "it takes 3 ms."]},
+        {"cell_type": "markdown", "source": "A slope of 0.4, a price of $1."},
+        {"cell_type": "markdown", "source": "| | x |\n|---|---|\n| a | 7 |\n\nIn $."},
+    ]
+    (tree / "notebooks").mkdir()
+    (tree / "notebooks/speed.ipynb").write_text(json.dumps({"cells": cells}))
+    assert claims.problems(tree) == [
+        "notebooks/speed.ipynb:cell 5: '7' is not in docs/claims.toml",
+        "notebooks/speed.ipynb:cell 3: '3 ms' is not in docs/claims.toml",
+        "notebooks/speed.ipynb:cell 4: 'slope of 0.4' is not in docs/claims.toml",
+    ]
+    page = 'page = "notebooks/speed.ipynb"'
+    made = 'command = "python -m benchmarks.speed"\nresults = '
+    made += '"benchmarks/results/speed.json"\n'
+    ledger = (
+        f'{LEDGER}\n[[claim]]\n{page}\ntext = "it takes {{}} ms"\n{made}'
+        'values = ["rows > name=ours & kind=y > ratio"]\n'
+        f'\n[[given]]\n{page}\ntexts = ["slope of 0.4"]\n'
+        f'\n[[table]]\n{page}\nafter = "| a"\n{made}'
+    )
+    (tree / "docs/claims.toml").write_text(ledger)
+    (said,) = claims.problems(tree)
+    assert said.startswith("notebooks/speed.ipynb:cell 3: '3', but 'rows > ")
+
+
 def test_a_patch_does_not_make_results_stale(tree):
     change(tree / "pyproject.toml", "0.2.0", "0.2.9")
     assert claims.problems(tree) == []
@@ -216,7 +247,7 @@ def test_no_entry_of_this_tree_would_let_another_number_pass():
         if "results" not in entry:
             continue
         assert not list(claims._origin(ROOT, entry, sources))
-        text = (ROOT / entry["page"]).read_text()
+        text = claims.read(ROOT, entry["page"])
         match = claims.pattern(entry["text"]).search(text)
         for k, place in enumerate(entry["values"], 1):
             if place.startswith(("<=", ">=")):
