@@ -1,11 +1,12 @@
 """Every task crossed with every controller that suits it.
 
 `python -m benchmarks.scoreboard` runs what is missing or changed, writes
-`results/scoreboard.jsonl`, and puts the tables into `docs/scoreboard.md`; with
-`--table` it only does the latter, with `--fresh` it runs all.
+`results/scoreboard.jsonl`, and puts the tables into `docs/scoreboard.md` and draws its
+picture; with `--table` it only does the latter, with `--fresh` it runs all.
 """
 
 import argparse
+import functools
 import sys
 import time
 from pathlib import Path
@@ -13,19 +14,24 @@ from typing import Any
 
 import jax
 import numpy as np
+from matplotlib.figure import Figure
 
 import delucax as dlx
 from benchmarks._machine import describe
 from delucax import experiments
 from delucax.experiments import interquartile_mean, Results
-from delucax.experiments._scoreboard import METHODS, scoreboard, task_of, tasks
+from delucax.experiments._methods import FAMILIES, task_of
+from delucax.experiments._scoreboard import METHODS, scoreboard, tasks
 
 
 STORE = Path(__file__).parent / "results" / "scoreboard.jsonl"
 PAGE = Path(__file__).parents[1] / "docs" / "scoreboard.md"
+PICTURE = PAGE.parent / "assets" / "scoreboard.svg"
+SHORT = {"FiniteHorizonLQR": "finite LQR", "HInfinity": "H∞"}
 BEGIN, END = "<!-- scoreboard -->\n", "<!-- end of scoreboard -->"
 
 
+@functools.cache
 def floor_of(task: str) -> str:
     """Zero control, or LQR where the plant is unstable at its equilibrium."""
     env = task_of(task)
@@ -38,65 +44,91 @@ def floor_of(task: str) -> str:
 
 
 def costs_of(results: Results) -> dict[tuple[str, str], np.ndarray | str]:
-    """The costs over the seeds by task and method, or why there are none."""
+    """The costs over the seeds by task and method, or that there are none."""
     found: dict[tuple[str, str], Any] = {}
-    for task in tasks():
-        for method in METHODS:
-            rows = results.where(task=task, method=method).rows
-            values = [row.get("cost") for row in rows]
-            if rows and all(value is not None for value in values):
-                found[task, method] = np.array(values, float)
-            else:
-                found[task, method] = "not suited"
+    for place, values in _by_case(results, "cost").items():
+        complete = bool(values) and None not in values
+        found[place] = np.array(values, float) if complete else "not suited"
     return found
+
+
+def _by_case(results: Results, name: str) -> dict[tuple[str, str], list]:
+    """What there is of one result over the seeds, by task and method."""
+    found = {(task, method): [] for task in tasks() for method in METHODS}
+    for row in results.rows:
+        if (row["task"], row["method"]) in found:
+            found[row["task"], row["method"]].append(row.get(name))
+    return found
+
+
+def scores_of(costs: dict[tuple[str, str], Any]) -> dict[tuple[str, str], float]:
+    """0 at the floor and 1 at the best known, by task and method: NaN where it is not
+    suited or there is next to nothing between the two, minus infinity where it
+    diverges."""
+    scores = {}
+    for task in tasks():
+        floor, low = floor_cost(costs, task), best_cost(costs, task)
+        flat = floor - low <= 5e-3 * abs(low) or not np.isfinite(floor)
+        for method in METHODS:
+            cost = costs[task, method]
+            if flat or isinstance(cost, str):
+                scores[task, method] = np.nan
+                continue
+            own = interquartile_mean(np.where(np.isfinite(cost), cost, np.inf))
+            scores[task, method] = (floor - own) / (floor - low)
+    return scores
+
+
+def floor_cost(costs: dict[tuple[str, str], Any], task: str) -> float:
+    """The interquartile mean of the floor."""
+    found = costs[task, floor_of(task)]
+    return interquartile_mean(costs[task, "zero"] if isinstance(found, str) else found)
+
+
+def best_cost(costs: dict[tuple[str, str], Any], task: str) -> float:
+    """The interquartile mean of the least cost of each start."""
+    usable = [c for m in METHODS if not isinstance(c := costs[task, m], str)]
+    best = np.min(np.where(np.isfinite(usable), usable, np.inf), axis=0)
+    return interquartile_mean(best)
 
 
 def tables(results: Results) -> str:
     """Scores, costs and speed, as Markdown."""
-    costs = costs_of(results)
-    scores, raw, speed = [], [], []
-    for task in dict.fromkeys(row["task"] for row in results.rows):
-        floor = floor_of(task)
-        if not isinstance(costs[task, floor], np.ndarray):
-            floor = "zero"
-        usable = [c for m in METHODS if isinstance(c := costs[task, m], np.ndarray)]
-        with np.errstate(invalid="ignore"):
-            best = np.nanmin(np.where(np.isfinite(usable), usable, np.inf), axis=0)
-        low, high = interquartile_mean(best), interquartile_mean(costs[task, floor])
-        line, numbers, times = [f"`{task}`", floor], [f"`{task}`"], [f"`{task}`"]
-        for method in METHODS:
-            cost = costs[task, method]
-            if isinstance(cost, str):
-                line.append("")
-                numbers.append("")
-                times.append("")
-                continue
-            own = interquartile_mean(np.where(np.isfinite(cost), cost, np.inf))
-            numbers.append(_number(own))
-            if high - low <= 1e-3 * abs(low) or not np.isfinite(high):
-                line.append("")
-            elif not np.isfinite(own):
-                line.append("diverges")
-            else:
-                score = (high - own) / (high - low)
-                text = f"{score:.2f}" if score > -10 else "below -10"
-                line.append(text.replace("-0.00", "0.00"))
-            rows = results.where(task=task, method=method).rows
-            took = [row["us_per_step"] for row in rows if row.get("us_per_step")]
-            times.append(f"{np.median(took):.2f}" if took else "")
-        numbers.append(_number(low))
-        scores.append(line)
-        raw.append(numbers)
-        speed.append(times)
-    names = ["zero", "PID", "LQR", "H∞", "GPC", "MLP", "plan"]
-    parts = [
-        "Score: 0 is the floor, 1 the best known.\n",
-        _markdown(["task", "floor", *names[:-1]], [row[:-1] for row in scores], 2),
-        "Cost of an episode, the interquartile mean over 8 starts.\n",
-        _markdown(["task", *names, "best known"], raw, 1),
-        "Microseconds a step of each of a batch of 8, the controller included.\n",
-        _markdown(["task", *names[:-1]], [row[:-1] for row in speed], 1),
+    costs, speeds = costs_of(results), _by_case(results, "us_per_step")
+    scores = scores_of(costs)
+    scored = [method for method in METHODS if method != "plan"]
+    body = [
+        [f"`{task}`", floor_of(task), *(_score(scores[task, m]) for m in scored)]
+        for task in tasks()
     ]
+    parts = [
+        "## Score\n\n0 is the floor, 1 the best known.\n",
+        _markdown(["task", "floor", *map(_short, scored)], body, 2),
+        "## Cost\n\nOf an episode, the interquartile mean over 8 starts.\n",
+    ]
+    for name, family in FAMILIES.items():
+        body = []
+        for task in tasks():
+            found = [costs[task, method] for method in family]
+            if all(isinstance(cost, str) for cost in found):
+                continue
+            found += [costs[task, "plan"]]
+            best = _number(best_cost(costs, task))
+            body.append([f"`{task}`", *map(_cost, found), best])
+        head = ["task", *map(_short, family), "plan", "best known"]
+        parts += [f"### {name}: cost\n", _markdown(head, body, 1)]
+    parts.append(
+        "## Time\n\nMicroseconds a step, the controller included, of each of a batch "
+        "of 8 on one core.\n"
+    )
+    for name, family in FAMILIES.items():
+        body = []
+        for task in tasks():
+            found = [_speed(speeds[task, method]) for method in family]
+            if any(found):
+                body.append([f"`{task}`", *found])
+        parts += [f"### {name}: time\n"]
+        parts += [_markdown(["task", *map(_short, family)], body, 1)]
     machine = describe()
     version = machine["versions"]
     parts.append(
@@ -106,10 +138,62 @@ def tables(results: Results) -> str:
     return "\n".join(parts)
 
 
-def _number(value: float) -> str:
+def draw(results: Results) -> Figure:
+    """The scores as a picture: a row for each task, a column for each controller."""
+    scores = scores_of(costs_of(results))
+    scored = [method for method in METHODS if method != "plan"]
+    rows = [t for t in tasks() if any(np.isfinite(scores[t, m]) for m in scored)]
+    values = np.array([[scores[task, method] for method in scored] for task in rows])
+    figure = Figure(figsize=(10, 0.3 * len(rows) + 1.6), layout="constrained")
+    axes = figure.subplots()
+    image = axes.imshow(np.clip(values, -1, 1), cmap="RdYlGn", vmin=-1, vmax=1)
+    for (i, j), value in np.ndenumerate(values):
+        text = "< -10" if value < -10 else f"{value:.2f}".replace("-0.00", "0.00")
+        if not np.isnan(value):
+            axes.text(j, i, text, ha="center", va="center", fontsize=6, color="black")
+    axes.set_xticks(range(len(scored)), map(_short, scored), rotation=60, ha="right")
+    axes.set_yticks(range(len(rows)), rows)
+    axes.tick_params(length=0, labelsize=8)
+    axes.set_facecolor("0.93")
+    edge = -0.5
+    for name, family in FAMILIES.items():
+        size = sum(method in scored for method in family)
+        axes.text(edge + size / 2, -0.8, name, ha="center", va="bottom", fontsize=9)
+        edge += size
+        if edge < len(scored) - 1:
+            axes.axvline(edge, color="black", linewidth=1)
+    axes.spines[:].set_visible(False)
+    figure.colorbar(image, label="score", shrink=0.6, pad=0.01)
+    return figure
+
+
+def _short(method: str) -> str:
+    return SHORT.get(method, method)
+
+
+def _score(value: float) -> str:
+    if np.isnan(value):
+        return ""
+    if value == -np.inf:
+        return "diverges"
+    return f"{value:.2f}".replace("-0.00", "0.00") if value > -10 else "below -10"
+
+
+def _cost(cost: Any) -> str:
+    if isinstance(cost, str):
+        return ""
+    return _number(interquartile_mean(np.where(np.isfinite(cost), cost, np.inf)))
+
+
+def _speed(values: list[float | None]) -> str:
+    took = [value for value in values if value]
+    return _number(float(np.median(took)), 3) if took else ""
+
+
+def _number(value: float, digits: int = 4) -> str:
     if not np.isfinite(value):
         return "diverges"
-    return f"{value:.4g}" if abs(value) < 1e5 else f"{value:.1e}"
+    return f"{value:.{digits}g}" if abs(value) < 1e5 else f"{value:.1e}"
 
 
 def _markdown(head: list[str], body: list[list[str]], left: int) -> str:
@@ -145,6 +229,7 @@ def main(arguments: list[str] | None = None) -> int:
     text = tables(results)
     print(text)
     write_page(text)
+    draw(results).savefig(PICTURE)
     print(f"{time.perf_counter() - begin:.0f} s on {jax.devices()[0].device_kind}")
     return 0
 

@@ -84,7 +84,7 @@ def _add_lung(commands: Any) -> None:
     def call(options: Any) -> None:
         from .lung import lung_study
 
-        names = ("small", "data", "seeds")
+        names = ("small", "data", "seeds", "sensor_delay")
         lung_study(options.out, **{name: getattr(options, name) for name in names})
 
     help = "learn lungs from breaths, and controllers of a ventilator in them"
@@ -93,6 +93,8 @@ def _add_lung(commands: Any) -> None:
     lung.add_argument("--small", action="store_true", help="two lungs, in a minute")
     lung.add_argument("--data", help="breaths, as a CSV file of the public data set")
     lung.add_argument("--seeds", type=int, help="controllers of each kind, 3 if not")
+    late = "samples that the sensor is late, in DATA too; 2 if not"
+    lung.add_argument("--sensor-delay", type=int, default=2, help=late)
 
 
 def _add_list(commands: Any) -> None:

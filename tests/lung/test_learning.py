@@ -12,7 +12,7 @@ import delucax as dlx
 from delucax import lung
 from delucax.lung._size import FULL
 from delucax.lung._train import _Careful
-from delucax.lung._tuned import tuned_pids
+from delucax.lung._tuned import _lost, best_of, tuned_pids
 
 
 pytestmark = once
@@ -167,10 +167,51 @@ def test_tuned_pids_are_the_best_that_were_tried(tmp_path):
     envs = lung.stack([lung.single_compartment(R) for R in (5.0, 50.0)])
     size = FULL._replace(tuned=20, pid_steps=3)
     options = dict(checkpoint=tmp_path / "tuned.fit", progress=False)
-    found = tuned_pids(envs, waveform, size, KEY, options)
-    assert len(found) == 4
+    said = []
+    found = tuned_pids(envs, waveform, size, KEY, options, said.append)
+    assert len(found) == 4 and not said
     error = lambda env, pid: jnp.mean(lung.breath_error(env, pid, key=KEY))
     own = eqx.filter_vmap(error)(envs, found["tuned PID + feed-forward"])
     shared = found["tuned PID + feed-forward for all"]
     alike = eqx.filter_vmap(error, in_axes=(eqx.if_array(0), None))(envs, shared)
     assert jnp.all(own <= alike + 1e-3) and jnp.all(own < 10)
+
+
+class Root(dlx.AbstractController):
+    """Not finite below 0, and no slope at 0."""
+
+    gain: jax.Array = dlx.weight()
+
+    def __call__(self, t, y, state):
+        return 10 * jnp.sqrt(self.gain)[None].astype(y.dtype), state
+
+
+@pytest.mark.parametrize("shared", [False, pytest.param(True, marks=thorough)])
+def test_those_that_diverge_harm_no_other(shared):
+    models = lung.stack([lung.LungModel(lung.SingleCompartment()) for _ in range(2)])
+
+    def trained(gains, throw):
+        start = Root(jnp.array(gains))
+        few = dict(shared=shared, steps=2, horizon=2, pips=[20.0], throw=throw)
+        return lung.train_controllers(models, start, key=KEY, **few)
+
+    begin = [1.0, -1.0, 0.0] if shared else [[1.0, -1.0], [0.0, 1.0]]
+    with user_error(RuntimeError, match="is not finite at step 0"):
+        trained(begin, True)
+    found = trained(begin, False)
+    expected = trained(np.ones(np.shape(begin)), True)
+    bad = found.model.gain < 0.5
+    assert_close(found.model.gain[bad], [-1.0, 0.0])
+    assert_close(found.model.gain[~bad], expected.model.gain[~bad])
+    assert np.all(expected.model.gain != 1)
+    assert found.history["diverged"].tolist() == [2, 2]
+
+
+def test_what_has_no_finite_error_is_not_chosen():
+    candidates = dict(number=jnp.arange(6).reshape(3, 2))
+    errors = jnp.array([[jnp.inf, 2.0, 1.0], [3.0, jnp.inf, 4.0]])
+    assert best_of(candidates, errors, False)["number"].tolist() == [4, 1]
+    assert best_of(candidates, errors, True)["number"].tolist() == [4, 5]
+    assert _lost(np.zeros(5), errors[:, 2]) == ""
+    assert "2 of 6 errors are not finite" in _lost(np.zeros(5), errors)
+    assert "in 1 of 5 steps" in _lost(np.eye(5)[0], errors[:, 2])

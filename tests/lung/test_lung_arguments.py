@@ -57,6 +57,17 @@ def test_the_peep_of_every_waveform_counts():
             lung.at_pip(ENV, pip)
 
 
+@pytest.mark.parametrize("task", ["single_compartment", "delay_lung"])
+def test_a_peep_below_that_of_the_valves_is_refused(task):
+    make, valves = getattr(lung, task), lung.Valves(peep=8.0)
+    with user_error(match=f"{task}: the peep of waveform must be at .* 8.0, .* got 5"):
+        make(valves=valves)
+    with user_error(match="valves, 5.0, below which no lung empties, got 3.0"):
+        make(waveform=lung.BreathWaveform(peep=3.0))
+    env = make(valves=valves, waveform=lung.BreathWaveform(peep=8.0))
+    assert_close(env.dynamics.pressure(env.initial_state), 8.0, rtol=1e-6)
+
+
 def test_traced_waveforms_are_taken():
     def error(peep, pips):
         env = eqx.tree_at(lambda e: e.cost.waveform.peep, ENV, peep)

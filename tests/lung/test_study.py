@@ -65,6 +65,10 @@ def test_other_settings_are_refused(begun):
         lung.lung_study(begun, small=True, seeds=2)
     with user_error(match="seeds must be at least 1, got 0"):
         lung.lung_study(begun, seeds=0)
+    with user_error(match="other settings: sensor_delay is 2 there and 3 here"):
+        lung.lung_study(begun, small=True, sensor_delay=3)
+    with user_error(match="sensor_delay must be a whole number of at least 0, got -1"):
+        lung.lung_study(begun, sensor_delay=-1)
 
 
 def test_damaged_files_are_refused(begun):

@@ -26,6 +26,7 @@ from ..controllers import (
     SFC,
     Zero,
 )
+from ..costs import AbstractCost, Function
 from ..disturbances import Gaussian
 from ..dynamics import linearize
 from ..environments import Environment, make, UniformState
@@ -132,7 +133,8 @@ def _adaptive(name: str) -> Any:
 
 
 def _receding(planner: Callable[..., Any], **options: Any) -> Callable[[str], Any]:
-    """MPC with the model and the cost of the task."""
+    """MPC with the model and the cost of the task and, at the end of a plan, the cost
+    to go of the LQR where there is one."""
 
     def made(name: str) -> Any:
         env = task_of(name)
@@ -143,10 +145,25 @@ def _receding(planner: Callable[..., Any], **options: Any) -> Callable[[str], An
             low, high = (np.asarray(bound, float) for bound in bounds)
             width = high - low
             more["scale"] = np.where(np.isfinite(width), width / 4, 1.0)
-        options_ = {"planner": planner, "bounds": bounds, "throw": False}
-        return MPC(env.dynamics, env.cost, LOOKAHEAD, **options_, **more)
+        how = {"planner": planner, "bounds": bounds, "throw": False}
+        return MPC(env.dynamics, _to_the_end(name), LOOKAHEAD, **how, **more)
 
     return made
+
+
+def _to_the_end(name: str) -> AbstractCost:
+    """The cost of the task, with the LQR's cost to go for a final cost."""
+    env = task_of(name)
+    try:
+        lqr = agent_of(name, "LQR")
+    except Unsuitable:
+        return env.cost
+
+    def to_go(t: Any, x: Any) -> Any:
+        deviation = env.dynamics.difference(x, lqr.x_ref)
+        return deviation @ lqr.P @ deviation
+
+    return Function(env.cost, to_go)
 
 
 def _by_gradient(network: Callable[..., Any]) -> Callable[[str], Any]:
@@ -190,21 +207,22 @@ def _by_actor_critic(method: type[PPO] | type[SHAC]) -> Callable[[str], Any]:
         first, key = jax.random.split(jax.random.key(1))
         model = actor_critic(env, width=32, depth=1, head=head, key=first)
         loss = method(env, EPISODES, min(env.horizon, LONGEST), discount=0.95)
-        steps = TRAINING_STEPS
+        # A step that a critic which has seen little can follow, as published.
+        steps, rate = TRAINING_STEPS, 0.002
         if isinstance(loss, PPO):
-            steps *= loss.epochs * loss.minibatches
+            steps, rate = steps * loss.epochs * loss.minibatches, 0.01
         options = {"key": key, "progress": False, "throw": False}
-        fitted = fit(loss, model, _adam(steps), steps, **options)
+        fitted = fit(loss, model, _adam(steps, rate), steps, **options)
         policy = fitted.model.policy
         return policy.base if method is PPO else policy
 
     return made
 
 
-def _adam(steps: int) -> optax.GradientTransformation:
+def _adam(steps: int, rate: float = 0.01) -> optax.GradientTransformation:
     return optax.chain(
         optax.clip_by_global_norm(1.0),
-        optax.adam(optax.cosine_decay_schedule(0.01, steps)),
+        optax.adam(optax.cosine_decay_schedule(rate, steps)),
     )
 
 

@@ -37,7 +37,6 @@ TRUE_PID = dict(
 )
 """The gains of the true PIDs that are tried."""
 _NOISE = 0.2
-_SENSOR_DELAY = 2
 _CAREFUL = ABORT - 15
 """One that does not know its lung has to stay well below the limit."""
 
@@ -198,7 +197,9 @@ def planners(trainer: Trainer) -> Contender:
     return Contender("MPC", 0, plan, False)
 
 
-def online_learners(train: Breaths, pids: dict[str, Any], trainer: Trainer) -> Any:
+def online_learners(
+    train: Breaths, pids: dict[str, Any], trainer: Trainer, sensor_delay: int
+) -> Any:
     """GPC around the best leaky PID of each lung, stacked over the lungs.
 
     Its model is linear: the least-squares fit of the next pressure to the last ones and
@@ -209,7 +210,7 @@ def online_learners(train: Breaths, pids: dict[str, Any], trainer: Trainer) -> A
     for breaths, pid in zip(unstack(train), unstack(pids["leaky PID"]), strict=True):
         outputs, controls = breaths.pressure[..., None], breaths.u_in[:, :-1, None]
         # A model to predict with: each of its numbers need not be known.
-        lags: Any = dict(delay=_SENSOR_DELAY + 1, dt=breaths.dt, throw=False)
+        lags: Any = dict(delay=sensor_delay + 1, dt=breaths.dt, throw=False)
         seen = arx(outputs, controls, outputs_back=2, controls_back=4, **lags).model
         n = seen.state_size
         model = LinearDynamics(seen.A, seen.B, dt=breaths.dt)

@@ -16,7 +16,7 @@ from ._data import LENGTH
 from ._policies import Breathing
 from ._runner import ABORT
 from ._size import BREATH, SEEN, SHOWN, UNSEEN
-from ._stacking import repeat, unstack
+from ._stacking import count_of, repeat, taken, unstack
 from ._waveform import at_pip, BreathWaveform
 
 
@@ -58,8 +58,8 @@ def _evaluated(envs, controllers, pips, keys):
 
 def breathing(controllers: Any, waveform: BreathWaveform) -> Any:
     """Controllers of the inspiratory valve, stacked, made ones of both valves."""
-    count = jax.tree.leaves(eqx.filter(controllers, eqx.is_array))[0].shape[0]
-    return eqx.filter_vmap(Breathing)(controllers, repeat(waveform, count))
+    waveforms = repeat(waveform, count_of(controllers))
+    return eqx.filter_vmap(Breathing)(controllers, waveforms)
 
 
 def error_rows(
@@ -84,7 +84,7 @@ def error_rows(
     for label, seed, controllers, shared in contenders:
         whole = breathing(controllers, waveform)
         *found, breaths = _evaluated(envs, whole, pips, keys)
-        runs.setdefault(label, jax.tree.map(lambda a: a[:, 0, place], breaths))
+        runs.setdefault(label, taken(breaths, (slice(None), 0, place)))
         for part, here in parts:
             columns = (array[..., here] for array in found)
             rows += _rows(names, label, seed, part, *columns)

@@ -24,7 +24,6 @@ from ._train import lung_environment
 from ._waveform import at_pip, BreathWaveform
 
 
-_SENSOR_DELAY = 2
 _SYSTEM = "dynamics.dynamics.system."
 
 
@@ -33,7 +32,7 @@ def explored(size: Size) -> Breaths:
     return stack_breaths(
         [
             explore(
-                double_compartment(R, C),
+                double_compartment(R, C, sensor_delay=size.sensor_delay),
                 size.breaths,
                 key=jr.key(i),
                 resistance=R,
@@ -103,7 +102,7 @@ def learned(train: Breaths, size: Size, key: Any, options: Any) -> Any:
 
 def fitted(kind: str, train: Breaths, size: Size, key: Any, options: Any) -> Any:
     """Models of a kind, stacked, fitted to the breaths of each lung."""
-    models, moved = _models(kind, train, jr.fold_in(key, 4))
+    models, moved = _models(kind, train, size.sensor_delay, jr.fold_in(key, 4))
     is_network = kind in ("neural ODE", "grey box")
     is_small = kind in ("single compartment", "balloon")
     return fit_lungs(
@@ -118,7 +117,7 @@ def fitted(kind: str, train: Breaths, size: Size, key: Any, options: Any) -> Any
     ).model
 
 
-def _models(kind: str, train: Breaths, key: Any) -> tuple[Any, Any]:
+def _models(kind: str, train: Breaths, delay: int, key: Any) -> tuple[Any, Any]:
     """Models of a kind before they are fitted, and what of them is."""
     count = train.pressure.shape[0]
     dt = train.dt[0]
@@ -141,7 +140,7 @@ def _models(kind: str, train: Breaths, key: Any) -> tuple[Any, Any]:
         systems = [GreyBoxLung(key=k) for k in jr.split(key, count)]
         moved = {_SYSTEM + name: None for name in ("network", "memory")}
         moved |= at("single.resistance", "single.compliance")
-    return stack([LungModel(system, dt, _SENSOR_DELAY) for system in systems]), moved
+    return stack([LungModel(system, dt, delay) for system in systems]), moved
 
 
 def open_loop_rows(

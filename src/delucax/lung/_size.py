@@ -15,6 +15,8 @@ BREATH = 100
 """Steps of a whole breath."""
 BETWEEN = ((10.0, 15.0), (10.0, 35.0), (35.0, 15.0), (35.0, 35.0))
 """Lungs between those that are trained on, (R, C)."""
+SENSOR_DELAY = 2
+"""Samples that the sensor is late."""
 PHYSICS = (
     "single compartment",
     "balloon",
@@ -48,6 +50,7 @@ class Size(NamedTuple):
     between: tuple[tuple[float, float], ...]
     physics: tuple[str, ...]
     extras: bool
+    sensor_delay: int = SENSOR_DELAY
 
 
 FULL = Size(

@@ -35,14 +35,14 @@ def stack(trees: Sequence[Any]) -> Any:
     if len(structures) > 1:
         raise ValueError("stack: trees must be of one structure.")
 
-    def joined(*leaves):
+    def together(*leaves):
         if not eqx.is_array(leaves[0]):
             return leaves[0]
         if all(_is_plain(leaf) for leaf in leaves):
             return jnp.asarray(np.stack(leaves))
         return jnp.stack(leaves)
 
-    return jax.tree.map(joined, *trees)
+    return jax.tree.map(together, *trees)
 
 
 def unstack(tree: Any) -> list[Any]:
@@ -62,10 +62,9 @@ def unstack(tree: Any) -> list[Any]:
     """
     arrays, rest = eqx.partition(tree, eqx.is_array)
     arrays = jax.tree.map(lambda a: np.asarray(a) if _is_plain(a) else a, arrays)
-    count = jax.tree.leaves(arrays)[0].shape[0]
     return [
         eqx.combine(jax.tree.map(lambda a, i=i: jnp.asarray(a[i]), arrays), rest)
-        for i in range(count)
+        for i in range(count_of(tree))
     ]
 
 
@@ -78,3 +77,19 @@ def _is_plain(leaf: Any) -> bool:
 def repeat(tree: Any, count: int) -> Any:
     """One module, stacked as often as asked for."""
     return stack([tree] * count)
+
+
+def count_of(tree: Any) -> int:
+    """How many modules are stacked."""
+    return jax.tree.leaves(eqx.filter(tree, eqx.is_array))[0].shape[0]
+
+
+def taken(tree: Any, index: Any) -> Any:
+    """What an index takes of each array of stacked modules."""
+    return jax.tree.map(lambda a: a[index] if eqx.is_array(a) else a, tree)
+
+
+def joined(one: Any, other: Any) -> Any:
+    """Stacked modules, and others of the same structure after them."""
+    join = lambda a, b: jnp.concatenate([a, b]) if eqx.is_array(a) else a  # noqa: E731
+    return jax.tree.map(join, one, other)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
+from .._check import check_count
 from ..environments import Environment
 from ._contenders import (
     bang_bang,
@@ -48,7 +49,7 @@ from ._simulators import (
     left_out,
     open_loop_rows,
 )
-from ._size import BREATH, FULL, SEEN, Size, SMALL, UNSEEN
+from ._size import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, UNSEEN
 from ._stacking import repeat, stack, unstack
 from ._stages import Stages
 from ._tasks import double_compartment
@@ -63,6 +64,7 @@ def lung_study(
     small: bool = False,
     data: str | Path | None = None,
     seeds: int | None = None,
+    sensor_delay: int = SENSOR_DELAY,
     say: Callable[[str], Any] = print,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
@@ -73,7 +75,10 @@ def lung_study(
     and compliances of the public data set: valves that lag, a sensor that is two
     samples late and adds noise of 0.2 cmH2O. With `data`, the breaths are those of a
     file; then what stands in for the lungs themselves is a grey-box lung fitted to the
-    same breaths, and there are no lungs between.
+    same breaths, and there are no lungs between. Of the file's ventilator are taken for
+    granted: that its sensor is `sensor_delay` samples late and as noisy as ours, that
+    it breathes from a PEEP of about 5 cmH2O, and, in all but the learned lungs, that
+    its valves are ours.
 
     Each part is written to the folder when it is done, so that a study that was cut off
     goes on from there.
@@ -89,14 +94,16 @@ def lung_study(
     - `data`: a file that [`delucax.lung.read_breaths`][] reads; none by default.
     - `seeds`: how many controllers of each kind are trained; 3 by default, and 1 if
         `small`.
+    - `sensor_delay`: how many samples late the sensor is, that of the file's ventilator
+        or of ours; 2 by default.
     - `say`: what to do with a line of text; `print` by default.
     - `progress`: whether trainings show a bar; true by default.
 
     **Returns:** the rows of the report, dictionaries.
 
-    **Raises:** `ValueError` if the folder holds a study with other settings, a file in
-        it is damaged, or the data are not what they should be; `OSError` if a file
-        cannot be read or written.
+    **Raises:** `ValueError` if an argument is illegal, the folder holds a study with
+        other settings, a file in it is damaged, or the data are not what they should
+        be; `OSError` if a file cannot be read or written.
 
     !!! example
 
@@ -109,6 +116,8 @@ def lung_study(
         size = size._replace(seeds=seeds)
     if size.seeds < 1:
         raise ValueError(f"lung: seeds must be at least 1, got {seeds}.")
+    sensor_delay = check_count(sensor_delay, "sensor_delay", "lung", least=0)
+    size = size._replace(sensor_delay=sensor_delay)
     recorded = None if data is None else read_breaths(data)
     settings = dict(
         size._asdict(),
@@ -134,9 +143,10 @@ def lung_study(
 
     between = None
     if recorded is None:
-        envs = stack([double_compartment(*lung) for lung in lungs])
+        late: Any = dict(sensor_delay=sensor_delay)
+        envs = stack([double_compartment(*lung, **late) for lung in lungs])
         around = [size.between[i % len(size.between)] for i in range(len(lungs))]
-        others = stack([double_compartment(*lung) for lung in around])
+        others = stack([double_compartment(*lung, **late) for lung in around])
         between = others, [_lung_name(*lung) for lung in size.between]
         judge = "the lungs themselves"
     else:
@@ -244,7 +254,9 @@ def _contenders(
         tuned = trained(
             "tuned_pids",
             "PIDs with feed-forward tuned on the lungs",
-            lambda options: tuned_pids(envs, trainer.waveform, size, key, options),
+            lambda options: tuned_pids(
+                envs, trainer.waveform, size, key, options, stages.say
+            ),
         )
         found += pid_contenders(tuned, trainer)
     if size.extras:
@@ -267,7 +279,7 @@ def _contenders(
         online = stages.stage(
             "online",
             "GPC around the best PIDs",
-            lambda: online_learners(train, pids, trainer),
+            lambda: online_learners(train, pids, trainer, size.sensor_delay),
         )
         found += pid_contenders(more, trainer)
         found += [

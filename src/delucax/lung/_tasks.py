@@ -1,6 +1,5 @@
 """The lungs by name."""
 
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from ._environment import ventilation
 from ._learned import LearnedLung
 from ._lungs import BalloonLung, DelayLung, DoubleCompartment, SingleCompartment
 from ._valves import Valves
-from ._waveform import BreathWaveform
+from ._waveform import BreathWaveform, check_peep
 
 
 def _task(
@@ -30,7 +29,9 @@ def _task(
     rest = plant.resting(plant.valves.peep)
     if isinstance(dynamics, Delayed):
         rest = dynamics.filled(rest)
-    return finish(task, ventilation(dynamics, rest=rest, **breath), environment)
+    arguments = ventilation(dynamics, rest=rest, **breath)
+    check_peep(arguments["cost"].waveform, plant.valves, task.__name__)
+    return finish(task, arguments, environment)
 
 
 def balloon_lung(
@@ -70,7 +71,8 @@ def balloon_lung(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
+    that of `valves`.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca), retuned.
@@ -136,7 +138,8 @@ def delay_lung(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
+    that of `valves`.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca), as a differential equation and retuned.
@@ -196,7 +199,8 @@ def single_compartment(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
+    that of `valves`.
 
     !!! example
 
@@ -258,7 +262,8 @@ def double_compartment(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
+    that of `valves`.
 
     !!! example
 
@@ -293,13 +298,15 @@ def learned_lung(
 ) -> Environment:
     """Make a lung breathe that was learned from breaths.
 
-    As `lung/balloon_lung`; its time step is that of the breaths.
+    As `lung/balloon_lung`; its time step is that of the breaths, and what it is let out
+    to is the pressure that they start at, whatever the PEEP of `waveform`.
 
     **Arguments:**
 
     - `model`: a [`delucax.lung.LearnedLung`][]. By default the one that comes with the
         library, learned from breaths of the task `lung/double_compartment`; its sensor
-        is two samples late, and so is its pressure.
+        is two samples late, and so is its pressure. `python -m benchmarks.learned_lung`,
+        in the repository, made it.
     - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
         minute, by default.
     - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
@@ -322,10 +329,7 @@ def learned_lung(
         ```
     """
     if model is None:
-        with warnings.catch_warnings():
-            # It is kept in double precision, and may be wanted in single.
-            warnings.simplefilter("ignore")
-            model = load(Path(__file__).with_name("learned_lung.dlx"))
+        model = load(Path(__file__).with_name("learned_lung.dlx"))
     if not isinstance(model, LearnedLung):
         raise ValueError(
             f"learned_lung: model must be a LearnedLung, got {type(model).__name__}."

@@ -1,5 +1,6 @@
 """Training controllers in fitted lungs."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -16,19 +17,21 @@ from .._check import (
     check_range,
 )
 from .._controller import AbstractController
-from .._fields import parameter
+from .._fields import function_field, parameter
 from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..environments import Environment
 from ..simulation import rollout
 from ..training import analytic, fit, Fitted
+from ..training._loss import cost_and_metrics
 from ._data import _waveform_of, LENGTH, PIPS
 from ._environment import BreathCost, ventilation
 from ._fitting import kept_at
 from ._learned import LearnedLung
 from ._models import LungModel
 from ._policies import Breathing
+from ._stacking import count_of
 from ._waveform import as_pips, at_pip, BreathWaveform, check_waveform
 
 
@@ -166,6 +169,11 @@ class _Ventilated(eqx.Module):
     limit: Array | None
     horizon: int = eqx.field(static=True)
     shared: bool = eqx.field(static=True)
+    throw: bool = eqx.field(static=True)
+
+    def _counted(self, errors):
+        """Errors, 0 for those that are not finite and are not to raise."""
+        return errors if self.throw else jnp.where(jnp.isfinite(errors), errors, 0)
 
     def __call__(self, controllers, key):
         def one(model, controller, key):
@@ -187,13 +195,36 @@ class _Ventilated(eqx.Module):
         )
 
         def of(controllers, key):
-            count = jax.tree.leaves(eqx.filter(self.models, eqx.is_array))[0].shape[0]
-            keys = jax.random.split(key, count)
-            return jnp.mean(over_lungs(self.models, controllers, keys))
+            keys = jax.random.split(key, count_of(self.models))
+            errors = over_lungs(self.models, controllers, keys)
+            if not self.shared:
+                errors = self._counted(errors)
+            return self._counted(jnp.mean(errors))
 
-        seeds = jax.tree.leaves(eqx.filter(controllers, eqx.is_array))[0].shape[0]
-        keys = jax.random.split(key, seeds)
+        keys = jax.random.split(key, count_of(controllers))
         return jnp.mean(eqx.filter_vmap(of)(controllers, keys))
+
+
+class _Apart(eqx.Module):
+    """A gradient that counts as 0 for a controller for which it is not finite."""
+
+    gradient: Callable[..., Any] = function_field()
+    axes: int = eqx.field(static=True)
+
+    def __call__(self, loss, values, key):
+        value, slope = self.gradient(loss, values, key)
+        fine: Any = True
+        for leaf in jax.tree.leaves(slope):
+            inner = tuple(range(self.axes, leaf.ndim))
+            fine = fine & jnp.all(jnp.isfinite(leaf), axis=inner)
+
+        def kept(leaf):
+            more = (1,) * (leaf.ndim - self.axes)
+            return jnp.where(fine.reshape(fine.shape + more), leaf, 0)
+
+        cost, metrics = cost_and_metrics(value, "train_controllers")
+        lost = jnp.sum(~fine).astype(cost.dtype)
+        return (cost, metrics | {"diverged": lost}), jax.tree.map(kept, slope)
 
 
 def train_controllers(
@@ -213,6 +244,7 @@ def train_controllers(
     gradient: Any = None,
     progress: bool = False,
     checkpoint: Any = None,
+    throw: bool = True,
 ) -> Fitted:
     """Train controllers through fitted lungs, by the gradient of their error.
 
@@ -239,11 +271,14 @@ def train_controllers(
         worse than an error [cmH2O]; none by default.
     - `trainable`, `gradient`, `progress`, `checkpoint`: of [`delucax.training.fit`][];
         the weights, the analytic gradient, no bar and no file by default.
+    - `throw`: raise if an error or its gradient is NaN or infinite (default); if false,
+        that gradient counts as 0, the other controllers are trained as if nothing were,
+        and `history["diverged"]` says of how many it was in each step.
 
     **Returns:** a [`delucax.training.Fitted`][].
 
     **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
-    say), `RuntimeError` if it diverges.
+    say), `RuntimeError` as `throw` says.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -285,7 +320,9 @@ def train_controllers(
         None if limit is None else jnp.asarray(limit, float),
         check_count(horizon, "horizon", where),
         check_bool(shared, "shared", where),
+        check_bool(throw, "throw", where),
     )
+    gradient = analytic if gradient is None else gradient
     return fit(
         loss,
         controllers,
@@ -293,7 +330,8 @@ def train_controllers(
         steps,
         key=check_key(key, where),
         trainable=trainable,
-        gradient=analytic if gradient is None else gradient,
+        gradient=gradient if throw else _Apart(gradient, 1 if shared else 2),
         progress=progress,
+        throw=throw,
         **kept_at(checkpoint),
     )

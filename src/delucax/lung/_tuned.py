@@ -1,17 +1,19 @@
 """PIDs with a feed-forward, tuned on the lungs themselves: what networks must beat."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.random as jr
+import numpy as np
 
 from ..environments import Environment
 from ._grid import make_pid
 from ._policies import FeedForward, Summed
 from ._size import SEEN, Size
+from ._stacking import joined, taken
 from ._train import breath_error, train_controllers
 from ._waveform import BreathWaveform
 
@@ -52,22 +54,25 @@ def _errors(envs: Environment, controllers: Any, key: Any, own: bool) -> Any:
     across = eqx.filter_vmap(of, in_axes=(None, eqx.if_array(0)))
     over = eqx.if_array(1) if own else None
     found = eqx.filter_vmap(across, in_axes=(eqx.if_array(0), over))(envs, controllers)
-    return jnp.nan_to_num(found, nan=jnp.inf)
+    return jnp.where(jnp.isfinite(found), found, jnp.inf)
 
 
-def _taken(controllers: Any, index: Any) -> Any:
-    return jax.tree.map(
-        lambda leaf: leaf[index] if eqx.is_array(leaf) else leaf, controllers
-    )
-
-
-def _joined(one: Any, other: Any) -> Any:
-    join = lambda a, b: jnp.concatenate([a, b]) if eqx.is_array(a) else a  # noqa: E731
-    return jax.tree.map(join, one, other)
+def best_of(candidates: Any, errors: Any, shared: bool) -> Any:
+    """The candidate with the least error in each lung, or on average over all; errors
+    have the shape `(lungs, candidates)`."""
+    if shared:
+        return taken(candidates, jnp.argmin(jnp.mean(errors, axis=0)))
+    lungs = jnp.arange(errors.shape[0])
+    return taken(candidates, (jnp.argmin(errors, axis=1), lungs))
 
 
 def tuned_pids(
-    envs: Environment, waveform: BreathWaveform, size: Size, key: Any, options: Any
+    envs: Environment,
+    waveform: BreathWaveform,
+    size: Size,
+    key: Any,
+    options: Any,
+    say: Callable[[str], Any],
 ) -> dict[str, Any]:
     """The best of many at random and of the best few of them trained on, in each lung
     and for all: by their errors in the lungs themselves, which no network is given."""
@@ -80,7 +85,7 @@ def tuned_pids(
         for shared in (False, True):
             ranked = jnp.mean(errors, axis=0) if shared else errors.T
             best = jnp.argsort(ranked, axis=0)[:_STARTS]
-            begin = _taken(drawn, best)
+            begin = taken(drawn, best)
             label = f"tuned {name} + feed-forward" + (" for all" if shared else "")
             trained = train_controllers(
                 envs,
@@ -91,12 +96,22 @@ def tuned_pids(
                 learning_rate=0.03,
                 checkpoint=Path(f"{options['checkpoint']}.{label.replace(' ', '_')}"),
                 progress=options["progress"],
-            ).model
-            candidates = _joined(begin, trained)
+                throw=False,
+            )
+            candidates = joined(begin, trained.model)
             judged = _errors(envs, candidates, judge_key, not shared)
-            if shared:
-                found[label] = _taken(candidates, jnp.argmin(jnp.mean(judged, axis=0)))
-            else:
-                lungs = jnp.arange(judged.shape[0])
-                found[label] = _taken(candidates, (jnp.argmin(judged, axis=1), lungs))
+            if words := _lost(trained.history["diverged"], judged):
+                say(f"  {label}: {words}")
+            found[label] = best_of(candidates, judged, shared)
     return found
+
+
+def _lost(diverged: Any, errors: Any) -> str:
+    """What there is to say of PIDs that diverged, nothing if none did."""
+    lost, steps = int(jnp.sum(~jnp.isfinite(errors))), int(np.sum(diverged > 0))
+    if not lost and not steps:
+        return ""
+    return (
+        f"{lost} of {errors.size} errors are not finite, and count as infinite; in "
+        f"{steps} of {len(diverged)} steps a PID had no finite gradient."
+    )

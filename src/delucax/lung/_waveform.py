@@ -36,7 +36,9 @@ class BreathWaveform(eqx.Module):
     **Arguments:**
 
     - `pip`: the peak inspiratory pressure [cmH2O], 35 by default.
-    - `peep`: the positive end-expiratory pressure [cmH2O], 5 by default.
+    - `peep`: the positive end-expiratory pressure [cmH2O], 5 by default. It is what is
+        asked for; what a lung is let out to is the `peep` of its
+        [`delucax.lung.Valves`][], so that whoever changes one changes both.
     - `rate`: breaths a minute, 20 by default.
     - `keypoints`: shares of a period, increasing, from 0 to 1; `(0, 1/3, 1/2, 1)` by
         default. The pressure may jump from the end of a breath to the next one.
@@ -161,6 +163,19 @@ def check_waveform(waveform: Any, where: str) -> None:
             f"{where}: waveform must be a BreathWaveform, got "
             f"{type(waveform).__name__}."
         )
+
+
+def check_peep(waveform: BreathWaveform, valves: Any, where: str) -> None:
+    """Raise if the PEEP of a waveform is below what the valves let a lung out to, as
+    far as can be seen."""
+    asked, least = waveform.peep, valves.peep
+    if is_concrete(asked) and is_concrete(least):
+        # Numbers of another precision may differ by their rounding.
+        if np.any(np.asarray(asked) < np.asarray(least) - 1e-3):
+            raise ValueError(
+                f"{where}: the peep of waveform must be at least that of valves, "
+                f"{least}, below which no lung empties, got {asked}. Give both."
+            )
 
 
 def as_pips(pips: Any, tree: Any, where: str) -> Array:
