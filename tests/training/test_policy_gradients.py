@@ -337,6 +337,17 @@ def test_bad_input():
         actor_critic(env, head="categorical", key=jr.key(0))
 
 
+@once
+def test_policy_and_critic_begin_flat():
+    """The slope of a critic that has seen nothing would lead the policy astray."""
+    env = dlx.make("double_integrator")
+    model = actor_critic(env, head="deterministic", key=jr.key(0))
+    y = jnp.array([1.0, -1.0])
+    for network in (model.critic, model.policy):
+        slope = jax.grad(lambda y, network=network: network(0.0, y, None)[0].sum())(y)
+        assert 0 < jnp.linalg.norm(slope) < 0.02
+
+
 @thorough
 @once
 def test_ppo_swings_up():

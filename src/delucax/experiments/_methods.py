@@ -207,22 +207,21 @@ def _by_actor_critic(method: type[PPO] | type[SHAC]) -> Callable[[str], Any]:
         first, key = jax.random.split(jax.random.key(1))
         model = actor_critic(env, width=32, depth=1, head=head, key=first)
         loss = method(env, EPISODES, min(env.horizon, LONGEST), discount=0.95)
-        # A step that a critic which has seen little can follow, as published.
-        steps, rate = TRAINING_STEPS, 0.002
+        steps = TRAINING_STEPS
         if isinstance(loss, PPO):
-            steps, rate = steps * loss.epochs * loss.minibatches, 0.01
+            steps *= loss.epochs * loss.minibatches
         options = {"key": key, "progress": False, "throw": False}
-        fitted = fit(loss, model, _adam(steps, rate), steps, **options)
+        fitted = fit(loss, model, _adam(steps), steps, **options)
         policy = fitted.model.policy
         return policy.base if method is PPO else policy
 
     return made
 
 
-def _adam(steps: int, rate: float = 0.01) -> optax.GradientTransformation:
+def _adam(steps: int) -> optax.GradientTransformation:
     return optax.chain(
         optax.clip_by_global_norm(1.0),
-        optax.adam(optax.cosine_decay_schedule(rate, steps)),
+        optax.adam(optax.cosine_decay_schedule(0.01, steps)),
     )
 
 

@@ -305,8 +305,8 @@ def learned_lung(
 
     - `model`: a [`delucax.lung.LearnedLung`][]. By default the one that comes with the
         library, learned from breaths of the task `lung/double_compartment`; its sensor
-        is two samples late, and so is its pressure. `python -m benchmarks.learned_lung`,
-        in the repository, made it.
+        is two samples late, and so is its pressure. In the repository,
+        `python -m benchmarks.learned_lung` makes it.
     - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
         minute, by default.
     - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.

@@ -105,8 +105,9 @@ def actor_critic(
     """Two fully connected networks made to fit an environment: policy and critic.
 
     Both are given `environment.encode(y)`, standardised by what training sees. The last
-    layer of the policy begins a hundred times smaller than usual, near the middle of
-    the bounds.
+    layers begin a hundred times smaller than usual: that of the policy near the middle
+    of the bounds, and that of the critic flat, for the slope of an estimate that has
+    seen nothing would lead a policy that follows it astray.
 
     **Arguments:**
 
@@ -124,7 +125,7 @@ def actor_critic(
     **Raises:** `ValueError` if `environment` is not an environment, `head` is unknown,
     a size is below 1, there is no key, or a categorical head has no table.
 
-    Source: Andrychowicz et al., 2021 (the small last layer).
+    Source: Andrychowicz et al., 2021 (the small last layer of the policy).
 
     !!! example
 
@@ -161,10 +162,14 @@ def actor_critic(
         policy = Deep(environment, **sizes, head=head, key=policy_key)
         where_base = lambda p: p.base if head == "gaussian" else p  # noqa: E731
         policy = eqx.tree_at(lambda p: where_base(p).features, policy, features)
-    last = lambda policy: where_base(policy).network.layers[-1].weight  # noqa: E731
-    policy = eqx.tree_at(last, policy, replace_fn=lambda weight: 0.01 * weight)
     critic = MLP(size, 1, **sizes, features=features, key=critic_key)
-    return ActorCritic(policy, critic)
+
+    def last(both):
+        networks = where_base(both[0]).network, both[1].network
+        return [network.layers[-1].weight for network in networks]
+
+    smaller = lambda weight: 0.01 * weight  # noqa: E731
+    return ActorCritic(*eqx.tree_at(last, (policy, critic), replace_fn=smaller))
 
 
 class Moments(NamedTuple):
