@@ -216,7 +216,6 @@ print("equal")
 """
 
 
-@thorough
 def test_eight_devices_agree_with_one():
     """A batch of rollouts, its gradient, and an experiment's seeds."""
     flags = "--xla_force_host_platform_device_count=8"
@@ -260,7 +259,6 @@ print("equal")
 """
 
 
-@thorough
 def test_two_processes_agree_with_one():
     """A batch of rollouts and its gradient over eight devices of two processes."""
     with socket.socket() as free:
@@ -318,7 +316,6 @@ if __name__ == "__main__":
 """
 
 
-@thorough
 def test_a_dask_worker_is_killed(tmp_path):
     """All results are there, and none twice."""
     pytest.importorskip("distributed")
