@@ -117,7 +117,8 @@ def _training(results: dict[str, Any]) -> str:
                 ratio = "" if first is None else f" (over {_below(most / first)} times)"
                 line.append(f"not in {most:,}{ratio}")
                 continue
-            ratio = "" if way == "gradient" else f" ({steps / first:.2g} times)"
+            known = way != "gradient" and first is not None
+            ratio = f" ({steps / first:.2g} times)" if known else ""
             line.append(f"{steps:,}{ratio}")
         body.append(line)
     ways = [name for name in results["training"]]

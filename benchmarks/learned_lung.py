@@ -25,7 +25,9 @@ SIZES: Any = dict(u_window=6, p_window=3)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="The lung of the task lung/learned_lung.")
+    parser = argparse.ArgumentParser(
+        description="The lung of the task lung/learned_lung."
+    )
     parser.add_argument("--out", default="build/learned_lung.dlx", help="file to write")
     out = Path(parser.parse_args().out)
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -149,8 +149,9 @@ def draw(results: Results) -> Figure:
     image = axes.imshow(np.clip(values, -1, 1), cmap="RdYlGn", vmin=-1, vmax=1)
     for (i, j), value in np.ndenumerate(values):
         text = "< -10" if value < -10 else f"{value:.2f}".replace("-0.00", "0.00")
+        ink = "white" if abs(value) > 0.7 else "black"
         if not np.isnan(value):
-            axes.text(j, i, text, ha="center", va="center", fontsize=6, color="black")
+            axes.text(j, i, text, ha="center", va="center", fontsize=6, color=ink)
     axes.set_xticks(range(len(scored)), map(_short, scored), rotation=60, ha="right")
     axes.set_yticks(range(len(rows)), rows)
     axes.tick_params(length=0, labelsize=8)
