@@ -29,10 +29,9 @@ lightly := XLA_FLAGS="--xla_backend_optimization_level=0 \
 unhooked := --jaxtyping-packages=
 pytest := $(one_thread) $(bin)/python -m pytest -n logical --maxprocesses=8 --dist worksteal
 
-# Each package's own use of what it depends on.
-oldest_tests := tests/contracts/test_systems.py tests/contracts/test_tasks.py \
-	tests/dynamics tests/experiments tests/interop tests/plotting tests/simulation \
-	tests/test_serialise.py
+# The same for every version: the ledger, and the examples of docs and docstrings.
+examples := --ignore tests/contracts/test_public.py --ignore tests/test_docs.py
+versionless := $(examples) --ignore tests/test_claims.py
 
 ##@ Use
 
@@ -61,19 +60,18 @@ test-float32: $(VENV)/.tests ## the tests in single precision
 
 .PHONY: test-float64
 test-float64: $(VENV)/.tests ## the tests in double precision; the docs' examples ran before
-	$(lightly) JAX_ENABLE_X64=1 $(pytest) $(unhooked) --ignore tests/contracts/test_public.py \
-		--ignore tests/plotting --ignore tests/test_docs.py $(PYTEST_ARGS)
+	$(lightly) JAX_ENABLE_X64=1 $(pytest) $(unhooked) $(examples) --ignore tests/plotting \
+		$(PYTEST_ARGS)
 
 .PHONY: thorough
 thorough: $(VENV)/.tests ## the tests that `test` leaves out, for they compile for long
 	JAX_ENABLE_X64=0 $(pytest) -m thorough $(PYTEST_ARGS)
-	JAX_ENABLE_X64=1 $(pytest) -m thorough --ignore tests/contracts/test_public.py \
-		--ignore tests/test_docs.py $(PYTEST_ARGS)
+	JAX_ENABLE_X64=1 $(pytest) -m thorough $(examples) $(PYTEST_ARGS)
 
 .PHONY: test-oldest
-test-oldest: $(VENV)-oldest/.tests ## part of the tests: oldest Python and dependencies allowed
+test-oldest: $(VENV)-oldest/.tests ## in single precision, oldest Python and dependencies allowed
 	$(lightly) JAX_ENABLE_X64=0 $(one_thread) $(VENV)-oldest/bin/python -m pytest \
-		-n logical --maxprocesses=8 --dist worksteal -W default $(oldest_tests) $(PYTEST_ARGS)
+		-n logical --maxprocesses=8 --dist worksteal -W default $(versionless) $(PYTEST_ARGS)
 
 .PHONY: notebooks
 notebooks: $(VENV)/.tests ## run every notebook from top to bottom, with little of everything
