@@ -98,9 +98,6 @@ def _finite(name: str) -> Any:
     return _regulator(functools.partial(FiniteHorizonLQR, horizon=horizon))(name)
 
 
-_lqr = _regulator(LQR)
-
-
 def _following(name: str) -> Any:
     """A PID on the waveform that a lung is to breathe as."""
     env = task_of(name)
@@ -115,7 +112,7 @@ def _learning(learner: Callable[..., Any], **options: Any) -> Callable[[str], An
 
     def made(name: str) -> Any:
         env = task_of(name)
-        return learner(env.dynamics, env.cost, base=_lqr(name), **options)
+        return learner(env.dynamics, env.cost, base=agent_of(name, "LQR"), **options)
 
     return made
 
@@ -125,7 +122,7 @@ def _neural(name: str) -> Any:
 
 
 def _bandit(name: str) -> Any:
-    return BPC(task_of(name).dynamics, _lqr(name))
+    return BPC(task_of(name).dynamics, agent_of(name, "LQR"))
 
 
 def _adaptive(name: str) -> Any:
@@ -229,7 +226,7 @@ FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
     "Feedback": {
         "zero": lambda name: Zero(task_of(name).control_size),
         "PID": _following,
-        "LQR": _lqr,
+        "LQR": _regulator(LQR),
         "FiniteHorizonLQR": _finite,
         "HInfinity": _regulator(HInfinity),
     },
@@ -264,8 +261,8 @@ def agent_of(name: str, method: str) -> Any:
 
     **Raises:** `Unsuitable` if it needs what the task has not got.
     """
-    makers = {key: make for family in FAMILIES.values() for key, make in family.items()}
+    (maker,) = (family[method] for family in FAMILIES.values() if method in family)
     try:
-        return makers[method](name)
+        return maker(name)
     except (ValueError, RuntimeError) as error:
         raise Unsuitable(str(error)) from error
