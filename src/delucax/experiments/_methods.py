@@ -8,7 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jaxtyping import Array
 
+from .._controller import AbstractController
 from ..controllers import (
     Adaptive,
     BPC,
@@ -40,6 +42,16 @@ from ..training import actor_critic, expected_cost, fit, PPO, SHAC
 TRAINING_STEPS, EPISODES, LONGEST = 200, 32, 100
 # Of a plan in MPC.
 LOOKAHEAD = 30
+
+
+class Pump(AbstractController):
+    """Push as hard as is allowed the way that it moves, as one does a swing: the least
+    cost by far that is known of the mountain cars before it is refined."""
+
+    push: Array
+
+    def __call__(self, t, y, state):
+        return jnp.where(y[1] < 0, -self.push, self.push), state
 
 
 class Unsuitable(Exception):
@@ -199,8 +211,6 @@ def _by_actor_critic(method: type[PPO] | type[SHAC]) -> Callable[[str], Any]:
 
     def made(name: str) -> Any:
         env, head = task_of(name), "gaussian" if method is PPO else "deterministic"
-        if method is PPO and env.control_bounds is None:
-            raise Unsuitable("the controls have no bounds")
         first, key = jax.random.split(jax.random.key(1))
         model = actor_critic(env, width=32, depth=1, head=head, key=first)
         loss = method(env, EPISODES, min(env.horizon, LONGEST), discount=0.95)

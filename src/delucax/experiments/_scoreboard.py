@@ -18,7 +18,7 @@ from ..environments import Environment, registered
 from ..planning import ilqr
 from ..simulation import rollout
 from ._experiment import experiment
-from ._methods import agent_of, FAMILIES, task_of, Unsuitable
+from ._methods import agent_of, FAMILIES, Pump, task_of, Unsuitable
 
 
 METHODS = (*(name for family in FAMILIES.values() for name in family), "plan")
@@ -28,8 +28,9 @@ BATCH = 8
 TIMED = 0.3
 
 
-# What the plan begins at.
-GUIDES = ("MLP", "MPC")
+# What the plan begins at, beside no control.
+GUIDES = ("MLP", "GRU", "MPC")
+PUMPED = ("mountain_car", "mountain_car_discrete")
 
 
 def tasks() -> tuple[str, ...]:
@@ -39,7 +40,8 @@ def tasks() -> tuple[str, ...]:
 
 def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
     """The controls that iLQR finds for a run whose start and disturbances it knows,
-    from no control and from what each of the guides does."""
+    from no control and from what each of the guides does, if they cost less than that.
+    """
     best, least = None, np.inf
     for agent in (Zero(env.control_size), *guides):
         run: Any = rollout(env, agent, key=key, throw=False)
@@ -54,9 +56,10 @@ def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
             max_iterations=100,
             throw=False,
         )
-        found = float(_cost(env, Sequence(plan.controls), key))
-        if np.isfinite(found) and found < least:
-            best, least = plan.controls, found
+        for controls in (guess, plan.controls):
+            found = float(_cost(env, Sequence(controls), key))
+            if np.isfinite(found) and found < least:
+                best, least = controls, found
     if best is None:
         raise Unsuitable("no plan was found")
     return Sequence(best)
@@ -88,6 +91,8 @@ def _batch(task: str, method: str, block: int) -> tuple[list[float], float | Non
     keys = jax.vmap(jax.random.key)(jnp.array(seeds))
     if method == "plan":
         guides = [agent for name in GUIDES if (agent := _suited(task, name))]
+        if task in PUMPED:
+            guides.append(Pump(jnp.ones(1)))
         plans = [_planned(env, guides, key) for key in keys]
         found = [_cost(env, plan, key) for plan, key in zip(plans, keys, strict=True)]
         return [float(cost) for cost in found], None
