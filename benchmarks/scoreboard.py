@@ -27,20 +27,23 @@ from delucax.experiments._scoreboard import METHODS, scoreboard, tasks
 STORE = Path(__file__).parent / "results" / "scoreboard.jsonl"
 PAGE = Path(__file__).parents[1] / "docs" / "scoreboard.md"
 PICTURE = PAGE.parent / "assets" / "scoreboard.svg"
+# Costs that differ by less, relative to the best known, are as good.
+CLOSE = 5e-3
 SHORT = {"FiniteHorizonLQR": "finite LQR", "HInfinity": "H∞"}
 BEGIN, END = "<!-- scoreboard -->\n", "<!-- end of scoreboard -->"
 
 
+def floor_of(costs: dict[tuple[str, str], Any], task: str) -> str:
+    """Zero control, or LQR where the plant is not stable at its equilibrium."""
+    return "zero" if isinstance(costs[task, "LQR"], str) else _floor(task)
+
+
 @functools.cache
-def floor_of(task: str) -> str:
-    """Zero control, or LQR where the plant is unstable at its equilibrium."""
+def _floor(task: str) -> str:
     env = task_of(task)
-    try:
-        model = dlx.linearize(env.dynamics, 0.0, *env.dynamics.equilibrium())
-    except ValueError:
-        return "zero"
+    model = dlx.linearize(env.dynamics, 0.0, *env.dynamics.equilibrium())
     radius = np.max(np.abs(np.linalg.eigvals(np.asarray(model.A))))
-    return "LQR" if radius > 1.001 else "zero"
+    return "LQR" if radius > 1 - 1e-4 else "zero"
 
 
 def costs_of(results: Results) -> dict[tuple[str, str], np.ndarray | str]:
@@ -61,28 +64,33 @@ def _by_case(results: Results, name: str) -> dict[tuple[str, str], list]:
     return found
 
 
-def scores_of(costs: dict[tuple[str, str], Any]) -> dict[tuple[str, str], float]:
-    """0 at the floor and 1 at the best known, by task and method: NaN where it is not
-    suited or there is next to nothing between the two, minus infinity where it
-    diverges."""
-    scores = {}
+def scores_of(costs: dict[tuple[str, str], Any]) -> dict[tuple[str, str], Any]:
+    """By task and method, 0 at the floor and 1 at the best known; or a word: nothing
+    where it is not suited, `diverges`, and where the floor is as good as the best
+    known, whether this is, `best` or `worse`."""
+    scores: dict[tuple[str, str], Any] = {}
     for task in tasks():
-        floor, low = floor_cost(costs, task), best_cost(costs, task)
-        flat = floor - low <= 5e-3 * abs(low) or not np.isfinite(floor)
+        low = best_cost(costs, task)
+        near = low + CLOSE * abs(low)
+        floor = _mean(costs[task, floor_of(costs, task)])
         for method in METHODS:
             cost = costs[task, method]
-            if flat or isinstance(cost, str):
-                scores[task, method] = np.nan
-                continue
-            own = interquartile_mean(np.where(np.isfinite(cost), cost, np.inf))
-            scores[task, method] = (floor - own) / (floor - low)
+            own = np.nan if isinstance(cost, str) else _mean(cost)
+            if np.isnan(own):
+                score = ""
+            elif not np.isfinite(own):
+                score = "diverges"
+            elif floor <= near:
+                score = "best" if own <= near else "worse"
+            else:
+                score = (floor - own) / (floor - low)
+            scores[task, method] = score
     return scores
 
 
-def floor_cost(costs: dict[tuple[str, str], Any], task: str) -> float:
-    """The interquartile mean of the floor."""
-    found = costs[task, floor_of(task)]
-    return interquartile_mean(costs[task, "zero"] if isinstance(found, str) else found)
+def _mean(cost: np.ndarray) -> float:
+    """The interquartile mean; infinite where a middling start diverges."""
+    return interquartile_mean(np.where(np.isfinite(cost), cost, np.inf))
 
 
 def best_cost(costs: dict[tuple[str, str], Any], task: str) -> float:
@@ -98,7 +106,7 @@ def tables(results: Results) -> str:
     scores = scores_of(costs)
     scored = [method for method in METHODS if method != "plan"]
     body = [
-        [f"`{task}`", floor_of(task), *(_score(scores[task, m]) for m in scored)]
+        [f"`{task}`", floor_of(costs, task), *(_score(scores[task, m]) for m in scored)]
         for task in tasks()
     ]
     parts = [
@@ -119,7 +127,7 @@ def tables(results: Results) -> str:
         parts += [f"### {name}: cost\n", _markdown(head, body, 1)]
     parts.append(
         "## Time\n\nMicroseconds a step, the controller included, of each of a batch "
-        "of 8 on one core.\n"
+        "of 8. Two processes ran side by side, on the two threads of one core.\n"
     )
     for name, family in FAMILIES.items():
         body = []
@@ -129,29 +137,35 @@ def tables(results: Results) -> str:
                 body.append([f"`{task}`", *found])
         parts += [f"### {name}: time\n"]
         parts += [_markdown(["task", *map(_short, family)], body, 1)]
+    return "\n".join(parts)
+
+
+def footer() -> str:
+    """What it was measured with."""
     machine = describe()
     version = machine["versions"]
-    parts.append(
-        f"Float32, one core of {machine['cpu']}, delucax {version['delucax']}, JAX "
+    return (
+        f"Float32, {machine['cpu']}, delucax {version['delucax']}, JAX "
         f"{version['jax']}."
     )
-    return "\n".join(parts)
 
 
 def draw(results: Results) -> Figure:
     """The scores as a picture: a row for each task, a column for each controller."""
     scores = scores_of(costs_of(results))
     scored = [method for method in METHODS if method != "plan"]
-    rows = [t for t in tasks() if any(np.isfinite(scores[t, m]) for m in scored)]
-    values = np.array([[scores[task, method] for method in scored] for task in rows])
+    rows = tasks()
+    shade = {"": np.nan, "diverges": -1.0, "worse": -0.5, "best": 1.0}
+    values = [[scores[task, m] for m in scored] for task in rows]
+    colours = np.array([[shade.get(v, v) for v in row] for row in values], float)
     figure = Figure(figsize=(10, 0.3 * len(rows) + 1.6), layout="constrained")
     axes = figure.subplots()
-    image = axes.imshow(np.clip(values, -1, 1), cmap="RdYlGn", vmin=-1, vmax=1)
-    for (i, j), value in np.ndenumerate(values):
-        text = "< -10" if value < -10 else f"{value:.2f}".replace("-0.00", "0.00")
-        ink = "white" if abs(value) > 0.7 else "black"
-        if not np.isnan(value):
-            axes.text(j, i, text, ha="center", va="center", fontsize=6, color=ink)
+    image = axes.imshow(np.clip(colours, -1, 1), cmap="RdYlGn", vmin=-1, vmax=1)
+    for (i, j), colour in np.ndenumerate(colours):
+        text = _score(values[i][j]).replace("below -10", "< -10")
+        text = text.replace("diverges", "div.")
+        ink = "white" if abs(colour) > 0.7 else "black"
+        axes.text(j, i, text, ha="center", va="center", fontsize=6, color=ink)
     axes.set_xticks(range(len(scored)), map(_short, scored), rotation=60, ha="right")
     axes.set_yticks(range(len(rows)), rows)
     axes.tick_params(length=0, labelsize=8)
@@ -172,18 +186,16 @@ def _short(method: str) -> str:
     return SHORT.get(method, method)
 
 
-def _score(value: float) -> str:
-    if np.isnan(value):
-        return ""
-    if value == -np.inf:
-        return "diverges"
+def _score(value: float | str) -> str:
+    if isinstance(value, str):
+        return value
     return f"{value:.2f}".replace("-0.00", "0.00") if value > -10 else "below -10"
 
 
 def _cost(cost: Any) -> str:
     if isinstance(cost, str):
         return ""
-    return _number(interquartile_mean(np.where(np.isfinite(cost), cost, np.inf)))
+    return _number(_mean(cost))
 
 
 def _speed(values: list[float | None]) -> str:
@@ -227,7 +239,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
     for row in {row["case"]: row for row in results.failed}.values():
         print(f"FAILED {row['case']}: {row['error'].splitlines()[0]}", file=sys.stderr)
-    text = tables(results)
+    text = f"{tables(results)}\n{footer()}"
     print(text)
     write_page(text)
     draw(results).savefig(PICTURE)

@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from helpers import once, thorough
+from helpers import once
 
 
 pytestmark = once
@@ -280,13 +280,10 @@ def test_paper(monkeypatch):
     assert made.table(stored["claims"]) in made.PAGE.read_text()
 
 
-@thorough
 def test_scoreboard(tmp_path, monkeypatch):
     """The tables of the page are those of what is stored."""
     monkeypatch.syspath_prepend(str(ROOT))
-    board = pytest.importorskip("benchmarks.scoreboard")
+    board = importlib.import_module("benchmarks.scoreboard")
     shutil.copy(board.STORE, tmp_path / "scoreboard.jsonl")
     made = board.tables(board.Results.read(tmp_path / "scoreboard.jsonl"))
-    page = (ROOT / "docs/scoreboard.md").read_text()
-    tables, _, _ = made.rpartition("Float32, ")
-    assert tables.strip() in page
+    assert made in (ROOT / "docs/scoreboard.md").read_text()

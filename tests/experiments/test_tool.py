@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -373,6 +374,16 @@ def test_a_line_cut_short_is_run_again(tmp_path):
         assert timeless(again) == timeless(whole)
         assert path.read_bytes().count(b"\n") >= 4
         json.loads(path.read_bytes().splitlines()[-1])
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="there is no such device")
+def test_a_device_is_no_store():
+    @experiment.parametrize("n", [1])
+    def one(n):
+        return n
+
+    with user_error(match="no regular file"):
+        one.run(store="/dev/zero", progress=False)
 
 
 def test_a_full_disk_keeps_what_was_done(tmp_path, monkeypatch):

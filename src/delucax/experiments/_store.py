@@ -40,6 +40,8 @@ class Store:
     def _read(self, path: Path) -> None:
         if path.is_dir():
             raise ValueError(f"{self.where}: '{path}' is a folder, not a results file.")
+        if not path.is_file():  # a device may have no end
+            raise ValueError(f"{self.where}: '{path}' is no regular file.")
         try:
             content = path.read_bytes()
         except OSError as error:
