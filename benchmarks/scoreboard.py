@@ -21,7 +21,7 @@ from benchmarks._machine import describe
 from delucax import experiments
 from delucax.experiments import interquartile_mean, Results
 from delucax.experiments._methods import FAMILIES, task_of
-from delucax.experiments._scoreboard import METHODS, scoreboard, tasks
+from delucax.experiments._scoreboard import METHODS, scoreboard
 
 
 STORE = Path(__file__).parent / "results" / "scoreboard.jsonl"
@@ -57,11 +57,17 @@ def costs_of(results: Results) -> dict[tuple[str, str], np.ndarray | str]:
 
 def _by_case(results: Results, name: str) -> dict[tuple[str, str], list]:
     """What there is of one result over the seeds, by task and method."""
-    found = {(task, method): [] for task in tasks() for method in METHODS}
+    names = dict.fromkeys(row["task"] for row in results.rows)
+    found = {(task, method): [] for task in names for method in METHODS}
     for row in results.rows:
-        if (row["task"], row["method"]) in found:
+        if row["method"] in METHODS:
             found[row["task"], row["method"]].append(row.get(name))
     return found
+
+
+def tasks_of(costs: dict[tuple[str, str], Any]) -> list[str]:
+    """The tasks that there are results of."""
+    return list(dict.fromkeys(task for task, _ in costs))
 
 
 def scores_of(costs: dict[tuple[str, str], Any]) -> dict[tuple[str, str], Any]:
@@ -69,7 +75,7 @@ def scores_of(costs: dict[tuple[str, str], Any]) -> dict[tuple[str, str], Any]:
     where it is not suited, `diverges`, and where the floor is as good as the best
     known, whether this is, `best` or `worse`."""
     scores: dict[tuple[str, str], Any] = {}
-    for task in tasks():
+    for task in tasks_of(costs):
         low = best_cost(costs, task)
         near = low + CLOSE * abs(low)
         floor = _mean(costs[task, floor_of(costs, task)])
@@ -107,7 +113,7 @@ def tables(results: Results) -> str:
     scored = [method for method in METHODS if method != "plan"]
     body = [
         [f"`{task}`", floor_of(costs, task), *(_score(scores[task, m]) for m in scored)]
-        for task in tasks()
+        for task in tasks_of(costs)
     ]
     parts = [
         "## Score\n\n0 is the floor, 1 the best known.\n",
@@ -116,7 +122,7 @@ def tables(results: Results) -> str:
     ]
     for name, family in FAMILIES.items():
         body = []
-        for task in tasks():
+        for task in tasks_of(costs):
             found = [costs[task, method] for method in family]
             if all(isinstance(cost, str) for cost in found):
                 continue
@@ -131,7 +137,7 @@ def tables(results: Results) -> str:
     )
     for name, family in FAMILIES.items():
         body = []
-        for task in tasks():
+        for task in tasks_of(costs):
             found = [_speed(speeds[task, method]) for method in family]
             if any(found):
                 body.append([f"`{task}`", *found])
@@ -152,9 +158,10 @@ def footer() -> str:
 
 def draw(results: Results) -> Figure:
     """The scores as a picture: a row for each task, a column for each controller."""
-    scores = scores_of(costs_of(results))
+    costs = costs_of(results)
+    scores = scores_of(costs)
     scored = [method for method in METHODS if method != "plan"]
-    rows = tasks()
+    rows = tasks_of(costs)
     shade = {"": np.nan, "diverges": -1.0, "worse": -0.5, "best": 1.0}
     values = [[scores[task, m] for m in scored] for task in rows]
     colours = np.array([[shade.get(v, v) for v in row] for row in values], float)
