@@ -38,20 +38,22 @@ def _batch(values, dims, *, batched):
 
 
 def _jvp(primals, tangents, *, batched):
-    tangents = [ad.instantiate_zeros(t) for t in tangents]
-    return _fence.bind(*primals, batched=batched), _fence.bind(
-        *tangents, batched=batched
-    )
+    return _fence.bind(*primals, batched=batched), _fence_nonzero(tangents, batched)
 
 
 def _transpose(cotangents, *values, batched):
     del values
-    known = [i for i, c in enumerate(cotangents) if type(c) is not ad.Zero]
-    fenced = _fence.bind(*(cotangents[i] for i in known), batched=batched)
-    found = list(cotangents)
-    for i, value in zip(known, fenced, strict=True):
-        found[i] = value
-    return found
+    return _fence_nonzero(cotangents, batched)
+
+
+def _fence_nonzero(values, batched):
+    """The values with those that are not symbolically zero behind a fence."""
+    nonzero = [i for i, value in enumerate(values) if type(value) is not ad.Zero]
+    fenced = _fence.bind(*(values[i] for i in nonzero), batched=batched)
+    out = list(values)
+    for i, value in zip(nonzero, fenced, strict=True):
+        out[i] = value
+    return out
 
 
 _fence.def_impl(_same)
