@@ -374,7 +374,7 @@ def receding(steps: int) -> Table:
         table.add(f"{name}: 99th percentile, ms", np.percentile(warm, 99), limit)
         table.add(f"{name}: most, ms", warm.max())
         table.add(f"{name}: most iterations", max(iterations[1:]))
-        table.add(f"{name}: plans that did not succeed", int(state.failures))
+        table.add(f"{name}: plans that did not succeed", int(state.failures.count))
         table.add(f"{name}: angle at the end", dlx.math.wrap(x[0]))
     table.show(f"Model predictive control, {steps} steps at 50 Hz")
     return table

@@ -4,6 +4,8 @@ import abc
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from ._fields import check_parameters
@@ -122,6 +124,65 @@ class AbstractLearner(AbstractController):
 
         **Returns:** the new state.
         """
+
+
+class Tally(eqx.Module):
+    """How often something went wrong in a controller, kept in the controller's state.
+
+    [`delucax.rollout`][] reads every tally in the state, however deep, after each step:
+    the steps at which one rose are in `trajectory.incidents`. So a wrapper has nothing
+    to pass on.
+
+    **Attributes:**
+
+    - `name`: what is counted, in the singular, such as `"failed_plan"`.
+    - `count`: a whole number, 0 at first.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        class Cautious(dlx.AbstractController):
+            def init(self, *, key=None):
+                return dlx.controllers.Tally("large_angle")
+
+            def __call__(self, t, y, tally):
+                return -y[1:], tally.add(jnp.abs(y[0]) > 0.5)
+
+        env = dlx.make("pendulum")
+        trajectory = dlx.rollout(env, Cautious(), key=jax.random.key(0))
+        trajectory.incident_counts
+        ```
+    """
+
+    name: str = eqx.field(static=True)
+    count: Array
+
+    def __init__(self, name: str):
+        self.name = name
+        self.count = jnp.zeros((), jnp.int32)
+
+    def add(self, happened: Array) -> "Tally":
+        """The tally, one higher if something happened.
+
+        **Arguments:** `happened`: a boolean.
+
+        **Returns:** the new tally.
+        """
+        return eqx.tree_at(lambda tally: tally.count, self, self.count + happened)
+
+
+def tallies(state: PyTree) -> dict[str, Array]:
+    """The sum of the tallies of each name in a controller's state."""
+    is_tally = lambda node: isinstance(node, Tally)
+    counts: dict[str, Any] = {}
+    for node in jax.tree.leaves(state, is_leaf=is_tally):
+        if is_tally(node):
+            counts[node.name] = counts.get(node.name, 0) + jnp.sum(node.count)
+    return counts
 
 
 def wrong_observation(controller: Any, expected: int, y: Array) -> ValueError:

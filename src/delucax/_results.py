@@ -52,6 +52,14 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "No step lowered the cost, although the gradient is not zero: the problem may "
         "not be smooth there, or the tolerance may be below rounding."
     )
+    plan_failed = (
+        "A plan of the controller did not succeed: `trajectory.incident_counts` says "
+        "how many did not."
+    )
+    update_refused = (
+        "An update of a learner was not finite and was not made: "
+        "`trajectory.incident_counts` says how many were not."
+    )
     infeasible = (
         "The problem has no solution: the cost has no unique minimum over the control, "
         "the constraints cannot all hold, or gamma is below the least level that any "

@@ -49,7 +49,7 @@ def test_a_plan_starts_from_the_last_one():
         assert_close(u, plan.controls[0], atol=1e-9)
         later = jnp.concatenate([plan.controls[1:], plan.controls[-1:]])
         assert_close(state.controls, later, atol=1e-9)
-        assert state.iterations == plan.iterations and state.failures == 0
+        assert state.iterations == plan.iterations and state.failures.count == 0
         x = env.dynamics(0.1 * k, x, u)
     # Where the model is right it does what it planned, and finds nothing to change.
     assert state.iterations <= 2
@@ -107,15 +107,15 @@ def test_a_plan_that_fails_is_seen():
     calm = MPC(dynamics, cost, 12, bounds=(-1.0, 1.0), throw=False)
     step = jax.jit(lambda y, state: calm(0.0, y, state))
     u, state = step(jnp.array([0.1]), calm.init())
-    assert state.failures == 0 and state.result == dlx.RESULTS.successful
+    assert state.failures.count == 0 and state.result == dlx.RESULTS.successful
     kept = state.controls
     u, state = step(jnp.array([9.0]), state)
-    assert state.failures == 1 and state.result == dlx.RESULTS.diverged
+    assert state.failures.count == 1 and state.result == dlx.RESULTS.diverged
     # What was planned a step before; then a new beginning.
     assert_close(u, kept[0])
     assert_close(state.controls, calm.start)
     u, state = step(jnp.array([0.1]), state)
-    assert state.failures == 1 and state.result == dlx.RESULTS.successful
+    assert state.failures.count == 1 and state.result == dlx.RESULTS.successful
 
 
 @thorough
@@ -128,7 +128,7 @@ def test_a_plan_that_fails_is_an_error():
     # Too few iterations are no failure of that kind, but are seen.
     short = MPC(dynamics, cost, 12, max_iterations=1)
     _, state = short(0.0, jnp.array([0.2]), short.init())
-    assert state.failures == 1 and state.result == dlx.RESULTS.not_converged
+    assert state.failures.count == 1 and state.result == dlx.RESULTS.not_converged
 
 
 @once

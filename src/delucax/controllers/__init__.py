@@ -1,5 +1,6 @@
 """Feedback laws."""
 
+from .._controller import Tally as Tally
 from ._basic import (
     Constant as Constant,
     Linear as Linear,

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._check import as_bounds, check_bool, check_count, check_finite, check_key
-from .._controller import AbstractController, wrong_observation
+from .._controller import AbstractController, Tally, wrong_observation
 from .._fields import as_float_array, as_module, function_field, parameter
 from .._results import Result, RESULTS
 from ..costs import AbstractCost
@@ -28,8 +28,9 @@ class MPCState(NamedTuple):
     """What [`delucax.controllers.MPC`][] remembers.
 
     **Attributes:** `controls`, from which the next plan starts, shape `(T, m)`;
-    `result`, that of the last plan; `failures`, how many plans did not succeed so far;
-    `iterations`, how many the last plan took; `key`, for planners that draw.
+    `result`, that of the last plan; `failures`, a [`delucax.controllers.Tally`][] of
+    the plans that did not succeed; `iterations`, how many the last plan took; `key`,
+    for planners that draw.
 
     !!! example
 
@@ -41,13 +42,13 @@ class MPCState(NamedTuple):
         cost = dlx.costs.Quadratic([1.0], [1.0])
         mpc = dlx.controllers.MPC(dynamics, cost, 5)
         u, state = mpc(0.0, jnp.ones(1), mpc.init())
-        state.failures
+        state.failures.count
         ```
     """
 
     controls: Array
     result: Result
-    failures: Array
+    failures: Tally
     iterations: Array
     key: Any
 
@@ -62,9 +63,10 @@ class MPC(AbstractController):
     on time, such as a reference to follow.
 
     What became of a plan is in the controller's state: `result`, and how often it was
-    no success, `failures`. A plan that ran out of iterations or found no descent is
-    used as it is, the best so far. Where there is none to use, since the start
-    diverges or the constraints cannot hold, `throw` says what happens.
+    no success, `failures`, which are `incidents["failed_plan"]` of a rollout. A plan
+    that ran out of iterations or found no descent is used as it is, the best so far.
+    Where there is none to use, since the start diverges or the constraints cannot hold,
+    `throw` says what happens.
 
     Derivatives are those of the planner: of [`delucax.planning.ilqr`][] by the implicit
     function theorem, NaN where a plan did not converge.
@@ -190,7 +192,8 @@ class MPC(AbstractController):
             check_key(key, "MPC.init")
         result = jax.tree.map(jnp.asarray, RESULTS.successful)
         zero = jnp.zeros((), int)
-        return MPCState(self.start, result, zero, zero, key if self.draws else None)
+        failures = Tally("failed_plan")
+        return MPCState(self.start, result, failures, zero, key if self.draws else None)
 
     def __call__(self, t, y, state):
         size = self.dynamics.state_size
@@ -225,7 +228,7 @@ class MPC(AbstractController):
         after = MPCState(
             later,
             plan.result,
-            state.failures + failed,
+            state.failures.add(failed),
             jnp.asarray(plan.iterations, state.iterations.dtype),
             key,
         )

@@ -10,3 +10,4 @@ from ._linearize import c2d as c2d, linearize as linearize
 from ._open_loop import open_loop as open_loop
 from ._runge_kutta import RK4 as RK4
 from ._worst_case import WorstCase as WorstCase
+from ._wrapper import AbstractWrapper as AbstractWrapper

@@ -4,6 +4,7 @@ import abc
 from typing import Any, ClassVar, TYPE_CHECKING
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
@@ -55,9 +56,23 @@ class AbstractDynamics(eqx.Module):
         return self.state_size
 
     @property
+    def increments(self) -> int:
+        """How many Brownian increments of equal variance `w` holds one after the other,
+        each of `disturbance_size / increments` entries; 0, the default, if `w` is not
+        Brownian."""
+        return 0
+
+    @property
     def is_stochastic(self) -> bool:
         """Whether `w` holds Brownian increments, so that no noise is the exception."""
-        return False
+        return self.increments > 0
+
+    @property
+    def observes_state(self) -> bool:
+        """Whether what `observe` returns is the state itself, as its program shows."""
+        x = jnp.zeros(self.state_size)
+        traced = jax.make_jaxpr(self.observe)(jnp.zeros(()), x).jaxpr
+        return list(traced.outvars) == [traced.invars[1]]
 
     @abc.abstractmethod
     def advance(

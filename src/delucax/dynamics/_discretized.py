@@ -209,9 +209,9 @@ class Discretized(AbstractDynamics):
         return size * self.substeps if self.is_stochastic else size
 
     @property
-    def is_stochastic(self) -> bool:
-        """Whether the system has a diffusion."""
-        return has_diffusion(self.system)
+    def increments(self) -> int:
+        """One a substep, where the system has a diffusion."""
+        return self.substeps if has_diffusion(self.system) else 0
 
     def observe(self, t, x):
         return self.system.observe(t, x)

@@ -4,9 +4,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import as_matrix, as_vector, check_step
+from .._check import as_matrix, as_vector, check_step, is_concrete
 from .._fields import as_float_array, parameter
 from .._results import RESULTS
 from ..math import matvec
@@ -113,6 +114,14 @@ class LinearDynamics(AbstractDynamics):
     def disturbance_size(self) -> int:
         """The number of columns of `E`; the size of the state by default."""
         return self.state_size if self.E is None else self.E.shape[-1]
+
+    @property
+    def observes_state(self) -> bool:
+        """Whether `C` is the identity; not, where it is traced."""
+        if self.C is None:
+            return True
+        same = is_concrete(self.C) and self.C.shape == (self.state_size,) * 2
+        return same and np.array_equal(self.C, np.eye(self.state_size))
 
     def at(self, t: Any) -> "LinearDynamics":
         """The time-invariant dynamics that hold at time `t`.

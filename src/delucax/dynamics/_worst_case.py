@@ -73,10 +73,6 @@ class WorstCase(AbstractWrapper):
             check_positive(bound, "bound", where)
         self.dynamics, self.bound = dynamics, bound
 
-    @property
-    def state_units(self):
-        return self.dynamics.state_units
-
     def attack(self, x: Array) -> Array:
         """What the adversary adds to the disturbance.
 

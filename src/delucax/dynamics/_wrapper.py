@@ -8,20 +8,47 @@ from ._base import AbstractDynamics
 
 
 class AbstractWrapper(AbstractDynamics):
-    """Has a field `dynamics`, and is like them but for what a subclass says.
+    """Dynamics with a field `dynamics`, like which they are in all that a subclass does
+    not say otherwise.
 
-    Units of the state are not passed on, for there may be more states.
+    A subclass writes `advance`. One whose state has more entries also gives
+    `state_names`, `observe`, `difference` and `equilibrium`. Anything else that
+    environments, planners and learners ask of dynamics is asked of the field.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        class Slippery(dlx.dynamics.AbstractWrapper):
+            dynamics: dlx.AbstractDynamics
+            grip: jnp.ndarray = dlx.parameter(0.8)
+
+            def advance(self, t, x, u, w):
+                return self.dynamics.advance(t, x, self.grip * u, w)
+
+        pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        Slippery(pendulum)(0.0, jnp.array([0.1, 0.0]), jnp.ones(1))
+        ```
     """
 
     if TYPE_CHECKING:  # as in AbstractDynamics
         dynamics: ClassVar[Any]
+        state_units: ClassVar[Any]
         control_units: ClassVar[Any]
     else:
         dynamics: eqx.AbstractVar[AbstractDynamics]
 
         @property
+        def state_units(self):
+            same = self.state_names == self.dynamics.state_names
+            return self.dynamics.state_units if same else ()
+
+        @property
         def control_units(self):
-            return self.dynamics.control_units
+            same = self.control_names == self.dynamics.control_names
+            return self.dynamics.control_units if same else ()
 
     @property
     def dt(self):
@@ -40,8 +67,15 @@ class AbstractWrapper(AbstractDynamics):
         return self.dynamics.disturbance_size
 
     @property
-    def is_stochastic(self):
-        return self.dynamics.is_stochastic
+    def increments(self):
+        return self.dynamics.increments
+
+    @property
+    def observes_state(self):
+        own = type(self).observe is not AbstractWrapper.observe
+        if own or self.state_size != self.dynamics.state_size:
+            return super().observes_state
+        return self.dynamics.observes_state
 
     def observe(self, t, x):
         return self.dynamics.observe(t, x)

@@ -174,11 +174,8 @@ class Environment(eqx.Module):
         self.dynamics = dynamics
         self.cost = cost
         if disturbance is None and isinstance(dynamics, AbstractDynamics):
-            k, substeps = dynamics.disturbance_size, getattr(dynamics, "substeps", 1)
-            if dynamics.is_stochastic:
-                disturbance = Brownian(k // substeps, substeps=substeps)
-            else:
-                disturbance = Zero(k)
+            k, count = dynamics.disturbance_size, dynamics.increments
+            disturbance = Brownian(k // count, substeps=count) if count else Zero(k)
         self.disturbance = disturbance  # pyright: ignore[reportAttributeAccessIssue]
         self.sensor_noise = sensor_noise
         if initial_state is None and isinstance(dynamics, AbstractDynamics):

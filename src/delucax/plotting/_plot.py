@@ -52,7 +52,9 @@ def plot(
     a batch of at most 8 every member is drawn as a thin line; of a larger one the
     median and the band between the quartiles of those that have not ended. Several
     trajectories are laid over each other, with a panel for each state. A ring marks
-    where an episode terminated, a cross where it failed.
+    where an episode terminated, a cross where it failed. Above the controls a tick
+    marks each step at which the bounds clipped the control, or at which something went
+    wrong in the controller, such as a failed plan.
 
     The figure belongs to nobody: pyplot does not know it, a notebook shows it, and
     `figure.savefig("run.pdf")` writes it.
@@ -127,7 +129,9 @@ def plot(
     else:
         figure.supxlabel(time_label(runs[0]), fontsize=SIZE)
     figure.align_ylabels(axes)
-    _head(figure, runs, with_costs=any(panel.kind == "costs" for panel in panels))
+    kinds = {panel.kind for panel in panels}
+    with_controls = "controls" in kinds
+    _head(figure, runs, with_costs="costs" in kinds, with_controls=with_controls)
     return figure
 
 
@@ -187,8 +191,10 @@ def draw_panel(
             handles.append(_draw_series(ax, run, panel.kind, values, style, faint))
             if panel.kind == "states":
                 _mark_ends(ax, run, values, style["color"])
-    if panel.kind == "controls" and bounds is not None:
-        _draw_bounds(ax, panel, bounds, compared)
+    if panel.kind == "controls":
+        if bounds is not None:
+            _draw_bounds(ax, panel, bounds, compared)
+        _mark_incidents(ax, runs)
     width = int(PANEL_HEIGHT * 13 * 9 / size) if columns == 1 else 16
     _label(ax, panel, width, size)
     if len(panel.names) > 1:
@@ -274,6 +280,48 @@ def _mark_ends(ax, run, values, color):
         )
 
 
+def _mark_incidents(ax, runs):
+    """Ticks above the panel, a row for each kind of incident."""
+    for row, name in enumerate(incident_names(runs)):
+        for run in runs:
+            steps = run.incidents.get(name)
+            if steps is None or len(steps) > FEW:
+                continue
+            times = run.times[:, :-1][steps]
+            ax.plot(
+                times,
+                np.full(len(times), 1.04 + 0.09 * row),
+                "|",
+                color=_incident_color(name),
+                markersize=4,
+                markeredgewidth=1.2,
+                transform=ax.get_xaxis_transform(),
+                clip_on=False,
+            )
+
+
+def incident_names(runs: Sequence[Run]) -> list[str]:
+    """The kinds of incident that happened in any run."""
+    return sorted({name for run in runs for name in run.incidents})
+
+
+def _incident_color(name: str) -> str:
+    return NEUTRAL if name == "clipped_control" else color_of(3)
+
+
+def _incident_label(name: str, runs: Sequence[Run]) -> str:
+    """`"failed plan: 12 steps, first at 0.55"`, or of how many members of a batch."""
+    steps = [run.incidents[name] for run in runs if name in run.incidents]
+    words = name.replace("_", " ")
+    members = sum(len(run.failed) for run in runs)
+    if members > 1:
+        hit = sum(int(now.any(axis=1).sum()) for now in steps)
+        return f"{words}: in {hit} of {members}"
+    count, first = int(steps[0].sum()), int(np.argmax(steps[0][0]))
+    plural = "step" if count == 1 else "steps"
+    return f"{words}: {count} {plural}, first at {runs[0].times[0, first]:.3g}"
+
+
 def _draw_bounds(ax, panel, bounds, compared):
     """A dashed line a bound: neutral where the controls of the panel share it."""
     chosen = bounds[:, list(panel.columns)]
@@ -284,7 +332,9 @@ def _draw_bounds(ax, panel, bounds, compared):
             ax.axhline(end, color=color, linestyle="--", linewidth=1.0, zorder=1)
 
 
-def _head(figure: Figure, runs: Sequence[Run], *, with_costs: bool) -> None:
+def _head(
+    figure: Figure, runs: Sequence[Run], *, with_costs: bool, with_controls: bool
+) -> None:
     """The legend above the panels: the labels, and what the marks mean."""
     handles: list[Line2D] = []
     labels: list[str] = []
@@ -314,6 +364,11 @@ def _head(figure: Figure, runs: Sequence[Run], *, with_costs: bool) -> None:
             labels.append(f"failed: {RESULTS[runs[0].trajectory.result]}")
         else:
             labels.append(name)
+    if with_controls:
+        for name in incident_names(runs):
+            style = {"marker": "|", "color": _incident_color(name)}
+            handles.append(Line2D([], [], linestyle="none", **style))
+            labels.append(_incident_label(name, runs))
     title = wrapped(runs[0].label, 80) if len(runs) == 1 else ""
     if not handles:
         figure.suptitle(title, fontsize=SIZE + 1)

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 
 from .._check import is_concrete
-from .._results import RESULTS
 from ..simulation import Trajectory
 
 
@@ -25,7 +24,8 @@ class Run:
 
     Every array of `series` has shape `(batch, T + 1, size)`, and is NaN where the
     trajectory has ended or is not finite. A series that is held over a step has its
-    last value repeated at the end of the last step.
+    last value repeated at the end of the last step. Of `incidents` there are those that
+    happened, booleans of shape `(batch, T)`.
     """
 
     label: str
@@ -34,6 +34,7 @@ class Run:
     ends: np.ndarray
     failed: np.ndarray
     terminated: np.ndarray
+    incidents: dict[str, np.ndarray]
     total_costs: np.ndarray
     batched: bool
     trajectory: Trajectory
@@ -122,11 +123,13 @@ def _run(label: str, trajectory: Trajectory, what: str, where: str) -> Run:
     shape = (*trajectory.batch_shape, steps + 1)
     times = flat(np.broadcast_to(trajectory.times, shape))
     ends = flat(trajectory.length).astype(int)
-    terminated = ends < steps
-    if trajectory.terminated is not None and steps:
-        terminated = terminated | flat(trajectory.terminated)[:, -1]
-    failed = np.asarray(trajectory.result != RESULTS.successful)
-    failed = flat(np.broadcast_to(failed, trajectory.batch_shape))
+    terminated = flat(np.broadcast_to(trajectory.ended, trajectory.batch_shape))
+    failed = flat(np.broadcast_to(trajectory.failed, trajectory.batch_shape))
+    incidents = {
+        name: flat(steps)
+        for name, steps in (trajectory.incidents or {}).items()
+        if np.any(steps)
+    }
     series = {}
     for kind in KINDS:
         array = getattr(trajectory, kind)
@@ -142,6 +145,7 @@ def _run(label: str, trajectory: Trajectory, what: str, where: str) -> Run:
         ends=ends,
         failed=failed,
         terminated=terminated,
+        incidents=incidents,
         total_costs=flat(trajectory.total_cost),
         batched=lead > 0,
         trajectory=trajectory,

@@ -12,7 +12,7 @@ import jax.random as jr
 
 from .._check import as_vector, check_count, check_finite, check_key
 from .._components import by_components
-from .._controller import AbstractController
+from .._controller import AbstractController, tallies
 from .._fields import as_float_array
 from .._results import choose, first_failure, first_of, or_none, RESULTS
 from .._typing import PRNGKey
@@ -32,6 +32,8 @@ KEEP = (
     "disturbances",
     "costs",
     "terminated",
+    "incidents",
+    "controller_state",
 )
 
 
@@ -71,7 +73,8 @@ def rollout(
     - `x0`: the first state, shape `(n,)`; drawn by the environment by default.
     - `w`: disturbances, shape `(horizon, k)`; drawn by the environment by default.
     - `keep`: what the trajectory stores, of `"states"`, `"observations"`, `"controls"`,
-        `"disturbances"`, `"costs"` and `"terminated"`; all by default.
+        `"disturbances"`, `"costs"`, `"terminated"`, `"incidents"` and
+        `"controller_state"`; all by default.
     - `checkpoint`: what the gradient stores. `"step"` (default): the state at each
         step, and the step is computed again; `"sqrt"`: the state at each of about the
         square root of T steps, for long horizons; `None`: all that is needed, nothing
@@ -81,10 +84,14 @@ def rollout(
         gradients of a long unstable horizon.
     - `truncate`: the gradient is cut before every `truncate`-th step, in the state and
         in the memory of the controller: truncated back-propagation. Never by default.
-    - `throw`: raise if a step fails or the states become NaN or infinite (default); if
-        false, look at `trajectory.result`.
+    - `throw`: raise if a step fails, the states become NaN or infinite, or a learner
+        refuses an update (default); if false, look at `trajectory.result`.
 
-    **Returns:** a [`delucax.Trajectory`][].
+    **Returns:** a [`delucax.Trajectory`][]. Its `result` is the first failure of a
+    step, else `diverged`, else `update_refused` if a learner's update was not finite,
+    else `plan_failed` if a plan of the controller did not succeed. `throw` raises on
+    all but the last: what follows a failed plan is for the controller to say (`throw=`
+    of [`delucax.controllers.MPC`][]).
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape; an error at run
     time as `throw` says.
@@ -191,7 +198,7 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
         if decay is not None:
             x = lax.stop_gradient(x) + decay * (x - lax.stop_gradient(x))
         if truncate is not None:
-            x, memory = _cut(k % truncate == 0, (x, memory))
+            x, memory = _cut((k > 0) & (k % truncate == 0), (x, memory))
         y = dynamics.observe(t, x)
         if not eqx.is_inexact_array(y) or y.ndim != 1:
             y = as_vector(y, env.observation_size, "observe(t, x)", "rollout")
@@ -218,7 +225,15 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
         after = controller.applied(step.control, cost, after)
         check_state(controller, eqx.combine(first, static), after)
         after = eqx.filter(after, eqx.is_array)
+        incidents = {}
+        if "incidents" in keep:
+            before, now = tallies(memory), tallies(after)
+            incidents = {name: now[name] > before[name] for name in now}
+            if env.control_bounds is not None and eqx.is_inexact_array(u):
+                low, high = env.control_bounds
+                incidents["clipped_control"] = jnp.any((u < low) | (u > high))
         if done is not None:
+            incidents = {name: now & ~done for name, now in incidents.items()}
             cost, applied = jnp.where(done, 0, cost), jnp.where(done, 0, applied)
             x_next = jnp.where(done, join_state(parts, size), x_next)
             after = jax.tree.map(lambda a, b: jnp.where(done, a, b), memory, after)
@@ -234,6 +249,7 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
             "controls": split_state(applied),
             "costs": cost,
             "terminated": ended[0] if ends else None,
+            "incidents": incidents,
         }
         kept = {name: value for name, value in kept.items() if name in keep}
         total = None if total is None else total + cost
@@ -247,7 +263,7 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
     )
     inputs = (jnp.arange(horizon), w, noise)
     carry, (kept, results) = _scan(body, carry, inputs, horizon, checkpoint)
-    parts, _, ended, total = carry
+    parts, last, ended, total = carry
     final_state = join_state(parts, size)
 
     def over_time(name: str, size: int, last: Any = ()) -> Any:
@@ -267,7 +283,15 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
     costs = kept.get("costs")
     total_cost = (jnp.sum(costs) if total is None else total) + final_cost
     finite = jnp.all(jnp.isfinite(final_state)) & jnp.isfinite(total_cost)
-    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
+    outcome = choose(finite, RESULTS.successful, RESULTS.diverged)
+    counts, before = tallies(last), tallies(first)
+    for name, kind in (
+        ("refused_update", RESULTS.update_refused),
+        ("failed_plan", RESULTS.plan_failed),
+    ):
+        if name in counts:
+            none = counts[name] == before[name]
+            outcome = first_failure(outcome, choose(none, RESULTS.successful, kind))
     return Trajectory(
         states=over_time("states", size, parts),
         controls=over_time("controls", env.control_size),
@@ -276,7 +300,8 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
         final_cost=final_cost,
         total_cost=total_cost,
         length=length,
-        result=first_failure(first_of(results), diverged),
+        ended=jnp.zeros((), bool) if ended is None else ended[0],
+        result=first_failure(first_of(results), outcome),
         dt=dt,
         steps=horizon,
         keep=keep,
@@ -284,6 +309,8 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
         recorded_observations=over_time("observations", env.observation_size),
         recorded_disturbances=w if "disturbances" in keep else None,
         recorded_terminated=kept.get("terminated"),
+        incidents=kept.get("incidents"),
+        controller_state=last if "controller_state" in keep else None,
         disturbance_size=env.disturbance_size,
         state_names=dynamics.state_names,
         control_names=dynamics.control_names,

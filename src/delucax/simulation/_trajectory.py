@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from .._check import is_concrete
 from .._extras import extra
@@ -37,7 +37,15 @@ class Trajectory(eqx.Module):
     - `final_cost`: a scalar, charged once.
     - `total_cost`: the sum of the stage costs and the final cost.
     - `length`: steps until termination, T if there was none.
+    - `ended`: whether the episode terminated within the T steps.
     - `result`: the first failure, or success; one of `delucax.RESULTS`.
+    - `incidents`: from the name of something that went wrong in the controller to the
+        steps at which it did, booleans of shape `(T,)`. `"clipped_control"`: the
+        environment's bounds changed the control. `"failed_plan"`: a plan of
+        [`delucax.controllers.MPC`][] did not succeed. `"refused_update"`: what a
+        learner would have learned was not finite. Others are those that a controller
+        counts with [`delucax.controllers.Tally`][].
+    - `controller_state`: the arrays of the controller's state at the end.
     - `steps`: T, an int. `dt`: the control interval. `disturbance_size`: k.
     - `keep`: the names of what was kept.
     - `recorded_times`, `recorded_observations`, `recorded_disturbances`,
@@ -65,6 +73,7 @@ class Trajectory(eqx.Module):
     final_cost: Array
     total_cost: Array
     length: Array
+    ended: Array
     result: Result
     dt: Array
     # What follows from the rest is not stored but made on demand: writing it out would
@@ -73,6 +82,8 @@ class Trajectory(eqx.Module):
     recorded_observations: Array | None
     recorded_disturbances: Array | None
     recorded_terminated: Array | None
+    incidents: dict[str, Array] | None
+    controller_state: PyTree
     steps: int = eqx.field(static=True)
     keep: tuple[str, ...] = eqx.field(static=True)
     disturbance_size: int = eqx.field(static=True)
@@ -115,6 +126,40 @@ class Trajectory(eqx.Module):
         if self.recorded_terminated is None and "terminated" in self.keep:
             return jnp.zeros((*self.batch_shape, self.steps), bool)
         return self.recorded_terminated
+
+    @property
+    def failed(self) -> Array:
+        """Whether a step failed, the run diverged or a learner refused an update. A
+        failed plan, which `result` names too, is no failure of the run."""
+        planned = self.result == RESULTS.plan_failed
+        return (self.result != RESULTS.successful) & ~planned
+
+    @property
+    def incident_counts(self) -> dict[str, Array]:
+        """At how many steps each of `incidents` happened."""
+        return {name: jnp.sum(now, -1) for name, now in self._incidents().items()}
+
+    @property
+    def incident_times(self) -> dict[str, Array]:
+        """When each of `incidents` happened first; NaN where it never did."""
+        return {
+            name: jnp.where(
+                jnp.any(now, -1),
+                jnp.take_along_axis(
+                    self.times, jnp.argmax(now, -1, keepdims=True), axis=-1
+                )[..., 0],
+                jnp.nan,
+            )
+            for name, now in self._incidents().items()
+        }
+
+    def _incidents(self) -> dict[str, Array]:
+        if self.incidents is None:
+            raise ValueError(
+                "Trajectory: incidents must be kept to be counted; got keep= without "
+                "them."
+            )
+        return self.incidents
 
     def __getitem__(self, index: Any) -> "Trajectory":
         """Members of a batch, or a stretch of time of one trajectory.
@@ -166,10 +211,13 @@ class Trajectory(eqx.Module):
             final_cost=final_cost,
             total_cost=final_cost if costs is None else jnp.sum(costs) + final_cost,
             length=jnp.clip(self.length - start, 0, stop - start),
+            ended=self.ended & (self.length <= stop),
             recorded_times=ends(self.times),
             recorded_observations=steps(self.recorded_observations),
             recorded_disturbances=steps(self.recorded_disturbances),
             recorded_terminated=steps(self.recorded_terminated),
+            incidents=jax.tree.map(steps, self.incidents),
+            controller_state=self.controller_state if is_end else None,
             steps=stop - start,
         )
 
@@ -225,7 +273,9 @@ class Trajectory(eqx.Module):
         """One row for a trajectory, one a member for a batch: cost, length, outcome.
 
         Columns: `total_cost`, `final_cost`, `mean_cost` (a step), `length`,
-        `terminated`, `result`.
+        `terminated`, `result`; and for each kind of incident that happened, such as
+        `failed_plan`, the number of steps `failed_plans` and the time of the first,
+        `first_failed_plan`.
 
         **Returns:** a `pandas.DataFrame`.
 
@@ -243,21 +293,25 @@ class Trajectory(eqx.Module):
             "successful" if fine else _message(code)
             for fine, code in zip(ok, codes, strict=True)
         ]
-        return pd.DataFrame(
-            {
-                "total_cost": total,
-                "final_cost": final,
-                "mean_cost": (total - final) / np.maximum(length, 1),
-                "length": length,
-                "terminated": length < self.steps,
-                "result": words,
-            }
-        )
+        columns = {
+            "total_cost": total,
+            "final_cost": final,
+            "mean_cost": (total - final) / np.maximum(length, 1),
+            "length": length,
+            "terminated": np.broadcast_to(np.ravel(self.ended), total.shape),
+            "result": words,
+        }
+        for name in self.incidents or ():
+            count = np.ravel(self.incident_counts[name])
+            if count.any():
+                columns[f"{name}s"] = count
+                columns[f"first_{name}"] = np.ravel(self.incident_times[name])
+        return pd.DataFrame(columns)
 
 
 def checked(trajectory: Trajectory, where: str) -> Trajectory:
     """Raise if the trajectory failed: now if it can be seen, else at run time."""
-    failed = trajectory.result != RESULTS.successful
+    failed = trajectory.failed
     if not is_concrete(failed):
         return trajectory.result.error_if(trajectory, failed)
     if failed:

@@ -12,7 +12,6 @@ from jaxtyping import Array
 from .._check import check_key
 from .._controller import AbstractController
 from .._fields import parameter
-from .._results import RESULTS
 from .._typing import PRNGKey, RealScalar
 from ..controllers import Categorical, Deep, Gaussian, MLP, Standardise
 from ..environments import Environment
@@ -288,7 +287,7 @@ def episode(
     options: Any = dict(gradient_decay=gradient_decay, keep=KEPT, throw=False)
     cut: Any = dict(horizon=horizon, truncate=truncate)
     run: Any = rollout(environment, model.policy, key=key, **cut, **options)
-    ok = run.result == RESULTS.successful
+    ok = ~run.failed
     costs = jnp.where(ok | ~jnp.isfinite(run.total_cost), run.costs, jnp.nan)
     # What is recorded of a cut rollout has lost its derivative at the cuts, where the
     # value of a state is asked for; so it is observed again, with the noise it had.

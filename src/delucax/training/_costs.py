@@ -12,7 +12,6 @@ from jaxtyping import Array
 from .._check import check_count, check_key
 from .._controller import AbstractController
 from .._fields import as_float_array
-from .._results import RESULTS
 from ..environments import Environment
 from ..simulation import rollout, Trajectory
 from ..simulation._answer import begun
@@ -258,6 +257,6 @@ def _check_environment(environment: Any, where: str) -> None:
 
 def _cost_or_nan(trajectory: Trajectory) -> Array:
     """The total cost, NaN where the run failed: a failed solve may look finite."""
-    ok = trajectory.result == RESULTS.successful
+    ok = ~trajectory.failed
     cost = trajectory.total_cost
     return jnp.where(ok | ~jnp.isfinite(cost), cost, jnp.nan)

@@ -14,7 +14,7 @@ from .._lqr import LQR
 from .._scheduled import Scheduled
 from ._features import Features
 from ._learner import OnlineLearner
-from ._loop import Loop, observes_state
+from ._loop import Loop
 from ._newton import online_newton
 from ._policy import LinearPolicy
 from ._step_size import adagrad_norm
@@ -43,7 +43,7 @@ def loop_of(
     if base is None:
         base = _default_base(dynamics, cost, where)
     if echoes is None:
-        echoes = not observes_state(dynamics)
+        echoes = not dynamics.observes_state
     return Loop(dynamics, base, horizon, where, echoes=echoes)
 
 
@@ -89,7 +89,7 @@ def _default_base(dynamics: AbstractDynamics, cost: Any, where: str) -> Any:
         model = linearize(dynamics, t, x, u)
         return LQR(model, Q, R, S, difference=dynamics.difference)
     if not dynamics.is_time_varying:
-        if observes_state(dynamics):
+        if dynamics.observes_state:
             return LQR(dynamics, Q, R, S)
         p, k = dynamics.observation_size, dynamics.disturbance_size
         eye = lambda n: jnp.eye(n, dtype=x.dtype)  # noqa: E731

@@ -9,13 +9,14 @@ import optax
 from jaxtyping import Array
 
 from ..._check import check_count, check_key
-from ..._controller import AbstractController
+from ..._controller import AbstractController, Tally
 from ..._fields import parameter, weight
 from ...dynamics import AbstractDynamics
 from ...math._norms import safe_norm, within_ball
 from ._base import RADIUS, scale
 from ._features import Features
-from ._loop import Loop, LoopState, observes_state, shift
+from ._learner import accepted
+from ._loop import Loop, LoopState, shift
 from ._step_size import adagrad_norm
 
 
@@ -28,6 +29,7 @@ class BPCState(NamedTuple):
     - `tried`: the unit directions that theta was moved in, newest first.
     - `level`: the running mean of the cost, and `steps`, how many it is of.
     - `key`: of the next direction.
+    - `refused`: how many updates were not finite, and so were not made.
     """
 
     loop: LoopState
@@ -38,6 +40,7 @@ class BPCState(NamedTuple):
     level: Array
     steps: Array
     key: Array
+    refused: Tally
 
 
 class BPC(AbstractController):
@@ -121,7 +124,7 @@ class BPC(AbstractController):
                 f"{where}: dynamics must be an AbstractDynamics, got "
                 f"{type(dynamics).__name__}."
             )
-        echoes = not observes_state(dynamics)
+        echoes = not dynamics.observes_state
         # A roll-out as long as it takes a control to be seen.
         loop = Loop(dynamics, base, dynamics.state_size, where, echoes=echoes)
         memory = check_count(memory, "memory", where)
@@ -147,6 +150,7 @@ class BPC(AbstractController):
             level=jnp.zeros((), dtype),
             steps=jnp.zeros((), dtype),
             key=own,
+            refused=Tally("refused_update"),
         )
 
     def __call__(self, t, y, state):
@@ -176,10 +180,13 @@ class BPC(AbstractController):
         step, optimiser = self.optimiser.update(step, state.optimiser, state.theta)
         theta = state.theta + self.learning_rate * step
         theta = within_ball(theta, self.radius).astype(state.theta.dtype)
+        old = state.theta, state.optimiser
+        (theta, optimiser), refused = accepted((theta, optimiser), old, state.refused)
         return state._replace(
             loop=self.loop.applied(u, cost, state.loop),
             theta=theta,
             optimiser=optimiser,
+            refused=refused,
             level=state.level + (cost - state.level) / steps,
             steps=steps,
         )

@@ -10,7 +10,7 @@ import optax
 from jax.interpreters import partial_eval
 from jaxtyping import Array
 
-from ..._controller import AbstractLearner
+from ..._controller import AbstractLearner, Tally
 from ..._fields import function_field, parameter
 from ._features import Features
 from ._fixed import FixedPolicy
@@ -29,6 +29,7 @@ class LearnerState(NamedTuple):
     - `optimiser`: the state of the optimiser.
     - `weighted`: the response weighted by the root of the curvature of the cost, where
         it is the same at all times.
+    - `refused`: how many updates were not finite, and so were not made.
     """
 
     loop: LoopState
@@ -37,6 +38,15 @@ class LearnerState(NamedTuple):
     theta: Any
     optimiser: Any
     weighted: Any
+    refused: Tally
+
+
+def accepted(new: Any, old: Any, refused: Tally) -> tuple[Any, Tally]:
+    """What was learned, or what was known before if that is not finite."""
+    floats = jax.tree.leaves(eqx.filter(new, eqx.is_inexact_array))
+    fine = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in floats]))
+    kept = jax.tree.map(lambda a, b: jnp.where(fine, a, b), new, old)
+    return kept, refused.add(~fine)
 
 
 class OnlineLearner(AbstractLearner):
@@ -108,6 +118,7 @@ class OnlineLearner(AbstractLearner):
             theta=theta,
             optimiser=self.optimiser.init(theta),
             weighted=None if same is None else self._weighted(same, inner),
+            refused=Tally("refused_update"),
         )
 
     def __call__(self, t, y, state):
@@ -117,9 +128,10 @@ class OnlineLearner(AbstractLearner):
         features = shift(self.features(signal), state.features)
         moved = loop.linearised(self.policy(state.theta, features[0]), before, moved)
         state = state._replace(loop=moved, signal=signal, features=features)
-        theta, optimiser = self._learn(state)
+        old = state.theta, state.optimiser
+        (theta, optimiser), refused = accepted(self._learn(state), old, state.refused)
         v = self.policy(theta, features[0])
-        state = state._replace(theta=theta, optimiser=optimiser)
+        state = state._replace(theta=theta, optimiser=optimiser, refused=refused)
         return (moved.u_base + v).astype(y.dtype), state
 
     def applied(self, u, cost, state):

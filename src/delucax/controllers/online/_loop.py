@@ -105,7 +105,7 @@ class Loop(eqx.Module):
     ):
         check_control(dynamics, base, where)
         linear = isinstance(dynamics, LinearDynamics)
-        self.observed = observes_state(dynamics)
+        self.observed = dynamics.observes_state
         self.echoes = echoes
         same = linear and not dynamics.is_time_varying and isinstance(base, _AFFINE)
         if not same and not self.observed:
@@ -249,16 +249,6 @@ def check_control(
             f"{where}: base must give a control of size {dynamics.control_size}, as "
             f"dynamics take, got shape {u.shape}."
         )
-
-
-def observes_state(dynamics: AbstractDynamics) -> bool:
-    """Whether an observation is the state itself."""
-    x = jnp.zeros(dynamics.state_size)
-    traced = jax.make_jaxpr(dynamics.observe)(jnp.zeros(()), x).jaxpr
-    if list(traced.outvars) == [traced.invars[1]]:
-        return True
-    C, eye = getattr(dynamics, "C", None), np.eye(len(x))
-    return C is not None and is_concrete(C) and np.array_equal(C, eye)
 
 
 def _vector(state: Any) -> tuple[Array, Any]:

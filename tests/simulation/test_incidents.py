@@ -1,0 +1,205 @@
+"""What went wrong in a controller reaches the user; how an episode ended; cuts."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+import pytest
+from helpers import assert_close, central_difference, needs_x64, thorough, user_error
+
+import delucax as dlx
+
+
+UPRIGHT = jnp.array([0.1, 0.0])
+
+
+class Cautious(dlx.AbstractController):
+    """Counts the steps at which the plant is fast, behind a structure of its own."""
+
+    name: str = eqx.field(static=True, default="fast")
+
+    def init(self, *, key=None):
+        return {"tally": dlx.controllers.Tally(self.name), "steps": jnp.zeros((), int)}
+
+    def __call__(self, t, y, state):
+        tally = state["tally"].add(jnp.abs(y[1]) > 1)
+        return 5 * jnp.cos(y[:1]), {"tally": tally, "steps": state["steps"] + 1}
+
+
+def test_incidents_are_counted_and_timed(key):
+    env = dlx.make("pendulum", horizon=40)
+    run = dlx.rollout(env, Cautious(), key=key, x0=UPRIGHT)
+    fast = np.abs(np.asarray(run.observations[:, 1])) > 1
+    clipped = np.abs(5 * np.cos(np.asarray(run.observations[:, 0]))) > 2
+    assert 0 < fast.sum() < 40 and 0 < clipped.sum() < 40
+    np.testing.assert_array_equal(run.incidents["fast"], fast)
+    np.testing.assert_array_equal(run.incidents["clipped_control"], clipped)
+    assert run.incident_counts["fast"] == fast.sum()
+    assert_close(run.incident_times["fast"], run.times[np.argmax(fast)])
+    assert run.controller_state["steps"] == 40
+    assert run.controller_state["tally"].count == fast.sum()
+    assert run.result == dlx.RESULTS.successful and not run.failed
+    row = run.summary().iloc[0]
+    assert row["fasts"] == fast.sum() and row["first_fast"] == run.times[fast.argmax()]
+    part = run[10:20]
+    assert part.incident_counts["fast"] == fast[10:20].sum()
+    assert part.controller_state is None
+    keys = jax.random.split(key, 3)
+    batch = jax.vmap(lambda k: dlx.rollout(env, Cautious(), key=k))(keys)
+    assert batch.incident_counts["fast"].shape == (3,)
+    assert batch[1].incidents["fast"].shape == (40,)
+    assert len(batch.summary()) == 3
+
+
+def test_an_incident_that_never_happened_has_no_time(key):
+    env = dlx.make("pendulum", horizon=5)
+    run = dlx.rollout(env, dlx.controllers.Zero(1), key=key, x0=UPRIGHT)
+    assert run.incident_counts == {"clipped_control": 0}
+    assert np.isnan(run.incident_times["clipped_control"])
+    assert "clipped_controls" not in run.summary()
+
+
+def test_incidents_need_not_be_kept(key):
+    env = dlx.make("pendulum", horizon=5)
+    run = dlx.rollout(env, Cautious("failed_plan"), key=key, keep=(), x0=UPRIGHT + 2)
+    assert run.incidents is run.controller_state is None
+    assert run.result == dlx.RESULTS.plan_failed
+    with user_error(match="incidents must be kept"):
+        _ = run.incident_counts
+
+
+def test_a_failed_plan_is_a_status_and_no_error(key):
+    env = dlx.make("pendulum", horizon=40)
+    run = dlx.rollout(env, Cautious("failed_plan"), key=key, x0=UPRIGHT)
+    assert run.result == dlx.RESULTS.plan_failed and not run.failed
+    assert "plan" in run.summary()["result"][0]
+
+
+def test_mpc_tells_of_its_plans(key):
+    env = dlx.make("pendulum", dt=0.05, horizon=6)
+    cost = dlx.costs.Quadratic([1.0, 0.1], [0.1])
+    hasty = dlx.controllers.MPC(env.dynamics, cost, 10, max_iterations=1)
+    run = dlx.rollout(env, hasty, key=key, x0=jnp.array([np.pi, 0.0]))
+    count = run.incident_counts["failed_plan"]
+    assert count > 0 and count == run.controller_state.failures.count
+    assert run.result == dlx.RESULTS.plan_failed
+
+
+def test_what_is_inside_another_controller_is_counted(key):
+    env = dlx.make("pendulum", horizon=10)
+    learner = dlx.controllers.GPC(
+        env.dynamics, env.cost, base=dlx.controllers.Linear([[20.0, 5.0]])
+    )
+    adaptive = dlx.controllers.Adaptive(learner, slots=2, every=2)
+    run = dlx.rollout(env, adaptive, key=key, x0=UPRIGHT)
+    assert run.incident_counts["refused_update"] == 0
+
+
+def test_a_learner_refuses_what_is_not_finite(key):
+    A, B = jnp.array([[1.0, 0.1], [0.0, 0.9]]), jnp.array([[0.0], [0.1]])
+    plant = dlx.LinearDynamics(A, B)
+    fine = dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1))
+    base = dlx.controllers.LQR(plant, jnp.eye(2), jnp.eye(1))
+
+    def cost(t, y, u):
+        return jnp.where(t == 5, jnp.nan, 1.0) * fine(t, y, u)
+
+    learner = dlx.controllers.GPC(plant, cost, base=base, optimiser=optax.sgd(1.0))
+    env = dlx.Environment(plant, fine, dlx.disturbances.Gaussian(0.1, size=2))
+    with pytest.raises(RuntimeError, match="update of a learner"):
+        dlx.rollout(env, learner, key=key, horizon=12)
+    run = dlx.rollout(env, learner, key=key, horizon=12, throw=False)
+    assert run.result == dlx.RESULTS.update_refused and run.failed
+    assert run.incident_counts["refused_update"] == 1
+    assert run.incident_times["refused_update"] == 5
+    assert np.all(np.isfinite(run.states))
+    assert np.any(np.asarray(run.controller_state.theta) != 0)
+
+
+@pytest.mark.parametrize("end", [3, 8, 9])
+def test_an_episode_that_ends_in_its_last_step_has_ended(key, end):
+    env = dlx.make("pendulum", horizon=8)
+    env = dlx.replace(env, {"terminated": lambda t, x: t > (end - 0.5) * env.dt})
+    run = dlx.rollout(env, dlx.controllers.Zero(1), key=key, x0=UPRIGHT)
+    assert bool(run.ended) == (end <= 8)
+    assert bool(run.summary()["terminated"][0]) == (end <= 8)
+    for start in range(8):
+        for stop in range(start + 1, 9):
+            assert bool(run[start:stop].ended) == (end <= stop)
+            if end <= 8:
+                assert bool(run[start:stop].terminated[-1]) == (end <= stop)
+
+
+@needs_x64
+def test_a_cut_keeps_the_derivative_of_the_start(key):
+    env = dlx.make("pendulum", horizon=6)
+    feedback = dlx.controllers.Linear([[20.0, 5.0]])
+
+    def cost(x0, truncate, horizon=6):
+        options = dict(key=key, truncate=truncate, horizon=horizon)
+        return dlx.rollout(env, feedback, x0=x0, **options).total_cost
+
+    whole = jax.grad(cost)(UPRIGHT, None)
+    assert np.all(np.asarray(whole) != 0)
+    for truncate in (6, 100):
+        assert_close(jax.grad(cost)(UPRIGHT, truncate), whole, rtol=1e-12)
+    # With a cut before step 2 the start is charged for steps 0 and 1.
+    first = jax.grad(cost)(UPRIGHT, None, 2)
+    last = dlx.rollout(env, feedback, key=key, x0=UPRIGHT, horizon=2).final_state
+    assert env.cost.final(0.1, last) == 0
+    assert_close(jax.grad(cost)(UPRIGHT, 2), first, rtol=1e-12)
+
+
+class Implicit(dlx.AbstractSystem):
+    """An acceleration that solves `a + m a^3 + k x = u`."""
+
+    state_names, control_names = ("x", "v"), ("u",)
+    m: jax.Array = dlx.parameter(0.7)
+    stacked: bool = eqx.field(static=True, default=False)
+
+    def vector_field(self, t, x, u, w):
+        def gap(a, given):
+            m, x, u = given
+            return a + m * a**3 + x - u
+
+        solver = optx.Newton(rtol=1e-10, atol=1e-10)
+        given = (self.m, x[:1], u) if self.stacked else (self.m, x[0], u[0])
+        start = jnp.zeros_like(given[1])
+        a = optx.root_find(gap, solver, start, args=given).value
+        return jnp.concatenate([x[1:], a]) if self.stacked else jnp.stack([x[1], a])
+
+
+@needs_x64
+@pytest.mark.parametrize(
+    "stacked, checkpoint, solver",
+    [
+        (False, "step", None),
+        (True, "step", None),
+        pytest.param(False, "sqrt", diffrax.Heun(), marks=thorough),
+        pytest.param(False, None, diffrax.ImplicitEuler(), marks=thorough),
+    ],
+)
+def test_derivatives_through_a_field_that_solves(key, stacked, checkpoint, solver):
+    system = Implicit(stacked=stacked)
+    plant = dlx.Discretized(system, dt=0.1, solver=solver)
+    env = dlx.Environment(plant, dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1)))
+    feedback = dlx.controllers.Linear([[1.0, 0.5]])
+
+    def cost(z):
+        there = dlx.replace(env, {"dynamics.system.m": z[0]})
+        options = dict(key=key, horizon=8, checkpoint=checkpoint)
+        return dlx.rollout(there, feedback, x0=z[1:], **options).total_cost
+
+    z = jnp.array([0.7, 0.8, -0.3])
+    expected = central_difference(jax.jit(cost), z, step=1e-5)
+    assert_close(jax.grad(cost)(z), expected, rtol=1e-6, atol=1e-6)
+
+    def last(z):
+        there = dlx.replace(plant, {"system.m": z[0]})
+        return jnp.sum(dlx.open_loop(there, z[1:], jnp.ones((5, 1)))[-1] ** 2)
+
+    expected = central_difference(jax.jit(last), z, step=1e-5)
+    assert_close(jax.grad(last)(z), expected, rtol=1e-6, atol=1e-6)
