@@ -203,3 +203,19 @@ def test_derivatives_through_a_field_that_solves(key, stacked, checkpoint, solve
 
     expected = central_difference(jax.jit(last), z, step=1e-5)
     assert_close(jax.grad(last)(z), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_one_solve_counts_too(key):
+    pendulum = dlx.systems.Pendulum()
+    options = dict(dt=0.05, key=key, substeps=2)
+    run = dlx.simulate(pendulum, Cautious("failed_plan"), 0.0, 1.0, UPRIGHT, **options)
+    fast = np.abs(np.asarray(run.observations[:, 1])) > 1
+    assert 0 < fast.sum() < 20
+    np.testing.assert_array_equal(run.incidents["failed_plan"], fast)
+    assert run.result == dlx.RESULTS.plan_failed and not run.failed
+    slope = jax.grad(
+        lambda x0: dlx.simulate(
+            pendulum, Cautious("failed_plan"), 0.0, 1.0, x0, **options
+        ).final_state[0]
+    )(UPRIGHT)
+    assert np.all(np.isfinite(slope))

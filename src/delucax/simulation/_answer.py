@@ -6,8 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._controller import AbstractController
+from .._results import choose, first_failure, Result, RESULTS
 
 
 def begun(controller: AbstractController, key: Any) -> Any:
@@ -30,6 +32,19 @@ def answer(controller: AbstractController, t: Any, y: Any, state: Any) -> Any:
             f"given if there is none to keep, got {got}."
         )
     return found
+
+
+def outcome_of(counts: dict[str, Array], before: dict[str, Array]) -> Result:
+    """What became of a controller, by its tallies before a run and after it."""
+    outcome = RESULTS.successful
+    for name, kind in (
+        ("refused_update", RESULTS.update_refused),
+        ("failed_plan", RESULTS.plan_failed),
+    ):
+        if name in counts:
+            none = counts[name] == before[name]
+            outcome = first_failure(outcome, choose(none, RESULTS.successful, kind))
+    return outcome
 
 
 def check_state(controller: AbstractController, first: Any, after: Any) -> None:

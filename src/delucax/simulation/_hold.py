@@ -8,7 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._controller import AbstractController
+from .._controller import AbstractController, tallies
 from ..dynamics._discretized import evaluate_field
 from ..dynamics._solvers import AbstractTransparentSolver
 from ..systems import AbstractSystem
@@ -79,16 +79,25 @@ def check_control(u: Any, source: Any, system: AbstractSystem) -> None:
 
 
 class Recorded(NamedTuple):
-    """A saved state with the held control of the step that it comes from."""
+    """A saved state with the held control of the step that it comes from, and the
+    controller's tallies then."""
 
     state: Array
     control: Array
+    counts: dict[str, Array]
 
 
 def recorded(t: Any, x: Any, args: Any) -> Recorded:
     """What is saved of a solve with a held controller."""
     del t
-    return x if isinstance(x, Recorded) else Recorded(x, args.u)
+    if isinstance(x, Recorded):
+        return x
+    return Recorded(x, args.u, _counts(args.memory, x))
+
+
+def _counts(memory: Any, like: Array) -> dict[str, Array]:
+    """A controller's tallies as floating-point numbers, as a solve saves them."""
+    return {n: count.astype(like.dtype) for n, count in tallies(memory).items()}
 
 
 class _Ends(diffrax.AbstractLocalInterpolation):
@@ -98,13 +107,13 @@ class _Ends(diffrax.AbstractLocalInterpolation):
     t1: Array
     inside: diffrax.AbstractLocalInterpolation
     end: Any
-    held: Array | None
+    held: tuple[Array, dict[str, Array]] | None
 
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
             return self.inside.evaluate(t0, t1, left=left)
         x = jnp.where(t0 == self.t1, self.end, self.inside.evaluate(t0, left=left))
-        return x if self.held is None else Recorded(x, self.held)
+        return x if self.held is None else Recorded(x, *self.held)
 
 
 class Hold(AbstractTransparentSolver):
@@ -156,7 +165,7 @@ class Hold(AbstractTransparentSolver):
         y1, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, made_jump | switched
         )
-        record = held[0] if self.sampled else None
+        record = (held[0], _counts(held[1], y1)) if self.sampled else None
         dense_info = dict(inner=dense_info, end=y1, held=record)
         return y1, error, dense_info, (inner, index, held), result
 

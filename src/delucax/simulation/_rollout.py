@@ -19,7 +19,7 @@ from .._typing import PRNGKey
 from ..disturbances import Zero
 from ..dynamics._runge_kutta import join_state, split_state, stack_steps
 from ..environments import Environment
-from ._answer import answer, begun, check_state
+from ._answer import answer, begun, check_state, outcome_of
 from ._horizon import as_number
 from ._trajectory import checked, Trajectory
 
@@ -284,14 +284,7 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
     total_cost = (jnp.sum(costs) if total is None else total) + final_cost
     finite = jnp.all(jnp.isfinite(final_state)) & jnp.isfinite(total_cost)
     outcome = choose(finite, RESULTS.successful, RESULTS.diverged)
-    counts, before = tallies(last), tallies(first)
-    for name, kind in (
-        ("refused_update", RESULTS.update_refused),
-        ("failed_plan", RESULTS.plan_failed),
-    ):
-        if name in counts:
-            none = counts[name] == before[name]
-            outcome = first_failure(outcome, choose(none, RESULTS.successful, kind))
+    outcome = first_failure(outcome, outcome_of(tallies(last), tallies(first)))
     return Trajectory(
         states=over_time("states", size, parts),
         controls=over_time("controls", env.control_size),

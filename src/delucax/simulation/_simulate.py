@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from .._check import as_vector, check_count, check_finite, check_key, is_concrete
-from .._controller import AbstractController
+from .._controller import AbstractController, tallies
 from .._results import choose, first_failure, promote, RESULTS
 from .._typing import PRNGKey
 from ..dynamics._solvers import (
@@ -20,6 +20,7 @@ from ..dynamics._solvers import (
     loud,
 )
 from ..systems import AbstractSystem
+from ._answer import outcome_of
 from ._hold import (
     check_control,
     field,
@@ -338,8 +339,9 @@ def _simulate(
     )
     states: Any = solution.ys
     applied: Any = None
+    counts: dict[str, Any] = {}
     if isinstance(states, Recorded):
-        states, applied = states.state, states.control
+        states, applied, counts = states
     final_state = states[-1]
     count = times.shape[0]
     states = states[:count]
@@ -357,7 +359,9 @@ def _simulate(
     else:
         controls = jax.vmap(args.control)(times[:-1], states[:-1])
     finite = jnp.all(jnp.isfinite(final_state))
-    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
+    outcome = choose(finite, RESULTS.successful, RESULTS.diverged)
+    last = {name: totals[-1] for name, totals in counts.items()}
+    outcome = first_failure(outcome, outcome_of(last, tallies(memory)))
     sensor = None
     if type(system).observe is not AbstractSystem.observe:
         sensor = jax.vmap(system.observe)(times[:-1], states[:-1])
@@ -371,13 +375,15 @@ def _simulate(
         total_cost=jnp.zeros((), dtype),
         length=jnp.asarray(count - 1),
         ended=jnp.zeros((), bool),
-        result=first_failure(promote(solution.result), diverged),
+        result=first_failure(promote(solution.result), outcome),
         dt=spacing,
         recorded_times=times,
         recorded_observations=sensor,
         recorded_disturbances=before(w),
         recorded_terminated=None,
-        incidents=None,
+        incidents={
+            n: totals[1:count] > totals[: count - 1] for n, totals in counts.items()
+        },
         controller_state=None,
         steps=count - 1,
         # There is no cost to keep, which is not to have left it out.
