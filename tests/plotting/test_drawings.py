@@ -55,6 +55,7 @@ def run_of(env, states, controls=None):
         final_cost=zero,
         total_cost=zero,
         length=jnp.asarray(steps),
+        ended=jnp.zeros((), bool),
         result=dlx.RESULTS.successful,
         dt=env.dt,
         recorded_times=None,

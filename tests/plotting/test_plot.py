@@ -1,5 +1,6 @@
 """Trajectories against time: what is in the figure."""
 
+import dataclasses
 import io
 import warnings
 
@@ -211,7 +212,10 @@ def test_comparison_has_a_panel_for_each_state(drone):
 def test_sequence_takes_labels(trajectory):
     figure = dlx.plot([trajectory, trajectory[:10]], labels=("long", "short"))
     assert [t.split(" (")[0] for t in legend_texts(figure)] == ["long", "short"]
-    assert dlx.plot(trajectory, labels="run 7").get_suptitle() == "run 7"
+    quiet = dataclasses.replace(trajectory, incidents={})
+    assert dlx.plot(quiet, labels="run 7").get_suptitle() == "run 7"
+    (legend,) = dlx.plot(trajectory, labels="run 7").legends
+    assert legend.get_title().get_text() == "run 7"
 
 
 def test_more_lines_than_colours_differ_in_style(trajectory):
@@ -375,3 +379,22 @@ def test_traced_values_are_refused(env, linear, key):
 
     with user_error(match="trajectory must hold values"):
         draw(jnp.zeros(2))
+
+
+def test_incidents_are_ticks_above_the_controls(env, trajectory, key):
+    failed = jnp.arange(30) % 7 == 3
+    clipped = jnp.arange(30) < 4
+    none = jnp.zeros(30, bool)
+    names = "failed_plan", "clipped_control", "refused_update"
+    incidents = dict(zip(names, (failed, clipped, none), strict=True))
+    run = dataclasses.replace(trajectory, incidents=incidents)
+    figure = dlx.plot(run)
+    assert legend_texts(figure) == [
+        "clipped control: 4 steps, first at 0",
+        "failed plan: 4 steps, first at 0.15",
+    ]
+    ticks = [ln for ln in figure.axes[2].get_lines() if ln.get_marker() == "|"]
+    np.testing.assert_allclose(ticks[0].get_xdata(), trajectory.times[:4])
+    np.testing.assert_allclose(ticks[1].get_xdata(), trajectory.times[:-1][failed])
+    texts = legend_texts(dlx.plot({"a": run, "b": trajectory}))
+    assert texts[2:] == ["failed plan: in 1 of 2"]

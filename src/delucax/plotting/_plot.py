@@ -53,8 +53,8 @@ def plot(
     median and the band between the quartiles of those that have not ended. Several
     trajectories are laid over each other, with a panel for each state. A ring marks
     where an episode terminated, a cross where it failed. Above the controls a tick
-    marks each step at which the bounds clipped the control, or at which something went
-    wrong in the controller, such as a failed plan.
+    marks each step at which something went wrong in the controller, such as a failed
+    plan, or, of one trajectory, at which the bounds clipped the control.
 
     The figure belongs to nobody: pyplot does not know it, a notebook shows it, and
     `figure.savefig("run.pdf")` writes it.
@@ -283,7 +283,7 @@ def _mark_ends(ax, run, values, color):
 def _mark_incidents(ax, runs):
     """Ticks above the panel, a row for each kind of incident."""
     for row, name in enumerate(incident_names(runs)):
-        for run in runs:
+        for i, run in enumerate(runs):
             steps = run.incidents.get(name)
             if steps is None or len(steps) > FEW:
                 continue
@@ -292,7 +292,7 @@ def _mark_incidents(ax, runs):
                 times,
                 np.full(len(times), 1.04 + 0.09 * row),
                 "|",
-                color=_incident_color(name),
+                color=color_of(i) if len(runs) > 1 else _incident_color(name),
                 markersize=4,
                 markeredgewidth=1.2,
                 transform=ax.get_xaxis_transform(),
@@ -301,8 +301,10 @@ def _mark_incidents(ax, runs):
 
 
 def incident_names(runs: Sequence[Run]) -> list[str]:
-    """The kinds of incident that happened in any run."""
-    return sorted({name for run in runs for name in run.incidents})
+    """The kinds of incident that happened in any run. Where runs are compared, those
+    of the controllers alone: every one of them may be clipped."""
+    names = {name for run in runs for name in run.incidents}
+    return sorted(names - {"clipped_control"} if len(runs) > 1 else names)
 
 
 def _incident_color(name: str) -> str:
@@ -310,7 +312,7 @@ def _incident_color(name: str) -> str:
 
 
 def _incident_label(name: str, runs: Sequence[Run]) -> str:
-    """`"failed plan: 12 steps, first at 0.55"`, or of how many members of a batch."""
+    """`"failed plan: 12 steps, first at 0.55"`, or in how many members of a batch."""
     steps = [run.incidents[name] for run in runs if name in run.incidents]
     words = name.replace("_", " ")
     members = sum(len(run.failed) for run in runs)
@@ -366,7 +368,8 @@ def _head(
             labels.append(name)
     if with_controls:
         for name in incident_names(runs):
-            style = {"marker": "|", "color": _incident_color(name)}
+            color = NEUTRAL if len(runs) > 1 else _incident_color(name)
+            style = {"marker": "|", "color": color}
             handles.append(Line2D([], [], linestyle="none", **style))
             labels.append(_incident_label(name, runs))
     title = wrapped(runs[0].label, 80) if len(runs) == 1 else ""

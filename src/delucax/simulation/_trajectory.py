@@ -82,8 +82,6 @@ class Trajectory(eqx.Module):
     recorded_observations: Array | None
     recorded_disturbances: Array | None
     recorded_terminated: Array | None
-    incidents: dict[str, Array] | None
-    controller_state: PyTree
     steps: int = eqx.field(static=True)
     keep: tuple[str, ...] = eqx.field(static=True)
     disturbance_size: int = eqx.field(static=True)
@@ -91,6 +89,8 @@ class Trajectory(eqx.Module):
     control_names: tuple[str, ...] = eqx.field(static=True)
     state_units: tuple[str, ...] = eqx.field(static=True)
     control_units: tuple[str, ...] = eqx.field(static=True)
+    incidents: dict[str, Array] | None = None
+    controller_state: PyTree = None
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
