@@ -46,7 +46,7 @@ import re
 import statistics
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -108,7 +108,7 @@ class _Ledger:
 
     quantities: dict[str, dict] = field(default_factory=dict)
     sources: dict[str, Any] = field(default_factory=dict)
-    # By page: where numbers are covered, and by which quantity if by one.
+    # By page: where numbers are covered, and by which quantity; "" if they are given.
     covered: dict[str, list[tuple[int, int, str | None]]] = field(default_factory=dict)
     # By the identity of a number: the pages that state it, and how one reads it.
     stated: dict[tuple, dict[str, str]] = field(default_factory=dict)
@@ -120,7 +120,7 @@ class _Ledger:
         telling = isinstance(value, float) and len(repr(value)) > 8
         return results, repr(value) if telling else place
 
-    def named(self, results: str | None, place: str) -> str | None:
+    def named(self, results: str, place: str) -> str | None:
         """The quantity that is at a place, if one is."""
         for name, known in self.quantities.items():
             if results == known["results"]:
@@ -168,7 +168,7 @@ def problems(root: Path = ROOT) -> list[str]:
 
 
 def _is_covered(
-    text: str, start: int, end: int, covered: list[tuple[int, int, str | None]]
+    text: str, start: int, end: int, covered: Iterable[tuple[int, int, str | None]]
 ) -> bool:
     """Whether the ledger has each number of a piece, or the whole of it."""
     number = rf"(?<![A-Za-z]){_NUMBER}"  # not the 2 of cmH2O
@@ -214,8 +214,8 @@ def _words(
 ) -> Iterator[str]:
     """Sentences that lack the words of what they state, or state another number."""
     named = [(start, end, name) for start, end, name in covered if name]
-    # Those that some page has given: no number of ours.
-    others = [(a, b, None) for a, b, name in covered if name == ""]
+    # What is given is no number of ours.
+    stated = [(start, end, name) for start, end, name in covered if name is not None]
     measured = list(_measured(text, cells=False))
     for start, end, said in _sentences(text):
         for a, b, name in named:
@@ -226,7 +226,7 @@ def _words(
                 line = _line(text, a)
                 yield f":{line}: {text[a:b]!r} is {name!r}, without {lacking[0]!r}"
         inside = [(a, b) for a, b in measured if start <= a < end]
-        unnamed = [s for s in inside if not _is_covered(text, *s, named + others)]
+        unnamed = [s for s in inside if not _is_covered(text, *s, stated)]
         for name, entry in ledger.quantities.items():
             if unnamed and not _lacking(entry, said):
                 a, b = unnamed[0]
@@ -311,7 +311,7 @@ def _claim(text: str, entry: dict, ledger: _Ledger) -> Iterator[str]:
         yield f": {len(values)} values for {entry['text']!r}"
         return
     for k, place in enumerate(values, 1):
-        name, results = None, entry.get("results")
+        name, results = None, entry.get("results", "")
         line = _line(text, match.start(k))
         if place.startswith("@"):
             name = place[1:]
@@ -331,16 +331,16 @@ def _claim(text: str, entry: dict, ledger: _Ledger) -> Iterator[str]:
             yield f":{line}: {said}"
 
 
-def _state(page: str, results: str | None, place: str, ledger: _Ledger) -> None:
+def _state(page: str, results: str, place: str, ledger: _Ledger) -> None:
     """Note that a page states what is at a place."""
-    if results is not None and not re.fullmatch(_NUMBER, place):
+    if not re.fullmatch(_NUMBER, place):
         where = ledger.stated.setdefault(ledger.identity(results, place), {})
         where.setdefault(page, place)
 
 
 def _table(text: str, entry: dict, ledger: _Ledger) -> Iterator[str]:
     covered = ledger.covered[entry["page"]]
-    source = ledger.sources.get(entry.get("results"))
+    source = ledger.sources.get(entry.get("results", ""))
     found = pattern(entry["after"]).search(text)
     start = found.end() if found else len(text)
     line = text.rfind("\n", 0, start) + 1
