@@ -506,3 +506,13 @@ def test_scoreboard(tmp_path, monkeypatch):
     shutil.copy(board.STORE, tmp_path / "scoreboard.jsonl")
     made = board.tables(board.Results.read(tmp_path / "scoreboard.jsonl"))
     assert made in (ROOT / "docs/scoreboard.md").read_text()
+
+
+def test_no_address_of_a_repository_is_invented():
+    """delucax is installed from a checkout until it has an address."""
+    kinds = ["*.md", "*.cff", "*.toml", "*.yml", "docs/**/*.md", "notebooks/*.ipynb"]
+    files = [path for kind in kinds for path in ROOT.glob(kind)]
+    files += [*ROOT.glob("src/**/*.py"), *ROOT.glob("docs/figures/*.py")]
+    invented = re.compile(r"git clone|://[^\s\"')]*delucax|git@")
+    found = [path for path in files if invented.search(path.read_text("utf-8"))]
+    assert len(files) > 100 and found == []
