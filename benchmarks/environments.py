@@ -1,11 +1,12 @@
-"""`python -m benchmarks.environments`: every named task against a raw scan, gymnax and
+"""`python -m benchmarks.environments`: the named tasks against a raw scan, gymnax and
 Gymnasium, in one run.
 
 Prints three tables and writes `benchmarks/results/environments.json`, of which
-`--table` prints those of `docs/benchmarks.md`:
+`--table` prints those of `docs/benchmarks.md`. The pendulum has a command of its own,
+`benchmarks.pendulum`:
 
 - the whole of delucax against a raw `lax.scan` of the task's own vector field;
-- the tasks that gymnax has too, one after the other and as a batch;
+- the tasks that gymnax has too, one after the other and as a batch, in the same rounds;
 - the tasks in Gymnasium's interface, one step and a step of a batch.
 """
 
@@ -46,56 +47,43 @@ def episodes(name: str, chain_steps: int, batch_steps: int) -> list[Episodes]:
     ]
 
 
-def against_raw(
+def against_peers(
     names: list[str], chain_steps: int, batch_steps: int, rounds: int
-) -> list[dict[str, Any]]:
-    """Nanoseconds a step of ours and of the raw scan, and how many times as long."""
-    rows = []
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Nanoseconds a step of ours and of the raw scan, and how many times as long; and
+    how many times as long gymnax takes, where it has the task, for the cost alone."""
+    raw_rows, gymnax_rows = [], []
     for name in names:
         gap = _tasks.disagreement(name)
         assert gap < TOLERANCE, f"{name}: the two differ by {gap:.1e}."
         row: dict[str, Any] = {"task": name}
+        beside: dict[str, Any] = {"task": name}
         for case in episodes(name, chain_steps, batch_steps):
+            found: list[Contender | Missing] = [*_tasks.contenders(case)]
+            if case.kept == "cost":
+                found += [
+                    gymnax_peer.episodes(case, stepping="step"),
+                    gymnax_peer.episodes(case, stepping="step_env"),
+                ]
+            t = timed(found, rounds)
             what = f"{LANES} lanes" if case.batched else f"chain, {case.kept}"
-            t = timed(list(_tasks.contenders(case)), rounds)
-            ours, raw = t[_tasks.OURS], t[_tasks.RAW]
+            ours, raw = t.pop(_tasks.OURS), t.pop(_tasks.RAW)
             row[f"{what}: ns"] = ours.best
             row[f"{what}: raw ns"] = raw.best
             row[f"{what}: ratio"] = ours.ratio(raw)
-        rows.append(row)
-        print(_line(row), flush=True)
-    return rows
-
-
-def against_gymnax(
-    names: list[str], chain_steps: int, batch_steps: int, rounds: int
-) -> list[dict[str, Any]]:
-    """The cost of whole episodes, the last state kept: ours and both ways of gymnax."""
-    rows = []
-    for name in names:
-        if name not in gymnax_peer.TASKS:
-            continue
-        row: dict[str, Any] = {"task": name}
-        _, chain, batch = episodes(name, chain_steps, batch_steps)
-        for case in (chain, batch):
             what = f"{LANES} lanes" if case.batched else "chain"
-            found: list[Contender | Missing] = [_tasks.contenders(case)[0]]
-            found += [
-                gymnax_peer.episodes(case, stepping="step"),
-                gymnax_peer.episodes(case, stepping="step_env"),
-            ]
-            t = timed(found, rounds)
-            ours = t.pop(_tasks.OURS)
-            row[f"{what}: delucax ns"] = ours.best
             for peer, timing in t.items():
-                row[f"{what}: {peer} ns"] = timing.best
-                row[f"{what}: {peer} / delucax"] = timing.ratio(ours)
-            for entry in found:
+                beside[f"{what}: {peer} ns"] = timing.best
+                beside[f"{what}: {peer} / delucax"] = timing.ratio(ours)
+            for entry in found if name in gymnax_peer.TASKS else ():
                 if isinstance(entry, Missing):
-                    row[f"{what}: {entry.name}"] = entry.reason
-        rows.append(row)
+                    beside[f"{what}: {entry.name}"] = entry.reason
+        raw_rows.append(row)
         print(_line(row), flush=True)
-    return rows
+        if len(beside) > 1:
+            gymnax_rows.append(beside)
+            print(_line(beside), flush=True)
+    return raw_rows, gymnax_rows
 
 
 def against_gymnasium(
@@ -183,7 +171,6 @@ def documented(found: dict[str, Any]) -> str:
             cell
             for what in ("chain", lanes)
             for cell in (
-                *times(row, f"{what}: delucax ns"),
                 *times(row, f"{what}: gymnax step / delucax"),
                 *times(row, f"{what}: gymnax step_env / delucax"),
             )
@@ -214,8 +201,12 @@ def documented(found: dict[str, Any]) -> str:
                 raw,
             ),
             _markdown(
-                ["", "one chain: delucax", "`step` / delucax", "`step_env` / delucax"]
-                + [f"{lanes}: delucax", "`step` / delucax", "`step_env` / delucax"],
+                [""]
+                + [
+                    f"{what}: `{way}` / delucax"
+                    for what in ("one chain", lanes)
+                    for way in ("step", "step_env")
+                ],
                 gymnax,
             ),
             _markdown(
@@ -262,10 +253,9 @@ def main() -> None:
     names = _tasks.names() if options.tasks is None else options.tasks
     adapted = list(_adapter.IDS) if options.tasks is None else []
 
-    print("Against a raw scan: ns a step of ours, of the raw scan, and the ratio")
-    raw = against_raw(names, chain, batch, rounds)
-    print("\nAgainst gymnax: ns a step")
-    gymnax = against_gymnax(names, chain, batch, rounds)
+    print("Against a raw scan: ns a step of ours, of the raw scan, and the ratio;")
+    print("and gymnax's ns a step, and how many times as long, where it has the task")
+    raw, gymnax = against_peers(names, chain, batch, rounds)
     print("\nIn Gymnasium's interface: us a step, of one and of a batch")
     one, many = against_gymnasium(adapted, 500 if options.quick else 3_000, rounds)
     tables = {"raw": raw, "gymnax": gymnax, "one step": one, "vector step": many}

@@ -1,15 +1,15 @@
 """`python -m benchmarks.pendulum`: the pendulum against every peer, in one run.
 
 Prints a table a case, then the ratios that matter beside their limits, and writes
-`benchmarks/results/pendulum.json`.
+`benchmarks/results/pendulum.json`; `--part chain` measures one part of it again.
 """
 
 import argparse
 import functools
-import json
 import subprocess
 import sys
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +25,14 @@ from benchmarks import _ours
 from benchmarks._machine import describe, limit_cores
 from benchmarks._peers import c, gymnasium_peer, gymnax_peer, raw
 from benchmarks._problem import Case
+from benchmarks._results import updated
 from benchmarks._timing import Contender, Missing, race, Timing
 
 
 RESULTS = Path(__file__).parent / "results"
 RAW = "raw, delucax.math"
+JNP = raw.NAME
+RUN = "delucax, run"
 OURS = raw.Numerics(dlx.math.sin, dlx.math.clip)
 
 
@@ -48,7 +51,9 @@ def entries(case: Case) -> list[Contender | Missing]:
         kept = functools.partial(raw.contender, numerics=OURS, checkpoint=True)
         found.append(kept(case, name=f"{RAW}, checkpoint"))
         found.append(_ours.contender(case, name="delucax, stored", checkpoint=None))
-        # What a gradient is measured against: the cost alone, forward.
+        # What a gradient is measured against: the run that it differentiates.
+        run = Case("cost", case.steps, case.lanes, case.method)
+        found.append(_ours.contender(run, name=RUN))
         forward = Case("trajectory", case.steps, case.lanes, case.method)
         found.append(raw.contender(forward, numerics=OURS, name=f"{RAW}, forward"))
     if case.method == "gym" and case.workload in ("trajectory", "cost"):
@@ -90,18 +95,126 @@ def noise_entries(lanes: int | None, steps: int) -> list[Contender]:
     return [_ours.contender(case, name=name, env=env) for name, env in tasks.items()]
 
 
-def run(case: Case, rounds: int, found: list[Any] | None = None) -> dict[str, Timing]:
-    """Race a case and print its table."""
-    found = entries(case) if found is None else found
-    ready = [entry for entry in found if isinstance(entry, Contender)]
-    timings = race(ready, rounds=rounds)
-    print(f"\n{case.label}, {case.steps} steps")
-    table = pd.DataFrame([timing.row(timings[0]) for timing in timings])
-    print(table.to_string(index=False, float_format="%.3g", na_rep=""), flush=True)
-    for entry in found:
-        if isinstance(entry, Missing):
-            print(f"  not there: {entry.name} ({entry.reason})")
-    return {timing.name: timing for timing in timings}
+@dataclass
+class Run:
+    """What a part has measured, and with how much of everything."""
+
+    quick: bool
+    rounds: int
+    timings: list[dict[str, Any]] = field(default_factory=list)
+    ratios: list[dict[str, Any]] = field(default_factory=list)
+
+    def scaled(self, steps: int) -> int:
+        """Steps of a run, a tenth if it is quick."""
+        return steps // 10 if self.quick else steps
+
+    def race(
+        self, case: Case, found: list[Any] | None = None, rounds: int | None = None
+    ) -> dict[str, Timing]:
+        """Race a case, print its table and keep it."""
+        found = entries(case) if found is None else found
+        ready = [entry for entry in found if isinstance(entry, Contender)]
+        timings = race(ready, rounds=min(self.rounds, rounds or self.rounds))
+        print(f"\n{case.label}, {case.steps} steps")
+        table = pd.DataFrame([timing.row(timings[0]) for timing in timings])
+        text = table.to_string(index=False, float_format="%.3g", na_rep="")
+        print(text, flush=True)
+        for entry in found:
+            if isinstance(entry, Missing):
+                print(f"  not there: {entry.name} ({entry.reason})")
+        about = {"case": case.label, "horizon": case.steps}
+        self.timings += [about | timing.row() for timing in timings]
+        return {timing.name: timing for timing in timings}
+
+    def ratio(
+        self,
+        what: str,
+        a: Timing | None,
+        b: Timing | None,
+        limit: str = "",
+        **about: str,
+    ) -> None:
+        """Keep how many times as long `a` takes, where both are there."""
+        if a is not None and b is not None:
+            row = {"ratio": what, "measured": a.ratio(b), "limit": limit}
+            self.ratios.append(row | about)
+
+    def by_hand(self, what: str, t: dict[str, Timing], limit: str = "") -> None:
+        """Against what a user writes, in plain `jnp`; and, as a note, with our sine."""
+        self.ratio(f"{what} delucax / by hand, jnp", t["delucax"], t[JNP], limit)
+        self.ratio(f"{what} delucax / by hand, dlx.math", t["delucax"], t[RAW])
+
+
+def measure_chain(run: Run) -> None:
+    """One pendulum."""
+    for workload in ("trajectory", "cost"):
+        t = run.race(Case(workload, run.scaled(100_000)))
+        run.by_hand(f"chain, {workload}:", t, "<= 1.3")
+
+
+def measure_batch(run: Run) -> None:
+    """Many pendulums at once."""
+    for workload in ("trajectory", "cost"):
+        for lanes, steps in ((1024, 1000), (16384, 200)):
+            t = run.race(Case(workload, run.scaled(steps), lanes))
+            what = f"{lanes} lanes, {workload}:"
+            ours, user = t["delucax"], t["delucax, user's pendulum"]
+            main_case = workload == "cost" and lanes == 1024
+            for name in ("gymnax step", "gymnax step_env"):
+                limit = ">= 10" if main_case and name == "gymnax step" else ""
+                run.ratio(f"{what} {name} / delucax", t.get(name), ours, limit)
+            run.ratio(f"{what} delucax / C", ours, t.get("C"), "<= 2.5" * main_case)
+            run.by_hand(what, t)
+            run.ratio(f"{what} user's / delucax", user, ours, "<= 1.1" * main_case)
+
+
+def measure_tsit5(run: Run) -> None:
+    """Tsit5 against Diffrax's own step."""
+    for workload in ("trajectory", "cost", "gradient"):
+        t = run.race(Case(workload, run.scaled(1000), 1024, "tsit5"))
+        what = f"1024 lanes, Tsit5, {workload}: Diffrax step / delucax"
+        run.ratio(what, t["delucax, Diffrax step"], t["delucax"], ">= 3")
+
+
+def measure_gradient(run: Run) -> None:
+    """Gradients against the runs that they differentiate."""
+    for method in ("gym", "rk4", "tsit5"):
+        for lanes in (None, 1024):
+            for steps in (200, 10_000):
+                if lanes and steps > 200 and run.quick:
+                    continue
+                case = Case("gradient", steps, lanes, method)
+                t = run.race(case, rounds=None if steps == 200 else 7)
+                what = f"{case.label}, T = {steps}:"
+                kind = f"gradient / run, {case.label.rpartition(', ')[2]}"
+                name = f"{what} gradient / run"
+                run.ratio(name, t["delucax"], t[RUN], kind=kind)
+                limit = "" if method == "tsit5" else "<= 4" if lanes is None else "<= 5"
+                scan = t[f"{RAW}, forward"]
+                what_else = f"{what} gradient / scan, dlx.math"
+                run.ratio(what_else, t["delucax"], scan, limit)
+                run.by_hand(what, t)
+
+
+def measure_noise(run: Run) -> None:
+    """What noise costs."""
+    for lanes, steps in ((None, 100_000), (1024, 1000)):
+        case = Case("trajectory", run.scaled(steps), lanes)
+        t = run.race(case, noise_entries(lanes, case.steps))
+        what = "chain" if lanes is None else f"{lanes} lanes"
+        gaussian, plain = t["delucax, Gaussian w"], t["delucax"]
+        run.ratio(f"{what}: Gaussian w / none", gaussian, plain, "<= 1.6")
+        noisy, calm = t["delucax, Euler-Maruyama"], t["delucax, Euler"]
+        run.ratio(f"{what}: Euler-Maruyama / Euler", noisy, calm, "<= 1.5")
+
+
+RACES = {
+    "chain": measure_chain,
+    "batch": measure_batch,
+    "tsit5": measure_tsit5,
+    "gradient": measure_gradient,
+    "noise": measure_noise,
+}
 
 
 def memory(steps: int = 1_000_000) -> dict[str, float]:
@@ -176,96 +289,61 @@ def imports(repeats: int = 7) -> float:
     return float(ours / theirs)
 
 
-def main() -> None:
-    """Run, print and write."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.pendulum")
-    parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--quick", action="store_true", help="small sizes, no file")
-    parser.add_argument("--out", default=str(RESULTS / "pendulum.json"))
-    parser.add_argument("--cores", type=int, default=1, help="cores to run on")
-    options = parser.parse_args()
-    limit_cores(options.cores)
-    few = 10 if options.quick else 1
-    rounds = 3 if options.quick else options.rounds
-    chain, batch, wide = 100_000 // few, 1000 // few, 200 // few
-    ratios: list[dict[str, Any]] = []
-    record: list[dict[str, Any]] = []
-
-    def keep(case: Case, timings: dict[str, Timing]) -> dict[str, Timing]:
-        for timing in timings.values():
-            record.append({"case": case.label, "horizon": case.steps} | timing.row())
-        return timings
-
-    def ratio(what: str, a: Timing | None, b: Timing | None, limit: str) -> None:
-        if a is not None and b is not None:
-            ratios.append({"ratio": what, "measured": a.ratio(b), "limit": limit})
-
-    for workload in ("trajectory", "cost"):
-        case = Case(workload, chain)
-        t = keep(case, run(case, rounds))
-        ratio(f"chain, {workload}: delucax / raw", t["delucax"], t[RAW], "<= 1.3")
-        slow = t.get("Gymnasium")
-        ratio(f"chain, {workload}: Gymnasium / delucax", slow, t["delucax"], ">= 300")
-        for lanes, steps in ((1024, batch), (16384, wide)):
-            case = Case(workload, steps, lanes)
-            t = keep(case, run(case, rounds))
-            what = f"{lanes} lanes, {workload}:"
-            ours, user = t["delucax"], t["delucax, user's pendulum"]
-            main_case = workload == "cost" and lanes == 1024
-            for name in ("gymnax step", "gymnax step_env"):
-                limit = ">= 10" if main_case and name == "gymnax step" else ""
-                ratio(f"{what} {name} / delucax", t.get(name), ours, limit)
-            ratio(f"{what} delucax / C", ours, t.get("C"), "<= 2.5" * main_case)
-            ratio(f"{what} delucax / raw", ours, t[RAW], "")
-            ratio(f"{what} user's / delucax", user, ours, "<= 1.1" * main_case)
-    for workload in ("trajectory", "cost", "gradient"):
-        case = Case(workload, batch, 1024, "tsit5")
-        t = keep(case, run(case, rounds))
-        what = f"1024 lanes, Tsit5, {workload}: Diffrax step / delucax"
-        ratio(what, t["delucax, Diffrax step"], t["delucax"], ">= 3")
-    for method in ("gym", "rk4", "tsit5"):
-        for lanes in (None, 1024):
-            for steps in (200, 10_000):
-                if lanes and steps > 200 and options.quick:
-                    continue
-                case = Case("gradient", steps, lanes, method)
-                t = keep(case, run(case, rounds if steps == 200 else min(rounds, 7)))
-                limit = "" if method == "tsit5" else "<= 4" if lanes is None else "<= 5"
-                what = f"{case.label}, T = {steps}: delucax / raw forward"
-                ratio(what, t["delucax"], t[f"{RAW}, forward"], limit)
-    for lanes, steps in ((None, chain), (1024, batch)):
-        case = Case("trajectory", steps, lanes)
-        t = keep(case, run(case, rounds, noise_entries(lanes, steps)))
-        what = "chain" if lanes is None else f"{lanes} lanes"
-        gaussian, plain = t["delucax, Gaussian w"], t["delucax"]
-        ratio(f"{what}: Gaussian w / none", gaussian, plain, "<= 1.6")
-        noisy, calm = t["delucax, Euler-Maruyama"], t["delucax, Euler"]
-        ratio(f"{what}: Euler-Maruyama / Euler", noisy, calm, "<= 1.5")
-
-    summary = pd.DataFrame(ratios)
-    print("\nRatios (median over the rounds of one run)")
-    print(summary.to_string(index=False, float_format="%.2f"))
+def measure_calls(run: Run) -> dict[str, Any]:
+    """Single calls, and the memory of a gradient."""
     single = calls()
     single["import delucax / import diffrax, optax, lineax"] = imports()
     print("\nSingle calls")
     limited = pd.DataFrame({"measured": single, "at most": pd.Series(LIMITS)})
     print(limited.loc[list(single)].to_string(float_format="%.3f", na_rep=""))
-    needed = memory(1_000_000 // few)
-    print(f"\nMemory of the gradient, one chain, {1_000_000 // few} steps (MB)")
+    steps = run.scaled(1_000_000)
+    needed = memory(steps)
+    print(f"\nMemory of the gradient, one chain, {steps} steps (MB)")
     print(pd.Series(needed).to_string(float_format="%.2f"))
-    if not options.quick:
-        out = Path(options.out)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        content = {
-            "machine": describe(),
-            "gymnax": gymnax_peer.versions(),
-            "ratios": ratios,
-            "single calls": single,
-            "gradient memory, 1e6 steps, MB": needed,
-            "timings": record,
-        }
-        out.write_text(json.dumps(content, indent=1) + "\n")
-        print(f"\nwritten: {out}")
+    return {"single calls": single, "gradient memory, 1e6 steps, MB": needed}
+
+
+def merged(before: dict[str, Any], part: str, run: Run) -> dict[str, Any]:
+    """The races of a part in the place of what was stored of it."""
+    kept = {
+        name: [row for row in before.get(name, []) if row["part"] != part]
+        for name in ("ratios", "timings")
+    }
+    made = {"ratios": run.ratios, "timings": run.timings}
+    return {n: kept[n] + [{"part": part} | row for row in made[n]] for n in kept}
+
+
+def main() -> None:
+    """Run the parts, print them and write each when it is done."""
+    parts = (*RACES, "calls")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.pendulum")
+    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--quick", action="store_true", help="small sizes, no file")
+    parser.add_argument("--part", choices=parts, help="one part alone, again")
+    parser.add_argument("--out", default=str(RESULTS / "pendulum.json"))
+    parser.add_argument("--cores", type=int, default=1, help="cores to run on")
+    options = parser.parse_args()
+    limit_cores(options.cores)
+    for part in [options.part] if options.part else parts:
+        run = Run(options.quick, 3 if options.quick else options.rounds)
+        if part == "calls":
+            made = measure_calls(run)
+        else:
+            RACES[part](run)
+            print("\nRatios (median over the rounds of one run)")
+            summary = pd.DataFrame(run.ratios)
+            print(summary.to_string(index=False, float_format="%.2f"), flush=True)
+            made = None
+        if options.quick:
+            continue
+        about = {"machine": describe(), "gymnax": gymnax_peer.versions()}
+
+        def change(before, part=part, run=run, made=made, about=about):
+            machines = before.get("parts", {}) | {part: about}
+            return {"parts": machines} | (made or merged(before, part, run))
+
+        updated(Path(options.out), change)
+        print(f"\nwritten: {options.out}")
 
 
 if __name__ == "__main__":

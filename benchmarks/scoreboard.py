@@ -1,4 +1,4 @@
-"""Every task crossed with every controller that suits it.
+"""Every task crossed with the controllers that suit it.
 
 `python -m benchmarks.scoreboard` runs what is missing or changed, writes
 `results/scoreboard.jsonl`, and puts the tables into `docs/scoreboard.md` and draws its

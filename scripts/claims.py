@@ -4,19 +4,30 @@
 the committed results. `python scripts/claims.py` fails where
 
 - a page has a number with a unit, with "times" or with "%", one "of" another, that of a
-  slope, ratio, residual or speed-up, or a table a cell that is a number, and nothing in
-  the ledger covers it;
+  slope, ratio, residual or speed-up, a table a cell that is a number, or a block of
+  text one that the code before it printed, and nothing in the ledger covers it;
 - a number is not that of the results, at the digits that are printed;
 - the results were made by an older minor version of delucax than this one;
-- an entry is not on its page, or its command, test or results file does not exist.
+- an entry is not on its page, or its command, test or results file does not exist;
+- one quantity has two numbers, or two names.
 
-The ledger has three kinds of entries. A `claim` is a piece of a page in which `{}` is
+The ledger has four kinds of entries. A `claim` is a piece of a page in which `{}` is
 a number, and `values` say where these are in `results`; where a test proves the claim,
 `test` names it in place of `results`, and `true` lists what must be true in these. A
 `table` is the one that follows the text `after`, or begins with it; `columns` has for
 each column where its numbers are, with `{}` for the first cell of the row, or for what
 `rows` has in its place, and `{2}` for the second. What is `given` was chosen, or is
-somebody else's number.
+somebody else's number; a number that a claim spells out, instead of `{}`, is given too.
+
+A `quantity` has a `name`, its `command`, its `results` and its one `value` in these. A
+claim states it by `@NAME` among its values. What README states is a quantity, and is
+stated on another page too, where a reader finds how it was measured; and what two pages
+state is a quantity. Each sentence that states one has all of its `words`, which are
+regular expressions (a row of a table: itself or in its head), so that a baseline has
+one name everywhere. No sentence that has these words may give another measured number,
+except that of another quantity or a given one, and no cell of a table whose row and
+column have them. So a number that is measured a second time, by whatever command, is
+refused.
 
 Of a notebook only the Markdown is read: an output is what the run shows. A message
 gives the line of a page, but the cell of a notebook, where cells of code count too.
@@ -35,13 +46,15 @@ import re
 import statistics
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 
 ROOT = Path(__file__).parents[1]
 LEDGER = "docs/claims.toml"
+FRONT = "README.md"
 _CELL_END = "\n\f\n"
 
 _NUMBER = r"[-+−]?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[-+]?\d+)?"
@@ -59,6 +72,11 @@ _MEASURED = re.compile(
 _NUMERIC_CELL = re.compile(rf"[*<>=~≤≥ ]*{_NUMBER}")
 _ROW = re.compile(r"^\|.*\|[ ]*$", re.MULTILINE)
 _HEAD = re.compile(r"^\|.*\|[ ]*\n\|[ :|-]+\|[ ]*$", re.MULTILINE)
+_FENCED = re.compile(
+    r"^(?P<raises><!-- raises[^\n]*-->\n)?```(?P<language>\w*)[^\n]*\n"
+    r"(?P<code>.*?)^```$",
+    re.MULTILINE | re.DOTALL,
+)
 # What no reader takes for a statement: code, comments, equations, addresses.
 _SILENT = [
     re.compile(r"^( *)```[^`]*?^\1``` *$", re.MULTILINE),
@@ -84,46 +102,177 @@ def read(root: Path, page: str) -> str:
     return text
 
 
+@dataclass
+class _Ledger:
+    """The entries, and what has been read of them so far."""
+
+    quantities: dict[str, dict] = field(default_factory=dict)
+    sources: dict[str, Any] = field(default_factory=dict)
+    # By page: where numbers are covered, and by which quantity; "" if they are given.
+    covered: dict[str, list[tuple[int, int, str | None]]] = field(default_factory=dict)
+    # By the identity of a number: the pages that state it, and how one reads it.
+    stated: dict[tuple, dict[str, str]] = field(default_factory=dict)
+
+    def identity(self, results: str, place: str) -> tuple:
+        """The same for two places of a file that hold one number."""
+        place = re.sub(r"^[<>]= ", "", place)
+        value = _look(self.sources.get(results), place)
+        telling = isinstance(value, float) and len(repr(value)) > 8
+        return results, repr(value) if telling else place
+
+    def named(self, results: str, place: str) -> str | None:
+        """The quantity that is at a place, if one is."""
+        for name, known in self.quantities.items():
+            if results == known["results"]:
+                here = self.identity(results, place)
+                if here == self.identity(results, known["value"]):
+                    return name
+        return None
+
+
 def problems(root: Path = ROOT) -> list[str]:
     """What is wrong, a line each."""
-    ledger = tomllib.loads((root / LEDGER).read_text(encoding="utf-8"))
+    entries = tomllib.loads((root / LEDGER).read_text(encoding="utf-8"))
     texts = {name: read(root, name) for name in pages(root)}
-    covered: dict[str, list[tuple[int, int]]] = {name: [] for name in texts}
+    ledger = _Ledger(covered={name: [] for name in texts})
     found = []
-    sources: dict[str, Any] = {}
-    for kind in ledger:
-        if kind not in ("claim", "table", "given"):
+    for kind in entries:
+        if kind not in ("quantity", "claim", "table", "given"):
             found.append(f"{LEDGER}: unknown kind of entry {kind!r}")
+    for entry in entries.get("quantity", []):
+        found += _origin(root, entry, ledger)
+        found += _quantity(entry, ledger)
     for kind, check in (("claim", _claim), ("table", _table), ("given", _given)):
-        for entry in ledger.get(kind, []):
+        for entry in entries.get(kind, []):
             page = entry.get("page")
             if page not in texts:
                 found.append(f"{LEDGER}: no page {page!r}")
                 continue
             if kind != "given":
-                found += _origin(root, entry, sources)
-            said = check(texts[page], entry, sources, covered[page])
+                found += _origin(root, entry, ledger)
+            said = check(texts[page], entry, ledger)
             try:
                 found += [f"{page}{line}" for line in said]
             except ValueError as error:
                 found.append(str(error))
     for name, text in texts.items():
+        covered = ledger.covered[name]
         for start, end in _measured(text):
-            if not any(a <= start and end <= b for a, b in covered[name]):
+            if not _is_covered(text, start, end, covered):
                 words = " ".join(text[start:end].split())
                 found.append(
                     f"{name}:{_line(text, start)}: {words!r} is not in {LEDGER}"
                 )
-    return found
+        found += [f"{name}{line}" for line in _words(text, ledger, covered)]
+    return found + list(_names(ledger))
 
 
-def _measured(text: str) -> Iterator[tuple[int, int]]:
-    """Where the measured numbers of a page are."""
+def _is_covered(
+    text: str, start: int, end: int, covered: Iterable[tuple[int, int, str | None]]
+) -> bool:
+    """Whether the ledger has each number of a piece, or the whole of it."""
+    number = rf"(?<![A-Za-z]){_NUMBER}"  # not the 2 of cmH2O
+    numbers = [m.span() for m in re.finditer(number, text[start:end])]
+    numbers = [(start + a, start + b) for a, b in numbers] or [(start, end)]
+    return all(
+        any(a <= first and last <= b for a, b, _ in covered) for first, last in numbers
+    )
+
+
+def _quantity(entry: dict, ledger: _Ledger) -> Iterator[str]:
+    name = entry["name"]
+    if name in ledger.quantities:
+        yield f"{LEDGER}: two quantities {name!r}"
+    if not entry.get("words"):
+        yield f"{LEDGER}: the quantity {name!r} has no words"
+    other = ledger.named(entry["results"], entry["value"])
+    if other not in (None, name):
+        yield f"{LEDGER}: {name!r} and {other!r} are one quantity"
+    ledger.quantities[name] = entry
+
+
+def _names(ledger: _Ledger) -> Iterator[str]:
+    """What is stated without a name, and what README alone states."""
+    known = {
+        ledger.identity(entry["results"], entry["value"]): name
+        for name, entry in ledger.quantities.items()
+    }
+    for identity, where in ledger.stated.items():
+        if identity not in known and len(where) > 1:
+            place = next(iter(where.values()))
+            yield f"{LEDGER}: {place!r} of {', '.join(sorted(where))} needs a name"
+    for identity, name in known.items():
+        where = set(ledger.stated.get(identity, {}))
+        if not where:
+            yield f"{LEDGER}: no page states {name!r}"
+        elif where == {FRONT}:
+            yield f"{LEDGER}: no page but {FRONT} states {name!r}"
+
+
+def _words(
+    text: str, ledger: _Ledger, covered: list[tuple[int, int, str | None]]
+) -> Iterator[str]:
+    """Sentences that lack the words of what they state, or state another number."""
+    named = [(start, end, name) for start, end, name in covered if name]
+    # What is given is no number of ours.
+    stated = [(start, end, name) for start, end, name in covered if name is not None]
+    measured = list(_measured(text, cells=False))
+    for start, end, said in _sentences(text):
+        for a, b, name in named:
+            if not start <= a < end:
+                continue
+            lacking = _lacking(ledger.quantities[name], said)
+            if lacking:
+                line = _line(text, a)
+                yield f":{line}: {text[a:b]!r} is {name!r}, without {lacking[0]!r}"
+        inside = [(a, b) for a, b in measured if start <= a < end]
+        unnamed = [s for s in inside if not _is_covered(text, *s, stated)]
+        for name, entry in ledger.quantities.items():
+            if unnamed and not _lacking(entry, said):
+                a, b = unnamed[0]
+                piece = " ".join(text[a:b].split())
+                yield f":{_line(text, a)}: {piece!r} beside the words of {name!r}"
+
+
+def _sentences(text: str) -> Iterator[tuple[int, int, str]]:
+    """Where the sentences and the rows of a page are, and their words: those of a row
+    with the head of its table."""
+    head, last = "", -1
+    for block in re.finditer(r"(?:[^\n\f]*\S[^\n\f]*\n?)+", text):
+        begin, rows = block.start(), list(_ROW.finditer(text, *block.span()))
+        for row in rows:
+            if row.start() > last + 1:
+                head = row.group()
+            last = row.end()
+            yield *row.span(), _spaced(f"{head} {row.group()}")
+        if rows:
+            continue
+        for stop in re.finditer(
+            r"[.!?:](?=\s+[A-Z`*\[(]|\s*$)|\n\s*[-*] |\Z", block.group()
+        ):
+            end = block.start() + stop.end()
+            if text[begin:end].strip():
+                yield begin, end, _spaced(text[begin:end])
+            begin = end
+
+
+def _lacking(quantity: dict, said: str) -> list[str]:
+    """The words of a quantity that are not there."""
+    find = lambda word: re.search(word, said, re.IGNORECASE)
+    return [word for word in quantity["words"] if not find(word)]
+
+
+def _spaced(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _measured(text: str, *, cells: bool = True) -> Iterator[tuple[int, int]]:
+    """Where the measured numbers of a page are; without `cells`, those with a unit."""
     plain = text
     for silent in _SILENT:
         plain = silent.sub(lambda m: re.sub(r"[^\n|]", " ", m.group()), plain)
     plain = _HEAD.sub(lambda m: re.sub(r"[^\n|]", " ", m.group()), plain)
-    for row in _ROW.finditer(plain):
+    for row in _ROW.finditer(plain) if cells else ():
         for cell in re.finditer(r"[^|]+", row.group()):
             if _NUMERIC_CELL.match(cell.group()):
                 start = row.start() + cell.start()
@@ -131,34 +280,67 @@ def _measured(text: str) -> Iterator[tuple[int, int]]:
                     yield start + number.start(), start + number.end()
     for match in _MEASURED.finditer(plain):
         yield match.span()
+    for start, end in _printed(text) if cells else ():
+        for number in re.finditer(rf"(?<![\w.]){_NUMBER}", text[start:end]):
+            yield start + number.start(), start + number.end()
 
 
-def _claim(
-    text: str, entry: dict, sources: dict, covered: list[tuple[int, int]]
-) -> Iterator[str]:
+def _printed(text: str) -> Iterator[tuple[int, int]]:
+    """Where a page shows what the code before prints, but for errors."""
+    shows = False
+    for block in _FENCED.finditer(text):
+        if block["language"] == "text" and shows:
+            yield block.span("code")
+        shows = block["language"] == "python" and not block["raises"]
+
+
+def _claim(text: str, entry: dict, ledger: _Ledger) -> Iterator[str]:
+    covered = ledger.covered[entry["page"]]
     match = pattern(entry["text"]).search(text)
     if match is None:
         yield f": no {entry['text']!r}"
         return
-    covered.append(match.span())
-    if "results" not in entry:
+    if "values" not in entry:
+        covered.append((*match.span(), None))
         return
     for place in entry.get("true", []):
-        if _look(sources[entry["results"]], place) is not True:
+        if _look(ledger.sources[entry["results"]], place) is not True:
             yield f": {entry['text']!r} needs {place!r} to be true"
     values = entry["values"]
     if len(values) != len(match.groups()):
         yield f": {len(values)} values for {entry['text']!r}"
         return
     for k, place in enumerate(values, 1):
-        said = _differs(match.group(k), sources.get(entry["results"]), place)
+        name, results = None, entry.get("results", "")
+        line = _line(text, match.start(k))
+        if place.startswith("@"):
+            name = place[1:]
+            if name not in ledger.quantities:
+                yield f":{line}: no quantity {name!r}"
+                continue
+            results = ledger.quantities[name]["results"]
+            place = ledger.quantities[name]["value"]
+        elif entry["page"] == FRONT:
+            yield f":{line}: {match.group(k)!r} is no quantity with a name"
+        elif (known := ledger.named(results, place)) is not None:
+            yield f":{line}: {match.group(k)!r} is {known!r}: write '@{known}'"
+        covered.append((*match.span(k), name))
+        _state(entry["page"], results, place, ledger)
+        said = _differs(match.group(k), ledger.sources.get(results), place)
         if said:
-            yield f":{_line(text, match.start(k))}: {said}"
+            yield f":{line}: {said}"
 
 
-def _table(
-    text: str, entry: dict, sources: dict, covered: list[tuple[int, int]]
-) -> Iterator[str]:
+def _state(page: str, results: str, place: str, ledger: _Ledger) -> None:
+    """Note that a page states what is at a place."""
+    if not re.fullmatch(_NUMBER, place):
+        where = ledger.stated.setdefault(ledger.identity(results, place), {})
+        where.setdefault(page, place)
+
+
+def _table(text: str, entry: dict, ledger: _Ledger) -> Iterator[str]:
+    covered = ledger.covered[entry["page"]]
+    source = ledger.sources.get(entry.get("results", ""))
     found = pattern(entry["after"]).search(text)
     start = found.end() if found else len(text)
     line = text.rfind("\n", 0, start) + 1
@@ -166,16 +348,16 @@ def _table(
     if not rows:
         yield f": no table after {entry['after']!r}"
         return
-    last = rows[0].start()
+    last, head = rows[0].start(), _cells(rows[0].group())
     for number, row in enumerate(rows):
         if text[last : row.start()].strip(" \n") or row.start() - last > 1:
             break
         last = row.end()
-        covered.append(row.span())
+        covered.append((*row.span(), None))
         if number < 2:
             continue
         line = _line(text, row.start())
-        cells = [cell.strip() for cell in row.group().strip(" ")[1:-1].split("|")]
+        cells = _cells(row.group())
         if "columns" not in entry:
             continue
         if len(cells) != len(entry["columns"]):
@@ -183,12 +365,33 @@ def _table(
             continue
         label = re.sub(r"[`*]", "", cells[0])
         label = entry.get("rows", {}).get(label, label)
-        for cell, places in zip(cells, entry["columns"], strict=True):
+        for title, cell, places in zip(head, cells, entry["columns"], strict=True):
             names = {"{}": label, "{2}": cells[1]}
             places = [places] if isinstance(places, str) else places
             places = [_filled(place, names) for place in places if place]
-            for said in _cell(cell, places, sources.get(entry["results"])):
+            is_number = lambda place: isinstance(_look(source, place), int | float)
+            places_of_numbers = [place for place in places if is_number(place)]
+            for place in places_of_numbers:
+                _state(entry["page"], entry["results"], place, ledger)
+            for name in _other(f"{title} {cells[0]}", entry, places_of_numbers, ledger):
+                yield f":{line}: {cell!r} beside the words of {name!r}"
+            for said in _cell(cell, places, source):
                 yield f":{line}: {said}"
+
+
+def _other(
+    words: str, entry: dict, places: list[str], ledger: _Ledger
+) -> Iterator[str]:
+    """The quantities whose words a cell has, and which it does not state."""
+    here = {ledger.identity(entry["results"], place) for place in places}
+    for name, known in ledger.quantities.items():
+        if here and not _lacking(known, words):
+            if ledger.identity(known["results"], known["value"]) not in here:
+                yield name
+
+
+def _cells(row: str) -> list[str]:
+    return [cell.strip() for cell in row.strip(" ")[1:-1].split("|")]
 
 
 def _filled(place: str, names: dict[str, str]) -> str:
@@ -218,19 +421,21 @@ def _cell(cell: str, places: list[str], source: Any) -> Iterator[str]:
             yield said
 
 
-def _given(
-    text: str, entry: dict, sources: dict, covered: list[tuple[int, int]]
-) -> Iterator[str]:
+def _given(text: str, entry: dict, ledger: _Ledger) -> Iterator[str]:
     for part in entry["texts"]:
         matches = list(pattern(part).finditer(text))
         if not matches:
             yield f": no {part!r}"
-        covered += [match.span() for match in matches]
+        ledger.covered[entry["page"]] += [(*match.span(), "") for match in matches]
 
 
-def _origin(root: Path, entry: dict, sources: dict) -> Iterator[str]:
+def _origin(root: Path, entry: dict, ledger: _Ledger) -> Iterator[str]:
     """Check the command or the test, and read the results."""
-    what = entry.get("text") or entry.get("after")
+    sources = ledger.sources
+    what = entry.get("text") or entry.get("after") or entry.get("name")
+    values = entry.get("values")
+    if values and "results" not in entry and all(v.startswith("@") for v in values):
+        return
     if "test" in entry:
         path, _, name = entry["test"].partition("::")
         file = root / path

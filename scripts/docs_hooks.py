@@ -14,6 +14,7 @@ import logging
 import re
 import tomllib
 import unicodedata
+from collections.abc import Iterable
 from typing import Any
 
 import claims  # pyright: ignore[reportMissingImports]
@@ -68,6 +69,7 @@ def ledger() -> str:
     """What is measured, page by page, as Markdown."""
     root = claims.ROOT
     entries = tomllib.loads((root / claims.LEDGER).read_text(encoding="utf-8"))
+    named = {f"@{entry['name']}": entry for entry in entries["quantity"]}
     found: dict[str, list[str]] = {}
     for entry in [*entries["claim"], *entries["table"]]:
         text = claims.read(root, entry["page"])
@@ -75,14 +77,20 @@ def ledger() -> str:
         said = " ".join(match.group().split()).strip("| ") if match else ""
         said = re.sub(r"[`*]", "", said).replace("|", ": ")
         said = said if "text" in entry else f"the table after “{said}”"
-        made = entry.get("command", entry.get("test"))
-        file = f"`{entry['results']}`" if "results" in entry else ""
-        found.setdefault(entry["page"], []).append(f"| {said} | `{made}` | {file} |\n")
+        origins = [entry, *(named[v] for v in entry.get("values", []) if v in named)]
+        made = _each(o.get("command", o.get("test")) for o in origins)
+        file = _each(o.get("results") for o in origins)
+        found.setdefault(entry["page"], []).append(f"| {said} | {made} | {file} |\n")
     head = "| | made by | stands in |\n|---|---|---|\n"
     return "\n".join(
         f"## {page.removeprefix('docs/')}\n\n{head}{''.join(lines)}"
         for page, lines in found.items()
     )
+
+
+def _each(names: Iterable[str | None]) -> str:
+    """Each name once, as code."""
+    return ", ".join(f"`{name}`" for name in dict.fromkeys(names) if name)
 
 
 def on_page_content(html_text: str, /, *, page: Any, **_: Any) -> str:

@@ -1,9 +1,9 @@
 """The pictures of the pages, drawn by the code that the pages show.
 
-`python docs/figures/pages.py` runs the Python blocks of the pages below and
-puts what they draw, in fewer colours, into `docs/assets/`, in a few minutes. The
-numbers that they print go to `pages.json` beside this file, by page and by the word
-that the line begins with.
+`python docs/figures/pages.py` runs the Python blocks of the pages below, or of those
+that are named, and puts what they draw, in fewer colours, into `docs/assets/`, in a few
+minutes. The numbers that they print go to `pages.json` beside this file, by page and by
+the word or the whole number that the line begins with.
 """
 
 import contextlib
@@ -11,6 +11,7 @@ import io
 import json
 import os
 import re
+import sys
 import tempfile
 from importlib.metadata import version
 from pathlib import Path
@@ -22,6 +23,7 @@ DOCS = Path(__file__).parents[1]
 PICTURES = {
     "index.md": ["van_der_pol.png"],
     "first_system.md": ["first_system.png"],
+    "gradients.md": [],
     "linear_analysis.md": ["bode.png", "nyquist.png", "root_locus.png"],
 }
 NUMBERS = DOCS / "figures" / "pages.json"
@@ -39,8 +41,8 @@ def run(page, folder):
 
 
 def numbers(printed):
-    """The numbers of each line that begins with a word."""
-    lines = re.findall(r"^([A-Za-z]\w*):? (.*)$", printed, re.MULTILINE)
+    """The numbers of each line that begins with a word or a whole number."""
+    lines = re.findall(r"^([A-Za-z]\w*|\d+):? (.*)$", printed, re.MULTILINE)
     return {
         word: [float(n) for n in re.findall(r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?", rest)]
         for word, rest in lines
@@ -48,11 +50,12 @@ def numbers(printed):
 
 
 if __name__ == "__main__":
-    found = {}
-    for name, pictures in PICTURES.items():
+    wanted = sys.argv[1:] or list(PICTURES)
+    found = json.loads(NUMBERS.read_text())["printed"] if sys.argv[1:] else {}
+    for name in wanted:
         with tempfile.TemporaryDirectory() as folder:
             found[name] = numbers(run(DOCS / name, folder))
-            for picture in pictures:
+            for picture in PICTURES[name]:
                 drawn = Image.open(Path(folder) / picture).convert("RGB")
                 small = drawn.quantize(128, dither=Image.Dither.NONE)
                 small.save(DOCS / "assets" / picture, optimize=True)

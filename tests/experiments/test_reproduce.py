@@ -2,12 +2,18 @@
 
 import csv
 
+import numpy as np
 import pytest
 from helpers import once, user_error
 from matplotlib.figure import Figure
 
 from delucax import experiments
-from delucax.experiments.paper import _policy_gradient, _reproduce, STUDIES
+from delucax.experiments.paper import (
+    _policy_gradient,
+    _reproduce,
+    _wall_clock,
+    STUDIES,
+)
 from delucax.experiments.paper._finding import Claim, Finding
 
 
@@ -80,3 +86,22 @@ def test_the_paper_is_judged_at_its_own_rate():
     assert claim.measured == "182 rollouts at the paper's rate 0.01 (108 at 0.02)"
     assert _policy_gradient.descent_claim(120, None).holds
     assert not _policy_gradient.descent_claim(None, 90).holds
+
+
+def test_a_load_that_comes_and_goes_meets_all_simulators(monkeypatch):
+    """The one run takes 100 times as long as the other, whatever else runs."""
+    now = 0.0
+
+    def taking(seconds):
+        def run():
+            nonlocal now, turns
+            load = 1 + 4 * (turns // 4 % 2)  # of every other two rounds
+            now, turns = now + load * seconds, turns + 1
+
+        return run
+
+    turns = 0
+    monkeypatch.setattr(_wall_clock.time, "perf_counter", lambda: now)
+    seconds = _wall_clock._take_turns([taking(0.01), taking(1.0)], 6)
+    assert seconds.shape == (6, 2) and seconds.std(axis=0).min() > 0
+    np.testing.assert_allclose(seconds[:, 1] / seconds[:, 0], 100)

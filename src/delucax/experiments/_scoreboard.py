@@ -1,4 +1,4 @@
-"""Every task crossed with every controller that suits it.
+"""Every task crossed with the controllers that suit it.
 
 `python -m delucax run scoreboard` runs it for whoever wants to see; `python -m
 benchmarks.scoreboard` runs it for the committed results and their page.
