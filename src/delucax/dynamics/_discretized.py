@@ -235,7 +235,7 @@ class Discretized(AbstractDynamics):
         else:
             held, added = None, w
 
-        # An interval is integrated from 0 to dt, for t + dt is rounded where t is large.
+        # An interval is integrated from 0 to dt: where t is large, t + dt is rounded.
         args = (system, jnp.asarray(t, x.dtype), u, held)
         if self.is_stochastic:
             x_next, result = self._noisy(x, args, w)
