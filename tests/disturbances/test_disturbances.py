@@ -79,6 +79,38 @@ def test_moments(key):
     assert np.all(np.abs(walk) <= 1) and np.max(np.abs(np.diff(walk, axis=0))) < 1.5
 
 
+RANDOM = {
+    "gaussian": lambda n: d.Gaussian(0.1, mean=0.05, size=n),
+    "uniform": lambda n: d.Uniform(-0.1, 0.3, size=n),
+    "walk": lambda n: d.RandomWalk(size=n),
+    "brownian": lambda n: d.Brownian(n, dt=0.1),
+    "sum": lambda n: d.Gaussian(0.1, size=n) + d.Uniform(-1.0, 1.0, size=n),
+    "window": lambda n: d.Window(d.Gaussian(0.1, size=n), 1.0, 20.0),
+}
+
+
+@pytest.mark.parametrize("name", RANDOM)
+@pytest.mark.parametrize("size", [1, 3])
+def test_a_short_horizon_is_the_beginning_of_a_long_one(name, size, key):
+    disturbance = RANDOM[name](size)
+    draw = eqx.filter_jit(lambda d, k, t: d.sequence(k, t))
+    for times in (TIMES, TIMES.astype(jnp.float32)):
+        long = draw(disturbance, key, times[:100])
+        for steps in (99, 50, 17, 2):
+            short = draw(disturbance, key, times[:steps])
+            np.testing.assert_array_equal(short, long[:steps])
+
+
+@once
+def test_recorded_steps():
+    recorded = d.FromArray(jnp.ones((5, 1)))
+    assert recorded.recorded_steps == 5
+    assert d.Window(recorded, 0.0, 1.0).recorded_steps == 5
+    longer = d.FromArray(jnp.ones((7, 1)))
+    assert (d.Gaussian(0.1, size=1) + longer + recorded).recorded_steps == 5
+    assert ALL["gaussian"].recorded_steps is None
+
+
 @once
 def test_sum_draws_each_with_its_own_key(key):
     one = d.Gaussian(1.0, size=1)

@@ -274,6 +274,69 @@ def test_stratonovich_steps_agree_to_their_order(solver):
     assert_close(still, [1 - 0.3e-3], atol=1e-6)
 
 
+class Driven(dlx.AbstractSystem):
+    """Two states under `motions` Brownian motions."""
+
+    state_names = ("x", "y")
+    control_names = ("u",)
+    motions: int = eqx.field(static=True)
+
+    def vector_field(self, t, x, u, w):
+        return -x
+
+    def diffusion(self, t, x, u):
+        return jnp.arange(1.0, 1 + 2 * self.motions).reshape(2, -1).astype(x.dtype)
+
+
+class Named(Driven):
+    disturbance_names = ("wind", "sea")
+
+
+@pytest.mark.parametrize("motions", [1, 3])
+@pytest.mark.parametrize("solver", [diffrax.Euler(), diffrax.EulerHeun()])
+def test_as_many_brownian_motions_as_the_diffusion_has_columns(motions, solver, key):
+    system = Driven(motions)
+    step = dlx.Discretized(system, 0.1, solver, substeps=2)
+    assert step.disturbance_size == 2 * motions
+    w = jnp.linspace(-0.2, 0.5, 2 * motions)
+    x, g = jnp.ones(2), system.diffusion(0.0, jnp.ones(2), None)
+    for dB in w.reshape(2, motions):
+        x = x - 0.05 * x + g @ dB
+    assert_close(
+        step(0.0, jnp.ones(2), jnp.zeros(1), w), x, rtol=tolerance(1e-6, 1e-12)
+    )
+    env = dlx.Environment(step, dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1)), horizon=3)
+    run = dlx.rollout(env, dlx.controllers.Zero(1), key=key)
+    assert run.disturbances.shape == (3, 2 * motions)
+    model = dlx.linearize(step, x=jnp.ones(2), u=jnp.zeros(1))
+    assert model.E.shape == (2, 2 * motions)
+
+
+@pytest.mark.parametrize(
+    "shape, words",
+    [
+        (
+            (3, 2),
+            r"diffusion must return an array of shape \(2, k\).*got shape \(3, 2\)",
+        ),
+        ((), r"diffusion must return an array .*got shape \(\)"),
+    ],
+)
+def test_a_diffusion_of_the_wrong_shape(shape, words):
+    class Wrong(Driven):
+        def diffusion(self, t, x, u):
+            return jnp.ones(shape)
+
+    with user_error(match=f"Wrong: {words}"):
+        dlx.Discretized(Wrong(1), 0.1)
+
+
+def test_names_of_brownian_motions():
+    assert dlx.Discretized(Named(2), 0.1).disturbance_size == 2
+    with user_error(match="Named: disturbance_names must name the 3 Brownian motions"):
+        dlx.Discretized(Named(3), 0.1)
+
+
 def test_substeps_of_noise_need_their_increments():
     step = dlx.Discretized(Growth(), 0.1, substeps=3)
     with user_error(match=r"w \(the disturbance\) must have shape \(3,\)"):

@@ -122,6 +122,27 @@ def test_episode_is_a_rollout():
         made.step(ZERO)
 
 
+@pytest.mark.parametrize("rows", [3, 4])
+def test_recorded_noise_of_a_horizon(rows):
+    """The state after the last step has the last row, if there is none of its own."""
+    noise = dlx.disturbances.FromArray(jnp.arange(2.0 * rows).reshape(rows, 2))
+    env = dlx.replace(dlx.make("pendulum", horizon=3), {"sensor_noise": noise})
+    x0 = np.array([0.5, -0.2], np.float32)
+    run = dlx.rollout(env, dlx.controllers.Zero(1), key=jax.random.key(0), x0=x0)
+    read = [env.encode(y) for y in run.observations]
+    read.append(env.encode(run.final_state + noise.values[-1]))
+    one = interop.GymnasiumEnv(env)
+    many = interop.GymnasiumVectorEnv(env, 2)
+    first, _ = one.reset(options={"state": x0})
+    both, _ = many.reset(options={"state": np.stack([x0, x0])})
+    for k in range(4):
+        assert_close(first, read[k], atol=2e-6)
+        assert_close(both, np.stack([read[k], read[k]]), atol=2e-6)
+        if k < 3:
+            first, *_ = one.step(ZERO)
+            both, *_ = many.step(np.stack([ZERO, ZERO]))
+
+
 def test_final_cost_comes_with_the_end():
     system = dlx.systems.Pendulum()
     cost = dlx.costs.Quadratic(0 * jnp.eye(2), jnp.eye(1), final=jnp.eye(2))

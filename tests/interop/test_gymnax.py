@@ -199,6 +199,30 @@ class TestToGymnax:
             )(jnp.ones(2))
 
 
+@pytest.mark.parametrize("name", ["gaussian", "walk", "recorded"])
+def test_noise_is_that_of_the_rollout(name):
+    d, horizon = dlx.disturbances, 5
+    noises = {
+        "gaussian": d.Gaussian(0.1, size=2),
+        "walk": d.RandomWalk(size=2),
+        "recorded": d.FromArray(jnp.arange(2.0 * horizon).reshape(-1, 2)),
+    }
+    task = dlx.make("pendulum", horizon=horizon)
+    task = dlx.replace(
+        task, {"disturbance": noises[name], "sensor_noise": noises[name]}
+    )
+    env = to_gymnax(task)
+    controls = jnp.linspace(-1, 3, horizon)[:, None]
+    run = dlx.rollout(task, dlx.controllers.Sequence(controls), key=KEY)
+    step = jax.jit(env.step_env)
+    observation, state = env.reset(KEY)
+    for k in range(horizon):
+        assert_close(observation, task.encode(run.observations[k]), rtol=2e-6)
+        observation, state, *_ = step(KEY, state, controls[k])
+    assert_close(state.state, run.final_state, rtol=2e-6)
+    assert np.all(np.isfinite(observation))
+
+
 class Space(NamedTuple):
     low: Any
     high: Any

@@ -228,6 +228,9 @@ def test_waveform():
     # The beginning of a breath, however k dt rounds.
     many = lung.BreathWaveform().pressure(DT * jnp.arange(0, 10_000, 100))
     assert_close(many, 35.0)
+    k = np.arange(100_000)
+    inhaling = lung.BreathWaveform().is_inspiration(0.1 * jnp.asarray(k))
+    np.testing.assert_array_equal(inhaling, k % 30 <= 10)
 
 
 def test_wrong_waveforms_are_named():

@@ -186,6 +186,16 @@ def test_keep(key):
         dlx.rollout(env, FEEDBACK, key=key, keep=("state",))
 
 
+def test_one_recorded_step(key):
+    one = dlx.disturbances.FromArray(jnp.array([[0.3, -0.2]]))
+    env = lds(disturbance=one, sensor_noise=one)
+    run = dlx.rollout(env, dlx.controllers.Zero(1), key=key, horizon=1)
+    assert_close(run.disturbances, one.values)
+    assert_close(run.observations[0], run.states[0] + one.values[0])
+    with user_error(match="FromArray: values has 1 steps, fewer than the horizon of 2"):
+        dlx.rollout(env, dlx.controllers.Zero(1), key=key, horizon=2)
+
+
 def test_sensor_noise_reaches_the_controller_alone(key):
     env = lds(sensor_noise=dlx.disturbances.Constant(1.0, size=2))
     K = jnp.array([[0.4, 1.2]])

@@ -12,6 +12,7 @@ from .._controller import AbstractController
 from .._fields import function_field, parameter, weight
 from ..dynamics import LinearDynamics
 from ..math import matvec
+from ..math._steps import row_at, step_at
 from ..riccati import dre
 from ._feed_forward import as_signal, KnownSignals
 from ._operating_point import check_linear, check_observed, check_state, deviation
@@ -142,8 +143,8 @@ class FiniteHorizonLQR(AbstractController):
 
     def __call__(self, t, y, state):
         check_state(self, y, self.x_ref.shape[1])
-        step = jnp.round(t / self.dt).astype(int)
-        at = lambda a: a.at[step].get(mode="fill", fill_value=jnp.nan)  # noqa: E731
-        e = deviation(y, at(self.x_ref), self.difference)
-        u = at(self.u_ref) - matvec(at(self.K), e) - at(self.k)
+        step = step_at(t, self.dt, len(self.K), type(self).__name__)
+        rows = row_at((self.x_ref, self.u_ref, self.K, self.k), step)
+        x_ref, u_ref, K, k = rows
+        u = u_ref - matvec(K, deviation(y, x_ref, self.difference)) - k
         return u.astype(y.dtype), state

@@ -13,6 +13,7 @@ from .._controller import AbstractController
 from .._fields import function_field, parameter, weight
 from ..dynamics import LinearDynamics
 from ..math import matvec
+from ..math._steps import row_at, step_at
 from ..riccati import hinf_dare, hinf_dre
 from ._operating_point import (
     check_linear,
@@ -54,8 +55,8 @@ class HInfinity(AbstractController):
     **Attributes:** `K`, the gain, trainable, shape `(m, n)`, or `(T, m, n)`; `P`, the
     solution of the game, shape `(n, n)`, or `(T+1, n, n)`; `L`, the gain of the worst
     disturbance `w = L dx`, shape `(k, n)`, or `(T, k, n)`; `gamma`, the level; `x_ref`
-    and `u_ref`, the operating point. From step `T` of a horizon on the control is NaN,
-    which a rollout reports.
+    and `u_ref`, the operating point. Before step 0 of a horizon and from step `T` on
+    the control is NaN, which a rollout reports.
 
     **Raises:** `ValueError` if `dynamics` is not linear, does not rest at its operating
     point or does not observe its state, or if an argument does not fit; an error at run
@@ -129,11 +130,10 @@ class HInfinity(AbstractController):
         check_state(self, y, self.x_ref.shape[-1])
         K, x_ref, u_ref = self.K, self.x_ref, self.u_ref
         if self.dt is not None:
-            step = jnp.round(t / self.dt).astype(int)
-            at = lambda a: a.at[step].get(mode="fill", fill_value=jnp.nan)  # noqa: E731
-            K = at(K)
-            x_ref = at(x_ref) if x_ref.ndim == 2 else x_ref
-            u_ref = at(u_ref) if u_ref.ndim == 2 else u_ref
+            step = step_at(t, self.dt, len(K), "HInfinity")
+            K = row_at(K, step)
+            x_ref = row_at(x_ref, step) if x_ref.ndim == 2 else x_ref
+            u_ref = row_at(u_ref, step) if u_ref.ndim == 2 else u_ref
         u = u_ref - matvec(K, deviation(y, x_ref, self.difference))
         return u.astype(y.dtype), state
 

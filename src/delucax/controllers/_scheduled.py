@@ -10,12 +10,14 @@ from jaxtyping import Array
 from .._check import check_step
 from .._controller import AbstractController
 from .._fields import parameter
+from ..math._steps import row_at, step_at
 
 
 class Scheduled(AbstractController):
     """A controller for each time step, `u_k = controllers[k](t_k, y_k)`.
 
-    The last one is used after the end. They share one state, so that it must mean the
+    The last one is used after the end; before the start the control is NaN, which a
+    rollout reports. They share one state, so that it must mean the
     same to each of them.
 
     **Arguments:**
@@ -71,9 +73,9 @@ class Scheduled(AbstractController):
 
     def _at(self, t: Any) -> AbstractController:
         arrays, rest = eqx.partition(self.controllers, eqx.is_array)
-        k = jnp.round(t / self.dt).astype(int)
-        pick = lambda array: array[jnp.minimum(k, array.shape[0] - 1)]  # noqa: E731
-        return eqx.combine(jax.tree.map(pick, arrays), rest)
+        count = len(jax.tree.leaves(arrays)[0])
+        k = step_at(t, self.dt, count, "Scheduled")
+        return eqx.combine(row_at(arrays, jnp.minimum(k, count - 1)), rest)
 
     def init(self, *, key=None):
         return self._at(0.0).init(key=key)

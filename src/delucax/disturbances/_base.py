@@ -39,6 +39,11 @@ class AbstractDisturbance(eqx.Module):
     def __check_init__(self):
         check_parameters(self)
 
+    @property
+    def recorded_steps(self) -> int | None:
+        """The most steps that `sequence` gives; `None` (default) for any number."""
+        return None
+
     @abc.abstractmethod
     def sequence(self, key: PRNGKey | None, times: Array) -> Array:
         """The disturbances at `times`.
@@ -46,7 +51,9 @@ class AbstractDisturbance(eqx.Module):
         **Arguments:**
 
         - `key`: a random key; those that draw nothing take `None` too.
-        - `times`: the start of each step, shape `(T,)`.
+        - `times`: the start of each step, shape `(T,)`, increasing. A rollout gives
+            `0, dt, ...` in the precision of the state, so a time of `k dt` is rounded:
+            compare it with another to the nearest step, not exactly.
 
         **Returns:** shape `(T, size)`.
         """
@@ -90,6 +97,15 @@ def common_size(where: str, size: int | None, **values: Any) -> tuple[int, dict]
             f"as {where}(..., size=2)."
         )
     return check_count(size, "size", where), arrays
+
+
+def times_to_draw(disturbance: AbstractDisturbance, times: Array, steps: int) -> Array:
+    """The `times` to draw `steps` steps for: two at least, which tell Brownian motion
+    the step between them, unless fewer are recorded.
+    """
+    recorded = disturbance.recorded_steps
+    least = 2 if recorded is None else min(recorded, 2)
+    return times[: max(steps, least)]
 
 
 def spread(values: Array, steps: int, size: int) -> Array:

@@ -10,6 +10,7 @@ from jaxtyping import Array
 from .._check import as_matrix, check_range
 from .._fields import parameter, positive
 from ..math import sin
+from ..math._steps import coarsest, position, step_between
 from ._base import AbstractDisturbance, common_size, spread
 
 
@@ -134,10 +135,13 @@ class Square(AbstractDisturbance):
     - `duty`: the part of a period at `+amplitude`, from 0 to 1; 0.5 by default.
     - `size`: entries a step; follows from the others if one is a vector.
 
-    The gradient with respect to `period` and `duty` is zero almost everywhere.
+    A period, or a part of one, within rounding of a whole number of steps is that
+    number of steps. The gradient with respect to `period` and `duty` is zero almost
+    everywhere.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, the period is not
-    positive, or `duty` is not between 0 and 1.
+    positive, or `duty` is not between 0 and 1; in a horizon of more than 2^22 steps in
+    single precision, whose times do not tell the steps apart.
 
     !!! example
 
@@ -167,9 +171,20 @@ class Square(AbstractDisturbance):
         check_range(self.duty, "duty", "Square", 0, 1)
 
     def sequence(self, key, times):
-        cycles = times[:, None] / self.period
-        first = cycles - jnp.floor(cycles) < self.duty
-        w = jnp.where(first, self.amplitude, -self.amplitude)
+        dt = step_between(times, "Square")
+        # Counted from 0 in steps, which late times of a few steps do not tell.
+        unit = self.period if dt is None else jnp.where(times[0] == 0, dt, self.period)
+        eps = coarsest(times, self.period, self.duty)
+        at, period = (
+            sum(position(t, unit, 0.0, eps)) for t in (times[:, None], self.period)
+        )
+        # Steps are whole numbers, between which rounding by `slack` decides nothing.
+        slack = jnp.minimum(2 * eps * (jnp.abs(at) + 1), 0.25)
+        phase = at - period * jnp.floor((at + slack) / period)
+        w = jnp.where(
+            phase < self.duty * period - slack, self.amplitude, -self.amplitude
+        )
+        w = w if dt is None else jnp.where(jnp.isnan(dt), jnp.nan, w)
         return spread(w, times.shape[0], self.size).astype(times.dtype)
 
 
@@ -202,6 +217,11 @@ class FromArray(AbstractDisturbance):
     def size(self) -> int:
         """The number of columns of `values`."""
         return self.values.shape[1]
+
+    @property
+    def recorded_steps(self) -> int:
+        """The number of rows of `values`."""
+        return self.values.shape[0]
 
     def sequence(self, key, times):
         steps = times.shape[0]

@@ -204,9 +204,13 @@ class Discretized(AbstractDynamics):
 
     @property
     def disturbance_size(self) -> int:
-        """That of the system; times the substeps where `w` is Brownian increments."""
-        size = self.system.disturbance_size
-        return size * self.substeps if self.is_stochastic else size
+        """That of the system; of a diffusion, its Brownian motions times the substeps,
+        of each of which `w` holds the increments.
+        """
+        motions = brownian_size(self.system)
+        if motions is None:
+            return self.system.disturbance_size
+        return motions * self.substeps
 
     @property
     def increments(self) -> int:
@@ -231,71 +235,73 @@ class Discretized(AbstractDynamics):
         else:
             held, added = None, w
 
-        args = (system, u, held)
+        # An interval is integrated from 0 to dt: where t is large, t + dt is rounded.
+        args = (system, jnp.asarray(t, x.dtype), u, held)
         if self.is_stochastic:
-            x_next, result = self._noisy(t, x, args, w)
+            x_next, result = self._noisy(x, args, w)
         elif self.stepsize_controller is not None:
-            x_next, result = self._adaptive(t, x, args)
+            x_next, result = self._adaptive(x, args)
         else:
-            x_next, result = self._fixed(t, x, args)
+            x_next, result = self._fixed(x, args)
         x_next = _array(system, "project", system.project(x_next), x.shape)
         if added is not None:
             x_next = x_next + added
         return x_next.astype(x.dtype), result
 
-    def _fixed(self, t, x, args):
+    def _fixed(self, x, args):
         tableau = tableau_of(self.solver)
         solver = for_fixed_steps(self.solver) if tableau is None else None
         h = self.dt / self.substeps
 
-        def step(t, x, _):
+        def step(s, x, _):
             if tableau is None:
-                return _solver_step(solver, diffrax.ODETerm(_field), t, x, h, args)
-            rhs = lambda t, y: _field(t, y, args)
-            return runge_kutta_step(tableau, rhs, t, x, h), RESULTS.successful
+                return _solver_step(solver, diffrax.ODETerm(_field), s, x, h, args)
+            rhs = lambda s, y: _field(s, y, args)
+            return runge_kutta_step(tableau, rhs, s, x, h), RESULTS.successful
 
-        return self._substep(step, t, x, None)
+        return self._substep(step, x, None)
 
-    def _noisy(self, t, x, args, w):
+    def _noisy(self, x, args, w):
         increments = zeros_if_none(w, self.disturbance_size, x)
         increments = increments.reshape(self.substeps, -1)
         h = self.dt / self.substeps
-        g: Any = self.system.diffusion
-        u = args[1]
+        system, t, u, _ = args
 
-        def step(t, x, dB):
+        def g(s, x):
+            return system.diffusion(t + s, x, u)
+
+        def step(s, x, dB):
             if type(self.solver) is diffrax.Euler:
-                noise = _apply(g(t, x, u), dB)
-                return x + h * _field(t, x, args) + noise, RESULTS.successful
-            term = diffrax.MultiTerm(diffrax.ODETerm(_field), _BrownianTerm(g, u, dB))
-            return _solver_step(self.solver, term, t, x, h, args)
+                noise = _apply(g(s, x), dB)
+                return x + h * _field(s, x, args) + noise, RESULTS.successful
+            term = diffrax.MultiTerm(diffrax.ODETerm(_field), _BrownianTerm(g, dB))
+            return _solver_step(self.solver, term, s, x, h, args)
 
-        return self._substep(step, t, x, increments)
+        return self._substep(step, x, increments)
 
-    def _substep(self, step, t, x, inputs):
+    def _substep(self, step, x, inputs):
         """`substeps` steps one after the other, the state carried by its components."""
         if self.substeps == 1:
-            return step(t, x, None if inputs is None else inputs[0])
+            return step(0, x, None if inputs is None else inputs[0])
         h = self.dt / self.substeps
 
         @by_components
         def body(parts, index_and_input):
             i, given = index_and_input
-            x_next, result = step(t + i * h, join_state(parts, x.shape[0]), given)
+            x_next, result = step(i * h, join_state(parts, x.shape[0]), given)
             return split_state(x_next.astype(x.dtype)), or_none(result)
 
         xs = (jnp.arange(self.substeps), inputs)
         parts, results = lax.scan(body, split_state(x), xs)
         return join_state(parts, x.shape[0]), first_of(results)
 
-    def _adaptive(self, t, x, args):
+    def _adaptive(self, x, args):
         assert self.stepsize_controller is not None and self.adjoint is not None
-        t0 = jnp.asarray(t, x.dtype)
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(_field),
             self.solver,
-            t0,
-            t0 + self.dt,
+            jnp.zeros((), x.dtype),
+            self.dt,
             dt0=None,
             y0=x,
             args=args,
@@ -310,20 +316,35 @@ class Discretized(AbstractDynamics):
 
 def has_diffusion(system: AbstractSystem) -> bool:
     """Whether `system` has noise inside."""
+    return brownian_size(system) is not None
+
+
+def brownian_size(system: AbstractSystem) -> int | None:
+    """The number of Brownian motions of `system`; `None` if it has no noise inside."""
     if type(system).diffusion is AbstractSystem.diffusion:
-        return False
+        return None
     t, x, u = (
         jnp.zeros(()),
         jnp.zeros(system.state_size),
         jnp.zeros(system.control_size),
     )
-    found: Any = eqx.filter_eval_shape(system.diffusion, t, x, u)
-    if found is not None and not hasattr(found, "shape"):
+    g: Any = eqx.filter_eval_shape(system.diffusion, t, x, u)
+    if g is None:
+        return None
+    name, n, names = type(system).__name__, system.state_size, system.disturbance_names
+    shape = getattr(g, "shape", None)
+    if shape is None or len(shape) not in (1, 2) or shape[0] != n:
+        got = f"a {type(g).__name__}" if shape is None else f"shape {shape}"
         raise ValueError(
-            f"{type(system).__name__}: diffusion must return an array, got a "
-            f"{type(found).__name__}."
+            f"{name}: diffusion must return an array of shape ({n}, k), of k Brownian "
+            f"motions, or ({n},), a diagonal, got {got}."
         )
-    return found is not None
+    if names and len(names) != shape[-1]:
+        raise ValueError(
+            f"{name}: disturbance_names must name the {shape[-1]} Brownian motions of "
+            f"the diffusion, or be left out, got {names}."
+        )
+    return shape[-1]
 
 
 def _apply(g: Array, dB: Array) -> Array:
@@ -334,12 +355,11 @@ class _BrownianTerm(diffrax.AbstractTerm):
     """`g dB` with the increment of this step given."""
 
     diffusion: Any
-    control: Array
     increment: Array
 
     def vf(self, t, y, args):
         del args
-        return self.diffusion(t, y, self.control)
+        return self.diffusion(t, y)
 
     def contr(self, t0, t1, **kwargs):
         del t0, t1, kwargs
@@ -349,12 +369,12 @@ class _BrownianTerm(diffrax.AbstractTerm):
         return _apply(vf, control)
 
 
-def _field(t, x, args):
-    """The vector field. An adjoint sees what is in `args`, not what a function closes
-    over.
+def _field(s, x, args):
+    """The vector field at `s` after the start of the interval. An adjoint sees what is
+    in `args`, not what a function closes over.
     """
-    system, u, held = args
-    return evaluate_field(system, t, x, u, held)
+    system, t, u, held = args
+    return evaluate_field(system, t + s, x, u, held)
 
 
 def evaluate_field(system: AbstractSystem, t: Any, x: Array, u: Array, w: Any) -> Array:
@@ -382,9 +402,11 @@ def _array(system: Any, method: str, found: Any, shape: tuple[int, ...]) -> Arra
     )
 
 
-def _solver_step(solver, term, t, x, h, args):
-    """One Diffrax step that starts afresh, as it must after a switch of the control."""
-    t0 = jnp.asarray(t, x.dtype)
+def _solver_step(solver, term, s, x, h, args):
+    """One Diffrax step of `h` from `s` after the start of the interval. It starts
+    afresh, as it must after a switch of the control.
+    """
+    t0 = jnp.asarray(s, x.dtype)
     t1 = t0 + h
     state = solver.init(term, t0, t1, x, args)
     x_next, _, _, _, result = solver.step(

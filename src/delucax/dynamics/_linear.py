@@ -11,6 +11,7 @@ from .._check import as_matrix, as_vector, check_step, is_concrete
 from .._fields import as_float_array, parameter
 from .._results import RESULTS
 from ..math import matvec
+from ..math._steps import row_at, step_at
 from ..systems._linear import check_matrices, checked_names
 from ._base import AbstractDynamics
 
@@ -22,7 +23,8 @@ class LinearDynamics(AbstractDynamics):
 
     with `x_ref_next` given as the argument `x_next`. Time-invariant, or time-varying:
     then `A` and `B` (and whichever of the rest) have a leading time axis, indexed by
-    `round(t / dt)`; beyond its end the next state is NaN, which a rollout reports.
+    `round(t / dt)`; before its start and beyond its end the next state is NaN, which a
+    rollout reports.
 
     **Arguments:**
 
@@ -132,15 +134,10 @@ class LinearDynamics(AbstractDynamics):
         """
         if not self.is_time_varying:
             return self
-        k = jnp.round(t / self.dt).astype(int)
-        here = lambda array: array.at[k].get(mode="fill", fill_value=jnp.nan)  # noqa: E731
+        k = step_at(t, self.dt, len(self.A), "LinearDynamics")
         pick = lambda s: [s.A, s.B, s.E, s.x_ref, s.u_ref, s.x_next]  # noqa: E731
-        return eqx.tree_at(
-            pick,
-            self,
-            [None if a is None else here(a) for a in pick(self)],
-            is_leaf=lambda leaf: leaf is None,
-        )
+        here = row_at(pick(self), k)
+        return eqx.tree_at(pick, self, here, is_leaf=lambda leaf: leaf is None)
 
     def advance(self, t, x, u, w):
         here = self.at(t)

@@ -8,6 +8,7 @@ from jaxtyping import Array
 
 from .._results import RESULTS
 from ..disturbances import Zero
+from ..disturbances._base import times_to_draw
 from ..environments import Environment
 
 
@@ -44,12 +45,20 @@ def split_key(key: Any) -> tuple[Any, Any]:
 
 def draw_signals(env: Environment, keys: Any, dtype: Any) -> Signals:
     """What is drawn for a whole episode, with the second of `split_key`."""
-    times = (jnp.arange(max(env.horizon, 2) + 1) * env.dt).astype(dtype)
+    steps = env.horizon
+    times = (jnp.arange(steps + 1) * env.dt).astype(dtype)
     w = noise = None
     if not isinstance(env.disturbance, Zero):
-        w = env.disturbance.sequence(keys[0], times[:-1]).astype(dtype)
+        shown = times_to_draw(env.disturbance, times, steps)
+        w = env.disturbance.sequence(keys[0], shown).astype(dtype)
     if env.sensor_noise is not None:
-        noise = env.sensor_noise.sequence(keys[1], times).astype(dtype)
+        # The state after the last step is observed too. Where what is recorded ends
+        # there, its last row is the noise of that.
+        recorded = env.sensor_noise.recorded_steps
+        ends = recorded is not None and recorded <= steps
+        shown = times_to_draw(env.sensor_noise, times, steps + (not ends))
+        noise = env.sensor_noise.sequence(keys[1], shown).astype(dtype)
+        noise = jnp.concatenate([noise, noise[-1:]]) if ends else noise
     return Signals(w, noise)
 
 

@@ -139,7 +139,8 @@ class SimulatedRunner:
         noise = self.environment.sensor_noise
         if noise is not None:
             own = jax.random.fold_in(self._key, self.steps)
-            y = y + noise.sequence(own, jnp.zeros(1))[0]
+            times = self.dt * np.arange(self.steps, self.steps + 2)
+            y = y + noise.sequence(own, jnp.asarray(times, self.state.dtype))[0]
         return float(y[0])
 
     def actuate(self, u_in: float, u_out: float) -> None:

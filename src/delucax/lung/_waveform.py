@@ -19,8 +19,6 @@ from .._fields import as_float_array, check_parameters, parameter, positive
 
 
 _T = TypeVar("_T")
-# Of a period: what rounding of `k dt` may be off by.
-_SLACK = 1e-6
 
 
 class BreathWaveform(eqx.Module):
@@ -130,7 +128,7 @@ class BreathWaveform(eqx.Module):
         counts as its beginning.
         """
         breaths = as_float_array(t) / self.period
-        return jnp.maximum(breaths - jnp.floor(breaths + _SLACK), 0)
+        return jnp.maximum(breaths - jnp.floor(breaths + _slack(breaths)), 0)
 
     def is_inspiration(self, t: Any) -> Array:
         """Whether time `t` is in an inspiratory phase.
@@ -139,7 +137,8 @@ class BreathWaveform(eqx.Module):
 
         **Returns:** booleans of the shape of `t`.
         """
-        return self.share(t) <= self.inspiration + _SLACK
+        slack = _slack(as_float_array(t) / self.period)
+        return self.share(t) <= self.inspiration + slack
 
     def pressure(self, t: Any) -> Array:
         """The target pressure at time `t`.
@@ -154,6 +153,12 @@ class BreathWaveform(eqx.Module):
     def __call__(self, t: Any) -> Array:
         """The target pressure at time `t`, shape `(1,)`."""
         return jnp.atleast_1d(self.pressure(t))
+
+
+def _slack(breaths: Array) -> Array:
+    """Of a period: by how much rounding of `k dt` may be off after so many breaths."""
+    eps = jnp.finfo(breaths.dtype).eps
+    return jnp.clip(2 * eps * jnp.abs(breaths), 1e-6, 1e-3)
 
 
 def check_waveform(waveform: Any, where: str) -> None:

@@ -11,6 +11,7 @@ from .._controller import AbstractController, wrong_observation
 from .._fields import function_field, parameter, weight
 from .._results import Result, RESULTS
 from ..math import matvec
+from ..math._steps import row_at, step_at
 
 
 class Plan(AbstractController):
@@ -84,14 +85,11 @@ class Plan(AbstractController):
         size = self.states.shape[1]
         if y.shape != (size,):
             raise wrong_observation(self, size, y)
-        step = jnp.round((t - self.t0) / self.dt).astype(int)
-        horizon = self.controls.shape[0]
-        # Negative indices would count from the end.
-        step = jnp.where(step < 0, horizon, step)
-        at = lambda a: a.at[step].get(mode="fill", fill_value=jnp.nan)  # noqa: E731
-        x_ref = at(self.states[:-1])
+        step = step_at(t - self.t0, self.dt, len(self.controls), "Plan")
+        rows = row_at((self.states[:-1], self.controls, self.gains), step)
+        x_ref, u_ref, K = rows
         e = y - x_ref if self.difference is None else self.difference(y, x_ref)
-        u = at(self.controls) - matvec(at(self.gains), e)
+        u = u_ref - matvec(K, e)
         if self.low is not None and self.high is not None:
             u = jnp.minimum(jnp.maximum(u, self.low), self.high)
         return u.astype(y.dtype), state

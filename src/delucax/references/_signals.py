@@ -10,6 +10,7 @@ from jaxtyping import Array
 from .._check import as_matrix, check_positive
 from .._fields import as_float_array, check_parameters, parameter, positive
 from ..math import sin
+from ..math._steps import step_at
 
 
 class Constant(eqx.Module):
@@ -45,7 +46,8 @@ class Constant(eqx.Module):
 
 
 class Sequence(eqx.Module):
-    """`r(t) = values[round(t / dt)]`; the last value is held after the end.
+    """`r(t) = values[round(t / dt)]`; the last value is held after the end, and the
+    first one before the start.
 
     **Arguments:**
 
@@ -76,8 +78,9 @@ class Sequence(eqx.Module):
 
     def __call__(self, t: Any) -> Array:
         """The signal at time `t`."""
-        k = jnp.clip(jnp.round(t / self.dt), 0, self.values.shape[0] - 1).astype(int)
-        return self.values[k]
+        count = self.values.shape[0]
+        k = step_at(t, self.dt, count, "Sequence")
+        return self.values[jnp.clip(k, 0, count - 1)]
 
 
 class FigureEight(eqx.Module):

@@ -23,6 +23,7 @@ class Inputs(eqx.Module):
     """
 
     system: AbstractSystem
+    start: Array  # the time at which the solve's own begins
     source: Any  # a controller, or a function of time; None for an array
     memory: Any  # the controller's first state
     controls: Array | None
@@ -30,11 +31,13 @@ class Inputs(eqx.Module):
     index: Array
     u: Array | None  # what a held controller asked for at the last switch
 
-    def control(self, t: Array, x: Array) -> Array:
+    def control(self, s: Array, x: Array) -> Array:
+        """The control at `s` after the start."""
         if self.u is not None:
             return self.u
         if self.controls is not None:
             return self.controls[self.index]
+        t = self.start + s
         if isinstance(self.source, AbstractController):
             y = self.system.observe(t, x)
             u, _ = answer(self.source, t, y, self.memory)
@@ -50,8 +53,9 @@ class Inputs(eqx.Module):
             return jnp.zeros(self.system.disturbance_size, x.dtype)
         return None
 
-    def act(self, t: Array, x: Array, memory: Any) -> tuple[Array, Any]:
+    def act(self, s: Array, x: Array, memory: Any) -> tuple[Array, Any]:
         """A held controller's answer at a switch, and its state after it."""
+        t = self.start + s
         arrays, static = memory, eqx.filter(self.memory, eqx.is_array, inverse=True)
         y = self.system.observe(t, x)
         state = eqx.combine(arrays, static)
@@ -63,9 +67,10 @@ class Inputs(eqx.Module):
         return u, eqx.filter(after, eqx.is_array)
 
 
-def field(t, x, args):
-    u = args.control(t, x)
-    return evaluate_field(args.system, t, x, u, args.disturbance(x)).astype(x.dtype)
+def field(s, x, args):
+    """The vector field at `s` after the start."""
+    u, w = args.control(s, x), args.disturbance(x)
+    return evaluate_field(args.system, args.start + s, x, u, w).astype(x.dtype)
 
 
 def check_control(u: Any, source: Any, system: AbstractSystem) -> None:

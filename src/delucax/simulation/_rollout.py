@@ -17,6 +17,7 @@ from .._fields import as_float_array
 from .._results import choose, first_failure, first_of, or_none, RESULTS
 from .._typing import PRNGKey
 from ..disturbances import Zero
+from ..disturbances._base import times_to_draw
 from ..dynamics._runge_kutta import join_state, split_state, stack_steps
 from ..environments import Environment
 from ._answer import answer, begun, check_state, outcome_of
@@ -177,12 +178,13 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
     size, dtype, dt = x0.shape[0], x0.dtype, env.dt
     times = (jnp.arange(horizon + 1) * dt).astype(dtype)
     if w is None and not isinstance(env.disturbance, Zero):
-        # Two times at least, which tell Brownian motion the step between them.
-        shown = times[: max(horizon, 2)]
+        shown = times_to_draw(env.disturbance, times, horizon)
         w = _drawn(env.disturbance, w_key, shown, env.disturbance_size)[:horizon]
     noise = None
     if env.sensor_noise is not None:
-        noise = _drawn(env.sensor_noise, noise_key, times[:-1], env.observation_size)
+        shown = times_to_draw(env.sensor_noise, times, horizon)
+        noise = _drawn(env.sensor_noise, noise_key, shown, env.observation_size)
+        noise = noise[:horizon]
     ends = env.terminated is not None
     plain_sight = True  # whether the observation is the state itself, found by tracing
 

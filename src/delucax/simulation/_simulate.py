@@ -6,6 +6,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from .._check import as_vector, check_count, check_finite, check_key, is_concrete
 from .._controller import AbstractController, tallies
@@ -19,6 +20,7 @@ from ..dynamics._solvers import (
     for_fixed_steps,
     loud,
 )
+from ..math._steps import check_steps
 from ..systems import AbstractSystem
 from ._answer import outcome_of
 from ._hold import (
@@ -70,6 +72,11 @@ def simulate(
     the control of the interval that the step lies in. A step that starts at a switch
     uses nothing from before it.
 
+    The solve counts its time from `t0`, so that a late start costs no precision: its
+    switches are rounded to that of `t1 - t0`, about `1e-7 (t1 - t0)` in single
+    precision, however large `t0` is. What is a function of time is given `t0 + s`,
+    which is rounded to that of `t0`.
+
     There is no cost here: `costs` is `None`, and the trajectory's `final_cost` and
     `total_cost` are zero. It is compiled at its door, as [`delucax.rollout`][] is.
 
@@ -114,7 +121,8 @@ def simulate(
     are what the sensor reads at each time but the last.
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, on a solver or
-    adjoint that does not fit, and on systems that one solve cannot integrate: those
+    adjoint that does not fit, on more than 2^22 steps in single precision, whose times
+    do not tell them apart, and on systems that one solve cannot integrate: those
     that `project` their state after each interval, that have a `diffusion`, or, with
     `w`, that name no disturbances; discretise these with [`delucax.Discretized`][]. An
     error at run time as `throw` says.
@@ -193,6 +201,7 @@ def simulate(
         )
     if ts is not None:
         ts = as_save_times(ts, t0, t1, where)
+    check_steps((steps or 1) * substeps, x0.dtype, "the horizon", where)
     solver = diffrax.Tsit5() if solver is None else solver
     check_solver(solver, where)
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
@@ -223,7 +232,8 @@ def simulate(
         w,
         x0,
         jnp.asarray(t0, x0.dtype),
-        jnp.asarray(t1, x0.dtype),
+        # Before they are rounded, if they are known.
+        jnp.asarray(t1 - t0, x0.dtype),
         ts,
         key,
         solver,
@@ -245,7 +255,7 @@ def _simulate(
     w,
     x0,
     t0,
-    t1,
+    length,
     ts,
     key,
     solver,
@@ -257,14 +267,16 @@ def _simulate(
     max_steps,
     hold,
 ):
+    # The solve's own time is from 0 to `length`, which is not rounded to what `t0` is.
     dtype = x0.dtype
     grid: Any = None
     switches: Any = None
     if steps is not None:
-        grid = t0 + (t1 - t0) * (jnp.arange(steps * substeps + 1) / (steps * substeps))
-        grid = grid.astype(dtype).at[-1].set(t1)
+        grid = length * (jnp.arange(steps * substeps + 1) / (steps * substeps))
+        grid = grid.astype(dtype).at[-1].set(length)
         switches = grid[::substeps]
-    times: Any = switches if ts is None else ts.astype(dtype)
+    saves: Any = switches if ts is None else _since(t0, ts.astype(dtype), grid, length)
+    times: Any = t0 + saves if ts is None else ts.astype(dtype)
 
     sampled = hold == "zero" and isinstance(source, AbstractController)
     controls: Any = None
@@ -285,14 +297,14 @@ def _simulate(
     elif not callable(source):
         controls = source
     elif hold == "zero":
-        controls = jax.vmap(source)(switches[:-1])
+        controls = jax.vmap(source)(t0 + switches[:-1])
         check_control(controls[0], source, system)
     if controls is not None:
         controls, source = controls.astype(dtype), None
     index = jnp.zeros((), jnp.int32)
-    args = Inputs(system, source, memory, controls, w, index, u)
+    args = Inputs(system, t0, source, memory, controls, w, index, u)
     if sampled:
-        u, _ = args.act(t0, x0, eqx.filter(memory, eqx.is_array))
+        u, _ = args.act(grid[0], x0, eqx.filter(memory, eqx.is_array))
         args = eqx.tree_at(lambda a: a.u, args, u, is_leaf=lambda leaf: leaf is None)
 
     held = hold == "zero" or w is not None
@@ -318,15 +330,15 @@ def _simulate(
                 backwards[name] = fit(backwards[name])
         adjoint = diffrax.BacksolveAdjoint(**backwards)
     saved: dict[str, Any] = (
-        dict(t0=True, ts=times[1:]) if ts is None else dict(t1=True, ts=times)
+        dict(t0=True, ts=saves[1:]) if ts is None else dict(t1=True, ts=saves)
     )
     if sampled:
         saved["fn"] = recorded
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
         fitted(solver),
-        t0,
-        t1,
+        jnp.zeros((), dtype),
+        length,
         dt0=None,
         y0=x0,
         args=args,
@@ -350,14 +362,14 @@ def _simulate(
         """Of a held sequence, what is in force just before each time but the first."""
         if held is None or ts is None:
             return held
-        return held[jax.vmap(lambda t: interval_before(switches, t))(times[1:])]
+        return held[jax.vmap(lambda s: interval_before(switches, s))(saves[1:])]
 
     if applied is not None:
         controls = applied[1:count]
     elif controls is not None:
         controls = before(controls)
     else:
-        controls = jax.vmap(args.control)(times[:-1], states[:-1])
+        controls = jax.vmap(args.control)(saves[:-1], states[:-1])
     finite = jnp.all(jnp.isfinite(final_state))
     outcome = choose(finite, RESULTS.successful, RESULTS.diverged)
     last = {name: totals[-1] for name, totals in counts.items()}
@@ -365,7 +377,7 @@ def _simulate(
     sensor = None
     if type(system).observe is not AbstractSystem.observe:
         sensor = jax.vmap(system.observe)(times[:-1], states[:-1])
-    spacing = (t1 - t0) / steps if ts is None else (times[-1] - times[0]) / (count - 1)
+    spacing = length / steps if ts is None else (times[-1] - times[0]) / (count - 1)
     return Trajectory(
         states=states,
         controls=controls,
@@ -394,3 +406,18 @@ def _simulate(
         state_units=system.state_units,
         control_units=system.control_units,
     )
+
+
+def _since(t0: Array, ts: Array, grid: Array | None, length: Array) -> Array:
+    """The save times `ts`, counted from `t0`.
+
+    A time that rounding puts beside a point of the grid is that point, so that what is
+    in force before it is known.
+    """
+    saves = jnp.clip(ts - t0, 0, length)
+    if grid is None:
+        return saves
+    steps = grid.shape[0] - 1
+    near = grid[jnp.round(saves / length * steps).astype(int)]
+    slack = 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(ts))
+    return jnp.where(jnp.abs(saves - near) <= slack, near, saves)

@@ -148,12 +148,13 @@ class AbstractSystem(eqx.Module):
     def diffusion(self, t: RealScalar, x: Array, u: Array) -> Array | None:
         """The matrix g of `dx = f dt + g dB`; none by default.
 
-        If it is given then `w` holds the Brownian increments over the step.
+        If it is given then `w` holds the increments of its k Brownian motions over the
+        step, which `disturbance_names` names if it is given too.
 
         **Arguments:** `t`: time. `x`: state. `u`: control.
 
-        **Returns:** shape `(state_size, k)`, or `(state_size,)` for a diagonal; or
-        `None` for a system without noise inside.
+        **Returns:** shape `(state_size, k)`, or `(state_size,)` for a diagonal (k is
+        then the number of states); or `None` for a system without noise inside.
         """
         del t, x, u
         return None

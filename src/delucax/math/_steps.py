@@ -1,0 +1,112 @@
+"""Times as steps of a grid.
+
+A time `k dt` is rounded, and so are the times that are compared with it. What decides
+is therefore the number of steps, which is whole where the two are meant to be equal.
+"""
+
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._check import is_concrete
+
+
+_T = TypeVar("_T")
+
+
+def most_steps(dtype: Any) -> int:
+    """How many steps times of this precision tell apart: 2^22 in single precision."""
+    return 2 ** (jnp.finfo(dtype).nmant - 1)
+
+
+def check_steps(count: int, dtype: Any, what: str, where: str) -> None:
+    """Raise if times of this precision do not tell `count` steps apart."""
+    most = most_steps(dtype)
+    if count > most:
+        raise ValueError(
+            f"{where}: {what} has {count} steps, but times in {jnp.dtype(dtype).name} "
+            f"tell only {most} apart; use double precision (JAX_ENABLE_X64=1) or "
+            "shorter pieces."
+        )
+
+
+def step_at(t: Any, dt: Any, count: int, where: str) -> Array:
+    """The step of `count` that time `t` belongs to, `round(t / dt)`."""
+    steps = t / dt
+    check_steps(count, jnp.result_type(steps), "the horizon", where)
+    return jnp.round(steps).astype(int)
+
+
+def row_at(tree: _T, k: Array) -> _T:
+    """Row `k` of each array; NaN before the first row and after the last."""
+    row = lambda a: a.at[k].get(mode="fill", wrap_negative_indices=False)
+    return jax.tree.map(row, tree)
+
+
+class Position(NamedTuple):
+    """A time in steps: the nearest whole number, and how far it is from there."""
+
+    whole: Array
+    off: Array
+
+
+def position(t: Any, dt: Any, origin: Any, eps: float) -> Position:
+    """Where `t` is, in steps of `dt` from `origin`.
+
+    It is on a step if it is as close to one as rounding by `eps` of the times and of
+    `dt` can put it. The quotient is taken in two parts, because its own rounding would
+    be another error of the size of those.
+    """
+    t, dt, origin = (lax.stop_gradient(jnp.asarray(a)) for a in (t, dt, origin))
+    dtype = jnp.result_type(t, dt, origin)
+    t, dt, origin = (a.astype(dtype) for a in (t, dt, origin))
+    info, since = jnp.finfo(dtype), t - origin
+    # The product of the coarse quotient, a whole number, with each part of dt is exact.
+    coarse = lax.reduce_precision(since / dt, info.nexp, info.nmant // 2 - 1)
+    coarse = jnp.round(coarse)
+    high = lax.reduce_precision(dt, info.nexp, (info.nmant + 1) // 2)
+    fine = (since - coarse * high - coarse * (dt - high)) / dt
+    near = jnp.round(fine)
+    size = (jnp.abs(t) + jnp.abs(origin)) / dt + 1
+    on_step = jnp.abs(fine - near) <= jnp.minimum(2 * eps * size, 0.5)
+    return Position(coarse + near, jnp.where(on_step, 0, fine - near))
+
+
+def coarsest(*arrays: Array) -> float:
+    """The relative rounding of the least precise of some arrays."""
+    return max(float(jnp.finfo(a.dtype).eps) for a in arrays)
+
+
+def step_between(times: Array, where: str) -> Any:
+    """The step of a grid of times; `None` for a single time.
+
+    It is the first one, or the average one where the grid does not start at 0, because
+    the difference of two late times is rounded. It is NaN, or an error where the times
+    are known, if the times are too late for their precision to tell steps apart.
+    """
+    check_steps(times.shape[0], times.dtype, "the horizon", where)
+    if times.shape[0] == 1:
+        return None
+    average = (times[-1] - times[0]) / (times.shape[0] - 1)
+    dt = jnp.where(times[0] == 0, times[1], average)
+    last = jnp.maximum(jnp.abs(times[0]), jnp.abs(times[-1]))
+    apart = last <= most_steps(times.dtype) * dt
+    if is_concrete(apart) and not np.all(apart):
+        raise ValueError(
+            f"{where}: times in {times.dtype.name} do not tell steps of {dt:.3g} apart "
+            f"at {last:.6g}; use double precision (JAX_ENABLE_X64=1) or times from 0."
+        )
+    return jnp.where(apart, dt, jnp.nan)
+
+
+def reached(times: Array, mark: Array, dt: Any) -> Array:
+    """Which of `times`, a grid of step `dt`, are `mark` or later."""
+    if dt is None:
+        return times >= mark
+    eps = coarsest(times, mark)
+    here, there = (position(t, dt, times[0], eps) for t in (times, mark))
+    return (here.whole - there.whole) + (here.off - there.off) >= 0
