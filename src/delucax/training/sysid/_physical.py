@@ -7,7 +7,7 @@ import jax
 import jax.flatten_util
 import jax.lax as lax
 import jax.numpy as jnp
-import lineax as lx
+import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array
 
@@ -19,6 +19,9 @@ from .._trainable import take_apart
 from ._identified import Certainty, Identified, outcome, quantile, raised
 from ._linear import runs_of
 
+
+_NEAR = 0.05
+"""The standard deviations from the minimum within which a fit has converged."""
 
 def physical(
     dynamics: AbstractDynamics,
@@ -190,6 +193,17 @@ class _Problem(NamedTuple):
     noise: Array
 
 
+class _Point(NamedTuple):
+    """Residuals and sensitivities at values of the parameters and first states."""
+
+    theta: Array
+    starts: Array
+    by_theta: Array
+    by_start: Array
+    rest: Array
+    cost: Array
+
+
 class _Solution(NamedTuple):
     values: Any
     starts: Array
@@ -205,7 +219,10 @@ def _solve(assembly, values, starts, problem, max_steps):
 
     The state at the beginning of a window moves nothing but that window, so it is
     eliminated there, and the cost of a step is linear in the number of windows; a
-    solver of dense least squares would pay its cube.
+    solver of dense least squares would pay its cube. Steps are measured by the largest
+    sensitivities so far (Moré, 1978), and so do not depend on units. It has converged
+    where no step of the linear model is longer than a small part of what the noise
+    makes the estimate differ by.
     """
     flat, unravel = jax.flatten_util.ravel_pytree(values)
     p = flat.size
@@ -231,83 +248,98 @@ def _solve(assembly, values, starts, problem, max_steps):
     slopes = jax.jacfwd(window, argnums=(0, 1), has_aux=True)
     sensitivity = jax.vmap(slopes, in_axes=(None, 0, 0))
 
-    def cost_of(theta, starts):
-        rest = jax.vmap(window, in_axes=(None, 0, 0))(theta, starts, data)[0]
-        return jnp.sum(rest**2)
+    def scaled(point, largest):
+        """Sensitivities as multiples of the largest so far, and these."""
+        norms = jnp.linalg.norm(point.by_theta, axis=(0, 1))
+        norms = norms, jnp.linalg.norm(point.by_start, axis=1)
+        largest = jax.tree.map(jnp.maximum, largest, norms)
+        units = jax.tree.map(lambda norm: jnp.where(norm > 0, norm, 1), largest)
+        own = [point.by_theta / units[0], point.rest[..., None]]
+        by_start = point.by_start / units[1][:, None]
+        return jnp.concatenate(own, axis=2), by_start, largest, units
+
+    def projected(own, by_start, damping):
+        """First on the states at the beginnings of the windows, then on the rest."""
+        eliminate = jax.vmap(_eliminate, in_axes=(0, 0, None))
+        R_x, on_starts, left = eliminate(by_start, own, damping)
+        own = left.reshape(-1, p + 1)
+        R, on_theta, _ = _eliminate(own[:, :p], own[:, p:], damping)
+        return R_x, on_starts, R, on_theta[:, 0], own
 
     def body(carry):
-        theta, starts, damping, cost, _, count = carry
-        (by_theta, by_start), rest = sensitivity(theta, starts, data)
+        candidate, best, largest, damping, flat, _, count = carry
+        slopes, rest = sensitivity(*candidate, data)
+        cost = jnp.sum(rest**2)
+        better = cost < best.cost
+        here = _Point(*candidate, *slopes, rest, cost)
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
+        damping = jnp.where(better | flat, damping / 8, damping * 4)
+        damping = jnp.clip(damping, 1e-10, 1e10)
+        own, by_start, largest, units = scaled(best, largest)
+        R_x, on_starts, R, on_theta, _ = projected(own, by_start, damping)
+        step = jsl.solve_triangular(R, on_theta)
+        right = on_starts[..., p] - on_starts[..., :p] @ step
+        steps = jax.vmap(jsl.solve_triangular)(R_x, right)
+        candidate = best.theta - step / units[0], best.starts - steps / units[1]
+        # What the linear model promises of a step. A damped one falls short, so it is
+        # a minimum only where one that is hardly damped promises nothing.
+        promise = jnp.sum(on_theta**2) + jnp.sum(on_starts[..., p] ** 2)
+        flat = promise <= small * best.cost
+        done = flat & (damping <= 1e-5) | (damping >= 1e9) | (best.cost < rounding)
+        return candidate, best, largest, damping, flat, done, count + 1
 
-        def damped(H):
-            size = jnp.diagonal(H, axis1=-2, axis2=-1)
-            size = jnp.maximum(size, 1e-8 * jnp.max(size, -1, keepdims=True) + 1e-30)
-            return H + damping * size[..., None] * jnp.eye(H.shape[-1], dtype=dtype)
-
-        H_tt = damped(jnp.einsum("kri,krj->ij", by_theta, by_theta))
-        H_xx = damped(jnp.einsum("kri,krj->kij", by_start, by_start))
-        H_xt = jnp.einsum("kri,krj->kij", by_start, by_theta)
-        g_t = jnp.einsum("kri,kr->i", by_theta, rest)
-        g_x = jnp.einsum("kri,kr->ki", by_start, rest)
-        inner = jax.vmap(_solved)(H_xx, jnp.concatenate([H_xt, g_x[..., None]], 2))
-        by_t, by_g = inner[..., :-1], inner[..., -1]
-        schur = H_tt - jnp.einsum("kij,kil->jl", H_xt, by_t)
-        right = g_t - jnp.einsum("kij,ki->j", H_xt, by_g)
-        step = _solved(schur, right[:, None])[:, 0]
-        new = theta - step, starts - (by_g - jnp.einsum("kij,j->ki", by_t, step))
-        new_cost = cost_of(*new)
-        better = new_cost < cost
-        fall = jnp.where(better, (cost - new_cost) / cost, jnp.inf)
-        theta, starts = jax.tree.map(
-            lambda a, b: jnp.where(better, a, b), new, (theta, starts)
-        )
-        damping = jnp.where(better, damping / 8, damping * 4)
-        cost = jnp.where(better, new_cost, cost)
-        return theta, starts, jnp.clip(damping, 1e-10, 1e10), cost, fall, count + 1
-
-    small = 1e-9 if dtype == jnp.float64 else 1e-5
-    scale = 100 * jnp.finfo(dtype).eps ** 2
+    eps = jnp.finfo(dtype).eps
+    small = 1e-9 if dtype == jnp.float64 else 1e-7
+    rounding = 100 * eps**2 * problem.observations.size
 
     def going(carry):
-        *_, damping, cost, fall, count = carry
-        done = (fall < small) | (damping >= 1e9) | (cost < scale * rest_size)
-        return ~done & (count < max_steps)
+        *_, done, count = carry
+        return ~done & (count <= max_steps)
 
-    rest_size = problem.observations.size
-    first = cost_of(flat, starts)
-    damping, fall = jnp.asarray(1e-2, dtype), jnp.asarray(jnp.inf, dtype)
-    carry = (flat, starts, damping, first, fall, jnp.zeros((), int))
-    theta, starts, _, cost, _, count = lax.while_loop(going, body, carry)
-    solver = choose(
-        count < max_steps,
-        choose(jnp.isfinite(cost), RESULTS.successful, RESULTS.diverged),
-        RESULTS.not_converged,
-    )
+    rows = problem.observations[0].size
+    zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
+    slopes = zeros(len(starts), rows, p), zeros(len(starts), rows, starts.shape[1])
+    point = _Point(flat, starts, *slopes, zeros(len(starts), rows), zeros() + jnp.inf)
+    none = zeros(p), zeros(*starts.shape)
+    no = jnp.array(False)
+    carry = (flat, starts), point, none, zeros() + 8e-3, no, no, jnp.zeros((), int)
+    _, best, _, _, _, _, count = lax.while_loop(going, body, carry)
 
-    (by_theta, by_start), rest = sensitivity(theta, starts, data)
+    theta, starts, rest, cost = best.theta, best.starts, best.rest, best.cost
+    own, by_start, _, units = scaled(best, none)
+    # What the states at the beginnings could explain as well tells nothing.
+    _, on_starts, _, on_theta, own = projected(own, by_start, eps)
     free = jnp.sum(problem.counts) * problem.observations.shape[2] - p - starts.size
     free = jnp.maximum(free, 1)
     sigma = jnp.sqrt(jnp.sum(rest**2) / free)
     each = jnp.sum(rest.reshape(problem.observations.shape) ** 2, axis=(0, 1))
     noise = problem.noise * jnp.sqrt(each * problem.observations.shape[2] / free)
     values = unravel(theta)
-    # What the states at the beginnings could explain as well tells nothing.
-    basis, _ = jnp.linalg.qr(by_start)
-    own = by_theta - basis @ (jnp.swapaxes(basis, 1, 2) @ by_theta)
-    slope = own.reshape(-1, p) * _per_relative(assembly, values)
     # No more certain than the noise that was given, or than rounding lets it be.
-    certainty = Certainty.of(slope, jnp.maximum(sigma, 1), 1.0)
+    sigma = jnp.maximum(sigma, 1)
+    slope = own[:, :p] * units[0] * _per_relative(assembly, values)
+    certainty = Certainty.of(slope, sigma, 1.0)
+    off = jnp.linalg.norm(on_starts[..., p], axis=1), jnp.linalg.norm(on_theta)
+    settled = jnp.maximum(jnp.max(off[0]), off[1]) <= _NEAR * sigma
+    stopped = choose(count <= max_steps, RESULTS.no_descent, RESULTS.not_converged)
+    stopped = choose(settled, RESULTS.successful, stopped)
+    solver = choose(jnp.isfinite(cost), stopped, RESULTS.diverged)
     legal = _flat_legal(assembly, values)
     noise = noise.astype(dtype)
     return _Solution(values, starts, legal, certainty, noise, solver)
 
 
-def _solved(H, right):
-    """The solution of a positive definite system."""
-    operator = lx.MatrixLinearOperator(H, lx.positive_semidefinite_tag)
-    solver = lx.Cholesky()
-    one = lambda b: lx.linear_solve(operator, b, solver, throw=False).value  # noqa: E731
-    return jax.vmap(one, in_axes=1, out_axes=1)(right)
+def _eliminate(A, B, damping):
+    """Least squares `min |A z - b|^2 + damping |z|^2` for the columns b of B.
+
+    `(R, C, left)`: `R z = C`, and what is left of B, with a row more for each z.
+    """
+    n = A.shape[1]
+    A = jnp.concatenate([A, jnp.sqrt(damping) * jnp.eye(n, dtype=A.dtype)])
+    B = jnp.concatenate([B, jnp.zeros((n, B.shape[1]), B.dtype)])
+    Q, R = jnp.linalg.qr(A)
+    C = Q.T @ B
+    return R, C, B - Q @ C
 
 
 def _flat_legal(assembly, values):
