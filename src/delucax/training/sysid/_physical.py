@@ -11,17 +11,21 @@ import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array
 
-from ..._check import as_vector, check_bool, check_count, check_positive
+from ..._check import as_vector, check_bool, check_count, check_positive, is_concrete
 from ..._fields import as_float_array
 from ..._results import choose, Result, RESULTS
 from ...dynamics import AbstractDynamics, open_loop
 from .._trainable import take_apart
-from ._identified import Certainty, Identified, outcome, quantile, raised
+from ._identified import Certainty, Identified, quantile
 from ._linear import runs_of
 
 
 _NEAR = 0.05
 """The standard deviations from the minimum within which a fit has converged."""
+
+_SHORT = 2
+"""The steps of a window in which not even a wild model grows much."""
+
 
 def physical(
     dynamics: AbstractDynamics,
@@ -44,9 +48,16 @@ def physical(
 
     Levenberg and Marquardt's method. The states at the beginning of each window are
     estimated with the parameters, so that noise in what was observed does no harm, and
-    a window is short enough that small errors do not grow beyond measure. What has a
-    constraint is moved in its unconstrained value, as in [`delucax.training.fit`][],
-    and its interval is within the legal set.
+    a window is short enough that small errors do not grow beyond measure. Steps are
+    scaled by the sensitivities, so that parameters of any size can be estimated
+    together. What has a constraint is moved in its unconstrained value, as in
+    [`delucax.training.fit`][], and its interval is within the legal set.
+
+    Where the states are observed and the fit does not converge, it starts once more,
+    from a fit on windows of two steps. It has converged where no step of the linear
+    model is longer than a twentieth of what the noise makes the estimate vary; if it
+    has not, `result` says so, and there are no intervals. A better first guess, a
+    shorter window or smaller steps of the integrator may help then.
 
     **Arguments:**
 
@@ -69,12 +80,13 @@ def physical(
         (default); if false, look at `result`.
 
     **Returns:** [`delucax.training.sysid.Identified`][]; its `model` is the dynamics
-    with the parameters found, and its directions are those of relative changes.
+    with the estimated parameters, its directions are those of relative changes, and its
+    `x0` is the estimated state at the beginning of the run, or of each run.
 
     **Raises:** `ValueError` on arrays of the wrong shape or kind, or if there is no
     such parameter; an error at run time as `throw` says.
 
-    Source: Bock, 1983 (multiple shooting); Ljung, 1999.
+    Source: Bock, 1983 (multiple shooting); Moré, 1978 (scaling); Ljung, 1999.
 
     !!! example
 
@@ -98,6 +110,7 @@ def physical(
             f"{where}: dynamics must be an AbstractDynamics, got "
             f"{type(dynamics).__name__}."
         )
+    is_batch = jnp.ndim(as_float_array(controls)) == 3
     observations, controls = runs_of(observations, controls, "observations", where)
     size, n = dynamics.observation_size, dynamics.state_size
     if observations.shape[2] != size or controls.shape[2] != dynamics.control_size:
@@ -114,59 +127,47 @@ def physical(
     if noise is not None:
         check_positive(noise, "noise", where)
         noise = jnp.broadcast_to(as_float_array(noise), (size,))
-    count = steps // window
-    if x0 is None:
-        if size != n:
-            raise ValueError(
-                f"{where}: x0 must be given where the state (of size {n}) is not what "
-                f"is observed (of size {size})."
-            )
-        guesses = observations[:, : count * window : window]
-    else:
+    if x0 is not None:
         x0 = as_vector(x0, n, "x0", where)
-        run = jax.vmap(lambda u: open_loop(dynamics, x0, u))
-        guesses = run(controls)[:, : count * window : window]
-    guesses = guesses.reshape(runs * count, n)
-    stop = count * window
-    inputs = controls[:, :stop].reshape(runs * count, window, -1)
-    index = np.arange(count)[:, None] * window + np.arange(window + 1)
-    seen = observations[:, index].reshape(runs * count, window + 1, size)
-    begins = np.tile(np.arange(count) * window, runs)
-    # The observation where a window ends and the next begins counts once.
-    counts = np.ones((count, window + 1), bool)
-    counts[:-1, -1] = False
-    counts = np.tile(counts, (runs, 1))
-    if noise is None:
-        # An output that never moves has a spread of rounding.
-        spread, size_seen = jnp.std(seen, axis=(0, 1)), jnp.max(jnp.abs(seen), (0, 1))
-        moves = spread > 1e3 * float(jnp.finfo(seen.dtype).eps) * size_seen
-        first = jnp.where(moves, spread, jnp.where(size_seen > 0, size_seen, 1))
+        guesses = jax.vmap(lambda u: open_loop(dynamics, x0, u))(controls)
+        guesses = guesses.astype(observations.dtype)
+    elif size == n:
+        guesses = observations
     else:
-        first = noise
-
+        raise ValueError(
+            f"{where}: x0 must be given where the state (of size {n}) is not what is "
+            f"observed (of size {size})."
+        )
     assembly, values = take_apart(dynamics, parameters, where)
     names = [
         path + (f"[{','.join(map(str, index))}]" if index else "")
         for path, value in sorted(values.items())
         for index in np.ndindex(value.shape)
     ]
-    problem = _Problem(begins, inputs, seen, counts, first)
-    starts = guesses.astype(seen.dtype)
-    solved = _solve(assembly, values, starts, problem, max_steps)
-    if noise is None:
+
+    def fit(values, window):
+        starts, problem, first = _windows(guesses, observations, controls, window)
+        problem = problem._replace(noise=first if noise is None else noise)
+        solved = _solve(assembly, values, starts, problem, max_steps)
+        if noise is not None:
+            return solved
         # Data without noise leave rounding alone, that of a whole window.
-        eps = float(jnp.finfo(seen.dtype).eps)
-        problem = problem._replace(noise=jnp.maximum(solved.noise, 1e3 * eps * first))
-        again = solved.values, solved.starts, problem, max_steps
-        solved = _solve(assembly, *again)
+        floor = 1e3 * float(jnp.finfo(first.dtype).eps) * first
+        problem = problem._replace(noise=jnp.maximum(solved.noise, floor))
+        return _solve(assembly, solved.values, solved.starts, problem, max_steps)
+
+    count = steps // window
+    unknown = len(names) + runs * count * n
+    few = size * runs * (count * window + 1) <= unknown
+    solved = fit(values, window)
+    if x0 is None and not few and window > _SHORT and _has_failed(solved):
+        # On short windows nothing grows, so that a worse guess does.
+        again = fit(fit(values, _SHORT).values, window)
+        solved = solved if _has_failed(again) else again
     values, legal, certainty = solved.values, solved.legal, solved.certainty
     std = certainty.std
     ends = [_ends(assembly, values, sign * reach * std) for sign in (-1, 1)]
-    finite = jnp.all(jnp.isfinite(legal))
-    few = size * int(np.sum(counts)) <= len(names) + guesses.size
-    known = certainty.identifiable & (not few)
-    # Where many values fit as well the iteration wanders: the data are to be blamed.
-    solver = RESULTS.successful if few else solved.result
+    starts = solved.starts.reshape(runs, count, n)[:, 0]
     found = Identified(
         model=assembly(values),
         names=tuple(names),
@@ -176,11 +177,42 @@ def physical(
         high=jnp.maximum(*ends),
         directions=certainty.directions,
         spread=certainty.spread,
-        identifiable=known,
+        identifiable=certainty.identifiable & (not few),
         noise=solved.noise,
-        result=outcome(known, solver, finite),
+        x0=starts if is_batch else starts[0],
+        # Where many values fit as well the iteration wanders: the data are to be
+        # blamed.
+        result=RESULTS.successful if few else solved.result,
     )
-    return raised(found, throw)
+    return found.checked(throw)
+
+
+def _has_failed(solved):
+    """Whether it is known now that the iteration did not converge."""
+    cost = solved.cost
+    return is_concrete(cost) and bool(solved.result != RESULTS.successful)
+
+
+def _windows(guesses, observations, controls, window):
+    """`(starts, problem, spread of each output)`, cut into windows."""
+    runs, steps, _ = controls.shape
+    n, size = guesses.shape[2], observations.shape[2]
+    count = steps // window
+    stop = count * window
+    starts = guesses[:, :stop:window].reshape(runs * count, n)
+    inputs = controls[:, :stop].reshape(runs * count, window, -1)
+    index = np.arange(count)[:, None] * window + np.arange(window + 1)
+    seen = observations[:, index].reshape(runs * count, window + 1, size)
+    begins = np.tile(np.arange(count) * window, runs)
+    # The observation where a window ends and the next begins counts once.
+    counts = np.ones((count, window + 1), bool)
+    counts[:-1, -1] = False
+    counts = np.tile(counts, (runs, 1))
+    # An output that never moves has a spread of rounding.
+    spread, largest = jnp.std(seen, axis=(0, 1)), jnp.max(jnp.abs(seen), (0, 1))
+    moves = spread > 1e3 * float(jnp.finfo(seen.dtype).eps) * largest
+    spread = jnp.where(moves, spread, jnp.where(largest > 0, largest, 1))
+    return starts, _Problem(begins, inputs, seen, counts, spread), spread
 
 
 class _Problem(NamedTuple):
@@ -207,6 +239,7 @@ class _Point(NamedTuple):
 class _Solution(NamedTuple):
     values: Any
     starts: Array
+    cost: Array
     legal: Array
     certainty: Certainty
     noise: Array
@@ -325,8 +358,8 @@ def _solve(assembly, values, starts, problem, max_steps):
     stopped = choose(settled, RESULTS.successful, stopped)
     solver = choose(jnp.isfinite(cost), stopped, RESULTS.diverged)
     legal = _flat_legal(assembly, values)
-    noise = noise.astype(dtype)
-    return _Solution(values, starts, legal, certainty, noise, solver)
+    noise = jnp.where(jnp.isfinite(cost), noise, jnp.nan).astype(dtype)
+    return _Solution(values, starts, cost, legal, certainty, noise, solver)
 
 
 def _eliminate(A, B, damping):
