@@ -23,6 +23,9 @@ from ._linear import runs_of
 _NEAR = 0.05
 """The standard deviations from the minimum within which a fit has converged."""
 
+_CORRELATED = 4.0
+"""The standard deviations by which white noise hardly ever seems correlated."""
+
 _SHORT = 2
 """The steps of a window in which not even a wild model grows much."""
 
@@ -53,8 +56,9 @@ def physical(
     together. What has a constraint is moved in its unconstrained value, as in
     [`delucax.training.fit`][], and its interval is within the legal set.
 
-    Where the states are observed and the fit does not converge, it starts once more,
-    from a fit on windows of two steps. It has converged where no step of the linear
+    Where the states are observed, and the fit does not converge or what remains of the
+    data is correlated from step to step, it starts once more, from a fit on windows of
+    two steps. It has converged where no step of the linear
     model is longer than a twentieth of what the noise makes the estimate vary; if it
     has not, `result` says so, and there are no intervals. A better first guess, a
     shorter window or smaller steps of the integrator may help then.
@@ -160,10 +164,14 @@ def physical(
     unknown = len(names) + runs * count * n
     few = size * runs * (count * window + 1) <= unknown
     solved = fit(values, window)
-    if x0 is None and not few and window > _SHORT and _has_failed(solved):
-        # On short windows nothing grows, so that a worse guess does.
+    if x0 is None and not few and window > _SHORT and _is_doubtful(solved):
+        # On short windows nothing grows, so that a worse guess does, and there are
+        # fewer minima that are not the least.
         again = fit(fit(values, _SHORT).values, window)
-        solved = solved if _has_failed(again) else again
+        failed = solved.result != RESULTS.successful
+        if again.result == RESULTS.successful:
+            if failed or jnp.prod(again.noise) < jnp.prod(solved.noise):
+                solved = again
     values, legal, certainty = solved.values, solved.legal, solved.certainty
     std = certainty.std
     ends = [_ends(assembly, values, sign * reach * std) for sign in (-1, 1)]
@@ -187,10 +195,13 @@ def physical(
     return found.checked(throw)
 
 
-def _has_failed(solved):
-    """Whether it is known now that the iteration did not converge."""
-    cost = solved.cost
-    return is_concrete(cost) and bool(solved.result != RESULTS.successful)
+def _is_doubtful(solved):
+    """Whether it is known now that the iteration did not converge, or that it ended
+    where what remains is correlated from step to step, as the noise is not."""
+    if not is_concrete(solved.cost):
+        return False
+    failed = solved.result != RESULTS.successful
+    return bool(failed | (solved.correlation > _CORRELATED))
 
 
 def _windows(guesses, observations, controls, window):
@@ -243,6 +254,7 @@ class _Solution(NamedTuple):
     legal: Array
     certainty: Certainty
     noise: Array
+    correlation: Array
     result: Result
 
 
@@ -345,7 +357,12 @@ def _solve(assembly, values, starts, problem, max_steps):
     free = jnp.sum(problem.counts) * problem.observations.shape[2] - p - starts.size
     free = jnp.maximum(free, 1)
     sigma = jnp.sqrt(jnp.sum(rest**2) / free)
-    each = jnp.sum(rest.reshape(problem.observations.shape) ** 2, axis=(0, 1))
+    rest = rest.reshape(problem.observations.shape)
+    each = jnp.sum(rest**2, axis=(0, 1))
+    paired = jnp.sum(rest[:, 1:] * rest[:, :-1], axis=(0, 1))
+    correlation = jnp.sqrt(jnp.sum(problem.counts)) * jnp.max(paired / each)
+    # Rounding is correlated as it likes.
+    correlation = jnp.where(sigma < 0.5, 0, correlation)
     noise = problem.noise * jnp.sqrt(each * problem.observations.shape[2] / free)
     values = unravel(theta)
     # No more certain than the noise that was given, or than rounding lets it be.
@@ -359,7 +376,7 @@ def _solve(assembly, values, starts, problem, max_steps):
     solver = choose(jnp.isfinite(cost), stopped, RESULTS.diverged)
     legal = _flat_legal(assembly, values)
     noise = jnp.where(jnp.isfinite(cost), noise, jnp.nan).astype(dtype)
-    return _Solution(values, starts, cost, legal, certainty, noise, solver)
+    return _Solution(values, starts, cost, legal, certainty, noise, correlation, solver)
 
 
 def _eliminate(A, B, damping):
