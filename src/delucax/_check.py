@@ -19,6 +19,17 @@ def is_concrete(x: Any) -> bool:
     return not isinstance(x, Tracer)
 
 
+def shortened(value: Any, most: int = 100) -> str:
+    """What an error message says of a value: its repr, if that is short."""
+    if type(value).__module__.split(".")[0] in ("pandas", "polars", "xarray"):
+        kind = type(value).__name__
+        return f"a {kind} of shape {value.shape}; `.to_numpy()` makes it an array"
+    text = repr(value)
+    if len(text) <= most and "\n" not in text:
+        return text
+    return f"a {type(value).__name__}: {' '.join(text[:most].split())} ..."
+
+
 def check_key(key: Any, where: str) -> Any:
     """`key`, if it is one random key, or an error."""
     if eqx.is_array(key):

@@ -52,6 +52,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "No step lowered the cost, although the gradient is not zero: the problem may "
         "not be smooth there, or the tolerance may be below rounding."
     )
+    no_equilibrium = (
+        "There is no equilibrium near the guess: the least residual there is not zero. "
+        "Fix fewer states and controls, or start from another guess."
+    )
     infeasible = (
         "The problem has no solution: the cost has no unique minimum over the control, "
         "the constraints cannot all hold, or gamma is below the least level that any "
