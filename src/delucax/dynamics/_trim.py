@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from .._check import check_bool, check_number, shortened
+from .._check import check_bool, check_number
+from .._message import shortened
 from .._results import choose, Result, RESULTS
 from .._typing import RealScalar
 from ..systems import AbstractSystem

@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from ..._check import check_bool, check_count, check_finite, check_step
 from ..._fields import as_float_array
+from ..._message import shortened
 from ..._results import RESULTS
 from ...dynamics import LinearDynamics
 from ._identified import Certainty, Identified, quantile
@@ -168,7 +169,7 @@ def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, 
     outputs, controls = as_float_array(outputs), as_float_array(controls)
     for what, array in ((name, outputs), ("controls", controls)):
         if not eqx.is_inexact_array(array) or array.ndim not in (2, 3):
-            got = f"shape {array.shape}" if eqx.is_array(array) else repr(array)
+            got = f"shape {array.shape}" if eqx.is_array(array) else shortened(array)
             raise ValueError(
                 f"{where}: {what} must have shape (steps, size) or (runs, steps, "
                 f"size), got {got}."
