@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from .._check import as_vector, check_count, check_finite, check_key, is_concrete
 from .._controller import AbstractController
-from .._results import choose, first_failure, promote, RESULTS
+from .._results import choose, first_failure, RESULTS
 from .._typing import PRNGKey
 from ..dynamics._solvers import (
     check_adaptive,
@@ -18,6 +18,7 @@ from ..dynamics._solvers import (
     check_stepsize_controller,
     for_fixed_steps,
     loud,
+    outcome,
 )
 from ..systems import AbstractSystem
 from ._hold import (
@@ -370,7 +371,7 @@ def _simulate(
         final_cost=jnp.zeros((), dtype),
         total_cost=jnp.zeros((), dtype),
         length=jnp.asarray(count - 1),
-        result=first_failure(promote(solution.result), diverged),
+        result=first_failure(outcome(solution, stepsize_controller, dtype), diverged),
         dt=spacing,
         recorded_times=times,
         recorded_observations=sensor,
