@@ -115,28 +115,21 @@ class Identified(eqx.Module):
             lines.append("all directions are identifiable")
         return "\n".join(lines)
 
-    def checked(self, throw: bool) -> "Identified":
-        """Without intervals where the solver failed, and with what became of it all.
 
-        **Arguments:** `throw`: whether a failure raises.
-
-        **Returns:** the same, with its final `result`.
-        """
-        finite = jnp.all(jnp.isfinite(self.estimate))
-        diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
-        solver = first_failure(promote(self.result), diverged)
-        solved = solver == RESULTS.successful
-        known = self.identifiable & solved
-        excited = choose(jnp.all(known), RESULTS.successful, RESULTS.unexciting)
-        result = first_failure(solver, excited)
-        doubtful = lambda s: [s.std, s.low, s.high, s.spread]  # noqa: E731
-        certain = [jnp.where(solved, a, jnp.nan) for a in doubtful(self)]
-        found = eqx.tree_at(doubtful, self, certain)
-        pick = lambda s: [s.identifiable, s.result]  # noqa: E731
-        found = eqx.tree_at(pick, found, [known, result])
-        if not throw:
-            return found
-        return result.error_if(found, result != RESULTS.successful)
+def checked(fit: Identified, throw: bool) -> Identified:
+    """`fit` with what became of it all, and without intervals where the solver failed."""
+    finite = jnp.all(jnp.isfinite(fit.estimate))
+    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
+    solver = first_failure(promote(fit.result), diverged)
+    solved = solver == RESULTS.successful
+    known = fit.identifiable & solved
+    excited = choose(jnp.all(known), RESULTS.successful, RESULTS.unexciting)
+    result = first_failure(solver, excited)
+    intervals = lambda fit: [fit.std, fit.low, fit.high, fit.spread]  # noqa: E731
+    certain = [jnp.where(solved, end, jnp.nan) for end in intervals(fit)]
+    fit = eqx.tree_at(intervals, fit, certain)
+    fit = eqx.tree_at(lambda fit: [fit.identifiable, fit.result], fit, [known, result])
+    return result.error_if(fit, result != RESULTS.successful) if throw else fit
 
 
 class Certainty(eqx.Module):

@@ -13,7 +13,7 @@ from ..._fields import as_float_array
 from ..._message import shortened
 from ..._results import RESULTS
 from ...dynamics import LinearDynamics
-from ._identified import Certainty, Identified, quantile
+from ._identified import Certainty, checked, Identified, quantile
 
 
 def linear(
@@ -80,7 +80,7 @@ def linear(
     A, B = found[:, :n], found[:, n : n + m]
     x_next = found[:, -1] if affine else None
     model = LinearDynamics(A, B, dt=dt, x_next=x_next)
-    return _identified(model, names, fit, reach).checked(throw)
+    return checked(_identified(model, names, fit, reach), throw)
 
 
 def arx(
@@ -161,7 +161,7 @@ def arx(
     targets = outputs[:, first:].reshape(-1, p)
     fit = _least_squares(regressors, targets)
     model = _realised(fit[0], p, m, a, b, delay, dt)
-    return _identified(model, names, fit, reach).checked(throw)
+    return checked(_identified(model, names, fit, reach), throw)
 
 
 def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from ..._fields import as_float_array
 from ..._results import choose, Result, RESULTS
 from ...dynamics import AbstractDynamics, open_loop
 from .._trainable import take_apart
-from ._identified import Certainty, Identified, quantile
+from ._identified import Certainty, checked, Identified, quantile
 from ._linear import runs_of
 
 
@@ -176,7 +176,7 @@ def physical(
     std = certainty.std
     ends = [_ends(assembly, values, sign * reach * std) for sign in (-1, 1)]
     starts = solved.starts.reshape(runs, count, n)[:, 0]
-    found = Identified(
+    fitted = Identified(
         model=assembly(values),
         names=tuple(names),
         estimate=legal,
@@ -192,7 +192,7 @@ def physical(
         # blamed.
         result=RESULTS.successful if few else solved.result,
     )
-    return found.checked(throw)
+    return checked(fitted, throw)
 
 
 def _is_doubtful(solved):
