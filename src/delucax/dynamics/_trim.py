@@ -35,6 +35,16 @@ class OperatingPoint(eqx.Module):
         dynamics; zero up to rounding where the result is a success.
     - `result`: success; `RESULTS.no_equilibrium` if the residual has a minimum that is
         not zero; `RESULTS.not_converged` or `RESULTS.diverged`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        pendulum = dlx.systems.Pendulum()
+        point = dlx.trim(pendulum, x=[0.3, 0.0], u=[1.0], fix="angle", throw=False)
+        point.u, point.residual, dlx.RESULTS[point.result]
+        ```
     """
 
     x: Float[Array, " n"]

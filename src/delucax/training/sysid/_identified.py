@@ -117,7 +117,7 @@ class Identified(eqx.Module):
 
 
 def checked(fit: Identified, throw: bool) -> Identified:
-    """`fit` with what became of it all, and without intervals where the solver failed."""
+    """`fit` with its final result, and without intervals where the solver failed."""
     finite = jnp.all(jnp.isfinite(fit.estimate))
     diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
     solver = first_failure(promote(fit.result), diverged)
