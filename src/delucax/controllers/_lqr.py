@@ -47,7 +47,9 @@ class LQR(AbstractController):
     **Arguments:**
 
     - `dynamics`: time-invariant linear dynamics whose operating point is an equilibrium
-        and whose state is observed; of [`delucax.linearize`][], for example.
+        and whose state is observed; of [`delucax.linearize`][], for example, at a point
+        of [`delucax.trim`][]. It is one if what moves the state there is below 1e-4 of
+        the terms that do.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `S`: cross weight, shape `(n, m)`; zero by default.

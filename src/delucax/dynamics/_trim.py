@@ -197,14 +197,14 @@ def _solve(model: Any, t: Array, guess: Array, free: tuple[int, ...]):
     and where J has not full rank.
     """
     n = model.state_size
-    free = jnp.array(free)
+    moves = jnp.array(free)
     eps = jnp.finfo(guess.dtype).eps
     terms = jnp.abs(jax.jacfwd(_drift, 2)(model, t, guess)) @ (jnp.abs(guess) + 1)
     terms = jnp.where(terms > 0, terms, 1)
     args = model, t, guess, terms
 
     def at(z, guess):
-        return guess.at[free].add((jnp.abs(guess[free]) + 1) * z)
+        return guess.at[moves].add((jnp.abs(guess[moves]) + 1) * z)
 
     def residual(z, args):
         model, t, guess, terms = args
@@ -218,7 +218,7 @@ def _solve(model: Any, t: Array, guess: Array, free: tuple[int, ...]):
 
     arrays, rest = eqx.partition(args, eqx.is_array)
     tol = float(1e3 * eps)
-    start = jnp.zeros(free.size, guess.dtype)
+    start = jnp.zeros(len(free), guess.dtype)
     near = optx.least_squares(
         residual,
         optx.LevenbergMarquardt(tol, tol),

@@ -312,13 +312,13 @@ def _solve(assembly, values, starts, problem, max_steps):
         return R_x, on_starts, R, on_theta[:, 0], own
 
     def body(carry):
-        candidate, best, largest, damping, flat, _, count = carry
+        candidate, best, largest, damping, at_minimum, _, count = carry
         slopes, rest = sensitivity(*candidate, data)
         cost = jnp.sum(rest**2)
         better = cost < best.cost
-        here = _Point(*candidate, *slopes, rest, cost)
+        here = _Point(*candidate, *slopes, rest=rest, cost=cost)
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
-        damping = jnp.where(better | flat, damping / 8, damping * 4)
+        damping = jnp.where(better | at_minimum, damping / 8, damping * 4)
         damping = jnp.clip(damping, 1e-10, 1e10)
         own, by_start, largest, units = scaled(best, largest)
         R_x, on_starts, R, on_theta, _ = projected(own, by_start, damping)
@@ -329,9 +329,11 @@ def _solve(assembly, values, starts, problem, max_steps):
         # What the linear model promises of a step. A damped one falls short, so it is
         # a minimum only where one that is hardly damped promises nothing.
         promise = jnp.sum(on_theta**2) + jnp.sum(on_starts[..., p] ** 2)
-        flat = promise <= small * best.cost
-        done = flat & (damping <= 1e-5) | (damping >= 1e9) | (best.cost < rounding)
-        return candidate, best, largest, damping, flat, done, count + 1
+        at_minimum = promise <= small * best.cost
+        done = (
+            at_minimum & (damping <= 1e-5) | (damping >= 1e9) | (best.cost < rounding)
+        )
+        return candidate, best, largest, damping, at_minimum, done, count + 1
 
     eps = jnp.finfo(dtype).eps
     small = 1e-9 if dtype == jnp.float64 else 1e-7
@@ -343,8 +345,14 @@ def _solve(assembly, values, starts, problem, max_steps):
 
     rows = problem.observations[0].size
     zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
-    slopes = zeros(len(starts), rows, p), zeros(len(starts), rows, starts.shape[1])
-    point = _Point(flat, starts, *slopes, zeros(len(starts), rows), zeros() + jnp.inf)
+    point = _Point(
+        theta=flat,
+        starts=starts,
+        by_theta=zeros(len(starts), rows, p),
+        by_start=zeros(len(starts), rows, starts.shape[1]),
+        rest=zeros(len(starts), rows),
+        cost=zeros() + jnp.inf,
+    )
     none = zeros(p), zeros(*starts.shape)
     no = jnp.array(False)
     carry = (flat, starts), point, none, zeros() + 8e-3, no, no, jnp.zeros((), int)
