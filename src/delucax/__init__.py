@@ -39,6 +39,7 @@ from .dynamics import (
     LinearDynamics as LinearDynamics,
     linearize as linearize,
     open_loop as open_loop,
+    trim as trim,
 )
 from .environments import (
     Environment as Environment,

@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from ._fields import as_float_array
+from ._message import shortened
 
 
 def is_concrete(x: Any) -> bool:
@@ -28,7 +29,7 @@ def check_key(key: Any, where: str) -> Any:
             return key
         got = f"an array of shape {key.shape} and dtype {key.dtype}"
     else:
-        got = repr(key)
+        got = shortened(key)
     raise ValueError(
         f"{where}: key must be one random key such as jax.random.key(0), got {got}."
     )
@@ -38,7 +39,7 @@ def as_vector(value: Any, size: int, name: str, where: str) -> Array:
     """`value` as a real floating-point vector of `size` entries, or an error."""
     array = as_float_array(value)
     if not eqx.is_inexact_array(array) or array.shape != (size,):
-        got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
         raise ValueError(f"{where}: {name} must have shape ({size},), got {got}.")
     check_real(array, name, where)
     return array
@@ -53,7 +54,9 @@ def check_real(array: Array, name: str, where: str) -> None:
 def as_path(value: Any, name: str, where: str) -> Path:
     """`value` as a path, or an error."""
     if not isinstance(value, str | os.PathLike):
-        raise ValueError(f"{where}: {name} must be the path of a file, got {value!r}.")
+        raise ValueError(
+            f"{where}: {name} must be the path of a file, got {shortened(value)}."
+        )
     return Path(value)
 
 
@@ -61,7 +64,7 @@ def as_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
     """`value` as a floating-point array of `ndim` axes with finite entries."""
     array = as_float_array(value)
     if not eqx.is_inexact_array(array) or array.ndim != ndim:
-        got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
         raise ValueError(f"{where}: {name} must be a matrix, got {got}.")
     check_finite(array, name, where)
     return array
@@ -80,7 +83,9 @@ def symmetric_matrix(value: Any, name: str, where: str) -> Array:
         scale = np.max(np.abs(array), initial=0.0)
         slack = 100 * np.finfo(array.dtype).eps * scale
         if np.max(np.abs(array - array.T), initial=0.0) > slack:
-            raise ValueError(f"{where}: {name} must be symmetric, got {array}.")
+            raise ValueError(
+                f"{where}: {name} must be symmetric, got {shortened(array)}."
+            )
     return (matrix + matrix.T) / 2
 
 
@@ -91,12 +96,15 @@ def as_bounds(
     if value is None:
         return None
     if not isinstance(value, tuple | list) or len(value) != 2:
-        raise ValueError(f"{where}: {name} must be a pair (low, high), got {value!r}.")
+        raise ValueError(
+            f"{where}: {name} must be a pair (low, high), got {shortened(value)}."
+        )
     low, high = (as_float_array(end) for end in value)
     fit = all(eqx.is_inexact_array(end) and end.ndim <= 1 for end in (low, high))
     if not fit or low.ndim == high.ndim == 1 and low.shape != high.shape:
         raise ValueError(
-            f"{where}: {name} must be numbers or vectors of one size, got {value!r}."
+            f"{where}: {name} must be numbers or vectors of one size, "
+            f"got {shortened(value)}."
         )
     if is_concrete(low) and is_concrete(high):
         if not np.all(np.asarray(low) <= np.asarray(high)):
@@ -110,18 +118,19 @@ def check_finite(array: Any, name: str, where: str) -> None:
     """Raise if a concrete `array` holds NaN or infinity."""
     if eqx.is_inexact_array(array) and is_concrete(array):
         if not np.all(np.isfinite(np.asarray(array))):
-            raise ValueError(f"{where}: {name} must be finite, got {array}.")
+            raise ValueError(f"{where}: {name} must be finite, got {shortened(array)}.")
 
 
 def check_positive(value: Any, name: str, where: str) -> None:
     """Raise unless a number is finite and above zero, as far as can be seen."""
-    array, got = as_float_array(value), repr(value)
+    array, got = as_float_array(value), shortened(value)
     if eqx.is_inexact_array(array):
         if not is_concrete(array):
             return
-        got = np.asarray(array)
-        if np.all(np.isfinite(got)) and np.all(got > 0):
+        at = np.asarray(array)
+        if np.all(np.isfinite(at)) and np.all(at > 0):
             return
+        got = shortened(at)
     raise ValueError(f"{where}: {name} must be positive and finite, got {got}.")
 
 
@@ -136,7 +145,7 @@ def check_number(value: Any, name: str, where: str) -> None:
     """Raise unless `value` is one finite real number, as far as can be seen."""
     array = as_float_array(value)
     if not eqx.is_inexact_array(array) or array.shape != ():
-        got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
         raise ValueError(f"{where}: {name} must be a number, got {got}.")
     check_real(array, name, where)
     check_finite(array, name, where)
@@ -146,13 +155,14 @@ def check_range(
     value: Any, name: str, where: str, low: Any = 0, high: float | int = np.inf
 ) -> None:
     """Raise unless numbers lie between `low` and `high`, as far as can be seen."""
-    array, least, got = as_float_array(value), as_float_array(low), repr(value)
+    array, least, got = as_float_array(value), as_float_array(low), shortened(value)
     if eqx.is_inexact_array(array) and eqx.is_inexact_array(least):
         if not (is_concrete(array) and is_concrete(least)):
             return
-        got = np.asarray(array)
-        if np.all((got >= np.asarray(least)) & (got <= high)):
+        at = np.asarray(array)
+        if np.all((at >= np.asarray(least)) & (at <= high)):
             return
+        got = shortened(at)
     ends = f"at least {low}" if high == np.inf else f"between {low} and {high}"
     raise ValueError(f"{where}: {name} must be {ends}, got {got}.")
 
@@ -160,7 +170,9 @@ def check_range(
 def check_bool(value: Any, name: str, where: str) -> bool:
     """`value`, if it is True or False, or an error."""
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{where}: {name} must be True or False, got {value!r}.")
+        raise ValueError(
+            f"{where}: {name} must be True or False, got {shortened(value)}."
+        )
     return bool(value)
 
 
@@ -170,6 +182,6 @@ def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
     if not whole or value < least:
         raise ValueError(
             f"{where}: {name} must be a whole number of at least {least}, got "
-            f"{value!r}."
+            f"{shortened(value)}."
         )
     return int(value)

@@ -12,6 +12,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from ._message import shortened
+
 
 _ROLE = "delucax_role"
 _CONSTRAINT = "delucax_constraint"
@@ -309,7 +311,7 @@ def check_parameters(module: eqx.Module) -> None:
             if function is not None and not callable(function):
                 raise ValueError(
                     f"{type(module).__name__}: {field.name} must be a function, got "
-                    f"{function!r}."
+                    f"{shortened(function)}."
                 )
             inner = getattr(function, "function", function)
             if isinstance(function, StaticFunction) and isinstance(inner, type):
@@ -332,11 +334,13 @@ def check_parameters(module: eqx.Module) -> None:
             # Inside a network there may be anything.
             bare = leaf is value or field.metadata[_ROLE] == "parameter"
             if bare and not (callable(leaf) or eqx.is_inexact_array(leaf)):
-                raise ValueError(f"{name} must be a number or an array, got {leaf!r}.")
+                raise ValueError(
+                    f"{name} must be a number or an array, got {shortened(leaf)}."
+                )
             if isinstance(leaf, Tracer) or not eqx.is_inexact_array(leaf):
                 continue
             leaf = np.asarray(leaf)
             if not np.all(np.isfinite(leaf)):
-                raise ValueError(f"{name} must be finite, got {leaf}.")
+                raise ValueError(f"{name} must be finite, got {shortened(leaf)}.")
             if constraint is not None and not np.all(constraint.holds(leaf)):
-                raise ValueError(f"{name} must be {constraint}, got {leaf}.")
+                raise ValueError(f"{name} must be {constraint}, got {shortened(leaf)}.")

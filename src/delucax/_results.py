@@ -21,6 +21,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The stages of an implicit solver were not solved: take more substeps or a "
         "smaller dt, or give its root finder other tolerances or more steps."
     )
+    beyond_precision = (
+        "The solver ran out of steps. Its rtol is below the precision of the state, so "
+        "more steps may not help: give a larger rtol, or compute in float64."
+    )
     not_stabilisable = (
         "The pair (A, B) is not stabilisable: no control moves some mode that does not "
         "decay, or so weakly that rounding of the data hides it."
@@ -59,6 +63,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     update_refused = (
         "An update of a learner was not finite and was not made: "
         "`trajectory.incident_counts` says how many were not."
+    )
+    no_equilibrium = (
+        "There is no equilibrium near the guess: the least residual there is not zero. "
+        "Fix fewer states and controls, or start from another guess."
     )
     infeasible = (
         "The problem has no solution: the cost has no unique minimum over the control, "

@@ -122,7 +122,8 @@ LONG = {
     controllers.MPC controllers.MPCState controllers.online_newton
     controllers.OutputFeedback controllers.regret controllers.run_filter
     controllers.Scheduled controllers.smooth controllers.Standardise
-    controllers.UnscentedKalmanFilter d2c Discretized dynamics.WorstCase
+    controllers.UnscentedKalmanFilter d2c Discretized dynamics.OperatingPoint
+    dynamics.WorstCase
     environments.cartpole environments.cartpole_linear experiments.reproduce
     experiments.train_swing_up lung.explore lung.fit_lungs lung.LearnedLung
     lung.least_error lung.pid_grid lung.ShootingMPC lung.train_controllers
@@ -133,6 +134,7 @@ LONG = {
     training.expected_cost training.fit training.PPO training.scored_cost
     training.SHAC training.sysid.arx training.sysid.Identified
     training.sysid.physical training.sysid.PredictionError training.worst_case
+    trim
     """.split()
 }
 """Examples that compile for long, beside those of whole packages that do."""

@@ -137,9 +137,9 @@ def test_wrong_arguments():
     with user_error(match="must be time-invariant, got matrices at 2 times"):
         LQR(varying, Q, R)
     LQR(varying.at(0.0), Q, R)
-    with user_error(match="must rest at their operating point.*x_next"):
+    with user_error(match=r"must rest at .*residual is 1.0e\+00.*delucax.trim"):
         LQR(dlx.LinearDynamics(A, B, x_ref=jnp.ones(2), x_next=jnp.zeros(2)), Q, R)
-    with user_error(match="must observe their state"):
+    with user_error(match="must observe their state.*use `delucax.controllers.LQG`"):
         LQR(dlx.LinearDynamics(A, B, jnp.array([[1.0, 0.0]])), Q, R)
     with user_error(match="must observe their state"):
         LQR(dlx.LinearDynamics(A, B, 2 * jnp.eye(2)), Q, R)
@@ -161,3 +161,34 @@ def test_traced_point_that_moves():
     gain(jnp.ones(2))
     with pytest.raises(eqx.EquinoxRuntimeError, match="rest at their operating point"):
         gain(jnp.zeros(2))
+
+
+def reactor(scale, dt, Tc):
+    """A stirred tank linearised at c = 0.5, T = 350, its state in any unit."""
+
+    def field(t, x, u, w):
+        c, T = x / scale
+        rate = 7.2e10 * jnp.exp(-8750 / T) * c
+        heat = 350 - T + 209.2 * rate + 2.092 * (u[0] - T)
+        return scale * jnp.stack([1 - c - rate, heat])
+
+    system = dlx.system(field, states=("c", "T"), controls=("Tc",))
+    x, u = scale * jnp.array([0.5, 350.0]), jnp.array([Tc])
+    return dlx.linearize(dlx.Discretized(system, dt, substeps=2), x=x, u=u)
+
+
+@pytest.mark.parametrize("dt", [0.05, 1e-3])
+@pytest.mark.parametrize("scale", [1.0, 1e3])
+def test_rest_is_relative_to_the_terms(dt, scale):
+    # As textbooks give it: what is left is two millionths of the terms.
+    regulators = (
+        lambda linear: dlx.controllers.LQR(linear, Q, R),
+        lambda linear: dlx.controllers.LQI(
+            linear, jnp.eye(3), R, output=jnp.array([[0.0, 1.0]])
+        ),
+        lambda linear: dlx.controllers.HInfinity(linear, Q, R, gamma=1e6),
+    )
+    for design in regulators if scale == 1 else regulators[:1]:
+        design(reactor(scale, dt, 300.0))
+        with user_error(match="must rest at their operating point.*residual is"):
+            design(reactor(scale, dt, 301.0))

@@ -370,6 +370,29 @@ def test_too_few_steps_is_a_status_and_an_error():
         step(0.0, X, U)
 
 
+def test_tolerance_below_the_precision_is_blamed():
+    eps = float(jnp.finfo(float).eps)
+    fine = diffrax.PIDController(rtol=1e-4 * eps, atol=1e-4 * eps)
+    for controller in (fine, diffrax.ClipStepSizeController(fine)):
+        dynamics = dlx.Discretized(
+            PENDULUM, 0.05, diffrax.Tsit5(), stepsize_controller=controller
+        )
+        _, result = dynamics.advance(0.0, jnp.array([0.1, 0.0]), jnp.zeros(1), None)
+        assert result == dlx.RESULTS.beyond_precision
+    run = dlx.simulate(
+        PENDULUM,
+        jnp.zeros((1, 1)),
+        0.0,
+        0.05,
+        jnp.array([0.1, 0.0]),
+        solver=diffrax.Tsit5(),
+        stepsize_controller=fine,
+        max_steps=256,
+        throw=False,
+    )
+    assert run.result == dlx.RESULTS.beyond_precision
+
+
 def backsolve(**kwargs):
     return dlx.Discretized(
         PENDULUM,

@@ -1,11 +1,15 @@
 """Models from recorded data, and what the data do not tell."""
 
+import re
+
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import optax
 import pytest
 from helpers import assert_close, needs_x64, thorough, user_error
+from hypothesis import given, settings, strategies as st
+from jaxtyping import Array
 
 import delucax as dlx
 from delucax.training import fit, sysid
@@ -151,6 +155,101 @@ def test_neural_fits_predict():
     # The data's own system leaves nothing but noise.
     own = dlx.Discretized(dlx.systems.Pendulum(**TRUE), dt=0.05)
     assert float(loss(own, data, jr.key(0))) < 1e-4
+
+
+class Reactor(dlx.AbstractSystem):
+    """A stirred tank with a cooling jacket, its rate constant in any unit."""
+
+    state_names = ("c", "T")
+    control_names = ("Tc",)
+    k0: Array = dlx.parameter(7.2e10)
+    UA: Array = dlx.parameter(2.092)
+    E: Array = dlx.parameter(8750.0)
+    unit: Array = dlx.parameter(1.0)
+
+    def vector_field(self, t, x, u, w):
+        c, T = x
+        rate = self.unit * self.k0 * jnp.exp(-self.E / T) * c
+        heat = 350 - T + 209.2 * rate + self.UA * (u[0] - T)
+        return jnp.stack([1 - c - rate, heat])
+
+
+RATES = ("system.k0", "system.UA")
+
+
+def reactor(k0=1.0, UA=1.0, E=1.0, unit=1.0):
+    """With parameters that are off by these factors."""
+    system = Reactor(7.2e10 * k0 / unit, 2.092 * UA, 8750.0 * E, unit)
+    return dlx.Discretized(system, dt=0.05, substeps=4)
+
+
+def reacted(seed=0):
+    """200 steps under a new jacket temperature every other step."""
+    levels = jr.uniform(jr.key(1002), (100, 1), minval=280.0, maxval=320.0)
+    controls = jnp.repeat(levels, 2, 0)
+    states = dlx.open_loop(reactor(), jnp.array([0.5, 350.0]), controls)
+    noise = jnp.array([0.01, 0.5])
+    return states + noise * jr.normal(jr.key(seed), states.shape), controls
+
+
+@given(st.floats(-10, 20), st.sampled_from([(0.6, 1.5), (1.4, 1.3), (0.7, 0.6)]))
+@settings(max_examples=6, deadline=None)
+def test_units_of_a_parameter_do_not_matter(power, off):
+    states, controls = reacted()
+    found = sysid.physical(reactor(*off, unit=10.0**power), states, controls, RATES)
+    assert found.result == dlx.RESULTS.successful
+    estimate = found.estimate * jnp.array([1, 10.0**power])
+    plain = sysid.physical(reactor(), states, controls, RATES)
+    assert_close(estimate, plain.estimate, rtol=1e-4)
+    assert_close(found.std / found.estimate, plain.std / plain.estimate, rtol=1e-3)
+    assert_close(found.x0, [0.5, 350.0], atol=2.0)
+    assert_close(plain.x0, jnp.array([0.5, 350.0]), rtol=0.02)
+
+
+def test_a_fit_that_did_not_converge_gives_no_intervals():
+    states, controls = reacted()
+    # Twelve times the rate: the integrator diverges at once.
+    hot = dict(dynamics=reactor(E=0.9), parameters=RATES)
+    hurried = dict(dynamics=reactor(0.6, 1.5), parameters=RATES, max_steps=1)
+    for case, result in (
+        (hot, dlx.RESULTS.diverged),
+        (hurried, dlx.RESULTS.not_converged),
+    ):
+        case = case | dict(observations=states, controls=controls)
+        found = sysid.physical(**case, throw=False)
+        assert found.result == result
+        for uncertain in (found.std, found.low, found.high, found.spread):
+            assert np.all(np.isnan(uncertain))
+        assert not np.any(found.identifiable)
+        for text in (found.report(), repr(found), str(found)):
+            assert "identifiable" not in text and "the fit failed" in text
+        with pytest.raises(Exception, match=re.escape(dlx.RESULTS[result])):
+            sysid.physical(**case)
+
+
+def test_the_start_of_each_run_is_returned():
+    states, controls, std = recorded()
+    found = sysid.physical(GUESS, states, controls, ("system.length", "system.mass"))
+    assert_close(found.x0, [3.0, 0.0], atol=3 * float(std.max()))
+    assert "identifiable" in repr(found)
+    both = jnp.stack([states[:41], states[40:81]]), controls[:80].reshape(2, 40, 1)
+    found = sysid.physical(GUESS, *both, "system.length")
+    assert_close(found.x0, both[0][:, 0], atol=3 * float(std.max()))
+    assert sysid.linear(states, controls).x0 is None
+
+
+@thorough
+@pytest.mark.parametrize(
+    "off, paths", [((0.6, 1.5), RATES), ((1.4, 0.6), RATES), ((1, 1, 1.3), "system.E")]
+)
+def test_intervals_of_a_reactor_cover_the_truth(off, paths):
+    truth = np.array([2.092, 7.2e10] if paths == RATES else [8750.0])
+    inside = []
+    for seed in range(60):
+        found = sysid.physical(reactor(*off), *reacted(seed), paths)
+        inside += list((found.low < truth) & (truth < found.high))
+    # Of 60 intervals of 95%, fewer than 51 has a chance below 0.1%.
+    assert np.mean(inside) >= 51 / 60
 
 
 def test_bad_input():

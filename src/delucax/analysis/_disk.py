@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._message import shortened
 from .._results import Result
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
@@ -102,7 +103,7 @@ def disk_margin(
         if not is_index or channel not in range(m):
             raise ValueError(
                 f"{where}: channel must be a whole number from 0 to {m - 1}, or None "
-                f"for all, got {channel!r}."
+                f"for all, got {shortened(channel)}."
             )
     found = disk_of(given, jnp.asarray(skew, given.A.dtype), channel)
     return thrown(found, where) if throw else found

@@ -11,6 +11,7 @@ from jaxtyping import Array
 from .._check import as_matrix, check_count, check_key, check_real, is_concrete
 from .._controller import AbstractController, wrong_observation
 from .._fields import as_float_array, parameter, weight
+from .._message import shortened
 from ..math import matvec
 
 
@@ -65,7 +66,9 @@ class Constant(AbstractController):
     def __init__(self, value: Any):
         value = as_float_array(value)
         if not eqx.is_array(value) or value.ndim != 1:
-            raise ValueError(f"Constant: value must be a vector, got {value!r}.")
+            raise ValueError(
+                f"Constant: value must be a vector, got {shortened(value)}."
+            )
         self.value = value
 
     def __call__(self, t, y, state):
@@ -103,7 +106,7 @@ class Random(AbstractController):
         if not eqx.is_array(self.std) or self.std.ndim != 1:
             raise ValueError(
                 "Random: std must be a vector with an entry for each control, got "
-                f"{std!r}."
+                f"{shortened(std)}."
             )
 
     def __check_init__(self):

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from .._check import as_bounds, check_key
 from .._controller import AbstractController
 from .._fields import as_float_array, weight
+from .._message import shortened
 from .._typing import PRNGKey, RealScalar
 from ..math import clip
 from ..simulation import Trajectory
@@ -80,7 +81,7 @@ class Gaussian(AbstractController):
         if not eqx.is_inexact_array(log_std) or log_std.ndim > 1:
             raise ValueError(
                 f"{where}: log_std must be a number or a vector with an entry for each "
-                f"control, got {log_std!r}."
+                f"control, got {shortened(log_std)}."
             )
         self.base, self.log_std = base, log_std
         self.bounds = as_bounds(bounds, where)

@@ -3,12 +3,10 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._check import check_count, is_concrete
+from .._check import check_count
 from .._controller import AbstractController
 from .._fields import function_field, parameter, weight
 from ..dynamics import LinearDynamics
@@ -21,6 +19,7 @@ from ._operating_point import (
     check_state,
     deviation,
     equilibrium,
+    path,
 )
 
 
@@ -109,7 +108,7 @@ class HInfinity(AbstractController):
         if final is not None and not is_finite:
             raise ValueError(f"{where}: final is given, which needs a horizon.")
         if varies:
-            self.x_ref = _path(dynamics, difference, where)
+            self.x_ref = path(dynamics, difference, where)
         else:
             self.x_ref = equilibrium(dynamics, difference, where)
         self.u_ref = dynamics.u_ref
@@ -136,18 +135,3 @@ class HInfinity(AbstractController):
             u_ref = row_at(u_ref, step) if u_ref.ndim == 2 else u_ref
         u = u_ref - matvec(K, deviation(y, x_ref, self.difference))
         return u.astype(y.dtype), state
-
-
-def _path(dynamics: LinearDynamics, difference: Any, where: str) -> Array:
-    """The operating points, if the dynamics go from each to the next."""
-    x_ref, reached = dynamics.x_ref, dynamics.x_next
-    miss = jax.vmap(lambda a, b: deviation(a, b, difference))(reached[:-1], x_ref[1:])
-    worst = jnp.max(jnp.abs(miss), initial=0.0)
-    slack = jnp.finfo(x_ref.dtype).eps ** 0.5 * (1 + jnp.max(jnp.abs(x_ref)))
-    strays = ~(worst <= slack)
-    rule = f"{where}: dynamics must go from each operating point to the next"
-    if not is_concrete(strays):
-        return eqx.error_if(x_ref, strays, rule + ".")
-    if strays:
-        raise ValueError(f"{rule}, got x_next {reached} and x_ref {x_ref}.")
-    return x_ref

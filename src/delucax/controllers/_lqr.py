@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from .._controller import AbstractController
 from .._fields import function_field, parameter, weight
+from .._message import shortened
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..math._linear_solve import solve
@@ -46,7 +47,9 @@ class LQR(AbstractController):
     **Arguments:**
 
     - `dynamics`: time-invariant linear dynamics whose operating point is an equilibrium
-        and whose state is observed; of [`delucax.linearize`][], for example.
+        and whose state is observed; of [`delucax.linearize`][], for example, at a point
+        of [`delucax.trim`][]. It is one if what moves the state there is below 1e-4 of
+        the terms that do.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `S`: cross weight, shape `(n, m)`; zero by default.
@@ -118,7 +121,7 @@ class LQR(AbstractController):
         if not steps or preview < 0 or (preview and signals is None):
             raise ValueError(
                 f"{where}: preview must be a number of steps, from 0, at which a "
-                f"reference or disturbance is looked up, got {preview!r}."
+                f"reference or disturbance is looked up, got {shortened(preview)}."
             )
         A, B = dynamics.A, dynamics.B
         A, B, Q, R, S, _ = riccati_arguments(where, A, B, Q, R, S, None, definite=False)

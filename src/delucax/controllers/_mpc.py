@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from .._check import as_bounds, check_bool, check_count, check_finite, check_key
 from .._controller import AbstractController, Tally, wrong_observation
 from .._fields import as_float_array, as_module, function_field, parameter
+from .._message import shortened
 from .._results import Result, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
@@ -166,7 +167,7 @@ class MPC(AbstractController):
             start = jnp.tile(_rest(dynamics), (horizon, 1))
         start = as_float_array(start)
         if not eqx.is_inexact_array(start) or start.shape != (horizon, m):
-            got = f"shape {start.shape}" if eqx.is_array(start) else repr(start)
+            got = f"shape {start.shape}" if eqx.is_array(start) else shortened(start)
             raise ValueError(
                 f"{where}: start must have shape (horizon, controls) = "
                 f"({horizon}, {m}), got {got}."

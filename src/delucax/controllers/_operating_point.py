@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -11,6 +12,11 @@ from jaxtyping import Array
 from .._check import is_concrete
 from .._controller import AbstractController, wrong_observation
 from ..dynamics import LinearDynamics
+from ..dynamics._trim import relative_drift
+
+
+_RESTS = 1e-4
+"""The share of the terms that move a state which may be left over at an equilibrium."""
 
 
 def check_linear(dynamics: Any, where: str) -> None:
@@ -41,26 +47,53 @@ def check_observed(dynamics: LinearDynamics, where: str) -> None:
     n = dynamics.state_size
     if C.shape != (n, n) or is_concrete(C) and not np.array_equal(C, np.eye(n)):
         raise ValueError(
-            f"{where}: dynamics must observe their state (C the identity), got a C of "
-            f"shape {C.shape} that does not; {where} acts on the state itself."
+            f"{where}: dynamics must observe their state (C the identity), for {where} "
+            f"acts on the state itself, got a C of shape {C.shape}. Where only C x is "
+            "measured use `delucax.controllers.LQG`, or `OutputFeedback` with a Kalman "
+            "filter; where the state is measured leave C out."
         )
 
 
 def equilibrium(dynamics: LinearDynamics, difference: Any, where: str) -> Array:
     """The operating point, if the dynamics rest there."""
     x_ref, x_next = dynamics.x_ref, dynamics.x_next
-    drift = jnp.max(jnp.abs(deviation(x_next, x_ref, difference)))
-    # What is left of an equilibrium that was computed, or is written in few digits.
-    slack = jnp.finfo(x_ref.dtype).eps ** 0.5 * (1 + jnp.max(jnp.abs(x_ref)))
-    moves = ~(drift <= slack)
-    rule = (
-        f"{where}: dynamics must rest at their operating point (x_next = x_ref); "
-        "choose an equilibrium as x and u of `delucax.linearize`"
-    )
+    drift = deviation(x_next, x_ref, difference)
+    moved = _moved(drift, dynamics.A, dynamics.B, x_ref, dynamics.u_ref)
+    rule = f"{where}: dynamics must rest at their operating point (x_next = x_ref)"
+    hint = "`delucax.trim(system, x=..., u=...)` computes one that does"
+    return _resting(x_ref, moved, rule, f"{hint}; got x_ref {x_ref}, x_next {x_next}")
+
+
+def path(dynamics: LinearDynamics, difference: Any, where: str) -> Array:
+    """The operating points over time, if the dynamics go from each to the next."""
+    x_ref, x_next = dynamics.x_ref, dynamics.x_next
+    if x_ref.shape[0] == 1:
+        return x_ref
+    off = jax.vmap(lambda a, b: deviation(a, b, difference))(x_next[:-1], x_ref[1:])
+    A, B, u_ref = (a[:-1] for a in (dynamics.A, dynamics.B, dynamics.u_ref))
+    moved = jnp.max(jax.vmap(_moved)(off, A, B, x_ref[:-1], u_ref))
+    rule = f"{where}: dynamics must go from each operating point to the next"
+    return _resting(x_ref, moved, rule, f"got x_ref {x_ref} and x_next {x_next}")
+
+
+@jax.jit
+def _moved(drift, A, B, x, u):
+    """What moves the state, relative to the terms that do."""
+    J = jnp.concatenate([A - jnp.eye(A.shape[0], dtype=A.dtype), B], axis=1)
+    return relative_drift(drift, J, x, u)
+
+
+def _resting(x_ref: Array, moved: Array, rule: str, rest: str) -> Array:
+    """`x_ref`, unless it moves by more than is left of an equilibrium that was computed
+    or is written in few digits."""
+    moves = ~(moved <= _RESTS)
     if not is_concrete(moves):
         return eqx.error_if(x_ref, moves, rule + ".")
     if moves:
-        raise ValueError(f"{rule}, got x_ref {x_ref} and x_next {x_next}.")
+        raise ValueError(
+            f"{rule}, to {_RESTS:g} of the terms that move them; the residual is "
+            f"{float(moved):.1e}. {rest}."
+        )
     return x_ref
 
 

@@ -19,6 +19,7 @@ from .._fields import (
     positive,
     weight,
 )
+from .._message import shortened
 from ..math import clip, matvec
 
 
@@ -291,7 +292,7 @@ def _as_output(output: Any, where: str) -> Any:
     if not eqx.is_inexact_array(array) or array.ndim != 2:
         raise ValueError(
             f"{where}: output must be an index from 0, a tuple of them, a matrix or a "
-            f"function, got {output!r}."
+            f"function, got {shortened(output)}."
         )
     check_finite(array, "output", where)
     return _Project(array)
@@ -312,7 +313,7 @@ def _count_loops(pid: Any, times: tuple[str, ...]) -> int:
         array = as_float_array(value)
         if not eqx.is_inexact_array(array) or array.ndim > 1:
             raise ValueError(
-                f"{where}: {name} must be a number or a vector, got {value!r}."
+                f"{where}: {name} must be a number or a vector, got {shortened(value)}."
             )
         if array.ndim == 1:
             sizes[name] = array.shape[0]

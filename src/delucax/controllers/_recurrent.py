@@ -11,6 +11,7 @@ from jaxtyping import Array, PyTree
 from .._check import as_bounds, check_count, check_finite, check_key, check_positive
 from .._controller import AbstractController, wrong_observation
 from .._fields import as_float_array, function_field, parameter, weight
+from .._message import shortened
 from .._typing import PRNGKey
 
 
@@ -245,7 +246,7 @@ class Standardise(eqx.Module):
         where = "Standardise"
         mean = as_float_array(mean)
         if not eqx.is_inexact_array(mean) or mean.ndim != 1:
-            raise ValueError(f"{where}: mean must be a vector, got {mean!r}.")
+            raise ValueError(f"{where}: mean must be a vector, got {shortened(mean)}.")
         check_finite(mean, "mean", where)
         check_positive(std, "std", where)
         std = as_float_array(std)

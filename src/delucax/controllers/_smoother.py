@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from .._check import check_finite, is_concrete
 from .._fields import as_float_array
+from .._message import shortened
 from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision
 from ._estimator import Belief
@@ -220,7 +221,7 @@ def _record(estimator, observations, controls, t0, where):
     p, m = estimator.V.shape[0], estimator.dynamics.control_size
     y = as_float_array(observations)
     if not eqx.is_inexact_array(y) or y.ndim != 2 or y.shape[1] != p or not len(y):
-        got = f"shape {y.shape}" if eqx.is_array(y) else repr(observations)
+        got = f"shape {y.shape}" if eqx.is_array(y) else shortened(observations)
         raise ValueError(
             f"{where}: observations must have shape (T, {p}), T at least 1, got {got}."
         )
@@ -228,7 +229,7 @@ def _record(estimator, observations, controls, t0, where):
     shape = (y.shape[0], m)
     u = jnp.zeros(shape, y.dtype) if controls is None else as_float_array(controls)
     if not eqx.is_inexact_array(u) or u.shape != shape:
-        got = f"shape {u.shape}" if eqx.is_array(u) else repr(controls)
+        got = f"shape {u.shape}" if eqx.is_array(u) else shortened(controls)
         raise ValueError(
             f"{where}: controls must have shape {shape}, a row for each observation, "
             f"got {got}."

@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from .._check import check_finite, symmetric_matrix
 from .._fields import as_float_array, function_field, parameter
+from .._message import shortened
 from .._typing import Matrix, RealScalar, Vector
 from ..math import quadratic_form
 from ..math._small import dot
@@ -135,7 +136,8 @@ class Tracking(AbstractCost):
         self.Q, self.R, self.Qf = _weights(Q, R, final, "Tracking")
         if not callable(reference):
             raise ValueError(
-                f"Tracking: reference must be a function of time, got {reference!r}."
+                f"Tracking: reference must be a function of time, "
+                f"got {shortened(reference)}."
             )
         self.reference = reference
         self.output = output
@@ -188,7 +190,7 @@ def _weight(value: Any, name: str, where: str) -> Array:
         check_finite(array, name, where)
         return array
     if not eqx.is_inexact_array(array) or array.ndim != 2:
-        got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
         raise ValueError(
             f"{where}: {name} must be a matrix or its diagonal, got {got}."
         )

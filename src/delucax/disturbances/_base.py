@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from .._check import check_count
 from .._fields import as_float_array, check_parameters
+from .._message import shortened
 from .._typing import PRNGKey
 
 
@@ -70,7 +71,7 @@ def check_disturbance(value: Any, name: str, where: str) -> None:
     """Raise unless `value` is a disturbance."""
     if not isinstance(value, AbstractDisturbance):
         raise ValueError(
-            f"{where}: {name} must be an AbstractDisturbance, got {value!r}."
+            f"{where}: {name} must be an AbstractDisturbance, got {shortened(value)}."
         )
 
 
@@ -79,7 +80,7 @@ def common_size(where: str, size: int | None, **values: Any) -> tuple[int, dict]
     arrays = {name: as_float_array(value) for name, value in values.items()}
     for name, array in arrays.items():
         if not eqx.is_inexact_array(array) or array.ndim > 1:
-            got = array.shape if eqx.is_array(array) else repr(array)
+            got = array.shape if eqx.is_array(array) else shortened(array)
             raise ValueError(
                 f"{where}: {name} must be a number or a vector with an entry for each "
                 f"disturbance, got {got}."

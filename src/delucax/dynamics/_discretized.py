@@ -30,6 +30,7 @@ from ._solvers import (
     check_stepsize_controller,
     for_fixed_steps,
     loud,
+    outcome,
 )
 
 
@@ -311,7 +312,8 @@ class Discretized(AbstractDynamics):
             throw=False,
         )
         assert solution.ys is not None
-        return solution.ys[0], promote(solution.result)
+        result = outcome(solution, self.stepsize_controller, x.dtype)
+        return solution.ys[0], result
 
 
 def has_diffusion(system: AbstractSystem) -> bool:

@@ -39,7 +39,7 @@ def linearize(
     - `model`: an [`delucax.AbstractDynamics`][] or [`delucax.AbstractSystem`][].
     - `t`: time, 0 by default.
     - `x`, `u`: the state and control to linearise at; by default the `equilibrium` that
-        the model names.
+        the model names. [`delucax.trim`][] computes one.
 
     **Returns:** [`delucax.LinearDynamics`][] of dynamics, with the same `dt`;
     [`delucax.systems.LinearSystem`][] of a system. `E` is the derivative with respect
@@ -66,12 +66,7 @@ def linearize(
             "linearize: model must be an AbstractSystem or AbstractDynamics (for an "
             f"environment, its `dynamics`), got {type(model).__name__}."
         )
-    if x is None or u is None:
-        x_rest, u_rest = model.equilibrium()
-        x = x_rest if x is None else x
-        u = u_rest if u is None else u
-    x = as_vector(x, model.state_size, "x (the state)", "linearize")
-    u = as_vector(u, model.control_size, "u (the control)", "linearize")
+    x, u = point_of(model, x, u, "linearize")
     t = jnp.asarray(t, x.dtype)
     C = _jacobian(lambda x: model.observe(t, x))(x)
     if is_system:
@@ -113,6 +108,16 @@ def linearize(
         state_names=model.state_names,
         control_names=model.control_names,
     )
+
+
+def point_of(model: Any, x: Any, u: Any, where: str) -> tuple[Array, Array]:
+    """The state and control that are given, or else those of the equilibrium."""
+    if x is None or u is None:
+        x_rest, u_rest = model.equilibrium()
+        x = x_rest if x is None else x
+        u = u_rest if u is None else u
+    x = as_vector(x, model.state_size, "x (the state)", where)
+    return x, as_vector(u, model.control_size, "u (the control)", where)
 
 
 def c2d(system: LinearSystem, dt: Any, method: str = "zoh") -> LinearDynamics:

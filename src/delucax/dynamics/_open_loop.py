@@ -11,6 +11,7 @@ from jaxtyping import Array
 from .._check import as_vector, check_real
 from .._components import by_components
 from .._fields import as_float_array
+from .._message import shortened
 from .._results import choose, first_failure, first_of, or_none, RESULTS
 from .._typing import RealScalar
 from ._base import AbstractDynamics
@@ -94,7 +95,7 @@ def _open_loop(dynamics, x0, controls, w, t0):
 def _sequence(value: Any, size: int, name: str, where: str) -> Array:
     array = as_float_array(value)
     if not eqx.is_inexact_array(array) or array.ndim != 2 or array.shape[1] != size:
-        got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
         raise ValueError(f"{where}: {name} must have shape (steps, {size}), got {got}.")
     if array.shape[0] == 0:
         raise ValueError(f"{where}: {name} must have at least one step.")

@@ -11,6 +11,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import PyTree, Scalar
 
+from .._results import choose, promote, Result, RESULTS
 from ._runge_kutta import tableau_of
 
 
@@ -83,6 +84,20 @@ def _check_implicit(solver: diffrax.AbstractSolver, where: str) -> None:
             f"{where}: solver {type(solver).__name__} hides the root finder of the "
             "implicit solver that it wraps; use that one by itself."
         )
+
+
+def outcome(solution: diffrax.Solution, controller: Any, dtype: Any) -> Result:
+    """What became of a solve. Where the steps ran out, and the tolerance is finer than
+    rounding of the state, it is the tolerance that is to blame."""
+    result = promote(solution.result)
+    while not hasattr(controller, "rtol") and hasattr(controller, "controller"):
+        controller = controller.controller
+    rtol = getattr(controller, "rtol", 1.0)
+    fine = rtol < 4 * float(jnp.finfo(dtype).eps)
+    if fine is False:
+        return result
+    blamed = fine & (result == RESULTS.max_steps_reached)
+    return choose(blamed, RESULTS.beyond_precision, result)
 
 
 class AbstractTransparentSolver(diffrax.AbstractWrappedSolver):

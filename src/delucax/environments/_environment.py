@@ -25,6 +25,7 @@ from .._fields import (
     function_field,
     parameter,
 )
+from .._message import shortened
 from .._paths import get_path, replace
 from .._results import Result
 from .._typing import PRNGKey, RealScalar
@@ -310,7 +311,7 @@ class Environment(eqx.Module):
         except (TypeError, ValueError):  # no number, or ragged
             raise ValueError(
                 "Environment: u (the control) must have shape "
-                f"({self.control_size},), got {given!r}."
+                f"({self.control_size},), got {shortened(given)}."
             ) from None
         check_real(u, "u (the control)", "Environment")
         if self.actions is not None and jnp.issubdtype(jnp.result_type(u), jnp.integer):
@@ -443,7 +444,7 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
             if not (eqx.is_inexact_array(low) and eqx.is_inexact_array(high)):
                 raise ValueError(
                     f"randomise: the range of {path!r} must be of numbers, got "
-                    f"{given!r}."
+                    f"{shortened(given)}."
                 )
             if is_concrete(low) and is_concrete(high) and not np.all(low <= high):
                 raise ValueError(
@@ -456,6 +457,6 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
         else:
             raise ValueError(
                 f"randomise: the range of {path!r} must be a pair (low, high) or a "
-                f"function of a key, got {given!r}."
+                f"function of a key, got {shortened(given)}."
             )
     return replace(tree, changes)

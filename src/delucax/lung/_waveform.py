@@ -16,6 +16,7 @@ from .._check import (
     is_concrete,
 )
 from .._fields import as_float_array, check_parameters, parameter, positive
+from .._message import shortened
 
 
 _T = TypeVar("_T")
@@ -191,7 +192,7 @@ def as_pips(pips: Any, tree: Any, where: str) -> Array:
     """
     array = as_float_array(pips)
     if not eqx.is_inexact_array(array) or array.ndim != 1 or not array.size:
-        got = f"shape {array.shape}" if eqx.is_array(array) else repr(pips)
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(pips)
         raise ValueError(f"{where}: pips must be a vector of pressures, got {got}.")
     check_real(array, "pips", where)
     for node in jax.tree.leaves(tree, is_leaf=_is_waveform):

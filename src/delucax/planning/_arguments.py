@@ -8,6 +8,7 @@ from jaxtyping import Array
 
 from .._check import as_bounds, as_vector, check_finite
 from .._fields import as_float_array, as_module
+from .._message import shortened
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ._constraints import Constraints
@@ -45,7 +46,7 @@ def as_problem(
         w = as_sequence(w, T, dynamics.disturbance_size, "w", where)
     t0 = as_float_array(t0)
     if not eqx.is_inexact_array(t0) or t0.shape != ():
-        raise ValueError(f"{where}: t0 must be a number, got {t0!r}.")
+        raise ValueError(f"{where}: t0 must be a number, got {shortened(t0)}.")
     check_finite(t0, "t0", where)
     if difference is not None and not callable(difference):
         raise ValueError(f"{where}: difference must be a function, got {difference!r}.")
@@ -86,7 +87,7 @@ def as_sequence(
     array = as_float_array(value)
     fits = eqx.is_inexact_array(array) and array.ndim == 2 and array.shape[1] == size
     if not fits or steps is not None and array.shape[0] != steps:
-        got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
         rows = "steps" if steps is None else steps
         raise ValueError(
             f"{where}: {name} must have shape ({rows}, {size}), got {got}."

@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from .._check import check_count, check_key, check_positive, check_range
 from .._fields import as_float_array
+from .._message import shortened
 from .._results import choose, RESULTS
 from ._plan import Plan
 from ._problem import Problem, roll_out
@@ -44,7 +45,7 @@ def as_spread(
     check_key(key, where)
     scale, m = as_float_array(scale), controls.shape[1]
     if not eqx.is_inexact_array(scale) or scale.shape not in ((), (m,)):
-        got = f"shape {scale.shape}" if eqx.is_array(scale) else repr(scale)
+        got = f"shape {scale.shape}" if eqx.is_array(scale) else shortened(scale)
         raise ValueError(
             f"{where}: scale must be a number or a vector of {m} entries, one for each "
             f"control, got {got}."

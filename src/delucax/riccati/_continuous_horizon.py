@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from .._check import as_matrix, check_finite, is_concrete, symmetric_matrix
 from .._fields import as_float_array
+from .._message import shortened
 from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision, solve
 from ._finite_horizon import raised
@@ -142,7 +143,7 @@ def checked_times(times: Any, where: str) -> Array:
     """`times` as an increasing vector of at least two, or an error."""
     array = as_float_array(times)
     if not eqx.is_inexact_array(array) or array.ndim != 1 or array.shape[0] < 2:
-        got = f"shape {array.shape}" if eqx.is_array(array) else repr(times)
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(times)
         raise ValueError(f"{where}: times must be at least two numbers, got {got}.")
     check_finite(array, "times", where)
     if is_concrete(array) and not np.all(np.diff(np.asarray(array)) > 0):

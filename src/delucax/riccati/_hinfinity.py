@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from .._check import as_matrix, check_positive, is_concrete, symmetric_matrix
 from .._fields import as_float_array
+from .._message import shortened
 from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision, solve
 from ._arguments import check_definite
@@ -297,7 +298,9 @@ def checked_level(where, gamma, tolerance, dtype, default=None):
             continue
         value = as_float_array(value)
         if not eqx.is_inexact_array(value) or value.ndim != 0:
-            raise ValueError(f"{where}: {name} must be a number, got {value!r}.")
+            raise ValueError(
+                f"{where}: {name} must be a number, got {shortened(value)}."
+            )
         check_positive(value, name, where)
         values.append(value.astype(dtype))
     gamma, tolerance = values

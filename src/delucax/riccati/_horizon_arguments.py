@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from .._check import as_matrix, check_count, check_finite, is_concrete, symmetric_matrix
 from .._fields import as_float_array
+from .._message import shortened
 
 
 def in_time(
@@ -30,7 +31,7 @@ def in_time(
         array = as_float_array(value)
         ndim = len(axes)
         if not eqx.is_inexact_array(array) or array.ndim not in (ndim, ndim + 1):
-            got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+            got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
             shape = ", ".join(axes) + ("," if ndim == 1 else "")
             raise ValueError(
                 f"{where}: {name} must have shape ({shape}), or that with a leading "

@@ -10,6 +10,7 @@ from jax.core import Tracer
 from .._check import check_finite, check_positive, is_concrete
 from .._controller import AbstractController
 from .._fields import as_float_array
+from .._message import shortened
 from ..dynamics._discretized import has_diffusion
 from ..dynamics._solvers import (
     check_adaptive,
@@ -55,9 +56,9 @@ def as_number(value: Any, name: str, where: str) -> Any:
         return array
     number = np.asarray(value)
     if number.shape != () or number.dtype.kind not in "iuf":
-        raise ValueError(f"{where}: {name} must be a number, got {value!r}.")
+        raise ValueError(f"{where}: {name} must be a number, got {shortened(value)}.")
     if not np.isfinite(number):
-        raise ValueError(f"{where}: {name} must be finite, got {value!r}.")
+        raise ValueError(f"{where}: {name} must be finite, got {shortened(value)}.")
     return float(number)
 
 
@@ -65,7 +66,7 @@ def as_sequence(value: Any, size: int, name: str, where: str) -> Any:
     """`value` as an array of shape `(T, size)`, or an error."""
     array = as_float_array(value)
     if not eqx.is_inexact_array(array) or array.ndim != 2 or array.shape[1] != size:
-        got = f"shape {array.shape}" if eqx.is_array(array) else repr(value)
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
         raise ValueError(f"{where}: {name} must have shape (T, {size}), got {got}.")
     if array.shape[0] == 0:
         raise ValueError(f"{where}: {name} must have at least one interval.")
@@ -111,7 +112,7 @@ def as_save_times(ts: Any, t0: Any, t1: Any, where: str) -> Any:
     ts = as_float_array(ts)
     if not eqx.is_inexact_array(ts) or ts.ndim != 1 or ts.shape[0] < 2:
         raise ValueError(
-            f"{where}: ts must be a vector of at least two times, got {ts!r}."
+            f"{where}: ts must be a vector of at least two times, got {shortened(ts)}."
         )
     if is_concrete(ts) and is_concrete(t0) and is_concrete(t1):
         values = np.asarray(ts)

@@ -14,6 +14,7 @@ from .._check import as_vector, check_count, check_finite, check_key
 from .._components import by_components
 from .._controller import AbstractController, tallies
 from .._fields import as_float_array
+from .._message import shortened
 from .._results import choose, first_failure, first_of, or_none, RESULTS
 from .._typing import PRNGKey
 from ..disturbances import Zero
@@ -132,7 +133,7 @@ def rollout(
         w = as_float_array(w)
         shape = (horizon, environment.disturbance_size)
         if not eqx.is_inexact_array(w) or w.shape != shape:
-            got = w.shape if eqx.is_array(w) else repr(w)
+            got = w.shape if eqx.is_array(w) else shortened(w)
             raise ValueError(
                 f"{where}: w must have shape (horizon, disturbances) = {shape}, got "
                 f"{got}."

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from .._check import as_vector, check_count, check_finite, check_key, is_concrete
 from .._controller import AbstractController, tallies
-from .._results import choose, first_failure, promote, RESULTS
+from .._results import choose, first_failure, RESULTS
 from .._typing import PRNGKey
 from ..dynamics._solvers import (
     check_adaptive,
@@ -19,6 +19,7 @@ from ..dynamics._solvers import (
     check_stepsize_controller,
     for_fixed_steps,
     loud,
+    outcome,
 )
 from ..math._steps import check_steps
 from ..systems import AbstractSystem
@@ -371,9 +372,11 @@ def _simulate(
     else:
         controls = jax.vmap(args.control)(saves[:-1], states[:-1])
     finite = jnp.all(jnp.isfinite(final_state))
-    outcome = choose(finite, RESULTS.successful, RESULTS.diverged)
+    result = outcome(solution, stepsize_controller, dtype)
+    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
     last = {name: totals[-1] for name, totals in counts.items()}
-    outcome = first_failure(outcome, outcome_of(last, tallies(memory)))
+    result = first_failure(result, diverged)
+    result = first_failure(result, outcome_of(last, tallies(memory)))
     sensor = None
     if type(system).observe is not AbstractSystem.observe:
         sensor = jax.vmap(system.observe)(times[:-1], states[:-1])
@@ -387,7 +390,7 @@ def _simulate(
         total_cost=jnp.zeros((), dtype),
         length=jnp.asarray(count - 1),
         ended=jnp.zeros((), bool),
-        result=first_failure(promote(solution.result), outcome),
+        result=result,
         dt=spacing,
         recorded_times=times,
         recorded_observations=sensor,

@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 
 from .._check import check_finite
 from .._fields import AbstractConstraint, marked_leaves
+from .._message import shortened
 from .._paths import get_path, path_string
 
 
@@ -56,7 +57,7 @@ def take_apart(
         floats = [path for path, leaf, _, _ in entries if is_float(leaf)]
         said = "no field is marked weight()"
         if trainable is not None:
-            said = f"trainable={trainable!r} picks no leaf"
+            said = f"trainable={shortened(trainable)} picks no leaf"
         raise ValueError(
             f"{where}: nothing in {type(model).__name__} is trainable: {said}. The "
             f"floating-point arrays that could be are {_listed(floats)}."
@@ -162,7 +163,7 @@ def _chosen_by_path(model, entries, paths, where) -> list[bool]:
         if not any(
             _is_under(path, prefix) and is_float(leaf) for path, leaf, _, _ in entries
         ):
-            got = f"dtype {node.dtype}" if eqx.is_array(node) else repr(node)
+            got = f"dtype {node.dtype}" if eqx.is_array(node) else shortened(node)
             raise ValueError(
                 f"{where}: trainable: {prefix!r} must be a floating-point array, or "
                 f"hold some, got {got}. A number becomes one where its field is "
@@ -188,7 +189,7 @@ def _chosen_by_filter(model, entries, trainable, where) -> list[bool]:
         if len(chosen) != len(entries):
             raise ValueError(
                 f"{where}: trainable must be a path, paths, a function of a leaf, or "
-                f"booleans in the structure of the model, got {trainable!r}."
+                f"booleans in the structure of the model, got {shortened(trainable)}."
             )
     for (path, leaf, _, _), moves in zip(entries, chosen, strict=True):
         if not isinstance(moves, bool | np.bool_):
@@ -199,7 +200,7 @@ def _chosen_by_filter(model, entries, trainable, where) -> list[bool]:
         if moves and not is_float(leaf):
             raise ValueError(
                 f"{where}: trainable picks {path!r}, which is not a floating-point "
-                f"array: {leaf!r}."
+                f"array: {shortened(leaf)}."
             )
     return [bool(moves) for moves in chosen]
 

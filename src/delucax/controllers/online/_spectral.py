@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from ..._check import check_count
 from ..._controller import AbstractController
+from ..._message import shortened
 from ...dynamics import AbstractDynamics
 from ._base import linear_learner, loop_of
 from ._features import Features
@@ -158,7 +159,8 @@ def _bank(filters: int, memory: int, margin: float, where: str) -> np.ndarray:
     number = isinstance(margin, int | float) and not isinstance(margin, bool)
     if not number or not (math.isfinite(margin) and 0 < margin < 1):
         raise ValueError(
-            f"{where}: margin must be a number between 0 and 1, got {margin!r}."
+            f"{where}: margin must be a number between 0 and 1, "
+            f"got {shortened(margin)}."
         )
     return spectral_filters(memory, filters, float(margin))
 

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.error import InvalidAction, ResetNeeded
 
 from ..._check import as_vector, check_bool, check_finite
+from ..._message import shortened
 from ...environments import Environment
 from .._episode import has_signals
 from ._program import program, REWARD, shared, STEP
@@ -217,12 +218,13 @@ class GymnasiumEnv(gymnasium.Env):
         if self._table is not None:
             raise InvalidAction(
                 "GymnasiumEnv: action must be a whole number from 0 to "
-                f"{len(self._table) - 1}, got {action!r}; discrete=False takes the "
+                f"{len(self._table) - 1}, "
+                f"got {shortened(action)}; discrete=False takes the "
                 "control itself."
             )
         raise InvalidAction(
             f"GymnasiumEnv: action must be numbers of shape {self._shape}, got "
-            f"{action!r}."
+            f"{shortened(action)}."
         )
 
     def _fail(self, action: Any) -> NoReturn:

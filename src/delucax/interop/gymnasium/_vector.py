@@ -15,6 +15,7 @@ from gymnasium.vector.utils import batch_space
 
 from ..._check import check_count, check_finite, check_real
 from ..._fields import as_float_array
+from ..._message import shortened
 from ...environments import Environment
 from ._program import FAILED, program, REWARD, TERMINATED, TRUNCATED
 from ._spaces import action_space, is_discrete, observation_space, read_options
@@ -150,7 +151,7 @@ class GymnasiumVectorEnv(VectorEnv):
         each = (self.num_envs, *shape)
         state = as_float_array(state)
         if not eqx.is_inexact_array(state) or state.shape not in (shape, each):
-            got = f"shape {state.shape}" if eqx.is_array(state) else repr(state)
+            got = f"shape {state.shape}" if eqx.is_array(state) else shortened(state)
             raise ValueError(
                 f"{where}: state must have shape {shape}, or {each} for one each, got "
                 f"{got}."
@@ -173,7 +174,7 @@ class GymnasiumVectorEnv(VectorEnv):
             if len(whole) != self.num_envs or not all(whole):
                 raise ValueError(
                     f"GymnasiumVectorEnv: seed must be {self.num_envs} whole numbers "
-                    f"from 0, one for each, or one for all, got {seed!r}."
+                    f"from 0, one for each, or one for all, got {shortened(seed)}."
                 )
             given = [int(one) for one in own if one is not None]
             mixed = np.random.SeedSequence(given).generate_state(1)[0]
@@ -238,7 +239,7 @@ class GymnasiumVectorEnv(VectorEnv):
         except ValueError:  # ragged
             raise InvalidAction(
                 f"{where}: actions must have the shape {self.action_space.shape}, got "
-                f"{actions!r}."
+                f"{shortened(actions)}."
             ) from None
         kinds = "iu" if isinstance(space, Discrete) else "iuf"
         shape = (self.num_envs, *(space.shape or ()))

@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from ..._check import check_bool, check_key, is_concrete
 from ..._fields import as_float_array
+from ..._message import shortened
 from ...environments import Environment
 from .._by_value import ByValue
 from .._episode import (
@@ -289,7 +290,7 @@ class GymnaxEnv:
         asked, size = as_float_array(action), self._made.env.control_size
         size = 1 if self.discrete else size
         if not eqx.is_inexact_array(asked) or asked.size != size:
-            got = f"shape {asked.shape}" if eqx.is_array(asked) else repr(action)
+            got = f"shape {asked.shape}" if eqx.is_array(asked) else shortened(action)
             raise ValueError(f"GymnaxEnv: action must have {size} entries, got {got}.")
         if self.discrete:
             check_index(asked, self.num_actions)

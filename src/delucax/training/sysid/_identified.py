@@ -8,7 +8,7 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float
 
-from ..._check import check_range
+from ..._check import check_range, is_concrete
 from ..._fields import as_float_array
 from ..._results import choose, first_failure, promote, Result, RESULTS
 
@@ -33,14 +33,21 @@ class Identified(eqx.Module):
     - `names`: of the p parameters.
     - `estimate`: their values, shape `(p,)`; in a linear fit `(outputs, p)`.
     - `std`: their standard deviations, of the same shape; infinite for what is not
-        identifiable.
-    - `low`, `high`: the ends of their confidence intervals, of the same shape.
+        identifiable, NaN where the fit did not converge.
+    - `low`, `high`: the ends of their confidence intervals, of the same shape; NaN
+        where the fit did not converge.
     - `directions`: shape `(p, p)`, a unit vector in each row, least known first.
-    - `spread`: the standard deviation along each, shape `(p,)`.
-    - `identifiable`: of each direction, shape `(p,)`.
+    - `spread`: the standard deviation along each, shape `(p,)`; NaN where the fit did
+        not converge.
+    - `identifiable`: of each direction, shape `(p,)`; false where the fit did not
+        converge.
     - `noise`: the standard deviation of what remains of each output.
+    - `x0`: the estimated state at the beginning, shape `(n,)`, or `(runs, n)`; `None`
+        where it is not estimated, in linear fits.
     - `result`: success; `RESULTS.unexciting` if a direction is not identifiable; or the
         failure of the solver.
+
+    Printed, it is the table of `report`.
 
     !!! example
 
@@ -66,12 +73,20 @@ class Identified(eqx.Module):
     spread: Float[Array, " p"]
     identifiable: Bool[Array, " p"]
     noise: Float[Array, " y"]
+    x0: Float[Array, "*runs n"] | None
     result: Result
+
+    def __repr__(self):
+        result: Any = self.result
+        if is_concrete(self.estimate) and jnp.shape(result._value) == ():
+            return self.report()
+        return super().__repr__()
 
     def report(self) -> str:
         """A table of the parameters and of what is not identifiable, in words.
 
-        **Returns:** text of several lines.
+        **Returns:** text of several lines. Where the fit did not converge it says why,
+        and gives no intervals.
         """
         lines = [f"{'parameter':<24}{'estimate':>12}{'low':>12}{'high':>12}"]
         shape = self.estimate.shape
@@ -80,6 +95,12 @@ class Identified(eqx.Module):
             label = name if len(shape) == 1 else f"output {index[0]}: {name}"
             ends = [float(a[index]) for a in (self.estimate, self.low, self.high)]
             lines.append(f"{label:<24}" + "".join(f"{end:>12.5g}" for end in ends))
+        failed = self.result != RESULTS.successful
+        if failed and self.result != RESULTS.unexciting:
+            lines.append(
+                f"the fit failed, and has no intervals: {RESULTS[self.result]}"
+            )
+            return "\n".join(lines)
         for row, known in zip(
             np.asarray(self.directions), np.asarray(self.identifiable), strict=True
         ):
@@ -93,6 +114,22 @@ class Identified(eqx.Module):
         if np.all(self.identifiable):
             lines.append("all directions are identifiable")
         return "\n".join(lines)
+
+
+def checked(fit: Identified, throw: bool) -> Identified:
+    """`fit` with its final result, and without intervals where the solver failed."""
+    finite = jnp.all(jnp.isfinite(fit.estimate))
+    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
+    solver = first_failure(promote(fit.result), diverged)
+    solved = solver == RESULTS.successful
+    known = fit.identifiable & solved
+    excited = choose(jnp.all(known), RESULTS.successful, RESULTS.unexciting)
+    result = first_failure(solver, excited)
+    intervals = lambda fit: [fit.std, fit.low, fit.high, fit.spread]  # noqa: E731
+    certain = [jnp.where(solved, end, jnp.nan) for end in intervals(fit)]
+    fit = eqx.tree_at(intervals, fit, certain)
+    fit = eqx.tree_at(lambda fit: [fit.identifiable, fit.result], fit, [known, result])
+    return result.error_if(fit, result != RESULTS.successful) if throw else fit
 
 
 class Certainty(eqx.Module):
@@ -136,21 +173,7 @@ class Certainty(eqx.Module):
         )
 
 
-def outcome(known: Array, solver: Result, finite: Array) -> Result:
-    """The status of a fit."""
-    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
-    excited = choose(jnp.all(known), RESULTS.successful, RESULTS.unexciting)
-    return first_failure(promote(solver), first_failure(diverged, excited))
-
-
 def quantile(level: Any, where: str) -> Array:
     """How many standard deviations a confidence interval reaches to either side."""
     check_range(level, "level", where, 0, 1)
     return ndtri((1 + as_float_array(level)) / 2)
-
-
-def raised(found: Identified, throw: bool) -> Identified:
-    """`found`, unless its result is a failure that is to be raised."""
-    if not throw:
-        return found
-    return found.result.error_if(found, found.result != RESULTS.successful)

@@ -10,8 +10,10 @@ from jaxtyping import Array
 
 from ..._check import check_bool, check_count, check_finite, check_step
 from ..._fields import as_float_array
+from ..._message import shortened
+from ..._results import RESULTS
 from ...dynamics import LinearDynamics
-from ._identified import Certainty, Identified, outcome, quantile, raised
+from ._identified import Certainty, checked, Identified, quantile
 
 
 def linear(
@@ -78,7 +80,7 @@ def linear(
     A, B = found[:, :n], found[:, n : n + m]
     x_next = found[:, -1] if affine else None
     model = LinearDynamics(A, B, dt=dt, x_next=x_next)
-    return raised(_identified(model, names, fit, reach), throw)
+    return checked(_identified(model, names, fit, reach), throw)
 
 
 def arx(
@@ -159,7 +161,7 @@ def arx(
     targets = outputs[:, first:].reshape(-1, p)
     fit = _least_squares(regressors, targets)
     model = _realised(fit[0], p, m, a, b, delay, dt)
-    return raised(_identified(model, names, fit, reach), throw)
+    return checked(_identified(model, names, fit, reach), throw)
 
 
 def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, Array]:
@@ -167,7 +169,7 @@ def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, 
     outputs, controls = as_float_array(outputs), as_float_array(controls)
     for what, array in ((name, outputs), ("controls", controls)):
         if not eqx.is_inexact_array(array) or array.ndim not in (2, 3):
-            got = f"shape {array.shape}" if eqx.is_array(array) else repr(array)
+            got = f"shape {array.shape}" if eqx.is_array(array) else shortened(array)
             raise ValueError(
                 f"{where}: {what} must have shape (steps, size) or (runs, steps, "
                 f"size), got {got}."
@@ -220,7 +222,6 @@ def _identified(model, names, fit, reach) -> Identified:
     std = noise[:, None] * unit / scale
     std = jnp.where(jnp.isinf(certainty.std), jnp.inf, jnp.where(worst > 0, std, 0))
     known = certainty.identifiable & (rows >= len(names))
-    finite = jnp.all(jnp.isfinite(estimate))
     return Identified(
         model=model,
         names=tuple(names),
@@ -232,11 +233,9 @@ def _identified(model, names, fit, reach) -> Identified:
         spread=certainty.spread,
         identifiable=known,
         noise=noise,
-        result=outcome(known, _SOLVED, finite),
+        x0=None,
+        result=RESULTS.successful,
     )
-
-
-_SOLVED = lx.RESULTS.successful
 
 
 def _realised(found, p, m, a, b, delay, dt) -> LinearDynamics:

@@ -1,0 +1,24 @@
+"""What error messages say of values."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+
+_MOST = 120
+"""The characters of a value that a message shows."""
+
+
+def shortened(value: Any) -> str:
+    """A value as an error message shows it: in a line or two, whatever it is."""
+    if hasattr(value, "to_numpy"):  # tables and their columns
+        return f"a {type(value).__name__}; `.to_numpy()` makes it an array"
+    is_array = isinstance(value, np.ndarray | jax.Array)
+    text = str(value) if is_array else repr(value)
+    if len(text) <= _MOST:
+        return text
+    if is_array and not isinstance(value, Tracer):
+        return f"an array of shape {value.shape} and dtype {value.dtype}"
+    return f"{' '.join(text[:_MOST].split())}... (a {type(value).__name__})"

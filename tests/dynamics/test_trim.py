@@ -1,0 +1,167 @@
+"""Operating points."""
+
+import control
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, needs_x64, thorough, user_error
+from hypothesis import given, settings, strategies as st
+from jaxtyping import Array
+
+import delucax as dlx
+
+
+class Reactor(dlx.AbstractSystem):
+    """A stirred tank with a cooling jacket."""
+
+    state_names = ("c", "T")
+    control_names = ("Tc",)
+    k0: Array = dlx.parameter(7.2e10)
+    UA: Array = dlx.parameter(2.092)
+
+    def vector_field(self, t, x, u, w):
+        c, T = x
+        rate = self.k0 * jnp.exp(-8750 / T) * c
+        heat = 350 - T + 209.2 * rate + self.UA * (u[0] - T)
+        return jnp.stack([1 - c - rate, heat])
+
+
+class Attitude(dlx.AbstractSystem):
+    """A thrust along the axis of a planar craft whose attitude is a unit vector."""
+
+    state_names = ("v", "rate", "cos", "sin")
+    control_names = ("thrust", "torque")
+
+    def vector_field(self, t, x, u, w):
+        v, rate, cos, sin = x
+        del v
+        return jnp.stack([u[0] * cos - 9.81, u[1], -sin * rate, cos * rate])
+
+    def project(self, x):
+        return x.at[2:].divide(jnp.linalg.norm(x[2:]))
+
+
+GUESS = dict(x=jnp.array([0.5, 350.0]), u=jnp.array([300.0]))
+
+
+@needs_x64
+@pytest.mark.parametrize("fix, output", [("Tc", []), ("T", [350.0])])
+def test_point_is_that_of_python_control(fix, output):
+    def rhs(t, x, u, params):
+        return np.asarray(Reactor().vector_field(t, x, u, None))
+
+    system = control.NonlinearIOSystem(
+        rhs, lambda t, x, u, params: x[1:], inputs=["Tc"], states=2, outputs=["T"]
+    )
+    # With an output that is asked for the control is free.
+    wanted = [output] if output else []
+    x, u = control.find_operating_point(system, GUESS["x"], GUESS["u"], *wanted)
+    point = dlx.trim(Reactor(), **GUESS, fix=fix)
+    assert_close(point.x, x, rtol=1e-5)
+    assert_close(point.u, u, rtol=1e-5)
+    assert_close(rhs(0.0, point.x, point.u, {}), 0, atol=1e-10)
+
+
+@given(st.floats(0.1, 0.9))
+@settings(max_examples=10, deadline=None)
+def test_a_value_that_is_given_is_held(c):
+    point = dlx.trim(Reactor(), **GUESS, fix={"c": c})
+    assert point.result == dlx.RESULTS.successful
+    assert float(point.x[0]) == np.asarray(c, point.x.dtype)
+    # From the two equations by hand.
+    T = 8750 / np.log(7.2e10 * c / (1 - c))
+    Tc = T - (350 - T + 209.2 * (1 - c)) / 2.092
+    tight = 1e-10 if point.x.dtype == float else 1e-4
+    assert_close(point.x[1], T, rtol=tight)
+    assert_close(point.u[0], Tc, rtol=tight)
+
+
+def test_more_unknowns_than_equations_change_least():
+    # x_next = x where 0.1 x0 = 0.1 x1 and 0.2 x1 = u: a line, at (s, s, 0.2 s).
+    A, B = jnp.array([[0.9, 0.1], [0.0, 0.8]]), jnp.array([[0.0], [1.0]])
+    guess = jnp.array([1.0, 2.0, 0.5])
+    point = dlx.trim(dlx.LinearDynamics(A, B), x=guess[:2], u=guess[2:])
+    along, unit = np.array([1.0, 1.0, 0.2]), np.asarray(guess) + 1
+    scaled = along / unit
+    s = scaled @ (guess / unit) / (scaled @ scaled)
+    tight = 1e-10 if point.x.dtype == float else 1e-4
+    assert_close(jnp.concatenate([point.x, point.u]), s * along, rtol=tight)
+
+
+def test_what_nothing_tells_stays_at_the_guess():
+    # Any position is at rest, and the equations have no full rank.
+    dynamics = dlx.Discretized(dlx.systems.DoubleIntegrator(), dt=0.1)
+    control_name = dynamics.control_names[0]
+    point = dlx.trim(dynamics, x=[3.0, 0.4], u=[0.0], fix=control_name)
+    assert_close(point.x, [3.0, 0.0], atol=1e-6)
+
+
+def test_manifold_of_the_state_is_kept():
+    angle = 0.3
+    x = jnp.array([0.0, 0.1, jnp.cos(angle), jnp.sin(angle)])
+    point = dlx.trim(Attitude(), x=x, u=jnp.array([8.0, 0.1]))
+    assert_close(jnp.linalg.norm(point.x[2:]), 1, rtol=1e-6)
+    field = Attitude().vector_field(0.0, point.x, point.u, None)
+    assert_close(field, 0, atol=1e-4)
+    assert_close(point.residual, field, atol=1e-4)
+
+
+def test_what_is_no_equilibrium_says_so():
+    case = dict(x=[0.9, 320.0], u=[300.0], fix=("T", "Tc"))
+    point = dlx.trim(Reactor(), **case, throw=False)
+    assert point.result == dlx.RESULTS.no_equilibrium
+    # The nearest to rest of all c, which is the only unknown.
+    assert float(jnp.abs(point.residual).max()) > 1
+    with pytest.raises(Exception, match="no equilibrium near the guess"):
+        dlx.trim(Reactor(), **case)
+    cold = dlx.trim(Reactor(), x=[0.5, 0.0], u=[300.0], fix="Tc", throw=False)
+    assert cold.result == dlx.RESULTS.diverged
+
+
+@needs_x64
+def test_gradient_of_a_held_value_is_that_of_the_formula():
+    def temperature(k0, c):
+        system = Reactor(7.2e10 * k0)
+        return dlx.trim(system, **GUESS, fix={"c": c}).x[1]
+
+    by_k0, by_c = jax.grad(temperature, (0, 1))(1.0, 0.4)
+    T = 8750 / np.log(7.2e10 * 0.4 / 0.6)
+    assert_close(by_k0, -(T**2) / 8750, rtol=1e-8)
+    assert_close(by_c, -(T**2) / 8750 / (0.4 * 0.6), rtol=1e-8)
+
+
+@thorough
+@needs_x64
+@pytest.mark.parametrize("fix", [(), "Tc", "c", ("T", "Tc")])
+def test_derivatives_are_those_of_finite_differences(fix):
+    def point(parameters):
+        k0, UA, c, T, Tc = parameters
+        system = Reactor(7.2e10 * k0, UA)
+        x, u = jnp.stack([c, T]), jnp.stack([Tc])
+        found = dlx.trim(system, x=x, u=u, fix=fix, throw=False)
+        return jnp.concatenate([found.x, found.u])
+
+    at = jnp.array([1.0, 2.092, 0.45, 352.0, 299.0])
+    forward = jax.jacfwd(point)(at)
+    assert_close(forward, jax.jacrev(point)(at), rtol=1e-8, atol=1e-9)
+    steps = jnp.diag(1e-5 * at)
+    rows = [(point(at + h) - point(at - h)) / 2e-5 for h in steps]
+    assert_close(forward * at, jnp.stack(rows, 1), rtol=1e-5, atol=1e-5)
+
+
+def test_bad_input():
+    with user_error(match="fix must name states and controls.*none is named 'k0'"):
+        dlx.trim(Reactor(), **GUESS, fix="k0")
+    with user_error(match="fix must leave a state or a control free"):
+        dlx.trim(Reactor(), **GUESS, fix=("c", "T", "Tc"))
+    with user_error(match="fix must be a name, names or a dictionary"):
+        dlx.trim(Reactor(), **GUESS, fix=2)
+    with user_error(match=r"fix\['c'\] must be a number"):
+        dlx.trim(Reactor(), **GUESS, fix={"c": [0.5, 0.5]})
+    with user_error(match="x \\(the state\\) must have shape"):
+        dlx.trim(Reactor(), x=[0.5], u=[300.0])
+    with user_error(match="names no equilibrium"):
+        dlx.trim(Reactor())
+    with user_error(match="model must be an AbstractSystem or AbstractDynamics"):
+        dlx.trim(dlx.make("pendulum"))
