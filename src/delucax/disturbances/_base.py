@@ -92,6 +92,12 @@ def common_size(where: str, size: int | None, **values: Any) -> tuple[int, dict]
     return check_count(size, "size", where), arrays
 
 
+def check_common_size(disturbance: Any, *names: str) -> None:
+    """Raise unless the named fields are numbers, or have `disturbance.size` entries."""
+    values = {name: getattr(disturbance, name) for name in names}
+    common_size(type(disturbance).__name__, disturbance.size, **values)
+
+
 def spread(values: Array, steps: int, size: int) -> Array:
     """`values` as shape `(steps, size)`."""
     return jnp.broadcast_to(values, (steps, size))

@@ -4,7 +4,7 @@ from typing import Any, ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 
-from ._base import AbstractDynamics
+from ._base import AbstractDynamics, check_dynamics
 
 
 class AbstractWrapper(AbstractDynamics):
@@ -22,6 +22,9 @@ class AbstractWrapper(AbstractDynamics):
         @property
         def control_units(self):
             return self.dynamics.control_units
+
+    def __check_init__(self):
+        check_dynamics(self.dynamics, type(self).__name__)
 
     @property
     def dt(self):
