@@ -29,16 +29,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    is_module = Path(sys.argv[0]).name == "__main__.py"
+    is_module = Path(sys.argv[0]).parts[-2:] == ("delucax", "__main__.py")
     prog = "python -m delucax" if is_module else "delucax"
     parser = argparse.ArgumentParser(
         prog=prog,
         description="Differentiable control in JAX.",
         epilog=f"{prog} COMMAND --help shows the options of a command.",
     )
-    parser.add_argument(
-        "--version", action="version", version=f"delucax {version('delucax')}"
-    )
+    parser.add_argument("--version", action="store_true", help="show the version")
     commands = parser.add_subparsers(
         title="commands", dest="command", metavar="COMMAND"
     )

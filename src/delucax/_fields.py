@@ -370,7 +370,7 @@ def _check_shapes(module: eqx.Module) -> None:
                 for hint in typing.get_args(field.type) or (field.type,)
                 if isinstance(hint, type) and issubclass(hint, AbstractArray)
             ]
-            value = getattr(module, field.name, None)
+            value: Any = getattr(module, field.name, None)
             if not hints or not eqx.is_inexact_array(value):
                 continue
             dims = " or ".join(f"({', '.join(h.dim_str.split())})" for h in hints)

@@ -104,20 +104,17 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
 
 def _with(tree: Any, path: str, value: Any) -> Any:
     """A copy of `tree` with `value`, converted as its owner does, at `path`."""
-    parent = tree
-    *before, name = path.split(".")
-    for part in [*before, name]:
-        if is_static(parent, part):
+    parent, old = None, tree
+    for name in path.split("."):
+        parent, old = old, _child(old, name, path)
+        if is_static(parent, name):
             raise ValueError(
                 f"replace: {path!r} is part of the structure of "
                 f"{type(parent).__name__}, not a leaf; build it anew with another "
-                f"{part}."
+                f"{name}."
             )
-        old = _child(parent, part, path)
-        if part is not name:
-            parent = old
     if isinstance(parent, eqx.Module):
-        value = converter_of(parent, name)(value)
+        value = converter_of(parent, path.rpartition(".")[2])(value)
     elif eqx.is_inexact_array(old):
         value = as_float_array(value)
     return eqx.tree_at(
@@ -163,7 +160,7 @@ def _check(module: Any, before: Any) -> None:
 
 
 def _is_batch(module: eqx.Module) -> bool:
-    """Whether `module` holds several, as `jax.vmap` makes them: no one passes."""
+    """Whether `module` does not pass its own checks, as a batch from `jax.vmap`."""
     try:
         check_module(module)
     except (TypeError, ValueError):

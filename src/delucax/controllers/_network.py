@@ -102,7 +102,7 @@ class MLP(AbstractController):
         self.bounds = bounds
 
     def __check_init__(self):
-        check_squash(self.bounds, self.network.out_size, "MLP")
+        check_squash(self.bounds, int(self.network.out_size), "MLP")
 
     def __call__(self, t, y, state):
         z = y if self.features is None else jnp.asarray(self.features(y))

@@ -82,7 +82,7 @@ class GRU(AbstractController):
         self.bounds = bounds
 
     def __check_init__(self):
-        check_squash(self.bounds, self.readout.out_features, "GRU")
+        check_squash(self.bounds, int(self.readout.out_features), "GRU")
 
     def init(self, *, key=None):
         del key
