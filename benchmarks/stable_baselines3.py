@@ -1,8 +1,9 @@
 """`python -m benchmarks.stable_baselines3`: Stable-Baselines3 trains on our pendulum.
 
 Its PPO, on the CPU, sees `delucax/Pendulum-v1` as it sees any Gymnasium id. The policy
-is then tried on Gymnasium's own `Pendulum-v1` too. Prints the mean returns before and
-after, and writes `benchmarks/results/stable_baselines3.json`. Needs the group `sb3`:
+is then tried on Gymnasium's own `Pendulum-v1` too. With `--vector` it trains on
+`SB3VecEnv`. Prints the mean returns before and after, and writes
+`benchmarks/results/stable_baselines3.json`. Needs the group `sb3`:
 `pip install -e ".[gymnasium]" --group bench --group sb3`.
 """
 
@@ -15,6 +16,7 @@ from typing import Any
 
 import gymnasium
 
+import delucax
 import delucax.interop.gymnasium  # noqa: F401, tells Gymnasium of our tasks
 from benchmarks._machine import describe, limit_cores
 
@@ -56,16 +58,26 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", default=str(OUT))
     parser.add_argument("--cores", type=int, default=1)
+    parser.add_argument(
+        "--vector", action="store_true", help="step all in one call, as `SB3VecEnv`"
+    )
     options = parser.parse_args()
     limit_cores(options.cores)
     import torch  # pyright: ignore
     from stable_baselines3 import PPO  # pyright: ignore
     from stable_baselines3.common.env_checker import check_env  # pyright: ignore
     from stable_baselines3.common.env_util import make_vec_env  # pyright: ignore
+    from stable_baselines3.common.vec_env import VecMonitor  # pyright: ignore
+
+    from delucax.interop.stable_baselines3 import SB3VecEnv
 
     torch.set_num_threads(options.cores)
     check_env(gymnasium.make(OURS).unwrapped)
-    envs = make_vec_env(OURS, n_envs=4, seed=options.seed)
+    if options.vector:
+        envs = VecMonitor(SB3VecEnv(delucax.make("pendulum"), 4))
+        envs.seed(options.seed)
+    else:
+        envs = make_vec_env(OURS, n_envs=4, seed=options.seed)
     model = PPO("MlpPolicy", envs, seed=options.seed, device="cpu", **SETTINGS)
     before = evaluated(model, OURS, options.episodes)
     print(f"before: {before['mean']} +- {before['deviation']}", flush=True)
@@ -81,6 +93,7 @@ def main() -> None:
         "machine": describe(),
         "versions": {name: version(name) for name in packages},
         "settings": SETTINGS,
+        "vector": options.vector,
         "seed": options.seed,
         "steps": model.num_timesteps,
         "seconds": round(seconds, 1),

@@ -2,11 +2,15 @@
 
 import contextlib
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+
+import delucax as dlx
+from delucax._paths import path_string
 
 
 needs_x64 = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="float64 only")
@@ -61,6 +65,18 @@ def user_error(kind=ValueError, match=None):
     """A user meets this error."""
     with as_a_user(), pytest.raises(kind, match=match):
         yield
+
+
+def assert_refuses_nan(module):
+    """Every number of `module` can be replaced by itself, and by NaN nowhere."""
+    for path, leaf in jax.tree_util.tree_flatten_with_path(module)[0]:
+        path = path_string(path)
+        # The options of a planner are checked when it is called.
+        if not eqx.is_inexact_array(leaf) or path.startswith("options."):
+            continue
+        assert eqx.tree_equal(dlx.replace(module, {path: leaf}), module), path
+        with pytest.raises(ValueError):
+            dlx.replace(module, {path: jnp.full_like(leaf, jnp.nan)})
 
 
 class CountCalls:

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from . import (
         analysis as analysis,
         controllers as controllers,
+        experiments as experiments,
         interop as interop,
         lung as lung,
         planning as planning,
@@ -67,12 +68,15 @@ if TYPE_CHECKING:
         training as training,
     )
     from .plotting import animate as animate, plot as plot
+
+    __version__: str
 del TYPE_CHECKING
 
 _LAZY = (
     "analysis",
     "animate",
     "controllers",
+    "experiments",
     "interop",
     "lung",
     "planning",
@@ -87,6 +91,10 @@ def __getattr__(name: str):
     """What the core does not need, imported when it is first asked for."""
     if name in ("animate", "plot"):
         return getattr(_import_module(".plotting", __name__), name)
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("delucax")
     if name in _LAZY:
         return _import_module(f".{name}", __name__)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -3,13 +3,25 @@
 import argparse
 import sys
 import textwrap
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
+
+
+_FILE = "a Python file of experiments, a module, or a suite that `list` names"
 
 
 def main(arguments: list[str] | None = None) -> int:
     """The command line; the exit status is 1 if cases failed, 2 on wrong arguments."""
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
     try:
+        if options.version:
+            print(f"delucax {version('delucax')}")
+            return 0
+        if options.command is None:
+            parser.print_help()
+            return 0
         return options.call(options) or 0
     except (OSError, ValueError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
@@ -17,13 +29,16 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    is_module = Path(sys.argv[0]).parts[-2:] == ("delucax", "__main__.py")
+    prog = "python -m delucax" if is_module else "delucax"
     parser = argparse.ArgumentParser(
-        prog="python -m delucax",
+        prog=prog,
         description="Differentiable control in JAX.",
-        epilog="python -m delucax COMMAND --help tells more of each.",
+        epilog=f"{prog} COMMAND --help shows the options of a command.",
     )
+    parser.add_argument("--version", action="store_true", help="show the version")
     commands = parser.add_subparsers(
-        title="commands", dest="command", metavar="COMMAND", required=True
+        title="commands", dest="command", metavar="COMMAND"
     )
     _add_demo(commands)
     _add_reproduce(commands)
@@ -35,6 +50,16 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    """Keeps the line breaks of examples, and adds the default to an option's help."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        shown = isinstance(action.default, str | int) and action.default not in ("", 0)
+        if not shown or action.default == argparse.SUPPRESS:
+            return action.help
+        return f"{action.help} (default: %(default)s)"
+
+
 def _command(commands: Any, name: str, call: Any, help: str, more: str = "") -> Any:
     """A command: `call` is given its options, and returns the exit status."""
     added = commands.add_parser(
@@ -42,7 +67,7 @@ def _command(commands: Any, name: str, call: Any, help: str, more: str = "") -> 
         help=help,
         description=f"{help[0].upper()}{help[1:]}.",
         epilog=textwrap.dedent(more).strip() or None,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=_Formatter,
     )
     added.set_defaults(call=call)
     return added
@@ -91,9 +116,13 @@ def _add_lung(commands: Any) -> None:
     lung = _command(commands, "lung", call, help)
     lung.add_argument("--out", default="lung", help="folder to write to, or go on in")
     lung.add_argument("--small", action="store_true", help="two lungs, in a minute")
-    lung.add_argument("--data", help="breaths, as a CSV file of the public data set")
-    lung.add_argument("--seeds", type=int, help="controllers of each kind, 3 if not")
-    late = "samples that the sensor is late, in DATA too; 2 if not"
+    lung.add_argument(
+        "--data",
+        help="breaths, as a CSV file of the public data set (default: simulated)",
+    )
+    seeds = "how many controllers of each kind to train (default: 3, or 1 if --small)"
+    lung.add_argument("--seeds", type=int, help=seeds)
+    late = "how late the sensor reads, in samples; holds for DATA too"
     lung.add_argument("--sensor-delay", type=int, default=2, help=late)
 
 
@@ -105,7 +134,9 @@ def _add_list(commands: Any) -> None:
 
     help = "name the tasks, controllers and suites, or the cases of FILE"
     listed = _command(commands, "list", call, help)
-    listed.add_argument("file", nargs="?", metavar="FILE", help="as for run")
+    listed.add_argument(
+        "file", nargs="?", metavar="FILE", help=f"{_FILE}; its cases are listed"
+    )
     _add_selection(listed)
 
 
@@ -142,19 +173,17 @@ def _add_run(commands: Any) -> None:
         """
     help = "run the experiments of FILE"
     run = _command(commands, "run", call, help, more)
-    run.add_argument(
-        "file", metavar="FILE", help="a Python file, a module, or a suite from list"
-    )
+    run.add_argument("file", metavar="FILE", help=_FILE)
     _add_selection(run)
     run.add_argument("--slow", action="store_true", help="also cases marked slow")
-    run.add_argument("--seeds", type=int, help="this many instead of the file's own")
+    run.add_argument("--seeds", type=int, help="how many seeds (default: as FILE says)")
     run.add_argument(
         "--workers", type=int, default=1, help="processes; -1 is one for each core"
     )
     run.add_argument(
         "--dask", metavar="ADDRESS", help="run on the Dask cluster of this scheduler"
     )
-    run.add_argument("--store", help="results file; results/FILE.jsonl by default")
+    run.add_argument("--store", help="results file (default: results/FILE.jsonl)")
     run.add_argument("--html", metavar="PAGE", help="write a report too")
     run.add_argument("--fresh", action="store_true", help="run also what is stored")
     run.add_argument("--retry", action="store_true", help="run again what failed")
@@ -192,7 +221,11 @@ def _add_report(commands: Any) -> None:
         help="write all rows to a .csv, .parquet, .md or .tex file",
     )
     report.add_argument(
-        "-k", dest="select", default="", metavar="EXPR", help="only these cases"
+        "-k",
+        dest="select",
+        default="",
+        metavar="EXPR",
+        help="only these cases (default: all)",
     )
 
 
@@ -204,7 +237,9 @@ def _add_bench(commands: Any) -> None:
 
     help = "measure speed against other libraries, in a checkout"
     bench = _command(commands, "bench", call, help)
-    bench.add_argument("name", nargs="?", help="one benchmark, such as pendulum")
+    bench.add_argument(
+        "name", nargs="?", help="one benchmark, such as pendulum (default: all)"
+    )
 
 
 def _add_selection(command: Any) -> None:
@@ -213,10 +248,14 @@ def _add_selection(command: Any) -> None:
         dest="select",
         default="",
         metavar="EXPR",
-        help="cases by name, such as 'lqr and not cartpole'",
+        help="cases by name, such as 'lqr and not cartpole' (default: all)",
     )
     command.add_argument(
-        "-m", dest="marks", default="", metavar="EXPR", help="cases by their marks"
+        "-m",
+        dest="marks",
+        default="",
+        metavar="EXPR",
+        help="cases by their marks (default: all)",
     )
 
 

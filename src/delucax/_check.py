@@ -1,5 +1,6 @@
 """Checks of arguments, with errors that name the argument and what was expected."""
 
+import functools
 import os
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,32 @@ from ._message import shortened
 def is_concrete(x: Any) -> bool:
     """Whether the value of `x` can be looked at now (it is not being traced)."""
     return not isinstance(x, Tracer)
+
+
+def output_of(function: Any, *shapes: tuple[int, ...]) -> Any:
+    """The shapes of what `function` returns for arrays of `shapes`, traced once for all
+    functions that differ in the values of their arrays alone."""
+    dtype = jnp.zeros(()).dtype
+    inputs = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
+    leaves, structure = jax.tree.flatten(function)
+    if not all(eqx.is_array(leaf) for leaf in leaves) or not _is_hashable(structure):
+        return eqx.filter_eval_shape(function, *inputs)
+    arrays = (jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
+    return _traced(structure, tuple(arrays), tuple(inputs))
+
+
+@functools.lru_cache(maxsize=256)
+def _traced(structure: Any, arrays: Any, inputs: Any) -> Any:
+    call = lambda arrays, inputs: jax.tree.unflatten(structure, arrays)(*inputs)
+    return jax.eval_shape(call, arrays, inputs)
+
+
+def _is_hashable(value: Any) -> bool:
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return True
 
 
 def check_key(key: Any, where: str) -> Any:
@@ -114,6 +141,11 @@ def as_bounds(
     return low, high
 
 
+def bounds_field(where: str, name: str = "bounds") -> Any:
+    """A field that holds `(low, high)`, converted and checked by `as_bounds`."""
+    return eqx.field(converter=functools.partial(as_bounds, where=where, name=name))
+
+
 def check_finite(array: Any, name: str, where: str) -> None:
     """Raise if a concrete `array` holds NaN or infinity."""
     if eqx.is_inexact_array(array) and is_concrete(array):
@@ -123,7 +155,7 @@ def check_finite(array: Any, name: str, where: str) -> None:
 
 def check_positive(value: Any, name: str, where: str) -> None:
     """Raise unless a number is finite and above zero, as far as can be seen."""
-    array, got = as_float_array(value), shortened(value)
+    array = as_float_array(value)
     if eqx.is_inexact_array(array):
         if not is_concrete(array):
             return
@@ -131,14 +163,18 @@ def check_positive(value: Any, name: str, where: str) -> None:
         if np.all(np.isfinite(at)) and np.all(at > 0):
             return
         got = shortened(at)
+    else:
+        got = shortened(value)
     raise ValueError(f"{where}: {name} must be positive and finite, got {got}.")
 
 
-def check_step(dt: Any, where: str) -> None:
-    """Raise unless `dt` is one positive number."""
-    check_positive(dt, "dt", where)
+def check_step(dt: Any, where: str, name: str = "dt") -> None:
+    """Raise unless `dt`, or what has another name, is one positive number."""
+    check_positive(dt, name, where)
     if jnp.shape(dt) != ():
-        raise ValueError(f"{where}: dt must be a number, got shape {jnp.shape(dt)}.")
+        raise ValueError(
+            f"{where}: {name} must be a number, got shape {jnp.shape(dt)}."
+        )
 
 
 def check_number(value: Any, name: str, where: str) -> None:

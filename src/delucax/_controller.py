@@ -192,3 +192,12 @@ def wrong_observation(controller: Any, expected: int, y: Array) -> ValueError:
         f"size {y.shape[0] if y.ndim else 0}. If it was made for the encoded "
         "observation, give it features=env.encode."
     )
+
+
+def check_controller(value: Any, name: str, where: str) -> None:
+    """Raise unless `value` is a controller."""
+    if not isinstance(value, AbstractController):
+        raise ValueError(
+            f"{where}: {name} must be an AbstractController, got "
+            f"{type(value).__name__}."
+        )

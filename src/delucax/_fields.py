@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import typing
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import AbstractArray, Array, jaxtyped
 
 from ._message import shortened
 
@@ -169,7 +170,7 @@ def parameter(
         ```python
         import delucax as dlx
         import jax.numpy as jnp
-        from jaxtyping import Array
+        from jaxtyping import AbstractArray, Array, jaxtyped
 
         class Oscillator(dlx.AbstractSystem):
             state_names = ("x", "v")
@@ -201,7 +202,7 @@ def weight(
 
         ```python
         import delucax as dlx
-        from jaxtyping import Array
+        from jaxtyping import AbstractArray, Array, jaxtyped
 
         class Proportional(dlx.AbstractController):
             gain: Array = dlx.weight(1.0)
@@ -219,7 +220,11 @@ def _field(role: str, default: Any, constraint: AbstractConstraint | None) -> An
         # A dataclass wants what can be changed, or has no hash, from a function.
         given = {"default_factory": lambda: default}
     metadata = {_ROLE: role, _CONSTRAINT: constraint}
-    return eqx.field(**given, converter=as_float_array, metadata=metadata)
+    return eqx.field(**given, converter=_as_value, metadata=metadata)
+
+
+def _as_value(value: Any) -> Any:
+    return as_module(value) if callable(value) else as_float_array(value)
 
 
 class StaticFunction(eqx.Module):
@@ -344,3 +349,38 @@ def check_parameters(module: eqx.Module) -> None:
                 raise ValueError(f"{name} must be finite, got {shortened(leaf)}.")
             if constraint is not None and not np.all(constraint.holds(leaf)):
                 raise ValueError(f"{name} must be {constraint}, got {shortened(leaf)}.")
+
+
+def check_module(module: eqx.Module) -> None:
+    """Raise unless `module` is one that its constructor would have made.
+
+    This runs its `__check_init__`, and looks at what needs no code of its own: its
+    parameters, and the shapes in the annotations of its fields.
+    """
+    check_parameters(module)
+    for cls in type(module).__mro__:
+        if "__check_init__" in cls.__dict__:
+            cls.__dict__["__check_init__"](module)
+    _check_shapes(module)
+
+
+def _check_shapes(module: eqx.Module) -> None:
+    """Raise unless a size that several fields name, such as `n`, is the same in all."""
+    shapes = []
+    with jaxtyped("context"):
+        for field in dataclasses.fields(module):
+            hints = [
+                hint
+                for hint in typing.get_args(field.type) or (field.type,)
+                if isinstance(hint, type) and issubclass(hint, AbstractArray)
+            ]
+            value: Any = getattr(module, field.name, None)
+            if not hints or not eqx.is_inexact_array(value):
+                continue
+            dims = " or ".join(f"({', '.join(h.dim_str.split())})" for h in hints)
+            shapes.append(f"{field.name} of shape {dims} is {value.shape}")
+            if not any(isinstance(value, hint) for hint in hints):
+                raise ValueError(
+                    f"{type(module).__name__}: shapes do not fit each other: "
+                    f"{'; '.join(shapes)}."
+                )

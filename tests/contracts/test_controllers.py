@@ -9,7 +9,15 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, once, thorough, tolerance, user_error
+from helpers import (
+    assert_close,
+    assert_refuses_nan,
+    needs_x64,
+    once,
+    thorough,
+    tolerance,
+    user_error,
+)
 from jax.flatten_util import ravel_pytree
 
 import delucax as dlx
@@ -399,6 +407,12 @@ def test_wrong_observation(case, key):
 
     with user_error(match="observation of size 2, got size 5.*features=env.encode"):
         eqx.filter_eval_shape(act)
+
+
+@once
+@over(CASES, set(CASES) - set(FEW))
+def test_no_number_can_be_replaced_by_nan(case):
+    assert_refuses_nan(case.make(1.0))
 
 
 @once

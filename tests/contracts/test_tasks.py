@@ -7,7 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, once, thorough, user_error
+from helpers import (
+    assert_close,
+    assert_refuses_nan,
+    needs_x64,
+    once,
+    thorough,
+    user_error,
+)
 from hypothesis import given, settings, strategies as st
 from jax.flatten_util import ravel_pytree
 from scipy.integrate import solve_ivp
@@ -100,6 +107,19 @@ def test_task(name, key, tmp_path):
 def test_a_wrong_argument_is_named(name):
     with user_error(match=f"{name}: no argument is called 'horizn'"):
         dlx.make(name, horizn=3, **ARGUMENTS.get(name, {}))
+
+
+@once
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=() if n in ("pendulum", "lds") else thorough)
+        for n in NAMES
+        if "/" not in n
+    ],
+)
+def test_no_number_can_be_replaced_by_nan(name):
+    assert_refuses_nan(task(name))
 
 
 def states_of(env, size, seed, edges):

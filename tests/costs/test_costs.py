@@ -1,5 +1,6 @@
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from helpers import assert_close, once, user_error
 
@@ -116,3 +117,42 @@ def test_weights_are_differentiable():
 def test_bad_arguments(make, match):
     with user_error(match=match):
         make()
+
+
+def test_costs_add_and_scale():
+    """Final costs too; a number may stand on either side, and can be differentiated."""
+    x, u = jnp.array([1.0, -2.0]), jnp.array([3.0])
+    a = dlx.costs.Quadratic(Q, R, final=2 * Q)
+    b = dlx.costs.Function(lambda t, x, u: t + x[0] + u[0], lambda t, x: x[1])
+    for cost, p, q in (
+        (a + b, 1, 1),
+        (2 * a + b, 2, 1),
+        (a * 2 + 0.5 * b, 2, 0.5),
+        (np.float32(3) * (a + b) * 2, 6, 6),
+        (jnp.array(2.0) * a + np.array(0.5) * b + a, 3, 0.5),
+    ):
+        assert isinstance(cost, dlx.AbstractCost)
+        expected = p * a(0.5, x, u) + q * b(0.5, x, u)
+        assert_close(cost(0.5, x, u), expected, rtol=1e-6)
+        expected = p * a.final(0.5, x) + q * b.final(0.5, x)
+        assert_close(cost.final(0.5, x), expected, rtol=1e-6)
+    price = jax.jit(lambda weight: (weight * a + b)(0.5, x, u))
+    assert_close(jax.grad(price)(2.0), a(0.5, x, u), rtol=1e-6)
+    scaled = dlx.replace(a + 2 * b, {"terms.1.factor": 3.0})
+    assert_close(scaled(0.5, x, u), a(0.5, x, u) + 3 * b(0.5, x, u), rtol=1e-6)
+
+
+@once
+def test_what_cannot_be_added():
+    cost = dlx.costs.PendulumCost()
+    for function in (lambda: cost + 1, lambda: cost * cost, lambda: 1 + cost):
+        with user_error(TypeError):
+            function()
+    with user_error(match="factor must be a number"):
+        cost * "2"  # pyright: ignore
+    with user_error(match="factor must be a number"):
+        jnp.ones(2) * cost
+    with user_error(match="Sum: at least one"):
+        dlx.costs.Sum()
+    with user_error(match="every term must be an AbstractCost"):
+        dlx.costs.Sum(cost, 1.0)  # pyright: ignore

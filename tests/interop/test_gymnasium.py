@@ -15,6 +15,7 @@ from helpers import assert_close, once, thorough, user_error
 
 import delucax as dlx
 import delucax.interop.gymnasium as interop
+from delucax.interop.gymnasium._same_step import dones_and_infos
 
 
 pytestmark = once
@@ -390,3 +391,31 @@ def test_pictures():
     assert first.shape == second.shape and first.shape[2] == 3
     assert first.dtype == np.uint8 and np.any(first != second)
     made.close()
+
+
+def test_a_step_as_stable_baselines3_tells_of_it():
+    """Where an episode ends by its limit the last observation is kept and said to be
+    cut off; where it ends by itself it is not."""
+    envs = interop.GymnasiumVectorEnv(
+        dlx.make("cartpole", horizon=15), 2, autoreset_mode=AutoresetMode.SAME_STEP
+    )
+    # The second falls, the first stays up for the whole episode.
+    start = np.array([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.2, 2.0]])
+    observations, _ = envs.reset(seed=0, options={"state": start})
+    ends = {}
+    for k in range(15):
+        before = observations
+        observations, rewards, dones, infos = dones_and_infos(
+            envs.step(np.array([k % 2, 1]))
+        )
+        assert rewards.dtype == np.float32 and dones.dtype == bool
+        for i in range(2):
+            assert bool(infos[i]) == dones[i]
+            if dones[i] and i not in ends:
+                ends[i] = infos[i]
+                last = infos[i]["terminal_observation"]
+                assert np.all(np.abs(last - before[i]) < 1)
+                assert np.all(np.abs(observations[i]) <= 0.05)
+    assert ends[0]["TimeLimit.truncated"] is True
+    assert ends[1]["TimeLimit.truncated"] is False
+    assert np.abs(ends[1]["terminal_observation"][2]) > 0.2

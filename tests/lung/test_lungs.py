@@ -1,10 +1,13 @@
 """The physics of the lungs, and the published numbers of the original's."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import assert_close, needs_x64, thorough, user_error
+from hypothesis import given, settings, strategies as st
 
 import delucax as dlx
 from delucax import lung
@@ -163,6 +166,47 @@ def test_rests_where_it_says(name):
     x = plant.resting(12.0)
     assert_close(plant.observe(0.0, x), [12.0], rtol=1e-12)
     assert_close(plant.vector_field(0.0, x, jnp.zeros(2), None), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["single", "double", "balloon"])
+@settings(max_examples=50, deadline=None, database=None)
+@given(
+    resistance=st.floats(5.0, 80.0),
+    inflow=st.floats(0.0, 100.0),
+    opening=st.floats(0.0, 1.0),
+)
+def test_a_breath_begins_as_its_equation_says(name, resistance, inflow, opening):
+    """A stage of a solver looks at an expiratory valve that has closed too far, where
+    the balance of the flows has no solution at some resistances."""
+    coarse, fine = (breath(name, n, resistance, inflow, opening) for n in (1, 16))
+    assert_close(coarse, fine, atol=0.01)
+
+
+def breath(name, substeps, resistance, inflow, opening):
+    return first_step(
+        LUNGS[name], substeps, jnp.array([resistance, inflow, opening], float)
+    )
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def first_step(plant, substeps, numbers):
+    resistance, inflow, opening = numbers
+    plant = dlx.replace(plant, {"resistance": resistance})
+    x0 = plant.resting(10.0).at[1].set(opening)
+    u = jnp.stack([inflow, jnp.zeros(())])
+    return dlx.Discretized(plant, DT, substeps=substeps)(0.0, x0, u)[2:]
+
+
+@pytest.mark.parametrize("name", LUNGS)
+def test_slope_where_the_valve_is_shut(name):
+    """A valve that is about to open has the slope of one that is open."""
+    plant = LUNGS[name]
+    x = plant.resting(12.0)
+    slope = lambda opening: jax.jacfwd(
+        lambda o: plant.vector_field(0.0, x.at[1].set(o), jnp.zeros(2), None)
+    )(opening)
+    assert_close(slope(0.0), slope(1e-9), rtol=1e-6)
+    assert np.any(slope(0.0)[2:] != 0)
 
 
 def test_the_quickest_lung_rests_while_its_valve_is_open():

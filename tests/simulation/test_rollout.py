@@ -428,3 +428,25 @@ def test_tables_keep_every_column(key):
     assert table["time"].to_list() == list(np.asarray(run.times))
     assert {"state time", "state cost", "x", "control x", "cost"} <= set(table)
     assert list(table)[-1] == "cost"
+
+
+def test_statistics_of_a_batch(key):
+    """Of members that go up and away, and end at different times."""
+    dynamics = dlx.LinearDynamics(np.eye(1), np.ones((1, 1)), dt=1.0)
+    cost = dlx.costs.Function(lambda t, x, u: x[0] + 0 * u[0])
+    env = dlx.Environment(dynamics, cost, terminated=lambda t, x: x[0] > 8.5, horizon=3)
+    push = dlx.controllers.Constant([1.0])
+    go = lambda x0: dlx.rollout(env, push, key=key, x0=x0[None], throw=False)
+    starts = jnp.array([0.0, 1.0, 2.0, 6.0, np.inf])
+    batch = jax.vmap(go)(starts)
+    total = np.asarray(batch.total_cost)[:4]
+    for found in (batch.statistics(), jax.jit(lambda run: run.statistics())(batch)):
+        for q in (5, 25, 50, 75, 95):
+            assert_close(found[f"{q}%"], np.percentile(total, q), rtol=1e-6)
+        assert_close(found["mean"], total.mean(), rtol=1e-6)
+        assert_close(found["finite"], 0.8, rtol=1e-6)
+        assert_close(found["successful"], 0.8, rtol=1e-6)
+    # The one from 6 ends in its last step.
+    assert_close(batch[:4].statistics()["terminated"], 0.25)
+    alone = go(starts[1]).statistics()
+    assert alone["5%"] == alone["95%"] == total[1] and alone["finite"] == 1

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from .._check import as_matrix, check_count, check_key, check_real, is_concrete
 from .._controller import AbstractController, wrong_observation
-from .._fields import as_float_array, parameter, weight
+from .._fields import parameter, weight
 from .._message import shortened
 from ..math import matvec
 
@@ -64,12 +64,13 @@ class Constant(AbstractController):
     value: Array = weight()
 
     def __init__(self, value: Any):
-        value = as_float_array(value)
-        if not eqx.is_array(value) or value.ndim != 1:
-            raise ValueError(
-                f"Constant: value must be a vector, got {shortened(value)}."
-            )
         self.value = value
+
+    def __check_init__(self):
+        if not eqx.is_array(self.value) or self.value.ndim != 1:
+            raise ValueError(
+                f"Constant: value must be a vector, got {shortened(self.value)}."
+            )
 
     def __call__(self, t, y, state):
         return self.value.astype(y.dtype), state
@@ -102,14 +103,19 @@ class Random(AbstractController):
     mean: Array = parameter()
 
     def __init__(self, std: Any, mean: Any = 0.0):
-        self.std, self.mean = as_float_array(std), as_float_array(mean)
+        self.std, self.mean = std, mean
+
+    def __check_init__(self):
         if not eqx.is_array(self.std) or self.std.ndim != 1:
             raise ValueError(
                 "Random: std must be a vector with an entry for each control, got "
-                f"{shortened(std)}."
+                f"{shortened(self.std)}."
             )
-
-    def __check_init__(self):
+        if jnp.shape(self.mean) not in ((), self.std.shape):
+            raise ValueError(
+                f"Random: mean must be a number or have shape {self.std.shape}, got "
+                f"{jnp.shape(self.mean)}."
+            )
         if is_concrete(self.std) and np.any(np.asarray(self.std) < 0):
             raise ValueError(f"Random: std must not be negative, got {self.std}.")
 
@@ -146,7 +152,10 @@ class Linear(AbstractController):
     K: Array = weight()
 
     def __init__(self, K: Any):
-        self.K = as_matrix(K, "K", "Linear")
+        self.K = K
+
+    def __check_init__(self):
+        as_matrix(self.K, "K", "Linear")
 
     def __call__(self, t, y, state):
         if y.shape != self.K.shape[1:]:
@@ -179,7 +188,10 @@ class Sequence(AbstractController):
     values: Array = weight()
 
     def __init__(self, values: Any):
-        self.values = as_matrix(values, "values", "Sequence")
+        self.values = values
+
+    def __check_init__(self):
+        as_matrix(self.values, "values", "Sequence")
         check_real(self.values, "values", "Sequence")
         if self.values.shape[0] == 0:
             raise ValueError("Sequence: values must have at least one row, got none.")

@@ -9,7 +9,7 @@ import jax.random as jr
 from jaxtyping import Array, Float, PyTree
 
 from .._check import as_matrix, check_key
-from .._controller import AbstractController
+from .._controller import AbstractController, check_controller
 from .._fields import parameter
 from .._typing import PRNGKey, RealScalar
 
@@ -55,14 +55,12 @@ class Categorical(AbstractController):
     actions: Float[Array, "actions m"] = parameter()
 
     def __init__(self, base: AbstractController, actions: Any):
-        where = "Categorical"
-        if not isinstance(base, AbstractController):
-            raise ValueError(
-                f"{where}: base must be an AbstractController, got "
-                f"{type(base).__name__}."
-            )
         self.base = base
-        self.actions = as_matrix(actions, "actions", where)
+        self.actions = actions
+
+    def __check_init__(self):
+        check_controller(self.base, "base", "Categorical")
+        as_matrix(self.actions, "actions", "Categorical")
 
     def init(self, *, key=None):
         key, base_key = jr.split(check_key(key, "Categorical.init"))

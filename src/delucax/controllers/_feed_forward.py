@@ -7,10 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._check import as_vector
-from .._fields import function_field
+from .._fields import function_field, parameter
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..references import Constant
@@ -108,9 +108,9 @@ class Preview(eqx.Module):
     """
 
     signals: KnownSignals
-    P: Array
-    M: Array
-    closed_loop: Array
+    P: Float[Array, "n n"] = parameter()
+    M: Float[Array, "m n"] = parameter()
+    closed_loop: Float[Array, "n n"] = parameter()
     steps: int = eqx.field(static=True)
 
     def __call__(self, t: Any) -> Array:

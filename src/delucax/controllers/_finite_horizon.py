@@ -76,7 +76,7 @@ class FiniteHorizonLQR(AbstractController):
     P: Float[Array, "T+1 n n"] = parameter()
     x_ref: Float[Array, "T n"] = parameter()
     u_ref: Float[Array, "T m"] = parameter()
-    dt: Array = parameter()
+    dt: Float[Array, ""] = parameter()
     difference: Callable[[Array, Array], Array] | None = function_field()
 
     def __init__(

@@ -9,9 +9,9 @@ import jax.random as jr
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, PyTree
 
-from .._check import as_bounds, check_key
-from .._controller import AbstractController
-from .._fields import as_float_array, weight
+from .._check import as_bounds, bounds_field, check_key
+from .._controller import AbstractController, check_controller
+from .._fields import weight
 from .._message import shortened
 from .._typing import PRNGKey, RealScalar
 from ..math import clip
@@ -68,23 +68,22 @@ class Gaussian(AbstractController):
 
     base: AbstractController
     log_std: Float[Array, "..."] = weight()
-    bounds: tuple[Array, Array] | None
+    bounds: tuple[Array, Array] | None = bounds_field("Gaussian")
 
     def __init__(self, base: AbstractController, log_std: Any, *, bounds: Any = None):
+        self.base, self.log_std = base, log_std
+        self.bounds = bounds
+
+    def __check_init__(self):
         where = "Gaussian"
-        if not isinstance(base, AbstractController):
-            raise ValueError(
-                f"{where}: base must be an AbstractController, got "
-                f"{type(base).__name__}."
-            )
-        log_std = as_float_array(log_std)
+        check_controller(self.base, "base", where)
+        log_std = self.log_std
         if not eqx.is_inexact_array(log_std) or log_std.ndim > 1:
             raise ValueError(
                 f"{where}: log_std must be a number or a vector with an entry for each "
                 f"control, got {shortened(log_std)}."
             )
-        self.base, self.log_std = base, log_std
-        self.bounds = as_bounds(bounds, where)
+        as_bounds(self.bounds, where)
 
     def init(self, *, key=None):
         key, base_key = jr.split(check_key(key, "Gaussian.init"))

@@ -27,12 +27,14 @@ class AbstractGaussianFilter(AbstractEstimator):
 
     if TYPE_CHECKING:  # a static checker would ask for abstract fields as arguments
         dynamics: ClassVar[Any]
+        W: ClassVar[Any]
         V: ClassVar[Any]
         mean: ClassVar[Any]
         covariance: ClassVar[Any]
         observation_difference: ClassVar[Any]
     else:
         dynamics: eqx.AbstractVar[AbstractDynamics]
+        W: eqx.AbstractVar[Array]
         V: eqx.AbstractVar[Array]
         mean: eqx.AbstractVar[Array]
         covariance: eqx.AbstractVar[Array]
@@ -56,6 +58,12 @@ class AbstractGaussianFilter(AbstractEstimator):
     def predict(self, t, u, belief):
         joint = self._moved(t, u, belief)
         return _like(Belief(joint.mean, joint.covariance), belief)
+
+    def __check_init__(self):
+        where, n = type(self).__name__, self.dynamics.state_size
+        noise_covariances(self.dynamics, self.W, self.V, where)
+        as_vector(self.mean, n, "mean", where)
+        covariance_matrix(self.covariance, n, "covariance", "the state", where)
 
     def log_likelihood(self, t: RealScalar, y: Array, belief: Belief) -> Array:
         """The log-density of an observation, given what is known before it.

@@ -85,7 +85,7 @@ class HInfinity(AbstractController):
     gamma: Float[Array, ""] = parameter()
     x_ref: Float[Array, "... n"] = parameter()
     u_ref: Float[Array, "... m"] = parameter()
-    dt: Array | None = parameter()
+    dt: Float[Array, ""] | None = parameter()
     difference: Callable[[Array, Array], Array] | None = function_field()
 
     def __init__(

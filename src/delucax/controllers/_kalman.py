@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._check import as_vector, check_finite
+from .._check import as_vector
 from .._fields import function_field, parameter, weight
 from ..dynamics import LinearDynamics
 from ..riccati import filter_dare
@@ -96,11 +96,7 @@ class KalmanFilter(AbstractGaussianFilter):
         observation_difference: Callable[[Array, Array], Array] | None = None,
     ):
         where = "KalmanFilter"
-        if not isinstance(dynamics, LinearDynamics):
-            raise ValueError(
-                f"{where}: dynamics must be LinearDynamics (ExtendedKalmanFilter and "
-                f"UnscentedKalmanFilter take any), got {type(dynamics).__name__}."
-            )
+        _check_linear(dynamics)
         if not isinstance(steady_state, bool):
             raise ValueError(
                 f"{where}: steady_state must be True or False, got {steady_state!r}."
@@ -110,7 +106,6 @@ class KalmanFilter(AbstractGaussianFilter):
         self.y_ref = None
         if y_ref is not None:
             self.y_ref = as_vector(y_ref, self.V.shape[0], "y_ref", where)
-            check_finite(self.y_ref, "y_ref", where)
         self.observation_difference = observation_difference
         self.L = self.updated_covariance = None
         first_ref = dynamics.at(0.0).x_ref
@@ -141,6 +136,12 @@ class KalmanFilter(AbstractGaussianFilter):
         joint = LinearJoint(C @ self.mean, self.covariance, C, self.V)
         L = joint.gain()
         self.L, self.updated_covariance = L, joint.remainder(L)
+
+    def __check_init__(self):
+        _check_linear(self.dynamics)
+        if self.y_ref is not None:
+            size = self.dynamics.observation_size
+            as_vector(self.y_ref, size, "y_ref", "KalmanFilter")
 
     @property
     def _C(self) -> Array:
@@ -174,3 +175,11 @@ class KalmanFilter(AbstractGaussianFilter):
         known = None if self.L is None else self.covariance
         P, noise = belief.covariance, self._noise(here)
         return LinearJoint(mean, P, here.A, noise, known_covariance=known)
+
+
+def _check_linear(dynamics: Any) -> None:
+    if not isinstance(dynamics, LinearDynamics):
+        raise ValueError(
+            "KalmanFilter: dynamics must be LinearDynamics (ExtendedKalmanFilter and "
+            f"UnscentedKalmanFilter take any), got {type(dynamics).__name__}."
+        )

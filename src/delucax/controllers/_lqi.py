@@ -91,7 +91,7 @@ class LQI(AbstractController):
     output: Float[Array, "p n"] = parameter()
     x_ref: Float[Array, " n"] = parameter()
     u_ref: Float[Array, " m"] = parameter()
-    dt: Array = parameter()
+    dt: Float[Array, ""] = parameter()
     reference: Callable[[Any], Array] | None = function_field()
     difference: Callable[[Array, Array], Array] | None = function_field()
 

@@ -157,12 +157,6 @@ class MPC(AbstractController):
                 )
         ends = as_bounds(bounds, where)
         m = dynamics.control_size
-        for end in ends or ():
-            if end.shape not in ((), (m,)):
-                raise ValueError(
-                    f"{where}: bounds must be numbers or vectors of {m} entries, one "
-                    f"for each control, got shape {end.shape}."
-                )
         if start is None:
             start = jnp.tile(_rest(dynamics), (horizon, 1))
         start = as_float_array(start)
@@ -187,6 +181,22 @@ class MPC(AbstractController):
             else:
                 kept[name] = as_module(as_float_array(value))
         self.options, self.settings = kept, tuple(fixed)
+
+    def __check_init__(self):
+        where, m = "MPC", self.dynamics.control_size
+        if self.start.ndim < 2 or self.start.shape[-1] != m:
+            raise ValueError(
+                f"{where}: start must have shape (horizon, {m}), got "
+                f"{self.start.shape}."
+            )
+        if self.low is None and self.high is None:
+            return
+        for end in as_bounds((self.low, self.high), where) or ():
+            if end.shape not in ((), (m,)):
+                raise ValueError(
+                    f"{where}: bounds must be numbers or vectors of {m} entries, one "
+                    f"for each control, got shape {end.shape}."
+                )
 
     def init(self, *, key=None):
         if self.draws:

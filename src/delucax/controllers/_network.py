@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_bounds, check_count, check_key, is_concrete
+from .._check import as_bounds, bounds_field, check_count, check_key, is_concrete
 from .._controller import AbstractController, wrong_observation
 from .._fields import as_module, function_field, weight
 from .._typing import PRNGKey
@@ -63,7 +63,7 @@ class MLP(AbstractController):
 
     network: eqx.nn.MLP = weight()
     features: Callable[[Array], Array] | None = function_field()
-    bounds: tuple[Array, Array] | None
+    bounds: tuple[Array, Array] | None = bounds_field("MLP")
 
     def __init__(
         self,
@@ -99,17 +99,10 @@ class MLP(AbstractController):
             key=key,
         )
         self.features = features
-        self.bounds = as_bounds(bounds, where)
-        for end in self.bounds or ():
-            if end.shape not in ((), (out_size,)):
-                raise ValueError(
-                    f"{where}: bounds must be numbers or have shape ({out_size},), got "
-                    f"shape {end.shape}."
-                )
-            if is_concrete(end) and not np.all(np.isfinite(end)):
-                raise ValueError(
-                    f"{where}: bounds must be finite to squash into, got {end}."
-                )
+        self.bounds = bounds
+
+    def __check_init__(self):
+        check_squash(self.bounds, int(self.network.out_size), "MLP")
 
     def __call__(self, t, y, state):
         z = y if self.features is None else jnp.asarray(self.features(y))
@@ -120,6 +113,21 @@ class MLP(AbstractController):
             low, high = self.bounds
             u = (high + low) / 2 + (high - low) / 2 * jnp.tanh(u)
         return u.astype(y.dtype), state
+
+
+def check_squash(bounds: Any, size: int, where: str) -> None:
+    """Raise unless the bounds, if any, are ones that `size` controls can be squashed
+    into."""
+    for end in as_bounds(bounds, where) or ():
+        if end.shape not in ((), (size,)):
+            raise ValueError(
+                f"{where}: bounds must be numbers or have shape ({size},), got shape "
+                f"{end.shape}."
+            )
+        if is_concrete(end) and not np.all(np.isfinite(end)):
+            raise ValueError(
+                f"{where}: bounds must be finite to squash into, got {end}."
+            )
 
 
 def Deep(

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import check_positive, is_concrete
+from .._check import check_number, check_positive, is_concrete
 from .._fields import function_field, parameter, positive
 from .._results import RESULTS
 from ..dynamics import AbstractDynamics
+from ..dynamics._base import check_dynamics
 from ..dynamics._linearize import _jacobian
 from ._gaussian_filter import (
     AbstractGaussianFilter,
@@ -93,6 +94,9 @@ class ExtendedKalmanFilter(AbstractGaussianFilter):
             mean, covariance, zero, (self.W, self.V), where
         )
         self.observation_difference = observation_difference
+
+    def __check_init__(self):
+        _check_dynamics(self.dynamics, "ExtendedKalmanFilter")
 
     def _observation(self, t, belief):
         observe = lambda x: self.dynamics.observe(t, x)
@@ -192,24 +196,25 @@ class UnscentedKalmanFilter(AbstractGaussianFilter):
         _check_dynamics(dynamics, where)
         self.dynamics = dynamics
         self.W, self.V = noise_covariances(dynamics, W, V, where)
-        n = dynamics.state_size
-        zero = jnp.zeros(n, self.W.dtype)
+        zero = jnp.zeros(dynamics.state_size, self.W.dtype)
         self.mean, self.covariance = first_belief(
             mean, covariance, zero, (self.W, self.V), where
         )
-        for name, value in {"alpha": alpha, "beta": beta, "kappa": kappa}.items():
-            if jnp.shape(value) != ():
-                raise ValueError(
-                    f"{where}: {name} must be a number, got shape {jnp.shape(value)}."
-                )
-        check_positive(alpha, "alpha", where)
+        self.alpha, self.beta, self.kappa = alpha, beta, kappa
+        self.observation_difference = observation_difference
+
+    def __check_init__(self):
+        where = "UnscentedKalmanFilter"
+        _check_dynamics(self.dynamics, where)
+        for name in ("alpha", "beta", "kappa"):
+            check_number(getattr(self, name), name, where)
+        check_positive(self.alpha, "alpha", where)
+        n, kappa = self.dynamics.state_size, self.kappa
         if is_concrete(kappa) and not np.asarray(kappa) > -n:
             raise ValueError(
                 f"{where}: kappa must be above -n = {-n}, n being the size of the "
                 f"state, got {kappa}."
             )
-        self.alpha, self.beta, self.kappa = alpha, beta, kappa
-        self.observation_difference = observation_difference
 
     def _observation(self, t, belief):
         observe = lambda x: self.dynamics.observe(t, x)
@@ -241,12 +246,7 @@ class UnscentedKalmanFilter(AbstractGaussianFilter):
 
 
 def _check_dynamics(dynamics: Any, where: str) -> None:
-    if not isinstance(dynamics, AbstractDynamics):
-        raise ValueError(
-            f"{where}: dynamics must be an AbstractDynamics (discretise a system with "
-            f"`delucax.Discretized`; of an environment give its `dynamics`), got "
-            f"{type(dynamics).__name__}."
-        )
+    check_dynamics(dynamics, where)
     n = dynamics.state_size
     x = jnp.zeros(n)
     shape = eqx.filter_eval_shape(dynamics.difference, x, x).shape

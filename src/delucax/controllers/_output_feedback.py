@@ -55,16 +55,18 @@ class OutputFeedback(AbstractController):
     estimator: AbstractEstimator
 
     def __init__(self, controller: AbstractController, estimator: AbstractEstimator):
+        self.controller, self.estimator = controller, estimator
+
+    def __check_init__(self):
         for name, value, kind in (
-            ("controller", controller, AbstractController),
-            ("estimator", estimator, AbstractEstimator),
+            ("controller", self.controller, AbstractController),
+            ("estimator", self.estimator, AbstractEstimator),
         ):
             if not isinstance(value, kind):
                 raise ValueError(
                     f"OutputFeedback: {name} must be an {kind.__name__}, got "
                     f"{type(value).__name__}."
                 )
-        self.controller, self.estimator = controller, estimator
 
     def init(self, *, key=None):
         keys = (None, None) if key is None else jax.random.split(key)

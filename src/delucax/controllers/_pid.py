@@ -1,7 +1,7 @@
 """Proportional-integral-derivative control."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_bounds, check_finite, check_step, is_concrete
+from .._check import as_bounds, as_matrix, bounds_field, check_step, is_concrete
 from .._controller import AbstractController, wrong_observation
 from .._fields import (
     as_float_array,
-    as_module,
     function_field,
     parameter,
     positive,
@@ -36,6 +35,9 @@ class _Project(eqx.Module):
     """A linear map of an observation."""
 
     C: Array = parameter()
+
+    def __check_init__(self):
+        as_matrix(self.C, "output", "PID")
 
     def __call__(self, y):
         return matvec(self.C, y)
@@ -104,11 +106,12 @@ class PID(AbstractController):
     dt: Array = parameter(constraint=positive)
     reference: Array | Callable[[Any], Array] | None = parameter()
     output: Callable[[Array], Array] | None = function_field()
-    bounds: tuple[Array, Array] | None
+    bounds: tuple[Array, Array] | None = bounds_field("PID")
     derivative_time_constant: Array = parameter()
     derivative_on: Literal["measurement", "error"] = eqx.field(static=True)
     anti_windup_time: Array | None = parameter(constraint=positive)
-    loops: int = eqx.field(static=True)
+
+    _times: ClassVar = ("derivative_time_constant", "anti_windup_time")
 
     def __init__(
         self,
@@ -130,20 +133,20 @@ class PID(AbstractController):
                 f"{where}: derivative_on must be 'measurement' or 'error', got "
                 f"{derivative_on!r}."
             )
-        check_step(dt, where)
         self.kp, self.ki, self.kd, self.dt = kp, ki, kd, dt
-        self.reference = as_module(reference)
+        self.reference = reference
         self.output = _as_output(output, where)
-        self.bounds = as_bounds(bounds, where)
+        self.bounds = bounds
         if derivative_time_constant is None:
             derivative_time_constant = dt
         self.derivative_time_constant = derivative_time_constant
         self.derivative_on = derivative_on
         self.anti_windup_time = anti_windup_time
-        times = ("derivative_time_constant", "anti_windup_time")
-        self.loops = _count_loops(self, times)
 
     def __check_init__(self):
+        check_step(self.dt, "PID")
+        as_bounds(self.bounds, "PID")
+        _count_loops(self)
         lag, windup, dt = self.derivative_time_constant, self.anti_windup_time, self.dt
         if is_concrete(lag) and np.any(np.asarray(lag) < 0):
             raise ValueError(
@@ -154,6 +157,11 @@ class PID(AbstractController):
                 raise ValueError(
                     f"PID: anti_windup_time must be at least dt = {dt}, got {windup}."
                 )
+
+    @property
+    def loops(self) -> int:
+        """The number of loops."""
+        return _count_loops(self)
 
     def init(self, *, key=None):
         zeros = _zeros(self.loops, self.kp, self.ki, self.kd, self.dt)
@@ -241,8 +249,9 @@ class LeakyPID(AbstractController):
     time_constant: Array = parameter(constraint=positive)
     reference: Array | Callable[[Any], Array] | None = parameter()
     output: Callable[[Array], Array] | None = function_field()
-    bounds: tuple[Array, Array] | None
-    loops: int = eqx.field(static=True)
+    bounds: tuple[Array, Array] | None = bounds_field("LeakyPID")
+
+    _times: ClassVar = ("time_constant",)
 
     def __init__(
         self,
@@ -259,10 +268,19 @@ class LeakyPID(AbstractController):
         where = "LeakyPID"
         self.kp, self.ki, self.kd, self.dt = kp, ki, kd, dt
         self.time_constant = time_constant
-        self.reference = as_module(reference)
+        self.reference = reference
         self.output = _as_output(output, where)
-        self.bounds = as_bounds(bounds, where)
-        self.loops = _count_loops(self, ("time_constant",))
+        self.bounds = bounds
+
+    def __check_init__(self):
+        check_step(self.dt, "LeakyPID")
+        as_bounds(self.bounds, "LeakyPID")
+        _count_loops(self)
+
+    @property
+    def loops(self) -> int:
+        """The number of loops."""
+        return _count_loops(self)
 
     def init(self, *, key=None):
         zeros = _zeros(self.loops, self.kp, self.ki, self.kd, self.dt)
@@ -294,16 +312,15 @@ def _as_output(output: Any, where: str) -> Any:
             f"{where}: output must be an index from 0, a tuple of them, a matrix or a "
             f"function, got {shortened(output)}."
         )
-    check_finite(array, "output", where)
     return _Project(array)
 
 
-def _count_loops(pid: Any, times: tuple[str, ...]) -> int:
+def _count_loops(pid: Any) -> int:
     """The size that all the vectors have; 1 where all are numbers."""
     where = type(pid).__name__
     low, high = (None, None) if pid.bounds is None else pid.bounds
     vectors = {"low bounds": low, "high bounds": high}
-    vectors |= {name: getattr(pid, name) for name in ("kp", "ki", "kd", *times)}
+    vectors |= {name: getattr(pid, name) for name in ("kp", "ki", "kd", *pid._times)}
     if not callable(pid.reference):
         vectors["reference"] = pid.reference
     sizes = {}

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, PyTree
 
-from .._check import as_bounds, check_count, check_finite, check_key, check_positive
-from .._controller import AbstractController, wrong_observation
+from .._check import bounds_field, check_count, check_finite, check_key, check_positive
+from .._controller import AbstractController, check_controller, wrong_observation
 from .._fields import as_float_array, function_field, parameter, weight
 from .._message import shortened
 from .._typing import PRNGKey
+from ._network import check_squash
 
 
 class GRU(AbstractController):
@@ -59,7 +60,7 @@ class GRU(AbstractController):
     cell: eqx.nn.GRUCell = weight()
     readout: eqx.nn.Linear = weight()
     features: Callable[[Array], Array] | None = function_field()
-    bounds: tuple[Array, Array] | None
+    bounds: tuple[Array, Array] | None = bounds_field("GRU")
 
     def __init__(
         self,
@@ -79,14 +80,10 @@ class GRU(AbstractController):
         self.cell = eqx.nn.GRUCell(in_size, width, key=cell_key)
         self.readout = eqx.nn.Linear(width, out_size, key=readout_key)
         self.features = features
-        self.bounds = as_bounds(bounds, where)
-        for end in self.bounds or ():
-            if end.shape not in ((), (out_size,)):
-                raise ValueError(
-                    f"{where}: bounds must be numbers or have shape ({out_size},), got "
-                    f"shape {end.shape}."
-                )
-            check_finite(end, "bounds", where)
+        self.bounds = bounds
+
+    def __check_init__(self):
+        check_squash(self.bounds, int(self.readout.out_features), "GRU")
 
     def init(self, *, key=None):
         del key
@@ -163,16 +160,14 @@ class History(AbstractController):
         features: Callable[[Array], Array] | None = None,
     ):
         where = "History"
-        if not isinstance(base, AbstractController):
-            raise ValueError(
-                f"{where}: base must be an AbstractController, got "
-                f"{type(base).__name__}."
-            )
         self.base = base
         self.size = check_count(size, "size", where)
         self.controls = check_count(controls, "controls", where)
         self.length = check_count(length, "length", where)
         self.features = features
+
+    def __check_init__(self):
+        check_controller(self.base, "base", "History")
 
     def init(self, *, key=None):
         return _Past(
@@ -243,21 +238,24 @@ class Standardise(eqx.Module):
         std: Any = 1.0,
         features: Callable[[Array], Array] | None = None,
     ):
-        where = "Standardise"
-        mean = as_float_array(mean)
+        self.mean = as_float_array(mean)
+        std = as_float_array(std)
+        if eqx.is_inexact_array(self.mean) and jnp.ndim(std) == 0:
+            std = jnp.broadcast_to(std, self.mean.shape).astype(self.mean.dtype)
+        self.std = std
+        self.features = features
+
+    def __check_init__(self):
+        where, mean = "Standardise", self.mean
         if not eqx.is_inexact_array(mean) or mean.ndim != 1:
             raise ValueError(f"{where}: mean must be a vector, got {shortened(mean)}.")
         check_finite(mean, "mean", where)
-        check_positive(std, "std", where)
-        std = as_float_array(std)
-        if std.shape not in ((), mean.shape):
+        check_positive(self.std, "std", where)
+        if self.std.shape != mean.shape:
             raise ValueError(
                 f"{where}: std must be a number or have shape {mean.shape}, got shape "
-                f"{std.shape}."
+                f"{self.std.shape}."
             )
-        self.mean = mean
-        self.std = jnp.broadcast_to(std, mean.shape).astype(mean.dtype)
-        self.features = features
 
     def of(self, y: Array) -> Array:
         """The features, as they are.

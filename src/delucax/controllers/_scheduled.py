@@ -56,12 +56,16 @@ class Scheduled(AbstractController):
     dt: Array = parameter()
 
     def __init__(self, controllers: AbstractController, dt: Any):
+        self.controllers, self.dt = controllers, dt
+
+    def __check_init__(self):
+        controllers = self.controllers
         if not isinstance(controllers, AbstractController):
             raise ValueError(
                 "Scheduled: controllers must be an AbstractController whose arrays "
                 f"have a leading axis, got {type(controllers).__name__}."
             )
-        check_step(dt, "Scheduled")
+        check_step(self.dt, "Scheduled")
         arrays = jax.tree.leaves(eqx.filter(controllers, eqx.is_array))
         lengths = {array.shape[:1] for array in arrays}
         if len(lengths) != 1 or () in lengths:
@@ -69,7 +73,6 @@ class Scheduled(AbstractController):
                 "Scheduled: controllers must have arrays with one leading axis in "
                 f"common, got lengths {sorted(lengths)}."
             )
-        self.controllers, self.dt = controllers, dt
 
     def _at(self, t: Any) -> AbstractController:
         arrays, rest = eqx.partition(self.controllers, eqx.is_array)

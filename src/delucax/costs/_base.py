@@ -1,6 +1,7 @@
 """Stage and final costs."""
 
 import abc
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +17,8 @@ class AbstractCost(eqx.Module):
     A cost is minus a reward. The stage cost is charged at the current state and the
     control that was applied, once a step; the final cost once, at the last state or on
     entering a terminated one.
+
+    Add two with `+`, and multiply one by a number with `*`.
 
     !!! example
 
@@ -33,6 +36,25 @@ class AbstractCost(eqx.Module):
 
     def __check_init__(self):
         check_parameters(self)
+
+    # So that a NumPy number times a cost is left to `__rmul__`.
+    __array_ufunc__: ClassVar = None
+
+    def __add__(self, other: "AbstractCost") -> "AbstractCost":
+        from ._compose import Sum
+
+        if not isinstance(other, AbstractCost):
+            return NotImplemented
+        return Sum(self, other)
+
+    def __mul__(self, factor: Any) -> "AbstractCost":
+        from ._compose import Scaled
+
+        if isinstance(factor, AbstractCost):
+            return NotImplemented
+        return Scaled(self, factor)
+
+    __rmul__ = __mul__
 
     @abc.abstractmethod
     def __call__(self, t: RealScalar, x: Array, u: Array) -> Array:
@@ -52,3 +74,12 @@ class AbstractCost(eqx.Module):
         """
         del t
         return jnp.zeros((), x.dtype)
+
+
+def check_cost(value: Any, name: str, where: str) -> None:
+    """Raise unless `value` is a cost."""
+    if not isinstance(value, AbstractCost):
+        raise ValueError(
+            f"{where}: {name} must be an AbstractCost (wrap a function with "
+            f"`delucax.costs.Function`), got {type(value).__name__}."
+        )

@@ -1,15 +1,14 @@
 """Costs made of functions and of other costs."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_step
+from .._check import check_number, check_step
 from .._fields import function_field, parameter
 from .._typing import RealScalar
-from ._base import AbstractCost
+from ._base import AbstractCost, check_cost
 
 
 class Function(AbstractCost):
@@ -43,6 +42,80 @@ class Function(AbstractCost):
         return self.final_cost(t, x)
 
 
+class Sum(AbstractCost):
+    """The sum of several costs, `c_1(t, x, u) + ... + c_n(t, x, u)`, and of their final
+    costs. `cost + other` makes it.
+
+    **Arguments:** `*terms`: the costs, at least one.
+
+    **Raises:** `ValueError` if there are none, or if one is no cost.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        effort = dlx.costs.Function(lambda t, x, u: jnp.sum(jnp.abs(u)))
+        cost = dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1)) + 0.1 * effort
+        cost(0.0, jnp.ones(2), jnp.ones(1))
+        ```
+    """
+
+    terms: tuple[AbstractCost, ...]
+
+    def __init__(self, *terms: AbstractCost):
+        self.terms = terms
+
+    def __check_init__(self):
+        if not self.terms:
+            raise ValueError("Sum: at least one cost must be given.")
+        for term in self.terms:
+            check_cost(term, "every term", "Sum")
+
+    def __call__(self, t, x, u):
+        first, *others = (term(t, x, u) for term in self.terms)
+        return sum(others, first)
+
+    def final(self, t, x):
+        first, *others = (term.final(t, x) for term in self.terms)
+        return sum(others, first)
+
+
+class Scaled(AbstractCost):
+    """A cost times a number, `factor c(t, x, u)`, and so its final cost.
+    `factor * cost` makes it.
+
+    **Arguments:**
+
+    - `cost`: the cost.
+    - `factor`: a number; it can be differentiated.
+
+    **Raises:** `ValueError` if `cost` is not one, or `factor` is not a finite number.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        doubled = 2 * dlx.costs.PendulumCost()
+        ```
+    """
+
+    cost: AbstractCost
+    factor: Array = parameter()
+
+    def __check_init__(self):
+        check_cost(self.cost, "cost", "Scaled")
+        check_number(self.factor, "factor", "Scaled")
+
+    def __call__(self, t, x, u):
+        return self.factor * self.cost(t, x, u)
+
+    def final(self, t, x):
+        return self.factor * self.cost.final(t, x)
+
+
 class Rate(AbstractCost):
     """A cost a second, charged for a step of `dt`: `c(t, x, u) dt`.
 
@@ -67,14 +140,9 @@ class Rate(AbstractCost):
     cost: AbstractCost
     dt: Array = parameter()
 
-    def __init__(self, cost: AbstractCost, dt: Any):
-        if not isinstance(cost, AbstractCost):
-            raise ValueError(
-                f"Rate: cost must be an AbstractCost, got {type(cost).__name__}."
-            )
-        check_step(dt, "Rate")
-        self.cost = cost
-        self.dt = dt
+    def __check_init__(self):
+        check_cost(self.cost, "cost", "Rate")
+        check_step(self.dt, "Rate")
 
     def __call__(self, t, x, u):
         return self.cost(t, x, u) * self.dt

@@ -63,9 +63,14 @@ class Quadratic(AbstractCost):
         difference: Callable[[Array, Array], Array] | None = None,
     ):
         self.Q, self.R, self.Qf = _weights(Q, R, final, "Quadratic")
-        self.state_target = _target(state_target, self.Q, "state_target")
-        self.control_target = _target(control_target, self.R, "control_target")
+        self.state_target = state_target
+        self.control_target = control_target
         self.difference = difference
+
+    def __check_init__(self):
+        _weights(self.Q, self.R, self.Qf, "Quadratic")
+        _check_target(self.state_target, self.Q, "state_target")
+        _check_target(self.control_target, self.R, "control_target")
 
     def _state(self, x: Array) -> Array:
         if x.shape != self.Q.shape[:1]:
@@ -134,13 +139,16 @@ class Tracking(AbstractCost):
         output: Callable[[Array], Array] | None = None,
     ):
         self.Q, self.R, self.Qf = _weights(Q, R, final, "Tracking")
-        if not callable(reference):
-            raise ValueError(
-                f"Tracking: reference must be a function of time, "
-                f"got {shortened(reference)}."
-            )
         self.reference = reference
         self.output = output
+
+    def __check_init__(self):
+        _weights(self.Q, self.R, self.Qf, "Tracking")
+        if not callable(self.reference):
+            raise ValueError(
+                "Tracking: reference must be a function of time, got "
+                f"{shortened(self.reference)}."
+            )
 
     def _error(self, t: RealScalar, x: Array) -> Array:
         y = x if self.output is None else self.output(x)
@@ -204,13 +212,11 @@ def _check_control(R: Array, u: Array, where: str) -> None:
         )
 
 
-def _target(value: Any, weight: Array, name: str) -> Array | None:
+def _check_target(value: Any, weight: Array, name: str) -> None:
     if value is None:
-        return None
-    array = as_float_array(value)
-    if not eqx.is_array(array) or array.shape != weight.shape[:1]:
+        return
+    if not eqx.is_array(value) or value.shape != weight.shape[:1]:
         raise ValueError(
             f"Quadratic: {name} must have shape {weight.shape[:1]}, got "
-            f"{jnp.shape(array)}."
+            f"{jnp.shape(value)}."
         )
-    return array

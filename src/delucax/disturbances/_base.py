@@ -109,6 +109,12 @@ def times_to_draw(disturbance: AbstractDisturbance, times: Array, steps: int) ->
     return times[: max(steps, least)]
 
 
+def check_common_size(disturbance: Any, *names: str) -> None:
+    """Raise unless the named fields are numbers, or have `disturbance.size` entries."""
+    values = {name: getattr(disturbance, name) for name in names}
+    common_size(type(disturbance).__name__, disturbance.size, **values)
+
+
 def spread(values: Array, steps: int, size: int) -> Array:
     """`values` as shape `(steps, size)`."""
     return jnp.broadcast_to(values, (steps, size))

@@ -36,12 +36,14 @@ class Sum(AbstractDisturbance):
     terms: tuple[AbstractDisturbance, ...]
 
     def __init__(self, *terms: AbstractDisturbance):
-        for term in terms:
+        self.terms = terms
+
+    def __check_init__(self):
+        for term in self.terms:
             check_disturbance(term, "every term", "Sum")
-        sizes = [term.size for term in terms]
+        sizes = [term.size for term in self.terms]
         if len(set(sizes)) != 1:
             raise ValueError(f"Sum: terms must be of one size, got sizes {sizes}.")
-        self.terms = terms
 
     @property
     def size(self) -> int:

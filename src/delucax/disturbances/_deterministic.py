@@ -11,7 +11,7 @@ from .._check import as_matrix, check_range
 from .._fields import parameter, positive
 from ..math import sin
 from ..math._steps import coarsest, position, step_between
-from ._base import AbstractDisturbance, common_size, spread
+from ._base import AbstractDisturbance, check_common_size, common_size, spread
 
 
 class Zero(AbstractDisturbance):
@@ -64,6 +64,9 @@ class Constant(AbstractDisturbance):
     def __init__(self, value: Any, *, size: int | None = None):
         self.size, arrays = common_size("Constant", size, value=value)
         self.value = arrays["value"]
+
+    def __check_init__(self):
+        check_common_size(self, "value")
 
     def sequence(self, key, times):
         return spread(self.value, times.shape[0], self.size).astype(times.dtype)
@@ -119,6 +122,9 @@ class Sinusoid(AbstractDisturbance):
         for name, array in arrays.items():
             setattr(self, name, array)
 
+    def __check_init__(self):
+        check_common_size(self, "amplitude", "frequency", "phase", "offset")
+
     def sequence(self, key, times):
         angle = 2 * np.pi * self.frequency * times[:, None] + self.phase
         w = self.amplitude * sin(angle) + self.offset
@@ -168,6 +174,7 @@ class Square(AbstractDisturbance):
             setattr(self, name, array)
 
     def __check_init__(self):
+        check_common_size(self, "amplitude", "period", "duty")
         check_range(self.duty, "duty", "Square", 0, 1)
 
     def sequence(self, key, times):
@@ -210,8 +217,8 @@ class FromArray(AbstractDisturbance):
 
     values: Array = parameter()
 
-    def __init__(self, values: Any):
-        self.values = as_matrix(values, "values", "FromArray")
+    def __check_init__(self):
+        as_matrix(self.values, "values", "FromArray")
 
     @property
     def size(self) -> int:

@@ -12,7 +12,7 @@ from .._check import check_count, check_key, check_range, check_step
 from .._fields import parameter
 from ..math import clip
 from ..math._normal import normal
-from ._base import AbstractDisturbance, common_size
+from ._base import AbstractDisturbance, check_common_size, common_size
 
 
 class Gaussian(AbstractDisturbance):
@@ -48,6 +48,7 @@ class Gaussian(AbstractDisturbance):
         self.std, self.mean = arrays["std"], arrays["mean"]
 
     def __check_init__(self):
+        check_common_size(self, "std", "mean")
         check_range(self.std, "std", "Gaussian")
 
     def sequence(self, key, times):
@@ -87,6 +88,7 @@ class Uniform(AbstractDisturbance):
         self.low, self.high = arrays["low"], arrays["high"]
 
     def __check_init__(self):
+        check_common_size(self, "low", "high")
         check_range(self.high, "high", "Uniform", self.low)
 
     def sequence(self, key, times):
@@ -130,6 +132,7 @@ class RandomWalk(AbstractDisturbance):
         self.std, self.bound = arrays["std"], arrays["bound"]
 
     def __check_init__(self):
+        check_common_size(self, "std", "bound")
         check_range(self.std, "std", "RandomWalk")
         check_range(self.bound, "bound", "RandomWalk")
 
@@ -177,11 +180,13 @@ class Brownian(AbstractDisturbance):
     substeps: int = eqx.field(static=True)
 
     def __init__(self, size: int, dt: Any = None, substeps: int = 1):
-        if dt is not None:
-            check_step(dt, "Brownian")
         self.dt = dt
         self.substeps = check_count(substeps, "substeps", "Brownian")
         self.size = check_count(size, "size", "Brownian") * self.substeps
+
+    def __check_init__(self):
+        if self.dt is not None:
+            check_step(self.dt, "Brownian")
 
     def sequence(self, key, times):
         if self.dt is None and times.shape[0] < 2:

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
+from .._check import check_step, output_of
+from .._fields import check_parameters
 from .._results import Result, RESULTS
 from .._typing import RealScalar
 from ..systems._base import validate_io
@@ -39,6 +41,10 @@ class AbstractDynamics(eqx.Module):
         control_names: eqx.AbstractVar[tuple[str, ...]]
     state_units: ClassVar[Any] = ()
     control_units: ClassVar[Any] = ()
+
+    def __check_init__(self):
+        check_step(self.dt, type(self).__name__)
+        check_parameters(self)
 
     @property
     def state_size(self) -> int:
@@ -141,9 +147,7 @@ class AbstractDynamics(eqx.Module):
     @property
     def observation_size(self) -> int:
         """The size of what `observe` returns."""
-        y: Any = eqx.filter_eval_shape(
-            self.observe, jnp.zeros(()), jnp.zeros(self.state_size)
-        )
+        y = output_of(self.observe, (), (self.state_size,))
         shape = getattr(y, "shape", None)
         if shape is None or len(shape) != 1:
             got = type(y).__name__ if shape is None else f"an array of shape {shape}"
@@ -151,3 +155,13 @@ class AbstractDynamics(eqx.Module):
                 f"{type(self).__name__}: observe must return a vector, got {got}."
             )
         return shape[0]
+
+
+def check_dynamics(value: Any, where: str) -> None:
+    """Raise unless `value` is discrete-time dynamics."""
+    if not isinstance(value, AbstractDynamics):
+        raise ValueError(
+            f"{where}: dynamics must be an AbstractDynamics (discretise a system with "
+            f"`delucax.Discretized`; of an environment give its `dynamics`), got "
+            f"{type(value).__name__}."
+        )

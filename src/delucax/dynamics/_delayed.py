@@ -48,11 +48,6 @@ class Delayed(AbstractWrapper):
 
     def __init__(self, dynamics: AbstractDynamics, controls: int = 0, sensor: int = 0):
         where = "Delayed"
-        if not isinstance(dynamics, AbstractDynamics):
-            raise ValueError(
-                f"{where}: dynamics must be an AbstractDynamics, got "
-                f"{type(dynamics).__name__}."
-            )
         self.dynamics = dynamics
         self.controls = check_count(controls, "controls", where, least=0)
         self.sensor = check_count(sensor, "sensor", where, least=0)

@@ -8,7 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_count, check_positive, check_step
+from .._check import check_count
 from .._components import by_components
 from .._fields import parameter
 from .._results import choose, first_of, or_none, promote, RESULTS
@@ -122,28 +122,41 @@ class Discretized(AbstractDynamics):
         max_steps: int | None = None,
     ):
         where = "Discretized"
+        self.system = system
+        self.dt = dt
+        self.substeps = check_count(substeps, "substeps", where)
+        if solver is None:
+            noisy = isinstance(system, AbstractSystem) and has_diffusion(system)
+            solver = diffrax.Euler() if noisy else RK4()
+        if stepsize_controller is not None:
+            if adjoint is None:
+                adjoint = diffrax.RecursiveCheckpointAdjoint()
+            max_steps = check_count(
+                256 if max_steps is None else max_steps, "max_steps", where
+            )
+        self.solver = solver
+        self.stepsize_controller = stepsize_controller
+        self.adjoint = adjoint
+        self.max_steps = max_steps
+
+    def __check_init__(self):
+        where, system, solver = "Discretized", self.system, self.solver
         if not isinstance(system, AbstractSystem):
             raise ValueError(
                 f"{where}: system must be an AbstractSystem (wrap a function with "
                 f"`delucax.system`), got {type(system).__name__}."
             )
-        check_step(dt, where)
-        self.system = system
-        self.dt = dt
-        self.substeps = check_count(substeps, "substeps", where)
         noisy = has_diffusion(system)
-        if solver is None:
-            solver = diffrax.Euler() if noisy else RK4()
         check_solver(solver, where)
-        if stepsize_controller is None:
-            if adjoint is not None:
+        if self.stepsize_controller is None:
+            if self.adjoint is not None:
                 raise ValueError(
                     f"{where}: adjoint is given without stepsize_controller. Fixed "
                     "steps are differentiated as they are written; give "
                     "stepsize_controller=diffrax.PIDController(rtol=..., atol=...), or "
                     "choose what `rollout` stores with its checkpoint= argument."
                 )
-            if max_steps is not None:
+            if self.max_steps is not None:
                 raise ValueError(
                     f"{where}: max_steps needs stepsize_controller; with fixed steps "
                     "give substeps."
@@ -157,31 +170,19 @@ class Discretized(AbstractDynamics):
             if not noisy:
                 check_fixed_step(solver, where)
         else:
-            check_stepsize_controller(stepsize_controller, where)
+            check_stepsize_controller(self.stepsize_controller, where)
             check_adaptive(solver, where)
             if noisy:
                 raise ValueError(
                     f"{where}: stepsize_controller does not fit a system with a "
                     "diffusion, whose Brownian increments are drawn for fixed steps."
                 )
-            if substeps != 1:
+            if self.substeps != 1:
                 raise ValueError(
                     f"{where}: substeps must be 1 with a stepsize_controller, which "
-                    f"chooses the steps, got {substeps}."
+                    f"chooses the steps, got {self.substeps}."
                 )
-            if adjoint is None:
-                adjoint = diffrax.RecursiveCheckpointAdjoint()
-            check_adjoint(adjoint, where)
-            max_steps = check_count(
-                256 if max_steps is None else max_steps, "max_steps", where
-            )
-        self.solver = solver
-        self.stepsize_controller = stepsize_controller
-        self.adjoint = adjoint
-        self.max_steps = max_steps
-
-    def __check_init__(self):
-        check_positive(self.dt, "dt", "Discretized")
+            check_adjoint(self.adjoint, where)
 
     @property
     def state_names(self) -> tuple[str, ...]:

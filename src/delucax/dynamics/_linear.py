@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import as_matrix, as_vector, check_step, is_concrete
+from .._check import as_matrix, as_vector, is_concrete
 from .._fields import as_float_array, parameter
 from .._results import RESULTS
 from ..math import matvec
@@ -81,23 +81,10 @@ class LinearDynamics(AbstractDynamics):
         control_names: tuple[str, ...] | None = None,
     ):
         where = "LinearDynamics"
-        A, B, E = as_float_array(A), as_float_array(B), as_float_array(E)
-        steps = None
-        if eqx.is_array(A) and A.ndim == 3:
-            steps = A.shape[0]
-            A = as_matrix(A, "A", where, ndim=3)
-            B = _in_time(as_matrix(B, "B", where, ndim=jnp.ndim(B)), steps, 2, "B")
-            if E is not None:
-                E = _in_time(as_matrix(E, "E", where, ndim=jnp.ndim(E)), steps, 2, "E")
-            if steps == 0:
-                raise ValueError(f"{where}: A must have at least one time step.")
-            E0 = None if E is None else E[0]
-            _, _, C, _ = check_matrices(A[0], B[0], C, E0, where)
-        else:
-            A, B, C, E = check_matrices(A, B, C, E, where)
+        A, B, C, E = _checked_matrices(A, B, C, E)
+        steps = A.shape[0] if A.ndim == 3 else None
         n, m = B.shape[-2:]
         self.A, self.B, self.C, self.E = A, B, C, E
-        check_step(dt, where)
         self.dt = dt
         self.x_ref = _point(x_ref, n, steps, "x_ref", jnp.zeros(n, A.dtype))
         self.u_ref = _point(u_ref, m, steps, "u_ref", jnp.zeros(m, A.dtype))
@@ -106,6 +93,23 @@ class LinearDynamics(AbstractDynamics):
         self.control_names = checked_names(
             control_names, "u", m, "control_names", where
         )
+
+    def __check_init__(self):
+        where = "LinearDynamics"
+        _checked_matrices(self.A, self.B, self.C, self.E)
+        time = self.A.shape[:-2]
+        n, m = self.B.shape[-2:]
+        k = None if self.E is None else self.E.shape[-1]
+        shapes = dict(B=(n, m), E=(n, k), x_ref=(n,), u_ref=(m,), x_next=(n,))
+        for name, shape in shapes.items():
+            array = getattr(self, name)
+            if array is not None and array.shape != (*time, *shape):
+                raise ValueError(
+                    f"{where}: {name} must have shape {(*time, *shape)}, got "
+                    f"{array.shape}."
+                )
+        checked_names(self.state_names, "x", n, "state_names", where)
+        checked_names(self.control_names, "u", m, "control_names", where)
 
     @property
     def is_time_varying(self) -> bool:
@@ -153,6 +157,22 @@ class LinearDynamics(AbstractDynamics):
     def equilibrium(self):
         here = self.at(0.0)
         return here.x_ref, here.u_ref
+
+
+def _checked_matrices(A: Any, B: Any, C: Any, E: Any) -> tuple[Array, Array, Any, Any]:
+    """`A`, `B`, `C`, `E` of fitting shapes, with the leading time axis that `A` has."""
+    where = "LinearDynamics"
+    A, B, E = as_float_array(A), as_float_array(B), as_float_array(E)
+    if not eqx.is_array(A) or A.ndim != 3:
+        return check_matrices(A, B, C, E, where)
+    A, steps = as_matrix(A, "A", where, ndim=3), A.shape[0]
+    B = _in_time(as_matrix(B, "B", where, ndim=jnp.ndim(B)), steps, 2, "B")
+    if E is not None:
+        E = _in_time(as_matrix(E, "E", where, ndim=jnp.ndim(E)), steps, 2, "E")
+    if steps == 0:
+        raise ValueError(f"{where}: A must have at least one time step.")
+    E0 = None if E is None else E[0]
+    return A, B, check_matrices(A[0], B[0], C, E0, where)[2], E
 
 
 def _in_time(array: Array, steps: int, ndim: int, name: str) -> Array:

@@ -8,7 +8,7 @@ from .._check import as_matrix, check_positive
 from .._fields import parameter
 from ..math import matvec
 from ..math._norms import within_ball
-from ._base import AbstractDynamics
+from ._base import AbstractDynamics, check_dynamics
 from ._wrapper import AbstractWrapper
 
 
@@ -55,23 +55,21 @@ class WorstCase(AbstractWrapper):
     bound: Array | None = parameter()
 
     def __init__(self, dynamics: AbstractDynamics, L: Any, *, bound: Any = None):
-        where = "WorstCase"
-        if not isinstance(dynamics, AbstractDynamics):
-            raise ValueError(
-                f"{where}: dynamics must be an AbstractDynamics, got "
-                f"{type(dynamics).__name__}."
-            )
+        self.dynamics, self.L, self.bound = dynamics, L, bound
+
+    def __check_init__(self):
+        where, dynamics = "WorstCase", self.dynamics
+        check_dynamics(dynamics, where)
         dynamics.equilibrium()
-        self.L = as_matrix(L, "L", where)
+        as_matrix(self.L, "L", where)
         shape = dynamics.disturbance_size, dynamics.state_size
         if self.L.shape != shape:
             raise ValueError(
                 f"{where}: L must have shape {shape}, a row for each disturbance and a "
                 f"column for each state, got shape {self.L.shape}."
             )
-        if bound is not None:
-            check_positive(bound, "bound", where)
-        self.dynamics, self.bound = dynamics, bound
+        if self.bound is not None:
+            check_positive(self.bound, "bound", where)
 
     def attack(self, x: Array) -> Array:
         """What the adversary adds to the disturbance.

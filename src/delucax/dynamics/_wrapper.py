@@ -4,7 +4,7 @@ from typing import Any, ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 
-from ._base import AbstractDynamics
+from ._base import AbstractDynamics, check_dynamics
 
 
 class AbstractWrapper(AbstractDynamics):
@@ -49,6 +49,9 @@ class AbstractWrapper(AbstractDynamics):
         def control_units(self):
             same = self.control_names == self.dynamics.control_names
             return self.dynamics.control_units if same else ()
+
+    def __check_init__(self):
+        check_dynamics(self.dynamics, type(self).__name__)
 
     @property
     def dt(self):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_number, check_positive, check_range, check_step
+from .._check import check_number, check_positive, check_range
 from .._fields import parameter, positive
 from .._results import RESULTS
 from .._typing import RealScalar
@@ -73,7 +73,6 @@ class GymAcrobot(AbstractDynamics):
         return self.system.disturbance_size
 
     def __check_init__(self):
-        check_step(self.dt, "GymAcrobot")
         check_positive(self.max_velocity_1, "max_velocity_1", "GymAcrobot")
         check_positive(self.max_velocity_2, "max_velocity_2", "GymAcrobot")
 

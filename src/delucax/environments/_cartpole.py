@@ -58,7 +58,6 @@ class GymCartPole(AbstractDynamics):
     control_units = CartPole.control_units
 
     def __check_init__(self):
-        check_step(self.dt, "GymCartPole")
         if not isinstance(self.semi_implicit, bool):
             raise ValueError(
                 "GymCartPole: semi_implicit must be True or False, got "

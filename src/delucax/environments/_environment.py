@@ -12,11 +12,13 @@ from jaxtyping import Array, ArrayLike
 from .._check import (
     as_bounds,
     as_vector,
+    bounds_field,
     check_count,
     check_finite,
     check_key,
     check_real,
     is_concrete,
+    output_of,
 )
 from .._fields import (
     as_float_array,
@@ -30,8 +32,10 @@ from .._paths import get_path, replace
 from .._results import Result
 from .._typing import PRNGKey, RealScalar
 from ..costs import AbstractCost
+from ..costs._base import check_cost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics
+from ..dynamics._base import check_dynamics
 from ..math import clip
 
 
@@ -93,14 +97,6 @@ def _as_start(value: Any) -> Any:
     return as_module(value) if callable(value) else as_float_array(value)
 
 
-def _as_control_bounds(value: Any) -> tuple[Array, Array] | None:
-    return as_bounds(value, "Environment", "control_bounds")
-
-
-def _as_observation_bounds(value: Any) -> tuple[Array, Array] | None:
-    return as_bounds(value, "Environment", "observation_bounds")
-
-
 class Environment(eqx.Module):
     """Dynamics, a cost, and what else makes a task of them.
 
@@ -149,13 +145,15 @@ class Environment(eqx.Module):
     disturbance: AbstractDisturbance
     sensor_noise: AbstractDisturbance | None
     initial_state: Any = eqx.field(converter=_as_start)
-    control_bounds: tuple[Array, Array] | None = eqx.field(converter=_as_control_bounds)
+    control_bounds: tuple[Array, Array] | None = bounds_field(
+        "Environment", "control_bounds"
+    )
     horizon: int = eqx.field(static=True)
     terminated: Callable[[RealScalar, Array], Array] | None = function_field()
     actions: Array | None = parameter()
     encode: Callable[[Array], Array] = function_field()
-    observation_bounds: tuple[Array, Array] | None = eqx.field(
-        converter=_as_observation_bounds
+    observation_bounds: tuple[Array, Array] | None = bounds_field(
+        "Environment", "observation_bounds"
     )
 
     def __init__(
@@ -191,16 +189,8 @@ class Environment(eqx.Module):
 
     def __check_init__(self):
         where, dynamics = "Environment", self.dynamics
-        if not isinstance(dynamics, AbstractDynamics):
-            raise ValueError(
-                f"{where}: dynamics must be an AbstractDynamics (discretise a system "
-                f"with `delucax.Discretized`), got {type(dynamics).__name__}."
-            )
-        if not isinstance(self.cost, AbstractCost):
-            raise ValueError(
-                f"{where}: cost must be an AbstractCost (wrap a function with "
-                f"`delucax.costs.Function`), got {type(self.cost).__name__}."
-            )
+        check_dynamics(dynamics, where)
+        check_cost(self.cost, "cost", where)
         for name, given, size in (
             ("disturbance", self.disturbance, dynamics.disturbance_size),
             ("sensor_noise", self.sensor_noise, None),
@@ -225,6 +215,7 @@ class Environment(eqx.Module):
             )
             check_finite(x0, "initial_state", where)
         if self.control_bounds is not None:
+            as_bounds(self.control_bounds, where, "control_bounds")
             for end in self.control_bounds:
                 if end.shape not in ((), (m,)):
                     raise ValueError(
@@ -233,6 +224,7 @@ class Environment(eqx.Module):
                     )
         if self.observation_bounds is not None:
             size = self.feature_size
+            as_bounds(self.observation_bounds, where, "observation_bounds")
             for end in self.observation_bounds:
                 if end.shape not in ((), (size,)):
                     raise ValueError(
@@ -274,8 +266,7 @@ class Environment(eqx.Module):
     @property
     def feature_size(self) -> int:
         """The size of what `encode` returns."""
-        y = jnp.zeros(self.observation_size)
-        shape = jnp.shape(eqx.filter_eval_shape(self.encode, y))
+        shape = jnp.shape(output_of(self.encode, (self.observation_size,)))
         if len(shape) != 1:
             raise ValueError(
                 "Environment: encode must return a vector, got an array of shape "

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_number, check_positive, check_range, check_step
+from .._check import check_number, check_positive, check_range
 from .._fields import parameter, positive
 from .._results import RESULTS
 from .._typing import RealScalar
@@ -69,7 +69,6 @@ class GymMountainCar(AbstractDynamics):
 
     def __check_init__(self):
         where = "GymMountainCar"
-        check_step(self.dt, where)
         check_positive(self.max_speed, "max_speed", where)
         check_range(self.max_position, "max_position", where, self.min_position)
 

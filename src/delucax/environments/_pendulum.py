@@ -60,7 +60,6 @@ class GymPendulum(AbstractDynamics):
     control_units = Pendulum.control_units
 
     def __check_init__(self):
-        check_positive(self.dt, "dt", "GymPendulum")
         check_positive(self.max_speed, "max_speed", "GymPendulum")
 
     def advance(self, t, x, u, w):

@@ -128,7 +128,11 @@ def _acts(name: str, member: Any) -> bool:
     """Whether it is a controller, or a function that makes one."""
     if inspect.isclass(member):
         return hasattr(member, "applied") and not inspect.isabstract(member)
-    return inspect.isfunction(member) and name[0].isupper()
+    if not inspect.isfunction(member):
+        return False
+    made = inspect.signature(member).return_annotation
+    is_controller = inspect.isclass(made) and hasattr(made, "applied")
+    return is_controller or name != name.lower()
 
 
 def show(results: Results) -> None:

@@ -15,6 +15,7 @@ from .._check import (
     check_key,
     check_positive,
     check_range,
+    check_step,
 )
 from .._controller import AbstractController
 from .._fields import check_parameters, parameter, positive
@@ -158,9 +159,12 @@ class Explorer(AbstractController):
         waveform: BreathWaveform,
         scale: Any = 1.0,
     ):
-        check_waveform(waveform, "Explorer")
         self.kp, self.ki, self.dt, self.scale = kp, ki, dt, scale
         self.waveform = waveform
+
+    def __check_init__(self):
+        check_waveform(self.waveform, "Explorer")
+        check_step(self.dt, "Explorer")
 
     def _pid(self, gains: Array) -> LeakyPID:
         return LeakyPID(gains[0], gains[1], dt=self.dt, reference=self.waveform)

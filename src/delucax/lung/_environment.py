@@ -11,6 +11,7 @@ from .._fields import parameter
 from ..costs import AbstractCost
 from ..disturbances import Gaussian
 from ..dynamics import AbstractDynamics
+from ..dynamics._base import check_dynamics
 from ..dynamics._wrapper import AbstractWrapper
 from ._waveform import BreathWaveform, check_waveform
 
@@ -49,18 +50,17 @@ class PressureSensor(AbstractWrapper):
 
     def __init__(self, dynamics: AbstractDynamics, delay: int = 0):
         where = "PressureSensor"
-        if not isinstance(dynamics, AbstractDynamics):
-            raise ValueError(
-                f"{where}: dynamics must be an AbstractDynamics, got "
-                f"{type(dynamics).__name__}."
-            )
-        if dynamics.observation_size != 1:
-            raise ValueError(
-                f"{where}: dynamics must observe one pressure, got "
-                f"{dynamics.observation_size} numbers."
-            )
         self.dynamics = dynamics
         self.delay = check_count(delay, "delay", where, least=0)
+
+    def __check_init__(self):
+        where = "PressureSensor"
+        check_dynamics(self.dynamics, where)
+        if self.dynamics.observation_size != 1:
+            raise ValueError(
+                f"{where}: dynamics must observe one pressure, got "
+                f"{self.dynamics.observation_size} numbers."
+            )
 
     @property
     def state_names(self):

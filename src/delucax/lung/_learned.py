@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._check import check_bool, check_count, check_key
 from .._fields import as_module, parameter, positive, weight
@@ -72,11 +72,11 @@ class LearnedLung(AbstractDynamics):
         ```
     """
 
-    line: Array = weight()
+    line: Float[Array, " inputs"] = weight()
     valve: eqx.nn.MLP = weight()
     network: eqx.nn.MLP = weight()
-    hidden: Array = weight()
-    output: Array = weight()
+    hidden: Float[Array, "boundary width windows"] = weight()
+    output: Float[Array, "boundary width"] = weight()
     u_mean: Array = parameter()
     u_std: Array = parameter(constraint=positive)
     p_mean: Array = parameter()

@@ -89,7 +89,7 @@ class SingleCompartment(AbstractLung):
 
     where the pressure `p` of the airway balances the flows of the valves,
     [`delucax.lung.Valves.airway_pressure`][]. The state is (inflow [L/s], opening,
-    volume [L]). Smooth everywhere.
+    volume [L]). Smooth but for an opening of 0.
 
     With the inspiratory valve held and no way out but a leak `G`, the pressure settles
     at `flow(u_in) / G`; with the expiratory valve open and no leak, at
@@ -153,7 +153,7 @@ class DoubleCompartment(AbstractLung):
     `R_2 = imbalance R_1`. The compliance is divided as `C_1 = share C` and
     `C_2 = (1 - share) C`. So a flow that begins meets `R`, and slow breathing `C`. The
     state is (inflow [L/s], opening, fast [L], slow [L]), the latter two volumes. Smooth
-    everywhere.
+    but for an opening of 0.
 
     **Arguments:**
 
@@ -245,7 +245,7 @@ class BalloonLung(AbstractLung):
     with `r` and `r0` the radii of spheres of the volumes `V` and `rest`. It is stiff at
     first, gives way, and past `V = 2.65 rest` the pressure falls as it grows. The state
     is (inflow [L/s], opening, volume [L]). Smooth where the volume is above a tenth of
-    `rest`, below which the pressure is held.
+    `rest`, below which the pressure is held, but for an opening of 0.
 
     For the map of the original Deluca, with its constants, see
     [`delucax.lung.OriginalBalloonLung`][].

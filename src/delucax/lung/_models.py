@@ -185,7 +185,7 @@ class GreyBoxLung(AbstractLung):
     `dh/dt = rate memory(inflow, V / C, h)`,
 
     with the state (inflow [L/s], opening, volume [L], memory h). The networks begin so
-    small that it begins as the physics. Smooth everywhere.
+    small that it begins as the physics. Smooth but for an opening of 0.
 
     **Arguments:**
 

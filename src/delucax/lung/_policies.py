@@ -9,7 +9,7 @@ import jax.random as jr
 from jaxtyping import Array
 
 from .._check import check_count, check_key, check_step
-from .._controller import AbstractController
+from .._controller import AbstractController, check_controller
 from .._fields import as_module, parameter, positive, weight
 from .._typing import PRNGKey
 from ..math import clip
@@ -100,17 +100,15 @@ class Breathing(AbstractController):
         valve: AbstractController | None = None,
         hold: Any = 0.0,
     ):
-        where = "Breathing"
-        check_waveform(waveform, where)
-        valve = ExpiratoryValve(waveform) if valve is None else valve
-        for name, given in (("inspiratory", inspiratory), ("valve", valve)):
-            if not isinstance(given, AbstractController):
-                raise ValueError(
-                    f"{where}: {name} must be an AbstractController, got "
-                    f"{type(given).__name__}."
-                )
+        check_waveform(waveform, "Breathing")
         self.inspiratory, self.waveform = inspiratory, waveform
-        self.valve, self.hold = valve, hold
+        self.valve = ExpiratoryValve(waveform) if valve is None else valve
+        self.hold = hold
+
+    def __check_init__(self):
+        check_waveform(self.waveform, "Breathing")
+        check_controller(self.inspiratory, "inspiratory", "Breathing")
+        check_controller(self.valve, "valve", "Breathing")
 
     def init(self, *, key=None):
         keys = (None, None) if key is None else jr.split(key)
@@ -252,8 +250,6 @@ class BreathPolicy(AbstractController):
         key: PRNGKey,
     ):
         where = "BreathPolicy"
-        check_waveform(waveform, where)
-        check_step(dt, where)
         if kind not in ("mlp", "cnn"):
             raise ValueError(f"{where}: kind must be 'mlp' or 'cnn', got {kind!r}.")
         key, filter_key = jr.split(check_key(key, where))
@@ -277,6 +273,10 @@ class BreathPolicy(AbstractController):
             key=key,
         )
         self.shift = -2.0  # pyright: ignore[reportAttributeAccessIssue]
+
+    def __check_init__(self):
+        check_waveform(self.waveform, "BreathPolicy")
+        check_step(self.dt, "BreathPolicy")
 
     def init(self, *, key=None):
         zeros = lambda size: jnp.zeros(size, jnp.result_type(self.dt))  # noqa: E731
@@ -339,13 +339,8 @@ class Summed(AbstractController):
     offset: Array = parameter(0.0)
 
     def __check_init__(self):
-        for name in ("first", "second"):
-            given = getattr(self, name)
-            if not isinstance(given, AbstractController):
-                raise ValueError(
-                    f"Summed: {name} must be an AbstractController, got "
-                    f"{type(given).__name__}."
-                )
+        check_controller(self.first, "first", "Summed")
+        check_controller(self.second, "second", "Summed")
 
     def init(self, *, key=None):
         keys = (None, None) if key is None else jr.split(key)

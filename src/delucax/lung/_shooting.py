@@ -74,15 +74,18 @@ class ShootingMPC(AbstractController):
         memory: Any = 0.7,
     ):
         where = "ShootingMPC"
-        if not isinstance(model, LearnedLung):
-            raise ValueError(
-                f"{where}: model must be a LearnedLung, got {type(model).__name__}."
-            )
-        check_waveform(waveform, where)
         self.model, self.waveform = model, waveform
         self.horizon = check_count(horizon, "horizon", where)
         self.iterations = check_count(iterations, "iterations", where)
         self.learning_rate, self.memory = learning_rate, memory
+
+    def __check_init__(self):
+        if not isinstance(self.model, LearnedLung):
+            raise ValueError(
+                "ShootingMPC: model must be a LearnedLung, got "
+                f"{type(self.model).__name__}."
+            )
+        check_waveform(self.waveform, "ShootingMPC")
 
     def init(self, *, key=None):
         lung = self.model.resting()

@@ -26,8 +26,9 @@ class Valves(eqx.Module):
     `lag d(inflow)/dt = flow(u_in) - inflow`,
     `expiratory_lag d(opening)/dt = u_out - opening`.
 
-    Out goes `opening (p - peep) / expiratory_resistance`, and through a leak
-    `leak p`.
+    Out goes `max(opening, 0) (p - peep) / expiratory_resistance`, and through a leak
+    `leak p`. Smooth but for an opening of 0, which the lag approaches and does not
+    cross.
 
     **Arguments:**
 
@@ -108,7 +109,7 @@ class Valves(eqx.Module):
 
         **Returns:** `p` [cmH2O].
         """
-        out = opening / self.expiratory_resistance
+        out = self._conductance(opening)
         flows = inflow + pressure / resistance + out * self.peep
         return flows / (1 / resistance + out + self.leak)
 
@@ -122,5 +123,10 @@ class Valves(eqx.Module):
 
         **Returns:** the flow [L/s].
         """
-        out = opening * (pressure - self.peep) / self.expiratory_resistance
+        out = self._conductance(opening) * (pressure - self.peep)
         return jnp.asarray(out + self.leak * pressure)
+
+    def _conductance(self, opening: Array) -> Array:
+        """Of the expiratory valve. A solver may look at an opening below 0, where the
+        balance of the flows would be singular; the slope at 0 is that to the right."""
+        return jnp.where(opening < 0, 0, opening) / self.expiratory_resistance

@@ -11,8 +11,8 @@ from jaxtyping import Array
 from .._check import (
     check_finite,
     check_number,
-    check_positive,
     check_real,
+    check_step,
     is_concrete,
 )
 from .._fields import as_float_array, check_parameters, parameter, positive
@@ -80,10 +80,6 @@ class BreathWaveform(eqx.Module):
         levels: Any = (1.0, 1.0, 0.0, 0.0),
         inspiration: Any = 1 / 3,
     ):
-        where = "BreathWaveform"
-        for name, value in (("pip", pip), ("peep", peep), ("inspiration", inspiration)):
-            check_number(value, name, where)
-        check_positive(rate, "rate", where)
         self.pip, self.peep, self.rate = pip, peep, rate
         self.keypoints, self.levels = keypoints, levels
         self.inspiration = inspiration
@@ -91,6 +87,9 @@ class BreathWaveform(eqx.Module):
     def __check_init__(self):
         where = "BreathWaveform"
         check_parameters(self)
+        for name in ("pip", "peep", "inspiration"):
+            check_number(getattr(self, name), name, where)
+        check_step(self.rate, where, "rate")
         keypoints, levels = self.keypoints, self.levels
         shapes = jnp.shape(keypoints), jnp.shape(levels)
         if len(shapes[0]) != 1 or shapes[0] != shapes[1] or shapes[0][0] < 2:

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_matrix, check_positive
-from .._fields import as_float_array, check_parameters, parameter, positive
+from .._check import as_matrix, check_step
+from .._fields import check_parameters, parameter, positive
 from ..math import sin
 from ..math._steps import step_at
 
@@ -71,10 +71,10 @@ class Sequence(eqx.Module):
     values: Array = parameter()
     dt: Array = parameter(constraint=positive)
 
-    def __init__(self, values: Any, dt: Any):
-        check_positive(dt, "dt", "Sequence")
-        self.values = as_matrix(values, "values", "Sequence")
-        self.dt = as_float_array(dt)
+    def __check_init__(self):
+        check_step(self.dt, "Sequence")
+        as_matrix(self.values, "values", "Sequence")
+        check_parameters(self)
 
     def __call__(self, t: Any) -> Array:
         """The signal at time `t`."""

@@ -83,7 +83,8 @@ def rollout(
         computed again.
     - `gradient_decay`: the gradient passing back through the state is multiplied by it
         at each step. 1, the true gradient, by default; 0.9 damps the exploding
-        gradients of a long unstable horizon.
+        gradients of a long unstable horizon. It is a factor a step: `exp(-dt / tau)`
+        forgets over the time `tau` at any `dt`.
     - `truncate`: the gradient is cut before every `truncate`-th step, in the state and
         in the memory of the controller: truncated back-propagation. Never by default.
     - `throw`: raise if a step fails, the states become NaN or infinite, or a learner

@@ -269,6 +269,44 @@ class Trajectory(eqx.Module):
             columns["cost"] = columns.pop("cost")  # the last column
         return pd.DataFrame({k: np.ravel(v) for k, v in columns.items()})
 
+    def statistics(self) -> dict[str, Array]:
+        """How the total cost is spread over a batch, and how its members ended.
+
+        `"5%"`, `"25%"`, `"50%"`, `"75%"` and `"95%"` are quantiles of the total cost
+        over the members whose cost is finite (NaN if there are none), `"mean"` is their
+        mean; `"finite"` is the fraction of these members, `"successful"` that of the
+        members without a failure, and `"terminated"` that of the members whose episode
+        ended early. One trajectory is a batch of one. Works under `jax.jit`.
+
+        **Returns:** a dictionary from these names to scalars.
+
+        !!! example
+
+            ```python
+            import delucax as dlx
+            import jax
+
+            env, zero = dlx.make("pendulum"), dlx.controllers.Zero(1)
+            run = lambda key: dlx.rollout(env, zero, key=key, throw=False)
+            batch = jax.vmap(run)(jax.random.split(jax.random.key(0), 100))
+            batch.statistics()["50%"]
+            ```
+        """
+        total = self.total_cost
+        finite = jnp.isfinite(total)
+        total = jnp.where(finite, total, jnp.nan)
+        levels = (5, 25, 50, 75, 95)
+        quantiles = jnp.nanquantile(total, jnp.array(levels, total.dtype) / 100)
+        ended = self.length < self.steps
+        if self.terminated is not None:
+            ended = jnp.any(self.terminated, axis=-1)
+        return {f"{q}%": value for q, value in zip(levels, quantiles, strict=True)} | {
+            "mean": jnp.nanmean(total),
+            "finite": jnp.mean(finite),
+            "successful": jnp.mean(self.result == RESULTS.successful),
+            "terminated": jnp.mean(ended),
+        }
+
     def summary(self) -> "pandas.DataFrame":
         """One row for a trajectory, one a member for a batch: cost, length, outcome.
 

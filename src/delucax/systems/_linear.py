@@ -69,17 +69,22 @@ class LinearSystem(AbstractSystem):
         self.A, self.B, self.C, self.E = check_matrices(A, B, C, E, where)
         n, m = self.B.shape
         zeros = jnp.zeros(n, self.A.dtype)
-        self.x_ref = zeros if x_ref is None else as_vector(x_ref, n, "x_ref", where)
-        self.u_ref = (
-            jnp.zeros(m, self.A.dtype)
-            if u_ref is None
-            else as_vector(u_ref, m, "u_ref", where)
-        )
-        self.dx_ref = zeros if dx_ref is None else as_vector(dx_ref, n, "dx_ref", where)
+        self.x_ref = zeros if x_ref is None else x_ref
+        self.u_ref = jnp.zeros(m, self.A.dtype) if u_ref is None else u_ref
+        self.dx_ref = zeros if dx_ref is None else dx_ref
         self.state_names = checked_names(state_names, "x", n, "state_names", where)
         self.control_names = checked_names(
             control_names, "u", m, "control_names", where
         )
+
+    def __check_init__(self):
+        where = "LinearSystem"
+        n, m = check_matrices(self.A, self.B, self.C, self.E, where)[1].shape
+        as_vector(self.x_ref, n, "x_ref", where)
+        as_vector(self.u_ref, m, "u_ref", where)
+        as_vector(self.dx_ref, n, "dx_ref", where)
+        checked_names(self.state_names, "x", n, "state_names", where)
+        checked_names(self.control_names, "u", m, "control_names", where)
 
     @property
     def disturbance_names(self) -> tuple[str, ...]:

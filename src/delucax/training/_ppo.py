@@ -150,11 +150,6 @@ class PPO(AbstractSurrogate):
         self.batch = check_count(batch, "batch", where)
         horizon = environment.horizon if horizon is None else horizon
         self.horizon = check_count(horizon, "horizon", where)
-        check_range(discount, "discount", where, 0, 1)
-        check_range(decay, "decay", where, 0, 1)
-        check_positive(clip, "clip", where)
-        check_range(value_weight, "value_weight", where)
-        check_range(entropy_weight, "entropy_weight", where)
         self.discount, self.decay = as_float_array(discount), as_float_array(decay)
         self.clip = as_float_array(clip)
         self.epochs = check_count(epochs, "epochs", where)
@@ -162,6 +157,15 @@ class PPO(AbstractSurrogate):
         self.value_weight = as_float_array(value_weight)
         self.entropy_weight = as_float_array(entropy_weight)
         self.bootstrap = check_bool(bootstrap, "bootstrap", where)
+
+    def __check_init__(self):
+        where = "PPO"
+        check_environment(self.environment, where)
+        check_range(self.discount, "discount", where, 0, 1)
+        check_range(self.decay, "decay", where, 0, 1)
+        check_positive(self.clip, "clip", where)
+        check_range(self.value_weight, "value_weight", where)
+        check_range(self.entropy_weight, "entropy_weight", where)
 
     def init(self, model, key):
         check_model(model, self.environment, "PPO", drawn=True)

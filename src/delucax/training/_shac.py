@@ -127,14 +127,18 @@ class SHAC(AbstractSurrogate):
         horizon = environment.horizon if horizon is None else horizon
         self.horizon = check_count(horizon, "horizon", where)
         self.window = check_count(window, "window", where)
-        for name, value in (("discount", discount), ("decay", decay), ("rate", rate)):
-            check_range(value, name, where, 0, 1)
-        check_range(value_weight, "value_weight", where)
         self.discount, self.decay = as_float_array(discount), as_float_array(decay)
         self.rate = as_float_array(rate)
         self.value_weight = as_float_array(value_weight)
         self.refresh = check_count(refresh, "refresh", where)
         self.bootstrap = check_bool(bootstrap, "bootstrap", where)
+
+    def __check_init__(self):
+        where = "SHAC"
+        check_environment(self.environment, where)
+        for name in ("discount", "decay", "rate"):
+            check_range(getattr(self, name), name, where, 0, 1)
+        check_range(self.value_weight, "value_weight", where)
 
     def init(self, model, key):
         check_model(model, self.environment, "SHAC", drawn=False)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from ..._check import check_count, check_key, check_positive, check_range
+from ..._check import check_count, check_key, check_range, check_step
 from ..._controller import AbstractController, AbstractLearner
 from ..._fields import parameter
 
@@ -101,20 +101,23 @@ class Adaptive(AbstractController):
         play: Literal["mix", "switch"] = "mix",
     ):
         where = "Adaptive"
-        if not isinstance(base, AbstractLearner):
-            raise ValueError(
-                f"{where}: base must be an AbstractLearner such as GPC makes, got "
-                f"{type(base).__name__}."
-            )
         if play not in ("mix", "switch"):
             raise ValueError(f"{where}: play must be 'mix' or 'switch', got {play!r}.")
-        check_positive(rate, "rate", where)
-        check_positive(share, "share", where)
-        check_range(share, "share", where, 0, 1)
         self.base, self.play = base, play
         self.slots = check_count(slots, "slots", where, least=2)
         self.every = check_count(every, "every", where)
         self.rate, self.share = rate, share
+
+    def __check_init__(self):
+        where = "Adaptive"
+        if not isinstance(self.base, AbstractLearner):
+            raise ValueError(
+                f"{where}: base must be an AbstractLearner such as GPC makes, got "
+                f"{type(self.base).__name__}."
+            )
+        check_step(self.rate, where, "rate")
+        check_step(self.share, where, "share")
+        check_range(self.share, "share", where, 0, 1)
 
     def init(self, *, key=None):
         switches = self.play == "switch"

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import optax
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from ..._check import check_count, check_key
+from ..._check import check_count, check_key, check_step
 from ..._controller import AbstractController, Tally
 from ..._fields import parameter, weight
 from ...dynamics import AbstractDynamics
@@ -99,7 +99,7 @@ class BPC(AbstractController):
 
     loop: Loop
     features: Features
-    start: Array = weight()
+    start: Float[Array, "m f"] = weight()
     radius: Array = parameter()
     delta: Array = parameter()
     learning_rate: Array = parameter()
@@ -137,6 +137,10 @@ class BPC(AbstractController):
         self.loop = loop
         self.optimiser = adagrad_norm() if optimiser is None else optimiser
         self.window = check_count(horizon, "horizon", where)
+
+    def __check_init__(self):
+        for name in ("radius", "delta", "learning_rate"):
+            check_step(getattr(self, name), "BPC", name)
 
     def init(self, *, key=None):
         own, base_key = jr.split(check_key(key, "BPC.init"))

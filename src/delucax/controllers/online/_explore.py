@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from ..._check import as_matrix, check_count, check_key, check_positive
+from ..._check import as_matrix, check_count, check_key, check_step
 from ..._controller import AbstractController, wrong_observation
 from ..._fields import function_field, parameter
 from ...dynamics import LinearDynamics
@@ -113,11 +113,15 @@ class Explore(AbstractController):
                 f"dynamics, got {type(build).__name__}."
             )
         self.K = as_matrix(K, "K", where)
-        check_positive(scale, "scale", where)
         order = self.K.shape[1] if order is None else order
         self.order = check_count(order, "order", where)
         self.steps = check_count(steps, "steps", where, least=self.order + 2)
         self.build, self.scale, self.dt = build, scale, dt
+
+    def __check_init__(self):
+        as_matrix(self.K, "K", "Explore")
+        check_step(self.scale, "Explore", "scale")
+        check_step(self.dt, "Explore")
 
     def init(self, *, key=None):
         key = check_key(key, "Explore.init")

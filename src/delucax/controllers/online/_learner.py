@@ -10,6 +10,7 @@ import optax
 from jax.interpreters import partial_eval
 from jaxtyping import Array
 
+from ..._check import check_step
 from ..._controller import AbstractLearner, Tally
 from ..._fields import function_field, parameter
 from ._features import Features
@@ -103,6 +104,9 @@ class OnlineLearner(AbstractLearner):
     policy: AbstractPolicy
     learning_rate: Array = parameter()
     optimiser: optax.GradientTransformation = eqx.field(static=True)
+
+    def __check_init__(self):
+        check_step(self.learning_rate, type(self).__name__, "learning_rate")
 
     def init(self, *, key=None):
         loop, features = self.loop, self.features

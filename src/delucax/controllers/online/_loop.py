@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ..._check import check_count, is_concrete
 from ..._controller import AbstractController, wrong_observation
@@ -88,8 +88,8 @@ class Loop(eqx.Module):
     dynamics: AbstractDynamics
     base: AbstractController
     tangents: Tangents | None = parameter()
-    response: Array | None = parameter()
-    reach: Array | None = parameter()
+    response: Float[Array, "h o m"] | None = parameter()
+    reach: Float[Array, ""] | None = parameter()
     horizon: int = eqx.field(static=True)
     observed: bool = eqx.field(static=True)
     echoes: bool = eqx.field(static=True)
@@ -124,6 +124,9 @@ class Loop(eqx.Module):
             response = _impulse_response(first, self.horizon)
             self.reach = _first_size(response[:, : dynamics.observation_size])
             self.response = response if same else None
+
+    def __check_init__(self):
+        check_control(self.dynamics, self.base, "Loop")
 
     @property
     def dtype(self) -> Any:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from ..._check import check_step
 from ..._fields import parameter, weight
 from ...math._norms import within_ball
 
@@ -53,6 +54,9 @@ class LinearPolicy(AbstractPolicy):
 
     start: Float[Array, "m f"] = weight()
     radius: Array = parameter()
+
+    def __check_init__(self):
+        check_step(self.radius, "LinearPolicy", "radius")
 
     def init(self):
         return self.start

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._check import check_count, check_key, check_positive, check_step
-from ..._fields import as_float_array, as_module, parameter, positive, weight
+from ..._fields import as_module, parameter, positive, weight
 from ..._results import RESULTS
 from ..._typing import PRNGKey
 from ...dynamics import AbstractDynamics
@@ -83,7 +83,6 @@ class NeuralDynamics(AbstractDynamics):
     ):
         where = "NeuralDynamics"
         check_key(key, where)
-        check_step(dt, where)
         self.state_names = names_of(states, "x", "states", where)
         self.control_names = names_of(controls, "u", "controls", where)
         n, m = len(self.state_names), len(self.control_names)
@@ -96,22 +95,21 @@ class NeuralDynamics(AbstractDynamics):
             as_module(jax.nn.identity),
             key=key,
         )
-        self.dt = as_float_array(dt)
-        for name, scale, size in (
-            ("x_mean", x_mean, n),
-            ("x_scale", x_scale, n),
-            ("u_scale", u_scale, m),
-            ("step_scale", step_scale, n),
-        ):
+        self.dt, self.x_mean, self.x_scale = dt, x_mean, x_scale
+        self.u_scale, self.step_scale = u_scale, step_scale
+
+    def __check_init__(self):
+        where, n, m = "NeuralDynamics", self.state_size, self.control_size
+        sizes = dict(x_mean=n, x_scale=n, u_scale=m, step_scale=n)
+        for name, size in sizes.items():
+            array = getattr(self, name)
             if name != "x_mean":
-                check_positive(scale, name, where)
-            array = as_float_array(scale)
+                check_positive(array, name, where)
             if jnp.shape(array) not in ((), (size,)):
                 raise ValueError(
                     f"{where}: {name} must be a number or have shape ({size},), got "
                     f"shape {jnp.shape(array)}."
                 )
-            setattr(self, name, array)
 
     def advance(self, t, x, u, w):
         z = jnp.concatenate([(x - self.x_mean) / self.x_scale, u / self.u_scale])

@@ -1,0 +1,138 @@
+"""A batch of environments with the interface of Stable-Baselines3."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore
+
+from ...environments import Environment
+from ..gymnasium import GymnasiumVectorEnv
+from ..gymnasium._same_step import dones_and_infos
+
+
+class SB3VecEnv(VecEnv):
+    """Many copies of a [`delucax.Environment`][] as one `VecEnv` of Stable-Baselines3.
+
+    Its algorithms take it as it is. A step of all copies, with the resets of those that
+    have ended, is one call of one compiled function. Put
+    `stable_baselines3.common.vec_env.VecMonitor` around it for the returns of episodes
+    in the logs.
+
+    **Arguments:**
+
+    - `env`: the environment.
+    - `num_envs`: how many.
+    - `discrete`: whether actions are whole numbers, indices into `env.actions`; by
+        default they are if there is such a table.
+
+    `seed` and `set_options({"state": x})` hold for the next `reset`.
+
+    **Raises:** `ValueError` on a wrong argument; when stepped, as
+    [`delucax.interop.gymnasium.GymnasiumVectorEnv`][].
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        from delucax.interop.stable_baselines3 import SB3VecEnv
+        from stable_baselines3 import PPO
+
+        envs = SB3VecEnv(dlx.make("pendulum"), 16)
+        PPO("MlpPolicy", envs, n_steps=64, device="cpu").learn(2_048)
+        ```
+
+    Source: Raffin, Hill, Gleave, Kanervisto, Ernestus and Dormann, 2021.
+    """
+
+    def __init__(
+        self, env: Environment, num_envs: int, *, discrete: bool | None = None
+    ):
+        self.vector = GymnasiumVectorEnv(
+            env, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, discrete=discrete
+        )
+        super().__init__(
+            self.vector.num_envs,
+            self.vector.single_observation_space,
+            self.vector.single_action_space,
+        )
+
+    def reset(self) -> np.ndarray:
+        """Begin an episode in each.
+
+        **Returns:** the observations.
+        """
+        states = [options["state"] for options in self._options if options]
+        options = {"state": np.stack(states)} if states else None
+        seeds = None if all(seed is None for seed in self._seeds) else self._seeds
+        observations, _ = self.vector.reset(seed=seeds, options=options)
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._reset_seeds()
+        self._reset_options()
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions for `step_wait`.
+
+        **Arguments:** `actions`: one for each copy.
+        """
+        self._actions = actions
+
+    def step_wait(
+        self,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """One step of each.
+
+        **Returns:** observations, rewards, whether each has ended, and a dictionary for
+        each.
+        """
+        return dones_and_infos(self.vector.step(self._actions))
+
+    def close(self) -> None:
+        """Nothing is left to close."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute, the same for all copies.
+
+        **Arguments:** `attr_name`: its name. `indices`: of which copies.
+
+        **Returns:** a list with an entry for each.
+        """
+        value = getattr(self.vector, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Copies have no attributes of their own.
+
+        **Arguments:** `attr_name`, `value`, `indices`: of no use.
+
+        **Raises:** `ValueError` always.
+        """
+        raise ValueError(
+            f"SB3VecEnv: {attr_name} cannot be set, as the copies are one program; "
+            "make another from a changed environment (`delucax.replace`)."
+        )
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **kwargs: Any
+    ) -> list[Any]:
+        """Copies have no methods of their own.
+
+        **Arguments:** `method_name`, `method_args`, `indices`, `kwargs`: of no use.
+
+        **Raises:** `ValueError` always.
+        """
+        raise ValueError(
+            f"SB3VecEnv: {method_name} cannot be called on a copy, as the copies are "
+            "one program."
+        )
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> Sequence[bool]:
+        """No copy is wrapped.
+
+        **Arguments:** `wrapper_class`: of no use. `indices`: of which copies.
+
+        **Returns:** a list of `False`.
+        """
+        return [False for _ in self._get_indices(indices)]

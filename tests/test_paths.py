@@ -1,0 +1,216 @@
+"""`replace` and `randomise`: all changes at once, and then every owner's checks."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, once, user_error
+from hypothesis import given, settings, strategies as st
+from jaxtyping import Array
+
+import delucax as dlx
+
+
+d = dlx.disturbances
+A, B = np.array([[1.0, 0.1], [0.0, 0.9]]), np.array([[0.0], [0.1]])
+
+
+def plant(n=2):
+    return dlx.LinearDynamics(np.eye(n), np.ones((n, 1)), dt=0.1)
+
+
+def task(n=2):
+    cost = dlx.costs.Quadratic(np.ones(n), np.ones(1))
+    return dlx.Environment(plant(n), cost, control_bounds=(-2.0, 2.0))
+
+
+class Split(dlx.AbstractController):
+    """Its gains sum to one, and lie in a dictionary in a tuple."""
+
+    gains: tuple[dict[str, Array], ...]
+    base: Any
+
+    def __check_init__(self):
+        total = sum(sum(part.values()) for part in self.gains)
+        if np.abs(total - 1) > 1e-6:
+            raise ValueError(f"Split: gains must sum to 1, got {total}.")
+        if np.any(self.base.K < 0):
+            raise ValueError("Split: K must not be negative.")
+
+    def __call__(self, t, y, state):
+        return self.base(t, y, state)
+
+
+def split():
+    part = {"a": jnp.array(0.2), "b": jnp.array(0.3)}
+    return Split((part, {"a": jnp.array(0.5)}), dlx.controllers.Linear([[1.0, 2.0]]))
+
+
+@once
+@pytest.mark.parametrize(
+    "make, changes, match",
+    [
+        (plant, {"dt": -1.0}, "dt must be positive"),
+        (plant, {"dt": [0.1, 0.2]}, "dt must be a number"),
+        (plant, {"A": np.eye(3)}, "B must have as many rows as A"),
+        (plant, {"A": np.eye(3), "B": np.ones((3, 1))}, r"x_ref must .*\(3,\)"),
+        (plant, {"x_ref": np.ones(3)}, r"x_ref must have shape \(2,\)"),
+        (task, {"dynamics.dt": -1.0}, "dt must be positive"),
+        (task, {"dynamics.A": np.eye(3)}, "B must have as many rows as A"),
+        (task, {"dynamics": plant(3)}, "disturbance has size 2 where 3 is expected"),
+        (task, {"control_bounds.0": 5.0}, "control_bounds must have low <= high"),
+        (task, {"control_bounds.0": [1.0, 2.0]}, r"control_bounds must be .*\(1,\)"),
+        (task, {"initial_state": [np.nan, 0.0]}, "initial_state must be finite"),
+        (task, {"cost.Q": [np.nan, 0.0]}, "must be finite"),
+        (task, {"dynamics.state_names.0": "x"}, "structure"),
+        (task, {"dynamics.state_size": 3}, "has no 'state_size'"),
+        (split, {"gains.0.a": 0.3}, "gains must sum to 1"),
+        (split, {"gains.1": {"a": jnp.array(0.7)}}, "gains must sum to 1"),
+        (split, {"base.K": [[-1.0, 2.0]]}, "K must not be negative"),
+        (lambda: d.Constant(1.0, size=2) + d.Constant(2.0, size=2),
+            {"terms.0": d.Constant(1.0, size=3)}, "must be of one size"),
+        (lambda: (plant(), {"p": plant()}), {"1.p.dt": -1.0}, "dt must be positive"),
+        (lambda: dlx.controllers.LQR(dlx.LinearDynamics(A, B), np.eye(2), np.eye(1)),
+            {"K": np.ones((3, 3))}, r"LQR: shapes do not fit each other: K .*\(3, 3\)"),
+        (lambda: dlx.make("single_compartment"),
+            {"dynamics.dynamics.system.resistance": [1.0, 2.0]}, "cannot work with"),
+    ],
+)  # fmt: skip
+def test_what_the_constructor_refuses(make, changes, match):
+    with user_error(match=match):
+        dlx.replace(make(), changes)
+
+
+@once
+@pytest.mark.parametrize(
+    "make, changes",
+    [
+        (lambda: d.Uniform(-1.0, 1.0, size=2), {"low": 3.0, "high": 5.0}),
+        (lambda: d.Window(d.Constant(1.0, size=1), 0.0, 1.0), {"stop": 8, "start": 5}),
+        (lambda: dlx.environments.UniformState([0.0], [1.0]), {"low": 2, "high": 3}),
+        (split, {"gains.0.a": 0.4, "gains.1.a": 0.3}),
+        (split, {"gains.0.a": 0.4, "base": dlx.controllers.Linear([[1.0]]),
+            "base.K": [[2.0, 2.0]], "gains.1.a": 0.3}),
+        (task, {"control_bounds.0": 5.0, "control_bounds.1": 6.0}),
+        (task, {"control_bounds": None}),
+        (task, {"disturbance": d.Gaussian(0.1, size=2), "disturbance.std": 0.2}),
+        (task, {
+            "initial_state": np.ones(3),
+            "dynamics": plant(3),
+            "disturbance": d.Zero(3),
+            "cost": dlx.costs.Quadratic(np.ones(3), np.ones(1)),
+        }),
+    ],
+)  # fmt: skip
+def test_changes_that_fit_together(make, changes):
+    """In any order, though values between may not be legal."""
+    forwards = dlx.replace(make(), changes)
+    assert jax.tree.structure(forwards) is not None
+    if any(a in b for a in changes for b in changes if a != b):
+        return
+    backwards = dlx.replace(make(), dict(reversed(changes.items())))
+    assert eqx.tree_equal(forwards, backwards)
+
+
+@once
+def test_a_random_window_crosses_the_old_one(key):
+    window = d.Window(d.Constant(1.0, size=1), 0.0, 1.0)
+    ranges = {"start": (5.0, 6.0), "stop": (7.0, 8.0)}
+    draw = lambda key: dlx.randomise(window, key, ranges)
+    for one in (draw(key), jax.jit(draw)(key)):
+        assert 5 <= one.start <= 6 and 7 <= one.stop <= 8
+    with user_error(match="stop must be at least"):
+        dlx.randomise(window, key, {"start": (9.0, 9.5), "stop": (7.0, 8.0)})
+
+
+@once
+@settings(max_examples=50, deadline=None, database=None)
+@given(
+    st.permutations(["low", "high", "bounds"]), st.integers(-50, 50), st.integers(0, 9)
+)
+def test_any_order_of_any_legal_box(order, low, width):
+    box = d.Uniform(-1.0, 1.0, size=1)
+    pair = (box, (task(), box))
+    values = {
+        "low": {"1.1.low": low},
+        "high": {"1.1.high": low + width},
+        "bounds": {"1.0.control_bounds": (low, low + width)},
+    }
+    changes = {}
+    for name in order:
+        changes |= values[name]
+    env, changed = dlx.replace(pair, changes)[1]
+    assert changed.low == low and changed.high == low + width
+    assert env.control_bounds[1] == low + width
+
+
+def test_traced_values():
+    """Their shapes are checked, and their values cannot be."""
+    env = task()
+
+    def cost(low, dt):
+        changes = {"control_bounds.0": low, "control_bounds.1": 9.0, "dynamics.dt": dt}
+        env_ = dlx.replace(env, changes)
+        step = env_.step(0.0, jnp.ones(2), jnp.full(1, -4.0))
+        return step.cost + env_.dt
+
+    # The control is clipped to `low`, and pays its square.
+    assert_close(cost(-3.0, 0.1), 2 + 9 + 0.1, rtol=1e-6)
+    value, slopes = jax.jit(jax.value_and_grad(cost, (0, 1)))(-3.0, 0.1)
+    assert_close(value, 2 + 9 + 0.1, rtol=1e-6)
+    assert_close(jnp.stack(slopes), [-6.0, 1.0], rtol=1e-6)
+    values = jax.vmap(cost, (0, None))(jnp.array([-1.0, -2.0]), 0.1)
+    assert_close(values, np.array([2 + 1 + 0.1, 2 + 4 + 0.1]), rtol=1e-6)
+    with user_error(match="initial_state must have shape"):
+        jax.jit(lambda x: dlx.replace(env, {"initial_state": x}))(jnp.ones(3))
+
+
+@once
+def test_a_batch_of_modules(key):
+    """What `vmap` made has one more axis everywhere, and can be changed."""
+    ranges = {"dynamics.A": lambda k: jax.random.normal(k, (2, 2))}
+    keys = jax.random.split(key, 3)
+    batch = jax.vmap(lambda k: dlx.randomise(task(), k, ranges))(keys)
+    starts = jnp.arange(6.0).reshape(3, 2)
+    changed = dlx.replace(batch, {"initial_state": starts})
+    assert_close(changed.initial_state, starts)
+    with user_error(match="must be finite"):
+        dlx.replace(batch, {"dynamics.B": jnp.full((3, 2, 1), jnp.nan)})
+    gains = eqx.filter_vmap(dlx.controllers.Linear)(jnp.ones((5, 1, 2)))
+    scheduled = dlx.controllers.Scheduled(gains, 0.1)
+    doubled = dlx.replace(scheduled, {"controllers.K": 2 * jnp.ones((5, 1, 2))})
+    assert_close(doubled.controllers.K, 2.0)
+    with user_error(match="arrays with one leading axis"):
+        dlx.replace(scheduled, {"controllers": dlx.controllers.Linear([[1.0, 2.0]]),
+                                "controllers.K": jnp.ones(())})  # fmt: skip
+
+
+@once
+def test_a_module_that_checks_nothing():
+    """Its parameters are checked all the same."""
+
+    class Bare(eqx.Module):
+        gain: Array = dlx.parameter(1.0, constraint=dlx.positive)
+
+    with user_error(match="gain must be positive"):
+        dlx.replace(Bare(), {"gain": -1.0})
+    assert_close(dlx.replace({"a": [Bare()]}, {"a.0.gain": 2.0})["a"][0].gain, 2.0)
+
+
+@once
+def test_bounds_become_arrays():
+    pid = dlx.controllers.PID(1.0, dt=0.1)
+    for controller in (
+        dlx.replace(pid, {"bounds": (-1, 1), "reference": lambda t: jnp.ones(1)}),
+        dlx.replace(dlx.controllers.Gaussian(pid, -1.0), {"bounds": (-1, 1)}),
+    ):
+        assert all(eqx.is_array(leaf) for leaf in jax.tree.leaves(controller))
+        with user_error(match="bounds must have low <= high"):
+            dlx.replace(controller, {"bounds.0": 3.0})
+    wide = dlx.replace(pid, {"kp": [1.0, 2.0]})
+    assert wide.loops == 2 and wide.init().integral.shape == (2,)
+    with user_error(match="one entry a loop"):
+        dlx.replace(wide, {"ki": [1.0, 2.0, 3.0]})
