@@ -21,12 +21,14 @@ class Residual(NamedTuple):
     - `relative`: a bound on the left side's norm over the sum of those of its terms.
     - `closed_loop`: `A - B K`, or `E^-1 (A - B K)`.
     - `terms`: the sum of the norms of the terms.
+    - `K`: the gain.
     """
 
     error: Array
     relative: Array
     closed_loop: Array
     terms: Array
+    K: Array
 
 
 def riccati_residual(discrete, A, B, Q, R, S, E, X, players=0) -> Residual:
@@ -97,9 +99,8 @@ def riccati_residual(discrete, A, B, Q, R, S, E, X, players=0) -> Residual:
     gap = jnp.abs(gap) + (n + 4) * jnp.finfo(dtype).eps * terms_of_gap
     error_bound = jnp.abs(error) + 2 * gap.T @ (jnp.abs(inverse) @ gap)
     error_bound += (lost + lost_last)[:, None]
-    return Residual(
-        error, _MARGIN * relative_size(error_bound, *terms), closed_loop, size(*terms)
-    )
+    relative = _MARGIN * relative_size(error_bound, *terms)
+    return Residual(error, relative, closed_loop, size(*terms), K)
 
 
 def linear_residual(discrete, A, B, C, X) -> Array:
