@@ -69,10 +69,13 @@ def product(
     return levels, lost * size[:n, 0]
 
 
-def rounded(levels: Float[Array, "levels n m"]) -> Float[Array, "2 n m"]:
-    """A sum from high to low as one of two."""
+def rounded(levels: Float[Array, "levels n m"], lost: Array) -> tuple[Array, Array]:
+    """A sum from high to low as one of two, and by how much entries may be wrong now,
+    having been `lost` before."""
     room = math.ceil(math.log2(len(levels)))
-    return _sliced(levels, Slices(2, jnp.finfo(levels.dtype).nmant - 1 - room))[0]
+    s = Slices(2, jnp.finfo(levels.dtype).nmant - 1 - room)
+    pair, size = _sliced(levels, s)
+    return pair, lost + 4 * len(levels) * 0.5 ** (2 * s.bits) * size[:, 0]
 
 
 def added(levels: Float[Array, "levels n m"], M: Float[Array, "n m"]) -> Array:

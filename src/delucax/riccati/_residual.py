@@ -65,26 +65,23 @@ def riccati_residual(discrete, A, B, Q, R, S, E, X, players=0) -> Residual:
 
     s, eye = slices(2 * (n + m), dtype), jnp.eye(n, dtype=dtype)
     data, feedback = jnp.block([[A, B], [S.T, R]]), jnp.concatenate([eye, -K])
-    both, lost = product(pair(data), pair(feedback), s)
-    both, lost_loop, lost_T = rounded(both), lost[:n], lost[n:]
-    loop, T = both[:, :n], both[:, n:]
+    both, lost = rounded(*product(pair(data), pair(feedback), s))
+    loop, T, lost_loop, lost_T = both[:, :n], both[:, n:], lost[:n], lost[n:]
     # By how much the entries may be wrong, row by row.
     lost = lost_T @ jnp.abs(K)
     left = top = pair(X)
     if discrete:
-        bottom, lost_bottom = product(left, loop, s)
-        bottom, lost_bottom = rounded(bottom), lost_bottom + jnp.abs(X) @ lost_loop
+        bottom, lost_bottom = rounded(*product(left, loop, s))
+        lost_bottom += jnp.abs(X) @ lost_loop
         lost += lost_loop @ jnp.abs(bottom[0]) + lost_bottom @ jnp.abs(loop[0])
         left = pair(-eye)
         if E is not None:
             left = pair(-E.T)
-            top, lost_top = product(top, pair(E), s)
-            top = rounded(top)
+            top, lost_top = rounded(*product(top, pair(E), s))
             lost += lost_top @ jnp.abs(E)
     else:
         if E is not None:
-            left, lost_left = product(pair(E.T), left, s)
-            left = rounded(left)
+            left, lost_left = rounded(*product(pair(E.T), left, s))
             lost += 2 * jnp.sum(lost_left) * _largest(loop)
         top, bottom = loop, jnp.swapaxes(left, 1, 2)
         lost += 2 * jnp.abs(left[0]) @ lost_loop
@@ -95,7 +92,7 @@ def riccati_residual(discrete, A, B, Q, R, S, E, X, players=0) -> Residual:
     error = symmetric(added(levels, Q))
 
     gap = jnp.sum(B.T @ bottom + T, axis=0)
-    terms_of_gap = n * _largest(B) * _largest(bottom) + _largest(T)
+    terms_of_gap = jnp.abs(B.T) @ jnp.abs(bottom[0]) + jnp.abs(T[0])
     gap = jnp.abs(gap) + (n + 4) * jnp.finfo(dtype).eps * terms_of_gap
     error_bound = jnp.abs(error) + 2 * gap.T @ (jnp.abs(inverse) @ gap)
     error_bound += (lost + lost_last)[:, None]

@@ -135,7 +135,7 @@ class Loop(eqx.Module):
         if at_rest is None:
             at_rest = _at_rest(self.dynamics, self.base)
         radius = None if at_rest is None else _radius(at_rest)
-        return _steps(radius or 0, FADED, LEAST_MEMORY, MOST_MEMORY)
+        return _steps(radius or 0.0, FADED, LEAST_MEMORY, MOST_MEMORY)
 
     @property
     def dtype(self) -> Any:
