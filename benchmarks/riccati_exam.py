@@ -49,7 +49,8 @@ reports, which is to be no less than the true one, and that, in 60 digits. A res
 no certificate: the bound is the spectral abscissa of the closed loop (below 0 if it is
 stable) in continuous time and its spectral radius (below 1) in discrete time. In single
 precision the data are rounded first, and what counts as solved is 1e-5 instead of
-1e-12; a solver whose precision does not suffice says so. The loop of CAREX 11 is on the boundary.
+1e-12; a solver whose precision does not suffice says so. The loop of
+CAREX 11 is on the boundary.
 
 """
 
