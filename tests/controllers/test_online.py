@@ -449,9 +449,8 @@ def test_the_default_memory_follows_the_closed_loop(decay, memory):
     plant = dlx.LinearDynamics(np.array([[decay]]), np.eye(1))
     cost = dlx.costs.Quadratic(np.eye(1), np.eye(1))
     base = c.Linear(np.zeros((1, 1)))
-    for make in (c.GPC, c.DRC):
-        assert make(plant, cost, base=base).features.memory == memory
-        assert make(plant, cost, base=base, memory=3).features.memory == 3
+    assert c.GPC(plant, cost, base=base).features.memory == memory
+    assert c.GPC(plant, cost, base=base, memory=3).features.memory == 3
     neural = c.NeuralGPC(plant, cost, base=base, key=jax.random.key(0))
     assert neural.features.memory == memory
 

@@ -6,9 +6,10 @@ from typing import Any
 import optax
 from jaxtyping import Array
 
+from ..._check import check_count
 from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics
-from ._base import linear_learner, loop_of, memory_of
+from ._base import linear_learner, loop_of
 from ._features import Features
 from ._learner import OnlineLearner
 
@@ -18,7 +19,7 @@ def DRC(
     cost: Callable[..., Array],
     *,
     base: AbstractController | None = None,
-    memory: int | None = None,
+    memory: int = 10,
     horizon: int | None = None,
     learning_rate: Any = None,
     optimiser: optax.GradientTransformation | None = None,
@@ -48,9 +49,7 @@ def DRC(
         [`delucax.controllers.LQG`][] for the curvature of the cost and for disturbances
         and sensor noise of unit covariance ([`delucax.controllers.LQR`][] where the
         state is observed).
-    - `memory`: the number of outputs; by default the least h, of 10 at least and 50 at
-        most, with `rho^h <= 0.1`, rho being the spectral radius of the closed loop. It
-        is 10 where the loop cannot be seen, inside a transformation of JAX.
+    - `memory`: the number of outputs, 10 by default.
     - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
         1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
         loop.
@@ -89,6 +88,6 @@ def DRC(
     """
     where = "DRC"
     loop = loop_of(dynamics, cost, base, horizon, where, echoes=True)
-    memory = memory_of(loop, memory, where)
+    memory = check_count(memory, "memory", where)
     features = Features(None, memory, dynamics.observation_size, nature=True)
     return linear_learner(loop, cost, features, learning_rate, optimiser, radius, where)

@@ -48,8 +48,8 @@ def GPC(
         point.
     - `memory`: the number of past disturbances; by default the least h, of 10 at least
         and 50 at most, with `rho^h <= 0.1`, rho being the spectral radius of the closed
-        loop. It is 10 where the loop cannot be seen: inside a transformation of JAX, or
-        of dynamics that name no equilibrium.
+        loop. It is 10 where dynamics are not linear and time-invariant, and inside a
+        transformation of JAX, where the loop cannot be seen.
     - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
         1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
         loop.

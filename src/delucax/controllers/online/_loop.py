@@ -131,10 +131,10 @@ class Loop(eqx.Module):
 
     def memory(self) -> int:
         """For how many steps a disturbance matters, as far as that can be seen."""
-        at_rest = self.tangents
-        if at_rest is None:
-            at_rest = _at_rest(self.dynamics, self.base)
-        radius = None if at_rest is None else _radius(at_rest)
+        # Newton's step, for nature's outputs and for loops that change, pays for each
+        # number that it learns.
+        known = self.tangents is not None and not self.echoes
+        radius = _radius(self.tangents) if known else None
         return _steps(radius or 0.0, FADED, LEAST_MEMORY, MOST_MEMORY)
 
     @property
