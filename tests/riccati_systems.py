@@ -7,6 +7,7 @@ A. J. Laub and V. Mehrmann (1995), CAREX and DAREX, in their parameters.
 import ast
 from pathlib import Path
 
+import mpmath
 import numpy as np
 import scipy.linalg
 
@@ -172,3 +173,87 @@ def continuous_residual(A, B, Q, R, X):
     terms = X @ A, H(A) @ X, X @ B @ gain, Q
     left = terms[0] + terms[1] - terms[2] + terms[3]
     return np.linalg.norm(left) / sum(map(np.linalg.norm, terms)), A - B @ gain
+
+
+DIGITS = 60
+
+
+def exact(M):
+    """A matrix of floating-point numbers, as objects of mpmath."""
+    kind = mpmath.mpc if np.iscomplexobj(M) else mpmath.mpf
+    number = complex if np.iscomplexobj(M) else float
+    entries = [kind(number(entry)) for entry in np.ravel(M)]
+    return np.array([*entries, None], object)[:-1].reshape(np.shape(M))
+
+
+def adjoint(M):
+    return np.frompyfunc(mpmath.conj, 1, 1)(M.T)
+
+
+def product(M, N):
+    """Of matrices of objects, in which many entries may be zero."""
+    out = np.full((len(M), N.shape[1]), mpmath.mpf(0), object)
+    for i, row in enumerate(M):
+        for k in np.flatnonzero(row):
+            out[i] += row[k] * N[k]
+    return out
+
+
+def quotient(M, N):
+    """`M^-1 N`, by refinement of the solution in double precision."""
+    is_complex = any(isinstance(x, mpmath.mpc) for x in (*M.ravel(), *N.ravel()))
+    rough = lambda A: A.astype(complex if is_complex else float)  # noqa: E731
+    factors = scipy.linalg.lu_factor(rough(M))
+    X, rest = np.full(N.shape, mpmath.mpf(0), object), N
+    for _ in range(100):
+        X = X + exact(scipy.linalg.lu_solve(factors, rough(rest)))
+        rest = N - product(M, X)
+        if norm(rest) <= mpmath.mpf(10) ** (15 - DIGITS) * norm(N):
+            return X
+    raise ValueError("the matrix is singular to working precision")
+
+
+def norm(M):
+    return mpmath.sqrt(mpmath.fsum(abs(entry) ** 2 for entry in M.ravel()))
+
+
+def true_residual(discrete, A, B, Q, R, X, S=None, E=None, players=0):
+    """The relative residual of a Riccati equation, in 60 digits.
+
+    The terms of the last `players` controls, a second player's, count apart.
+    """
+    with mpmath.workdps(DIGITS):
+        A, B, Q, R, X = map(exact, (A, B, Q, R, X))
+        H = adjoint
+        weighted = X if E is None else product(H(exact(E)), X)
+        moved = product(H(A), X) if discrete else weighted
+        cross = product(moved, B)
+        if S is not None:
+            cross = cross + exact(S)
+        gain = quotient(R + product(H(B), product(X, B)) if discrete else R, H(cross))
+        first = B.shape[1] - players
+        quadratic = [product(cross[:, :first], gain[:first])]
+        if players:
+            quadratic.append(product(cross[:, first:], gain[first:]))
+        moved = product(moved, A)
+        if discrete:
+            weighted = weighted if E is None else product(weighted, exact(E))
+            left = moved - weighted
+        else:
+            weighted = moved
+            left = moved + H(moved)
+        terms = [moved, weighted, Q, *quadratic]
+        total = mpmath.fsum(map(norm, terms))
+        return float(norm(left + Q - sum(quadratic)) / (total or 1))
+
+
+def true_linear_residual(discrete, A, B, C, X):
+    """That of `A X + X B = C`, or of `X - A X B = C`, relative to the data."""
+    with mpmath.workdps(DIGITS):
+        A, B, C, X = map(exact, (A, B, C, X))
+        a, b, c, x = map(norm, (A, B, C, X))
+        if discrete:
+            left, scale = X - product(product(A, X), B), a * b + 1
+        else:
+            left, scale = product(A, X) + product(X, B), a + b
+        return float(norm(left - C) / ((scale * x + c) or 1))

@@ -440,6 +440,47 @@ class Twice(dlx.AbstractDynamics):
         return 2 * x
 
 
+@pytest.mark.parametrize(
+    "decay, memory",
+    [(0.5, 10), (0.79, 10), (0.8, 11), (0.9, 22), (0.99, 50)],
+)
+def test_the_default_memory_follows_the_closed_loop(decay, memory):
+    """The least h with decay^h <= 0.1, from 10 to 50."""
+    plant = dlx.LinearDynamics(np.array([[decay]]), np.eye(1))
+    cost = dlx.costs.Quadratic(np.eye(1), np.eye(1))
+    base = c.Linear(np.zeros((1, 1)))
+    assert c.GPC(plant, cost, base=base).features.memory == memory
+    assert c.GPC(plant, cost, base=base, memory=3).features.memory == 3
+    neural = c.NeuralGPC(plant, cost, base=base, key=jax.random.key(0))
+    assert neural.features.memory == memory
+
+
+def test_the_default_memory_of_a_loop_that_cannot_be_seen():
+    seen = []
+
+    def make(a):
+        plant = dlx.LinearDynamics(a * jnp.eye(1), np.eye(1))
+        cost = dlx.costs.Quadratic(np.eye(1), np.eye(1))
+        base = c.Linear(np.zeros((1, 1)))
+        seen.append(c.GPC(plant, cost, base=base, horizon=20).features.memory)
+        return a
+
+    jax.eval_shape(make, jnp.asarray(0.9))
+    assert seen == [10]
+
+
+def test_a_slow_plant_needs_a_long_memory():
+    """With 10 disturbances GPC has 0.41 of the regulator's cost."""
+    A = np.array([[1, 0.1, 0], [0, 0.95, 0.2], [0, -0.1, 0.9]])
+    plant = dlx.LinearDynamics(A, np.array([[0.0], [0.1], [1.0]]))
+    cost = dlx.costs.Quadratic(np.eye(3), np.eye(1))
+    learner = c.GPC(plant, cost)
+    assert learner.features.memory == 21
+    w = np.sin(2 * np.pi * TIMES / 57)[:, None] * np.ones(3)
+    total = run(learner, w, plant, cost).total_cost
+    assert total < 0.28 * run(learner.loop.base, w, plant, cost).total_cost
+
+
 UNSTABLE = c.Linear(np.zeros((1, 2)))
 LOOSE = dlx.LinearDynamics(A, B, np.array([[1.0, 0.0]]))
 vector = lambda t, x, u: x

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import lineax as lx
 
 from ..math._linear_solve import full_precision, is_definite, solve, symmetric
-from ..math._size import relative_size, size
+from ..math._size import size
 from ._arguments import complex_form, is_complex, real_form, riccati_arguments
 from ._dare import double
 from ._lyapunov import lyapunov
 from ._newton import attainable, found_tangent, outside, polish, settled
+from ._residual import riccati_residual
 from ._search import Attempt, Found, search, SECOND, verdict, weights
 from ._solution import checked, RiccatiSolution
 from ._spectrum import abscissa_and_size
@@ -132,12 +133,10 @@ def _terms(A, B, R, S, E, X):
 
 
 def _equation(A, B, Q, R, S, E, X):
-    """What is left of the equation at `X`, also relatively; and the closed loop."""
+    """What is left of the equation at `X`, and the closed loop; for derivatives."""
     weighted, quadratic, _, closed_loop = _terms(A, B, R, S, E, X)
     moved = weighted @ A
-    error = symmetric(moved + moved.T - quadratic + Q)
-    relative = relative_size(error, moved, moved, quadratic, Q)
-    return error, (relative, closed_loop)
+    return symmetric(moved + moved.T - quadratic + Q), closed_loop
 
 
 @jax.custom_jvp
@@ -156,25 +155,25 @@ def _find(A, B, Q, R, S, E) -> Found:
     def attempt(kind):
         q, r, s, size_Q = weights(kind, Q, R, S)
         X, size_G, iterations = _start(plain_A, plain_B, q, r, s, kind == SECOND)
-        X, residual, closed_loop, terms = polish(
-            lambda X: _equation(A, B, q, r, s, E, X),
+        X, left = polish(
+            lambda X: riccati_residual(False, A, B, q, r, s, E, X),
             lambda loop, error: outside(E, lyapunov(loop, error)),
             outside(E, X),
         )
-        abscissa, scale = abscissa_and_size(closed_loop)
+        abscissa, scale = abscissa_and_size(left.closed_loop)
         rounding = n * eps * scale
         # A change of Q by rounding moves eigenvalues on the axis off it by its root.
         reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
         return Attempt(
             X=X,
-            residual=residual,
+            residual=left.relative,
             bound=abscissa,
             gap=-abscissa,
             rounding=rounding,
             near=jnp.abs(abscissa) < reach,
-            least=attainable(X, (2 * size(closed_loop)) * magnified, terms),
+            least=attainable(X, (2 * size(left.closed_loop)) * magnified, left.terms),
             modest=size(X) * eps**0.5 < size_Q,
-            around=jnp.abs(abscissa) < 4 * eps**0.125 * size(closed_loop),
+            around=jnp.abs(abscissa) < 4 * eps**0.125 * size(left.closed_loop),
             iterations=iterations,
         )
 

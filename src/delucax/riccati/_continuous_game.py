@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..math._linear_solve import full_precision, solve
-from ..math._size import relative_size
 from ._flow import hamiltonian, lyapunov, scale_of, short_element
 from ._game import (
     double,
@@ -18,6 +17,7 @@ from ._game import (
 )
 from ._level import Game, search
 from ._recursion import is_clearly_definite, symmetric
+from ._residual import riccati_residual
 from ._spectrum import spectral_abscissa
 
 
@@ -76,15 +76,13 @@ def continuous_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     time = 0.5 / jnp.where(size > 0, size, 1)
     J, iterations = double(short_element(H, time), X0 / unit)
 
-    def equation(X):
-        K, loop = joint_gain(A, both, weight, X)
-        return rate(A, both, Q, weight, K, X), loop, K
+    S = jnp.zeros_like(both)
 
-    X, error, loop, K = polish(X0 + unit * J, equation, even_lyapunov, size)
-    moved = A.T @ X
-    # What control and disturbance do nearly cancels at the least level.
-    terms = (moved, moved.T, X @ B @ K[:m], X @ D @ K[m:], Q)
-    residual = relative_size(error, *terms)
+    def equation(X):
+        left = riccati_residual(False, A, both, Q, weight, S, None, X, D.shape[1])
+        return left.error, left.closed_loop, left.K, left.relative
+
+    X, _, loop, K, residual = polish(X0 + unit * J, equation, even_lyapunov, size)
     slack = n * jnp.finfo(A.dtype).eps * jnp.linalg.norm(A)
     loops = jnp.stack([loop, A - B @ K[:m]])
     holds = is_semidefinite(X) & is_clearly_definite(R)

@@ -8,9 +8,10 @@ import jax.lax as lax
 import jax.numpy as jnp
 
 from ..math._linear_solve import full_precision, is_definite, solve, symmetric
-from ..math._size import relative_size, size
+from ..math._size import size
 from ._arguments import complex_form, is_complex, real_form, riccati_arguments
 from ._newton import attainable, found_tangent, outside, polish, settled
+from ._residual import riccati_residual
 from ._search import Attempt, Found, search, SECOND, verdict, weights
 from ._solution import checked, RiccatiSolution
 from ._spectrum import spectral_radius
@@ -129,13 +130,10 @@ def _terms(A, B, R, S, E, X):
 
 
 def _equation(A, B, Q, R, S, E, X):
-    """What is left of the equation at `X`, also relatively; and the closed loop."""
+    """What is left of the equation at `X`, and the closed loop; for derivatives."""
     moved, quadratic, _, closed_loop = _terms(A, B, R, S, E, X)
-    moved = moved @ A
     weight = X if E is None else E.T @ X @ E
-    error = symmetric(moved - weight - quadratic + Q)
-    relative = relative_size(error, moved, weight, quadratic, Q)
-    return error, (relative, closed_loop)
+    return symmetric(moved @ A - weight - quadratic + Q), closed_loop
 
 
 @jax.custom_jvp
@@ -154,22 +152,24 @@ def _find(A, B, Q, R, S, E) -> Found:
         q, r, s, size_Q = weights(kind, Q, R, S)
         height = size_Q * jnp.where(kind == SECOND, _SECOND_START, 1)
         X, iterations = _start(plain_A, plain_B, q, r, s, height)
-        X, residual, closed_loop, terms = polish(
-            lambda X: _equation(A, B, q, r, s, E, X),
+        X, left = polish(
+            lambda X: riccati_residual(True, A, B, q, r, s, E, X),
             lambda loop, error: outside(E, stein(loop, error)),
             outside(E, X),
         )
-        radius = spectral_radius(closed_loop)
+        radius = spectral_radius(left.closed_loop)
         # A stable loop may belong to a stationary point of a cost without a minimum.
         gap = jnp.where(_is_semidefinite(r + B.T @ X @ B), 1 - radius, -jnp.inf)
         return Attempt(
             X=X,
-            residual=residual,
+            residual=left.relative,
             bound=radius,
             gap=gap,
             rounding=jnp.asarray(n * eps, dtype),
             near=jnp.abs(gap) < 10 * eps**0.5,
-            least=attainable(X, (1 + size(closed_loop) ** 2) * magnified, terms),
+            least=attainable(
+                X, (1 + size(left.closed_loop) ** 2) * magnified, left.terms
+            ),
             modest=size(X) * eps**0.5 < size_Q,
             around=jnp.abs(gap) < 4 * eps**0.125,
             iterations=iterations,

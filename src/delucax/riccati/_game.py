@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..math._linear_solve import full_precision, solve
-from ..math._size import relative_size
 from ._level import Game
 from ._recursion import gain, is_saddle, joined, one_step, symmetric
+from ._residual import riccati_residual
 from ._spectrum import spectral_radius
 from ._stein import MAX_DOUBLINGS, stein
 
@@ -64,15 +64,13 @@ def discrete_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     J, iterations = double((A - both @ K, G, J), X0)
 
     def equation(X):
-        K, loop = gain(A, both, weight, S, X)
-        return one_step(A, both, Q, weight, S, K, X) - X, loop, K
+        left = riccati_residual(True, A, both, Q, weight, S, None, X, D.shape[1])
+        return left.error, left.closed_loop, left.K, left.relative
 
-    X, error, loop, K = polish(X0 + J, equation, lambda _, *linear: stein(*linear))
+    X, _, loop, K, residual = polish(
+        X0 + J, equation, lambda _, *linear: stein(*linear)
+    )
     pivot = symmetric(weight + both.T @ X @ both)
-    # What control and disturbance do nearly cancels at the least level.
-    moved = A.T @ X
-    terms = (moved @ A, X, moved @ B @ K[:m], moved @ D @ K[m:], Q)
-    residual = relative_size(error, *terms)
     bound = 1 - n * jnp.finfo(A.dtype).eps
     loops = jnp.stack([loop, A - B @ K[:m]])
     holds = is_semidefinite(X) & is_saddle(pivot, D.shape[1])
@@ -113,8 +111,9 @@ def double(element, X0):
 def polish(X: Array, equation: Callable, correction: Callable, unit: Array | float = 1):
     """Newton steps for as long as they bring `X` closer; and the equation there.
 
-    `equation(X)` is its error, the closed loop and the gains, and `correction(X, loop,
-    error)` the solution of its linearisation. `unit` is the size of error over `X`.
+    `equation(X)` is its error, the closed loop, the gains and the residual, and
+    `correction(X, loop, error)` the solution of its linearisation. `unit` is the size
+    of error over `X`.
     """
     small = unit * X.shape[0] * jnp.finfo(X.dtype).eps
 
@@ -124,7 +123,7 @@ def polish(X: Array, equation: Callable, correction: Callable, unit: Array | flo
 
     def body(carry):
         old, relative, k = carry
-        X, error, loop, _ = old
+        X, error, loop, *_ = old
         candidate = symmetric(X + jnp.where(k == 0, 0, correction(X, loop, error)))
         new = (candidate, *equation(candidate))
         found = jnp.linalg.norm(new[1]) / jnp.linalg.norm(candidate)

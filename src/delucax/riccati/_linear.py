@@ -14,6 +14,7 @@ from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision, no_tangent, solve
 from ._arguments import complex_form, is_complex, real_form, square_matrix
 from ._lyapunov import stable_sylvester
+from ._residual import linear_residual
 from ._search import tolerance
 from ._solution import checked, MatrixSolution
 from ._spectrum import spectral_abscissa
@@ -243,17 +244,6 @@ def _left_side(discrete, A, B, X):
     return X - A @ X @ B if discrete else A @ X + X @ B
 
 
-def _backward_error(discrete, A, B, C, X):
-    """By how much, relatively, the data would have to change for `X` to be exact."""
-    size_A = jnp.linalg.norm(A)
-    size_B = size_A if B is None else jnp.linalg.norm(B)
-    factor = 1 + size_A * size_B if discrete else size_A + size_B
-    size = factor * jnp.linalg.norm(X) + jnp.linalg.norm(C)
-    error = jnp.linalg.norm(_left_side(discrete, A, B, X) - C)
-    relative = error / jnp.where(size == 0, 1, size)
-    return jnp.where(jnp.isfinite(relative), relative, jnp.inf)
-
-
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 @full_precision
 def _find(discrete, A, B, C) -> _Found:
@@ -267,7 +257,8 @@ def _find(discrete, A, B, C) -> _Found:
         X, iterations = _separated(discrete, A, B, C, plain, shifted)
         if last == _DENSELY:
             X = _densely(discrete, A, B, C, X, kind == _DENSELY)
-        return X, _backward_error(discrete, A, B, C, X), iterations
+        other = A.T if B is None else B
+        return X, linear_residual(discrete, A, other, C, X), iterations
 
     def more(carry):
         return carry[0] != _DONE

@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from ..math._linear_solve import no_tangent, solve, symmetric
 from ..math._size import size
+from ._residual import Residual
 from ._search import Found
 
 
@@ -18,39 +19,42 @@ _FINE = 64
 
 
 def polish(
-    equation: Callable[[Array], tuple[Array, tuple[Array, Array]]],
+    residual: Callable[[Array], Residual],
     correction: Callable[[Array, Array], Array],
     X: Array,
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Residual]:
     """Newton steps on the equation itself, if it asks for them, while they help.
 
-    `equation(X)` is what is left of it, `(error, (relative, closed_loop))`;
-    `correction(closed_loop, error)` solves it to first order. Returns `X`, the relative
-    residual, the closed loop, and the size of the equation's terms.
+    `correction(closed_loop, error)` solves the equation to first order. Returns `X`
+    and what is left there.
     """
     fine = _FINE * jnp.finfo(X.dtype).eps
 
     def more(carry):
         *_, going, k = carry
-        return (k < _NEWTON_STEPS) & going
+        return (k <= _NEWTON_STEPS) & going
 
     def body(carry):
-        *before, _, k = carry
-        X, error, residual, closed_loop = before
-        candidate = symmetric(X + correction(closed_loop, error))
-        error, (found, closed_loop) = equation(candidate)
-        better = found < residual
+        X, now, _, k = carry
+        # The first round only measures.
+        step = jnp.where(k == 0, 0, correction(now.closed_loop, now.error))
+        candidate = symmetric(X + step)
+        new = residual(candidate)
+        better = (new.relative < now.relative) | (k == 0)
         # Where steps stop to help much, rounding is all that is left.
-        going = (found < residual / 4) & (found > fine)
-        now = candidate, error, found, closed_loop
-        kept = (jnp.where(better, a, b) for a, b in zip(now, before, strict=True))
-        return *kept, going, k + 1
+        going = (new.relative < now.relative / 4) & (new.relative > fine)
+        X, now = jax.tree.map(
+            lambda a, b: jnp.where(better, a, b), (candidate, new), (X, now)
+        )
+        return X, now, going, k + 1
 
-    error, (residual, closed_loop) = equation(X)
-    start = (X, error, residual, closed_loop, residual > fine, jnp.asarray(0))
-    X, error, residual, closed_loop, *_ = lax.while_loop(more, body, start)
-    terms = size(error) / jnp.where(residual > 0, residual, 1)
-    return X, residual, closed_loop, terms
+    unknown = jax.tree.map(
+        lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(residual, X)
+    )
+    unknown = unknown._replace(relative=jnp.asarray(jnp.inf, X.dtype))
+    start = (X, unknown, jnp.asarray(True), jnp.asarray(0))
+    X, now, *_ = lax.while_loop(more, body, start)
+    return X, now
 
 
 def attainable(X: Array, gain: Array, terms: Array) -> Array:
@@ -83,7 +87,7 @@ def found_tangent(
     def left(*data):
         return equation(*data, X)
 
-    _, error, (_, loop) = jax.jvp(left, tuple(safe), tangents, has_aux=True)
+    _, error, loop = jax.jvp(left, tuple(safe), tangents, has_aux=True)
     stand_in = -jnp.eye(loop.shape[0], dtype=loop.dtype) / 2
     change = correction(jnp.where(ok, loop, stand_in), jnp.where(ok, error, 0))
     return no_tangent(found)._replace(X=jnp.where(ok, change, 0))

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._check import check_positive, is_concrete
+from ..._check import check_count, check_positive, is_concrete
 from ...dynamics import AbstractDynamics, LinearDynamics, linearize
 from .._lqg import LQG
 from .._lqr import LQR
@@ -45,6 +45,12 @@ def loop_of(
     if echoes is None:
         echoes = not dynamics.observes_state
     return Loop(dynamics, base, horizon, where, echoes=echoes)
+
+
+def memory_of(loop: Loop, memory: int | None, where: str) -> int:
+    """How many values of its signal a learner keeps: as given, or for as long as they
+    matter."""
+    return loop.memory() if memory is None else check_count(memory, "memory", where)
 
 
 def _check_cost(dynamics: Any, cost: Any, where: str) -> None:

@@ -6,10 +6,9 @@ from typing import Any
 import optax
 from jaxtyping import Array
 
-from ..._check import check_count
 from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics
-from ._base import linear_learner, loop_of
+from ._base import linear_learner, loop_of, memory_of
 from ._features import Features
 from ._learner import OnlineLearner
 
@@ -19,7 +18,7 @@ def GPC(
     cost: Callable[..., Array],
     *,
     base: AbstractController | None = None,
-    memory: int = 10,
+    memory: int | None = None,
     horizon: int | None = None,
     learning_rate: Any = None,
     optimiser: optax.GradientTransformation | None = None,
@@ -47,7 +46,10 @@ def GPC(
     - `base`: a controller that stabilises the dynamics; by default the
         [`delucax.controllers.LQR`][] for the curvature of the cost at the operating
         point.
-    - `memory`: the number of past disturbances, 10 by default.
+    - `memory`: the number of past disturbances; by default the least h, of 10 at least
+        and 50 at most, with `rho^h <= 0.1`, rho being the spectral radius of the closed
+        loop. It is 10 where dynamics are not linear and time-invariant, and inside a
+        transformation of JAX, where the loop cannot be seen.
     - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
         1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
         loop.
@@ -98,6 +100,6 @@ def GPC(
             f"got {loop.dynamics.observation_size} outputs of {dynamics.state_size} "
             "states."
         )
-    memory = check_count(memory, "memory", where)
+    memory = memory_of(loop, memory, where)
     features = Features(None, memory, dynamics.state_size, nature=False)
     return linear_learner(loop, cost, features, learning_rate, optimiser, radius, where)

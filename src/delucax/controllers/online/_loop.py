@@ -30,6 +30,10 @@ is the same at all times."""
 FORGOTTEN = 0.03
 """What is left of an impulse at the end of a roll-out."""
 LEAST_HORIZON, MOST_HORIZON = 10, 1000
+FADED = 0.1
+"""What is left of an impulse at the end of the default memory. A longer policy reaches
+a little less, and costs more to learn: under noise it is worse."""
+LEAST_MEMORY, MOST_MEMORY = 10, 50
 
 
 class Tangents(NamedTuple):
@@ -127,6 +131,14 @@ class Loop(eqx.Module):
 
     def __check_init__(self):
         check_control(self.dynamics, self.base, "Loop")
+
+    def memory(self) -> int:
+        """For how many steps a disturbance matters, as far as that can be seen."""
+        # Newton's step, for nature's outputs and for loops that change, pays for each
+        # number that it learns.
+        known = self.tangents is not None and not self.echoes
+        radius = _radius(self.tangents) if known else None
+        return _steps(radius or 0.0, FADED, LEAST_MEMORY, MOST_MEMORY)
 
     @property
     def dtype(self) -> Any:
@@ -315,8 +327,13 @@ def _roll_out(tangents: Tangents | None, horizon: int | None, where: str) -> int
             f"{where}: horizon must be given where the closed loop cannot be seen: "
             "inside a transformation of JAX, or of dynamics that name no equilibrium."
         )
-    steps = math.log(FORGOTTEN) / math.log(radius) if radius > 0 else 0
-    return min(max(LEAST_HORIZON, math.ceil(steps)), MOST_HORIZON)
+    return _steps(radius, FORGOTTEN, LEAST_HORIZON, MOST_HORIZON)
+
+
+def _steps(radius: float, left: float, least: int, most: int) -> int:
+    """After how many steps no more than a part `left` is left, between limits."""
+    steps = math.log(left) / math.log(radius) if 0 < radius < 1 else 0
+    return min(max(least, math.ceil(steps)), most)
 
 
 def _radius(tangents: Tangents) -> float | None:

@@ -14,7 +14,7 @@ from ..._controller import AbstractController
 from ..._fields import as_module
 from ..._typing import PRNGKey
 from ...dynamics import AbstractDynamics
-from ._base import loop_of
+from ._base import loop_of, memory_of
 from ._features import Features
 from ._learner import OnlineLearner
 from ._policy import NetworkPolicy
@@ -26,7 +26,7 @@ def NeuralGPC(
     cost: Callable[..., Array],
     *,
     base: AbstractController | None = None,
-    memory: int = 10,
+    memory: int | None = None,
     width: int = 32,
     depth: int = 1,
     horizon: int | None = None,
@@ -75,7 +75,7 @@ def NeuralGPC(
     loop = loop_of(dynamics, cost, base, horizon, where)
     check_key(key, where)
     check_positive(learning_rate, "learning_rate", where)
-    memory = check_count(memory, "memory", where)
+    memory = memory_of(loop, memory, where)
     features = Features(None, memory, dynamics.observation_size, nature=loop.echoes)
     network = eqx.nn.MLP(
         features.size,
