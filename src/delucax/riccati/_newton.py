@@ -36,9 +36,7 @@ def polish(
 
     def body(carry):
         X, now, _, k = carry
-        # The first round only measures.
-        step = jnp.where(k == 0, 0, correction(now.closed_loop, now.error))
-        candidate = symmetric(X + step)
+        candidate = symmetric(X + step(now, k > 0))
         new = residual(candidate)
         better = (new.relative < now.relative) | (k == 0)
         # Where steps stop to help much, rounding is all that is left.
@@ -47,6 +45,13 @@ def polish(
             lambda a, b: jnp.where(better, a, b), (candidate, new), (X, now)
         )
         return X, now, going, k + 1
+
+    def step(now, needed):
+        """The correction, zero in the first round, which only measures. A loop of one
+        round is not run for a batch in which no member needs it."""
+        once = lambda carry: (jnp.zeros_like(needed), correction(*carry[2]), carry[2])
+        start = needed, jnp.zeros_like(X), (now.closed_loop, now.error)
+        return lax.while_loop(lambda carry: carry[0], once, start)[1]
 
     unknown = jax.tree.map(
         lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(residual, X)
