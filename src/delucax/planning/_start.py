@@ -132,17 +132,20 @@ def operating_point(
     dynamics: AbstractDynamics, cost: AbstractCost
 ) -> tuple[Array, Array] | None:
     """The state and control to regulate about, if cost or dynamics name them."""
+    n, m = dynamics.state_size, dynamics.control_size
     quadratic = isinstance(cost, Quadratic)
-    if quadratic and cost.state_target is not None and cost.control_target is not None:
-        return cost.state_target, cost.control_target
-    try:
-        return dynamics.equilibrium()
-    except ValueError:
-        if not quadratic:
-            return None
-    x, u = cost.state_target, cost.control_target
-    x = jnp.zeros(dynamics.state_size) if x is None else x
-    return x, jnp.zeros(dynamics.control_size) if u is None else u
+    x, u = (cost.state_target, cost.control_target) if quadratic else (None, None)
+    if x is None or u is None:
+        try:
+            x, u = dynamics.equilibrium()
+        except ValueError:
+            if not quadratic:
+                return None
+            x = jnp.zeros(n) if x is None else x
+            u = jnp.zeros(m) if u is None else u
+    x, u = as_float_array(x), as_float_array(u)
+    # What does not fit the dynamics is an error of the planner, not of its start.
+    return (x, u) if x.shape == (n,) and u.shape == (m,) else None
 
 
 def control_at_rest(dynamics: AbstractDynamics, cost: AbstractCost) -> Array:
