@@ -89,8 +89,6 @@ def test_a_limit_of_the_temperature(limit, x0, expected):
     plan = ilqr(dynamics, cost, x0, T, bounds=BOUNDS, constraints=below)
     assert_close(plan.cost, expected, atol=1e-6)
     assert jnp.max(plan.states[:-1, 1]) < limit + 1e-6
-    # It goes on from where it is, not from its controls alone.
-    assert plan.rollouts < 40
 
 
 @once

@@ -86,7 +86,8 @@ class MPC(AbstractController):
     hold, `throw` says what happens.
 
     Derivatives are those of the planner: of [`delucax.planning.ilqr`][] by the implicit
-    function theorem, NaN where a plan did not converge.
+    function theorem, NaN where a plan did not converge. Of a planner that samples they
+    go through the start that was taken; which one that is, is held.
 
     **Arguments:**
 
