@@ -279,7 +279,7 @@ class MPC(AbstractController):
         )
         lost = (plan.result == RESULTS.diverged) | (plan.result == RESULTS.infeasible)
         lost = lost | ~jnp.all(jnp.isfinite(plan.controls))
-        u = jnp.where(lost, self._followed(y, last), plan.controls[0])
+        u = jnp.where(lost, self._followed(y, state), plan.controls[0])
         if self.throw:
             u = plan.result.error_if(u, lost)
         shift = lambda a: jnp.concatenate([a[1:], a[-1:]])
@@ -298,8 +298,8 @@ class MPC(AbstractController):
         )
         return u.astype(y.dtype), after
 
-    def _followed(self, y: Array, last: Start) -> Array:
-        """The first control of a start, without a plan."""
+    def _followed(self, y: Array, last: MPCState) -> Array:
+        """The control of the last plan, or of the first start where there is none."""
         difference = self.options.get("difference")
         x = last.states[0]
         e = y - x if difference is None else difference(y, x)
@@ -323,10 +323,9 @@ def _arguments(planner: Any, where: str) -> tuple[str, ...]:
 
 def _stacked(start: Start, n: int) -> Start:
     """One start or several as several, with states and gains."""
+    if start.controls.ndim == 2:
+        start = jax.tree.map(lambda a: a[None], start)
     controls, states, gains = start.controls, start.states, start.gains
-    if controls.ndim == 2:
-        add = lambda a: None if a is None else a[None]
-        controls, states, gains = (add(a) for a in (controls, states, gains))
     c, T, m = controls.shape
     if states is None or gains is None:
         states = jnp.zeros((c, T + 1, n), controls.dtype)

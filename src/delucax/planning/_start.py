@@ -143,7 +143,7 @@ def operating_point(
                 return None
             x = jnp.zeros(n) if x is None else x
             u = jnp.zeros(m) if u is None else u
-    x, u = as_float_array(x), as_float_array(u)
+    x, u = jnp.asarray(as_float_array(x)), jnp.asarray(as_float_array(u))
     # What does not fit the dynamics is an error of the planner, not of its start.
     return (x, u) if x.shape == (n,) and u.shape == (m,) else None
 
@@ -245,6 +245,7 @@ def begin(problem: Problem, start: Start) -> tuple[Start, Array, Array, Array]:
 
     if start.controls.ndim == 2:
         return start, *roll(start)
-    rolled = jax.vmap(roll)(start)
+    # A loop over scalars is faster on CPU than one over vectors of a few entries.
+    rolled = lax.map(roll, start)
     best = jnp.argmin(lax.stop_gradient(rolled[2]))
     return jax.tree.map(lambda a: a[best], (start, *rolled))
