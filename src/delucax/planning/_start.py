@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from .._check import check_count, check_finite
 from .._fields import as_float_array, parameter
+from .._message import shortened
 from .._typing import RealScalar
 from ..costs import AbstractCost, Quadratic
 from ..dynamics import AbstractDynamics
@@ -193,7 +194,8 @@ def _constant(tree: Any) -> Any:
 
 def as_start(value: Start, n: int, m: int, name: str, where: str) -> Start:
     """A start whose arrays fit each other and the problem, or an error."""
-    arrays = [as_float_array(a) for a in (value.controls, value.states, value.gains)]
+    given = value.controls, value.states, value.gains
+    arrays: list[Any] = [as_float_array(a) for a in given]
     shape = getattr(arrays[0], "shape", ())
     batch, T = shape[:-2], shape[-2] if len(shape) > 1 else 0
     if len(batch) > 1 or T < 1:
@@ -206,7 +208,7 @@ def as_start(value: Start, n: int, m: int, name: str, where: str) -> Start:
         if array is None and field != "controls":
             continue
         if not eqx.is_inexact_array(array) or array.shape != (*batch, *row):
-            got = f"shape {array.shape}" if eqx.is_array(array) else repr(array)
+            got = f"shape {array.shape}" if eqx.is_array(array) else shortened(array)
             raise ValueError(
                 f"{where}: {name}.{field} must have shape {(*batch, *row)}, got {got}."
             )
