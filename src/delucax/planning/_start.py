@@ -207,8 +207,9 @@ def as_start(value: Start, n: int, m: int, name: str, where: str) -> Start:
     for (field, row), array in zip(rows.items(), arrays, strict=True):
         if array is None and field != "controls":
             continue
-        if not eqx.is_inexact_array(array) or array.shape != (*batch, *row):
-            got = f"shape {array.shape}" if eqx.is_array(array) else shortened(array)
+        got = getattr(array, "shape", None)
+        if not eqx.is_inexact_array(array) or got != (*batch, *row):
+            got = shortened(array) if got is None else f"shape {got}"
             raise ValueError(
                 f"{where}: {name}.{field} must have shape {(*batch, *row)}, got {got}."
             )
