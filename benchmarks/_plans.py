@@ -6,7 +6,7 @@ to use, and arrays of that module.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 
@@ -23,8 +23,14 @@ class Plans:
     final: Callable[..., Any]
     rest: float = 0.0  # the control to start from
     bound: float | None = None
+    bounds: tuple[float, float] | None = None  # where they are not symmetric
     obstacle: Callable[..., Any] | None = None  # at most 0
     arrival: tuple[float, ...] | None = None
+
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """Of the controls."""
+        return self.bounds if self.bound is None else (-self.bound, self.bound)
 
 
 def stack(module: Any, entries: list[Any]) -> Any:
@@ -107,7 +113,67 @@ def cart_cost(weight: float) -> Callable[..., Any]:
     return cost
 
 
+COLDEST, HOTTEST = 280.0, 320.0
+# At half the concentration of the feed.
+MIXED = 8750 / math.log(7.2e10)
+COOLANT = MIXED - (350.0 - MIXED + 209.2 * 0.5) / 2.092
+# The cost to go of the LQR there, which the benchmark checks.
+TO_GO = (553.2798101150212, 10.253882224314259, 0.3316803252438305)
+
+
+def react(module: Any, x: Any, u: Any) -> Any:
+    """A stirred tank about its unstable equilibrium, four steps of Runge and Kutta."""
+
+    def rates(x: Any) -> Any:
+        reaction = 7.2e10 * module.exp(-8750 / x[1]) * x[0]
+        warming = 350 - x[1] + 209.2 * reaction
+        return stack(module, [1 - x[0] - reaction, warming + 2.092 * (u[0] - x[1])])
+
+    h = 0.05 / 4
+    for _ in range(4):
+        k1 = rates(x)
+        k2 = rates(x + h / 2 * k1)
+        k3 = rates(x + h / 2 * k2)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(x + h * k3))
+    return x
+
+
+def off(x: Any) -> tuple[Any, Any]:
+    """How far a tank is from its equilibrium."""
+    return x[0] - 0.5, x[1] - MIXED
+
+
+def regulated(module: Any, x: Any, u: Any) -> Any:
+    """The cost of a step of the tank."""
+    c, T = off(x)
+    return 10 * c * c + 0.01 * T * T + 0.01 * (u[0] - COOLANT) ** 2
+
+
+def to_go(module: Any, x: Any) -> Any:
+    """What the LQR would cost from there on."""
+    (c, T), (cc, cT, TT) = off(x), TO_GO
+    return cc * c * c + 2 * cT * c * T + TT * T * T
+
+
+REACTOR = Plans(
+    (0.6495, 346.71),
+    1,
+    30,
+    0.05,
+    react,
+    regulated,
+    to_go,
+    rest=COOLANT,
+    bounds=(COLDEST, HOTTEST),
+)
+
+
 CASES = {
+    "reactor": REACTOR,
+    "reactor, at most 352 K": replace(REACTOR, obstacle=lambda module, x: x[1] - 352.0),
+    "reactor, at most 349.5 K": replace(
+        REACTOR, obstacle=lambda module, x: x[1] - 349.5
+    ),
     "quadrotor": Plans(
         (1.0, 1.0, 0.0, 0.0, 0.0, 0.0),
         2,

@@ -126,7 +126,7 @@ class Charged(dlx.AbstractCost):
 
 def planned(case: Plans, x0: Any, controls: Any, **options: Any) -> Any:
     """Our plan of a case."""
-    bounds = None if case.bound is None else (-case.bound, case.bound)
+    bounds = case.limits
     constraints = None
     if case.obstacle is not None or case.arrival is not None:
         obstacle, arrival = case.obstacle, case.arrival
@@ -294,7 +294,7 @@ def agreement(casadi: Worker) -> Table:
     from what IPOPT found."""
     table = Table()
     for name, case in CASES.items():
-        if name == "quadrotor":
+        if name == "quadrotor" or name.startswith("reactor"):
             continue
         x0, guess = jnp.asarray(case.x0), guess_of(case, case.x0)
         built = casadi.ask(build=name, solver="ipopt")

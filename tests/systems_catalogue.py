@@ -125,6 +125,7 @@ SYSTEMS = {
         0.01,
     ),
     "TwoTank": Case(s.TwoTank, [0.0, 0.0], [20.0, 20.0], [0.0], [30.0], 1.0),
+    "CSTR": Case(s.CSTR, [0.3, 340.0], [0.7, 360.0], [280.0], [320.0], 0.05),
     "PermanentMagnetMotor": Case(
         lambda: s.PermanentMagnetMotor(d_inductance=0.006),
         *box(20.0, 20.0, 200.0),

@@ -39,8 +39,9 @@ def build(case: Plans, solver: str) -> Any:
         opti.subject_to(X[k + 1] == step(X[k], U[k]))
         if k == 0:
             opti.subject_to(X[0] == x0)
-        if case.bound is not None:
-            opti.subject_to(opti.bounded(-case.bound, U[k], case.bound))
+        if case.limits is not None:
+            low, high = case.limits
+            opti.subject_to(opti.bounded(low, U[k], high))
         # The first state is given.
         if case.obstacle is not None and k > 0:
             opti.subject_to(case.obstacle(ca, X[k]) <= 0)

@@ -1,12 +1,17 @@
 """Model predictive control over every planner; learning online around a plan."""
 
+import functools
+
+import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import assert_close, needs_x64, once, thorough, user_error
+from hypothesis import settings, strategies as st
 
 import delucax as dlx
+from delucax.dynamics._wrapper import AbstractWrapper
 
 
 MPC = dlx.controllers.MPC
@@ -42,14 +47,15 @@ def test_a_plan_starts_from_the_last_one():
     step = jax.jit(lambda t, y, state: mpc(t, y, state))
     x, state = env.initial_state, mpc.init()
     for k in range(3):
-        plan = dlx.planning.ilqr(
-            env.dynamics, env.cost, x, state.controls, bounds=(-2.0, 2.0)
-        )
+        last = dlx.planning.Start(state.controls, state.states, state.gains)
+        plan = dlx.planning.ilqr(env.dynamics, env.cost, x, last, bounds=(-2.0, 2.0))
         u, state = step(0.1 * k, x, state)
         assert_close(u, plan.controls[0], atol=1e-9)
         later = jnp.concatenate([plan.controls[1:], plan.controls[-1:]])
         assert_close(state.controls, later, atol=1e-9)
-        assert state.iterations == plan.iterations and state.failures.count == 0
+        assert_close(state.states[:-1], plan.states[1:], atol=1e-9)
+        assert_close(state.gains[:-1], plan.gains[1:], atol=1e-9)
+        assert state.iterations <= plan.iterations and state.failures.count == 0
         x = env.dynamics(0.1 * k, x, u)
     # Where the model is right it does what it planned, and finds nothing to change.
     assert state.iterations <= 2
@@ -108,14 +114,21 @@ def test_a_plan_that_fails_is_seen():
     step = jax.jit(lambda y, state: calm(0.0, y, state))
     u, state = step(jnp.array([0.1]), calm.init())
     assert state.failures.count == 0 and state.result == dlx.RESULTS.successful
-    kept = state.controls
+    last = state
     u, state = step(jnp.array([9.0]), state)
     assert state.failures.count == 1 and state.result == dlx.RESULTS.diverged
-    # What was planned a step before; then a new beginning.
-    assert_close(u, kept[0])
-    assert_close(state.controls, calm.start)
+    # The last plan is followed, under its gains; after that the regulator.
+    followed = last.controls[0] - last.gains[0] @ (9.0 - last.states[0])
+    assert followed < -1
+    assert_close(u, [-1.0])
+    assert_close(state.controls, calm.start.controls[0])
+    assert jnp.all(state.gains == calm.start.gains[0]) and jnp.all(state.gains > 0)
+    u, state = step(jnp.array([4.0]), state)
+    assert state.failures.count == 2 and u == -1
+    u, state = step(jnp.array([jnp.nan]), state)
+    assert state.failures.count == 3 and u == 0
     u, state = step(jnp.array([0.1]), state)
-    assert state.failures.count == 1 and state.result == dlx.RESULTS.successful
+    assert state.failures.count == 3 and state.result == dlx.RESULTS.successful
 
 
 @thorough
@@ -129,6 +142,140 @@ def test_a_plan_that_fails_is_an_error():
     short = MPC(dynamics, cost, 12, max_iterations=1)
     _, state = short(0.0, jnp.array([0.2]), short.init())
     assert state.failures.count == 1 and state.result == dlx.RESULTS.not_converged
+
+
+def reactor():
+    """A task, its LQR, and its cost with the LQR's cost to go."""
+    env = dlx.make("cstr")
+    x, u = env.dynamics.equilibrium()
+    Q, R = jnp.diag(jnp.array([10.0, 0.01])), jnp.array([[0.01]])
+    lqr = dlx.controllers.LQR(dlx.linearize(env.dynamics), Q, R)
+    cost = dlx.costs.Quadratic(Q, R, final=lqr.P, state_target=x, control_target=u)
+    return env, lqr, cost
+
+
+@functools.cache
+def first_costs():
+    """Of a plan of MPC, and of a run of the LQR, from a state and after a last plan."""
+    env, lqr, cost = reactor()
+    mpc = MPC(env.dynamics, cost, 30, bounds=(280.0, 320.0))
+    short = dlx.Environment(
+        env.dynamics, cost, control_bounds=(280.0, 320.0), horizon=30
+    )
+
+    @jax.jit
+    def costs(x0, controls):
+        state = mpc.init()
+        state = state._replace(controls=state.controls + controls)
+        u, state = mpc(0.0, x0, state)
+        U = jnp.concatenate([u[None], state.controls[:-1]])
+        followed = dlx.controllers.Sequence(U)
+        run = lambda c: dlx.rollout(short, c, key=KEY, x0=x0).total_cost
+        return run(followed), run(lqr), state.failures.count
+
+    return costs
+
+
+@needs_x64
+@settings(max_examples=100, deadline=None)
+@hypothesis.given(
+    c=st.floats(0.3, 0.7),
+    T=st.floats(342.0, 352.0),
+    seed=st.integers(0, 2**31),
+    scale=st.floats(0.0, 30.0),
+)
+def test_a_plan_costs_at_most_the_regulator(c, T, seed, scale):
+    """From any state on an unstable plant, and after any last plan."""
+    controls = scale * jax.random.normal(jax.random.key(seed), (30, 1))
+    plan, regulated, _ = first_costs()(jnp.array([c, T]), controls)
+    # An open loop of 30 steps adds to the rounding of the plan.
+    assert plan <= regulated * (1 + 1e-9) + 1e-9
+
+
+@needs_x64
+def test_the_first_plan_on_an_unstable_plant():
+    starts = (0.6495, 346.71), (0.6408, 349.82), (0.6035, 351.85)
+    # IPOPT's optima, of `python -m benchmarks.reactor`.
+    optima = 5.210338665957, 10.028732157678, 11.955587196360
+    for x0, optimum in zip(starts, optima, strict=True):
+        cost, _, failures = first_costs()(jnp.array(x0), jnp.zeros((30, 1)))
+        assert_close(cost, optimum, atol=1e-8)
+        assert failures == 0
+
+
+class Thermometer(AbstractWrapper):
+    """Dynamics of which the second state alone is read."""
+
+    dynamics: dlx.AbstractDynamics
+
+    def advance(self, t, x, u, w):
+        return self.dynamics.advance(t, x, u, w)
+
+    def observe(self, t, x):
+        return x[1:]
+
+
+@needs_x64
+@thorough
+def test_on_an_estimate_of_an_unstable_plant():
+    """Twenty pairs of runs with the noise of `python -m benchmarks.reactor`."""
+    env, lqr, cost = reactor()
+    mean, spread = jnp.array([0.6495, 346.71]), jnp.array([0.01, 0.5])
+    w, v = jnp.array([0.003, 0.1]), 0.2
+    measured = Thermometer(env.dynamics)
+    task = dlx.Environment(
+        measured,
+        env.cost,
+        initial_state=lambda key: mean + spread * jax.random.normal(key, (2,)),
+        disturbance=dlx.disturbances.Gaussian(w, size=2),
+        sensor_noise=dlx.disturbances.Gaussian(v, size=1),
+        control_bounds=(280.0, 320.0),
+        horizon=60,
+    )
+    ekf = dlx.controllers.ExtendedKalmanFilter(
+        measured,
+        jnp.diag(w**2),
+        jnp.array([[v**2]]),
+        mean=mean,
+        covariance=jnp.diag(spread**2),
+    )
+    keys = jax.random.split(jax.random.key(0), 20)
+
+    def costs(controller):
+        around = dlx.controllers.OutputFeedback(controller, ekf)
+        run = lambda key: dlx.rollout(task, around, key=key).total_cost
+        return jax.jit(lambda keys: jax.lax.map(run, keys))(keys)
+
+    mpc = MPC(env.dynamics, cost, 30, bounds=(280.0, 320.0))
+    pairs = costs(mpc) - costs(lqr)
+    assert jnp.mean(pairs) < -0.05
+
+
+@thorough
+@once
+def test_a_start_of_ones_own():
+    env, lqr, cost = reactor()
+    given = env.dynamics, cost, 30
+    x0 = jnp.array([0.6495, 346.71])
+    held = jnp.tile(lqr.u_ref, (30, 1))
+    law = dlx.planning.Start(
+        held, jnp.tile(lqr.x_ref, (31, 1)), jnp.tile(lqr.K, (30, 1, 1))
+    )
+    line = jnp.tile(lqr.x_ref, (31, 1))
+    controls = {}
+    for name, options in {
+        "default": {},
+        "other controls": dict(start=held + 5.0),
+        "a law": dict(start=law),
+        "states": dict(states=line),
+        "alone": dict(start=dlx.planning.Start(held)),
+    }.items():
+        mpc = MPC(*given, bounds=(280.0, 320.0), throw=False, **options)
+        controls[name] = mpc(0.0, x0, mpc.init())[0]
+    for name in ("other controls", "a law", "states"):
+        assert_close(controls[name], controls["default"], atol=0.02)
+    assert jnp.abs(controls["alone"] - controls["default"]) > 1
+    assert MPC(*given, start=held + 5.0).start.controls[1, 0, 0] == held[0, 0] + 5
 
 
 @once
@@ -153,6 +300,10 @@ def test_bad_arguments_are_named():
         MPC(*given, 5, bounds=(1.0, -1.0))
     with user_error(match=r"start must have shape .* = \(5, 1\)"):
         MPC(*given, 5, start=jnp.zeros((4, 1)))
+    with user_error(match="start must have 5 steps, as the horizon, got 4"):
+        MPC(*given, 5, start=dlx.planning.Start(jnp.zeros((4, 1))))
+    with user_error(match=r"start.controls must have shape \(5, 1\)"):
+        MPC(*given, 5, start=dlx.planning.Start(jnp.zeros((5, 2))))
     with user_error(match="one random key"):
         MPC(*given, 5, planner=dlx.planning.cem).init()
 

@@ -79,6 +79,7 @@ def step_with(u):
 NUMBERS = {
     "acrobot": ["goal_height", "max_torque"],
     "cartpole": ["max_force"],
+    "cstr": ["concentration", "min_coolant", "max_coolant"],
     "double_integrator": ["max_force"],
     "dynamic_bicycle": ["speed", "max_acceleration", "max_steering"],
     "kinematic_bicycle": ["speed", "max_acceleration", "max_steering"],

@@ -95,6 +95,7 @@ def test_lanes_and_levels_are_held(key):
         assert_close(dlx.make(name).cost(0.0, at, jnp.zeros(2)), 0.0, atol=1e-10)
     for name, arguments in (
         ("two_tank", dict(level=12.0)),
+        ("cstr", dict(concentration=0.6)),
         ("permanent_magnet_motor", dict(speed=80.0)),
     ):
         env = dlx.make(name, **arguments)
@@ -151,6 +152,18 @@ def test_constants_reach_the_physics():
                 lower_outlet=0.05,
                 gravity=980.0,
                 smoothing=0.02,
+            ),
+        ),
+        (
+            "cstr",
+            dict(
+                flow=1.1,
+                feed_concentration=1.2,
+                feed_temperature=345.0,
+                rate=7e10,
+                activation=8700.0,
+                heat=200.0,
+                cooling=2.0,
             ),
         ),
         (
@@ -233,6 +246,7 @@ FLOW = dlx.systems.LinearSystem(jnp.eye(1), jnp.eye(1))
         ("reacher", dict(goal=[1.0]), r"goal must have shape \(2,\), got \(1,\)"),
         ("reacher", dict(goal=[1.0, np.nan]), "goal must be finite"),
         ("two_tank", dict(level=-1.0), "level must be at least 0"),
+        ("cstr", dict(concentration=-0.1), "concentration must be positive"),
         ("lorenz", dict(max_control=-1.0), "max_control must be at least 0"),
         ("quadrotor", dict(inputs="motors"), "inputs must be 'rotors' or 'wrench'"),
         ("neural", {}, "give a system, or a key .* got neither"),

@@ -95,7 +95,8 @@ def drawn(env, x, u=None):
 def test_every_task_has_a_drawing_that_moves(name, arguments):
     env = dlx.make(name, **arguments)
     generic = _DRAWINGS[dlx.AbstractDynamics]
-    assert (drawing_for(env) is generic) == (name in ("lds", "neural", "van_der_pol"))
+    phase_planes = ("cstr", "lds", "neural", "van_der_pol")
+    assert (drawing_for(env) is generic) == (name in phase_planes)
     rng = np.random.default_rng(0)
     states = 0.5 * rng.normal(size=(4, env.state_size))
     scene = scene_of(env, run_of(env, states, rng.normal(size=(3, env.control_size))))

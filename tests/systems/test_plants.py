@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 from helpers import assert_close, needs_x64, user_error
 
 import delucax as dlx
@@ -39,6 +40,45 @@ def test_an_empty_tank_stays_so():
     dynamics = dlx.Discretized(s.TwoTank(), dt=1.0)
     states = dlx.open_loop(dynamics, jnp.array([5.0, 0.0]), jnp.zeros((600, 1)))
     assert np.all(states >= -1e-6) and states[-1, 0] < 0.01
+
+
+def test_a_reactor_rests_at_any_concentration():
+    reactor = s.CSTR()
+    for c in (0.2, 0.5, 0.8):
+        x, u = reactor.equilibrium(c)
+        assert_close(field(reactor, x, u), [0, 0], atol=2e-12)
+        assert_close(x[0], c)
+    # The root of the vector field, from the numbers of the literature.
+    x, u = reactor.equilibrium()
+    root = scipy.optimize.root(
+        lambda z: np.asarray(field(reactor, [0.5, z[0]], [z[1]])),
+        [350.0, 300.0],
+        jac=lambda z: np.asarray(
+            jax.jacobian(lambda z: field(reactor, jnp.stack([0.5, z[0]]), z[1:]))(z)
+        ),
+        tol=1e-15,
+    ).x
+    assert_close([x[1], u[0]], root, rtol=1e-14)
+    assert_close([x[1], u[0]], [350.001, 300.0014], atol=1e-4)
+    slope = jax.jacobian(lambda rate: s.CSTR(rate=rate).equilibrium()[1])(7.2e10)
+    assert_close(
+        slope[0], (s.CSTR(rate=7.2e10 + 1e4).equilibrium()[1] - u)[0] / 1e4, rtol=1e-2
+    )
+
+
+def test_a_reactor_does_not_stay_by_itself():
+    reactor = s.CSTR()
+    x, u = reactor.equilibrium()
+    poles = np.linalg.eigvals(jax.jacobian(lambda x: field(reactor, x, u))(x))
+    assert_close(np.sort(poles.real), [-0.454, 2.834], atol=1e-3)
+    dynamics = dlx.Discretized(reactor, 0.05, substeps=8)
+    for shift in (-1.0, 1.0):
+        start = x + jnp.array([0.0, shift])
+        states = dlx.open_loop(dynamics, start, jnp.tile(u, (400, 1)))
+        # It goes out, from the warm side after running hot.
+        assert (jnp.max(states[:, 1]) > 400.0) == (shift > 0)
+        assert_close(states[-1], [0.8772, 324.4784], atol=1e-4)
+    assert np.all(np.isfinite(field(reactor, [0.5, -10.0], u)))
 
 
 def test_motor_in_the_steady_state():
@@ -107,6 +147,7 @@ def test_van_der_pol_goes_to_its_cycle():
         (lambda: s.DoubleIntegrator(0.0), "mass must be positive"),
         (lambda: s.MassSpringDamper(masses=0), "masses must be a whole number"),
         (lambda: s.TwoTank(smoothing=0.0), "smoothing must be positive"),
+        (lambda: s.CSTR(flow=0.0), "flow must be positive"),
         (lambda: s.PermanentMagnetMotor(flux=-1.0), "flux must be positive"),
         (lambda: s.NeuralSystem(2, 1, key=0), "NeuralSystem: key must be one random"),
         (

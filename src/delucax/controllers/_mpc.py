@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from .._check import as_bounds, check_bool, check_count, check_finite, check_key
 from .._controller import AbstractController, Tally, wrong_observation
@@ -18,7 +18,9 @@ from .._message import shortened
 from .._results import Result, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ..planning import ilqr
+from ..math import matvec
+from ..planning import default_start, ilqr, Start
+from ..planning._start import as_start, controls_of
 
 
 _OURS = ("dynamics", "cost", "x0", "controls", "t0", "w", "bounds", "key", "throw")
@@ -28,7 +30,8 @@ _OURS = ("dynamics", "cost", "x0", "controls", "t0", "w", "bounds", "key", "thro
 class MPCState(NamedTuple):
     """What [`delucax.controllers.MPC`][] remembers.
 
-    **Attributes:** `controls`, from which the next plan starts, shape `(T, m)`;
+    **Attributes:** `controls`, shape `(T, m)`, `states`, shape `(T+1, n)`, and `gains`,
+    shape `(T, m, n)`, of the last plan a step later, from which the next one starts;
     `result`, that of the last plan; `failures`, a [`delucax.controllers.Tally`][] of
     the plans that did not succeed; `iterations`, how many the last plan took; `key`,
     for planners that draw.
@@ -48,6 +51,8 @@ class MPCState(NamedTuple):
     """
 
     controls: Array
+    states: Array
+    gains: Array
     result: Result
     failures: Tally
     iterations: Array
@@ -58,19 +63,31 @@ class MPC(AbstractController):
     """Model predictive control: plan from where the plant is, apply the first control,
     and plan again.
 
-    `u_k` is the first control of the plan over `T` steps from `y_k` at `t_k`. Each plan
-    starts from the one before, a step later, its last control held. It works with every
-    planner of [`delucax.planning`][delucax.planning.ilqr], and with a cost that depends
-    on time, such as a reference to follow.
+    `u_k` is the first control of the plan over `T` steps from `y_k` at `t_k`. It works
+    with every planner of [`delucax.planning`][delucax.planning.ilqr], and with a cost
+    that depends on time, such as a reference to follow.
+
+    Each plan starts from the cheapest of a few trajectories from `y_k`, which are
+    computed together between the bounds:
+
+    1. the last plan a step later, under its gains, its last control held,
+    2. the LQR about the equilibrium,
+    3. the control of the equilibrium, held.
+
+    The second one keeps an unstable plant where the model is worth something, and a
+    plan of [`delucax.planning.ilqr`][] without constraints costs at most as much as
+    each of them. The LQR is computed when the controller is made, as
+    [`delucax.planning.default_start`][] says, and is left out where there is none.
 
     What became of a plan is in the controller's state: `result`, and how often it was
     no success, `failures`, which are `incidents["failed_plan"]` of a rollout. A plan
     that ran out of iterations or found no descent is used as it is, the best so far.
-    Where there is none to use, since the start diverges or the constraints cannot hold,
-    `throw` says what happens.
+    Where there is none to use, since every start diverges or the constraints cannot
+    hold, `throw` says what happens.
 
     Derivatives are those of the planner: of [`delucax.planning.ilqr`][] by the implicit
-    function theorem, NaN where a plan did not converge.
+    function theorem, NaN where a plan did not converge. Of a planner that samples they
+    go through the start that was taken; which one that is, is held.
 
     **Arguments:**
 
@@ -80,17 +97,23 @@ class MPC(AbstractController):
         horizon lets this be short.
     - `horizon`: the steps `T` of a plan.
     - `planner`: [`delucax.planning.ilqr`][] by default, [`delucax.planning.mppi`][],
-        [`delucax.planning.cem`][], or any function with their arguments.
+        [`delucax.planning.cem`][], or any function with their arguments, the fourth of
+        which is a [`delucax.planning.Start`][].
     - `bounds`: `(low, high)` of the controls, each a number or of shape `(m,)`; none by
         default.
-    - `start`: controls for the first plan to start from, shape `(T, m)`; by default
-        those of the equilibrium if the dynamics name one, else zero.
-    - `throw`: raise at run time where there is no plan to use (default); if false, the
-        control that was planned a step before is applied, and the next plan starts
-        afresh.
+    - `start`: what each plan may start from besides the last one:
+        [`delucax.planning.default_start`][] by default, the second and third above;
+        controls in place of the third, shape `(T, m)`; or a
+        [`delucax.planning.Start`][] in place of both, such as another stabilising law,
+        or controls alone.
+    - `throw`: raise at run time where there is no plan to use (default). If false, the
+        last plan is followed for one more step, under its gains, and forgotten; if
+        there is no plan in the next step either, the first one of `start`, by default
+        the LQR, is applied.
     - `**options`: other arguments of the planner, such as `max_iterations`, `samples`
         or `constraints`. Floating-point numbers among them can be differentiated and
-        changed without compiling again.
+        changed without compiling again. With `states` each plan starts from these, and
+        from the controls of the last plan, alone.
 
     **Raises:** `ValueError` on arguments of the wrong kind or shape, or options that
     the planner does not have; an error at run time as `throw` says.
@@ -116,7 +139,7 @@ class MPC(AbstractController):
 
     dynamics: AbstractDynamics
     cost: AbstractCost
-    start: Float[Array, "*batch T m"] = parameter()
+    start: Start
     low: Array | None = parameter()
     high: Array | None = parameter()
     planner: Callable[..., Any] = function_field()
@@ -157,17 +180,27 @@ class MPC(AbstractController):
                 )
         ends = as_bounds(bounds, where)
         m = dynamics.control_size
-        if start is None:
-            start = jnp.tile(_rest(dynamics), (horizon, 1))
-        start = as_float_array(start)
-        if not eqx.is_inexact_array(start) or start.shape != (horizon, m):
-            got = f"shape {start.shape}" if eqx.is_array(start) else shortened(start)
-            raise ValueError(
-                f"{where}: start must have shape (horizon, controls) = "
-                f"({horizon}, {m}), got {got}."
-            )
-        check_finite(start, "start", where)
-        self.dynamics, self.cost, self.start = dynamics, cost, start
+        if isinstance(start, Start):
+            start = as_start(start, dynamics.state_size, m, "start", where)
+            if controls_of(start).shape[0] != horizon:
+                raise ValueError(
+                    f"{where}: start must have {horizon} steps, as the horizon, got "
+                    f"{controls_of(start).shape[0]}."
+                )
+        else:
+            if start is not None:
+                start = as_float_array(start)
+                if not eqx.is_inexact_array(start) or start.shape != (horizon, m):
+                    array = eqx.is_array(start)
+                    got = f"shape {start.shape}" if array else shortened(start)
+                    raise ValueError(
+                        f"{where}: start must have shape (horizon, controls) = "
+                        f"({horizon}, {m}), got {got}."
+                    )
+                check_finite(start, "start", where)
+            start = default_start(dynamics, cost, horizon, controls=start)
+        self.dynamics, self.cost = dynamics, cost
+        self.start = _stacked(start, dynamics.state_size)
         self.low, self.high = (None, None) if ends is None else ends
         self.planner = planner
         self.throw = check_bool(throw, "throw", where)
@@ -184,10 +217,16 @@ class MPC(AbstractController):
 
     def __check_init__(self):
         where, m = "MPC", self.dynamics.control_size
-        if self.start.ndim < 2 or self.start.shape[-1] != m:
+        if not isinstance(self.start, Start):
             raise ValueError(
-                f"{where}: start must have shape (horizon, {m}), got "
-                f"{self.start.shape}."
+                f"{where}: start must be a delucax.planning.Start, got "
+                f"{type(self.start).__name__}."
+            )
+        controls = self.start.controls
+        if controls.ndim < 3 or controls.shape[-1] != m:
+            raise ValueError(
+                f"{where}: start.controls must have shape (c, horizon, {m}), got "
+                f"{controls.shape}."
             )
         if self.low is None and self.high is None:
             return
@@ -203,8 +242,16 @@ class MPC(AbstractController):
             check_key(key, "MPC.init")
         result = jax.tree.map(jnp.asarray, RESULTS.successful)
         zero = jnp.zeros((), int)
-        failures = Tally("failed_plan")
-        return MPCState(self.start, result, failures, zero, key if self.draws else None)
+        first = jax.tree.map(lambda a: a[0], self.start)
+        return MPCState(
+            first.controls,
+            first.states,
+            first.gains,
+            result,
+            Tally("failed_plan"),
+            zero,
+            key if self.draws else None,
+        )
 
     def __call__(self, t, y, state):
         size = self.dynamics.state_size
@@ -215,11 +262,16 @@ class MPC(AbstractController):
         if self.draws:
             key, options["key"] = jr.split(key)
         bounds = None if self.low is None else (self.low, self.high)
+        last = Start(state.controls, state.states, state.gains)
+        starts = state.controls
+        if "states" not in self.options:
+            join = lambda a, b: jnp.concatenate([a[None], b])
+            starts = jax.tree.map(join, last, self.start)
         plan = self.planner(
             self.dynamics,
             self.cost,
             y,
-            state.controls,
+            starts,
             t0=t,
             bounds=bounds,
             throw=False,
@@ -227,23 +279,36 @@ class MPC(AbstractController):
         )
         lost = (plan.result == RESULTS.diverged) | (plan.result == RESULTS.infeasible)
         lost = lost | ~jnp.all(jnp.isfinite(plan.controls))
-        before = state.controls
-        if self.low is not None and self.high is not None:
-            before = jnp.minimum(jnp.maximum(before, self.low), self.high)
-        u = jnp.where(lost, before[0], plan.controls[0])
+        u = jnp.where(lost, self._followed(y, state), plan.controls[0])
         if self.throw:
             u = plan.result.error_if(u, lost)
-        later = jnp.concatenate([plan.controls[1:], plan.controls[-1:]])
-        later = jnp.where(lost, self.start, later).astype(before.dtype)
+        shift = lambda a: jnp.concatenate([a[1:], a[-1:]])
+        later = Start(*(shift(a) for a in (plan.controls, plan.states, plan.gains)))
+        renewed = lambda new, old: jnp.where(lost, old[0], new).astype(old.dtype)
+        later = jax.tree.map(renewed, later, self.start)
         failed = plan.result != RESULTS.successful
         after = MPCState(
-            later,
+            later.controls,
+            later.states,
+            later.gains,
             plan.result,
             state.failures.add(failed),
             jnp.asarray(plan.iterations, state.iterations.dtype),
             key,
         )
         return u.astype(y.dtype), after
+
+    def _followed(self, y: Array, last: MPCState) -> Array:
+        """The control of the last plan, or of the first start where there is none."""
+        difference = self.options.get("difference")
+        x = last.states[0]
+        e = y - x if difference is None else difference(y, x)
+        u = last.controls[0]
+        tried = u - matvec(last.gains[0], e)
+        u = jnp.where(jnp.isfinite(tried), tried, u)
+        if self.low is not None and self.high is not None:
+            u = jnp.minimum(jnp.maximum(u, self.low), self.high)
+        return u
 
 
 def _arguments(planner: Any, where: str) -> tuple[str, ...]:
@@ -256,9 +321,13 @@ def _arguments(planner: Any, where: str) -> tuple[str, ...]:
     return tuple(inspect.signature(planner).parameters)
 
 
-def _rest(dynamics: AbstractDynamics) -> Array:
-    """The control of the equilibrium, or zero."""
-    try:
-        return dynamics.equilibrium()[1]
-    except ValueError:
-        return jnp.zeros(dynamics.control_size)
+def _stacked(start: Start, n: int) -> Start:
+    """One start or several as several, with states and gains."""
+    if start.controls.ndim == 2:
+        start = jax.tree.map(lambda a: a[None], start)
+    controls, states, gains = start.controls, start.states, start.gains
+    c, T, m = controls.shape
+    if states is None or gains is None:
+        states = jnp.zeros((c, T + 1, n), controls.dtype)
+        gains = jnp.zeros((c, T, m, n), controls.dtype)
+    return Start(controls, states, gains)

@@ -10,6 +10,7 @@ from ._cartpole import (
     cartpole_linear as cartpole_linear,
     GymCartPole as GymCartPole,
 )
+from ._cstr import cstr as cstr
 from ._double_integrator import double_integrator as double_integrator
 from ._dynamic_bicycle import dynamic_bicycle as dynamic_bicycle
 from ._environment import (

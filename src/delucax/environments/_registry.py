@@ -33,6 +33,7 @@ _REGISTRY: dict[str, str] = {
     "kinematic_bicycle": "delucax.environments:kinematic_bicycle",
     "dynamic_bicycle": "delucax.environments:dynamic_bicycle",
     "two_tank": "delucax.environments:two_tank",
+    "cstr": "delucax.environments:cstr",
     "permanent_magnet_motor": "delucax.environments:permanent_magnet_motor",
     "neural": "delucax.environments:neural",
     "balloon_lung": "delucax.lung:balloon_lung",

@@ -6,3 +6,4 @@ from ._count import count_evaluations as count_evaluations, Evaluations as Evalu
 from ._ilqr import ilqr as ilqr
 from ._mppi import mppi as mppi
 from ._plan import Plan as Plan
+from ._start import default_start as default_start, Start as Start

@@ -1,18 +1,22 @@
 """Arguments that every planner takes, checked."""
 
+import numbers
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_bounds, as_vector, check_finite
+from .._check import as_bounds, as_vector, check_count, check_finite
 from .._fields import as_float_array, as_module
 from .._message import shortened
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ._constraints import Constraints
+from ._plan import Plan
 from ._problem import Problem
+from ._start import as_start, control_at_rest, controls_of, default_start, Start
 
 
 def as_problem(
@@ -26,8 +30,8 @@ def as_problem(
     difference: Any,
     constraints: Any,
     where: str,
-) -> tuple[Problem, Array]:
-    """The problem, and the controls to start from, or an error."""
+) -> tuple[Problem, Start]:
+    """The problem, and what to start from, or an error."""
     if not isinstance(dynamics, AbstractDynamics):
         raise ValueError(
             f"{where}: dynamics must be an AbstractDynamics (for an environment, its "
@@ -40,14 +44,25 @@ def as_problem(
     m = dynamics.control_size
     x0 = as_vector(x0, dynamics.state_size, "x0", where)
     check_finite(x0, "x0", where)
-    controls = as_sequence(controls, None, m, "controls", where)
-    T = controls.shape[0]
-    if w is not None:
-        w = as_sequence(w, T, dynamics.disturbance_size, "w", where)
     t0 = as_float_array(t0)
     if not eqx.is_inexact_array(t0) or t0.shape != ():
         raise ValueError(f"{where}: t0 must be a number, got {shortened(t0)}.")
     check_finite(t0, "t0", where)
+    if isinstance(controls, Plan):
+        controls = Start(controls.controls, controls.states, controls.gains)
+    dtype = x0.dtype
+    if isinstance(controls, Start):
+        start = as_start(controls, dynamics.state_size, m, "controls", where)
+    elif isinstance(controls, numbers.Integral):
+        T = check_count(controls, "controls (the horizon)", where)
+        start = default_start(dynamics, cost, T, t0)
+    else:
+        start = Start(as_sequence(controls, None, m, "controls", where))
+    if not isinstance(controls, numbers.Integral):
+        dtype = jnp.result_type(x0, start.controls)
+    T = controls_of(start).shape[0]
+    if w is not None:
+        w = as_sequence(w, T, dynamics.disturbance_size, "w", where)
     if difference is not None and not callable(difference):
         raise ValueError(f"{where}: difference must be a function, got {difference!r}.")
     if constraints is not None and not isinstance(constraints, Constraints):
@@ -55,7 +70,6 @@ def as_problem(
             f"{where}: constraints must be delucax.planning.Constraints, got "
             f"{type(constraints).__name__}."
         )
-    dtype = jnp.result_type(x0, controls)
     low = high = None
     ends = as_bounds(bounds, where)
     if ends is not None:
@@ -77,7 +91,20 @@ def as_problem(
         as_module(difference),
         constraints,
     )
-    return problem, controls.astype(dtype)
+    return problem, jax.tree.map(lambda a: a.astype(dtype), start)
+
+
+def at_rest(dynamics: Any, cost: Any, controls: Any, where: str) -> Any:
+    """The controls for states that are given: those at rest for a number of steps."""
+    if isinstance(controls, Start | Plan):
+        raise ValueError(
+            f"{where}: states go with an array of controls or a number of steps, got "
+            f"{type(controls).__name__}."
+        )
+    if not isinstance(controls, numbers.Integral):
+        return controls
+    T = check_count(controls, "controls (the horizon)", where)
+    return jnp.tile(control_at_rest(dynamics, cost), (T, 1))
 
 
 def as_sequence(

@@ -28,6 +28,7 @@ from ._descent import (
     Tolerances,
 )
 from ._problem import Problem
+from ._start import begin, controls_of, count_of, Start
 
 
 FIRST_RHO = 10.0
@@ -45,7 +46,7 @@ class _Progress(NamedTuple):
 
 def with_constraints(
     problem: Problem,
-    controls: Array,
+    start: Start,
     guess: Array | None,
     tolerances: Tolerances,
     options: Options,
@@ -55,8 +56,9 @@ def with_constraints(
     Source: Bertsekas, 1982; Howell, Jackson and Manchester, 2019 (in this setting).
     """
     if problem.constraints is None:
-        return optimise(problem, controls, guess, tolerances.gradient, options)
-    constraints, T = problem.constraints, controls.shape[0]
+        return optimise(problem, start, guess, tolerances.gradient, options)
+    constraints, controls = problem.constraints, controls_of(start)
+    T = controls.shape[0]
     dtype = problem.x0.dtype
     most_rho = 1 / jnp.finfo(dtype).eps ** 0.6
 
@@ -71,13 +73,18 @@ def with_constraints(
         final_equalities(constraints, problem.x0),
     )
 
-    def inner(controls, states, multipliers, tolerance, before):
-        augmented = eqx.tree_at(
+    def augmented(multipliers):
+        return eqx.tree_at(
             lambda p: p.multipliers, problem, multipliers, is_leaf=lambda p: p is None
         )
-        start = None if guess is None else states
+
+    def inner(before, multipliers, tolerance):
+        # The gains keep an unstable plant on the trajectory that it goes on from.
+        start = Start(before.controls, before.states, before.gains)
+        states = None if guess is None else before.states
         tolerance = jnp.maximum(tolerance, tolerances.gradient)
-        out = optimise(augmented, controls, start, tolerance, options, before)
+        given = augmented(multipliers), start, states, tolerance, options
+        out = optimise(*given, before)
         values = constrained(out.states, out.controls)
         rho = multipliers.rho
         known = multipliers.stage, multipliers.final
@@ -93,7 +100,7 @@ def with_constraints(
         out, rho = before.out, before.rho
         assert out.multipliers is not None
         multipliers = out.multipliers._replace(rho=rho)
-        after = inner(out.controls, out.states, multipliers, before.tolerance, out)
+        after = inner(out, multipliers, before.tolerance)
         precise = before.tolerance <= tolerances.gradient
         holds = after.violation <= tolerances.constraints
         settled = (after.status == CONVERGED) & precise & holds
@@ -113,23 +120,31 @@ def with_constraints(
     zero = jnp.zeros((), dtype)
     sizes = jax.eval_shape(constrained, jnp.zeros((T + 1, *problem.x0.shape)), controls)
     y = tuple(jnp.zeros(c.shape, dtype) for c in sizes)
-    still = jnp.broadcast_to(problem.x0, (T + 1, *problem.x0.shape))
-    states = still if guess is None else guess
-    start = Outcome(
+    rho, loose = jnp.full((), FIRST_RHO, dtype), jnp.full((), 1e-2, dtype)
+    rollouts = 0
+    if count_of(start) > 1:
+        rollouts = count_of(start)
+        start = begin(augmented(Multipliers(y[0], y[1], rho)), start)[0]
+    n = problem.x0.shape[0]
+    states, gains = start.states if guess is None else guess, start.gains
+    if states is None:
+        states = jnp.broadcast_to(problem.x0, (T + 1, n))
+    if gains is None:
+        gains = jnp.zeros((T, controls.shape[1], n), dtype)
+    first = Outcome(
         states=states,
-        controls=controls,
-        gains=jnp.zeros((T, controls.shape[1], problem.x0.shape[0]), dtype),
+        controls=start.controls,
+        gains=gains,
         cost=zero,
         residual=zero,
         trace=jnp.zeros(options.max_iterations + 1, dtype),
         status=jnp.asarray(NOT_CONVERGED),
         iterations=jnp.asarray(0),
-        rollouts=jnp.asarray(0),
+        rollouts=jnp.asarray(rollouts),
         mu=zero,
         violation=jnp.full((), jnp.inf, dtype),
         multipliers=Multipliers(y[0], y[1], zero),
     )
-    rho, loose = jnp.full((), FIRST_RHO, dtype), jnp.full((), 1e-2, dtype)
-    first = _Progress(start, rho, loose, jnp.asarray(False))
-    out = lax.while_loop(lambda progress: ~progress.done, body, first).out
+    progress = _Progress(first, rho, loose, jnp.asarray(False))
+    out = lax.while_loop(lambda progress: ~progress.done, body, progress).out
     return out._replace(cost=problem.total(out.states, out.controls))

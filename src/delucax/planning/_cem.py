@@ -15,6 +15,7 @@ from ..dynamics import AbstractDynamics
 from ._arguments import as_problem
 from ._plan import checked, Plan
 from ._sampling import as_samples, as_spread, average, Samples, search
+from ._start import controls_of, Start
 
 
 def cem(
@@ -54,7 +55,7 @@ def cem(
     - `dynamics`: the discrete-time dynamics.
     - `cost`: the stage and final cost.
     - `x0`: the first state, shape `(n,)`.
-    - `controls`: the controls to start from, shape `(T, m)`, which give the horizon.
+    - `controls`: what to start from, as for [`delucax.planning.ilqr`][].
     - `t0`: the time of the first state, 0 by default.
     - `w`: disturbances known in advance, shape `(T, k)`; zero by default.
     - `bounds`: `(low, high)`, each a number or of shape `(m,)`, between which every
@@ -101,9 +102,10 @@ def cem(
         ```
     """
     where = "cem"
-    problem, controls = as_problem(
+    problem, start = as_problem(
         dynamics, cost, x0, controls, t0, w, bounds, difference, None, where
     )
+    controls = controls_of(start)
     spread = as_spread(scale, correlation, controls, key, where)
     sizes = as_samples(samples, iterations, where)
     elites = check_count(elites, "elites", where)
@@ -114,14 +116,14 @@ def cem(
     check_number(momentum, "momentum", where)
     check_range(momentum, "momentum", where, 0, 1)
     momentum = jnp.asarray(momentum, controls.dtype)
-    plan = _plan(problem, controls, key, spread, momentum, sizes, elites)
+    plan = _plan(problem, start, key, spread, momentum, sizes, elites)
     return checked(plan, where) if throw else plan
 
 
 @eqx.filter_jit
 def _plan(
     problem: Any,
-    controls: Array,
+    start: Start,
     key: Array,
     spread: Any,
     momentum: Array,
@@ -139,5 +141,5 @@ def _plan(
         blend = lambda old, new: momentum * old + (1 - momentum) * new
         return blend(mean, centre), blend(width, after)
 
-    width = jnp.broadcast_to(spread.scale, controls.shape)
-    return search(problem, controls, key, spread, samples, width, update)
+    width = jnp.broadcast_to(spread.scale, controls_of(start).shape)
+    return search(problem, start, key, spread, samples, width, update)

@@ -10,8 +10,9 @@ from jaxtyping import Array
 
 from ._constraints import Multipliers
 from ._lq import in_parallel, in_sequence, Policy, promised, Stages
-from ._problem import gaps_of, model, Problem, roll_out
+from ._problem import gaps_of, model, Problem
 from ._search import Found, search
+from ._start import begin, controls_of, count_of, Start
 
 
 FACTOR = 2.0
@@ -72,28 +73,24 @@ class _Progress(NamedTuple):
 
 def optimise(
     problem: Problem,
-    controls: Array,
+    start: Start,
     guess: Array | None,
     tolerance: Array,
     options: Options,
     before: Outcome | None = None,
 ) -> Outcome:
-    """Iterate from controls, and from states that need not follow from them if there
-    is a guess of those; counting on from `before`, if that is given."""
-    T, m = controls.shape
+    """Iterate from the cheapest start, or from its controls and states that need not
+    follow from them if there is a guess of those; counting on from `before`, if that is
+    given."""
+    T, m = controls_of(start).shape
     dtype = problem.x0.dtype
     n = problem.x0.shape[0]
     zero = jnp.zeros((), dtype)
-    controls = jax.vmap(problem.clip)(controls)
-    K, k = jnp.zeros((T, m, n), dtype), jnp.zeros((T, m), dtype)
     gaps = None
     if guess is None:
-        still = jnp.broadcast_to(problem.x0, (T + 1, n))
-        start = (problem, still, controls, K, k, zero, None)
-        states, controls, cost = roll_out(*start)
-        # Of a start that diverges at least the controls are as they were given.
-        controls = jnp.where(jnp.isfinite(cost), controls, start[2])
+        _, states, controls, cost = begin(problem, start)
     else:
+        controls = jax.vmap(problem.clip)(controls_of(start))
         states = guess.at[0].set(problem.x0)
         gaps = gaps_of(problem, states, controls)
         cost = problem.total(states, controls)
@@ -113,11 +110,11 @@ def optimise(
         gaps,
         jnp.asarray(True),
         jnp.ones((), dtype),
-        rollouts + (1 if guess is None else 0),
+        rollouts + (count_of(start) if guess is None else 0),
     )
     first = _Progress(
         now=now,
-        gains=K,
+        gains=jnp.zeros((T, m, n), dtype),
         mu=zero,
         delta=jnp.ones((), dtype),
         curved=jnp.asarray(True),

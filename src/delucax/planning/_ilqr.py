@@ -5,14 +5,13 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from .._check import check_count, check_positive, check_range
 from .._fields import as_float_array
 from .._results import choose, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ._arguments import as_problem, as_sequence
+from ._arguments import as_problem, as_sequence, at_rest
 from ._constraints import Constraints
 from ._descent import (
     CONVERGED,
@@ -25,6 +24,7 @@ from ._descent import (
 from ._implicit import solution
 from ._plan import checked, Plan
 from ._search import SEARCHES
+from ._start import Start
 
 
 def ilqr(
@@ -73,6 +73,11 @@ def ilqr(
     of nothing, such as that of a lane that a batch masks, stays zero). It does not
     depend on `controls` and `states`, from which the iteration only starts.
 
+    The minimum is a local one, and which one it is depends on the start. On an unstable
+    plant controls alone lead far away, and the iteration may end in a stationary point
+    out there. With the number of steps as `controls` it starts from the LQR's
+    trajectory, if that is cheaper.
+
     Under `jax.vmap` on CPU the plans of a batch are made one after the other, which is
     up to six times as fast as together, where each iteration would wait for the longest
     line search and the last plan; accelerators make them together.
@@ -82,13 +87,17 @@ def ilqr(
     - `dynamics`: the discrete-time dynamics.
     - `cost`: the stage and final cost.
     - `x0`: the first state, shape `(n,)`.
-    - `controls`: the controls to start from, shape `(T, m)`, which give the horizon.
+    - `controls`: what to start from: controls, shape `(T, m)`; the number of steps `T`,
+        for [`delucax.planning.default_start`][]; feedback, or several starts of which
+        the cheapest is taken, as [`delucax.planning.Start`][]; or an earlier plan, with
+        its gains.
     - `t0`: the time of the first state, 0 by default.
     - `w`: disturbances known in advance, shape `(T, k)`; zero by default.
     - `bounds`: `(low, high)`, each a number or of shape `(m,)`, between which every
         control is kept; none by default.
     - `states`: states to start from, shape `(T+1, n)`, which need not follow from
-        `controls` (multiple shooting). The steps close the gaps. By default the states
+        `controls` (multiple shooting), which are an array or the number of steps then,
+        for those of the equilibrium. The steps close the gaps. By default the states
         follow from `controls`.
     - `constraints`: [`delucax.planning.Constraints`][] on states and controls, by the
         method of multipliers; none by default.
@@ -120,7 +129,7 @@ def ilqr(
         angles, for dynamics that wrap them; subtraction by default.
     - `throw`: raise unless converged (default); if false, look at `plan.result`, which
         is `not_converged`, `no_descent`, `infeasible` if no weight makes the
-        constraints hold, or `diverged` if the start itself diverges: the plan is then
+        constraints hold, or `diverged` if every start diverges: the plan is then
         the best iterate.
 
     **Returns:** a [`delucax.planning.Plan`][]. Converged is stationary: where the
@@ -158,13 +167,15 @@ def ilqr(
         ```
     """
     where = "ilqr"
-    problem, controls = as_problem(
+    if states is not None:
+        controls = at_rest(dynamics, cost, controls, where)
+    problem, start = as_problem(
         dynamics, cost, x0, controls, t0, w, bounds, difference, constraints, where
     )
-    guess = None
+    guess, dtype = None, start.controls.dtype
     if states is not None:
-        shape = controls.shape[0] + 1, dynamics.state_size
-        guess = as_sequence(states, *shape, "states", where).astype(controls.dtype)
+        shape = start.controls.shape[0] + 1, dynamics.state_size
+        guess = as_sequence(states, *shape, "states", where).astype(dtype)
     if regularise not in ("control", "state"):
         raise ValueError(
             f"{where}: regularise must be 'control' or 'state', got {regularise!r}."
@@ -185,7 +196,7 @@ def ilqr(
             f"{where}: parallel=True goes without bounds and with "
             "regularise='control'; solve in sequence otherwise."
         )
-    eps = float(jnp.finfo(controls.dtype).eps)
+    eps = float(jnp.finfo(dtype).eps)
     if tolerance is None:
         # What differences leave over is no descent direction of the true cost.
         tolerance = max(eps**0.5, (finite_difference or 0.0) ** 2)
@@ -209,18 +220,16 @@ def ilqr(
         max_iterations=check_count(max_iterations, "max_iterations", where),
         spacing=finite_difference,
     )
-    tolerances = (
-        as_float_array(t).astype(controls.dtype) for t in (tolerance, feasible)
-    )
-    plan = _plan(problem, controls, guess, Tolerances(*tolerances), options)
+    tolerances = (as_float_array(t).astype(dtype) for t in (tolerance, feasible))
+    plan = _plan(problem, start, guess, Tolerances(*tolerances), options)
     return checked(plan, where) if throw else plan
 
 
 @eqx.filter_jit
 def _plan(
-    problem: Any, controls: Array, guess: Any, tolerances: Any, options: Options
+    problem: Any, start: Start, guess: Any, tolerances: Any, options: Options
 ) -> Plan:
-    out = solution(problem, controls, guess, tolerances, options=options)
+    out = solution(problem, start, guess, tolerances, options=options)
     result = RESULTS.not_converged
     for code, kind in (
         (CONVERGED, RESULTS.successful),

@@ -27,6 +27,7 @@ from ._lanes import by_lanes
 from ._lq import apply, in_parallel, in_sequence, product, solve_free, Stages
 from ._poison import poison
 from ._problem import costates_of, model, Problem
+from ._start import controls_of, Start
 
 
 REFINEMENTS = 20
@@ -38,7 +39,7 @@ STIFFER = 10.0
 @eqx.filter_custom_jvp
 def solution(
     problem: Problem,
-    controls: Array,
+    start: Start,
     guess: Array | None,
     tolerances: Tolerances,
     *,
@@ -46,7 +47,7 @@ def solution(
 ) -> Outcome:
     """What the iteration ends with; differentiable with respect to the problem."""
     run = functools.partial(with_constraints, options=options)
-    return by_lanes(run, problem, controls, guess, tolerances)
+    return by_lanes(run, problem, start, guess, tolerances)
 
 
 @solution.def_jvp
@@ -73,7 +74,7 @@ def _with_tangents(primals: Any, tangents: Any, options: Options) -> Any:
     # the problem is looked at where it began.
     x0 = jnp.where(jnp.isfinite(problem.x0), problem.x0, 0)
     X = jnp.where(solved, out.states, x0)
-    U = jnp.where(solved, out.controls, primals[1])
+    U = jnp.where(solved, out.controls, controls_of(primals[1]))
     y = out.multipliers
 
     def given(varied) -> Problem:

@@ -14,6 +14,7 @@ from ..dynamics import AbstractDynamics
 from ._arguments import as_problem
 from ._plan import checked, Plan
 from ._sampling import above_least, as_samples, as_spread, average, Samples, search
+from ._start import controls_of, Start
 
 
 def mppi(
@@ -50,7 +51,7 @@ def mppi(
     - `dynamics`: the discrete-time dynamics.
     - `cost`: the stage and final cost.
     - `x0`: the first state, shape `(n,)`.
-    - `controls`: the controls to start from, shape `(T, m)`, which give the horizon.
+    - `controls`: what to start from, as for [`delucax.planning.ilqr`][].
     - `t0`: the time of the first state, 0 by default.
     - `w`: disturbances known in advance, shape `(T, k)`; zero by default.
     - `bounds`: `(low, high)`, each a number or of shape `(m,)`, between which every
@@ -96,22 +97,23 @@ def mppi(
         ```
     """
     where = "mppi"
-    problem, controls = as_problem(
+    problem, start = as_problem(
         dynamics, cost, x0, controls, t0, w, bounds, difference, None, where
     )
+    controls = controls_of(start)
     spread = as_spread(scale, correlation, controls, key, where)
     check_number(temperature, "temperature", where)
     check_positive(temperature, "temperature", where)
     temperature = jnp.asarray(temperature, controls.dtype)
     sizes = as_samples(samples, iterations, where)
-    plan = _plan(problem, controls, key, spread, temperature, sizes)
+    plan = _plan(problem, start, key, spread, temperature, sizes)
     return checked(plan, where) if throw else plan
 
 
 @eqx.filter_jit
 def _plan(
     problem: Any,
-    controls: Array,
+    start: Start,
     key: Array,
     spread: Any,
     temperature: Array,
@@ -122,4 +124,4 @@ def _plan(
         weights = jnp.where(finite, jnp.exp(-above / temperature), 0)
         return average(weights, tried, mean), width
 
-    return search(problem, controls, key, spread, samples, spread.scale, update)
+    return search(problem, start, key, spread, samples, spread.scale, update)

@@ -107,7 +107,7 @@ def roll_out(
 ) -> tuple[Array, Array, Array]:
     """The trajectory under `u - length k - K (x - x_planned)`, and its cost.
 
-    Without `K` and `k` it is that of the controls. `1 - length` of each gap is left.
+    Each of `K` and `k` may be left out. `1 - length` of each gap is left.
     The cost is infinite if anything goes wrong.
     """
     size = problem.x0.shape[0]
@@ -116,8 +116,10 @@ def roll_out(
     def body(parts, inputs):
         t, planned, u, K, k, gap, w = inputs
         x = join_state(parts, size)
+        if k is not None:
+            u = u - length * k
         if K is not None:
-            u = u - length * k - matvec(K, problem.deviation(x, planned))
+            u = u - matvec(K, problem.deviation(x, planned))
         u = problem.clip(u)
         x_next, result = problem.dynamics.advance(t, x, u, w)
         x_next = x_next.astype(x.dtype)

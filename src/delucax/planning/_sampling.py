@@ -16,6 +16,7 @@ from .._message import shortened
 from .._results import choose, RESULTS
 from ._plan import Plan
 from ._problem import Problem, roll_out
+from ._start import begin, controls_of, count_of, Start
 
 
 class Samples(NamedTuple):
@@ -75,7 +76,7 @@ def draw(key: Array, spread: Spread, count: int, like: Array) -> Array:
 
 def search(
     problem: Problem,
-    controls: Array,
+    start: Start,
     key: Array,
     spread: Spread,
     samples: Samples,
@@ -87,7 +88,11 @@ def search(
     `update(tried, costs, mean, width)` gives the next mean and width. The costs of what
     diverged are infinite.
     """
-    still = jnp.broadcast_to(problem.x0, (controls.shape[0] + 1, *problem.x0.shape))
+    controls = controls_of(start)
+    if start.gains is not None or count_of(start) > 1:
+        controls = begin(problem, start)[2]
+    T, m = controls.shape
+    still = jnp.broadcast_to(problem.x0, (T + 1, *problem.x0.shape))
 
     def cost_of(controls):
         return roll_out(problem, still, controls, None, None, 0.0, None)[2]
@@ -115,7 +120,6 @@ def search(
     best = better(best, mean, cost_of(mean))
     states, planned, cost = roll_out(problem, still, best[0], None, None, 0.0, None)
     good = jnp.isfinite(cost)
-    T, m = controls.shape
     zero = jnp.zeros((), mean.dtype)
     return Plan(
         states=states,

@@ -3,6 +3,7 @@
 from ._acrobot import Acrobot as Acrobot
 from ._base import AbstractSystem as AbstractSystem
 from ._cartpole import CartPole as CartPole
+from ._cstr import CSTR as CSTR
 from ._double_integrator import DoubleIntegrator as DoubleIntegrator
 from ._dynamic_bicycle import DynamicBicycle as DynamicBicycle
 from ._function import FunctionSystem as FunctionSystem, system as system

@@ -24,6 +24,7 @@ _IDS = {
     "CartPole-v1": ("cartpole", True),
     "CartPoleContinuous-v1": ("cartpole", False),
     "CartPoleLinear-v1": ("cartpole_linear", False),
+    "CSTR-v1": ("cstr", False),
     "DelayLung-v1": ("delay_lung", False),
     "DoubleCompartment-v1": ("double_compartment", False),
     "DoubleIntegrator-v1": ("double_integrator", False),

@@ -61,17 +61,21 @@ def setup_plane(
 
 
 def _draw_flow(ax: Axes, environment: Environment, view: View) -> None:
-    """Faint arrows along which the states go without control, all of one length."""
+    """Faint arrows along which the states go, all of one length: under the control of
+    the equilibrium, or without control if none is named."""
     ends = view.centre - view.half, view.centre + view.half
     sides = np.linspace(*ends, ARROWS + 2)[1:-1].T
     places = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     system: Any = system_of(environment)
-    zero = jnp.zeros(system.control_size)
+    try:
+        u = environment.dynamics.equilibrium()[1]
+    except ValueError:
+        u = jnp.zeros(system.control_size)
     if isinstance(system, AbstractSystem):
         w = jnp.zeros(system.disturbance_size) if system.disturbance_names else None
-        field = lambda x: system.vector_field(0.0, x, zero, w)
+        field = lambda x: system.vector_field(0.0, x, u, w)
     else:
-        field = lambda x: system(0.0, x, zero) - x
+        field = lambda x: system(0.0, x, u) - x
     ways = np.asarray(jax.vmap(field)(jnp.asarray(places)), float) / view.half
     ways = ways / np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-12)
     ax.quiver(

@@ -1,0 +1,254 @@
+"""Where planners start: trajectories under feedback, of which the cheapest is taken."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._check import check_count, check_finite
+from .._fields import as_float_array, parameter
+from .._message import shortened
+from .._typing import RealScalar
+from ..costs import AbstractCost, Quadratic
+from ..dynamics import AbstractDynamics
+from ..math._linear_solve import is_definite
+from ..riccati import dare
+from ._problem import model, Problem, roll_out
+
+
+class Start(eqx.Module):
+    """Where a planner starts: the trajectory that the model takes under
+
+    `u_k = controls[k] - gains[k] (x_k - states[k])`,
+
+    between the bounds of the planner. Controls alone, without gains, drive an unstable
+    plant far away. Under a stabilising gain it stays near `states`.
+
+    Several starts are stacked along a first axis. A planner computes their trajectories
+    together and starts from the cheapest. One that diverges is ignored.
+
+    **Arguments:**
+
+    - `controls`: shape `(T, m)`, or `(c, T, m)` for `c` starts.
+    - `states`: shape `(T+1, n)` or `(c, T+1, n)`; needed with `gains`.
+    - `gains`: shape `(T, m, n)` or `(c, T, m, n)`; none by default.
+
+    **Raises:** `ValueError` from the planner on shapes that do not fit, or numbers that
+    are not finite.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        cost = dlx.costs.Quadratic([1.0, 0.1], [0.1])
+        lqr = dlx.controllers.LQR(
+            dlx.linearize(dynamics), jnp.eye(2), 0.1 * jnp.eye(1)
+        )
+        start = dlx.planning.Start(
+            jnp.tile(lqr.u_ref, (60, 1)),
+            jnp.tile(lqr.x_ref, (61, 1)),
+            jnp.tile(lqr.K, (60, 1, 1)),
+        )
+        plan = dlx.planning.ilqr(dynamics, cost, jnp.array([0.3, 0.0]), start)
+        plan.trace[0], plan.cost
+        ```
+    """
+
+    controls: Float[Array, "*batch T m"] = parameter()
+    states: Float[Array, "*batch T+1 n"] | None = parameter(None)
+    gains: Float[Array, "*batch T m n"] | None = parameter(None)
+
+
+def default_start(
+    dynamics: AbstractDynamics,
+    cost: AbstractCost,
+    horizon: int,
+    t0: RealScalar = 0.0,
+    *,
+    controls: Any = None,
+) -> Start:
+    """The start that planners take by default, of which they use the cheaper one:
+
+    1. under the LQR about an operating point,
+    2. with its control held.
+
+    The operating point is the target of a [`delucax.costs.Quadratic`][] that names both
+    a state and a control, else the equilibrium that the dynamics name, else the target
+    with zero for what it does not name. The weights of the LQR are the second
+    derivatives of the stage cost there. Where there is no stabilising solution, or the
+    control weight is not positive definite, or the dynamics cannot be differentiated,
+    its gain is zero. Without an operating point there is only the second one, of zeros.
+
+    The LQR holds the plant near the line that stays at the operating point. So the line
+    itself, which is no trajectory and has no cost to compare, is not tried.
+
+    **Arguments:**
+
+    - `dynamics`: the discrete-time dynamics.
+    - `cost`: the stage and final cost.
+    - `horizon`: the steps `T`.
+    - `t0`: the time at which both are looked at, 0 by default.
+    - `controls`: in place of those of the second one, shape `(T, m)`.
+
+    **Returns:** a [`delucax.planning.Start`][]. No derivative goes through it.
+
+    **Raises:** `ValueError` on a horizon that is not a whole number of at least 1.
+
+    Source: Rawlings, Mayne and Diehl, 2017 (the regulator as a warm start).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("pendulum")
+        start = dlx.planning.default_start(env.dynamics, env.cost, 20)
+        start.gains[0, 0]
+        ```
+    """
+    T = check_count(horizon, "horizon", "default_start")
+    dynamics, cost = (_constant(tree) for tree in (dynamics, cost))
+    point = operating_point(dynamics, cost)
+    if point is None:
+        zero = jnp.zeros((T, dynamics.control_size))
+        return Start(zero if controls is None else controls)
+    try:
+        t0 = jnp.asarray(t0, point[0].dtype)
+        *matrices, posed = _expanded(dynamics, cost, *point, t0)
+    except (NotImplementedError, RuntimeError, TypeError, ValueError):
+        # Not differentiable. A planner that needs derivatives says so itself.
+        regulator = None
+    else:
+        regulator = dare(*matrices, throw=False), posed
+    return _both(point, regulator, controls, T)
+
+
+def operating_point(
+    dynamics: AbstractDynamics, cost: AbstractCost
+) -> tuple[Array, Array] | None:
+    """The state and control to regulate about, if cost or dynamics name them."""
+    n, m = dynamics.state_size, dynamics.control_size
+    quadratic = isinstance(cost, Quadratic)
+    x, u = (cost.state_target, cost.control_target) if quadratic else (None, None)
+    if x is None or u is None:
+        try:
+            x, u = dynamics.equilibrium()
+        except ValueError:
+            if not quadratic:
+                return None
+            x = jnp.zeros(n) if x is None else x
+            u = jnp.zeros(m) if u is None else u
+    x, u = jnp.asarray(as_float_array(x)), jnp.asarray(as_float_array(u))
+    # What does not fit the dynamics is an error of the planner, not of its start.
+    return (x, u) if x.shape == (n,) and u.shape == (m,) else None
+
+
+def control_at_rest(dynamics: AbstractDynamics, cost: AbstractCost) -> Array:
+    """That of the operating point, or zero."""
+    point = operating_point(dynamics, cost)
+    return jnp.zeros(dynamics.control_size) if point is None else point[1]
+
+
+@eqx.filter_jit
+def _expanded(dynamics, cost, x, u, t0):
+    """The linear-quadratic problem about a point, and whether it is one."""
+    problem = Problem(dynamics, cost, x, t0, None, None, None, None, None)
+    stages = model(problem, jnp.stack([x, x]), u[None], None, False)
+    n, F, H = x.shape[0], stages.F[0], stages.H[0]
+    A, B, Q, R, S = F[:, :n], F[:, n:], H[:n, :n], H[n:, n:], H[:n, n:]
+    posed = jnp.all(jnp.isfinite(F)) & jnp.all(jnp.isfinite(H)) & is_definite(R)
+    safe = (jnp.where(posed, M, jnp.eye(*M.shape, dtype=M.dtype)) for M in (A, B, Q, R))
+    return *safe, jnp.where(posed, S, 0), posed
+
+
+@eqx.filter_jit
+def _both(point, regulator, controls, T):
+    """The starts under a regulator, and under the controls alone."""
+    x, u = point
+    K = jnp.zeros((u.shape[0], x.shape[0]), x.dtype)
+    if regulator is not None:
+        solution, posed = regulator
+        # A gain that stabilises will do, whatever its residual.
+        stable = posed & (solution.spectral_radius < 1)
+        stable = stable & jnp.all(jnp.isfinite(solution.K))
+        K = jnp.where(stable, solution.K, K)
+    held = jnp.tile(u, (T, 1))
+    return Start(
+        jnp.stack([held, held if controls is None else controls]),
+        jnp.tile(x, (2, T + 1, 1)),
+        jnp.stack([jnp.tile(K, (T, 1, 1)), jnp.zeros((T, *K.shape), K.dtype)]),
+    )
+
+
+def _constant(tree: Any) -> Any:
+    """A module through which no derivative goes."""
+    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.tree.map(lax.stop_gradient, arrays), rest)
+
+
+def as_start(value: Start, n: int, m: int, name: str, where: str) -> Start:
+    """A start whose arrays fit each other and the problem, or an error."""
+    given = value.controls, value.states, value.gains
+    arrays: list[Any] = [as_float_array(a) for a in given]
+    shape = getattr(arrays[0], "shape", ())
+    batch, T = shape[:-2], shape[-2] if len(shape) > 1 else 0
+    if len(batch) > 1 or T < 1:
+        raise ValueError(
+            f"{where}: {name}.controls must have shape (T, {m}), or (c, T, {m}) for c "
+            f"starts, got shape {shape}."
+        )
+    rows = dict(controls=(T, m), states=(T + 1, n), gains=(T, m, n))
+    for (field, row), array in zip(rows.items(), arrays, strict=True):
+        if array is None and field != "controls":
+            continue
+        got = getattr(array, "shape", None)
+        if not eqx.is_inexact_array(array) or got != (*batch, *row):
+            got = shortened(array) if got is None else f"shape {got}"
+            raise ValueError(
+                f"{where}: {name}.{field} must have shape {(*batch, *row)}, got {got}."
+            )
+        check_finite(array, f"{name}.{field}", where)
+    if value.gains is not None and value.states is None:
+        raise ValueError(
+            f"{where}: {name}.states must be given with {name}.gains, got none."
+        )
+    return Start(*arrays)
+
+
+def controls_of(start: Start) -> Array:
+    """The controls of the first start, shape `(T, m)`."""
+    return start.controls[0] if start.controls.ndim == 3 else start.controls
+
+
+def count_of(start: Start) -> int:
+    """How many starts there are."""
+    return start.controls.shape[0] if start.controls.ndim == 3 else 1
+
+
+def begin(problem: Problem, start: Start) -> tuple[Start, Array, Array, Array]:
+    """The cheapest start, and its states, controls and cost, infinite if all of them
+    diverge."""
+
+    def roll(start):
+        states, gains = start.states, start.gains
+        if states is None:
+            T, n = start.controls.shape[0], problem.x0.shape[0]
+            states = jnp.broadcast_to(problem.x0, (T + 1, n))
+        about = states, start.controls, gains, None, 0.0, None
+        states, controls, cost = roll_out(problem, *about)
+        # Of a start that diverges at least the controls are as they were given.
+        given = jax.vmap(problem.clip)(start.controls)
+        return states, jnp.where(jnp.isfinite(cost), controls, given), cost
+
+    if start.controls.ndim == 2:
+        return start, *roll(start)
+    # A loop over scalars is faster on CPU than one over vectors of a few entries.
+    rolled = lax.map(roll, start)
+    best = jnp.argmin(lax.stop_gradient(rolled[2]))
+    return jax.tree.map(lambda a: a[best], (start, *rolled))
