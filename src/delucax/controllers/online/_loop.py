@@ -136,8 +136,9 @@ class Loop(eqx.Module):
         """For how many steps a disturbance matters, as far as that can be seen."""
         # Newton's step, for nature's outputs and for loops that change, pays for each
         # number that it learns.
-        known = self.tangents is not None and not self.echoes
-        radius = _radius(self.tangents) if known else None
+        if self.tangents is None or self.echoes:
+            return LEAST_MEMORY
+        radius = _radius(self.tangents)
         return _steps(radius or 0.0, FADED, LEAST_MEMORY, MOST_MEMORY)
 
     @property
