@@ -69,6 +69,7 @@ def run_of(env, states, controls=None):
         control_names=tuple(env.dynamics.control_names),
         state_units=tuple(env.dynamics.state_units),
         control_units=tuple(env.dynamics.control_units),
+        time_unit=env.dynamics.time_unit,
     )
 
 
@@ -169,7 +170,11 @@ def test_view_goes_along_with_what_leaves_it():
 
 
 def test_time_is_told_in_the_unit_of_the_plant():
-    texts = {"mountain_car": "t = 2", "cartpole": "t = 0.04 s"}
+    texts = {
+        "mountain_car": "t = 2",
+        "cartpole": "t = 0.04 s",
+        "cstr": "t = 0.10 min",
+    }
     for name, text in texts.items():
         env = dlx.make(name)
         scene = scene_of(env, run_of(env, np.zeros((4, env.state_size))))

@@ -41,6 +41,7 @@ class AbstractDynamics(eqx.Module):
         control_names: eqx.AbstractVar[tuple[str, ...]]
     state_units: ClassVar[Any] = ()
     control_units: ClassVar[Any] = ()
+    time_unit: ClassVar[Any] = "s"
 
     def __check_init__(self):
         check_step(self.dt, type(self).__name__)

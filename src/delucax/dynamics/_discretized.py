@@ -200,6 +200,11 @@ class Discretized(AbstractDynamics):
         return self.system.state_units
 
     @property
+    def time_unit(self) -> str:
+        """That of the system."""
+        return self.system.time_unit
+
+    @property
     def control_units(self) -> tuple[str, ...]:
         """Those of the system."""
         return self.system.control_units

@@ -37,6 +37,7 @@ class AbstractWrapper(AbstractDynamics):
         dynamics: ClassVar[Any]
         state_units: ClassVar[Any]
         control_units: ClassVar[Any]
+        time_unit: ClassVar[Any]
     else:
         dynamics: eqx.AbstractVar[AbstractDynamics]
 
@@ -44,6 +45,10 @@ class AbstractWrapper(AbstractDynamics):
         def state_units(self):
             same = self.state_names == self.dynamics.state_names
             return self.dynamics.state_units if same else ()
+
+        @property
+        def time_unit(self):
+            return self.dynamics.time_unit
 
         @property
         def control_units(self):

@@ -65,6 +65,7 @@ class GymMountainCar(AbstractDynamics):
     state_names: ClassVar = MountainCar.state_names
     control_names: ClassVar = MountainCar.control_names
     state_units = MountainCar.state_units
+    time_unit = MountainCar.time_unit
     control_units = MountainCar.control_units
 
     def __check_init__(self):

@@ -232,9 +232,7 @@ def panels_of(run: Run, show: Any, *, grouped: bool, where: str) -> list[Panel]:
 
 
 def time_label(run: Run) -> str:
-    """`"time [s]"` where the plant has units, which are then SI; else `"time"`. Where
-    one is of a step, time is counted in steps."""
-    units = (*run.trajectory.state_units, *run.trajectory.control_units)
-    if any("step" in unit for unit in units):
-        return "time [steps]"
-    return "time [s]" if any(units) else "time"
+    """`"time [s]"`, in the unit of a plant that names units; else `"time"`."""
+    trajectory = run.trajectory
+    named = any((*trajectory.state_units, *trajectory.control_units))
+    return f"time [{trajectory.time_unit}]" if named else "time"

@@ -105,7 +105,8 @@ class Scene:
     def frame(self, k: int) -> np.ndarray:
         """The picture of step `k`, shape `(height, width, 3)`."""
         times = self.run.times[0]
-        unit = " s" if "[s]" in time_label(self.run) else ""
+        unit = time_label(self.run).removeprefix("time").strip(" []")
+        unit = f" {unit}" if unit not in ("", "steps") else ""
         self.texts[0].set_text(f"t = {times[k]:.{self.decimals}f}{unit}")
         if "costs" in self.run.series:
             costs = self.run.series["costs"][0, :, 0]

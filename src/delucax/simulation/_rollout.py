@@ -313,6 +313,7 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
         control_names=dynamics.control_names,
         state_units=dynamics.state_units,
         control_units=dynamics.control_units,
+        time_unit=dynamics.time_unit,
     )
 
 

@@ -408,6 +408,7 @@ def _simulate(
         control_names=system.control_names,
         state_units=system.state_units,
         control_units=system.control_units,
+        time_unit=system.time_unit,
     )
 
 

@@ -52,6 +52,7 @@ class Trajectory(eqx.Module):
         `recorded_terminated`: the arrays behind `times`, `observations`,
         `disturbances` and `terminated` where they do not follow from the rest.
     - `state_names`, `control_names`, `state_units`, `control_units`: tuples of strings.
+    - `time_unit`: a string.
 
     !!! example
 
@@ -89,6 +90,7 @@ class Trajectory(eqx.Module):
     control_names: tuple[str, ...] = eqx.field(static=True)
     state_units: tuple[str, ...] = eqx.field(static=True)
     control_units: tuple[str, ...] = eqx.field(static=True)
+    time_unit: str = eqx.field(static=True, default="s")
     incidents: dict[str, Array] | None = None
     controller_state: PyTree = None
 

@@ -25,6 +25,7 @@ class AbstractSystem(eqx.Module):
         has the size of the state and is added to the next state by the discrete
         dynamics; otherwise `w` enters the vector field, and is held over a step.
     - `state_units`, `control_units`: tuples of strings, empty by default.
+    - `time_unit`: a string, `"s"` by default.
 
     **Hooks**, which alone may be overridden: `observe`, `project`, `difference`,
     `equilibrium`, `diffusion`.
@@ -61,6 +62,7 @@ class AbstractSystem(eqx.Module):
     disturbance_names: ClassVar[Any] = ()
     state_units: ClassVar[Any] = ()
     control_units: ClassVar[Any] = ()
+    time_unit: ClassVar[str] = "s"
 
     def __check_init__(self):
         for name in ("state_names", "control_names", "disturbance_names"):

@@ -64,6 +64,7 @@ class CSTR(AbstractSystem):
     state_names: ClassVar = ("concentration", "temperature")
     control_names: ClassVar = ("coolant",)
     state_units: ClassVar = ("mol/l", "K")
+    time_unit: ClassVar = "min"
     control_units: ClassVar = ("K",)
 
     def vector_field(self, t, x, u, w):

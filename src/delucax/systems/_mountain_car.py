@@ -50,6 +50,7 @@ class MountainCar(AbstractSystem):
     state_names: ClassVar = ("position", "velocity")
     control_names: ClassVar = ("push",)
     state_units: ClassVar = ("", "1/step")
+    time_unit: ClassVar = "steps"
     control_units: ClassVar = ("",)
 
     def acceleration(self, position: Array, push: Array) -> Array:
