@@ -453,6 +453,20 @@ def check(c: Composition) -> None:
         assert not np.any(wrong & ~at)
         count = int(np.sum(np.asarray(run.incidents["clipped_control"])))
         assert run.incident_counts["clipped_control"] == count
+    check_start_time(c, env.dynamics, twin, x0, close)
+
+
+def check_start_time(c: Composition, plant: Any, twin: Twin, x0: Any, close) -> None:
+    """The same dynamics from a later time, under controls and disturbances given."""
+    rng = np.random.default_rng(c.seed + 1)
+    first, steps = int(rng.integers(0, 20)), 5
+    u = (0.3 * rng.normal(size=(steps, 1))).astype(x0.dtype)
+    w = (0.1 * rng.normal(size=(steps, twin.k))).astype(x0.dtype)
+    states = dlx.open_loop(plant, x0, u, w, t0=first * c.dt)
+    x = x0.astype(np.float64)
+    for k in range(steps):
+        x = twin.advance((first + k) * c.dt, x, u[k].astype(float), w[k].astype(float))
+        np.testing.assert_allclose(states[k + 1], x, err_msg="later", **close)
 
 
 quietly = dict(
