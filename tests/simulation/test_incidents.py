@@ -219,3 +219,15 @@ def test_one_solve_counts_too(key):
         ).final_state[0]
     )(UPRIGHT)
     assert np.all(np.isfinite(slope))
+
+
+def test_a_random_key_in_the_state_is_kept_and_saved(key, tmp_path):
+    env = dlx.make("pendulum", horizon=3)
+    policy = dlx.controllers.Gaussian(dlx.controllers.Zero(1), [0.5])
+    cost = lambda k: dlx.rollout(env, policy, key=k).total_cost
+    assert np.all(np.isfinite(jax.vmap(cost)(jax.random.split(key, 2))))
+    run = dlx.rollout(env, policy, key=key)
+    dlx.save(tmp_path / "run.dlx", run)
+    again = dlx.load(tmp_path / "run.dlx")
+    data = [jax.random.key_data(r.controller_state.key) for r in (run, again)]
+    np.testing.assert_array_equal(*data)

@@ -353,7 +353,9 @@ def checked(trajectory: Trajectory, where: str) -> Trajectory:
     """Raise if the trajectory failed: now if it can be seen, else at run time."""
     failed = trajectory.failed
     if not is_concrete(failed):
-        return trajectory.result.error_if(trajectory, failed)
+        # A random key in the controller's state is no argument of a run-time check.
+        numbers, rest = eqx.partition(trajectory, eqx.is_inexact_array)
+        return eqx.combine(trajectory.result.error_if(numbers, failed), rest)
     if failed:
         message = f"{where}: {RESULTS[trajectory.result]}"
         if trajectory.states is not None:
