@@ -98,7 +98,9 @@ def test_a_short_horizon_is_the_beginning_of_a_long_one(name, size, key):
         long = draw(disturbance, key, times[:100])
         for steps in (99, 50, 17, 2):
             short = draw(disturbance, key, times[:steps])
-            np.testing.assert_array_equal(short, long[:steps])
+            # Programs of two sizes may round differently.
+            close = 4 * np.finfo(times.dtype).eps * np.max(np.abs(long))
+            assert_close(short, long[:steps], atol=close)
 
 
 @once
