@@ -110,7 +110,7 @@ def riccati_residual(
         ]
         last = {"N": S, "T": N.T, "Q": eye}
         right["Z"] = Z
-        last["Z"] = minus if discrete else 2 * L.T
+        last["Z"] = minus if discrete else L.T
         # What these are multiplied by in the equation.
         factors = [2 * Y.T, N.T]
         if discrete:
@@ -118,10 +118,12 @@ def riccati_residual(
             rows.append({"L": X, "Y": -eye})
             last["Y"] = L.T
             factors.append(L.T)
+        else:
+            last["L"] = Z.T
         if E is not None:
             right["E"] = E
             rows.append({"E": X, "Z": -eye})
-            factors.append(last["Z"])
+            factors.append(minus if discrete else 2 * L.T)
 
         def row(blocks):
             height = len(next(iter(blocks.values())))
