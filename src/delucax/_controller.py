@@ -138,6 +138,9 @@ class Tally(eqx.Module):
     - `name`: what is counted, in the singular, such as `"failed_plan"`.
     - `count`: a whole number, 0 at first.
 
+    **Raises:** `ValueError` for the name `"clipped_control"`, which a rollout counts
+    itself.
+
     !!! example
 
         ```python
@@ -162,6 +165,11 @@ class Tally(eqx.Module):
     count: Array
 
     def __init__(self, name: str):
+        if name == "clipped_control":
+            raise ValueError(
+                "Tally: name must not be 'clipped_control', which a rollout counts "
+                "itself."
+            )
         self.name = name
         self.count = jnp.zeros((), jnp.int32)
 

@@ -82,6 +82,13 @@ else:
 """An item of `RESULTS`; the type of every `result` field."""
 
 
+INCIDENTS = {
+    "refused_update": RESULTS.update_refused,
+    "failed_plan": RESULTS.plan_failed,
+}
+"""What a run becomes by what a controller counts."""
+
+
 def promote(result: Result) -> Result:
     """A result of Diffrax, Optimistix or Lineax, as one of `RESULTS`."""
     if isinstance(result, RESULTS):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough
+from helpers import assert_close, needs_x64, thorough, user_error
 from hypothesis import given, HealthCheck, Phase, settings, strategies as st
 
 import delucax as dlx
@@ -611,3 +611,26 @@ def test_a_learner_takes_a_wrapped_plant_that_observes_its_state(key):
     learner = dlx.controllers.GPC(game, cost, base=base)
     run = dlx.rollout(dlx.Environment(game, cost), learner, key=key, horizon=20)
     assert np.isfinite(run.total_cost)
+
+
+def test_noise_that_a_hand_made_wrapper_would_lose_is_an_error():
+    class ByHand(dlx.AbstractDynamics):
+        dynamics: dlx.AbstractDynamics
+        dt = property(lambda self: self.dynamics.dt)
+        state_names = property(lambda self: self.dynamics.state_names)
+        control_names = property(lambda self: self.dynamics.control_names)
+        disturbance_size = property(lambda self: self.dynamics.disturbance_size)
+        is_stochastic = property(lambda self: self.dynamics.is_stochastic)
+
+        def advance(self, t, x, u, w):
+            return self.dynamics.advance(t, x, u, w)
+
+    plant = ByHand(dlx.Discretized(Shaky(), dt=0.1, substeps=2))
+    with user_error(match="increments must be at least 1.*AbstractWrapper"):
+        dlx.Environment(plant, dlx.costs.Quadratic(np.eye(2), np.eye(1)))
+
+
+def test_a_delay_of_nothing_observes_the_state():
+    plant = dlx.Discretized(Spring(), dt=0.1)
+    assert dlx.dynamics.Delayed(plant).observes_state
+    assert not dlx.dynamics.Delayed(plant, controls=1).observes_state

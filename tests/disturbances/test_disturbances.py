@@ -167,3 +167,12 @@ def test_ends_that_meet_are_legal(key):
 def test_bad_arguments(make, match):
     with user_error(match=match):
         make()
+
+
+@once
+def test_the_built_in_sum_adds_disturbances_and_costs():
+    two = [d.Constant(1.0, size=2), d.Constant(0.5, size=2)]
+    assert_close(sum(two).sequence(None, TIMES[:1]), [[1.5, 1.5]])
+    cost = dlx.costs.Quadratic([1.0], [1.0])
+    one = jnp.ones(1)
+    assert_close(sum([cost, 2 * cost])(0.0, one, one), 3 * cost(0.0, one, one))

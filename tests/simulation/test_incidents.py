@@ -43,7 +43,8 @@ def test_incidents_are_counted_and_timed(key):
     assert run.controller_state["tally"].count == fast.sum()
     assert run.result == dlx.RESULTS.successful and not run.failed
     row = run.summary().iloc[0]
-    assert row["fasts"] == fast.sum() and row["first_fast"] == run.times[fast.argmax()]
+    assert row["fast_count"] == fast.sum()
+    assert row["fast_time"] == run.times[fast.argmax()]
     part = run[10:20]
     assert part.incident_counts["fast"] == fast[10:20].sum()
     assert part.controller_state is None
@@ -59,7 +60,7 @@ def test_an_incident_that_never_happened_has_no_time(key):
     run = dlx.rollout(env, dlx.controllers.Zero(1), key=key, x0=UPRIGHT)
     assert run.incident_counts == {"clipped_control": 0}
     assert np.isnan(run.incident_times["clipped_control"])
-    assert "clipped_controls" not in run.summary()
+    assert "clipped_control_count" not in run.summary()
 
 
 def test_incidents_need_not_be_kept(key):
@@ -76,6 +77,14 @@ def test_a_failed_plan_is_a_status_and_no_error(key):
     run = dlx.rollout(env, Cautious("failed_plan"), key=key, x0=UPRIGHT)
     assert run.result == dlx.RESULTS.plan_failed and not run.failed
     assert "plan" in run.summary()["result"][0]
+    for k, failed in enumerate(run.incidents["failed_plan"]):
+        kind = dlx.RESULTS.plan_failed if failed else dlx.RESULTS.successful
+        assert run[k : k + 1].result == kind
+
+
+def test_a_name_of_the_rollout_is_taken():
+    with user_error(match="clipped_control"):
+        dlx.controllers.Tally("clipped_control")
 
 
 def test_mpc_tells_of_its_plans(key):
@@ -126,6 +135,8 @@ def test_an_episode_that_ends_in_its_last_step_has_ended(key, end):
     run = dlx.rollout(env, dlx.controllers.Zero(1), key=key, x0=UPRIGHT)
     assert bool(run.ended) == (end <= 8)
     assert bool(run.summary()["terminated"][0]) == (end <= 8)
+    lean = dlx.rollout(env, dlx.controllers.Zero(1), key=key, x0=UPRIGHT, keep=())
+    assert lean.statistics()["terminated"] == (end <= 8)
     for start in range(8):
         for stop in range(start + 1, 9):
             assert bool(run[start:stop].ended) == (end <= stop)

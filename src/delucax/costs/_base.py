@@ -47,6 +47,10 @@ class AbstractCost(eqx.Module):
             return NotImplemented
         return Sum(self, other)
 
+    def __radd__(self, other: Any) -> "AbstractCost":
+        # The built-in `sum` starts at 0.
+        return self if isinstance(other, int) and other == 0 else NotImplemented
+
     def __mul__(self, factor: Any) -> "AbstractCost":
         from ._compose import Scaled
 

@@ -66,6 +66,10 @@ class AbstractDisturbance(eqx.Module):
             return NotImplemented
         return Sum(self, other)
 
+    def __radd__(self, other: Any) -> "AbstractDisturbance":
+        # The built-in `sum` starts at 0.
+        return self if isinstance(other, int) and other == 0 else NotImplemented
+
 
 def check_disturbance(value: Any, name: str, where: str) -> None:
     """Raise unless `value` is a disturbance."""

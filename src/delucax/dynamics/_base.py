@@ -158,6 +158,17 @@ class AbstractDynamics(eqx.Module):
         return shape[0]
 
 
+def check_increments(dynamics: "AbstractDynamics", where: str) -> None:
+    """Raise where noise would be lost: dynamics that hold others and forward by hand
+    that they are stochastic, and not how many increments they take."""
+    if dynamics.is_stochastic and not dynamics.increments:
+        raise ValueError(
+            f"{where}: {type(dynamics).__name__} says that w is Brownian, so its "
+            "increments must be at least 1, got 0. A subclass of "
+            "delucax.dynamics.AbstractWrapper forwards them."
+        )
+
+
 def check_dynamics(value: Any, where: str) -> None:
     """Raise unless `value` is discrete-time dynamics."""
     if not isinstance(value, AbstractDynamics):

@@ -114,6 +114,12 @@ class Delayed(AbstractWrapper):
         after, result = self.dynamics.advance(t, own, acting, w)
         return jnp.concatenate([after, *late]), result
 
+    @property
+    def observes_state(self):
+        """Whether there is no delay, and the plant observes its state."""
+        delayed = self.controls or self.sensor
+        return not delayed and self.dynamics.observes_state
+
     def observe(self, t, x):
         own, _, seen = self._cut(x)
         if not self.sensor:

@@ -35,7 +35,7 @@ from ..costs import AbstractCost
 from ..costs._base import check_cost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics
-from ..dynamics._base import check_dynamics
+from ..dynamics._base import check_dynamics, check_increments
 from ..math import clip
 
 
@@ -190,6 +190,7 @@ class Environment(eqx.Module):
     def __check_init__(self):
         where, dynamics = "Environment", self.dynamics
         check_dynamics(dynamics, where)
+        check_increments(dynamics, where)
         check_cost(self.cost, "cost", where)
         for name, given, size in (
             ("disturbance", self.disturbance, dynamics.disturbance_size),

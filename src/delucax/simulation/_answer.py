@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._controller import AbstractController
-from .._results import choose, first_failure, Result, RESULTS
+from .._results import choose, first_failure, INCIDENTS, Result, RESULTS
 
 
 def begun(controller: AbstractController, key: Any) -> Any:
@@ -37,10 +37,7 @@ def answer(controller: AbstractController, t: Any, y: Any, state: Any) -> Any:
 def outcome_of(counts: dict[str, Array], before: dict[str, Array]) -> Result:
     """What became of a controller, by its tallies before a run and after it."""
     outcome = RESULTS.successful
-    for name, kind in (
-        ("refused_update", RESULTS.update_refused),
-        ("failed_plan", RESULTS.plan_failed),
-    ):
+    for name, kind in INCIDENTS.items():
         if name in counts:
             none = counts[name] == before[name]
             outcome = first_failure(outcome, choose(none, RESULTS.successful, kind))

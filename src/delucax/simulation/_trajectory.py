@@ -11,7 +11,7 @@ from jaxtyping import Array, PyTree
 
 from .._check import is_concrete
 from .._extras import extra
-from .._results import Result, RESULTS
+from .._results import choose, INCIDENTS, Result, RESULTS
 
 
 if TYPE_CHECKING:
@@ -214,6 +214,7 @@ class Trajectory(eqx.Module):
             total_cost=final_cost if costs is None else jnp.sum(costs) + final_cost,
             length=jnp.clip(self.length - start, 0, stop - start),
             ended=self.ended & (self.length <= stop),
+            result=_result_of(self.result, jax.tree.map(steps, self.incidents)),
             recorded_times=ends(self.times),
             recorded_observations=steps(self.recorded_observations),
             recorded_disturbances=steps(self.recorded_disturbances),
@@ -299,14 +300,11 @@ class Trajectory(eqx.Module):
         total = jnp.where(finite, total, jnp.nan)
         levels = (5, 25, 50, 75, 95)
         quantiles = jnp.nanquantile(total, jnp.array(levels, total.dtype) / 100)
-        ended = self.length < self.steps
-        if self.terminated is not None:
-            ended = jnp.any(self.terminated, axis=-1)
         return {f"{q}%": value for q, value in zip(levels, quantiles, strict=True)} | {
             "mean": jnp.nanmean(total),
             "finite": jnp.mean(finite),
             "successful": jnp.mean(self.result == RESULTS.successful),
-            "terminated": jnp.mean(ended),
+            "terminated": jnp.mean(self.ended),
         }
 
     def summary(self) -> "pandas.DataFrame":
@@ -314,8 +312,8 @@ class Trajectory(eqx.Module):
 
         Columns: `total_cost`, `final_cost`, `mean_cost` (a step), `length`,
         `terminated`, `result`; and for each kind of incident that happened, such as
-        `failed_plan`, the number of steps `failed_plans` and the time of the first,
-        `first_failed_plan`.
+        `failed_plan`, the number of steps `failed_plan_count` and the time of the
+        first, `failed_plan_time`.
 
         **Returns:** a `pandas.DataFrame`.
 
@@ -344,9 +342,18 @@ class Trajectory(eqx.Module):
         for name in self.incidents or ():
             count = np.ravel(self.incident_counts[name])
             if count.any():
-                columns[f"{name}s"] = count
-                columns[f"first_{name}"] = np.ravel(self.incident_times[name])
+                columns[f"{name}_count"] = count
+                columns[f"{name}_time"] = np.ravel(self.incident_times[name])
         return pd.DataFrame(columns)
+
+
+def _result_of(result: Result, incidents: dict[str, Array] | None) -> Result:
+    """The result of a stretch in which the incidents that it speaks of may not be."""
+    for name, kind in INCIDENTS.items():
+        if incidents is not None and name in incidents:
+            elsewhere = (result == kind) & ~jnp.any(incidents[name])
+            result = choose(elsewhere, RESULTS.successful, result)
+    return result
 
 
 def checked(trajectory: Trajectory, where: str) -> Trajectory:
