@@ -10,9 +10,12 @@ The page of claims is written from the ledger.
 """
 
 import html
+import importlib.util
 import logging
 import re
+import sys
 import tomllib
+import types
 import unicodedata
 from collections.abc import Iterable
 from typing import Any
@@ -41,6 +44,20 @@ _SPELLINGS = [
 
 # It takes some relations and brackets for letters.
 _LETTER = re.compile(r"<mi>(&#x[0-9A-F]+;)</mi>")
+
+
+def _stand_in_for_stable_baselines3() -> None:
+    """The reference imports what it documents. One class extends another of
+    Stable-Baselines3, which brings PyTorch; for its docstring an empty class will do.
+    """
+    if importlib.util.find_spec("stable_baselines3") is None:
+        names = ("", ".common", ".common.vec_env")
+        modules = [types.ModuleType(f"stable_baselines3{name}") for name in names]
+        modules[-1].VecEnv = type("VecEnv", (), {})
+        sys.modules.update({module.__name__: module for module in modules})
+
+
+_stand_in_for_stable_baselines3()
 
 
 def to_mathml(latex: str, display: bool) -> str:
