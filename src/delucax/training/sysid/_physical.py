@@ -213,17 +213,17 @@ def _windows(guesses, observations, controls, window):
     starts = guesses[:, :stop:window].reshape(runs * count, n)
     inputs = controls[:, :stop].reshape(runs * count, window, -1)
     index = np.arange(count)[:, None] * window + np.arange(window + 1)
-    seen = observations[:, index].reshape(runs * count, window + 1, size)
+    observed = observations[:, index].reshape(runs * count, window + 1, size)
     begins = np.tile(np.arange(count) * window, runs)
     # The observation where a window ends and the next begins counts once.
     counts = np.ones((count, window + 1), bool)
     counts[:-1, -1] = False
     counts = np.tile(counts, (runs, 1))
     # An output that never moves has a spread of rounding.
-    spread, largest = jnp.std(seen, axis=(0, 1)), jnp.max(jnp.abs(seen), (0, 1))
-    moves = spread > 1e3 * float(jnp.finfo(seen.dtype).eps) * largest
+    spread, largest = jnp.std(observed, axis=(0, 1)), jnp.max(jnp.abs(observed), (0, 1))
+    moves = spread > 1e3 * float(jnp.finfo(observed.dtype).eps) * largest
     spread = jnp.where(moves, spread, jnp.where(largest > 0, largest, 1))
-    return starts, _Problem(begins, inputs, seen, counts, spread), spread
+    return starts, _Problem(begins, inputs, observed, counts, spread), spread
 
 
 class _Problem(NamedTuple):
