@@ -176,6 +176,25 @@ def first_costs():
     return costs
 
 
+@once
+def test_a_stall_at_rounding_is_no_failed_plan():
+    """In single precision the temperatures are rounded to 3e-5 K. A stall at the kink
+    of a cost, with more to gain than rounding, is a failed plan."""
+    env, _, cost = reactor()
+    env = dlx.Environment(env.dynamics, cost, control_bounds=(280.0, 320.0))
+    kinked = dlx.make("pendulum")
+    for task, charged, x0, steps, failed in (
+        (env, cost, [0.6495, 346.71], 20, 0),
+        (kinked, kinked.cost, [1.0, 0.0], 3, 3),
+    ):
+        mpc = MPC(
+            task.dynamics, charged, 30, bounds=task.control_bounds, max_iterations=50
+        )
+        run = dlx.rollout(task, mpc, key=KEY, x0=jnp.array(x0), horizon=steps)
+        assert run.states.dtype == jnp.float32
+        assert run.incident_counts["failed_plan"] == failed
+
+
 @needs_x64
 @settings(max_examples=100, deadline=None)
 @hypothesis.given(

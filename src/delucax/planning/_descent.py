@@ -163,7 +163,7 @@ def _iterate(
     # What is promised may be below the rounding of the cost. Full steps still lower the
     # gradient then; when they no longer do there is nothing left to gain.
     promise = -policy.slope - policy.curvature / 2
-    rounding = jnp.finfo(now.cost.dtype).eps * jnp.abs(now.cost)
+    rounding = _rounding(stages, now)
     spent = (jnp.abs(promise) <= rounding) & (mu == 0) & (tolerance > 0)
     spent = spent & (missed <= tolerance * precise) & (residual >= before.residual)
     converged = policy.ok & (settled | spent)
@@ -172,7 +172,7 @@ def _iterate(
     found = lax.cond(
         converged | out_of_time | ~policy.ok,
         lambda: rest,
-        lambda: search(options.line_search, problem, now, policy, penalty),
+        lambda: search(options.line_search, problem, now, policy, penalty, rounding),
     )
     # Where the second derivatives make the problem concave, or mislead, it is tried
     # without them first.
@@ -234,6 +234,16 @@ def directions(
     met = room <= tolerance * (1 + jnp.abs(controls))
     step = jnp.minimum(jnp.maximum(-slope, box[0]), box[1])
     return policy, jnp.max(jnp.abs(step)), jnp.all(small | met)
+
+
+def _rounding(stages: Stages, now: Found) -> Array:
+    """By how much rounding may change the cost: its own, and that of the states and
+    controls that it is computed from, which weighs more where targets are far from
+    zero."""
+    z = jnp.concatenate([now.states[:-1], now.controls], axis=1)
+    terms = jnp.sum(jnp.abs(stages.h * z))
+    terms = terms + jnp.sum(jnp.abs(stages.v * now.states[-1]))
+    return jnp.finfo(z.dtype).eps * (jnp.abs(now.cost) + terms)
 
 
 def _penalty(before: Array, now: Found, policy: Policy) -> Array:

@@ -63,7 +63,8 @@ def ilqr(
     rises, and it falls after a success, by the schedule of Tassa, Erez and Todorov.
     Converged is: the (projected) gradient with respect to each control is at most
     `tolerance` times one plus the size of the terms that cancel in it, or what a step
-    promises is below the rounding of the cost.
+    promises is below the rounding of the cost, and of the states and controls that go
+    into it.
 
     The plan is differentiable, in either mode and to any order, with respect to every
     array in `dynamics`, `cost`, `x0`, `w`, `t0` and `bounds`, by the implicit function

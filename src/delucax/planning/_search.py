@@ -37,14 +37,15 @@ def search(
     now: Found,
     policy: Policy,
     penalty: Array,
+    rounding: Array,
 ) -> Found:
     """The first step, of those from long to short, that brings enough; or none.
 
     What counts is the cost, plus `penalty` times the sum of the gaps where there are
-    any.
+    any. It is known to within `rounding`.
     """
     missed = 0.0 if now.gaps is None else jnp.sum(jnp.abs(now.gaps))
-    rounding = 10 * jnp.finfo(now.cost.dtype).eps * jnp.abs(now.cost)
+    slack = rounding + 10 * jnp.finfo(now.cost.dtype).eps * jnp.abs(now.cost)
 
     def trial(length):
         states, controls, cost = roll_out(
@@ -55,7 +56,7 @@ def search(
         bent = length * policy.curvature / 2
         promise = length * (penalty * missed - policy.slope - bent)
         gain = now.cost - cost + length * penalty * missed
-        enough = gain >= LEAST_SHARE * promise - rounding
+        enough = gain >= LEAST_SHARE * promise - slack
         return states, controls, cost, enough & jnp.isfinite(cost)
 
     dtype = now.cost.dtype
