@@ -142,6 +142,35 @@ def test_costs_add_and_scale():
     assert_close(scaled(0.5, x, u), a(0.5, x, u) + 3 * b(0.5, x, u), rtol=1e-6)
 
 
+def test_targets_of_costs_that_are_made_of_others():
+    x, u = jnp.array([1.0, 2.0]), jnp.array([3.0])
+    effort = dlx.costs.Function(lambda t, x, u: u @ u)
+    at_x = dlx.costs.Quadratic(Q, R, state_target=x)
+    at_u = dlx.costs.Quadratic(Q, R, control_target=u)
+
+    class Around(dlx.AbstractCost):
+        """What any wrapper is."""
+
+        inner: dict[str, dlx.AbstractCost]
+
+        def __call__(self, t, x, u):
+            return self.inner["cost"](t, x, u)
+
+    for cost, state, control in (
+        (at_x, x, None),
+        (2 * at_x + effort, x, None),
+        (effort + dlx.costs.Rate(at_x, 0.1) + 0.5 * at_u, x, u),
+        (Around({"cost": 3 * (at_u + at_x)}), x, u),
+        (dlx.costs.Quadratic(Q, R), None, None),
+    ):
+        for found, expected in zip(cost.targets, (state, control), strict=True):
+            assert (found is None) == (expected is None)
+            assert found is None or jnp.all(found == expected)
+    tracking = dlx.costs.Tracking(Q, R, lambda t: t * x)
+    for cost in (effort, 2 * effort, Around({"cost": tracking}), tracking):
+        assert cost.targets is None
+
+
 @once
 def test_what_cannot_be_added():
     cost = dlx.costs.PendulumCost()

@@ -167,8 +167,16 @@ def test_the_operating_point(monkeypatch):
     assert jnp.all(start.controls == 0.5)
     start = default(bare, dlx.costs.Quadratic(*weights), 5)
     assert jnp.all(start.states == 0) and jnp.all(start.gains[0] != 0)
-    start = default(bare, dlx.costs.Function(lambda t, x, u: u @ u), 5)
-    assert start.gains is None and jnp.all(start.controls == 0)
+    # Costs that are made of others name what these do.
+    cost = dlx.costs.Quadratic(*weights, **target)
+    effort = dlx.costs.Function(lambda t, x, u: u @ u)
+    for made in (cost + cost, effort + cost, 2 * cost, dlx.costs.Rate(cost, 0.1)):
+        start = default(bare, made, 5)
+        assert jnp.all(start.controls == 0.5) and jnp.all(start.gains[0] != 0)
+    moving = dlx.costs.Tracking(*weights, lambda t: jnp.ones(2) * t)
+    for nowhere in (effort, moving):
+        start = default(bare, nowhere, 5)
+        assert start.gains is None and jnp.all(start.controls == 0)
 
 
 def test_without_a_regulator_the_control_is_held():

@@ -71,13 +71,18 @@ class MPC(AbstractController):
     computed together between the bounds:
 
     1. the last plan a step later, under its gains, its last control held,
-    2. the LQR about the equilibrium,
-    3. the control of the equilibrium, held.
+    2. the LQR about an operating point,
+    3. the control of that point, held.
 
     The second one keeps an unstable plant where the model is worth something, and a
     plan of [`delucax.planning.ilqr`][] without constraints costs at most as much as
-    each of them. The LQR is computed when the controller is made, as
-    [`delucax.planning.default_start`][] says, and is left out where there is none.
+    each of them. It is computed when the controller is made, about the point that
+    [`delucax.planning.default_start`][] chooses: the targets of the cost, or the
+    equilibrium of the dynamics. There is no LQR, and an unstable plant needs a `start`,
+    where neither names one, as with [`delucax.costs.Function`][] or
+    [`delucax.costs.Tracking`][] over dynamics of your own; where the second derivative
+    of the cost with respect to the control is not positive definite; where no gain
+    stabilises the plant; and where the dynamics cannot be differentiated.
 
     What became of a plan is in the controller's state: `result`, and how often it was
     no success, `failures`, which are `incidents["failed_plan"]` of a rollout. A plan

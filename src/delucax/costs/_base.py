@@ -4,6 +4,7 @@ import abc
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -36,6 +37,24 @@ class AbstractCost(eqx.Module):
 
     def __check_init__(self):
         check_parameters(self)
+
+    @property
+    def targets(self) -> tuple[Array | None, Array | None] | None:
+        """The state and the control that the cost draws to, each `None` where it is not
+        named; `None` alone, as by default, for a cost that draws to no fixed point.
+
+        A cost made of others has the first state and the first control that they name.
+        Where planners start by default depends on it; see
+        [`delucax.planning.default_start`][].
+        """
+        is_part = lambda node: isinstance(node, AbstractCost) and node is not self
+        nodes = jax.tree.leaves(self, is_leaf=is_part)
+        named = [node.targets for node in nodes if is_part(node)]
+        pairs = [pair for pair in named if pair is not None]
+        if not pairs:
+            return None
+        first = lambda values: next((a for a in values if a is not None), None)
+        return first(x for x, _ in pairs), first(u for _, u in pairs)
 
     # So that a NumPy number times a cost is left to `__rmul__`.
     __array_ufunc__: ClassVar = None

@@ -72,6 +72,10 @@ class Quadratic(AbstractCost):
         _check_target(self.state_target, self.Q, "state_target")
         _check_target(self.control_target, self.R, "control_target")
 
+    @property
+    def targets(self):
+        return self.state_target, self.control_target
+
     def _state(self, x: Array) -> Array:
         if x.shape != self.Q.shape[:1]:
             raise ValueError(
@@ -98,6 +102,8 @@ class Quadratic(AbstractCost):
 
 class Tracking(AbstractCost):
     """`e' Q e + u' R u` with `e = h(x) - r(t)`, and `e' Qf e` at the end.
+
+    It names no `targets`, as the reference moves.
 
     **Arguments:**
 

@@ -12,7 +12,7 @@ from .._check import check_count, check_finite
 from .._fields import as_float_array, parameter
 from .._message import shortened
 from .._typing import RealScalar
-from ..costs import AbstractCost, Quadratic
+from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math._linear_solve import is_definite
 from ..riccati import dare
@@ -78,15 +78,22 @@ def default_start(
     1. under the LQR about an operating point,
     2. with its control held.
 
-    The operating point is the target of a [`delucax.costs.Quadratic`][] that names both
-    a state and a control, else the equilibrium that the dynamics name, else the target
-    with zero for what it does not name. The weights of the LQR are the second
-    derivatives of the stage cost there. Where there is no stabilising solution, or the
-    control weight is not positive definite, or the dynamics cannot be differentiated,
-    its gain is zero. Without an operating point there is only the second one, of zeros.
+    The operating point is the `targets` of the cost where they name both a state and a
+    control. Otherwise it is the equilibrium that the dynamics name. Where they name
+    none, zeros stand in for the target that is missing. Such a point need not be an
+    equilibrium, and an LQR about it may be a poor start: name the control that holds
+    the state as well, which [`delucax.trim`][] finds. A [`delucax.costs.Quadratic`][]
+    has targets, and so has what is made of it by `+`, `*` or [`delucax.costs.Rate`][].
 
-    The LQR holds the plant near the line that stays at the operating point. So the line
-    itself, which is no trajectory and has no cost to compare, is not tried.
+    The weights of the LQR are the second derivatives of the stage cost at that point.
+
+    No LQR is among the starts in two cases. Where neither cost nor dynamics name a
+    point, there is only one start, which holds zero. Where the second derivative of the
+    cost with respect to the control is not positive definite, or no gain stabilises the
+    plant, or the dynamics cannot be differentiated, the gain of the first one is zero.
+
+    A trajectory that rests at the operating point is not among the starts, for it does
+    not begin at the first state. The LQR leads there.
 
     **Arguments:**
 
@@ -134,13 +141,13 @@ def operating_point(
 ) -> tuple[Array, Array] | None:
     """The state and control to regulate about, if cost or dynamics name them."""
     n, m = dynamics.state_size, dynamics.control_size
-    quadratic = isinstance(cost, Quadratic)
-    x, u = (cost.state_target, cost.control_target) if quadratic else (None, None)
+    targets = cost.targets
+    x, u = (None, None) if targets is None else targets
     if x is None or u is None:
         try:
             x, u = dynamics.equilibrium()
         except ValueError:
-            if not quadratic:
+            if targets is None:
                 return None
             x = jnp.zeros(n) if x is None else x
             u = jnp.zeros(m) if u is None else u

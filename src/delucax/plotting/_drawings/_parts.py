@@ -207,13 +207,12 @@ def finite_states(trajectory: Trajectory) -> np.ndarray:
 
 
 def target_of(environment: Environment) -> np.ndarray | None:
-    """The state that a quadratic cost draws to: the origin unless it says otherwise."""
-    cost: Any = environment.cost
-    if not hasattr(cost, "state_target"):
+    """The state that the cost draws to, the origin if it names none; or nothing."""
+    targets = environment.cost.targets
+    if targets is None:
         return None
-    if cost.state_target is None:
-        return np.zeros(environment.state_size)
-    return np.asarray(cost.state_target, float)
+    x, _ = targets
+    return np.zeros(environment.state_size) if x is None else np.asarray(x, float)
 
 
 class View(NamedTuple):
