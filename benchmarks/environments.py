@@ -152,7 +152,7 @@ def limits(
 def documented(found: dict[str, Any]) -> str:
     """The tables of `docs/benchmarks.md`, of what a run has written.
 
-    Times are the best of all rounds, ratios the medians over the rounds.
+    Times are the best of all rounds, and ratios those of such times.
     """
     times = lambda row, *keys: [_number(row.get(key)) for key in keys]
     lanes = f"{LANES} lanes"

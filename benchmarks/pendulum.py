@@ -23,7 +23,7 @@ import pandas as pd
 import delucax as dlx
 from benchmarks import _ours
 from benchmarks._machine import describe, limit_cores
-from benchmarks._peers import c, gymnasium_peer, gymnax_peer, raw
+from benchmarks._peers import c, gymnax_peer, raw
 from benchmarks._problem import Case
 from benchmarks._results import updated
 from benchmarks._timing import Contender, Missing, race, Timing
@@ -62,8 +62,6 @@ def entries(case: Case) -> list[Contender | Missing]:
         found.append(c.contender(case))
         found.append(gymnax_peer.contender(case, stepping="step"))
         found.append(gymnax_peer.contender(case, stepping="step_env"))
-        if case.lanes is None:
-            found.append(gymnasium_peer.contender(case))
     return found
 
 
@@ -330,7 +328,7 @@ def main() -> None:
             made = measure_calls(run)
         else:
             RACES[part](run)
-            print("\nRatios (median over the rounds of one run)")
+            print("\nRatios of the best rounds")
             summary = pd.DataFrame(run.ratios)
             print(summary.to_string(index=False, float_format="%.2f"), flush=True)
             made = None

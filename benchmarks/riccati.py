@@ -153,7 +153,7 @@ def main() -> None:
     print(times.to_string(index=False, float_format="%.4g"))
     print("\nWhat was found")
     print(pd.DataFrame(qualities).to_string(index=False, float_format="%.2g"))
-    print("\nRatios (median over the rounds of one run)")
+    print("\nRatios of the best rounds")
     print(pd.DataFrame(ratios).to_string(index=False, float_format="%.2f"))
     out = Path(options.out)
     out.parent.mkdir(parents=True, exist_ok=True)

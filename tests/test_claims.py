@@ -516,3 +516,29 @@ def test_no_address_of_a_repository_is_invented():
     invented = re.compile(r"git clone|://[^\s\"')]*delucax|git@")
     found = [path for path in files if invented.search(path.read_text("utf-8"))]
     assert len(files) > 100 and found == []
+
+
+def test_ratios_are_those_of_the_times_beside_them():
+    results = ROOT / "benchmarks/results"
+    pendulum = json.loads((results / "pendulum.json").read_text())
+    best = {
+        (row["part"], row["case"], row["contender"]): row["best ns/step"]
+        for row in pendulum["timings"]
+    }
+    ratios = {row["ratio"]: row["measured"] for row in pendulum["ratios"]}
+    for where, case, what in (
+        ("chain", "one chain", "chain"),
+        ("batch", "1024 lanes", "1024 lanes"),
+    ):
+        for kept in ("trajectory", "cost"):
+            time = lambda name: best[where, f"gym, {kept}, {case}", name]  # noqa: B023, E731
+            ratio = ratios[f"{what}, {kept}: delucax / by hand, jnp"]
+            assert ratio == pytest.approx(time("delucax") / time("raw lax.scan"))
+    tasks = json.loads((results / "environments.json").read_text())
+    for row in tasks["raw"]:
+        for what in ("chain, trajectory", "chain, cost", "1024 lanes"):
+            ratio = row[f"{what}: ns"] / row[f"{what}: raw ns"]
+            assert row[f"{what}: ratio"] == pytest.approx(ratio)
+    wall = json.loads((results / "wall_clock.json").read_text())
+    us, ns = (float(row["time a step"].split()[0]) for row in wall["rows"])
+    assert wall["ratio of the means"] == pytest.approx(1e3 * us / ns, rel=1e-3)

@@ -22,9 +22,17 @@ def plant(n=2):
     return dlx.LinearDynamics(np.eye(n), np.ones((n, 1)), dt=0.1)
 
 
+def cost(n=2):
+    return dlx.costs.Quadratic(np.ones(n), np.ones(1))
+
+
 def task(n=2):
-    cost = dlx.costs.Quadratic(np.ones(n), np.ones(1))
-    return dlx.Environment(plant(n), cost, control_bounds=(-2.0, 2.0))
+    return dlx.Environment(plant(n), cost(n), control_bounds=(-2.0, 2.0))
+
+
+def noisy(**options):
+    noise = d.Gaussian(0.1, size=2)
+    return dlx.Environment(plant(), cost(), noise, **options)
 
 
 class Split(dlx.AbstractController):
@@ -60,7 +68,15 @@ def split():
         (plant, {"x_ref": np.ones(3)}, r"x_ref must have shape \(2,\)"),
         (task, {"dynamics.dt": -1.0}, "dt must be positive"),
         (task, {"dynamics.A": np.eye(3)}, "B must have as many rows as A"),
-        (task, {"dynamics": plant(3)}, "disturbance has size 2 where 3 is expected"),
+        (task, {"dynamics": plant(3)}, "cost does not fit a state of size 3 .*Q has"),
+        (task, {"dynamics": plant(3), "cost": cost(3), "disturbance": d.Zero(2)},
+            "disturbance has size 2 where 3 is expected"),
+        (noisy, {"dynamics": plant(3), "cost": cost(3)},
+            "disturbance has size 2 where 3 is expected"),
+        (lambda: noisy(initial_state=np.ones(2)),
+            {"dynamics": plant(3), "cost": cost(3), "disturbance": d.Zero(3)},
+            r"initial_state must have shape \(3,\)"),
+        (task, {"cost.R": np.ones(2)}, "cost does not fit .*control of size 1"),
         (task, {"control_bounds.0": 5.0}, "control_bounds must have low <= high"),
         (task, {"control_bounds.0": [1.0, 2.0]}, r"control_bounds must be .*\(1,\)"),
         (task, {"initial_state": [np.nan, 0.0]}, "initial_state must be finite"),
@@ -101,8 +117,9 @@ def test_what_the_constructor_refuses(make, changes, match):
             "initial_state": np.ones(3),
             "dynamics": plant(3),
             "disturbance": d.Zero(3),
-            "cost": dlx.costs.Quadratic(np.ones(3), np.ones(1)),
+            "cost": cost(3),
         }),
+        (noisy, {"dynamics": plant(3), "cost": cost(3), "disturbance": d.Zero(3)}),
     ],
 )  # fmt: skip
 def test_changes_that_fit_together(make, changes):
@@ -113,6 +130,51 @@ def test_changes_that_fit_together(make, changes):
         return
     backwards = dlx.replace(make(), dict(reversed(changes.items())))
     assert eqx.tree_equal(forwards, backwards)
+
+
+class Drift(dlx.AbstractSystem):
+    """With a diffusion, so that noise is the default."""
+
+    state_names = ("x",)
+    control_names = ("u",)
+
+    def vector_field(self, t, x, u, w):
+        return u - x
+
+    def diffusion(self, t, x, u):
+        return jnp.ones(1)
+
+
+@once
+@pytest.mark.parametrize("n", [1, 3])
+def test_defaults_follow_the_dynamics(n):
+    env = dlx.replace(task(), {"dynamics": plant(n), "cost": cost(n)})
+    assert eqx.tree_equal(env, task(n))
+    inner = (env, {"dynamics": plant(2), "cost": cost(2)})
+    pair = dlx.replace(inner, {"0.dynamics": plant(2), "0.cost": cost(2)})
+    assert eqx.tree_equal(pair[0], task())
+    own = dlx.replace(env, {"dynamics": plant(2), "cost": cost(2),
+                            "disturbance": d.Gaussian(0.1, size=2)})  # fmt: skip
+    assert isinstance(own.disturbance, d.Gaussian)
+    assert own.initial_state.shape == (2,)
+    drift = dlx.Discretized(Drift(), 0.1, substeps=3)
+    noise = dlx.replace(env, {"dynamics": drift, "cost": cost(1)}).disturbance
+    assert isinstance(noise, d.Brownian) and noise.size == noise.substeps == 3
+    # That there is no noise was said, and is not the default.
+    calm = dlx.Environment(drift, cost(1), d.Zero(3))
+    fewer = dlx.Discretized(Drift(), 0.1, substeps=2)
+    with user_error(match="disturbance has size 3 where 2 is expected"):
+        dlx.replace(calm, {"dynamics": fewer})
+    batch = jax.vmap(lambda _: task())(jnp.arange(4))
+    new = jax.vmap(lambda _: task(n))(jnp.arange(4))
+    changes = {k: getattr(new, k) for k in ("dynamics", "cost", "initial_state")}
+    assert dlx.replace(batch, changes).disturbance.size == n
+
+
+def test_a_changed_number_adds_nothing_to_the_program():
+    env = task()
+    traced = jax.make_jaxpr(lambda dt: dlx.replace(env, {"dynamics.dt": dt}).dt)
+    assert not traced(0.2).jaxpr.eqns
 
 
 @once
@@ -151,18 +213,18 @@ def test_traced_values():
     """Their shapes are checked, and their values cannot be."""
     env = task()
 
-    def cost(low, dt):
+    def paid(low, dt):
         changes = {"control_bounds.0": low, "control_bounds.1": 9.0, "dynamics.dt": dt}
         env_ = dlx.replace(env, changes)
         step = env_.step(0.0, jnp.ones(2), jnp.full(1, -4.0))
         return step.cost + env_.dt
 
     # The control is clipped to `low`, and pays its square.
-    assert_close(cost(-3.0, 0.1), 2 + 9 + 0.1, rtol=1e-6)
-    value, slopes = jax.jit(jax.value_and_grad(cost, (0, 1)))(-3.0, 0.1)
+    assert_close(paid(-3.0, 0.1), 2 + 9 + 0.1, rtol=1e-6)
+    value, slopes = jax.jit(jax.value_and_grad(paid, (0, 1)))(-3.0, 0.1)
     assert_close(value, 2 + 9 + 0.1, rtol=1e-6)
     assert_close(jnp.stack(slopes), [-6.0, 1.0], rtol=1e-6)
-    values = jax.vmap(cost, (0, None))(jnp.array([-1.0, -2.0]), 0.1)
+    values = jax.vmap(paid, (0, None))(jnp.array([-1.0, -2.0]), 0.1)
     assert_close(values, np.array([2 + 1 + 0.1, 2 + 4 + 0.1]), rtol=1e-6)
     with user_error(match="initial_state must have shape"):
         jax.jit(lambda x: dlx.replace(env, {"initial_state": x}))(jnp.ones(3))
@@ -179,6 +241,19 @@ def test_a_batch_of_modules(key):
     assert_close(changed.initial_state, starts)
     with user_error(match="must be finite"):
         dlx.replace(batch, {"dynamics.B": jnp.full((3, 2, 1), jnp.nan)})
+    low, high = -jnp.ones(3), jnp.ones(3)
+    with user_error(match="low <= high.* member 1 of a batch"):
+        dlx.replace(batch, {"control_bounds.0": low.at[1].set(5.0)})
+    one = jax.vmap(lambda a, b: d.Uniform(a, b, size=1))(low, high)
+    assert_close(dlx.replace(one, {"high": 2 * high}).high, 2.0)
+    with user_error(match="member 2 of a batch"):
+        dlx.replace(one, {"high": high.at[2].set(-9.0)})
+    rows = jax.vmap(jax.vmap(lambda a, b: d.Uniform(a, b, size=1)))
+    grid = rows(jnp.stack([low, low]), jnp.stack([high, high]))
+    with user_error(match="member 2 of a batch. This is member 1 of a batch"):
+        dlx.replace(grid, {"high": grid.high.at[1, 2].set(-9.0)})
+    ends = jax.jit(lambda high: dlx.replace(one, {"high": high}).high)
+    assert_close(ends(-9 * high), -9.0)  # traced, so that it cannot be looked at
     gains = eqx.filter_vmap(dlx.controllers.Linear)(jnp.ones((5, 1, 2)))
     scheduled = dlx.controllers.Scheduled(gains, 0.1)
     doubled = dlx.replace(scheduled, {"controllers.K": 2 * jnp.ones((5, 1, 2))})
@@ -186,6 +261,17 @@ def test_a_batch_of_modules(key):
     with user_error(match="arrays with one leading axis"):
         dlx.replace(scheduled, {"controllers": dlx.controllers.Linear([[1.0, 2.0]]),
                                 "controllers.K": jnp.ones(())})  # fmt: skip
+
+
+@once
+def test_a_large_batch():
+    """Of which the extreme members are looked at, and others, but not all."""
+    make = lambda high: d.Uniform(-1.0, high, size=1)
+    batch = jax.vmap(make)(jnp.ones(5000))
+    looked = len(dlx._paths._members(batch))
+    assert 100 < looked <= dlx._paths._MOST_MEMBERS
+    with user_error(match="member 4321 of a batch"):
+        dlx.replace(batch, {"high": batch.high.at[4321].set(-2.0)})
 
 
 @once

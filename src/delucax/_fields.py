@@ -368,12 +368,10 @@ def _check_shapes(module: eqx.Module) -> None:
     """Raise unless a size that several fields name, such as `n`, is the same in all."""
     shapes = []
     with jaxtyped("context"):
-        for field in dataclasses.fields(module):
-            hints = [
-                hint
-                for hint in typing.get_args(field.type) or (field.type,)
-                if isinstance(hint, type) and issubclass(hint, AbstractArray)
-            ]
+        fields = [(field, _hints(field)) for field in dataclasses.fields(module)]
+        # A sum such as T+1 is known when T is.
+        fields.sort(key=lambda pair: any("+" in hint.dim_str for hint in pair[1]))
+        for field, hints in fields:
             value: Any = getattr(module, field.name, None)
             if not hints or not eqx.is_inexact_array(value):
                 continue
@@ -384,3 +382,9 @@ def _check_shapes(module: eqx.Module) -> None:
                     f"{type(module).__name__}: shapes do not fit each other: "
                     f"{'; '.join(shapes)}."
                 )
+
+
+def _hints(field: dataclasses.Field) -> list[Any]:
+    """The shapes that the annotation of a field has."""
+    hints = typing.get_args(field.type) or (field.type,)
+    return [h for h in hints if isinstance(h, type) and issubclass(h, AbstractArray)]

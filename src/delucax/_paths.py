@@ -7,6 +7,8 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import PyTree
 
 from ._fields import (
@@ -19,6 +21,9 @@ from ._fields import (
 
 
 _T = TypeVar("_T")
+
+_MOST_MEMBERS = 256
+"""Of a batch whose members are checked one by one, in a fraction of a second."""
 
 
 def get_path(tree: PyTree, path: str) -> Any:
@@ -66,8 +71,11 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
     Nothing compiles again for it: a number put in the place of a
     [`delucax.parameter`][] becomes the same kind of leaf as the old one was. All
     changes are made before any is checked, so values that only fit together are given
-    in one call. Then every module above a change runs the checks of its constructor;
-    traced values cannot be looked at, only their shapes.
+    in one call. What an environment has by default of its dynamics, its disturbance and
+    a first state of zeros, follows new dynamics. Then every module above a change runs
+    the checks of its constructor; in a batch from `jax.vmap` each member does, of more
+    than 256 those with extreme numbers and others spread evenly. Traced values cannot
+    be looked at, only their shapes.
 
     **Arguments:**
 
@@ -98,7 +106,9 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
     for path, value in changes.items():
         changed = _with(changed, path, value)
     for path in _owners(changes):
-        _check(get_path(changed, path), _node_or_none(tree, path))
+        before = _node_or_none(tree, path)
+        changed = _followed(changed, path, before, changes)
+        _check(get_path(changed, path), before)
     return changed
 
 
@@ -125,6 +135,23 @@ def _with(tree: Any, path: str, value: Any) -> Any:
     )
 
 
+def _followed(tree: Any, path: str, before: Any, changes: Mapping[str, Any]) -> Any:
+    """A copy of `tree` in which what the node at `path` had by default of something
+    that was changed is the default of the new one."""
+    node = get_path(tree, path)
+    if type(node) is not type(before) or not hasattr(node, "__replaced__"):
+        return tree
+    for name, value in node.__replaced__(before).items():
+        place = f"{path}.{name}".lstrip(".")
+        if not any(_is_within(place, at) or _is_within(at, place) for at in changes):
+            tree = _with(tree, place, value)
+    return tree
+
+
+def _is_within(path: str, other: str) -> bool:
+    return f"{path}.".startswith(f"{other}.")
+
+
 def _owners(changes: Mapping[str, Any]) -> list[str]:
     """The paths of all nodes above the changes, the deepest first."""
     owners = set()
@@ -148,9 +175,10 @@ def _check(module: Any, before: Any) -> None:
     try:
         check_module(module)
     except (TypeError, ValueError) as error:
-        if type(before) is type(module) and _is_batch(before):
-            # Its shapes are not those of one module; its numbers can be checked.
+        if type(before) is type(module) and not _passes(before):
+            # Its shapes are not those of one module, so it may be a batch.
             check_parameters(module)
+            _check_members(module, before)
             return
         if isinstance(error, ValueError):
             raise
@@ -159,13 +187,53 @@ def _check(module: Any, before: Any) -> None:
         ) from error
 
 
-def _is_batch(module: eqx.Module) -> bool:
-    """Whether `module` does not pass its own checks, as a batch from `jax.vmap`."""
+def _check_members(module: eqx.Module, before: eqx.Module) -> None:
+    """Run the checks of the members of a batch, as `before` was."""
+    legal = lambda one: _passes(one) or any(map(legal, _members(one).values()))
+    like = next(filter(legal, _members(before).values()), None)
+    if like is None:  # no batch, or one that cannot be looked at
+        return
+    for place, member in _members(module).items():
+        try:
+            _check(member, like)
+        except ValueError as error:
+            raise ValueError(f"{error} This is member {place} of a batch.") from error
+
+
+def _members(module: eqx.Module) -> dict[int, eqx.Module]:
+    """The members of a batch by their place, at most `_MOST_MEMBERS` of them; none if
+    the arrays of `module` share no leading axis or are traced."""
+    arrays, rest = eqx.partition(module, eqx.is_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    if any(isinstance(leaf, Tracer) for leaf in leaves):
+        return {}
+    lengths = {leaf.shape[:1] for leaf in leaves}
+    if len(lengths) != 1 or () in lengths:
+        return {}
+    (count,) = lengths.pop()
+    places = range(count) if count <= _MOST_MEMBERS else _telling(leaves, count)
+    rows = zip(*(list(leaf[np.asarray(places)]) for leaf in leaves), strict=True)
+    whole = lambda row: eqx.combine(jax.tree.unflatten(structure, row), rest)
+    return {int(k): whole(row) for k, row in zip(places, rows, strict=True)}
+
+
+def _telling(leaves: list[Any], count: int) -> np.ndarray:
+    """The members of a large batch to look at: those with the smallest or the largest
+    entry of an array, and others spread evenly."""
+    half = _MOST_MEMBERS // 2
+    flat = [np.asarray(a).reshape(count, -1) for a in leaves if eqx.is_inexact_array(a)]
+    ends = [end for a in flat for end in (np.argmin(a, axis=0), np.argmax(a, axis=0))]
+    extreme = np.unique(np.concatenate([*ends, np.zeros(0, int)]))[:half]
+    return np.union1d(extreme, np.linspace(0, count - 1, half).astype(int))
+
+
+def _passes(module: eqx.Module) -> bool:
+    """Whether `module` passes its own checks, unlike a batch from `jax.vmap`."""
     try:
         check_module(module)
     except (TypeError, ValueError):
-        return True
-    return False
+        return False
+    return True
 
 
 def path_string(path: tuple) -> str:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from helpers import as_a_user, once
+from helpers import as_a_user, once, user_error
 from hypothesis import given, settings, strategies as st
 from systems_catalogue import SYSTEMS
 
@@ -141,3 +141,100 @@ def test_replacing_is_constructing_anew(name, data):
             jax.tree.leaves(replaced), jax.tree.leaves(made_anew), strict=True
         ):
             np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def dynamics(n, m=1):
+    return dlx.LinearDynamics(0.9 * np.eye(n), np.ones((n, m)), dt=0.1)
+
+
+def quadratic(n, m=1):
+    return c.Quadratic(np.ones(n), np.ones(m))
+
+
+PARTS = {
+    "MPC": lambda: dlx.controllers.MPC(dynamics(2), quadratic(2), 5),
+    "sampling MPC": lambda: dlx.controllers.MPC(
+        dynamics(2), quadratic(2), 5, planner=dlx.planning.cem
+    ),
+    "LQR that follows": lambda: dlx.controllers.LQR(
+        dynamics(2), np.eye(2), np.eye(1), reference=np.ones(2)
+    ),
+    "LQI": lambda: dlx.controllers.LQI(
+        dynamics(2), np.eye(3), np.eye(1), output=[[1.0, 0.0]], reference=[1.0]
+    ),
+    "FiniteHorizonLQR": lambda: dlx.controllers.FiniteHorizonLQR(
+        dynamics(2), np.eye(2), np.eye(1), horizon=5
+    ),
+    "HInfinity": lambda: dlx.controllers.HInfinity(dynamics(2), np.eye(2), np.eye(1)),
+    "LQG": lambda: dlx.controllers.LQG(
+        dynamics(2), np.eye(2), np.eye(1), np.eye(2), np.eye(2)
+    ),
+    "KalmanFilter": lambda: dlx.controllers.KalmanFilter(
+        dynamics(2), np.eye(2), np.eye(2), steady_state=True
+    ),
+    "Plan": lambda: dlx.planning.ilqr(
+        dynamics(2), quadratic(2), np.ones(2), np.zeros((5, 1)), bounds=(-1, 1)
+    ),
+    "GPC": lambda: dlx.controllers.GPC(
+        dynamics(2), quadratic(2), base=dlx.controllers.Linear(A[:1]), memory=3
+    ),
+}
+
+
+@functools.cache
+def part(name):
+    return PARTS[name]()
+
+
+@once
+@pytest.mark.parametrize(
+    "name, changes, match",
+    [
+        ("MPC", {"dynamics": dynamics(3)}, "MPC: cost does not fit a state of size 3"),
+        ("MPC", {"dynamics": dynamics(3), "cost": quadratic(3)},
+            r"MPC: start.states must have shape \(2, 6, 3\), got \(2, 6, 2\)"),
+        ("MPC", {"dynamics": dynamics(2, 2), "cost": quadratic(2, 2)},
+            r"MPC: start.controls must have shape \(2, 5, 2\)"),
+        ("MPC", {"dynamics": 5}, "MPC: dynamics must be an AbstractDynamics"),
+        ("MPC", {"cost": quadratic(3)}, "MPC: cost does not fit a state of size 2"),
+        ("MPC", {"cost": 5}, "MPC: cost must be an AbstractCost"),
+        ("MPC", {"start.states": None}, "MPC: start.states must .*got None"),
+        ("MPC", {"planner": dlx.planning.cem}, "planner must draw if the old one did"),
+        ("sampling MPC", {"dynamics": dynamics(3)}, "MPC: cost does not fit"),
+        ("sampling MPC", {"planner": dlx.planning.ilqr}, "planner must draw if"),
+        ("LQR that follows", {"feed_forward.signals.dynamics": dynamics(3)},
+            "feed_forward must be that of 2 states"),
+        ("LQR that follows", {"feed_forward.signals.reference": lambda t: np.ones(3)},
+            "LQR: reference must be a vector of size 2"),
+        ("LQI", {"reference": lambda t: np.ones(2)}, "LQI: reference must be a vector"),
+        ("LQI", {"dt": -1.0}, "LQI: dt must be positive"),
+        ("FiniteHorizonLQR", {"dt": -1.0}, "FiniteHorizonLQR: dt must be positive"),
+        ("HInfinity", {"gamma": -1.0}, "HInfinity: gamma must be positive"),
+        ("LQG", {"regulator.K": np.ones((1, 3)), "regulator.P": np.eye(3),
+            "regulator.x_ref": np.ones(3)}, r"regulator.K must have shape \(1, 2\)"),
+        ("LQG", {"regulator": dlx.controllers.Linear([[1.0, 2.0]])}, "must be a LQR"),
+        ("KalmanFilter", {"dynamics": dynamics(3)}, r"W must have shape \(3, 3\)"),
+        ("KalmanFilter",
+            {"dynamics": dlx.LinearDynamics(np.stack([A, A]), np.stack([B, B]))},
+            "steady_state needs time-invariant dynamics"),
+        ("Plan", {"states": np.ones((7, 2))}, "Plan: shapes do not fit each other"),
+        ("Plan", {"dt": -1.0}, "Plan: dt must be positive"),
+        ("Plan", {"low": [1.0], "high": [-1.0]}, "low <= high"),
+        ("Plan", {"low": [1.0, 1.0], "high": [2.0, 2.0]}, "low and high must be"),
+        ("GPC",
+            {"loop.dynamics": dynamics(3),
+             "loop.base": dlx.controllers.Linear(A[:1, [0, 1, 1]])},
+            r"response must have shape \(h, 4, 1\)"),
+        ("GPC", {"policy.start": np.ones((2, 6))}, "policy must take 6 features"),
+        ("GPC", {"cost": lambda t, y, u: y}, "cost must give a scalar"),
+    ],
+)  # fmt: skip
+def test_parts_of_a_controller_must_fit(name, changes, match):
+    with user_error(match=match):
+        dlx.replace(part(name), changes)
+
+
+@once
+def test_a_plan_can_be_changed():
+    plan = dlx.replace(part("Plan"), {"states": np.ones((6, 2)), "low": [-2.0]})
+    np.testing.assert_allclose(plan.states, 1.0)

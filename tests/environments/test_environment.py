@@ -203,7 +203,8 @@ def test_replace_checks_and_converts():
         dlx.replace(env, {"cost": 3.0})
     with user_error(match="disturbance has size 2 where 3 is expected"):
         dynamics = dlx.LinearDynamics(jnp.eye(3), jnp.ones((3, 1)))
-        dlx.replace(env, {"dynamics": dynamics})
+        noise = dlx.disturbances.Gaussian(0.1, size=2)
+        dlx.replace(env, {"dynamics": dynamics, "disturbance": noise})
     with user_error(match="horizon.*structure"):
         dlx.replace(env, {"horizon": 100})
     with user_error(match="pendulum: max_speed"):

@@ -77,6 +77,11 @@ def test_data_that_say_nothing_say_so():
     assert found.result == dlx.RESULTS.unexciting
     assert not np.any(found.identifiable)
     assert np.all(np.isfinite(found.estimate))
+    # Both are positive, and may be anything.
+    assert_close(found.low, 0.0)
+    assert np.all(found.high == np.inf)
+    for line in found.report().splitlines()[1:3]:
+        assert line.split()[2:] == ["0", "inf"]
 
 
 @thorough

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float
 
-from .._check import as_vector
+from .._check import as_vector, output_of
 from .._fields import function_field, parameter
 from ..dynamics import LinearDynamics
 from ..math import matvec
@@ -34,6 +34,14 @@ class KnownSignals(eqx.Module):
     control_reference: Signal | None = function_field()
     disturbance: Signal | None = function_field()
     difference: Callable[[Array, Array], Array] | None = function_field()
+
+    def check(self, where: str) -> None:
+        """Raise unless the signals have the sizes of the dynamics."""
+        point = self.dynamics
+        as_signal(self.reference, point.state_size, "reference", where)
+        push = self.control_reference
+        as_signal(push, point.control_size, "control_reference", where)
+        as_signal(self.disturbance, point.disturbance_size, "disturbance", where)
 
     def state(self, t: Any) -> Array:
         """`r(t)`."""
@@ -90,7 +98,7 @@ def as_signal(value: Any, size: int, name: str, where: str) -> Any:
         return None
     if not callable(value):
         return Constant(as_vector(value, size, name, where))
-    shape = eqx.filter_eval_shape(value, jnp.zeros(())).shape
+    shape = output_of(value, ()).shape
     if shape != (size,):
         raise ValueError(
             f"{where}: {name} must be a vector of size {size}, or a function of time "

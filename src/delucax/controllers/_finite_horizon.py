@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._check import check_count
+from .._check import check_count, check_step
 from .._controller import AbstractController
 from .._fields import function_field, parameter, weight
 from ..dynamics import LinearDynamics
@@ -140,6 +140,9 @@ class FiniteHorizonLQR(AbstractController):
         self.K, self.k, self.P = solution.K, solution.k, solution.X
         self.dt = dynamics.dt
         self.difference = difference
+
+    def __check_init__(self):
+        check_step(self.dt, "FiniteHorizonLQR")
 
     def __call__(self, t, y, state):
         check_state(self, y, self.x_ref.shape[1])

@@ -5,7 +5,7 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from .._check import check_count
+from .._check import check_count, check_positive, check_step
 from .._controller import AbstractController
 from .._fields import function_field, parameter, weight
 from ..dynamics import LinearDynamics
@@ -123,6 +123,11 @@ class HInfinity(AbstractController):
             self.dt = None
         self.K, self.P, self.L = solution.K, solution.X, solution.L
         self.gamma = solution.gamma
+
+    def __check_init__(self):
+        check_positive(self.gamma, "gamma", "HInfinity")
+        if self.dt is not None:
+            check_step(self.dt, "HInfinity")
 
     def __call__(self, t, y, state):
         check_state(self, y, self.x_ref.shape[-1])

@@ -115,11 +115,7 @@ class KalmanFilter(AbstractGaussianFilter):
                 mean, covariance, first_ref, like, where
             )
             return
-        if dynamics.is_time_varying:
-            raise ValueError(
-                f"{where}: steady_state needs time-invariant dynamics, got matrices at "
-                f"{dynamics.A.shape[0]} times."
-            )
+        _check_time_invariant(dynamics)
         if covariance is not None:
             raise ValueError(
                 f"{where}: covariance must not be given with steady_state, of which it "
@@ -139,6 +135,8 @@ class KalmanFilter(AbstractGaussianFilter):
 
     def __check_init__(self):
         _check_linear(self.dynamics)
+        if self.L is not None:
+            _check_time_invariant(self.dynamics)
         if self.y_ref is not None:
             size = self.dynamics.observation_size
             as_vector(self.y_ref, size, "y_ref", "KalmanFilter")
@@ -182,4 +180,12 @@ def _check_linear(dynamics: Any) -> None:
         raise ValueError(
             "KalmanFilter: dynamics must be LinearDynamics (ExtendedKalmanFilter and "
             f"UnscentedKalmanFilter take any), got {type(dynamics).__name__}."
+        )
+
+
+def _check_time_invariant(dynamics: LinearDynamics) -> None:
+    if dynamics.is_time_varying:
+        raise ValueError(
+            "KalmanFilter: steady_state needs time-invariant dynamics, got matrices at "
+            f"{dynamics.A.shape[0]} times."
         )

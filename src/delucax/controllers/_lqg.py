@@ -126,6 +126,21 @@ class LQG(AbstractController):
                 price @ covariance
             )
 
+    def __check_init__(self):
+        for name, kind in (("regulator", LQR), ("estimator", KalmanFilter)):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(
+                    f"LQG: {name} must be a {kind.__name__}, got "
+                    f"{type(getattr(self, name)).__name__}."
+                )
+        dynamics = self.estimator.dynamics
+        shape = dynamics.control_size, dynamics.state_size
+        if self.regulator.K.shape != shape:
+            raise ValueError(
+                f"LQG: regulator.K must have shape {shape}, as the dynamics of "
+                f"estimator need, got {self.regulator.K.shape}."
+            )
+
     @property
     def _feedback(self) -> OutputFeedback:
         return OutputFeedback(self.regulator, self.estimator)

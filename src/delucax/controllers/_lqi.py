@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float
 
-from .._check import as_matrix, check_finite
+from .._check import as_matrix, check_finite, check_step
 from .._controller import AbstractController
 from .._fields import as_float_array, function_field, parameter, weight
 from ..dynamics import LinearDynamics
@@ -132,6 +132,10 @@ class LQI(AbstractController):
         solution = dare(A, B, Q, R, S)
         self.K, self.Ki = solution.K[:, :n], solution.K[:, n:]
         self.P = solution.X
+
+    def __check_init__(self):
+        check_step(self.dt, "LQI")
+        as_signal(self.reference, self.Ki.shape[1], "reference", "LQI")
 
     def init(self, *, key=None):
         dtype = jnp.result_type(self.K, self.Ki)

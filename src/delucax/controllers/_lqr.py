@@ -135,6 +135,19 @@ class LQR(AbstractController):
             loop = solution.closed_loop
             self.feed_forward = Preview(signals, P, M, loop, int(preview))
 
+    def __check_init__(self):
+        if self.feed_forward is None:
+            return
+        m, n = self.K.shape
+        shapes = self.feed_forward.M.shape, self.feed_forward.signals.dynamics.B.shape
+        if shapes != ((m, n), (n, m)):
+            raise ValueError(
+                f"LQR: feed_forward must be that of {n} states and {m} controls, as K "
+                f"is, got M of shape {shapes[0]} and dynamics with B of shape "
+                f"{shapes[1]}."
+            )
+        self.feed_forward.signals.check("LQR")
+
     def __call__(self, t, y, state):
         check_state(self, y, self.x_ref.shape[0])
         x_ref, u_ref = self.x_ref, self.u_ref

@@ -1,7 +1,7 @@
 """Model predictive control."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,11 +13,19 @@ from jaxtyping import Array
 
 from .._check import as_bounds, check_bool, check_count, check_finite, check_key
 from .._controller import AbstractController, Tally, wrong_observation
-from .._fields import as_float_array, as_module, function_field, parameter
+from .._fields import (
+    as_float_array,
+    as_module,
+    function_field,
+    parameter,
+    StaticFunction,
+)
 from .._message import shortened
 from .._results import Result, RESULTS
 from ..costs import AbstractCost
+from ..costs._base import check_cost
 from ..dynamics import AbstractDynamics
+from ..dynamics._base import check_dynamics
 from ..math import matvec
 from ..planning import default_start, ilqr, Start
 from ..planning._start import as_start, controls_of
@@ -166,23 +174,10 @@ class MPC(AbstractController):
         **options: Any,
     ):
         where = "MPC"
-        if not isinstance(dynamics, AbstractDynamics):
-            raise ValueError(
-                f"{where}: dynamics must be an AbstractDynamics (for an environment, "
-                f"its `dynamics`), got {type(dynamics).__name__}."
-            )
-        if not isinstance(cost, AbstractCost):
-            raise ValueError(
-                f"{where}: cost must be an AbstractCost, got {type(cost).__name__}."
-            )
+        check_dynamics(dynamics, where)
+        check_cost(cost, "cost", where)
         horizon = check_count(horizon, "horizon", where)
-        known = _arguments(planner, where)
-        for name in options:
-            if name not in known or name in _OURS:
-                raise ValueError(
-                    f"{where}: {name} is no option of the planner; it has "
-                    f"{', '.join(k for k in known if k not in _OURS)}."
-                )
+        self.draws = "key" in _known(planner, options, where)
         ends = as_bounds(bounds, where)
         m = dynamics.control_size
         if isinstance(start, Start):
@@ -209,7 +204,6 @@ class MPC(AbstractController):
         self.low, self.high = (None, None) if ends is None else ends
         self.planner = planner
         self.throw = check_bool(throw, "throw", where)
-        self.draws = "key" in known
         kept, fixed = {}, []
         for name, value in sorted(options.items()):
             # The spacing of differences is part of the planner's program.
@@ -221,18 +215,37 @@ class MPC(AbstractController):
         self.options, self.settings = kept, tuple(fixed)
 
     def __check_init__(self):
-        where, m = "MPC", self.dynamics.control_size
+        where, dynamics = "MPC", self.dynamics
+        check_dynamics(dynamics, where)
+        n, m = dynamics.state_size, dynamics.control_size
+        check_cost(self.cost, "cost", where, (n, m))
+        planner: Any = self.planner
+        planner = planner.function if isinstance(planner, StaticFunction) else planner
+        options = self.options | dict(self.settings)
+        if self.draws != ("key" in _known(planner, options, where)):
+            raise ValueError(
+                f"{where}: planner must draw if the old one did, and must not if it "
+                "did not; build the controller anew."
+            )
         if not isinstance(self.start, Start):
             raise ValueError(
                 f"{where}: start must be a delucax.planning.Start, got "
                 f"{type(self.start).__name__}."
             )
-        controls = self.start.controls
-        if controls.ndim < 3 or controls.shape[-1] != m:
+        shape = self.start.controls.shape
+        if len(shape) != 3:
             raise ValueError(
                 f"{where}: start.controls must have shape (c, horizon, {m}), got "
-                f"{controls.shape}."
+                f"{shape}."
             )
+        c, T, _ = shape
+        rows = dict(controls=(c, T, m), states=(c, T + 1, n), gains=(c, T, m, n))
+        for name, row in rows.items():
+            got = getattr(getattr(self.start, name), "shape", None)
+            if got != row:
+                raise ValueError(
+                    f"{where}: start.{name} must have shape {row}, got {got}."
+                )
         if self.low is None and self.high is None:
             return
         for end in as_bounds((self.low, self.high), where) or ():
@@ -316,14 +329,21 @@ class MPC(AbstractController):
         return u
 
 
-def _arguments(planner: Any, where: str) -> tuple[str, ...]:
-    """The names of a planner's arguments."""
+def _known(planner: Any, options: Mapping[str, Any], where: str) -> tuple[str, ...]:
+    """The names of a planner's arguments, among which those of `options` are."""
     if not callable(planner):
         raise ValueError(
             f"{where}: planner must be a function such as delucax.planning.ilqr, got "
             f"{planner!r}."
         )
-    return tuple(inspect.signature(planner).parameters)
+    known = tuple(inspect.signature(planner).parameters)
+    for name in options:
+        if name not in known or name in _OURS:
+            raise ValueError(
+                f"{where}: {name} is no option of the planner; it has "
+                f"{', '.join(k for k in known if k not in _OURS)}."
+            )
+    return known
 
 
 def _stacked(start: Start, n: int) -> Start:

@@ -8,8 +8,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._check import output_of
 from .._fields import check_parameters
 from .._typing import RealScalar
+
+
+_UNTRACEABLE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
 
 
 class AbstractCost(eqx.Module):
@@ -99,10 +107,25 @@ class AbstractCost(eqx.Module):
         return jnp.zeros((), x.dtype)
 
 
-def check_cost(value: Any, name: str, where: str) -> None:
-    """Raise unless `value` is a cost."""
+def check_cost(
+    value: Any, name: str, where: str, sizes: tuple[int, int] | None = None
+) -> None:
+    """Raise unless `value` is a cost, of states and controls of these `sizes`."""
     if not isinstance(value, AbstractCost):
         raise ValueError(
             f"{where}: {name} must be an AbstractCost (wrap a function with "
             f"`delucax.costs.Function`), got {type(value).__name__}."
         )
+    if sizes is None:
+        return
+    n, m = sizes
+    try:
+        output_of(value, (), (n,), (m,))
+        output_of(value.final, (), (n,))
+    except _UNTRACEABLE:  # it may still be called, one step after the other
+        return
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{where}: {name} does not fit a state of size {n} and a control of size "
+            f"{m}: {error}"
+        ) from error

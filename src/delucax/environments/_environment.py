@@ -173,8 +173,7 @@ class Environment(eqx.Module):
         self.dynamics = dynamics
         self.cost = cost
         if disturbance is None and isinstance(dynamics, AbstractDynamics):
-            k, count = dynamics.disturbance_size, dynamics.increments
-            disturbance = Brownian(k // count, substeps=count) if count else Zero(k)
+            disturbance = _default_disturbance(dynamics)
         self.disturbance = disturbance  # pyright: ignore[reportAttributeAccessIssue]
         self.sensor_noise = sensor_noise
         if initial_state is None and isinstance(dynamics, AbstractDynamics):
@@ -191,7 +190,8 @@ class Environment(eqx.Module):
         where, dynamics = "Environment", self.dynamics
         check_dynamics(dynamics, where)
         check_increments(dynamics, where)
-        check_cost(self.cost, "cost", where)
+        sizes = dynamics.state_size, dynamics.control_size
+        check_cost(self.cost, "cost", where, sizes)
         for name, given, size in (
             ("disturbance", self.disturbance, dynamics.disturbance_size),
             ("sensor_noise", self.sensor_noise, None),
@@ -238,6 +238,20 @@ class Environment(eqx.Module):
                     f"{where}: actions must have shape (actions, {m}), got "
                     f"{self.actions.shape}."
                 )
+
+    def __replaced__(self, before: "Environment") -> dict[str, Any]:
+        """What `before` had by default of its dynamics, by default of the new ones."""
+        old, new, x0 = before.dynamics, self.dynamics, before.initial_state
+        if not isinstance(new, AbstractDynamics):
+            return {}
+        fields: dict[str, Any] = {}
+        if eqx.tree_equal(before.disturbance, _default_disturbance(old)):
+            fields["disturbance"] = _default_disturbance(new)
+        n = new.state_size
+        if n != old.state_size and not callable(x0) and is_concrete(x0):
+            if x0.shape == (old.state_size,) and not np.any(x0):
+                fields["initial_state"] = jnp.zeros(n, x0.dtype)
+        return fields
 
     @property
     def dt(self) -> Array:
@@ -371,6 +385,11 @@ class Environment(eqx.Module):
 
 def _identity(x):
     return x
+
+
+def _default_disturbance(dynamics: AbstractDynamics) -> AbstractDisturbance:
+    k, count = dynamics.disturbance_size, dynamics.increments
+    return Brownian(k // count, substeps=count) if count else Zero(k)
 
 
 def _check_bounds(low: Array, high: Array, shape: tuple[int, ...], what: str) -> None:

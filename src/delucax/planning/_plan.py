@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._check import is_concrete
+from .._check import as_bounds, check_step, is_concrete
 from .._controller import AbstractController, wrong_observation
 from .._fields import function_field, parameter, weight
 from .._results import Result, RESULTS
@@ -80,6 +80,17 @@ class Plan(AbstractController):
     low: Array | None = parameter()
     high: Array | None = parameter()
     difference: Callable[[Any, Any], Any] | None = function_field()
+
+    def __check_init__(self):
+        check_step(self.dt, "Plan")
+        if self.low is None and self.high is None:
+            return
+        for end in as_bounds((self.low, self.high), "Plan") or ():
+            if end.shape not in ((), self.controls.shape[1:]):
+                raise ValueError(
+                    "Plan: low and high must be numbers or have shape "
+                    f"{self.controls.shape[1:]}, got {end.shape}."
+                )
 
     def __call__(self, t, y, state):
         size = self.states.shape[1]

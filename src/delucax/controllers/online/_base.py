@@ -13,7 +13,7 @@ from .._lqg import LQG
 from .._lqr import LQR
 from .._scheduled import Scheduled
 from ._features import Features
-from ._learner import OnlineLearner
+from ._learner import check_scalar_cost, OnlineLearner
 from ._loop import Loop
 from ._newton import online_newton
 from ._policy import LinearPolicy
@@ -66,12 +66,7 @@ def _check_cost(dynamics: Any, cost: Any, where: str) -> None:
             f"{where}: cost must be a function of (t, y, u), such as one of "
             f"delucax.costs, got {type(cost).__name__}."
         )
-    y, u = jnp.zeros(dynamics.observation_size), jnp.zeros(dynamics.control_size)
-    found: Any = eqx.filter_eval_shape(cost, jnp.zeros(()), y, u)
-    if getattr(found, "shape", None) != ():
-        got = getattr(found, "shape", None)
-        got = type(found).__name__ if got is None else f"an array of shape {got}"
-        raise ValueError(f"{where}: cost must give a scalar, got {got}.")
+    check_scalar_cost(cost, dynamics, where)
 
 
 def _default_base(dynamics: AbstractDynamics, cost: Any, where: str) -> Any:

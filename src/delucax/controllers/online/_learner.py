@@ -10,9 +10,10 @@ import optax
 from jax.interpreters import partial_eval
 from jaxtyping import Array
 
-from ..._check import check_step
+from ..._check import check_step, output_of
 from ..._controller import AbstractLearner, Tally
 from ..._fields import function_field, parameter
+from ...dynamics import AbstractDynamics
 from ._features import Features
 from ._fixed import FixedPolicy
 from ._loop import Loop, LoopState, shift
@@ -106,7 +107,20 @@ class OnlineLearner(AbstractLearner):
     optimiser: optax.GradientTransformation = eqx.field(static=True)
 
     def __check_init__(self):
-        check_step(self.learning_rate, type(self).__name__, "learning_rate")
+        where, dynamics, policy = "OnlineLearner", self.loop.dynamics, self.policy
+        check_step(self.learning_rate, where, "learning_rate")
+        check_scalar_cost(self.cost, dynamics, where)
+        features, m = jnp.zeros(self.features.size), dynamics.control_size
+        added = lambda policy: policy(policy.init(), features)
+        try:
+            got = eqx.filter_eval_shape(added, policy).shape
+        except TypeError:  # matrices that do not fit
+            got = None
+        if got != (m,):
+            raise ValueError(
+                f"{where}: policy must take {self.features.size} features and give "
+                f"{m} controls, got {type(policy).__name__} that does not."
+            )
 
     def init(self, *, key=None):
         loop, features = self.loop, self.features
@@ -218,3 +232,13 @@ class OnlineLearner(AbstractLearner):
         traced = jax.make_jaxpr(self._root)(*here)
         _, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
         return None if any(used) else self._root(*here)
+
+
+def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None:
+    """Raise unless a cost of what `dynamics` show is a scalar."""
+    y, u = (dynamics.observation_size,), (dynamics.control_size,)
+    found = output_of(cost, (), y, u)
+    if getattr(found, "shape", None) != ():
+        got = getattr(found, "shape", None)
+        got = type(found).__name__ if got is None else f"an array of shape {got}"
+        raise ValueError(f"{where}: cost must give a scalar, got {got}.")

@@ -131,6 +131,14 @@ class Loop(eqx.Module):
 
     def __check_init__(self):
         check_control(self.dynamics, self.base, "Loop")
+        if self.response is not None:
+            m, p = self.dynamics.control_size, self.dynamics.observation_size
+            if self.response.shape[1:] != (p + m, m):
+                raise ValueError(
+                    f"Loop: response must have shape (h, {p + m}, {m}), got "
+                    f"{self.response.shape}; build the learner anew for dynamics of "
+                    "another size."
+                )
 
     def memory(self) -> int:
         """For how many steps a disturbance matters, as far as that can be seen."""

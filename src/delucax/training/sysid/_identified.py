@@ -34,7 +34,8 @@ class Identified(eqx.Module):
     - `estimate`: their values, shape `(p,)`; in a linear fit `(outputs, p)`.
     - `std`: their standard deviations, of the same shape; infinite for what is not
         identifiable, NaN where the fit did not converge.
-    - `low`, `high`: the ends of their confidence intervals, of the same shape; NaN
+    - `low`, `high`: the ends of their confidence intervals, of the same shape; those of
+        all legal values, such as 0 and infinity, for what is not identifiable; NaN
         where the fit did not converge.
     - `directions`: shape `(p, p)`, a unit vector in each row, least known first.
     - `spread`: the standard deviation along each, shape `(p,)`; NaN where the fit did

@@ -428,4 +428,8 @@ def _ends(assembly, values, reach):
     """The legal values that far from the estimate, in relative changes."""
     flat, unravel = jax.flatten_util.ravel_pytree(values)
     step = reach * _per_relative(assembly, values)
-    return _flat_legal(assembly, unravel(flat + step))
+    legal = _flat_legal(assembly, unravel(flat + step))
+    # A constraint keeps numbers off the ends of its set; an interval may reach them.
+    edge, size = jnp.finfo(legal.dtype), jnp.abs(legal)
+    end = jnp.where(size >= edge.max, jnp.sign(legal) * jnp.inf, legal)
+    return jnp.where(size <= edge.tiny, 0, end)
