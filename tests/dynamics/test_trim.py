@@ -167,6 +167,8 @@ def test_rest_at_zero_is_told_from_rounding():
 def test_printed_it_shows_numbers():
     point = dlx.trim(Reactor(), **GUESS, fix={"c": 0.5})
     assert all(part in repr(point) for part in ("350.0", "300.0", "successful"))
+    long = jnp.arange(40.0) + 0.123
+    assert "39.123" in repr(eqx.tree_at(lambda p: p.residual, point, long))
     batch = jax.vmap(lambda c: dlx.trim(Reactor(), **GUESS, fix={"c": c}, throw=False))
     assert "successful: 2 of 2" in repr(batch(jnp.array([0.4, 0.5])))
     traced = []

@@ -44,9 +44,9 @@ class OperatingPoint(eqx.Module):
     result: Result
 
     def __repr__(self):
-        rows = (
-            f"    {k}={shortened(getattr(self, k))}," for k in ("x", "u", "residual")
-        )
+        text = lambda array: str(array) if is_concrete(array) else shortened(array)
+        shown = dict(x=self.x, u=self.u, residual=self.residual)
+        rows = (f"    {name}={text(array)}," for name, array in shown.items())
         return "\n".join(["OperatingPoint(", *rows, f"    {self._outcome()},", ")"])
 
     def _outcome(self) -> str:
