@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers import assert_close, central_difference, needs_x32, needs_x64, thorough
 from hypothesis import given, settings, strategies as st
+from jaxtyping import Array
 
 import delucax as dlx
 
@@ -64,6 +65,10 @@ def advance(dynamics, t, x, u, w):
 def step_of(system, kind, dt):
     """One step, `(t, x, u, w) -> x_next`; the interval is no part of the program."""
     dynamics = dlx.Discretized(system(kind in NOISY), dt, **KINDS[kind])
+    return jitted(dynamics)
+
+
+def jitted(dynamics):
     return functools.partial(advance, dynamics)
 
 
@@ -103,6 +108,49 @@ def test_a_late_step_is_that_of_double_precision(kind, t):
     ulp = np.spacing(np.abs(np.asarray(single)))
     assert single.dtype == jnp.float32
     assert np.all(np.abs(np.asarray(single, np.float64) - double) <= 4 * ulp)
+
+
+class Fast(dlx.AbstractSystem):
+    """Slopes of up to 2 with respect to the time."""
+
+    state_names = ("x", "y")
+    control_names = ("u",)
+    noisy: bool = eqx.field(static=True)
+
+    def vector_field(self, t, x, u, w):
+        return jnp.stack([jnp.sin(2 * t) - 0.1 * x[0], jnp.cos(2 * t) + u[0]])
+
+
+class FastMap(dlx.AbstractDynamics):
+    """A map is given the time itself, of which nothing is rounded."""
+
+    state_names = ("x", "y")
+    control_names = ("u",)
+    dt: Array = dlx.parameter(1e-2)
+
+    def advance(self, t, x, u, w):
+        return x + self.dt * Fast(False).vector_field(
+            t, x, u, w
+        ), dlx.RESULTS.successful
+
+
+WEIGHTS = {"explicit": 7.6, "explicit substeps": 1.0, "adaptive": 7.6, "implicit": 3.0}
+"""At least the sum of the absolute weights of the stages."""
+
+
+@needs_x64
+@pytest.mark.parametrize("kind", [*WEIGHTS, "map"])
+@settings(max_examples=20, deadline=None)
+@given(t=st.floats(1, 1e5, width=32))
+def test_a_late_step_of_a_fast_field_is_off_by_the_rounding_of_time(kind, t):
+    step = step_of(Fast, kind, 1e-2) if kind in KINDS else jitted(FastMap())
+    plain = [jnp.asarray(a, jnp.float32) for a in (X, U, DISTURBANCE[False])]
+    single = np.asarray(step(jnp.float32(t), *plain), np.float64)
+    double = step(jnp.float64(t), *(a.astype(jnp.float64) for a in plain))
+    late = 0.0 if kind == "map" else np.spacing(np.float32(t + 1e-2)) / 2
+    rounding = WEIGHTS.get(kind, 1.0) * 2 * late * 1e-2
+    ulp = np.spacing(np.abs(single).astype(np.float32)).astype(np.float64)
+    assert np.all(np.abs(single - double) <= 4 * ulp + rounding)
 
 
 def adaptive(system, adjoint):

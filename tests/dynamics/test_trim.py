@@ -1,11 +1,12 @@
 """Operating points."""
 
 import control
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough, user_error
+from helpers import assert_close, needs_x64, thorough, tolerance, user_error
 from hypothesis import given, settings, strategies as st
 from jaxtyping import Array
 
@@ -82,7 +83,7 @@ def test_more_unknowns_than_equations_change_least():
     A, B = jnp.array([[0.9, 0.1], [0.0, 0.8]]), jnp.array([[0.0], [1.0]])
     guess = jnp.array([1.0, 2.0, 0.5])
     point = dlx.trim(dlx.LinearDynamics(A, B), x=guess[:2], u=guess[2:])
-    along, unit = np.array([1.0, 1.0, 0.2]), np.asarray(guess) + 1
+    along, unit = np.array([1.0, 1.0, 0.2]), np.asarray(guess)
     scaled = along / unit
     s = scaled @ (guess / unit) / (scaled @ scaled)
     tight = 1e-10 if point.x.dtype == float else 1e-4
@@ -113,10 +114,90 @@ def test_what_is_no_equilibrium_says_so():
     assert point.result == dlx.RESULTS.no_equilibrium
     # The nearest to rest of all c, which is the only unknown.
     assert float(jnp.abs(point.residual).max()) > 1
-    with pytest.raises(Exception, match="no equilibrium near the guess"):
+    with pytest.raises(RuntimeError, match="^trim: There is no equilibrium.*residual"):
         dlx.trim(Reactor(), **case)
+
+    def found(x):
+        return dlx.trim(Reactor(), x=x, u=[300.0], fix=("T", "Tc")).x
+
+    with pytest.raises(eqx.EquinoxRuntimeError, match="trim: There is no equilibrium"):
+        eqx.filter_jit(found)(jnp.array(case["x"]))
     cold = dlx.trim(Reactor(), x=[0.5, 0.0], u=[300.0], fix="Tc", throw=False)
     assert cold.result == dlx.RESULTS.diverged
+
+
+SCALED = {
+    "reactor": (Reactor(), (0.5, 340.0), (299.0,), "Tc"),
+    "tanks": (dlx.systems.TwoTank(), (9.0, 8.0), (25.0,), "flow"),
+    "Lorenz": (dlx.systems.Lorenz(), (8.0, 9.0, 25.0), (0.0,), "u"),
+}
+
+
+def in_units(name, scale):
+    """A plant whose state is in a unit of `1 / scale`, and a guess for it."""
+    system, x, u, fix = SCALED[name]
+    field = lambda t, x, u, w: scale * system.vector_field(t, x / scale, u, w)
+    names = dict(states=system.state_names, controls=system.control_names)
+    return dlx.system(field, **names), scale * jnp.array(x), jnp.array(u), fix
+
+
+@pytest.mark.parametrize("name", SCALED)
+def test_units_do_not_matter(name):
+    tight = tolerance(1e-3, 1e-9)
+    plain, x, u, fix = in_units(name, 1.0)
+    point = dlx.trim(plain, x=x, u=u, fix=fix)
+    for scale in (1e-6, 1e6):
+        scaled, x, u, _ = in_units(name, scale)
+        found = dlx.trim(scaled, x=x, u=u, fix=fix)
+        assert_close(found.x, scale * point.x, rtol=tight)
+        # At the guess itself, with nothing else free, it moves.
+        others = [*scaled.state_names, *scaled.control_names][1:]
+        stuck = dlx.trim(scaled, x=x, u=u, fix=others, throw=False)
+        assert stuck.result == dlx.RESULTS.no_equilibrium
+
+
+def test_rest_at_zero_is_told_from_rounding():
+    # Newton's method passes zero by ever less, and never meets it.
+    point = dlx.trim(dlx.systems.Pendulum(), x=[0.3, 0.1], u=[0.0], fix="torque")
+    assert_close(point.x, np.zeros(2))
+    dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+    dlx.controllers.LQR(dynamics, jnp.eye(2), jnp.eye(1), point=point)
+
+
+def test_printed_it_shows_numbers():
+    point = dlx.trim(Reactor(), **GUESS, fix={"c": 0.5})
+    assert all(part in repr(point) for part in ("350.0", "300.0", "successful"))
+    long = jnp.arange(40.0) + 0.123
+    assert "39.123" in repr(eqx.tree_at(lambda p: p.residual, point, long))
+    batch = jax.vmap(lambda c: dlx.trim(Reactor(), **GUESS, fix={"c": c}, throw=False))
+    assert "successful: 2 of 2" in repr(batch(jnp.array([0.4, 0.5])))
+    traced = []
+    jax.jit(lambda c: traced.append(repr(dlx.trim(Reactor(), **GUESS, fix={"c": c}))))(
+        0.5
+    )
+    assert "traced" in traced[0]
+
+
+def test_a_task_is_regulated_at_its_operating_point():
+    env = dlx.make("cstr", concentration=0.4)
+    point = env.trim(fix="concentration")
+    x, u = env.dynamics.system.equilibrium(0.4)
+    tight = tolerance(1e-5, 1e-10)
+    assert_close(jnp.concatenate([point.x, point.u]), jnp.append(x, u), rtol=tight)
+    Q, R = jnp.eye(2), jnp.eye(1)
+    linear = dlx.linearize(env.dynamics, x=point)
+    assert_close(linear.x_ref, point.x)
+    regulator = dlx.controllers.LQR(env.dynamics, Q, R, point=point)
+    assert_close(regulator.K, dlx.controllers.LQR(linear, Q, R).K)
+    assert_close(regulator.u_ref, point.u)
+    system = env.dynamics.system
+    sampled = dlx.controllers.lqrd(system, Q, R, 0.05, point=point)
+    about = dlx.linearize(system, x=point)
+    assert_close(sampled.K, dlx.controllers.lqrd(about, Q, R, 0.05).K)
+    with user_error(match="LQR: point must be an OperatingPoint.*delucax.trim"):
+        dlx.controllers.LQR(env.dynamics, Q, R, point=point.x)
+    with user_error(match="linearize: u must be left out"):
+        dlx.linearize(env.dynamics, x=point, u=point.u)
 
 
 @needs_x64
@@ -161,6 +242,10 @@ def test_bad_input():
         dlx.trim(Reactor(), **GUESS, fix={"c": [0.5, 0.5]})
     with user_error(match="x \\(the state\\) must have shape"):
         dlx.trim(Reactor(), x=[0.5], u=[300.0])
+    with user_error(match="trim: x \\(the state\\) must be finite"):
+        dlx.trim(Reactor(), x=[0.5, np.nan], u=[300.0])
+    with user_error(match="trim: u \\(the control\\) must be finite"):
+        dlx.trim(Reactor(), x=[0.5, 350.0], u=[np.nan])
     with user_error(match="names no equilibrium"):
         dlx.trim(Reactor())
     with user_error(match="model must be an AbstractSystem or AbstractDynamics"):

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from .._controller import AbstractController
 from .._fields import function_field, parameter, weight
 from .._message import shortened
-from ..dynamics import LinearDynamics
+from ..dynamics import AbstractDynamics, OperatingPoint
 from ..math import matvec
 from ..math._linear_solve import solve
 from ..riccati import dare
@@ -22,6 +22,7 @@ from ._operating_point import (
     check_time_invariant,
     deviation,
     equilibrium,
+    linear_at,
 )
 
 
@@ -47,9 +48,11 @@ class LQR(AbstractController):
     **Arguments:**
 
     - `dynamics`: time-invariant linear dynamics whose operating point is an equilibrium
-        and whose state is observed; of [`delucax.linearize`][], for example, at a point
-        of [`delucax.trim`][]. It is one if what moves the state there is below 1e-4 of
-        the terms that do.
+        and whose state is observed, of [`delucax.linearize`][] for example; or any
+        dynamics, with a `point`. At an equilibrium what is left to move each state is
+        below 1e-4 of the terms `|A - I| |x_ref| + |B| |u_ref|` that move it, or below
+        the rounding of the state or of the largest term (4 units in the last place), so
+        that units do not matter.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `S`: cross weight, shape `(n, m)`; zero by default.
@@ -60,7 +63,10 @@ class LQR(AbstractController):
     - `disturbance`: a disturbance known in advance, a vector or a function of time.
     - `preview`: for how many steps ahead the signals are looked up, 0 by default.
     - `difference`: `(x, x_ref) -> deviation`, such as the `difference` of the system
-        that was linearised, which wraps angles; subtraction by default.
+        that was linearised, which wraps angles; subtraction by default, and with a
+        `point` that of `dynamics`.
+    - `point`: the [`delucax.dynamics.OperatingPoint`][] of [`delucax.trim`][] at which
+        `dynamics` are linearised, at time 0; by default they are linear already.
 
     **Attributes:** `K`, the gain, trainable, shape `(m, n)`; `P`, the solution of the
     Riccati equation, shape `(n, n)`; `x_ref` and `u_ref`, the operating point.
@@ -97,7 +103,7 @@ class LQR(AbstractController):
 
     def __init__(
         self,
-        dynamics: LinearDynamics,
+        dynamics: AbstractDynamics,
         Q: Any,
         R: Any,
         S: Any = None,
@@ -107,15 +113,17 @@ class LQR(AbstractController):
         disturbance: Any = None,
         preview: int = 0,
         difference: Callable[[Array, Array], Array] | None = None,
+        point: OperatingPoint | None = None,
     ):
         where = "LQR"
-        check_time_invariant(dynamics, where)
-        check_observed(dynamics, where)
-        self.x_ref = equilibrium(dynamics, difference, where)
-        self.u_ref = dynamics.u_ref
+        linear, difference = linear_at(dynamics, point, difference, where)
+        check_time_invariant(linear, where)
+        check_observed(linear, where)
+        self.x_ref = equilibrium(linear, difference, where)
+        self.u_ref = linear.u_ref
         self.difference = difference
         signals = known_signals(
-            dynamics, reference, control_reference, disturbance, difference, where
+            linear, reference, control_reference, disturbance, difference, where
         )
         steps = isinstance(preview, int | np.integer) and not isinstance(preview, bool)
         if not steps or preview < 0 or (preview and signals is None):
@@ -123,14 +131,14 @@ class LQR(AbstractController):
                 f"{where}: preview must be a number of steps, from 0, at which a "
                 f"reference or disturbance is looked up, got {shortened(preview)}."
             )
-        A, B = dynamics.A, dynamics.B
+        A, B = linear.A, linear.B
         A, B, Q, R, S, _ = riccati_arguments(where, A, B, Q, R, S, None, definite=False)
         solution = dare(A, B, Q, R, S)
         self.K, self.P = solution.K, solution.X
         if signals is None:
             self.feed_forward = None
         else:
-            B, P = dynamics.B, solution.X
+            B, P = linear.B, solution.X
             M = solve(jnp.asarray(R, P.dtype) + B.T @ P @ B, B.T)
             loop = solution.closed_loop
             self.feed_forward = Preview(signals, P, M, loop, int(preview))

@@ -11,12 +11,31 @@ from jaxtyping import Array
 
 from .._check import is_concrete
 from .._controller import AbstractController, wrong_observation
-from ..dynamics import LinearDynamics
+from .._message import shortened
+from ..dynamics import LinearDynamics, linearize, OperatingPoint
 from ..dynamics._trim import relative_drift
+from ..systems import LinearSystem
 
 
 _RESTS = 1e-4
-"""The share of the terms that move a state which may be left over at an equilibrium."""
+"""The share of the terms that move a state which may be left over at an equilibrium,
+which may be written in few digits."""
+
+
+def linear_at(
+    dynamics: Any, point: Any, difference: Any, where: str
+) -> tuple[Any, Callable[[Array, Array], Array] | None]:
+    """`dynamics` linearised at a point that is given, and how their states differ."""
+    if point is None:
+        return dynamics, difference
+    if not isinstance(point, OperatingPoint):
+        raise ValueError(
+            f"{where}: point must be an OperatingPoint (`delucax.trim` computes one), "
+            f"got {shortened(point)}."
+        )
+    if difference is None and not isinstance(dynamics, LinearDynamics | LinearSystem):
+        difference = getattr(dynamics, "difference", None)
+    return linearize(dynamics, x=point), difference
 
 
 def check_linear(dynamics: Any, where: str) -> None:
@@ -71,7 +90,7 @@ def path(dynamics: LinearDynamics, difference: Any, where: str) -> Array:
         return x_ref
     off = jax.vmap(lambda a, b: deviation(a, b, difference))(x_next[:-1], x_ref[1:])
     A, B, u_ref = (a[:-1] for a in (dynamics.A, dynamics.B, dynamics.u_ref))
-    moved = jnp.max(jax.vmap(_moved)(off, A, B, x_ref[:-1], u_ref))
+    moved = _moved(off, A, B, x_ref[:-1], u_ref)
     rule = f"{where}: dynamics must go from each operating point to the next"
     return _resting(x_ref, moved, rule, f"got x_ref {x_ref} and x_next {x_next}")
 
@@ -79,7 +98,7 @@ def path(dynamics: LinearDynamics, difference: Any, where: str) -> Array:
 @jax.jit
 def _moved(drift, A, B, x, u):
     """What moves the state, relative to the terms that do."""
-    J = jnp.concatenate([A - jnp.eye(A.shape[0], dtype=A.dtype), B], axis=1)
+    J = jnp.concatenate([A - jnp.eye(A.shape[-1], dtype=A.dtype), B], axis=-1)
     return relative_drift(drift, J, x, u)
 
 

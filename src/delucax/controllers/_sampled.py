@@ -9,9 +9,10 @@ import jax.scipy.linalg as jsl
 from jaxtyping import Array
 
 from .._check import as_matrix, check_positive, symmetric_matrix
-from ..dynamics import c2d, linearize
+from ..dynamics import c2d, linearize, OperatingPoint
 from ..systems import AbstractSystem, LinearSystem
 from ._lqr import LQR
+from ._operating_point import linear_at
 
 
 _MOST_DOUBLINGS = 20
@@ -104,6 +105,7 @@ def lqrd(
     S: Any = None,
     *,
     difference: Callable[[Array, Array], Array] | None = None,
+    point: OperatingPoint | None = None,
 ) -> LQR:
     """The sampled-data regulator of a continuous problem: of all controls held over
     each `dt` it minimises the integral over all time of
@@ -115,13 +117,15 @@ def lqrd(
     **Arguments:**
 
     - `system`: a linear system about an equilibrium, or any system, which is linearised
-        about the equilibrium it names.
+        at the `point`, or else about the equilibrium it names.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `dt`: the step, a positive number.
     - `S`: cross weight, shape `(n, m)`; zero by default.
     - `difference`: `(x, x_ref) -> deviation`; that of a system that is not linear by
         default.
+    - `point`: the [`delucax.dynamics.OperatingPoint`][] of [`delucax.trim`][] at which
+        `system` is linearised, at time 0.
 
     **Returns:** a [`delucax.controllers.LQR`][].
 
@@ -147,8 +151,9 @@ def lqrd(
             f"lqrd: system must be an AbstractSystem, got {type(system).__name__}; for "
             "dynamics in discrete time use `delucax.controllers.LQR`."
         )
-    linear = system if isinstance(system, LinearSystem) else linearize(system)
-    if difference is None and linear is not system:
-        difference = system.difference
+    linear, difference = linear_at(system, point, difference, "lqrd")
+    if not isinstance(linear, LinearSystem):
+        linear = linearize(system)
+        difference = system.difference if difference is None else difference
     Qd, Rd, Sd = sampled_weights(linear, Q, R, dt, S)
     return LQR(c2d(linear, dt), Qd, Rd, Sd, difference=difference)

@@ -10,12 +10,14 @@ import lineax as lx
 from jaxtyping import Array
 
 from .._check import as_vector, check_step
+from .._message import shortened
 from .._typing import RealScalar
 from ..systems import AbstractSystem, LinearSystem
 from ..systems._base import zeros_if_none
 from ._base import AbstractDynamics
 from ._discretized import evaluate_field
 from ._linear import LinearDynamics
+from ._operating_point import OperatingPoint
 
 
 @overload
@@ -39,7 +41,10 @@ def linearize(
     - `model`: an [`delucax.AbstractDynamics`][] or [`delucax.AbstractSystem`][].
     - `t`: time, 0 by default.
     - `x`, `u`: the state and control to linearise at; by default the `equilibrium` that
-        the model names. [`delucax.trim`][] computes one.
+        the model names. The [`delucax.dynamics.OperatingPoint`][] that
+        [`delucax.trim`][] computes stands as `x` for both. Any point will do: it is the
+        regulators which ask that the plant rests there, as
+        [`delucax.controllers.LQR`][] says.
 
     **Returns:** [`delucax.LinearDynamics`][] of dynamics, with the same `dt`;
     [`delucax.systems.LinearSystem`][] of a system. `E` is the derivative with respect
@@ -112,6 +117,13 @@ def linearize(
 
 def point_of(model: Any, x: Any, u: Any, where: str) -> tuple[Array, Array]:
     """The state and control that are given, or else those of the equilibrium."""
+    if isinstance(x, OperatingPoint):
+        if u is not None:
+            raise ValueError(
+                f"{where}: u must be left out where x is an OperatingPoint, which has "
+                f"its own, got {shortened(u)}."
+            )
+        x, u = x.x, x.u
     if x is None or u is None:
         x_rest, u_rest = model.equilibrium()
         x = x_rest if x is None else x

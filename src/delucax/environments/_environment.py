@@ -34,8 +34,9 @@ from .._typing import PRNGKey, RealScalar
 from ..costs import AbstractCost
 from ..costs._base import check_cost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
-from ..dynamics import AbstractDynamics
+from ..dynamics import AbstractDynamics, OperatingPoint, trim
 from ..dynamics._base import check_dynamics, check_increments
+from ..dynamics._operating_point import operating_point
 from ..math import clip
 
 
@@ -288,6 +289,38 @@ class Environment(eqx.Module):
                 f"{shape}."
             )
         return shape[0]
+
+    def trim(self, *, fix: Any = (), throw: bool = True) -> OperatingPoint:
+        """The operating point of the task: that of [`delucax.trim`][] from the targets
+        of its cost, where it is a [`delucax.costs.Quadratic`][] that names both, else
+        from the equilibrium of its dynamics, else from the targets and zeros.
+
+        **Arguments:** `fix`, `throw`: as in [`delucax.trim`][].
+
+        **Returns:** [`delucax.dynamics.OperatingPoint`][].
+
+        **Raises:** `ValueError` if neither cost nor dynamics name a point, and as
+        [`delucax.trim`][] does.
+
+        !!! example
+
+            ```python
+            import delucax as dlx
+            import jax.numpy as jnp
+
+            env = dlx.make("cstr", concentration=0.4)
+            Q, R = jnp.diag(jnp.array([10.0, 0.01])), 0.01 * jnp.eye(1)
+            dlx.controllers.LQR(env.dynamics, Q, R, point=env.trim(fix="concentration"))
+            ```
+        """
+        point = operating_point(self.dynamics, self.cost)
+        if point is None:
+            raise ValueError(
+                "Environment: trim needs a Quadratic cost or dynamics that name an "
+                "equilibrium; use `delucax.trim(env.dynamics, x=..., u=...)`."
+            )
+        x, u = point
+        return trim(self.dynamics, x=x, u=u, fix=fix, throw=throw)
 
     def reset(self, key: PRNGKey) -> Array:
         """A first state.

@@ -14,6 +14,7 @@ from .._message import shortened
 from .._typing import RealScalar
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
+from ..dynamics._operating_point import operating_point
 from ..math._linear_solve import is_definite
 from ..riccati import dare
 from ._problem import model, Problem, roll_out
@@ -134,26 +135,6 @@ def default_start(
     else:
         regulator = dare(*matrices, throw=False), posed
     return _both(point, regulator, controls, T)
-
-
-def operating_point(
-    dynamics: AbstractDynamics, cost: AbstractCost
-) -> tuple[Array, Array] | None:
-    """The state and control to regulate about, if cost or dynamics name them."""
-    n, m = dynamics.state_size, dynamics.control_size
-    targets = cost.targets
-    x, u = (None, None) if targets is None else targets
-    if x is None or u is None:
-        try:
-            x, u = dynamics.equilibrium()
-        except ValueError:
-            if targets is None:
-                return None
-            x = jnp.zeros(n) if x is None else x
-            u = jnp.zeros(m) if u is None else u
-    x, u = jnp.asarray(as_float_array(x)), jnp.asarray(as_float_array(u))
-    # What does not fit the dynamics is an error of the planner, not of its start.
-    return (x, u) if x.shape == (n,) and u.shape == (m,) else None
 
 
 def control_at_rest(dynamics: AbstractDynamics, cost: AbstractCost) -> Array:
