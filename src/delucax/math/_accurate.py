@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
-_MORE_DIGITS = 30
+_MORE_DIGITS = 18
 """Binary digits beyond those of the precision."""
 _SMALL = 8192
 """Up to here XLA compiles a sum of products as one kernel with all around it, and a
@@ -31,6 +31,11 @@ def product(
     bits = int((digits - math.log2(k)) / 2)
     count = -(-(digits + _MORE_DIGITS) // bits)
     both = jnp.concatenate([left, right.T])
+    # In units in which the k-th column and the k-th row are alike.
+    across, down = (jnp.max(jnp.abs(M), axis=0) for M in (both[:n], both[n:]))
+    unit = _power(jnp.sqrt(down) / jnp.sqrt(jnp.where(across > 0, across, 1)))
+    unit = jnp.where(unit > 0, unit, 1)
+    both *= jnp.where(np.arange(n + m)[:, None] < n, unit, 1 / unit)
     power = _power(jnp.max(jnp.abs(both), axis=1, keepdims=True))
     power = lax.max(power, jnp.finfo(dtype).tiny)
     # Entries as multiples of ever smaller steps, and what each adds to the last.
