@@ -156,7 +156,7 @@ def _find(A, B, Q, R, S, E) -> Found:
         q, r, s, size_Q = weights(kind, Q, R, S)
         X, size_G, iterations = _start(plain_A, plain_B, q, r, s, kind == SECOND)
         X, left = polish(
-            lambda X: riccati_residual(False, A, B, q, r, s, E, X),
+            lambda *at: riccati_residual(False, A, B, q, r, s, E, *at),
             lambda loop, error: outside(E, lyapunov(loop, error)),
             outside(E, X),
         )
@@ -166,7 +166,7 @@ def _find(A, B, Q, R, S, E) -> Found:
         reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
         return Attempt(
             X=X,
-            residual=left.relative,
+            residual=left.bound,
             bound=abscissa,
             gap=-abscissa,
             rounding=rounding,

@@ -79,15 +79,18 @@ def continuous_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     S = jnp.zeros_like(both)
 
     def equation(X):
-        left = riccati_residual(False, A, both, Q, weight, S, None, X, D.shape[1])
-        return left.error, left.closed_loop, left.K, left.relative
+        left = riccati_residual(
+            False, A, both, Q, weight, S, None, X, False, D.shape[1]
+        )
+        return left.error, left.closed_loop, left.K, left
 
-    X, _, loop, K, residual = polish(X0 + unit * J, equation, even_lyapunov, size)
+    X, _, loop, K, left = polish(X0 + unit * J, equation, even_lyapunov, size)
     slack = n * jnp.finfo(A.dtype).eps * jnp.linalg.norm(A)
     loops = jnp.stack([loop, A - B @ K[:m]])
     holds = is_semidefinite(X) & is_clearly_definite(R)
     holds &= jnp.all(jax.vmap(spectral_abscissa)(loops) < -slack)
-    return Game(X, residual, holds, residual < rounding(n, A.dtype), iterations)
+    solved = left.relative < rounding(n, A.dtype)
+    return Game(X, left.bound, holds, solved, iterations)
 
 
 @jax.custom_jvp

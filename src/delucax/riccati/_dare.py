@@ -153,7 +153,7 @@ def _find(A, B, Q, R, S, E) -> Found:
         height = size_Q * jnp.where(kind == SECOND, _SECOND_START, 1)
         X, iterations = _start(plain_A, plain_B, q, r, s, height)
         X, left = polish(
-            lambda X: riccati_residual(True, A, B, q, r, s, E, X),
+            lambda *at: riccati_residual(True, A, B, q, r, s, E, *at),
             lambda loop, error: outside(E, stein(loop, error)),
             outside(E, X),
         )
@@ -162,7 +162,7 @@ def _find(A, B, Q, R, S, E) -> Found:
         gap = jnp.where(_is_semidefinite(r + B.T @ X @ B), 1 - radius, -jnp.inf)
         return Attempt(
             X=X,
-            residual=left.relative,
+            residual=left.bound,
             bound=radius,
             gap=gap,
             rounding=jnp.asarray(n * eps, dtype),

@@ -64,18 +64,17 @@ def discrete_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     J, iterations = double((A - both @ K, G, J), X0)
 
     def equation(X):
-        left = riccati_residual(True, A, both, Q, weight, S, None, X, D.shape[1])
-        return left.error, left.closed_loop, left.K, left.relative
+        left = riccati_residual(True, A, both, Q, weight, S, None, X, False, D.shape[1])
+        return left.error, left.closed_loop, left.K, left
 
-    X, _, loop, K, residual = polish(
-        X0 + J, equation, lambda _, *linear: stein(*linear)
-    )
+    X, _, loop, K, left = polish(X0 + J, equation, lambda _, *linear: stein(*linear))
     pivot = symmetric(weight + both.T @ X @ both)
     bound = 1 - n * jnp.finfo(A.dtype).eps
     loops = jnp.stack([loop, A - B @ K[:m]])
     holds = is_semidefinite(X) & is_saddle(pivot, D.shape[1])
     holds &= jnp.all(jax.vmap(spectral_radius)(loops) < bound)
-    return Game(X, residual, holds, residual < rounding(n, A.dtype), iterations)
+    solved = left.relative < rounding(n, A.dtype)
+    return Game(X, left.bound, holds, solved, iterations)
 
 
 def double(element, X0):
@@ -111,9 +110,9 @@ def double(element, X0):
 def polish(X: Array, equation: Callable, correction: Callable, unit: Array | float = 1):
     """Newton steps for as long as they bring `X` closer; and the equation there.
 
-    `equation(X)` is its error, the closed loop, the gains and the residual, and
-    `correction(X, loop, error)` the solution of its linearisation. `unit` is the size
-    of error over `X`.
+    `equation(X)` is its error, the closed loop, the gains and all about what is left,
+    and `correction(X, loop, error)` the solution of its linearisation. `unit` is the
+    size of error over `X`.
     """
     small = unit * X.shape[0] * jnp.finfo(X.dtype).eps
 
@@ -133,7 +132,7 @@ def polish(X: Array, equation: Callable, correction: Callable, unit: Array | flo
         return new, jnp.where(better, found, 0), k + 1
 
     unknown = jax.eval_shape(equation, X)
-    nothing = (jnp.zeros(s.shape, s.dtype) for s in unknown)
+    nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), unknown)
     start = ((X, *nothing), jnp.asarray(jnp.inf, X.dtype), jnp.asarray(0))
     return lax.while_loop(more, body, start)[0]
 

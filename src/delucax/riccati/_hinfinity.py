@@ -44,7 +44,7 @@ class GameSolution(eqx.Module):
     - `L`: the gain of the worst disturbance `w = L x`, shape `(k, n)`.
     - `gamma`: the level that is attained.
     - `residual`: the norm of the equation's residual over the sum of the norms of its
-        terms, from above: rounding in its own evaluation is counted.
+        terms: an upper bound, with rounding of its own evaluation counted.
     - `closed_loop`: the matrix `A - B K`, shape `(n, n)`.
     - `spectral_radius`: an upper bound on that of `closed_loop`, close to it.
     - `iterations`: doublings taken at `gamma`.
@@ -87,7 +87,7 @@ class ContinuousGameSolution(eqx.Module):
     - `L`: the gain of the worst disturbance `w = L x`, shape `(k, n)`.
     - `gamma`: the level that is attained.
     - `residual`: the norm of the equation's residual over the sum of the norms of its
-        terms, from above: rounding in its own evaluation is counted.
+        terms: an upper bound, with rounding of its own evaluation counted.
     - `closed_loop`: the matrix `A - B K`, shape `(n, n)`.
     - `spectral_abscissa`: the largest real part of its eigenvalues, up to rounding.
     - `iterations`: doublings taken at `gamma`.

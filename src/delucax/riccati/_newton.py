@@ -10,7 +10,7 @@ from jaxtyping import Array
 from ..math._linear_solve import no_tangent, solve, symmetric
 from ..math._size import size
 from ._residual import Residual
-from ._search import Found
+from ._search import Found, tolerance
 
 
 _NEWTON_STEPS = 8
@@ -19,46 +19,56 @@ _FINE = 64
 
 
 def polish(
-    residual: Callable[[Array], Residual],
+    residual: Callable[[Array, Array], Residual],
     correction: Callable[[Array, Array], Array],
     X: Array,
 ) -> tuple[Array, Residual]:
     """Newton steps on the equation itself, if it asks for them, while they help.
 
-    `correction(closed_loop, error)` solves the equation to first order. Returns `X`
-    and what is left there.
+    `residual(X, accurately)` is what is left of it, and `correction(closed_loop,
+    error)` solves it to first order. Where rounding may hide more than there is to be
+    left, the steps go on with accurate residuals. Returns `X` and what is left there.
     """
-    fine = _FINE * jnp.finfo(X.dtype).eps
+    eps = float(jnp.finfo(X.dtype).eps)
+    fine = _FINE * eps
+    wide = tolerance(X.dtype)
 
     def more(carry):
-        *_, going, k = carry
-        return (k <= _NEWTON_STEPS) & going
+        return carry[3]
 
     def body(carry):
-        X, now, _, k = carry
-        candidate = symmetric(X + step(now, k > 0))
-        new = residual(candidate)
-        better = (new.relative < now.relative) | (k == 0)
+        X, now, accurately, going, k = carry
+        first = k == 0
+        candidate = symmetric(X + step(now, going & ~first))
+        new = residual(candidate, going & accurately)
+        better = first | (new.relative < now.relative)
         # Where steps stop to help much, rounding is all that is left.
-        going = (new.relative < now.relative / 4) & (new.relative > fine)
+        helped = first | (new.relative < now.relative / 4)
+        again = helped & (new.relative > fine) & (k < _NEWTON_STEPS)
         X, now = jax.tree.map(
             lambda a, b: jnp.where(better, a, b), (candidate, new), (X, now)
         )
-        return X, now, going, k + 1
+        hidden = ~again & ~accurately & (now.bound > wide)
+        k = jnp.where(hidden, 0, k + 1)
+        return X, now, accurately | hidden, again | hidden, k
 
     def step(now, needed):
-        """The correction, zero in the first round, which only measures. A loop of one
-        round is not run for a batch in which no member needs it."""
-        once = lambda carry: (jnp.zeros_like(needed), correction(*carry[2]), carry[2])
+        """The correction. A loop of one round is not run for a batch in which no member
+        needs it, as in the first round, which only measures."""
+
+        def once(carry):
+            # What is carried changes, so that no work on it is moved ahead of the loop.
+            nothing = jnp.zeros_like(now.closed_loop), jnp.zeros_like(now.error)
+            return jnp.zeros_like(needed), correction(*carry[2]), nothing
+
         start = needed, jnp.zeros_like(X), (now.closed_loop, now.error)
         return lax.while_loop(lambda carry: carry[0], once, start)[1]
 
+    no, yes = jnp.asarray(False), jnp.asarray(True)
     unknown = jax.tree.map(
-        lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(residual, X)
+        lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(residual, X, no)
     )
-    unknown = unknown._replace(relative=jnp.asarray(jnp.inf, X.dtype))
-    start = (X, unknown, jnp.asarray(True), jnp.asarray(0))
-    X, now, *_ = lax.while_loop(more, body, start)
+    X, now, *_ = lax.while_loop(more, body, (X, unknown, no, yes, jnp.asarray(0)))
     return X, now
 
 

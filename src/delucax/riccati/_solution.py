@@ -18,7 +18,7 @@ class RiccatiSolution(eqx.Module):
     - `K`: the gain of `u = -K x`, shape `(m, n)`; of a filter that of
         `K (y - C x)`, shape `(n, p)`.
     - `residual`: the norm of the equation's residual over the sum of the norms of its
-        terms, from above: rounding in its own evaluation is counted.
+        terms: an upper bound, with rounding of its own evaluation counted.
     - `closed_loop`: the matrix of `x_next = closed_loop x` (of
         `dx/dt = closed_loop x`), shape `(n, n)`.
     - `spectral_radius`: in discrete time, that of `closed_loop`, to about eight digits
