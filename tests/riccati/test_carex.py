@@ -26,6 +26,9 @@ def exam(name, *problem):
     solution = solve(A, B, Q, R)
     X = np.asarray(solution.X)
     residual, loop = riccati_systems.continuous_residual(A, B, Q, R, X)
+    if len(A) < 10:
+        # Where R is of high condition, double precision does not measure it.
+        residual = riccati_systems.true_residual(False, A, B, Q, R, X)
     assert residual < 1e-12 and solution.residual < 1e-12, name
     if name == "CAREX 11":
         # X = [[2, 1], [1, 1]], whose loop has the eigenvalues +-i.

@@ -1,6 +1,8 @@
 """Products of matrices in more digits than their precision has."""
 
+import functools
 import math
+import operator
 
 import jax.lax as lax
 import jax.numpy as jnp
@@ -56,7 +58,8 @@ def product(
     else:
         pairs = rows @ columns.T
     pairs = pairs.reshape(count, n, count, m)
-    total = sum(pairs[i, :, j] for i, j in sorted(np.ndindex(count, count), key=sum))
+    order = sorted(np.ndindex(count, count), key=sum)
+    total = functools.reduce(operator.add, (pairs[i, :, j] for i, j in order))
     lost = 16 * k * 0.5 ** (count * bits) * power[:n] * power[n:].T
     return total, lost + count**2 * jnp.finfo(dtype).eps * jnp.abs(total)
 
