@@ -111,6 +111,7 @@ def in_single(solver: Callable, measure: Callable, *data) -> dict[str, Any]:
 
 def examine(name: str, continuous: bool, *data: np.ndarray) -> dict[str, Any]:
     """One row of the table."""
+    print(f"{name}, {len(data[0])} states", file=sys.stderr, flush=True)
     if continuous:
         ours, theirs = dlx.riccati.care, scipy.linalg.solve_continuous_are
         measure = riccati_systems.continuous_residual

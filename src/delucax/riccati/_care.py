@@ -10,10 +10,10 @@ import lineax as lx
 
 from ..math._linear_solve import full_precision, is_definite, solve, symmetric
 from ..math._size import size
-from ._arguments import complex_form, is_complex, real_form, riccati_arguments
+from ._arguments import riccati_arguments
 from ._dare import double
 from ._lyapunov import lyapunov
-from ._newton import attainable, found_tangent, outside, polish, settled
+from ._newton import attainable, found_tangent, outside, polish, settled, solution_of
 from ._residual import riccati_residual
 from ._search import Attempt, Found, search, SECOND, verdict, weights
 from ._solution import checked, RiccatiSolution
@@ -94,13 +94,7 @@ def care(
 
 def continuous_solution(A, B, Q, R, S, E) -> RiccatiSolution:
     """The solution of the equation with checked arguments."""
-    arguments = A, B, Q, R, S, E
-    if not is_complex(*arguments):
-        return _solution(*arguments)
-    found = _solution(*jax.tree.map(real_form, arguments))
-    return eqx.tree_at(
-        lambda s: (s.X, s.K, s.closed_loop), found, replace_fn=complex_form
-    )
+    return solution_of(_solution, False, A, B, Q, R, S, E)
 
 
 @eqx.filter_jit

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from ..math._linear_solve import full_precision, is_definite, solve, symmetric
 from ..math._size import size
-from ._arguments import complex_form, is_complex, real_form, riccati_arguments
-from ._newton import attainable, found_tangent, outside, polish, settled
+from ._arguments import riccati_arguments
+from ._newton import attainable, found_tangent, outside, polish, settled, solution_of
 from ._residual import riccati_residual
 from ._search import Attempt, Found, search, SECOND, verdict, weights
 from ._solution import checked, RiccatiSolution
@@ -92,13 +92,7 @@ def dare(
 
 def discrete_solution(A, B, Q, R, S, E) -> RiccatiSolution:
     """The solution of the equation with checked arguments."""
-    arguments = A, B, Q, R, S, E
-    if not is_complex(*arguments):
-        return _solution(*arguments)
-    found = _solution(*jax.tree.map(real_form, arguments))
-    return eqx.tree_at(
-        lambda s: (s.X, s.K, s.closed_loop), found, replace_fn=complex_form
-    )
+    return solution_of(_solution, True, A, B, Q, R, S, E)
 
 
 @eqx.filter_jit

@@ -1,16 +1,19 @@
-"""What both Riccati equations share: Newton steps, and derivatives."""
+"""What both Riccati equations share: Newton steps, derivatives, complex data."""
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..math._linear_solve import no_tangent, solve, symmetric
+from ..math._linear_solve import full_precision, no_tangent, solve, symmetric
 from ..math._size import size
-from ._residual import Residual
+from ._arguments import complex_form, is_complex, real_form
+from ._residual import Residual, riccati_residual
 from ._search import Found, tolerance
+from ._solution import RiccatiSolution
 
 
 _NEWTON_STEPS = 8
@@ -134,3 +137,27 @@ def settled(ok: Array, terms: Callable, *data) -> tuple[Array, Array]:
 def outside(E: Array | None, Y: Array) -> Array:
     """The `X` of `Y = E'XE`."""
     return Y if E is None else symmetric(solve(E.T, solve(E.T, Y).T))
+
+
+def solution_of(
+    solve: Callable, discrete: bool, *data: Array | None
+) -> RiccatiSolution:
+    """The solution of an equation with checked data, complex ones in real form."""
+    if not is_complex(*data):
+        return solve(*data)
+    data = jax.tree.map(real_form, data)
+    return _as_complex(solve(*data), discrete, data)
+
+
+@eqx.filter_jit
+@full_precision
+def _as_complex(found: RiccatiSolution, discrete: bool, data: tuple):
+    """A solution in complex form, for which the residual is bounded once more: rounding
+    may have left an X that is no real form."""
+    found = eqx.tree_at(
+        lambda s: (s.X, s.K, s.closed_loop), found, replace_fn=complex_form
+    )
+    A, B, Q, R, S, E, X = lax.stop_gradient((*data, real_form(found.X)))
+    bound = riccati_residual(discrete, A, B, Q, R, S, E, X, True).bound
+    bound = jnp.where(jnp.isfinite(bound), bound, found.residual)
+    return eqx.tree_at(lambda s: s.residual, found, bound)
