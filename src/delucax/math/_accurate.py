@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
-_MORE_DIGITS = 18
+_MORE_DIGITS = 30
 """Binary digits beyond those of the precision."""
 _SMALL = 8192
 """Up to here XLA compiles a sum of products as one kernel with all around it, and a
