@@ -191,12 +191,30 @@ def adjoint(M):
 
 
 def product(M, N):
-    """Of matrices of objects, in which many entries may be zero."""
-    out = np.full((len(M), N.shape[1]), mpmath.mpf(0), object)
-    for i, row in enumerate(M):
-        for k in np.flatnonzero(row):
-            out[i] += row[k] * N[k]
-    return out
+    """Of matrices of objects, as whole numbers of a small unit, which are fast."""
+    (M, unit_M), (N, unit_N) = whole(M), whole(N)
+    sums = lambda A, B: np.array([row[row != 0] @ B[row != 0] for row in A], object)
+    back = np.frompyfunc(lambda k: mpmath.ldexp(int(k), unit_M + unit_N), 1, 1)
+    if len(M) == len(N) == 1:
+        return back(sums(M[0], N[0]))
+    (a, b), (c, d) = (*M, 0 * M[0])[:2], (*N, 0 * N[0])[:2]
+    both = np.frompyfunc(mpmath.mpc, 2, 1)
+    return both(
+        back(sums(a, c) - sums(b, d)),
+        back(sums(a, d) + sums(b, c)),
+    )
+
+
+def whole(M):
+    """The parts of a matrix in units of `2^k`, `DIGITS` and more below its largest
+    entry; and `k`."""
+    parts = [M]
+    if any(isinstance(entry, mpmath.mpc) for entry in M.ravel()):
+        parts = [np.frompyfunc(part, 1, 1)(M) for part in (mpmath.re, mpmath.im)]
+    largest = max(abs(entry) for part in parts for entry in part.ravel())
+    k = int(mpmath.frexp(largest)[1]) - 5 * DIGITS
+    units = np.frompyfunc(lambda entry: int(mpmath.nint(mpmath.ldexp(entry, -k))), 1, 1)
+    return [units(part) for part in parts], k
 
 
 def quotient(M, N):
