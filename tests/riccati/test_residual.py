@@ -132,7 +132,7 @@ def test_games(name):
 
 
 def systems():
-    """The published ones, in this precision; CAREX 20 compiles for long."""
+    """The published ones, in this precision; CAREX 20 takes minutes."""
     for name, *data in riccati_systems.carex() + riccati_systems.darex():
         complex_data = any(map(np.iscomplexobj, data))
         if name == "CAREX 20" or complex_data and dtype() != jnp.float64:
