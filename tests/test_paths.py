@@ -109,10 +109,9 @@ def test_what_the_constructor_refuses(make, changes, match):
         (lambda: dlx.environments.UniformState([0.0], [1.0]), {"low": 2, "high": 3}),
         (split, {"gains.0.a": 0.4, "gains.1.a": 0.3}),
         (split, {"gains.0.a": 0.4, "base": dlx.controllers.Linear([[1.0]]),
-            "base.K": [[2.0, 2.0]], "gains.1.a": 0.3}),
+            "gains.1.a": 0.3}),
         (task, {"control_bounds.0": 5.0, "control_bounds.1": 6.0}),
         (task, {"control_bounds": None}),
-        (task, {"disturbance": d.Gaussian(0.1, size=2), "disturbance.std": 0.2}),
         (task, {
             "initial_state": np.ones(3),
             "dynamics": plant(3),
@@ -126,8 +125,6 @@ def test_changes_that_fit_together(make, changes):
     """In any order, though values between may not be legal."""
     forwards = dlx.replace(make(), changes)
     assert jax.tree.structure(forwards) is not None
-    if any(a in b for a in changes for b in changes if a != b):
-        return
     backwards = dlx.replace(make(), dict(reversed(changes.items())))
     assert eqx.tree_equal(forwards, backwards)
 
@@ -259,8 +256,8 @@ def test_a_batch_of_modules(key):
     doubled = dlx.replace(scheduled, {"controllers.K": 2 * jnp.ones((5, 1, 2))})
     assert_close(doubled.controllers.K, 2.0)
     with user_error(match="arrays with one leading axis"):
-        dlx.replace(scheduled, {"controllers": dlx.controllers.Linear([[1.0, 2.0]]),
-                                "controllers.K": jnp.ones(())})  # fmt: skip
+        scalar = eqx.tree_at(lambda c: c.K, doubled.controllers, jnp.ones(()))
+        dlx.replace(scheduled, {"controllers": scalar})
 
 
 @once
@@ -300,3 +297,26 @@ def test_bounds_become_arrays():
     assert wide.loops == 2 and wide.init().integral.shape == (2,)
     with user_error(match="one entry a loop"):
         dlx.replace(wide, {"ki": [1.0, 2.0, 3.0]})
+
+
+@once
+@pytest.mark.parametrize(
+    "changes, match",
+    [
+        (
+            {"dynamics.A": 2 * A, "dynamics": plant()},
+            "paths must not overlap, got 'dynamics' and 'dynamics.A'",
+        ),
+        (
+            {"dynamics": plant(), "dynamics.A": 2 * A},
+            "paths must not overlap, got 'dynamics' and 'dynamics.A'",
+        ),
+        ({3: 1.0}, "a path must be a string.*got 3"),
+        ({None: 1.0}, "a path must be a string.*got None"),
+    ],
+)
+def test_paths_that_cannot_be(changes, match, key):
+    with user_error(match=f"replace: {match}"):
+        dlx.replace(task(), changes)
+    with user_error(match=f"randomise: {match}"):
+        dlx.randomise(task(), key, changes)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from ._fields import check_parameters
+from ._message import shortened
 from ._typing import PRNGKey, RealScalar
 
 
@@ -172,6 +173,9 @@ class Tally(eqx.Module):
             )
         self.name = name
         self.count = jnp.zeros((), jnp.int32)
+
+    def __repr__(self):
+        return f"Tally({self.name!r}, count={shortened(self.count)})"
 
     def add(self, happened: Array) -> "Tally":
         """The tally, one higher if something happened.

@@ -18,6 +18,7 @@ from ._fields import (
     converter_of,
     is_static,
 )
+from ._message import shortened
 
 
 _T = TypeVar("_T")
@@ -85,8 +86,8 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
 
     **Returns:** the copy.
 
-    **Raises:** `ValueError` if a path is not in the tree, or if the values are not
-    legal where they go.
+    **Raises:** `ValueError` if a path is not in the tree or is part of another one, or
+    if the values are not legal where they go.
 
     !!! example
 
@@ -102,6 +103,7 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
             "replace: changes must be a dictionary from paths to values, such as "
             f"{{'dynamics.system.length': 1.2}}, got {changes!r}."
         )
+    check_paths(changes, "replace")
     changed = tree
     for path, value in changes.items():
         changed = _with(changed, path, value)
@@ -110,6 +112,24 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
         changed = _followed(changed, path, before, changes)
         _check(get_path(changed, path), before)
     return changed
+
+
+def check_paths(changes: Mapping[Any, Any], where: str) -> None:
+    """Raise unless the keys are paths, of which none goes through another."""
+    for path in changes:
+        if not isinstance(path, str):
+            raise ValueError(
+                f"{where}: a path must be a string such as 'dynamics.system.length', "
+                f"got {shortened(path)}."
+            )
+        parts = path.split(".")
+        for end in range(1, len(parts)):
+            above = ".".join(parts[:end])
+            if above in changes:
+                raise ValueError(
+                    f"{where}: paths must not overlap, got {above!r} and {path!r}, "
+                    "which is part of it; put the one into the value of the other."
+                )
 
 
 def _with(tree: Any, path: str, value: Any) -> Any:

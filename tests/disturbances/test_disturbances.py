@@ -113,6 +113,34 @@ def test_recorded_steps():
     assert ALL["gaussian"].recorded_steps is None
 
 
+class Half(d.AbstractDisturbance):
+    """A wrapper that forwards nothing."""
+
+    inside: d.AbstractDisturbance
+
+    @property
+    def size(self):
+        return self.inside.size
+
+    def sequence(self, key, times):
+        return self.inside.sequence(key, times) / 2
+
+
+@once
+def test_a_wrapper_need_not_forward_the_recorded_steps(key):
+    half = Half(d.FromArray(jnp.ones((1, 1))))
+    assert half.recorded_steps == 1
+    assert Half(d.Gaussian(0.1, size=1)).recorded_steps is None
+    dynamics = dlx.LinearDynamics(jnp.eye(1), jnp.ones((1, 1)), dt=0.1)
+    cost = dlx.costs.Quadratic([1.0], [1.0])
+    env = dlx.Environment(dynamics, cost, half, sensor_noise=half, horizon=1)
+    run = dlx.rollout(env, dlx.controllers.Zero(1), key=key)
+    assert run.observations == 0.5 and run.final_state == 0.5
+    theirs = dlx.interop.gymnax.to_gymnax(env)
+    observation, _ = theirs.reset(key, theirs.default_params)
+    assert_close(observation, [0.5])
+
+
 @once
 def test_sum_draws_each_with_its_own_key(key):
     one = d.Gaussian(1.0, size=1)

@@ -247,6 +247,11 @@ FLOW = dlx.systems.LinearSystem(jnp.eye(1), jnp.eye(1))
         ("reacher", dict(goal=[1.0, np.nan]), "goal must be finite"),
         ("two_tank", dict(level=-1.0), "level must be at least 0"),
         ("cstr", dict(concentration=-0.1), "concentration must be positive"),
+        (
+            "cstr",
+            dict(concentration=2.0),
+            "concentration must be above 0 and below feed_concentration, 1.0, got 2.0",
+        ),
         ("lorenz", dict(max_control=-1.0), "max_control must be at least 0"),
         ("quadrotor", dict(inputs="motors"), "inputs must be 'rotors' or 'wrench'"),
         ("neural", {}, "give a system, or a key .* got neither"),

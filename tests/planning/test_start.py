@@ -176,7 +176,35 @@ def test_the_operating_point(monkeypatch):
     moving = dlx.costs.Tracking(*weights, lambda t: jnp.ones(2) * t)
     for nowhere in (effort, moving):
         start = default(bare, nowhere, 5)
-        assert start.gains is None and jnp.all(start.controls == 0)
+        assert jnp.all(start.states == 0) and jnp.all(start.gains[0] != 0)
+
+
+def test_an_unstable_plant_that_nothing_names_a_point_of():
+    """From zero control alone the plan ends in a minimum at a cost of 259."""
+
+    def thrust(t, x, u, w):
+        return jnp.stack([x[1], 30 * jnp.sin(x[0]) + u[0]])
+
+    dynamics = dlx.Discretized(dlx.system(thrust, states=2, controls=1), dt=0.05)
+    stage = lambda t, x, u: x[0] ** 2 + 0.1 * x[1] ** 2 + 0.001 * u[0] ** 2
+    for cost in (
+        dlx.costs.Function(stage),
+        dlx.costs.Quadratic([1.0, 0.1], [0.001]),
+    ):
+        plan = ilqr(dynamics, cost, jnp.array([0.3, 0.0]), 60, bounds=(-15.0, 15.0))
+        assert_close(plan.cost, 1.300551, rtol=1e-4)
+    # It is a start, not a name.
+    with user_error(match="Environment: trim needs"):
+        dlx.Environment(dynamics, dlx.costs.Function(stage)).trim()
+
+
+def test_no_regulator_where_the_origin_is_singular():
+    dynamics = dlx.Discretized(
+        dlx.system(lambda t, x, u, w: x / jnp.abs(x) + u, states=1, controls=1), dt=0.1
+    )
+    cost = dlx.costs.Function(lambda t, x, u: x @ x + u @ u)
+    start = dlx.planning.default_start(dynamics, cost, 5)
+    assert jnp.all(start.gains == 0) and jnp.all(start.controls == 0)
 
 
 def test_without_a_regulator_the_control_is_held():
@@ -244,3 +272,7 @@ def test_bad_starts():
         ilqr(UNSTABLE, CHEAP, x0, law(1.0), states=jnp.zeros((9, 1)))
     with user_error(match="horizon must be a whole number"):
         dlx.planning.default_start(UNSTABLE, CHEAP, 2.0)
+    with user_error(match="default_start: dynamics must be an AbstractDynamics"):
+        dlx.planning.default_start(3, CHEAP, 5)
+    with user_error(match="default_start: cost must be an AbstractCost"):
+        dlx.planning.default_start(UNSTABLE, 3, 5)

@@ -99,6 +99,18 @@ def test_states_that_are_well_made(run):
             ),
             "controller_or_controls must be finite",
         ),
+        (
+            lambda: dlx.rollout(
+                dlx.make("pendulum"), FEEDBACK, key=jax.random.key(0), throw="no"
+            ),
+            "rollout: throw must be True or False, got 'no'",
+        ),
+        (
+            lambda: dlx.simulate(
+                PENDULUM, np.zeros((3, 1)), 0.0, 0.3, jnp.zeros(2), throw="no"
+            ),
+            "simulate: throw must be True or False, got 'no'",
+        ),
     ],
 )
 def test_bad_input(run, match):

@@ -76,6 +76,7 @@ def test_a_failed_plan_is_a_status_and_no_error(key):
     env = dlx.make("pendulum", horizon=40)
     run = dlx.rollout(env, Cautious("failed_plan"), key=key, x0=UPRIGHT)
     assert run.result == dlx.RESULTS.plan_failed and not run.failed
+    assert run.statistics()["successful"] == 1
     assert "plan" in run.summary()["result"][0]
     for k, failed in enumerate(run.incidents["failed_plan"]):
         kind = dlx.RESULTS.plan_failed if failed else dlx.RESULTS.successful
@@ -85,6 +86,15 @@ def test_a_failed_plan_is_a_status_and_no_error(key):
 def test_a_name_of_the_rollout_is_taken():
     with user_error(match="clipped_control"):
         dlx.controllers.Tally("clipped_control")
+
+
+def test_a_tally_shows_its_count():
+    tally, shown = dlx.controllers.Tally("failed_plan"), []
+    assert repr(tally.add(jnp.array(True))) == "Tally('failed_plan', count=1)"
+    add = jax.vmap(lambda happened: tally.add(happened))
+    assert repr(add(jnp.array([True, False]))) == "Tally('failed_plan', count=[1 0])"
+    jax.jit(lambda tally: shown.append(repr(tally)))(tally)
+    assert "int32[]" in shown[0]
 
 
 def test_mpc_tells_of_its_plans(key):

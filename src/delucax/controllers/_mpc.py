@@ -86,11 +86,12 @@ class MPC(AbstractController):
     plan of [`delucax.planning.ilqr`][] without constraints costs at most as much as
     each of them. It is computed when the controller is made, about the point that
     [`delucax.planning.default_start`][] chooses: the targets of the cost, or the
-    equilibrium of the dynamics. There is no LQR, and an unstable plant needs a `start`,
-    where neither names one, as with [`delucax.costs.Function`][] or
-    [`delucax.costs.Tracking`][] over dynamics of your own; where the second derivative
-    of the cost with respect to the control is not positive definite; where no gain
-    stabilises the plant; and where the dynamics cannot be differentiated.
+    equilibrium of the dynamics, or zero where neither names one, as with
+    [`delucax.costs.Function`][] or [`delucax.costs.Tracking`][] over dynamics of your
+    own. An unstable plant needs a `start` where it is to be held far from that point,
+    and where there is no LQR: the second derivative of the cost with respect to the
+    control is not positive definite there, no gain stabilises the plant, or the
+    dynamics cannot be differentiated.
 
     What became of a plan is in the controller's state: `result`, and how often it was
     no success, `failures`, which are `incidents["failed_plan"]` of a rollout. A plan

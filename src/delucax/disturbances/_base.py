@@ -4,6 +4,7 @@ import abc
 from typing import Any, ClassVar, TYPE_CHECKING
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -42,8 +43,16 @@ class AbstractDisturbance(eqx.Module):
 
     @property
     def recorded_steps(self) -> int | None:
-        """The most steps that `sequence` gives; `None` (default) for any number."""
-        return None
+        """The most steps that `sequence` gives; `None` for any number.
+
+        By default those of the shortest disturbance among its fields.
+        """
+        is_part = lambda node: (
+            isinstance(node, AbstractDisturbance) and node is not self
+        )
+        nodes = jax.tree.leaves(self, is_leaf=is_part)
+        steps = [node.recorded_steps for node in nodes if is_part(node)]
+        return min((n for n in steps if n is not None), default=None)
 
     @abc.abstractmethod
     def sequence(self, key: PRNGKey | None, times: Array) -> Array:

@@ -50,12 +50,6 @@ class Sum(AbstractDisturbance):
         """The size that the terms share."""
         return self.terms[0].size
 
-    @property
-    def recorded_steps(self) -> int | None:
-        """Those of the shortest of its terms."""
-        steps = [term.recorded_steps for term in self.terms]
-        return min((n for n in steps if n is not None), default=None)
-
     def sequence(self, key, times):
         n = len(self.terms)
         if key is not None:
@@ -105,11 +99,6 @@ class Window(AbstractDisturbance):
     def size(self) -> int:
         """That of the disturbance inside."""
         return self.disturbance.size
-
-    @property
-    def recorded_steps(self) -> int | None:
-        """Those of the disturbance inside."""
-        return self.disturbance.recorded_steps
 
     def sequence(self, key, times):
         w = self.disturbance.sequence(key, times)

@@ -37,7 +37,7 @@ def open_loop(
     - `w`: disturbances, shape `(T, k)`; zero by default.
     - `t0`: the time of the first state, 0 by default.
 
-    **Returns:** the states, shape `(T + 1, n)`. Compiled at its door; differentiable
+    **Returns:** the states, shape `(T + 1, n)`. Already compiled; differentiable
     with respect to every array.
 
     **Raises:** `ValueError` on a wrong shape, and an error at run time if the solver

@@ -28,7 +28,7 @@ from .._fields import (
     parameter,
 )
 from .._message import shortened
-from .._paths import get_path, replace
+from .._paths import check_paths, get_path, replace
 from .._results import Result
 from .._typing import PRNGKey, RealScalar
 from ..costs import AbstractCost
@@ -450,8 +450,8 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
 
     **Returns:** the copy.
 
-    **Raises:** `ValueError` if a path is not there, or a range is not a pair or
-    function.
+    **Raises:** `ValueError` if a path is not there or is part of another one, or a
+    range is not a pair or function.
 
     !!! example
 
@@ -476,6 +476,7 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
             "randomise: ranges must be a dictionary from paths to ranges, such as "
             f"{{'dynamics.system.length': (0.8, 1.2)}}, got {ranges!r}."
         )
+    check_paths(ranges, "randomise")
     changes = {}
     for (path, given), one in zip(
         ranges.items(), jr.split(key, len(ranges)), strict=True

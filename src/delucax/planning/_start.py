@@ -13,7 +13,9 @@ from .._fields import as_float_array, parameter
 from .._message import shortened
 from .._typing import RealScalar
 from ..costs import AbstractCost
+from ..costs._base import check_cost
 from ..dynamics import AbstractDynamics
+from ..dynamics._base import check_dynamics
 from ..dynamics._operating_point import operating_point
 from ..math._linear_solve import is_definite
 from ..riccati import dare
@@ -81,17 +83,18 @@ def default_start(
 
     The operating point is the `targets` of the cost where they name both a state and a
     control. Otherwise it is the equilibrium that the dynamics name. Where they name
-    none, zeros stand in for the target that is missing. Such a point need not be an
-    equilibrium, and an LQR about it may be a poor start: name the control that holds
-    the state as well, which [`delucax.trim`][] finds. A [`delucax.costs.Quadratic`][]
-    has targets, and so has what is made of it by `+`, `*` or [`delucax.costs.Rate`][].
+    none, zeros stand in for the target that is missing, or for both. Such a point need
+    not be an equilibrium, and an LQR about it may be a poor start: name the state to
+    regulate to and the control that holds it, which [`delucax.trim`][] finds. A
+    [`delucax.costs.Quadratic`][] has targets, and so has what is made of it by `+`, `*`
+    or [`delucax.costs.Rate`][].
 
     The weights of the LQR are the second derivatives of the stage cost at that point.
 
-    No LQR is among the starts in two cases. Where neither cost nor dynamics name a
-    point, there is only one start, which holds zero. Where the second derivative of the
-    cost with respect to the control is not positive definite, or no gain stabilises the
-    plant, or the dynamics cannot be differentiated, the gain of the first one is zero.
+    The gain of the first start is zero, and no LQR is among them, where the derivatives
+    at that point are not finite, the second derivative of the cost with respect to the
+    control is not positive definite, no gain stabilises the plant, or the dynamics
+    cannot be differentiated.
 
     A trajectory that rests at the operating point is not among the starts, for it does
     not begin at the first state. The LQR leads there.
@@ -106,7 +109,8 @@ def default_start(
 
     **Returns:** a [`delucax.planning.Start`][]. No derivative goes through it.
 
-    **Raises:** `ValueError` on a horizon that is not a whole number of at least 1.
+    **Raises:** `ValueError` if `dynamics` or `cost` is not one, or the horizon is not a
+    whole number of at least 1.
 
     Source: Rawlings, Mayne and Diehl, 2017 (the regulator as a warm start).
 
@@ -120,12 +124,11 @@ def default_start(
         start.gains[0, 0]
         ```
     """
+    check_dynamics(dynamics, "default_start")
+    check_cost(cost, "cost", "default_start")
     T = check_count(horizon, "horizon", "default_start")
     dynamics, cost = (_constant(tree) for tree in (dynamics, cost))
-    point = operating_point(dynamics, cost)
-    if point is None:
-        zero = jnp.zeros((T, dynamics.control_size))
-        return Start(zero if controls is None else controls)
+    point = _point(dynamics, cost)
     try:
         t0 = jnp.asarray(t0, point[0].dtype)
         *matrices, posed = _expanded(dynamics, cost, *point, t0)
@@ -138,9 +141,14 @@ def default_start(
 
 
 def control_at_rest(dynamics: AbstractDynamics, cost: AbstractCost) -> Array:
-    """That of the operating point, or zero."""
-    point = operating_point(dynamics, cost)
-    return jnp.zeros(dynamics.control_size) if point is None else point[1]
+    """That of the operating point."""
+    return _point(dynamics, cost)[1]
+
+
+def _point(dynamics: AbstractDynamics, cost: AbstractCost) -> tuple[Array, Array]:
+    """The operating point, or zeros where neither names one."""
+    n, m = dynamics.state_size, dynamics.control_size
+    return operating_point(dynamics, cost) or (jnp.zeros(n), jnp.zeros(m))
 
 
 @eqx.filter_jit

@@ -10,7 +10,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
 
-from .._check import as_vector, check_count, check_finite, check_key
+from .._check import as_vector, check_bool, check_count, check_finite, check_key
 from .._components import by_components
 from .._controller import AbstractController, tallies
 from .._fields import as_float_array
@@ -61,7 +61,7 @@ def rollout(
     at `x_T` or on entering a terminated state, after which the state is held at no
     cost.
 
-    It is compiled at its door, as `diffrax.diffeqsolve` is: a second call with other
+    It is already compiled, as `diffrax.diffeqsolve` is: a second call with other
     numbers, another key or start does not compile again. A batch is `jax.vmap` of it.
     It is differentiable with respect to every array leaf of its arguments.
 
@@ -125,6 +125,7 @@ def rollout(
             f"{type(controller).__name__}."
         )
     check_key(key, where)
+    check_bool(throw, "throw", where)
     horizon = environment.horizon if horizon is None else horizon
     horizon = check_count(horizon, "horizon", where)
     if x0 is not None:

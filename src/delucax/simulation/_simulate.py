@@ -8,7 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_vector, check_count, check_finite, check_key, is_concrete
+from .._check import (
+    as_vector,
+    check_bool,
+    check_count,
+    check_finite,
+    check_key,
+    is_concrete,
+)
 from .._controller import AbstractController, tallies
 from .._results import choose, first_failure, RESULTS
 from .._typing import PRNGKey
@@ -79,7 +86,7 @@ def simulate(
     which is rounded to that of `t0`.
 
     There is no cost here: `costs` is `None`, and the trajectory's `final_cost` and
-    `total_cost` are zero. It is compiled at its door, as [`delucax.rollout`][] is.
+    `total_cost` are zero. It is already compiled, as [`delucax.rollout`][] is.
 
     **Arguments:**
 
@@ -164,6 +171,7 @@ def simulate(
     check_system(system, where)
     if hold not in ("zero", None):
         raise ValueError(f"{where}: hold must be 'zero' or None, got {hold!r}.")
+    check_bool(throw, "throw", where)
     x0 = as_vector(x0, system.state_size, "x0", where)
     check_finite(x0, "x0", where)
     if key is not None:

@@ -278,8 +278,8 @@ class Trajectory(eqx.Module):
         `"5%"`, `"25%"`, `"50%"`, `"75%"` and `"95%"` are quantiles of the total cost
         over the members whose cost is finite (NaN if there are none), `"mean"` is their
         mean; `"finite"` is the fraction of these members, `"successful"` that of the
-        members without a failure, and `"terminated"` that of the members whose episode
-        ended early. One trajectory is a batch of one. Works under `jax.jit`.
+        members that are not `failed`, and `"terminated"` that of the members whose
+        episode ended early. One trajectory is a batch of one. Works under `jax.jit`.
 
         **Returns:** a dictionary from these names to scalars.
 
@@ -303,7 +303,7 @@ class Trajectory(eqx.Module):
         return {f"{q}%": value for q, value in zip(levels, quantiles, strict=True)} | {
             "mean": jnp.nanmean(total),
             "finite": jnp.mean(finite),
-            "successful": jnp.mean(self.result == RESULTS.successful),
+            "successful": jnp.mean(~self.failed),
             "terminated": jnp.mean(self.ended),
         }
 

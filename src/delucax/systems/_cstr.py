@@ -3,9 +3,12 @@
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
+from .._check import is_concrete
 from .._fields import parameter, positive
+from .._message import shortened
 from ._base import AbstractSystem
 
 
@@ -82,9 +85,18 @@ class CSTR(AbstractSystem):
         [mol/l]; 0.5 by default.
 
         **Returns:** `(x, u)`.
+
+        **Raises:** `ValueError` if `concentration` is not between these.
         """
-        c = jnp.asarray(concentration, float)
-        reaction = self.flow * (self.feed_concentration - c)
+        c, feed = jnp.asarray(concentration, float), self.feed_concentration
+        if is_concrete(c) and is_concrete(feed):
+            at, most = np.asarray(c), np.asarray(feed)
+            if not np.all((at > 0) & (at < most)):
+                raise ValueError(
+                    "CSTR: concentration must be above 0 and below feed_concentration, "
+                    f"{shortened(most)}, got {shortened(at)}."
+                )
+        reaction = self.flow * (feed - c)
         T = self.activation / jnp.log(self.rate * c / reaction)
         warming = self.flow * (self.feed_temperature - T) + self.heat * reaction
         return jnp.stack([c, T]), jnp.stack([T - warming / self.cooling])

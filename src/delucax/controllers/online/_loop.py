@@ -156,7 +156,7 @@ class Loop(eqx.Module):
         return jnp.result_type(*arrays) if arrays else jnp.zeros(()).dtype
 
     def init(self, key: Any, horizon: int) -> LoopState:
-        """Before the first step; `horizon` is 0 for who does not ask what if."""
+        """Before the first step; `horizon` is 0 without counterfactuals."""
         dynamics, dtype = self.dynamics, self.dtype
         n, m = dynamics.state_size, dynamics.control_size
         p = dynamics.observation_size
