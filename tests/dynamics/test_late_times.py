@@ -212,10 +212,14 @@ def test_what_does_not_vary_with_time_costs_nothing():
         return len(jax.make_jaxpr(step)(0.0).eqns)
 
     def rows(t, x, u, w):
-        return dlx.references.Sequence(jnp.ones((3, 1)), 0.1)(t) + u - x
+        return dlx.references.Sequence(jnp.ones((3, 1)), jnp.asarray(0.1))(t) + u - x
 
     def ignored(t, x, u, w):
-        return dlx.references.Sequence(jnp.ones((3, 1)), 0.1)(0.0 * x[0]) + u - x
+        return (
+            dlx.references.Sequence(jnp.ones((3, 1)), jnp.asarray(0.1))(0.0 * x[0])
+            + u
+            - x
+        )
 
     make = functools.partial(dlx.system, states=1, controls=1)
     # Nothing but the product of the time with 0.
