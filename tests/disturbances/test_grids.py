@@ -155,6 +155,12 @@ def test_more_steps_than_single_precision_tells_apart():
         assert np.all(np.isnan(w))
 
 
+def test_late_brownian_increments_have_the_size_of_their_step(key):
+    late = 1000 + 1e-3 * jnp.arange(100)
+    known = d.Brownian(1, dt=1e-3).sequence(key, late)
+    np.testing.assert_allclose(d.Brownian(1).sequence(key, late), known, rtol=1e-3)
+
+
 @pytest.mark.parametrize("k", [0, 7])
 def test_a_rollout_meets_a_shock_of_whole_steps(k, key):
     dynamics = dlx.LinearDynamics(jnp.eye(1), jnp.eye(1), dt=0.02)

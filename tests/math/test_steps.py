@@ -54,6 +54,7 @@ def test_rows_outside_the_horizon_are_nan(name):
     assert np.all(np.isnan(before))
     after = at(0.1 * jnp.array([5.0, 9.0]))
     assert np.all(np.isnan(after)) != (name == "schedule")
+    assert np.all(np.isnan(at(jnp.full(1, jnp.nan))))
 
 
 @settings(max_examples=100, deadline=None)

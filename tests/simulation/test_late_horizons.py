@@ -34,11 +34,18 @@ def test_an_autonomous_solve_does_not_depend_on_the_start(how, source):
     assert runs[2].times[0] == 1e5
 
 
-def test_a_late_field_of_time():
-    ramp = dlx.system(lambda t, x, u, w: 1e-5 * t + u, states=1, controls=1)
-    t0, length = 1e5, 0.01
-    run = dlx.simulate(ramp, jnp.zeros((10, 1)), t0, t0 + length, X, **HOW["fixed"])
-    exact = 1 + 1e-5 * (t0 * length + length**2 / 2)
+@pytest.mark.parametrize("how", HOW)
+@pytest.mark.parametrize("source", ["field", "control"])
+def test_a_late_field_of_time(how, source):
+    wave = lambda t: jnp.sin(2 * t)  # noqa: E731
+    field, controls, given = (
+        (lambda t, x, u, w: wave(t) + u, jnp.zeros((10, 1)), {})
+        if source == "field"
+        else (lambda t, x, u, w: u, lambda t: wave(t)[None], dict(hold=None, dt=0.05))
+    )
+    system, t0, length = dlx.system(field, states=1, controls=1), 1e5, 0.5
+    run = dlx.simulate(system, controls, t0, t0 + length, X, **given, **HOW[how])
+    exact = 1 + (np.cos(2 * t0) - np.cos(2 * (t0 + length))) / 2
     assert_close(run.final_state, [exact], rtol=2e-6)  # the rounding of 20 steps
 
 

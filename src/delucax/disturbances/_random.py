@@ -12,6 +12,7 @@ from .._check import check_count, check_key, check_range, check_step
 from .._fields import parameter
 from ..math import clip
 from ..math._normal import normal
+from ..math._steps import step_between
 from ._base import AbstractDisturbance, check_common_size, common_size
 
 
@@ -161,7 +162,8 @@ class Brownian(AbstractDisturbance):
     - `substeps`: solver steps an interval, 1 by default; the increments of all of them
         follow one another in `w`.
 
-    **Raises:** `ValueError` if `dt` is not positive or `substeps` is below 1.
+    **Raises:** `ValueError` if `dt` is not positive or `substeps` is below 1, or if
+    `dt` is left out and the times are too late for their precision to tell it.
 
     !!! example
 
@@ -194,6 +196,6 @@ class Brownian(AbstractDisturbance):
                 f"Brownian: dt must be given for {times.shape[0]} times, which do not "
                 "tell it."
             )
-        dt = times[1] - times[0] if self.dt is None else self.dt
+        dt = step_between(times, "Brownian") if self.dt is None else self.dt
         e = normal(check_key(key, "Brownian"), (times.shape[0], self.size), times.dtype)
         return (jnp.sqrt(dt / self.substeps) * e).astype(times.dtype)

@@ -32,6 +32,7 @@ from ._solvers import (
     loud,
     outcome,
 )
+from ._start import Start
 
 
 _SDE_SOLVERS = (
@@ -58,10 +59,11 @@ class Discretized(AbstractDynamics):
     `diffrax.diffeqsolve`, whose gradient is taken as `adjoint` says.
 
     The interval is integrated in its own time, from 0, so that an autonomous step is
-    the same at any `t`. A field of time is evaluated at `t + s`, rounded by at most
-    half a unit in the last place (5e-4 at 1e4 in float32), which moves the next state
-    by at most `c dt |df/dt| ulp(t + dt) / 2` to first order in dt, c being the sum of
-    the absolute weights of the solver (1 for RK4, 7.6 for Tsit5).
+    the same at any `t`. A field of time, or a diffusion, is evaluated at `t + s`. Below
+    double precision that sum is rounded (by up to 5e-4 at 1e4 in float32), and the
+    field is then corrected by its first two derivatives with respect to time along the
+    rounding error. One that cannot be differentiated twice forwards (a
+    `jax.custom_vjp` of time) stays as it is at the rounded time.
 
     If the system has a `diffusion`, then `w` holds the Brownian increments of the
     substeps one after the other, each with variance `dt / substeps`, and the solver is
@@ -249,7 +251,9 @@ class Discretized(AbstractDynamics):
             held, added = None, w
 
         # An interval is integrated from 0 to dt: where t is large, t + dt is rounded.
-        args = (system, jnp.asarray(t, x.dtype), u, held)
+        t = jnp.asarray(t, x.dtype)
+        start = Start(t, lambda t: evaluate_field(system, t, x, u, held))
+        args = (system, start, u, held)
         if self.is_stochastic:
             x_next, result = self._noisy(x, args, w)
         elif self.stepsize_controller is not None:
@@ -278,10 +282,11 @@ class Discretized(AbstractDynamics):
         increments = zeros_if_none(w, self.disturbance_size, x)
         increments = increments.reshape(self.substeps, -1)
         h = self.dt / self.substeps
-        system, t, u, _ = args
+        system, start, u, _ = args
+        start = Start(start.t, lambda t: system.diffusion(t, x, u))
 
         def g(s, x):
-            return system.diffusion(t + s, x, u)
+            return start.after(s, lambda t: system.diffusion(t, x, u))
 
         def step(s, x, dB):
             if type(self.solver) is diffrax.Euler:
@@ -387,8 +392,8 @@ def _field(s, x, args):
     """The vector field at `s` after the start of the interval. An adjoint sees what is
     in `args`, not what a function closes over.
     """
-    system, t, u, held = args
-    return evaluate_field(system, t + s, x, u, held)
+    system, start, u, held = args
+    return start.after(s, lambda t: evaluate_field(system, t, x, u, held))
 
 
 def evaluate_field(system: AbstractSystem, t: Any, x: Array, u: Array, w: Any) -> Array:

@@ -105,7 +105,7 @@ def runge_kutta_step(
     slopes: list[Sequence[Array]] = []
     for row, node in zip(rows, nodes, strict=True):
         stage = join(_combine(base, row, slopes, h), split)
-        slope = field(t + node * h, stage)
+        slope = field(t + node * h if node else t, stage)
         slopes.append(fence(*slope) if split else (slope,))
     return join(_combine(base, weights, slopes, h), split).astype(x.dtype)
 

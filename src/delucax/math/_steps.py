@@ -35,10 +35,13 @@ def check_steps(count: int, dtype: Any, what: str, where: str) -> None:
 
 
 def step_at(t: Any, dt: Any, count: int, where: str) -> Array:
-    """The step of `count` that time `t` belongs to, `round(t / dt)`."""
+    """The step of `count` that time `t` belongs to, `round(t / dt)`.
+
+    A time that is NaN belongs to none: it is before the first step.
+    """
     steps = t / dt
     check_steps(count, jnp.result_type(steps), "the horizon", where)
-    return jnp.round(steps).astype(int)
+    return jnp.where(jnp.isnan(steps), -1, jnp.round(steps)).astype(int)
 
 
 def row_at(tree: _T, k: Array) -> _T:

@@ -11,6 +11,7 @@ from jaxtyping import Array
 from .._controller import AbstractController, tallies
 from ..dynamics._discretized import evaluate_field
 from ..dynamics._solvers import AbstractTransparentSolver
+from ..dynamics._start import Start
 from ..systems import AbstractSystem
 from ._answer import answer, check_state
 
@@ -23,7 +24,7 @@ class Inputs(eqx.Module):
     """
 
     system: AbstractSystem
-    start: Array  # the time at which the solve's own begins
+    start: Start  # the time at which the solve's own begins
     source: Any  # a controller, or a function of time; None for an array
     memory: Any  # the controller's first state
     controls: Array | None
@@ -31,13 +32,12 @@ class Inputs(eqx.Module):
     index: Array
     u: Array | None  # what a held controller asked for at the last switch
 
-    def control(self, s: Array, x: Array) -> Array:
-        """The control at `s` after the start."""
+    def control(self, t: Array, x: Array) -> Array:
+        """The control at time `t`."""
         if self.u is not None:
             return self.u
         if self.controls is not None:
             return self.controls[self.index]
-        t = self.start + s
         if isinstance(self.source, AbstractController):
             y = self.system.observe(t, x)
             u, _ = answer(self.source, t, y, self.memory)
@@ -53,9 +53,14 @@ class Inputs(eqx.Module):
             return jnp.zeros(self.system.disturbance_size, x.dtype)
         return None
 
+    def field(self, t: Array, x: Array) -> Array:
+        """The vector field at time `t`."""
+        u, w = self.control(t, x), self.disturbance(x)
+        return evaluate_field(self.system, t, x, u, w).astype(x.dtype)
+
     def act(self, s: Array, x: Array, memory: Any) -> tuple[Array, Any]:
         """A held controller's answer at a switch, and its state after it."""
-        t = self.start + s
+        t = self.start.t + s
         arrays, static = memory, eqx.filter(self.memory, eqx.is_array, inverse=True)
         y = self.system.observe(t, x)
         state = eqx.combine(arrays, static)
@@ -69,8 +74,7 @@ class Inputs(eqx.Module):
 
 def field(s, x, args):
     """The vector field at `s` after the start."""
-    u, w = args.control(s, x), args.disturbance(x)
-    return evaluate_field(args.system, args.start + s, x, u, w).astype(x.dtype)
+    return args.start.after(s, lambda t: args.field(t, x))
 
 
 def check_control(u: Any, source: Any, system: AbstractSystem) -> None:

@@ -28,6 +28,7 @@ from ..dynamics._solvers import (
     loud,
     outcome,
 )
+from ..dynamics._start import Start
 from ..math._steps import check_steps
 from ..systems import AbstractSystem
 from ._answer import outcome_of
@@ -82,8 +83,9 @@ def simulate(
 
     The solve counts its time from `t0`, so that a late start costs no precision: its
     switches are rounded to that of `t1 - t0`, about `1e-7 (t1 - t0)` in single
-    precision, however large `t0` is. What is a function of time is given `t0 + s`,
-    which is rounded to that of `t0`.
+    precision, however large `t0` is. The field, with a control that is not held, is
+    corrected for the rounding of `t0 + s` as in [`delucax.Discretized`][]; what is
+    sampled at a switch is given the rounded time.
 
     There is no cost here: `costs` is `None`, and the trajectory's `final_cost` and
     `total_cost` are zero. It is already compiled, as [`delucax.rollout`][] is.
@@ -311,10 +313,13 @@ def _simulate(
     if controls is not None:
         controls, source = controls.astype(dtype), None
     index = jnp.zeros((), jnp.int32)
-    args = Inputs(system, t0, source, memory, controls, w, index, u)
+    args = Inputs(system, Start(t0), source, memory, controls, w, index, u)
     if sampled:
         u, _ = args.act(grid[0], x0, eqx.filter(memory, eqx.is_array))
         args = eqx.tree_at(lambda a: a.u, args, u, is_leaf=lambda leaf: leaf is None)
+
+    start = Start(t0, lambda t: args.field(t, x0))
+    args = eqx.tree_at(lambda a: a.start, args, start)
 
     held = hold == "zero" or w is not None
 
@@ -378,7 +383,7 @@ def _simulate(
     elif controls is not None:
         controls = before(controls)
     else:
-        controls = jax.vmap(args.control)(saves[:-1], states[:-1])
+        controls = jax.vmap(args.control)(times[:-1], states[:-1])
     finite = jnp.all(jnp.isfinite(final_state))
     result = outcome(solution, stepsize_controller, dtype)
     diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
