@@ -137,7 +137,7 @@ def test_wrong_arguments():
     with user_error(match="must be time-invariant, got matrices at 2 times"):
         LQR(varying, Q, R)
     LQR(varying.at(0.0), Q, R)
-    with user_error(match=r"must rest at .*residual is 1.0e\+00.*delucax.trim"):
+    with user_error(match=r"must rest at .*residual is 5.0e-01.*delucax.trim"):
         LQR(dlx.LinearDynamics(A, B, x_ref=jnp.ones(2), x_next=jnp.zeros(2)), Q, R)
     with user_error(match="must observe their state.*use `delucax.controllers.LQG`"):
         LQR(dlx.LinearDynamics(A, B, jnp.array([[1.0, 0.0]])), Q, R)
@@ -192,3 +192,31 @@ def test_rest_is_relative_to_the_terms(dt, scale):
         design(reactor(scale, dt, 300.0))
         with user_error(match="must rest at their operating point.*residual is"):
             design(reactor(scale, dt, 301.0))
+
+
+@pytest.mark.parametrize("dt", [0.05, 1e-3])
+def test_states_of_other_sizes_do_not_hide_one_that_moves(dt):
+    def field(t, x, u, w):
+        p, z, v = x
+        return jnp.stack([-10 * (p - 1e5) + u[0], v, -z - v + u[1]])
+
+    system = dlx.system(field, states=("p", "z", "v"), controls=("u", "F"))
+    dynamics = dlx.Discretized(system, dt)
+    design = lambda x, u: dlx.controllers.LQR(
+        dlx.linearize(dynamics, x=jnp.array(x), u=jnp.array(u)), jnp.eye(3), jnp.eye(2)
+    )
+    design([1e5, 0.1, 0.0], [0.0, 0.1])
+    with user_error(match="must rest at their operating point.*residual is"):
+        design([1e5, 0.0, 0.1], [0.0, 0.1])
+
+
+@once
+def test_a_point_that_does_not_fit():
+    point = dlx.dynamics.OperatingPoint(
+        jnp.zeros(3), jnp.zeros(1), jnp.zeros(3), dlx.RESULTS.successful
+    )
+    with user_error(match="LQR: point needs AbstractDynamics, got CSTR"):
+        dlx.controllers.LQR(dlx.systems.CSTR(), Q, R, point=point)
+    dynamics = dlx.Discretized(dlx.systems.CSTR(), dt=0.1)
+    with user_error(match=r"LQR: point must have x of shape \(2,\).*got \(3,\)"):
+        dlx.controllers.LQR(dynamics, Q, R, point=point)

@@ -156,6 +156,44 @@ def test_units_do_not_matter(name):
         assert stuck.result == dlx.RESULTS.no_equilibrium
 
 
+@pytest.mark.parametrize("guess", [0.03, 0.01, 0.05, 0.1])
+def test_a_small_state_beside_a_large_one_is_found(guess):
+    field = lambda t, x, u, w: jnp.stack([101325 - x[0] + u[0], 0.03 - x[1]])
+    system = dlx.system(field, states=("p", "c"), controls=("u",))
+    point = dlx.trim(system, x=[101325.0, guess], u=[0.0], fix="u")
+    assert_close(point.x, [101325.0, 0.03], rtol=tolerance(1e-6, 1e-13))
+
+
+def test_a_large_state_does_not_hide_one_that_moves():
+    def field(t, x, u, w):
+        p, z, v = x
+        return jnp.stack([-10 * (p - 1e5) + u[0], v, -z - v + u[1]])
+
+    system = dlx.system(field, states=("p", "z", "v"), controls=("u", "F"))
+    guess = dict(x=[1e5, 0.0, 0.1], u=[0.0, 0.1])
+    stuck = dlx.trim(system, **guess, fix="v", throw=False)
+    assert stuck.result == dlx.RESULTS.no_equilibrium
+    assert_close(stuck.residual[1], 0.1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("angle, root", [(1.5, 0.0), (1.6, np.pi), (-1.6, -np.pi)])
+def test_a_neighbouring_root_is_found(angle, root):
+    point = dlx.trim(dlx.systems.Pendulum(), x=[angle, 0.0], u=[0.0], fix="torque")
+    assert_close(point.x, [root, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "power, offset, result", [(2, 1, "no_equilibrium"), (3, 0, "successful")]
+)
+def test_where_the_slope_is_lost(power, offset, result):
+    field = lambda t, x, u, w: x**power + offset
+    system = dlx.system(field, states=("x",), controls=("u",))
+    for guess in (0.0, 0.5):
+        point = dlx.trim(system, x=[guess], u=[0.0], fix="u", throw=False)
+        assert point.result == getattr(dlx.RESULTS, result)
+        assert_close(point.x, [0.0], atol=1e-3)
+
+
 def test_rest_at_zero_is_told_from_rounding():
     # Newton's method passes zero by ever less, and never meets it.
     point = dlx.trim(dlx.systems.Pendulum(), x=[0.3, 0.1], u=[0.0], fix="torque")
@@ -246,6 +284,9 @@ def test_bad_input():
         dlx.trim(Reactor(), x=[0.5, np.nan], u=[300.0])
     with user_error(match="trim: u \\(the control\\) must be finite"):
         dlx.trim(Reactor(), x=[0.5, 350.0], u=[np.nan])
+    for t in (np.nan, "a"):
+        with user_error(match="trim: t must be"):
+            dlx.trim(Reactor(), t, **GUESS)
     with user_error(match="names no equilibrium"):
         dlx.trim(Reactor())
     with user_error(match="model must be an AbstractSystem or AbstractDynamics"):

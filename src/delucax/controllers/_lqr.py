@@ -51,8 +51,8 @@ class LQR(AbstractController):
         and whose state is observed, of [`delucax.linearize`][] for example; or any
         dynamics, with a `point`. At an equilibrium what is left to move each state is
         below 1e-4 of the terms `|A - I| |x_ref| + |B| |u_ref|` that move it, or below
-        the rounding of the state or of the largest term (4 units in the last place), so
-        that units do not matter.
+        the rounding of the state (4 units in the last place). A zero counts there as
+        the largest state or control, at most 1, and as 1 if all are zero.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `S`: cross weight, shape `(n, m)`; zero by default.
@@ -116,6 +116,12 @@ class LQR(AbstractController):
         point: OperatingPoint | None = None,
     ):
         where = "LQR"
+        if point is not None and not isinstance(dynamics, AbstractDynamics):
+            raise ValueError(
+                f"{where}: point needs AbstractDynamics, got {type(dynamics).__name__}; "
+                "sample a system with `delucax.Discretized`, or use "
+                "`delucax.controllers.lqrd`."
+            )
         linear, difference = linear_at(dynamics, point, difference, where)
         check_time_invariant(linear, where)
         check_observed(linear, where)

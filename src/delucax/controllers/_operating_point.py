@@ -33,6 +33,12 @@ def linear_at(
             f"{where}: point must be an OperatingPoint (`delucax.trim` computes one), "
             f"got {shortened(point)}."
         )
+    sizes = (dynamics.state_size,), (dynamics.control_size,)
+    if (point.x.shape, point.u.shape) != sizes:
+        raise ValueError(
+            f"{where}: point must have x of shape {sizes[0]} and u of shape {sizes[1]}, "
+            f"got {point.x.shape} and {point.u.shape}."
+        )
     if difference is None and not isinstance(dynamics, LinearDynamics | LinearSystem):
         difference = getattr(dynamics, "difference", None)
     return linearize(dynamics, x=point), difference
@@ -99,7 +105,7 @@ def path(dynamics: LinearDynamics, difference: Any, where: str) -> Array:
 def _moved(drift, A, B, x, u):
     """What moves the state, relative to the terms that do."""
     J = jnp.concatenate([A - jnp.eye(A.shape[-1], dtype=A.dtype), B], axis=-1)
-    return relative_drift(drift, J, x, u)
+    return relative_drift(drift, J, x, u, is_map=True)
 
 
 def _resting(x_ref: Array, moved: Array, rule: str, rest: str) -> Array:

@@ -42,15 +42,19 @@ def trim(
 
     `f(t, x, u) = 0` for a system, `F(t, x, u) = x` for dynamics.
 
-    Of all such points it is the one nearest to the guess, each state and control in
-    units of its guess, or where that is zero of the largest state or control, or of 1
-    if all are zero. So where there are as many free unknowns as equations it is the
-    root, and where there are more it is the least change. Where there is no such point
-    it is the one with the least residual, each equation in units of the size of its
-    terms, and the result says so. What is below the rounding of its unit is zero.
+    It is a point near the guess, and where there are more free unknowns than equations
+    one from which no change along the others is nearer, to first order. The unit of
+    each state is its guess, or where that is zero the largest guess of a state, at
+    most 1, and 1 if all are zero; so for controls. A guess below 100 roundings of that
+    largest one counts as zero, so a small state beside large ones, in float32 below
+    1e-5, wants a larger unit. Where there is no such point it is one of least residual,
+    each equation in units of the size of its terms, and the result says so. What is
+    below the rounding of its unit is zero. At a multiple root, or where the least
+    residual has no slope, the last digits may be missing, and the result may be
+    `no_equilibrium`.
 
-    Levenberg and Marquardt's method, then Newton's on the conditions of the nearest
-    point. Differentiable in forward and reverse mode with respect to all arrays in
+    Levenberg and Marquardt's method in a trust region, then Newton's on the conditions
+    of the nearest point. Differentiable in forward and reverse mode with respect to all arrays in
     `model`, the guess and what is fixed, by the implicit function theorem. Disturbances
     are zero.
 
@@ -69,8 +73,8 @@ def trim(
 
     **Returns:** [`delucax.dynamics.OperatingPoint`][].
 
-    **Raises:** `ValueError` on a wrong shape, an unknown name or a guess that is not
-    finite, if all is fixed, or if no guess is given and the model names no equilibrium;
+    **Raises:** `ValueError` on a wrong shape, an unknown name, a time or guess that is
+    not finite, if all is fixed, or if no guess is given and the model names no equilibrium;
     an error at run time as `throw` says.
 
     Source: Nocedal and Wright, 2006.
@@ -94,6 +98,7 @@ def trim(
             f"environment has `env.trim()`), got {type(model).__name__}."
         )
     check_bool(throw, "throw", where)
+    check_number(t, "t", where)
     if isinstance(model, LinearDynamics):
         model = model.at(t)
     x, u = point_of(model, x, u, where)
@@ -127,17 +132,23 @@ def trim(
     return point
 
 
-def relative_drift(drift: Array, jacobian: Array, x: Array, u: Array) -> Array:
+def relative_drift(
+    drift: Array, jacobian: Array, x: Array, u: Array, *, is_map: bool
+) -> Array:
     """How far from rest a point is: the largest share of `drift` among its terms,
 
-    `|drift_i| / (|drift_i| + sum_j |jacobian_ij z_j|)`, with `z = (x, u)`, after what
-    rounding may leave is taken off: of the state itself, and of the largest of the
-    terms. Axes in front are times, with one largest term.
+    `|drift_i| / (|drift_i| + sum_j |jacobian_ij| unit_j)`, row by row. Of a map the
+    drift is `F(x) - x`, and what the rounding of `x_i` may leave is taken off. Axes in
+    front are times, along which a unit is that of the largest value.
     """
-    z = jnp.abs(jnp.concatenate([x, u], axis=-1))
-    terms = (jnp.abs(jacobian) @ z[..., None])[..., 0]
-    rounding = _ULPS * jnp.finfo(x.dtype).eps * (jnp.abs(x) + jnp.max(terms))
-    left = jnp.maximum(jnp.abs(drift) - rounding, 0)
+    largest = lambda z: jnp.max(jnp.abs(z).reshape(-1, z.shape[-1]), axis=0)
+    terms = jnp.abs(jacobian) @ jnp.concatenate(
+        [_units(largest(x)), _units(largest(u))]
+    )
+    left = jnp.abs(drift)
+    if is_map:
+        rounding = _ULPS * jnp.finfo(x.dtype).eps * largest(x)
+        left = jnp.maximum(left - rounding, 0)
     return jnp.max(jnp.where(left == 0, 0, left / (left + terms)))
 
 
@@ -167,13 +178,13 @@ def _fixed(model: Any, fix: Any, where: str) -> dict[int, Any]:
     return values
 
 
-def _units(guess: Array) -> Array:
-    """The size of each entry, or where it is zero up to rounding that of the largest;
-    1 if all are."""
-    size = jnp.abs(guess)
+def _units(z: Array) -> Array:
+    """The size of each entry, or where it is zero up to rounding 1, or that of the
+    largest entry if this is less and not zero."""
+    size = jnp.abs(z)
     largest = jnp.max(size, initial=0)
-    known = size > 10 * jnp.finfo(guess.dtype).eps * largest
-    return jnp.where(known, size, jnp.where(largest > 0, largest, 1))
+    floor = jnp.where(largest > 0, jnp.minimum(largest, 1), 1)
+    return jnp.where(size > 100 * jnp.finfo(z.dtype).eps * floor, size, floor)
 
 
 class _Problem(eqx.Module):
@@ -193,7 +204,7 @@ class _Problem(eqx.Module):
         moves, units = jnp.array(self.free), self.units
         y = self.guess.at[moves].add(units[moves] * z)
         # What is below the rounding of its unit is zero, and moves as it did.
-        tiny = jnp.abs(y) <= 4 * jnp.finfo(y.dtype).eps * units
+        tiny = jnp.abs(y) <= _ULPS * jnp.finfo(y.dtype).eps * units
         tiny = tiny & jnp.zeros(y.shape, bool).at[moves].set(True)
         return y - lax.stop_gradient(jnp.where(tiny, y, 0))
 
@@ -275,44 +286,61 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
     """The nearest point, the drift there and its Jacobian, and how far from it the last
     step still was.
 
-    Levenberg and Marquardt's method, then Newton's, in one loop with one copy of the
-    model, whose compilation is most of the price.
+    Levenberg and Marquardt's method within a trust radius, then Newton's, in one loop
+    with one copy of the model, whose compilation is most of the price. Where Newton's
+    does not converge, as where J loses rank, it is the point of least residual.
     """
     dtype, n = problem.guess.dtype, problem.model.state_size
     eps = jnp.finfo(dtype).eps
     zero, zeros = jnp.zeros(len(problem.free), dtype), jnp.zeros(n, dtype)
+    one, inf = jnp.ones((), dtype), jnp.full((), jnp.inf, dtype)
     blank = jax.eval_shape(_look, problem, zero, zeros)
     blank = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, dtype), blank)
-    blank = eqx.tree_at(
-        lambda point: (point.cost, point.terms),
-        blank,
-        (jnp.asarray(jnp.inf, dtype), zeros),
-    )
+    blank = eqx.tree_at(lambda point: (point.cost, point.terms), blank, (inf, zeros))
+    select = lambda which, a, b: jax.tree.map(functools.partial(jnp.where, which), a, b)
 
     def proceeds(carry):
-        step, _, _, done, _, d, _, _ = carry
+        step, _, _, done, _, d, *_ = carry
         return (step < 2 * _MAX_STEPS) & ~done & jnp.all(jnp.isfinite(d))
 
     def body(carry):
-        step, newton, last, _, z, d, damping, old = carry
+        step, newton, last, _, z, d, damping, radius, old, best = carry
         new = _look(problem, z + d, old.terms)
         finite = jnp.isfinite(jnp.sum(new.slope) + jnp.sum(new.gram))
         better = newton | (finite & (new.cost < old.cost))
-        z = jnp.where(better, z + d, z)
-        new = jax.tree.map(functools.partial(jnp.where, better), new, old)
-        damping = jnp.where(better, damping / 4, damping * 4)
+        z, new = select(better, (z + d, new), (z, old))
+        damping = jnp.where(better, jnp.maximum(damping / 4, eps), damping * 4)
+        radius = jnp.where(better, 2 * radius, jnp.max(jnp.abs(d)) / 4)
         diagonal = jnp.diagonal(new.gram)
-        damped = new.gram + jnp.diag(damping * (diagonal + eps * jnp.max(diagonal)))
+        floor = eps * (jnp.max(diagonal) + eps)
+        damped = new.gram + jnp.diag(damping * (diagonal + floor))
         matrix = jnp.where(newton, new.slope, damped)
         d = -jnp.linalg.solve(matrix, jnp.where(newton, new.off, new.gradient))
-        small = jnp.max(jnp.abs(d)) <= 1e3 * eps * (1 + jnp.max(jnp.abs(z)))
+        length = jnp.max(jnp.abs(d))
+        d = jnp.where(newton | (length <= radius), d, d * (radius / length))
+        gap = jnp.max(jnp.abs(d))
+        small = gap <= 1e3 * eps * (1 + jnp.max(jnp.abs(z)))
         turn = newton | small | (step >= _MAX_STEPS)
-        return step + 1, turn, newton & small, last, z, d, damping, new
+        here = new.cost, z, new.drift, new.jacobian
+        best = (
+            *select(new.cost < best[0], here, best[:-1]),
+            jnp.where(newton, best[-1], gap),
+        )
+        newton_ends = newton & small
+        return step + 1, turn, newton_ends, last, z, d, damping, radius, new, best
 
     no = jnp.array(False)
-    start = jnp.array(0), no, no, no, zero, zero, jnp.ones((), dtype), blank
-    *_, z, d, _, point = lax.while_loop(proceeds, body, start)
-    return z, point.drift, point.jacobian, jnp.max(jnp.abs(d))
+    best = inf, zero, blank.drift, blank.jacobian, inf
+    start = jnp.array(0), no, no, no, zero, zero, one, one / 2, blank, best
+    end = lax.while_loop(proceeds, body, start)
+    _, _, _, _, z, d, _, _, point, (cost, *best) = end
+    gap = jnp.max(jnp.abs(d))
+    good = _settled(gap, z) & (point.cost <= 1.01 * cost + eps)
+    return select(good, (z, point.drift, point.jacobian, gap), tuple(best))
+
+
+def _settled(gap: Array, z: Array) -> Array:
+    return gap <= jnp.finfo(z.dtype).eps ** (1 / 3) * (1 + jnp.max(jnp.abs(z)))
 
 
 @_nearest.def_jvp
@@ -339,11 +367,13 @@ def _solve(model: Any, t: Array, guess: Array, free: tuple[int, ...]):
     z, drift, jacobian, off = _nearest(problem)
     y = problem.at(z)
     x, u = y[:n], y[n:]
-    rests = lax.stop_gradient(relative_drift(drift, jacobian, x, u)) <= eps**0.5
-    settled = off <= eps ** (1 / 3) * (1 + jnp.max(jnp.abs(z)))
+    is_system = isinstance(model, AbstractSystem)
+    moved = relative_drift(drift, jacobian, x, u, is_map=not is_system)
+    rests = lax.stop_gradient(moved) <= eps**0.5
+    settled = _settled(off, z)
     failure = choose(settled, RESULTS.no_equilibrium, RESULTS.not_converged)
     failure = choose(jnp.all(jnp.isfinite(drift)), failure, RESULTS.diverged)
-    if isinstance(model, AbstractSystem):
+    if is_system:
         x = model.project(x)
     return OperatingPoint(
         x, u, drift, choose(rests & settled, RESULTS.successful, failure)
