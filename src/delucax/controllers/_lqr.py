@@ -118,9 +118,9 @@ class LQR(AbstractController):
         where = "LQR"
         if point is not None and not isinstance(dynamics, AbstractDynamics):
             raise ValueError(
-                f"{where}: point needs AbstractDynamics, got {type(dynamics).__name__}; "
-                "sample a system with `delucax.Discretized`, or use "
-                "`delucax.controllers.lqrd`."
+                f"{where}: point needs AbstractDynamics, got "
+                f"{type(dynamics).__name__}; sample a system with "
+                "`delucax.Discretized`, or use `delucax.controllers.lqrd`."
             )
         linear, difference = linear_at(dynamics, point, difference, where)
         check_time_invariant(linear, where)

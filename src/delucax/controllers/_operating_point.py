@@ -36,8 +36,8 @@ def linear_at(
     sizes = (dynamics.state_size,), (dynamics.control_size,)
     if (point.x.shape, point.u.shape) != sizes:
         raise ValueError(
-            f"{where}: point must have x of shape {sizes[0]} and u of shape {sizes[1]}, "
-            f"got {point.x.shape} and {point.u.shape}."
+            f"{where}: point must have x of shape {sizes[0]} and u of shape "
+            f"{sizes[1]}, got {point.x.shape} and {point.u.shape}."
         )
     if difference is None and not isinstance(dynamics, LinearDynamics | LinearSystem):
         difference = getattr(dynamics, "difference", None)

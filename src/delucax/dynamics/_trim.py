@@ -42,21 +42,20 @@ def trim(
 
     `f(t, x, u) = 0` for a system, `F(t, x, u) = x` for dynamics.
 
-    It is a point near the guess, and where there are more free unknowns than equations
-    one from which no change along the others is nearer, to first order. The unit of
-    each state is its guess, or where that is zero the largest guess of a state, at
-    most 1, and 1 if all are zero; so for controls. A guess below 100 roundings of that
-    largest one counts as zero, so a small state beside large ones, in float32 below
-    1e-5, wants a larger unit. Where there is no such point it is one of least residual,
-    each equation in units of the size of its terms, and the result says so. What is
-    below the rounding of its unit is zero. At a multiple root, or where the least
-    residual has no slope, the last digits may be missing, and the result may be
-    `no_equilibrium`.
+    It is a root near the guess, not always the nearest. Where there are more free
+    unknowns than equations it is the least change among its neighbours, to first order.
+    The unit of each state is its guess, or where that is zero the largest guess of a
+    state, at most 1, and 1 if all are zero; so for controls. A guess below 100
+    roundings of that counts as zero, so that states as small beside larger ones want a
+    smaller unit. Where there is no root it is a point of least residual, each equation
+    in units of the size of its terms, and the result says so. What is below the
+    rounding of its unit is zero. At a multiple root the last digits may be missing, and
+    the result be `no_equilibrium`.
 
     Levenberg and Marquardt's method in a trust region, then Newton's on the conditions
-    of the nearest point. Differentiable in forward and reverse mode with respect to all arrays in
-    `model`, the guess and what is fixed, by the implicit function theorem. Disturbances
-    are zero.
+    of the nearest point. Differentiable in forward and reverse mode with respect to all
+    arrays in `model`, the guess and what is fixed, by the implicit function theorem.
+    Disturbances are zero.
 
     **Arguments:**
 
@@ -74,8 +73,8 @@ def trim(
     **Returns:** [`delucax.dynamics.OperatingPoint`][].
 
     **Raises:** `ValueError` on a wrong shape, an unknown name, a time or guess that is
-    not finite, if all is fixed, or if no guess is given and the model names no equilibrium;
-    an error at run time as `throw` says.
+    not finite, if all is fixed, or if no guess is given and the model names no
+    equilibrium; an error at run time as `throw` says.
 
     Source: Nocedal and Wright, 2006.
 
