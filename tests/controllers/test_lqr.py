@@ -180,9 +180,10 @@ def reactor(scale, dt, Tc):
 @pytest.mark.parametrize("dt", [0.05, 1e-3])
 @pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
 def test_rest_is_relative_to_the_terms(dt, scale):
-    # As textbooks give it: what is left is two millionths of the terms.
+    # As textbooks give it: what is left is two millionths of the terms. The weights are
+    # those of the same problem in other units.
     regulators = (
-        lambda linear: dlx.controllers.LQR(linear, Q, R),
+        lambda linear: dlx.controllers.LQR(linear, Q / scale**2, R),
         lambda linear: dlx.controllers.LQI(
             linear, jnp.eye(3), R, output=jnp.array([[0.0, 1.0]])
         ),
