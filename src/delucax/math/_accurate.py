@@ -1,6 +1,7 @@
 """Products of matrices in more digits than their precision has."""
 
 import functools
+import itertools
 import math
 import operator
 
@@ -10,8 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
-_MORE_DIGITS = 30
-"""Binary digits beyond those of the precision."""
 _SMALL = 8192
 """Up to here XLA compiles a sum of products as one kernel with all around it, and a
 product of matrices not: that costs the solvers much of their compile time."""
@@ -22,16 +21,17 @@ def product(
 ) -> tuple[Float[Array, "n m"], Float[Array, "n m"]]:
     """The product of two matrices, and by how much its entries may be wrong.
 
-    Where terms cancel, what is left has digits too: each factor is cut into slices of
-    so few bits that products of slices are exact, in any order of summation and with
-    fused operations. These are added from high to low.
+    Where terms cancel, what is left has digits too. From each factor slices are cut, of
+    so few bits that their products are exact, in any order of summation and with fused
+    operations; what remains of the factors is small, and so is the rounding of its
+    products. These are added last.
 
     Source: Ozaki, Ogita, Oishi and Rump, 2012.
     """
     (n, k), m, dtype = left.shape, right.shape[1], left.dtype
-    digits = jnp.finfo(dtype).nmant + 1
-    bits = int((digits - math.log2(k)) / 2)
-    count = -(-(digits + _MORE_DIGITS) // bits)
+    eps, digits = jnp.finfo(dtype).eps, jnp.finfo(dtype).nmant + 1
+    count = 1 if digits > 50 else 2
+    bits = int((digits - math.log2(count * k)) / 2)
     both = jnp.concatenate([left, right.T])
     # In units in which the k-th column and the k-th row are alike.
     across, down = (jnp.max(jnp.abs(M), axis=0) for M in (both[:n], both[n:]))
@@ -40,28 +40,36 @@ def product(
     both *= jnp.where(np.arange(n + m)[:, None] < n, unit, 1 / unit)
     power = _power(jnp.max(jnp.abs(both), axis=1, keepdims=True))
     power = lax.max(power, jnp.finfo(dtype).tiny)
-    # Entries as multiples of ever smaller steps, and what each adds to the last.
-    step = 2.0 ** (bits * np.arange(count + 1)[:, None, None] - 2)
+    # Entries as multiples of ever smaller steps, what each adds, and what is left.
+    step = 2.0 ** (bits * np.arange(1, count + 1)[:, None, None] - 2)
     step = step.astype(dtype)
-    parts = jnp.round(both / power * step) / step
-    parts = power * (
-        parts[1:] - jnp.where(np.arange(count)[:, None, None] > 0, parts[:-1], 0)
+    whole = power * (jnp.round(both / power * step) / step)
+    rests = [both, *(both - M for M in whole)]
+    slices = [whole[0], *(b - a for a, b in itertools.pairwise(whole))]
+
+    def summed(rows, columns):
+        rows = jnp.concatenate([M[:n] for M in rows], axis=1)
+        columns = jnp.concatenate([M[n:] for M in columns], axis=1)
+        return _product(rows, columns), rows, columns
+
+    exact = (summed(slices[: i + 1], slices[i::-1])[0] for i in range(count))
+    small, rows, columns = summed([*slices, rests[-1]], rests[::-1])
+    total = functools.reduce(operator.add, [*exact, small])
+    terms = _product(jnp.abs(rows), jnp.abs(columns))
+    lost = (rows.shape[1] + 2 * count) * eps * terms
+    return total, lost + count * eps * jnp.abs(total)
+
+
+def _product(rows: Array, columns: Array) -> Array:
+    """`rows @ columns.T`."""
+    if rows.size * len(columns) > _SMALL:
+        return rows @ columns.T
+    return lax.fori_loop(
+        0,
+        rows.shape[1],
+        lambda i, added: added + rows[:, i, None] * columns[:, i],
+        jnp.zeros((len(rows), len(columns)), rows.dtype),
     )
-    rows, columns = parts[:, :n].reshape(-1, k), parts[:, n:].reshape(-1, k)
-    if n * k * m <= _SMALL:
-        pairs = lax.fori_loop(
-            0,
-            k,
-            lambda i, added: added + rows[:, i, None] * columns[:, i],
-            jnp.zeros((count * n, count * m), dtype),
-        )
-    else:
-        pairs = rows @ columns.T
-    pairs = pairs.reshape(count, n, count, m)
-    order = sorted(np.ndindex(count, count), key=sum)
-    total = functools.reduce(operator.add, (pairs[i, :, j] for i, j in order))
-    lost = 16 * k * 0.5 ** (count * bits) * power[:n] * power[n:].T
-    return total, lost + count**2 * jnp.finfo(dtype).eps * jnp.abs(total)
 
 
 def _power(x: Array) -> Array:
