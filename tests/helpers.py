@@ -87,3 +87,16 @@ class CountCalls:
 
     def __call__(self):
         self.count += 1
+
+
+class Drift(dlx.AbstractSystem):
+    """With a diffusion, so that noise is the default."""
+
+    state_names = ("x",)
+    control_names = ("u",)
+
+    def vector_field(self, t, x, u, w):
+        return u - x
+
+    def diffusion(self, t, x, u):
+        return jnp.ones(1)

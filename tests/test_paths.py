@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, once, user_error
+from helpers import assert_close, Drift, once, user_error
 from hypothesis import given, settings, strategies as st
 from jaxtyping import Array
 
@@ -127,19 +127,6 @@ def test_changes_that_fit_together(make, changes):
     assert jax.tree.structure(forwards) is not None
     backwards = dlx.replace(make(), dict(reversed(changes.items())))
     assert eqx.tree_equal(forwards, backwards)
-
-
-class Drift(dlx.AbstractSystem):
-    """With a diffusion, so that noise is the default."""
-
-    state_names = ("x",)
-    control_names = ("u",)
-
-    def vector_field(self, t, x, u, w):
-        return u - x
-
-    def diffusion(self, t, x, u):
-        return jnp.ones(1)
 
 
 @once

@@ -3,7 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, CountCalls, once, thorough, user_error
+from helpers import assert_close, CountCalls, Drift, once, thorough, user_error
 
 import delucax as dlx
 
@@ -123,17 +123,7 @@ def test_lds(key):
 
 @once
 def test_default_noise_of_a_diffusion():
-    class Brownian(dlx.AbstractSystem):
-        state_names = ("x",)
-        control_names = ("u",)
-
-        def vector_field(self, t, x, u, w):
-            return u - x
-
-        def diffusion(self, t, x, u):
-            return jnp.ones(1)
-
-    dynamics = dlx.Discretized(Brownian(), dt=0.1, substeps=4)
+    dynamics = dlx.Discretized(Drift(), dt=0.1, substeps=4)
     env = dlx.Environment(dynamics, dlx.costs.Function(lambda t, x, u: x[0] ** 2))
     assert env.disturbance.size == dynamics.disturbance_size == 4
     run = dlx.rollout(env, dlx.controllers.Zero(1), key=jax.random.key(0))

@@ -291,9 +291,9 @@ class Environment(eqx.Module):
         return shape[0]
 
     def trim(self, *, fix: Any = (), throw: bool = True) -> OperatingPoint:
-        """The operating point of the task: that of [`delucax.trim`][] from the targets
-        of its cost, where it is a [`delucax.costs.Quadratic`][] that names both, else
-        from the equilibrium of its dynamics, else from the targets and zeros.
+        """The operating point of the task: that of [`delucax.trim`][] from the
+        `targets` of its cost where they name both a state and a control, else from the
+        equilibrium of its dynamics, else from the target that is named and zeros.
 
         **Arguments:** `fix`, `throw`: as in [`delucax.trim`][].
 
@@ -316,7 +316,7 @@ class Environment(eqx.Module):
         point = operating_point(self.dynamics, self.cost)
         if point is None:
             raise ValueError(
-                "Environment: trim needs a Quadratic cost or dynamics that name an "
+                "Environment: trim needs a cost with targets or dynamics that name an "
                 "equilibrium; use `delucax.trim(env.dynamics, x=..., u=...)`."
             )
         x, u = point

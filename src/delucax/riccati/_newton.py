@@ -151,13 +151,13 @@ def solution_of(
 
 @eqx.filter_jit
 @full_precision
-def _as_complex(found: RiccatiSolution, discrete: bool, data: tuple):
+def _as_complex(solution: RiccatiSolution, discrete: bool, data: tuple):
     """A solution in complex form, for which the residual is bounded once more: rounding
     may have left an X that is no real form."""
-    found = eqx.tree_at(
-        lambda s: (s.X, s.K, s.closed_loop), found, replace_fn=complex_form
+    solution = eqx.tree_at(
+        lambda s: (s.X, s.K, s.closed_loop), solution, replace_fn=complex_form
     )
-    A, B, Q, R, S, E, X = lax.stop_gradient((*data, real_form(found.X)))
+    A, B, Q, R, S, E, X = lax.stop_gradient((*data, real_form(solution.X)))
     bound = riccati_residual(discrete, A, B, Q, R, S, E, X, True).bound
-    bound = jnp.where(jnp.isfinite(bound), bound, found.residual)
-    return eqx.tree_at(lambda s: s.residual, found, bound)
+    bound = jnp.where(jnp.isfinite(bound), bound, solution.residual)
+    return eqx.tree_at(lambda s: s.residual, solution, bound)

@@ -237,8 +237,8 @@ class OnlineLearner(AbstractLearner):
 def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None:
     """Raise unless a cost of what `dynamics` show is a scalar."""
     y, u = (dynamics.observation_size,), (dynamics.control_size,)
-    found = output_of(cost, (), y, u)
-    if getattr(found, "shape", None) != ():
-        got = getattr(found, "shape", None)
-        got = type(found).__name__ if got is None else f"an array of shape {got}"
+    value = output_of(cost, (), y, u)
+    if getattr(value, "shape", None) != ():
+        got = getattr(value, "shape", None)
+        got = type(value).__name__ if got is None else f"an array of shape {got}"
         raise ValueError(f"{where}: cost must give a scalar, got {got}.")
