@@ -30,49 +30,54 @@ def polish(
 
     `residual(X, accurately)` is what is left of it, and `correction(closed_loop,
     error)` solves it to first order. Where rounding may hide more than there is to be
-    left, the steps go on with accurate residuals. Returns `X` and what is left there.
+    left, the steps go on with accurate residuals. Returns the best `X`, and what is
+    left there.
     """
     eps = float(jnp.finfo(X.dtype).eps)
     fine = _FINE * eps
     wide = tolerance(X.dtype)
 
     def more(carry):
-        return carry[3]
+        return carry[4]
 
     def body(carry):
-        X, now, accurately, going, k = carry
+        X, last, best, accurately, going, patient, k = carry
         first = k == 0
-        candidate = symmetric(X + step(now, going & ~first))
-        new = residual(candidate, going & accurately)
-        better = first | (new.relative < now.relative)
-        # Where steps stop to help much, rounding is all that is left.
-        helped = first | (new.relative < now.relative / 4)
-        again = helped & (new.relative > fine) & (k < _NEWTON_STEPS)
-        X, now = jax.tree.map(
-            lambda a, b: jnp.where(better, a, b), (candidate, new), (X, now)
-        )
-        hidden = ~again & ~accurately & (now.bound > wide)
+        X = symmetric(X + step(last, going & ~first))
+        new = residual(X, going & accurately)
+        better = first | (new.relative < best[1].relative)
+        # Where steps stop to help much, rounding is all that is left. But far from the
+        # solution the first may not help and yet be one towards it.
+        helped = first | (new.relative < best[1].relative / 4)
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), (X, new), best)
+        rest = best[1].relative
+        again = helped | patient & (rest > wide)
+        again &= (rest > fine) & (k < _NEWTON_STEPS)
+        hidden = ~again & ~accurately & (best[1].bound > wide)
+        X = jnp.where(hidden, best[0], X)
         k = jnp.where(hidden, 0, k + 1)
-        return X, now, accurately | hidden, again | hidden, k
+        last = new.closed_loop, new.error
+        return X, last, best, accurately | hidden, again | hidden, helped, k
 
-    def step(now, needed):
+    def step(last, needed):
         """The correction. A loop of one round is not run for a batch in which no member
         needs it, as in the first round, which only measures."""
 
         def once(carry):
             # What is carried changes, so that no work on it is moved ahead of the loop.
-            nothing = jnp.zeros_like(now.closed_loop), jnp.zeros_like(now.error)
+            nothing = jax.tree.map(jnp.zeros_like, last)
             return jnp.zeros_like(needed), correction(*carry[2]), nothing
 
-        start = needed, jnp.zeros_like(X), (now.closed_loop, now.error)
+        start = needed, jnp.zeros_like(X), last
         return lax.while_loop(lambda carry: carry[0], once, start)[1]
 
     no, yes = jnp.asarray(False), jnp.asarray(True)
     unknown = jax.tree.map(
         lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(residual, X, no)
     )
-    X, now, *_ = lax.while_loop(more, body, (X, unknown, no, yes, jnp.asarray(0)))
-    return X, now
+    last = unknown.closed_loop, unknown.error
+    start = X, last, (X, unknown), no, yes, yes, jnp.asarray(0)
+    return lax.while_loop(more, body, start)[2]
 
 
 def attainable(X: Array, gain: Array, terms: Array) -> Array:

@@ -5,10 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..math._accurate import product
+from ..math._accurate import in_parts, product
 from ..math._linear_solve import solve, symmetric
 from ..math._size import relative_size, size
 
@@ -57,14 +56,13 @@ def riccati_residual(
     `L'XL - E'XE + Q + S N + N'T - G'W^-1 G`, `W = R + B'XB`, `G = B'XL + T`,
 
     in continuous and in discrete time. G is rounding alone, and the last term its
-    square. The rounding of the others is bounded by the same sum of absolute values.
-    Where that is too wide they are evaluated `accurately`.
+    square. The rounding of each product is bounded by that of the absolute values of
+    its factors. Where that is too wide they are evaluated `accurately`.
 
     The last `players` controls are a second player's, whose terms count apart.
     """
     n, m = B.shape
     dtype = A.dtype
-    eps = jnp.finfo(dtype).eps
     weighted = X if E is None else E.T @ X
     moved = A.T @ X if discrete else weighted
     cross = moved @ B + S
@@ -79,109 +77,139 @@ def riccati_residual(
     if players:
         terms.append(cross[:, first:] @ K[first:])
 
-    def left_side(sign, A, B, Q, R, S, E, X, K):
-        N = sign * K
-        L, T = A + B @ N, S.T + R @ N
-        Z = X if E is None else X @ E
-        Y = X @ L if discrete else Z
-        square = L.T @ Y
-        if not discrete:
-            square += square.T
-        else:
-            square += sign * (X if E is None else E.T @ Z)
-        return square + Q + S @ N + N.T @ T, B.T @ Y + T, L, T, Y, Z
-
-    # In the second, absolute values take the places of the terms.
-    given = (A, B, Q, R, S, E, X, K)
-    error, gap, L, T, Y, Z = left_side(-1, *given)
-    most = left_side(1, *jax.tree.map(jnp.abs, given))
-    rounding = (n + m + 6) * eps
-
-    def more_accurate(carry):
-        K = carry[1]
-        eye = jnp.eye(n, dtype=dtype)
-        N, minus = -K, -eye if E is None else -E.T
-        # The rows of one product with all of these; what rounding left out of L, T, Y
-        # and Z, and the rest of the equation with them in these places.
-        right = {"I": eye, "N": N, "L": L, "T": T, "Q": Q}
-        rows = [
-            {"I": A, "N": B, "L": -eye},
-            {"I": S.T, "N": R, "T": -jnp.eye(m, dtype=dtype)},
-        ]
-        last = {"N": S, "T": N.T, "Q": eye}
-        right["Z"] = Z
-        last["Z"] = minus if discrete else L.T
-        # What these are multiplied by in the equation.
-        factors = [2 * Y.T, N.T]
-        if discrete:
-            right["Y"] = Y
-            rows.append({"L": X, "Y": -eye})
-            last["Y"] = L.T
-            factors.append(L.T)
-        else:
-            last["L"] = Z.T
-        if E is not None:
-            right["E"] = E
-            rows.append({"E": X, "Z": -eye})
-            factors.append(minus if discrete else 2 * L.T)
-
-        def row(blocks):
-            height = len(next(iter(blocks.values())))
-            return [
-                blocks.get(name, jnp.zeros((height, len(M)), dtype))
-                for name, M in right.items()
-            ]
-
-        both = product(
-            jnp.block([row(blocks) for blocks in (*rows, last)]),
-            jnp.concatenate(list(right.values())),
-        )
-        ends = np.cumsum([len(factor.T) for factor in factors])
-        *rests, error = jnp.split(both[0], ends)
-        *losts, lost = jnp.split(both[1], ends)
-        most = []
-        for factor, rest, rest_lost in zip(factors, rests, losts, strict=True):
-            error += factor @ rest
-            rest = jnp.abs(rest)
-            rest_lost += (4 * n + 2 * m + 8) * eps * rest
-            lost += jnp.abs(factor) @ rest_lost
-            most.append(rest + rest_lost)
-        around = (n + 4) * eps * jnp.abs(Y)
-        most_L, most_T, *most_Y = most
-        if most_Y:
-            around += most_Y[0]
-            lost += 2 * most_L.T @ most_Y[0]
-        if discrete:
-            twice = jnp.abs(X) @ most_L
-            around += twice
-            lost += most_L.T @ twice
-        gap_lost = jnp.abs(B.T) @ around + most_T + (n + 4) * eps * jnp.abs(T)
-        # Both bounds hold, entry by entry.
-        _, _, wide_error, wide, wide_gap = carry
-        sharper = lost < wide
-        return (
-            jnp.zeros_like(needed),
-            jnp.zeros_like(K),
-            jnp.where(sharper, symmetric(error), wide_error),
-            jnp.where(sharper, lost, wide),
-            jnp.minimum(gap_lost, wide_gap),
-        )
-
-    lost, gap_lost = rounding * most[0], rounding * most[1]
+    data = A, B, Q, R, S, E, X
+    working, left = _evaluated(discrete, *data, K)
+    closed_loop = working[1] if E is None else solve(E, working[1])
     needed = jnp.asarray(accurately)
     if accurately is not False:
+
+        def more_accurate(carry):
+            _, working, left = carry
+            left = _sharper(discrete, *data, working, left)
+            return jnp.zeros_like(needed), jax.tree.map(jnp.zeros_like, working), left
+
         # A loop of one round is not run for a batch in which no member needs it. What
         # it works on is carried and changes: else compilers move work ahead of it.
-        start = needed, K, error, lost, gap_lost
-        *_, error, lost, gap_lost = lax.while_loop(
-            lambda carry: carry[0], more_accurate, start
-        )
+        start = needed, working, left
+        *_, left = lax.while_loop(lambda carry: carry[0], more_accurate, start)
+    error, lost, gap, gap_lost = left
     gap = jnp.abs(gap) + gap_lost
     bound = jnp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
-    closed_loop = L if E is None else solve(E, L)
     bound = _MARGIN * relative_size(bound, *terms)
     relative = jnp.where(needed, bound, relative_size(error, *terms))
     return Residual(error, relative, bound, closed_loop, size(*terms), K)
+
+
+class _Left(NamedTuple):
+    """The left side and G, and by how much rounding may have changed each entry."""
+
+    error: Array
+    lost: Array
+    gap: Array
+    gap_lost: Array
+
+
+def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
+    """N, L, T, Y = XL (XE in continuous time) and Z = XE, and what is left."""
+    n, m = B.shape
+    unit = jnp.finfo(A.dtype).eps / 2
+    size_B, size_S, size_X, size_N = (jnp.abs(M) for M in (B, S, X, K))
+    N = -K
+    BN, units_BN = in_parts(B, N)
+    L, T = A + BN, S.T + R @ N
+    lost_L = (units_BN + 1) * unit * (jnp.abs(A) + size_B @ size_N)
+    lost_T = (m + 1) * unit * (size_S.T + jnp.abs(R) @ size_N)
+    most_L, size_T = jnp.abs(L) + lost_L, jnp.abs(T)
+    Z, lost_Z = X, jnp.zeros_like(X)
+    if E is not None:
+        Z, units = in_parts(X, E)
+        lost_Z = units * unit * (size_X @ jnp.abs(E))
+    if discrete:
+        Y, units = in_parts(X, L)
+        lost_Y, from_L = units * unit * (size_X @ most_L), size_X @ lost_L
+        subtracted = Z if E is None else E.T @ Z
+    else:
+        Y, lost_Y, from_L = Z, lost_Z, jnp.zeros_like(X)
+        subtracted = jnp.zeros_like(X)
+    size_Y = jnp.abs(Y)
+    square, units = in_parts(L.T, Y)
+    SN, NT = S @ N, N.T @ T
+    lost = most_L.T @ (units * unit * size_Y + lost_Y)
+    # What is wrong with L is in both factors where the second is XL.
+    both = lost_L.T @ (size_Y + from_L / 2)
+    if discrete:
+        lost += _twice(both)
+        if E is not None:
+            lost += jnp.abs(E).T @ (n * unit * jnp.abs(Z) + lost_Z)
+    else:
+        square, lost = _twice(square), _twice(lost + both)
+    lost += m * unit * (size_S @ size_N) + size_N.T @ (m * unit * size_T + lost_T)
+    lost += 5 * unit * sum(jnp.abs(M) for M in (square, subtracted, Q, SN, NT))
+    gap_lost = size_B.T @ ((n + 2) * unit * size_Y + lost_Y + from_L)
+    gap_lost += lost_T + 2 * unit * size_T
+    error = square - subtracted + Q + SN + NT
+    return (N, L, T, Y, Z), _Left(error, lost, B.T @ Y + T, gap_lost)
+
+
+def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
+    """What is left in more digits, and entry by entry the sharper bound.
+
+    The rests are what rounding left out of L, T, Y and Z. They are summed with the rest
+    of the equation, each as often as it is there.
+    """
+    N, L, T, Y, Z = working
+    n, m = B.shape
+    eps = jnp.finfo(A.dtype).eps
+    stacked = jnp.concatenate
+    if discrete:
+        terms, of_X, added = [(L, Y), (S.T, N), (N, T)], [(L, Y, L)], [Q]
+        if E is None:
+            added.append(-X)
+        else:
+            terms.append((-E, Z))
+            of_X.append((E, Z, -E))
+    else:
+        terms, added = [(L, Z), (Z, L), (S.T, N), (N, T)], [Q]
+        of_X = [] if E is None else [(E, Z, 2 * L)]
+    # Pairs of what is left out and a bound on what this leaves out again.
+    found = product(stacked([B, R]), N, stacked([A, S.T]), -stacked([L, T]))
+    rests = list(zip(*(jnp.split(M, [n]) for M in found), strict=True))
+    if of_X:
+        rights, wholes, _ = (stacked(M, axis=1) for M in zip(*of_X, strict=True))
+        found = product(X, rights, -wholes)
+        rests += zip(*(jnp.split(M, len(of_X), axis=1) for M in found), strict=True)
+    factor = stacked([2 * Y, N, *(M for *_, M in of_X)]).T
+    rest, rest_lost = (stacked(M) for M in zip(*rests, strict=True))
+    sizes = jnp.abs(rest)
+    most = sizes + rest_lost
+    left, right = (stacked(M) for M in zip(*terms, strict=True))
+    error, lost = product(left.T, right, *added)
+    error += factor @ rest
+    lost += jnp.abs(factor) @ (rest_lost + (4 * n + 2 * m + 8) * eps * sizes)
+    # What is wrong with L, times what is wrong with the factor beside it.
+    most_L, most_T, around = most[:n], most[n : n + m], (n + 4) * eps * jnp.abs(Y)
+    if of_X:
+        most_Y = most[n + m : 2 * n + m]
+        around += most_Y
+        lost += 2 * most_L.T @ most_Y
+    if discrete:
+        from_L = jnp.abs(X) @ most_L
+        around += from_L
+        lost += most_L.T @ from_L
+    gap_lost = jnp.abs(B.T) @ around + most_T + (n + 4) * eps * jnp.abs(T)
+    lost = symmetric(lost)
+    sharper = lost < wide.lost
+    return _Left(
+        jnp.where(sharper, symmetric(error), wide.error),
+        jnp.where(sharper, lost, wide.lost),
+        wide.gap,
+        jnp.minimum(gap_lost, wide.gap_lost),
+    )
+
+
+def _twice(M):
+    """A matrix and its transpose."""
+    return M + M.T
 
 
 def linear_residual(discrete, A, B, C, X) -> Array:
