@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from delucax.lung._report import PID_ROWS
 from delucax.plotting._figure import color_of, NotebookFigure, style_axes
+from delucax.studies.ventilator._report import PID_ROWS
 
 
 DOCS = Path(__file__).parents[1] / "docs"

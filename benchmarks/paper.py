@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks._machine import describe
-from delucax import experiments
-from delucax.experiments.paper._reproduce import STUDIES
+from delucax import studies
+from delucax.studies.paper._reproduce import STUDIES
 
 
 RESULTS = Path(__file__).parent / "results" / "paper.json"
@@ -75,9 +75,9 @@ def main() -> None:
         out = Path(options.out)
         rows = read(out / "claims.csv")
         if {row["study"] for row in rows} != set(STUDIES):
-            rows = experiments.reproduce("all", out)
+            rows = studies.reproduce("all", out)
         elif options.study is not None:
-            again = experiments.reproduce(options.study, out / "again")
+            again = studies.reproduce(options.study, out / "again")
             rows = [row for row in rows if row["study"] != options.study] + again
             rows.sort(key=lambda row: list(STUDIES).index(row["study"]))
         content = {"machine": describe(), "claims": rows}

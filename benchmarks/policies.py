@@ -32,7 +32,7 @@ import delucax as dlx
 from benchmarks._machine import describe, limit_cores
 from benchmarks._paired import middle, spread
 from benchmarks._results import updated
-from delucax.experiments import holds_upright, train_swing_up
+from delucax.studies import holds_upright, train_swing_up
 from delucax.training import (
     actor_critic,
     expected_cost,

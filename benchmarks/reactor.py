@@ -218,7 +218,7 @@ def noisy(x0: Any) -> tuple[dlx.Environment, Any]:
         horizon=60,
     )
     covariances = jnp.diag(W**2), jnp.array([[V**2]])
-    ekf = dlx.controllers.ExtendedKalmanFilter(
+    ekf = dlx.estimators.ExtendedKalmanFilter(
         measured, *covariances, mean=x0, covariance=jnp.diag(SPREAD**2)
     )
     return task, ekf

@@ -20,8 +20,8 @@ import delucax as dlx
 from benchmarks._machine import describe
 from delucax import experiments
 from delucax.experiments import interquartile_mean, Results
-from delucax.experiments._methods import FAMILIES, task_of
-from delucax.experiments._scoreboard import METHODS, scoreboard
+from delucax.studies._methods import FAMILIES, task_of
+from delucax.studies._scoreboard import METHODS, scoreboard
 
 
 STORE = Path(__file__).parent / "results" / "scoreboard.jsonl"

@@ -24,9 +24,9 @@ from benchmarks._breath_training import steps_to, WAYS
 from benchmarks._lungs import as_published, least_errors
 from benchmarks._machine import describe
 from benchmarks._ventilator_page import write_page
-from delucax import lung
-from delucax.lung._report import PID_ROWS
-from delucax.lung._size import FULL
+from delucax import lung, studies
+from delucax.studies.ventilator._report import PID_ROWS
+from delucax.studies.ventilator._size import FULL
 
 
 RESULTS = Path(__file__).parent / "results" / "ventilator.json"
@@ -173,7 +173,7 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     # First, for what the study has compiled would take no time.
     seconds = kept(out / "parts.json", parts)
-    rows = lung.lung_study(out, seeds=options.seeds)
+    rows = studies.lung_study(out, seeds=options.seeds)
     summary = json.loads((out / "summary.json").read_text())
     trained = {
         name: kept(out / f"{name}.json".replace(" ", "_"), lambda way=way: way(5))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import delucax as dlx
-from delucax._paths import path_string
+from delucax._module import path_string
 
 
 needs_x64 = pytest.mark.skipif(not jax.config.jax_enable_x64, reason="float64 only")

@@ -6,7 +6,7 @@ import pytest
 from helpers import assert_close, needs_x64, thorough, tolerance
 from jax.test_util import check_grads
 
-from delucax._components import by_components
+from delucax._jax import by_components
 
 
 pytestmark = needs_x64

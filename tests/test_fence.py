@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from helpers import assert_close, once, tolerance
 from jax.test_util import check_grads
 
-from delucax._fence import fence
+from delucax._jax import fence
 
 
 pytestmark = once

@@ -20,15 +20,16 @@ from ._controller import (
     AbstractController as AbstractController,
     AbstractLearner as AbstractLearner,
 )
-from ._fields import (
+from ._module import (
     bounded as bounded,
+    load as load,
     parameter as parameter,
     positive as positive,
+    replace as replace,
+    save as save,
     weight as weight,
 )
-from ._paths import replace as replace
 from ._results import RESULTS as RESULTS
-from ._serialise import load as load, save as save
 from .costs import AbstractCost as AbstractCost
 from .disturbances import AbstractDisturbance as AbstractDisturbance
 from .dynamics import (
@@ -59,12 +60,14 @@ if TYPE_CHECKING:
     from . import (
         analysis as analysis,
         controllers as controllers,
+        estimators as estimators,
         experiments as experiments,
         interop as interop,
         lung as lung,
         planning as planning,
         plotting as plotting,
         riccati as riccati,
+        studies as studies,
         training as training,
     )
     from .plotting import animate as animate, plot as plot
@@ -76,6 +79,7 @@ _LAZY = (
     "analysis",
     "animate",
     "controllers",
+    "estimators",
     "experiments",
     "interop",
     "lung",
@@ -83,6 +87,7 @@ _LAZY = (
     "plot",
     "plotting",
     "riccati",
+    "studies",
     "training",
 )
 

@@ -75,7 +75,7 @@ def _command(commands: Any, name: str, call: Any, help: str, more: str = "") -> 
 
 def _add_demo(commands: Any) -> None:
     def call(options: Any) -> None:
-        from .experiments import demo
+        from .studies import demo
 
         demo(options.out, seeds=options.seeds)
 
@@ -87,7 +87,7 @@ def _add_demo(commands: Any) -> None:
 
 def _add_reproduce(commands: Any) -> None:
     def call(options: Any) -> int:
-        from .experiments import reproduce
+        from .studies import reproduce
 
         rows = reproduce(options.name, options.out, small=options.small)
         return 0 if all(row["holds"] for row in rows) else 1
@@ -107,7 +107,7 @@ def _add_reproduce(commands: Any) -> None:
 
 def _add_lung(commands: Any) -> None:
     def call(options: Any) -> None:
-        from .lung import lung_study
+        from .studies import lung_study
 
         names = ("small", "data", "seeds", "sensor_delay")
         lung_study(options.out, **{name: getattr(options, name) for name in names})

@@ -12,8 +12,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from ._fields import as_float_array
 from ._message import shortened
+from ._module import as_float_array
 
 
 def is_concrete(x: Any) -> bool:

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from ._fields import check_parameters
 from ._message import shortened
+from ._module import check_parameters
 from ._typing import PRNGKey, RealScalar
 
 

@@ -114,18 +114,18 @@ LONG = {
     AbstractDisturbance analysis.disk_margin analysis.DiskMargin analysis.hinf_norm
     analysis.Margins analysis.margins c2d controllers.Adaptive
     controllers.best_in_hindsight controllers.BPC controllers.Categorical
-    controllers.DRC controllers.Explore controllers.ExtendedKalmanFilter
-    controllers.Filtered controllers.FiniteHorizonLQR controllers.FixedPolicy
+    controllers.DRC controllers.Explore estimators.ExtendedKalmanFilter
+    estimators.Filtered controllers.FiniteHorizonLQR controllers.FixedPolicy
     controllers.Gaussian controllers.GPC controllers.Hindsight controllers.HInfinity
-    controllers.iGPC controllers.ILC controllers.KalmanFilter controllers.Linear
+    controllers.iGPC controllers.ILC estimators.KalmanFilter controllers.Linear
     controllers.LQG controllers.LQI controllers.LQR controllers.lqrd controllers.MLP
     controllers.MPC controllers.MPCState controllers.online_newton
-    controllers.OutputFeedback controllers.regret controllers.run_filter
-    controllers.Scheduled controllers.smooth controllers.Standardise
-    controllers.UnscentedKalmanFilter d2c Discretized dynamics.OperatingPoint
+    controllers.OutputFeedback controllers.regret estimators.run_filter
+    controllers.Scheduled estimators.smooth controllers.Standardise
+    estimators.UnscentedKalmanFilter d2c Discretized dynamics.OperatingPoint
     dynamics.WorstCase
-    environments.cartpole environments.cartpole_linear experiments.reproduce
-    experiments.train_swing_up lung.explore lung.fit_lungs lung.LearnedLung
+    environments.cartpole environments.cartpole_linear studies.reproduce
+    studies.train_swing_up lung.explore lung.fit_lungs lung.LearnedLung
     lung.least_error lung.pid_grid lung.ShootingMPC lung.train_controllers
     lung.write_example planning.cem planning.Constraints planning.ilqr planning.Plan
     plotting.phase_portrait randomise riccati.ContinuousGameSolution
@@ -154,7 +154,7 @@ HEAVY = tuple(
 )
 def test_example_runs(name, value, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    if _is_marker(value) or value is dlx.experiments.demo:  # a test of the demo runs it
+    if _is_marker(value) or value is dlx.studies.demo:  # a test of the demo runs it
         return
     examples = _examples(inspect.getdoc(value) or "")
     owner = {"delucax.environments.Step": dlx.Environment}.get(name)

@@ -13,7 +13,7 @@ from hypothesis import given, settings, strategies as st
 from systems_catalogue import SYSTEMS
 
 import delucax as dlx
-from delucax._paths import path_string
+from delucax._module import path_string
 
 
 c, d = dlx.costs, dlx.disturbances
@@ -169,7 +169,7 @@ PARTS = {
     "LQG": lambda: dlx.controllers.LQG(
         dynamics(2), np.eye(2), np.eye(1), np.eye(2), np.eye(2)
     ),
-    "KalmanFilter": lambda: dlx.controllers.KalmanFilter(
+    "KalmanFilter": lambda: dlx.estimators.KalmanFilter(
         dynamics(2), np.eye(2), np.eye(2), steady_state=True
     ),
     "Plan": lambda: dlx.planning.ilqr(

@@ -251,7 +251,7 @@ def test_on_an_estimate_of_an_unstable_plant():
         control_bounds=(280.0, 320.0),
         horizon=60,
     )
-    ekf = dlx.controllers.ExtendedKalmanFilter(
+    ekf = dlx.estimators.ExtendedKalmanFilter(
         measured,
         jnp.diag(w**2),
         jnp.array([[v**2]]),

@@ -6,10 +6,10 @@ from helpers import needs_x32, once, thorough, user_error
 from PIL import Image
 
 import delucax as dlx
-from delucax import experiments
+from delucax import studies
 from delucax.__main__ import main
-from delucax.experiments.paper import STUDIES
-from delucax.experiments.paper._finding import Claim, Finding
+from delucax.studies.paper import STUDIES
+from delucax.studies.paper._finding import Claim, Finding
 
 
 pytestmark = once
@@ -27,7 +27,7 @@ def test_the_demo_writes_what_it_says(tmp_path, monkeypatch):
     monkeypatch.setitem(STUDIES, "study", study)
     lines = []
     out = tmp_path / "new" / "demo"
-    table = experiments.demo(out, seeds=1, steps=20, say=lines.append)
+    table = studies.demo(out, seeds=1, steps=20, say=lines.append)
     written = pd.read_csv(out / "table.csv")
     assert list(written["controller"]) == ["zero", "LQR", "linear policy", "MLP"] * 2
     assert len(table) == 8
@@ -54,22 +54,22 @@ def test_the_demo_writes_what_it_says(tmp_path, monkeypatch):
 def test_an_unwritable_folder_is_an_error_before_any_work(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     with user_error(OSError, match="out must be a folder to write to"):
-        experiments.demo(tmp_path / "file", say=lambda line: pytest.fail(line))
+        studies.demo(tmp_path / "file", say=lambda line: pytest.fail(line))
     assert main(["demo", "--out", str(tmp_path / "file")]) == 2
     assert "error: demo: out must be" in capsys.readouterr().err
     with user_error(match="seeds must be at least 1"):
-        experiments.demo(tmp_path, seeds=0)
+        studies.demo(tmp_path, seeds=0)
 
 
 @needs_x32
 def test_swings_up_from_unseen_starts():
     env = dlx.make("pendulum")
-    fitted = experiments.train_swing_up(key=jax.random.key(0), progress=False)
+    fitted = studies.train_swing_up(key=jax.random.key(0), progress=False)
     keys = jax.random.split(jax.random.key(2**20), 100)
     runs = jax.vmap(
         lambda k: dlx.rollout(env, fitted.model, key=k, horizon=400, keep="states")
     )(keys)
-    assert jnp.sum(experiments.holds_upright(runs)) >= 95
+    assert jnp.sum(studies.holds_upright(runs)) >= 95
 
 
 def test_holds_upright_looks_at_the_end_alone():
@@ -78,8 +78,8 @@ def test_holds_upright_looks_at_the_end_alone():
     key = jax.random.key(0)
     upright = dlx.rollout(env, zero, key=key, x0=jnp.zeros(2), horizon=200)
     hanging = dlx.rollout(env, zero, key=key, x0=jnp.array([3.0, 0.0]), horizon=200)
-    assert experiments.holds_upright(upright)
-    assert not experiments.holds_upright(hanging)
+    assert studies.holds_upright(upright)
+    assert not studies.holds_upright(hanging)
     bare = dlx.rollout(env, zero, key=key, keep=())
     with user_error(match="states kept"):
-        experiments.holds_upright(bare)
+        studies.holds_upright(bare)

@@ -7,14 +7,13 @@ import pytest
 from helpers import once, user_error
 from matplotlib.figure import Figure
 
-from delucax import experiments
-from delucax.experiments.paper import (
+from delucax.studies.paper import (
     _policy_gradient,
     _reproduce,
     _wall_clock,
     STUDIES,
 )
-from delucax.experiments.paper._finding import Claim, Finding
+from delucax.studies.paper._finding import Claim, Finding
 
 
 pytestmark = once
@@ -48,7 +47,7 @@ def studies(monkeypatch):
 
 def test_the_report_holds_claims_tables_and_images(tmp_path, studies):
     lines = []
-    rows = experiments.reproduce("all", tmp_path, small=True, say=lines.append)
+    rows = studies.reproduce("all", tmp_path, small=True, say=lines.append)
     assert [row["holds"] for row in rows] == [True, False, False]
     with open(tmp_path / "claims.csv", newline="") as file:
         assert [row["study"] for row in csv.DictReader(file)] == [
@@ -68,15 +67,15 @@ def test_the_report_holds_claims_tables_and_images(tmp_path, studies):
 
 def test_small_and_full_lungs_are_apart(tmp_path, studies):
     for small in (True, False):
-        experiments.reproduce("ventilator", tmp_path, small=small, say=len)
+        studies.reproduce("ventilator", tmp_path, small=small, say=len)
     assert {path.name for path in tmp_path.glob("lung*")} == {"lung", "lung-small"}
 
 
 def test_unknown_studies_are_named(tmp_path):
     with user_error(match=f"among {', '.join(STUDIES)}; got 'lungs'"):
-        experiments.reproduce("lungs", tmp_path)
+        studies.reproduce("lungs", tmp_path)
     with user_error(match="got 'nope'"):  # before all of them are begun
-        experiments.reproduce(["all", "nope"], tmp_path / "none")
+        studies.reproduce(["all", "nope"], tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 

@@ -10,9 +10,9 @@ from helpers import assert_close, once, thorough, tolerance, user_error
 
 import delucax as dlx
 from delucax import lung
-from delucax.lung._size import FULL
 from delucax.lung._train import _Careful
-from delucax.lung._tuned import _lost, best_of, tuned_pids
+from delucax.studies.ventilator._size import FULL
+from delucax.studies.ventilator._tuned import _lost, best_of, tuned_pids
 
 
 pytestmark = once

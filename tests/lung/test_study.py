@@ -10,13 +10,13 @@ import pytest
 from helpers import assert_close, once, thorough, user_error
 
 import delucax as dlx
-from delucax import lung
+from delucax import lung, studies
 from delucax.__main__ import main
 from delucax.lung import _study
-from delucax.lung._contenders import Contender
-from delucax.lung._report import save_controllers
-from delucax.lung._simulators import grouped, left_out
-from delucax.lung._stages import Stages
+from delucax.studies.ventilator._contenders import Contender
+from delucax.studies.ventilator._report import save_controllers
+from delucax.studies.ventilator._simulators import grouped, left_out
+from delucax.studies.ventilator._stages import Stages
 
 
 pytestmark = once
@@ -31,7 +31,7 @@ def begun(tmp_path, monkeypatch):
 
     monkeypatch.setattr(_study, "explored", cut_off)
     with pytest.raises(KeyboardInterrupt):
-        lung.lung_study(tmp_path, small=True, say=lambda line: None)
+        studies.lung_study(tmp_path, small=True, say=lambda line: None)
     return tmp_path
 
 
@@ -62,22 +62,22 @@ def test_goes_on_where_it_was_cut_off(tmp_path):
 
 def test_other_settings_are_refused(begun):
     with user_error(match="other settings: seeds is 1 there and 2 here"):
-        lung.lung_study(begun, small=True, seeds=2)
+        studies.lung_study(begun, small=True, seeds=2)
     with user_error(match="seeds must be at least 1, got 0"):
-        lung.lung_study(begun, seeds=0)
+        studies.lung_study(begun, seeds=0)
     with user_error(match="other settings: sensor_delay is 2 there and 3 here"):
-        lung.lung_study(begun, small=True, sensor_delay=3)
+        studies.lung_study(begun, small=True, sensor_delay=3)
     with user_error(match="sensor_delay must be a whole number of at least 0, got -1"):
-        lung.lung_study(begun, sensor_delay=-1)
+        studies.lung_study(begun, sensor_delay=-1)
 
 
 def test_damaged_files_are_refused(begun):
     (begun / "breaths.dlx").write_bytes(b"delucax-file 1 0000\nnonsense")
     with user_error(match=r"breaths.dlx' is damaged"):
-        lung.lung_study(begun, small=True)
+        studies.lung_study(begun, small=True)
     (begun / "settings.json").write_text("{")
     with user_error(match=r"settings.json' is damaged"):
-        lung.lung_study(begun, small=True)
+        studies.lung_study(begun, small=True)
 
 
 def test_wrong_data_are_named(tmp_path, capsys):
@@ -105,7 +105,7 @@ def test_breaths_that_are_left_out_are_said(tmp_path, monkeypatch):
     lung.write_breaths(data, recorded)
     for _ in range(2):  # also where the breaths are found
         with pytest.raises(KeyboardInterrupt):
-            lung.lung_study(tmp_path / "out", data=data, say=said.append)
+            studies.lung_study(tmp_path / "out", data=data, say=said.append)
         assert "2 of the 16 breaths are left out: each of the 2 lungs has 7" in said[-1]
 
 
@@ -131,7 +131,9 @@ def test_small_study(tmp_path, from_file):
         data = tmp_path / "train.csv"
         lung.write_example(data, 8, key=jax.random.key(0))
     said = []
-    rows = lung.lung_study(out, small=True, data=data, say=said.append, progress=False)
+    rows = studies.lung_study(
+        out, small=True, data=data, say=said.append, progress=False
+    )
     lungs = {row["lung"] for row in rows if row["split"] == "unseen"}
     assert len(lungs) == (9 if from_file else 2)
     with open(out / "report.csv") as file:
@@ -155,5 +157,7 @@ def test_small_study(tmp_path, from_file):
         assert (out / name).stat().st_size > 1000
     # A second time there is nothing left to do but the report.
     said.clear()
-    again = lung.lung_study(out, small=True, data=data, say=said.append, progress=False)
+    again = studies.lung_study(
+        out, small=True, data=data, say=said.append, progress=False
+    )
     assert again == rows and sum("found" in line for line in said) >= 6

@@ -81,7 +81,7 @@ def test_matvec_names_the_shapes():
     "shape", [pytest.param((200_001,), marks=thorough), (1000, 3, 50)]
 )
 def test_normal_noise_is_normal(shape, key):
-    from delucax.math._normal import normal
+    from delucax._jax import normal
 
     x = np.asarray(normal(key, shape, jnp.float32)).ravel()
     assert x.shape == (np.prod(shape),) and np.all(np.isfinite(x))
@@ -94,7 +94,7 @@ def test_normal_noise_is_normal(shape, key):
 
 @needs_x32
 def test_normal_noise_of_any_kind_of_key():
-    from delucax.math._normal import normal
+    from delucax._jax import normal
 
     old = normal(jax.random.PRNGKey(3), (5,), jnp.float32)
     assert_close(normal(jax.random.key(3), (5,), jnp.float32), old)

@@ -10,7 +10,7 @@ import pytest
 from helpers import assert_close, needs_x64, once, thorough, user_error
 
 import delucax as dlx
-from delucax.experiments import holds_upright
+from delucax.studies import holds_upright
 from delucax.training import (
     actor_critic,
     ActorCritic,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from .._check import is_concrete
-from .._fields import as_float_array
+from .._module import as_float_array
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
 from ._plant import Plant, plant, response, solve

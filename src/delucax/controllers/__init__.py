@@ -9,33 +9,21 @@ from ._basic import (
     Zero as Zero,
 )
 from ._categorical import Categorical as Categorical, Likeliest as Likeliest
-from ._estimator import AbstractEstimator as AbstractEstimator, Belief as Belief
 from ._finite_horizon import FiniteHorizonLQR as FiniteHorizonLQR
 from ._gaussian import Gaussian as Gaussian
 from ._hinfinity import HInfinity as HInfinity
 from ._igpc import iGPC as iGPC
 from ._ilc import ILC as ILC
-from ._kalman import KalmanFilter as KalmanFilter
 from ._lqg import LQG as LQG
 from ._lqi import LQI as LQI
 from ._lqr import LQR as LQR
 from ._mpc import MPC as MPC, MPCState as MPCState
 from ._network import Deep as Deep, MLP as MLP
-from ._nonlinear_filters import (
-    ExtendedKalmanFilter as ExtendedKalmanFilter,
-    UnscentedKalmanFilter as UnscentedKalmanFilter,
-)
 from ._output_feedback import OutputFeedback as OutputFeedback
 from ._pid import LeakyPID as LeakyPID, PID as PID
 from ._recurrent import GRU as GRU, History as History, Standardise as Standardise
 from ._sampled import lqrd as lqrd, sampled_weights as sampled_weights
 from ._scheduled import Scheduled as Scheduled
-from ._smoother import (
-    Filtered as Filtered,
-    run_filter as run_filter,
-    smooth as smooth,
-    Smoothed as Smoothed,
-)
 from .online import (
     adagrad_norm as adagrad_norm,
     Adaptive as Adaptive,

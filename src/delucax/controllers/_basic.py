@@ -10,8 +10,8 @@ from jaxtyping import Array
 
 from .._check import as_matrix, check_count, check_key, check_real, is_concrete
 from .._controller import AbstractController, wrong_observation
-from .._fields import parameter, weight
 from .._message import shortened
+from .._module import parameter, weight
 from ..math import matvec
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._check import as_matrix, check_key
 from .._controller import AbstractController, check_controller
-from .._fields import parameter
+from .._module import parameter
 from .._typing import PRNGKey, RealScalar
 
 

@@ -10,7 +10,7 @@ import lineax as lx
 from jaxtyping import Array, Float
 
 from .._check import as_vector, output_of
-from .._fields import function_field, parameter
+from .._module import function_field, parameter
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..references import Constant

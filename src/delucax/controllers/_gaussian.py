@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, PyTree
 
 from .._check import as_bounds, bounds_field, check_key
 from .._controller import AbstractController, check_controller
-from .._fields import weight
 from .._message import shortened
+from .._module import weight
 from .._typing import PRNGKey, RealScalar
 from ..math import clip
 from ..simulation import Trajectory

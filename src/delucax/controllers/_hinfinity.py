@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from .._check import check_count, check_positive, check_step
 from .._controller import AbstractController
-from .._fields import function_field, parameter, weight
+from .._module import function_field, parameter, weight
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..math._steps import row_at, step_at

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_bool, check_count, check_number, check_positive
-from .._fields import as_float_array
+from .._module import as_float_array
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_matrix, check_count, check_number, check_positive
-from .._fields import as_float_array
+from .._module import as_float_array
 from .._results import choose, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._controller import AbstractController
-from .._fields import parameter
+from .._module import parameter
 from ..dynamics import LinearDynamics
-from ._kalman import KalmanFilter
+from ..estimators import KalmanFilter
 from ._lqr import LQR
 from ._output_feedback import OutputFeedback
 
@@ -51,7 +51,7 @@ class LQG(AbstractController):
     - `observation_difference`: likewise for observations.
 
     **Attributes:** `regulator`, a [`delucax.controllers.LQR`][], with `K` and `P`;
-    `estimator`, a [`delucax.controllers.KalmanFilter`][], with `L`; `average_cost`, a
+    `estimator`, a [`delucax.estimators.KalmanFilter`][], with `L`; `average_cost`, a
     scalar, of the steady state (`None` without it).
 
     **Raises:** `ValueError` as those two do; an error at run time if there is no

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._check import as_matrix, check_finite, check_step
 from .._controller import AbstractController
-from .._fields import as_float_array, function_field, parameter, weight
+from .._module import as_float_array, function_field, parameter, weight
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..riccati import dare

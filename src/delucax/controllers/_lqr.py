@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._controller import AbstractController
-from .._fields import function_field, parameter, weight
 from .._message import shortened
+from .._module import function_field, parameter, weight
 from ..dynamics import AbstractDynamics, OperatingPoint
 from ..math import matvec
 from ..math._linear_solve import solve

@@ -13,14 +13,14 @@ from jaxtyping import Array
 
 from .._check import as_bounds, check_bool, check_count, check_finite, check_key
 from .._controller import AbstractController, Tally, wrong_observation
-from .._fields import (
+from .._message import shortened
+from .._module import (
     as_float_array,
     as_module,
     function_field,
     parameter,
     StaticFunction,
 )
-from .._message import shortened
 from .._results import Result, RESULTS
 from ..costs import AbstractCost
 from ..costs._base import check_cost

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from .._check import as_bounds, bounds_field, check_count, check_key, is_concrete
 from .._controller import AbstractController, wrong_observation
-from .._fields import as_module, function_field, weight
+from .._module import as_module, function_field, weight
 from .._typing import PRNGKey
 from ..environments import Environment
 from ._gaussian import Gaussian

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .._controller import AbstractController
-from ._estimator import AbstractEstimator, Belief
+from ..estimators import AbstractEstimator, Belief
 
 
 class _State(NamedTuple):
@@ -26,7 +26,7 @@ class OutputFeedback(AbstractController):
     **Arguments:**
 
     - `controller`: a controller that reads the state.
-    - `estimator`: what estimates it, such as a [`delucax.controllers.KalmanFilter`][].
+    - `estimator`: what estimates it, such as a [`delucax.estimators.KalmanFilter`][].
 
     **Raises:** `ValueError` if either is of the wrong kind.
 
@@ -43,7 +43,7 @@ class OutputFeedback(AbstractController):
         regulator = dlx.controllers.LQR(
             dlx.linearize(env.dynamics), jnp.eye(2), jnp.eye(1)
         )
-        ekf = dlx.controllers.ExtendedKalmanFilter(
+        ekf = dlx.estimators.ExtendedKalmanFilter(
             env.dynamics, 1e-6 * jnp.eye(2), 1e-2 * jnp.eye(2)
         )
         controller = dlx.controllers.OutputFeedback(regulator, ekf)

@@ -11,14 +11,8 @@ from jaxtyping import Array
 
 from .._check import as_bounds, as_matrix, bounds_field, check_step, is_concrete
 from .._controller import AbstractController, wrong_observation
-from .._fields import (
-    as_float_array,
-    function_field,
-    parameter,
-    positive,
-    weight,
-)
 from .._message import shortened
+from .._module import as_float_array, function_field, parameter, positive, weight
 from ..math import clip, matvec
 
 

@@ -10,8 +10,8 @@ from jaxtyping import Array, PyTree
 
 from .._check import bounds_field, check_count, check_finite, check_key, check_positive
 from .._controller import AbstractController, check_controller, wrong_observation
-from .._fields import as_float_array, function_field, parameter, weight
 from .._message import shortened
+from .._module import as_float_array, function_field, parameter, weight
 from .._typing import PRNGKey
 from ._network import check_squash
 

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from .._check import check_step
 from .._controller import AbstractController
-from .._fields import parameter
+from .._module import parameter
 from ..math._steps import row_at, step_at
 
 

@@ -2,7 +2,7 @@
 
 from jaxtyping import Array
 
-from .._fields import parameter
+from .._module import parameter
 from ..math import cos
 from ._base import AbstractCost
 

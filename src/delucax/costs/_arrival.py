@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._fields import function_field, parameter
+from .._module import function_field, parameter
 from .._typing import RealScalar
 from ._base import AbstractCost
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import output_of
-from .._fields import check_parameters
+from .._module import check_parameters
 from .._typing import RealScalar
 
 

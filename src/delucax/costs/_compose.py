@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_number, check_step
-from .._fields import function_field, parameter
+from .._module import function_field, parameter
 from .._typing import RealScalar
 from ._base import AbstractCost, check_cost
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_finite, symmetric_matrix
-from .._fields import as_float_array, function_field, parameter
 from .._message import shortened
+from .._module import as_float_array, function_field, parameter
 from .._typing import Matrix, RealScalar, Vector
 from ..math import quadratic_form
 from ..math._small import dot

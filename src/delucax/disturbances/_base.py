@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_count
-from .._fields import as_float_array, check_parameters
 from .._message import shortened
+from .._module import as_float_array, check_parameters
 from .._typing import PRNGKey
 
 

@@ -7,7 +7,7 @@ import jax.random as jr
 from jaxtyping import Array
 
 from .._check import check_key, check_range
-from .._fields import parameter
+from .._module import parameter
 from ..math._steps import reached, step_between
 from ._base import AbstractDisturbance, check_disturbance
 from ._deterministic import Constant

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import as_matrix, check_range
-from .._fields import parameter, positive
+from .._module import parameter, positive
 from ..math import sin
 from ..math._steps import coarsest, position, step_between
 from ._base import AbstractDisturbance, check_common_size, common_size, spread

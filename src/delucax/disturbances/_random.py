@@ -9,9 +9,9 @@ import jax.random as jr
 from jaxtyping import Array
 
 from .._check import check_count, check_key, check_range, check_step
-from .._fields import parameter
+from .._jax import normal
+from .._module import parameter
 from ..math import clip
-from ..math._normal import normal
 from ..math._steps import step_between
 from ._base import AbstractDisturbance, check_common_size, common_size
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from .._check import check_step, output_of
-from .._fields import check_parameters
+from .._module import check_parameters
 from .._results import Result, RESULTS
 from .._typing import RealScalar
 from ..systems._base import validate_io

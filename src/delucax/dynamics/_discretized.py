@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_count
-from .._components import by_components
-from .._fields import parameter
+from .._jax import by_components
+from .._module import parameter
 from .._results import choose, first_of, or_none, promote, RESULTS
 from ..systems import AbstractSystem
 from ..systems._base import zeros_if_none

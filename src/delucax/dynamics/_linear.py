@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._check import as_matrix, as_vector, is_concrete
-from .._fields import as_float_array, parameter
+from .._module import as_float_array, parameter
 from .._results import RESULTS
 from ..math import matvec
 from ..math._steps import row_at, step_at

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_vector, check_real
-from .._components import by_components
-from .._fields import as_float_array
+from .._jax import by_components
 from .._message import shortened
+from .._module import as_float_array
 from .._results import choose, first_failure, first_of, or_none, RESULTS
 from .._typing import RealScalar
 from ._base import AbstractDynamics

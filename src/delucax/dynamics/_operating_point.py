@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._check import is_concrete
-from .._fields import as_float_array
 from .._message import shortened
+from .._module import as_float_array
 from .._results import Result, RESULTS
 from ..costs import AbstractCost
 from ._base import AbstractDynamics

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._fence import fence
+from .._jax import fence
 from .._typing import RealScalar
 
 

@@ -5,7 +5,7 @@ from typing import Any
 from jaxtyping import Array, Float
 
 from .._check import as_matrix, check_positive
-from .._fields import parameter
+from .._module import parameter
 from ..math import matvec
 from ..math._norms import within_ball
 from ._base import AbstractDynamics, check_dynamics

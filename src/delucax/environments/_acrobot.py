@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import check_number, check_positive, check_range
-from .._fields import parameter, positive
+from .._module import parameter, positive
 from .._results import RESULTS
 from .._typing import RealScalar
 from ..costs import Arrival

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import check_positive, check_range, check_step
-from .._fence import fence
-from .._fields import as_float_array, parameter, positive
+from .._jax import fence
+from .._module import as_float_array, parameter, positive
 from .._results import RESULTS
 from .._typing import RealScalar
 from ..costs import Arrival, Quadratic

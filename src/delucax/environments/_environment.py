@@ -20,15 +20,17 @@ from .._check import (
     is_concrete,
     output_of,
 )
-from .._fields import (
+from .._message import shortened
+from .._module import (
     as_float_array,
     as_module,
     check_parameters,
+    check_paths,
     function_field,
+    get_path,
     parameter,
+    replace,
 )
-from .._message import shortened
-from .._paths import check_paths, get_path, replace
 from .._results import Result
 from .._typing import PRNGKey, RealScalar
 from ..costs import AbstractCost

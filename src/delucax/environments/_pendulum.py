@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import check_positive, check_range
-from .._fields import parameter, positive
+from .._module import parameter, positive
 from .._results import RESULTS
 from ..costs import PendulumCost
 from ..dynamics import AbstractDynamics

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_range
-from .._fields import as_float_array
+from .._module import as_float_array
 from .._typing import PRNGKey
 from ..costs import Quadratic
 from ..dynamics import Discretized

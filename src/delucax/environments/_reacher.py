@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import check_finite
-from .._fields import parameter
+from .._module import parameter
 from ..costs import AbstractCost
 from ..dynamics import Discretized
 from ..math import cos, sin

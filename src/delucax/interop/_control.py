@@ -7,7 +7,7 @@ import numpy as np
 
 from .._check import is_concrete
 from .._extras import extra
-from .._names import indexed_names
+from .._module import indexed_names
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
 

@@ -58,7 +58,6 @@ from ._runner import (
 )
 from ._shooting import ShootingMPC as ShootingMPC
 from ._stacking import stack as stack, unstack as unstack
-from ._study import lung_study as lung_study
 from ._tasks import (
     balloon_lung as balloon_lung,
     delay_lung as delay_lung,

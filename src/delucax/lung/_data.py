@@ -18,7 +18,7 @@ from .._check import (
     check_step,
 )
 from .._controller import AbstractController
-from .._fields import check_parameters, parameter, positive
+from .._module import check_parameters, parameter, positive
 from .._typing import PRNGKey
 from ..controllers import LeakyPID
 from ..environments import Environment

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_vector, check_count, check_range
-from .._fields import parameter
+from .._module import parameter
 from ..costs import AbstractCost
 from ..disturbances import Gaussian
 from ..dynamics import AbstractDynamics

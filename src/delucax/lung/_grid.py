@@ -9,7 +9,7 @@ import optax
 from jaxtyping import Array
 
 from .._check import check_count, check_finite, check_key
-from .._fields import as_float_array
+from .._module import as_float_array
 from .._typing import PRNGKey
 from ..controllers import LeakyPID, PID
 from ..environments import Environment

@@ -9,7 +9,7 @@ import jax.random as jr
 from jaxtyping import Array, Float
 
 from .._check import check_bool, check_count, check_key
-from .._fields import as_module, parameter, positive, weight
+from .._module import as_module, parameter, positive, weight
 from .._results import RESULTS
 from .._typing import PRNGKey
 from ..dynamics import AbstractDynamics

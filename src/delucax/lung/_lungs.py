@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import is_concrete
-from .._fields import bounded, parameter, positive
+from .._module import bounded, parameter, positive
 from ..systems import AbstractSystem
 from ._valves import Valves
 

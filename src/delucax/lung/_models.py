@@ -10,7 +10,7 @@ import jax.random as jr
 from jaxtyping import Array
 
 from .._check import check_count, check_key, check_step
-from .._fields import as_module, parameter, positive, weight
+from .._module import as_module, parameter, positive, weight
 from .._typing import PRNGKey
 from ..dynamics import Discretized
 from ._environment import PressureSensor

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_bool, check_count
-from .._fields import parameter, positive
+from .._module import parameter, positive
 from .._results import RESULTS
 from ..dynamics import AbstractDynamics
 from ._lungs import balloon_pressure

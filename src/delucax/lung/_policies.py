@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from .._check import check_count, check_key, check_step
 from .._controller import AbstractController, check_controller
-from .._fields import as_module, parameter, positive, weight
+from .._module import as_module, parameter, positive, weight
 from .._typing import PRNGKey
 from ..math import clip
 from ._waveform import BreathWaveform, check_waveform

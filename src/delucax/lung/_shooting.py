@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from .._check import check_count
 from .._controller import AbstractController
-from .._fields import parameter, positive
+from .._module import parameter, positive
 from ._learned import LearnedLung
 from ._waveform import BreathWaveform, check_waveform
 

@@ -7,7 +7,7 @@ from typing import Any
 import diffrax
 
 from .._check import check_count
-from .._serialise import load
+from .._module import load
 from ..dynamics import Delayed, Discretized
 from ..environments import Environment
 from ..environments._registry import finish

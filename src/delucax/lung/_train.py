@@ -17,7 +17,7 @@ from .._check import (
     check_range,
 )
 from .._controller import AbstractController
-from .._fields import function_field, parameter
+from .._module import function_field, parameter
 from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics

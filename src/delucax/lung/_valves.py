@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_range
-from .._fields import check_parameters, parameter, positive
+from .._module import check_parameters, parameter, positive
 
 
 class Valves(eqx.Module):

@@ -15,8 +15,8 @@ from .._check import (
     check_step,
     is_concrete,
 )
-from .._fields import as_float_array, check_parameters, parameter, positive
 from .._message import shortened
+from .._module import as_float_array, check_parameters, parameter, positive
 
 
 _T = TypeVar("_T")

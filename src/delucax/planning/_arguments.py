@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_bounds, as_vector, check_count, check_finite
-from .._fields import as_float_array, as_module
 from .._message import shortened
+from .._module import as_float_array, as_module
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ._constraints import Constraints

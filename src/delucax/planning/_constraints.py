@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._fields import check_parameters, function_field
+from .._module import check_parameters, function_field
 
 
 class Constraints(eqx.Module):

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._check import check_count, check_positive, check_range
-from .._fields import as_float_array
+from .._module import as_float_array
 from .._results import choose, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics

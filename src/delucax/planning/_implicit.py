@@ -13,6 +13,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._jax import by_lanes, poison
 from ..math import matvec
 from ._augmented import with_constraints
 from ._constraints import (
@@ -23,9 +24,7 @@ from ._constraints import (
     stage_values,
 )
 from ._descent import CONVERGED, Options, Outcome, Tolerances
-from ._lanes import by_lanes
 from ._lq import apply, in_parallel, in_sequence, product, solve_free, Stages
-from ._poison import poison
 from ._problem import costates_of, model, Problem
 from ._start import controls_of, Start
 

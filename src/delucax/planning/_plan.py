@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .._check import as_bounds, check_step, is_concrete
 from .._controller import AbstractController, wrong_observation
-from .._fields import function_field, parameter, weight
+from .._module import function_field, parameter, weight
 from .._results import Result, RESULTS
 from ..math import matvec
 from ..math._steps import row_at, step_at

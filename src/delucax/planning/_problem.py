@@ -8,7 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._components import by_components
+from .._jax import by_components
 from .._results import first_of, or_none, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics

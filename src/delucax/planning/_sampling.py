@@ -11,8 +11,8 @@ import jax.random as jr
 from jaxtyping import Array
 
 from .._check import check_count, check_key, check_positive, check_range
-from .._fields import as_float_array
 from .._message import shortened
+from .._module import as_float_array
 from .._results import choose, RESULTS
 from ._plan import Plan
 from ._problem import Problem, roll_out

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._check import check_count, check_finite
-from .._fields import as_float_array, parameter
 from .._message import shortened
+from .._module import as_float_array, parameter
 from .._typing import RealScalar
 from ..costs import AbstractCost
 from ..costs._base import check_cost

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from .._check import as_vector
-from .._fields import as_float_array
+from .._module import as_float_array
 from ..systems import AbstractSystem
 from ._figure import (
     color_of,

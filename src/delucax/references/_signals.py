@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import as_matrix, check_step
-from .._fields import check_parameters, parameter, positive
+from .._module import check_parameters, parameter, positive
 from ..math import sin
 from ..math._steps import step_at
 

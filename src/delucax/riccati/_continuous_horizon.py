@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import as_matrix, check_finite, is_concrete, symmetric_matrix
-from .._fields import as_float_array
 from .._message import shortened
+from .._module import as_float_array
 from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision, solve
 from ._finite_horizon import raised

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_matrix, check_positive, is_concrete, symmetric_matrix
-from .._fields import as_float_array
 from .._message import shortened
+from .._module import as_float_array
 from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision, solve
 from ._arguments import check_definite

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import as_matrix, check_count, check_finite, is_concrete, symmetric_matrix
-from .._fields import as_float_array
 from .._message import shortened
+from .._module import as_float_array
 
 
 def in_time(

@@ -9,8 +9,8 @@ from jax.core import Tracer
 
 from .._check import check_finite, check_positive, is_concrete
 from .._controller import AbstractController
-from .._fields import as_float_array
 from .._message import shortened
+from .._module import as_float_array
 from ..dynamics._discretized import has_diffusion
 from ..dynamics._solvers import (
     check_adaptive,

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import jax.random as jr
 
 from .._check import as_vector, check_bool, check_count, check_finite, check_key
-from .._components import by_components
 from .._controller import AbstractController, tallies
-from .._fields import as_float_array
+from .._jax import by_components
 from .._message import shortened
+from .._module import as_float_array
 from .._results import choose, first_failure, first_of, or_none, RESULTS
 from .._typing import PRNGKey
 from ..disturbances import Zero

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._fields import parameter, positive
+from .._module import parameter, positive
 from ..math import cos, sin, wrap
 from ._base import AbstractSystem
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_vector
-from .._fields import check_parameters
+from .._module import check_parameters
 from .._typing import RealScalar
 
 

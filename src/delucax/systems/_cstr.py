@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import is_concrete
-from .._fields import parameter, positive
 from .._message import shortened
+from .._module import parameter, positive
 from ._base import AbstractSystem
 
 

@@ -5,8 +5,7 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 from jaxtyping import Array
 
-from .._fields import function_field
-from .._names import indexed_names
+from .._module import function_field, indexed_names
 from ._base import AbstractSystem
 
 

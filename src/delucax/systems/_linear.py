@@ -5,8 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_matrix, as_vector
-from .._fields import parameter
-from .._names import indexed_names
+from .._module import indexed_names, parameter
 from .._typing import Matrix
 from ..math import matvec
 from ._base import AbstractSystem

@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._fields import parameter
+from .._module import parameter
 from ._base import AbstractSystem
 
 

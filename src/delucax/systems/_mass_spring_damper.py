@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_count
-from .._fields import parameter, positive
+from .._module import parameter, positive
 from ._base import AbstractSystem
 
 

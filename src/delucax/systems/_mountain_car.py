@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from .._fields import parameter
+from .._module import parameter
 from ..math import cos, sin
 from ._base import AbstractSystem
 

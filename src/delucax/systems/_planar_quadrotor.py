@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._fields import function_field, parameter, positive
+from .._module import function_field, parameter, positive
 from ..math import cos, sin, wrap
 from ._base import AbstractSystem
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._fields import parameter, positive
+from .._module import parameter, positive
 from ._base import AbstractSystem
 
 

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._fields import parameter, positive
+from .._module import parameter, positive
 from ._base import AbstractSystem
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._fields import check_parameters, parameter, positive
+from .._module import check_parameters, parameter, positive
 from .._typing import RealScalar
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from .._check import check_key
 from .._controller import AbstractController
-from .._fields import parameter
+from .._module import parameter
 from .._typing import PRNGKey, RealScalar
 from ..controllers import Categorical, Deep, Gaussian, MLP, Standardise
 from ..environments import Environment

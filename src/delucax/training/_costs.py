@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from .._check import check_count, check_key
 from .._controller import AbstractController
-from .._fields import as_float_array
+from .._module import as_float_array
 from ..environments import Environment
 from ..simulation import rollout, Trajectory
 from ..simulation._answer import begun

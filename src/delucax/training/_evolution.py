@@ -9,7 +9,7 @@ import jax.random as jr
 from jaxtyping import Array, PyTree
 
 from .._check import check_count, check_key
-from .._fields import as_float_array, check_parameters, parameter, positive
+from .._module import as_float_array, check_parameters, parameter, positive
 from .._typing import PRNGKey
 from ._loss import cost_and_metrics
 from ._trainable import weights_of

@@ -10,7 +10,7 @@ import jax.random as jr
 from jaxtyping import Array
 
 from .._check import check_bool, check_count, check_positive, check_range
-from .._fields import as_float_array, parameter
+from .._module import as_float_array, parameter
 from ..environments import Environment
 from ..simulation._answer import begun
 from ._actor_critic import (

@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._check import check_finite
-from .._fields import AbstractConstraint, marked_leaves
 from .._message import shortened
-from .._paths import get_path, path_string
+from .._module import AbstractConstraint, get_path, marked_leaves, path_string
 
 
 class Assembly(eqx.Module):

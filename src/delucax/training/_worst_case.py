@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from .._check import as_vector, check_count, check_key, check_positive
 from .._controller import AbstractController
-from .._fields import as_float_array
+from .._module import as_float_array
 from .._typing import PRNGKey
 from ..environments import Environment
 from ..math import safe_norm

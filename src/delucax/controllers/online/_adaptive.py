@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ..._check import check_count, check_key, check_range, check_step
 from ..._controller import AbstractController, AbstractLearner
-from ..._fields import parameter
+from ..._module import parameter
 
 
 class AdaptiveState(NamedTuple):

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..._check import check_count, check_key, check_step
 from ..._controller import AbstractController, Tally
-from ..._fields import parameter, weight
+from ..._module import parameter, weight
 from ...dynamics import AbstractDynamics
 from ...math._norms import safe_norm, within_ball
 from ._base import RADIUS, scale

@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from ..._check import as_matrix, check_count, check_key, check_step
 from ..._controller import AbstractController, wrong_observation
-from ..._fields import function_field, parameter
+from ..._module import function_field, parameter
 from ...dynamics import LinearDynamics
 from ...math._linear_solve import solve
 from ._loop import shift

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..._fields import parameter
+from ..._module import parameter
 from ._loop import Loop, LoopState, shift
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from ..._check import check_count
 from ..._controller import AbstractController
-from ..._fields import marked_leaves
+from ..._module import marked_leaves
 from ..._results import choose, Result, RESULTS
 from ...disturbances import FromArray
 from ...environments import Environment

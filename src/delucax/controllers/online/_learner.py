@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from ..._check import check_step, output_of
 from ..._controller import AbstractLearner, Tally
-from ..._fields import function_field, parameter
+from ..._module import function_field, parameter
 from ...dynamics import AbstractDynamics
 from ._features import Features
 from ._fixed import FixedPolicy

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ..._check import check_count, is_concrete
 from ..._controller import AbstractController, wrong_observation
-from ..._fields import parameter
+from ..._module import parameter
 from ...dynamics import AbstractDynamics, LinearDynamics
 from ...dynamics._linearize import _jacobian
 from ...math import matvec

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from ..._check import check_count, check_key, check_positive
 from ..._controller import AbstractController
-from ..._fields import as_module
+from ..._module import as_module
 from ..._typing import PRNGKey
 from ...dynamics import AbstractDynamics
 from ._base import loop_of, memory_of

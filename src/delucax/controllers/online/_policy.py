@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..._check import check_step
-from ..._fields import parameter, weight
+from ..._module import parameter, weight
 from ...math._norms import within_ball
 
 

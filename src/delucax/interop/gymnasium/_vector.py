@@ -14,8 +14,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from ..._check import check_count, check_finite, check_real
-from ..._fields import as_float_array
 from ..._message import shortened
+from ..._module import as_float_array
 from ...environments import Environment
 from ._program import FAILED, program, REWARD, TERMINATED, TRUNCATED
 from ._spaces import action_space, is_discrete, observation_space, read_options

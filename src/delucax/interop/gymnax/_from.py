@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from ..._check import check_step
-from ..._fields import as_float_array, parameter
+from ..._module import as_float_array, parameter
 from ..._results import RESULTS
 from ..._typing import RealScalar
 from ...costs import AbstractCost

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..._check import check_bool, check_key, is_concrete
-from ..._fields import as_float_array
 from ..._message import shortened
+from ..._module import as_float_array
 from ...environments import Environment
 from .._by_value import ByValue
 from .._episode import (

@@ -9,7 +9,7 @@ from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float
 
 from ..._check import check_range, is_concrete
-from ..._fields import as_float_array
+from ..._module import as_float_array
 from ..._results import choose, first_failure, promote, Result, RESULTS
 
 

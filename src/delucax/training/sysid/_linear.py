@@ -9,8 +9,8 @@ import lineax as lx
 from jaxtyping import Array
 
 from ..._check import check_bool, check_count, check_finite, check_step
-from ..._fields import as_float_array
 from ..._message import shortened
+from ..._module import as_float_array
 from ..._results import RESULTS
 from ...dynamics import LinearDynamics
 from ._identified import Certainty, checked, Identified, quantile

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._check import check_count, check_key, check_positive, check_step
-from ..._fields import as_module, parameter, positive, weight
+from ..._module import as_module, parameter, positive, weight
 from ..._results import RESULTS
 from ..._typing import PRNGKey
 from ...dynamics import AbstractDynamics

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._check import as_vector, check_bool, check_count, check_positive, is_concrete
-from ..._fields import as_float_array
+from ..._module import as_float_array
 from ..._results import choose, Result, RESULTS
 from ...dynamics import AbstractDynamics, open_loop
 from .._trainable import take_apart

@@ -15,8 +15,7 @@ import optax
 
 from .. import plotting
 from .._extras import extra
-from .._paths import replace
-from .._serialise import save
+from .._module import replace, save
 from ..controllers import Linear, LQR, Zero
 from ..disturbances import Shock
 from ..dynamics import linearize
@@ -46,7 +45,7 @@ def demo(
     of the Deluca paper (Section 4) and an MLP by differentiating the rollout; runs them
     and zero control from the same 100 starts, without and with a shock in the middle;
     and writes a table, the controller, a figure and an animation. Then it is
-    [`delucax.experiments.reproduce`][] with `small`, of all but the ventilator, in the
+    [`delucax.studies.reproduce`][] with `small`, of all but the ventilator, in the
     folder `paper` beside them.
 
     **Arguments:**
@@ -68,7 +67,7 @@ def demo(
         from delucax import experiments
 
         with tempfile.TemporaryDirectory() as folder:
-            table = experiments.demo(folder, seeds=1, steps=20)
+            table = studies.demo(folder, seeds=1, steps=20)
         ```
     """
     pd = extra("pandas", "demo")

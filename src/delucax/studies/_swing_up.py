@@ -8,7 +8,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool
 
-from .._paths import replace
+from .._module import replace
 from .._typing import PRNGKey
 from ..controllers import Deep
 from ..environments import Environment, pendulum
@@ -51,7 +51,7 @@ def train_swing_up(
         import jax
         from delucax import experiments
 
-        fitted = experiments.train_swing_up(key=jax.random.key(0), steps=20)
+        fitted = studies.train_swing_up(key=jax.random.key(0), steps=20)
         ```
     """
     environment = pendulum() if environment is None else environment
@@ -111,7 +111,7 @@ def holds_upright(
         env = dlx.make("pendulum")
         zero = dlx.controllers.Zero(1)
         trajectory = dlx.rollout(env, zero, key=jax.random.key(0))
-        experiments.holds_upright(trajectory)
+        studies.holds_upright(trajectory)
         ```
     """
     if trajectory.states is None:

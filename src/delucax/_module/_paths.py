@@ -11,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import PyTree
 
+from .._message import shortened
 from ._fields import (
     as_float_array,
     check_module,
@@ -18,7 +19,6 @@ from ._fields import (
     converter_of,
     is_static,
 )
-from ._message import shortened
 
 
 _T = TypeVar("_T")

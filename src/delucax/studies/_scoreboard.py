@@ -15,9 +15,9 @@ import numpy as np
 
 from ..controllers import Sequence, Zero
 from ..environments import Environment, registered
+from ..experiments._experiment import experiment
 from ..planning import ilqr
 from ..simulation import rollout
-from ._experiment import experiment
 from ._methods import agent_of, FAMILIES, Pump, task_of, Unsuitable
 
 

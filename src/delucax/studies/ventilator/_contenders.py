@@ -8,26 +8,21 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from ..controllers import (
-    GPC,
-    KalmanFilter,
-    LeakyPID,
-    online_newton,
-    OutputFeedback,
-)
-from ..costs import Tracking
-from ..dynamics import LinearDynamics
-from ..environments import Environment
-from ..training.sysid import arx
-from ._data import Breaths
-from ._grid import GAINS, make_pid, pid_grid
-from ._policies import BangBang, BreathPolicy, FeedForward, Summed
-from ._runner import ABORT
-from ._shooting import ShootingMPC
+from ...controllers import GPC, LeakyPID, online_newton, OutputFeedback
+from ...costs import Tracking
+from ...dynamics import LinearDynamics
+from ...environments import Environment
+from ...estimators import KalmanFilter
+from ...lung._data import Breaths
+from ...lung._grid import GAINS, make_pid, pid_grid
+from ...lung._policies import BangBang, BreathPolicy, FeedForward, Summed
+from ...lung._runner import ABORT
+from ...lung._shooting import ShootingMPC
+from ...lung._stacking import repeat, stack, unstack
+from ...lung._train import train_controllers
+from ...lung._waveform import BreathWaveform
+from ...training.sysid import arx
 from ._size import Size
-from ._stacking import repeat, stack, unstack
-from ._train import train_controllers
-from ._waveform import BreathWaveform
 
 
 TRUE_PID = dict(

@@ -10,16 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._check import check_number, check_positive, is_concrete
-from .._fields import function_field, parameter, positive
+from .._module import function_field, parameter, positive
 from .._results import RESULTS
 from ..dynamics import AbstractDynamics
 from ..dynamics._base import check_dynamics
 from ..dynamics._linearize import _jacobian
-from ._gaussian_filter import (
-    AbstractGaussianFilter,
-    first_belief,
-    noise_covariances,
-)
+from ._gaussian import AbstractGaussianFilter, first_belief, noise_covariances
 from ._moments import congruence, LinearJoint, SampledJoint, square_root
 
 
@@ -30,7 +26,7 @@ class ExtendedKalmanFilter(AbstractGaussianFilter):
     `x_next = F(t, x, u, w)`, `w ~ N(0, W)`, `y = h(t, x) + v`, `v ~ N(0, V)`,
 
     with `A = dF/dx`, `E = dF/dw` and `C = dh/dx` in the places of the matrices of
-    [`delucax.controllers.KalmanFilter`][]. On linear dynamics it is that filter.
+    [`delucax.estimators.KalmanFilter`][]. On linear dynamics it is that filter.
 
     **Arguments:**
 
@@ -60,7 +56,7 @@ class ExtendedKalmanFilter(AbstractGaussianFilter):
 
         pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         W, V = 1e-4 * jnp.eye(2), 1e-2 * jnp.eye(2)
-        ekf = dlx.controllers.ExtendedKalmanFilter(
+        ekf = dlx.estimators.ExtendedKalmanFilter(
             pendulum, W, V, observation_difference=pendulum.difference
         )
         belief = ekf.update(0.0, jnp.array([0.1, 0.0]), ekf.init())
@@ -122,7 +118,7 @@ class UnscentedKalmanFilter(AbstractGaussianFilter):
     `2 - n / c - alpha^2 + beta` in the covariance. They are drawn anew for each update.
     The disturbance counts to first order, by `E W E'` with `E = dF/dw` at the mean,
     which is exact where it is added to the state. On linear dynamics this is the
-    [`delucax.controllers.KalmanFilter`][].
+    [`delucax.estimators.KalmanFilter`][].
 
     With the default weights no weight is negative, so that covariances stay
     semidefinite. A small `alpha`, such as the common 1e-3, has weights of `1 / alpha^2`
@@ -161,7 +157,7 @@ class UnscentedKalmanFilter(AbstractGaussianFilter):
 
         pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         W, V = 1e-4 * jnp.eye(2), 1e-2 * jnp.eye(2)
-        ukf = dlx.controllers.UnscentedKalmanFilter(
+        ukf = dlx.estimators.UnscentedKalmanFilter(
             pendulum, W, V, observation_difference=pendulum.difference
         )
         belief = ukf.update(0.0, jnp.array([0.1, 0.0]), ukf.init())

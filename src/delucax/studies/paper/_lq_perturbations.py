@@ -11,8 +11,8 @@ from ... import controllers
 from ...costs import Quadratic
 from ...dynamics import LinearDynamics
 from ...environments import Environment
+from ...experiments._statistics import mean_and_half_width, paired_ratio
 from ...simulation import rollout
-from .._statistics import mean_and_half_width, paired_ratio
 from ._finding import Claim, Finding
 
 

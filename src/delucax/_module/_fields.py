@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import AbstractArray, Array, jaxtyped
 
-from ._message import shortened
+from .._message import shortened
 
 
 _ROLE = "delucax_role"

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import check_finite, is_concrete
-from .._fields import as_float_array
 from .._message import shortened
+from .._module import as_float_array
 from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision
-from ._estimator import Belief
-from ._gaussian_filter import AbstractGaussianFilter
+from ._base import Belief
+from ._gaussian import AbstractGaussianFilter
 
 
 class Filtered(eqx.Module):
@@ -24,7 +24,7 @@ class Filtered(eqx.Module):
     **Attributes:**
 
     - `predicted`: the belief of each state before it is observed, and at the end that
-        of the state after the last control: a [`delucax.controllers.Belief`][] with a
+        of the state after the last control: a [`delucax.estimators.Belief`][] with a
         leading axis of `T + 1`.
     - `updated`: the belief once it is observed, with a leading axis of `T`.
     - `log_likelihoods`: the log-density of each observation given those before it,
@@ -40,8 +40,8 @@ class Filtered(eqx.Module):
         import jax.numpy as jnp
 
         dynamics = dlx.LinearDynamics(0.9 * jnp.eye(1), jnp.ones((1, 1)))
-        kalman = dlx.controllers.KalmanFilter(dynamics, jnp.eye(1), jnp.eye(1))
-        filtered = dlx.controllers.run_filter(kalman, jnp.ones((20, 1)))
+        kalman = dlx.estimators.KalmanFilter(dynamics, jnp.eye(1), jnp.eye(1))
+        filtered = dlx.estimators.run_filter(kalman, jnp.ones((20, 1)))
         filtered.updated.mean, filtered.log_likelihood
         ```
     """
@@ -64,7 +64,7 @@ class Smoothed(eqx.Module):
 
     - `mean`: of each state, given the whole record, shape `(T, n)`.
     - `covariance`: likewise, shape `(T, n, n)`.
-    - `filtered`: what the filter made of it, a [`delucax.controllers.Filtered`][].
+    - `filtered`: what the filter made of it, a [`delucax.estimators.Filtered`][].
     - `result`: success, or why not; one of `delucax.RESULTS`.
 
     !!! example
@@ -74,8 +74,8 @@ class Smoothed(eqx.Module):
         import jax.numpy as jnp
 
         dynamics = dlx.LinearDynamics(0.9 * jnp.eye(1), jnp.ones((1, 1)))
-        kalman = dlx.controllers.KalmanFilter(dynamics, jnp.eye(1), jnp.eye(1))
-        smoothed = dlx.controllers.smooth(kalman, jnp.ones((20, 1)))
+        kalman = dlx.estimators.KalmanFilter(dynamics, jnp.eye(1), jnp.eye(1))
+        smoothed = dlx.estimators.smooth(kalman, jnp.ones((20, 1)))
         smoothed.mean, smoothed.covariance
         ```
     """
@@ -106,16 +106,16 @@ def run_filter(
 
     **Arguments:**
 
-    - `estimator`: a [`delucax.controllers.KalmanFilter`][],
-        [`delucax.controllers.ExtendedKalmanFilter`][] or
-        [`delucax.controllers.UnscentedKalmanFilter`][].
+    - `estimator`: a [`delucax.estimators.KalmanFilter`][],
+        [`delucax.estimators.ExtendedKalmanFilter`][] or
+        [`delucax.estimators.UnscentedKalmanFilter`][].
     - `observations`: shape `(T, p)`; `trajectory.observations`, for example.
     - `controls`: those that were applied, shape `(T, m)`; zero by default.
     - `t0`: the time of the first observation, 0 by default.
     - `throw`: raise if a belief or the likelihood is not finite (default); if false,
         look at `result`.
 
-    **Returns:** a [`delucax.controllers.Filtered`][]. Its result is
+    **Returns:** a [`delucax.estimators.Filtered`][]. Its result is
     `RESULTS.diverged` where a belief is not finite, and `RESULTS.ill_posed` where only
     the likelihood is not, as the covariance of an observation is not definite.
 
@@ -136,8 +136,8 @@ def run_filter(
 
         def log_likelihood(noise):
             V = jnp.exp(noise) * jnp.eye(1)
-            kalman = dlx.controllers.KalmanFilter(dynamics, jnp.eye(1), V)
-            return dlx.controllers.run_filter(kalman, y).log_likelihood
+            kalman = dlx.estimators.KalmanFilter(dynamics, jnp.eye(1), V)
+            return dlx.estimators.run_filter(kalman, y).log_likelihood
 
         jax.grad(log_likelihood)(0.0)
         ```
@@ -172,16 +172,16 @@ def smooth(
 
     **Arguments:**
 
-    - `estimator`: a [`delucax.controllers.KalmanFilter`][],
-        [`delucax.controllers.ExtendedKalmanFilter`][] or
-        [`delucax.controllers.UnscentedKalmanFilter`][].
+    - `estimator`: a [`delucax.estimators.KalmanFilter`][],
+        [`delucax.estimators.ExtendedKalmanFilter`][] or
+        [`delucax.estimators.UnscentedKalmanFilter`][].
     - `observations`: shape `(T, p)`.
     - `controls`: those that were applied, shape `(T, m)`; zero by default.
     - `t0`: the time of the first observation, 0 by default.
     - `throw`: raise if a belief or the likelihood is not finite (default); if false,
         look at `result`.
 
-    **Returns:** a [`delucax.controllers.Smoothed`][].
+    **Returns:** a [`delucax.estimators.Smoothed`][].
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, or that is not
     finite; an error at run time as `throw` says.
@@ -198,10 +198,10 @@ def smooth(
         env = dlx.make("pendulum")
         zero = dlx.controllers.Zero(1)
         run = dlx.rollout(env, zero, key=jax.random.key(0), x0=[0.1, 0.0])
-        ekf = dlx.controllers.ExtendedKalmanFilter(
+        ekf = dlx.estimators.ExtendedKalmanFilter(
             env.dynamics, 1e-6 * jnp.eye(2), 1e-2 * jnp.eye(2)
         )
-        dlx.controllers.smooth(ekf, run.observations, run.controls).mean
+        dlx.estimators.smooth(ekf, run.observations, run.controls).mean
         ```
     """
     where = "smooth"

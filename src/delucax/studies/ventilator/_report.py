@@ -8,16 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._serialise import save
-from ..environments import Environment
-from ..simulation import rollout
+from ..._module import save
+from ...environments import Environment
+from ...lung._data import LENGTH
+from ...lung._policies import Breathing
+from ...lung._runner import ABORT
+from ...lung._stacking import count_of, repeat, taken, unstack
+from ...lung._waveform import at_pip, BreathWaveform
+from ...simulation import rollout
 from ._contenders import Contender
-from ._data import LENGTH
-from ._policies import Breathing
-from ._runner import ABORT
 from ._size import BREATH, SEEN, SHOWN, UNSEEN
-from ._stacking import count_of, repeat, taken, unstack
-from ._waveform import at_pip, BreathWaveform
 
 
 Rows = list[dict[str, Any]]

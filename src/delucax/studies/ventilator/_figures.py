@@ -6,13 +6,13 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from ..environments import Environment
-from ..plotting import animate
-from ..plotting._figure import color_of, NEUTRAL, NotebookFigure, style_axes
+from ...environments import Environment
+from ...lung._stacking import unstack
+from ...lung._waveform import at_pip
+from ...plotting import animate
+from ...plotting._figure import color_of, NEUTRAL, NotebookFigure, style_axes
 from ._report import PID_ROWS
 from ._size import SHOWN
-from ._stacking import unstack
-from ._waveform import at_pip
 
 
 _SIZE = 9.0

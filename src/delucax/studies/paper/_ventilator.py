@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ...lung import lung_study
+from ..ventilator import lung_study
 from ._finding import Claim, Finding
 
 

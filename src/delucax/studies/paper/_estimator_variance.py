@@ -9,7 +9,7 @@ import jax.random as jr
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ..._paths import replace
+from ..._module import replace
 from ...controllers import Deep, Gaussian, MLP
 from ...environments import pendulum
 from ...simulation import rollout

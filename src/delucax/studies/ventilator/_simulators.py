@@ -8,20 +8,20 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
-from .._fields import positive
-from ..environments import Environment
-from ..simulation import rollout
-from ._data import Breaths, explore, LENGTH, split
-from ._fitting import fit_lungs, open_loop_error
-from ._learned import LearnedLung
-from ._lungs import BalloonLung, DoubleCompartment, SingleCompartment
-from ._models import GreyBoxLung, LungModel, NeuralLung
-from ._policies import Breathing
+from ..._module import positive
+from ...environments import Environment
+from ...lung._data import Breaths, explore, LENGTH, split
+from ...lung._fitting import fit_lungs, open_loop_error
+from ...lung._learned import LearnedLung
+from ...lung._lungs import BalloonLung, DoubleCompartment, SingleCompartment
+from ...lung._models import GreyBoxLung, LungModel, NeuralLung
+from ...lung._policies import Breathing
+from ...lung._stacking import repeat, stack, unstack
+from ...lung._tasks import double_compartment
+from ...lung._train import lung_environment
+from ...lung._waveform import at_pip, BreathWaveform
+from ...simulation import rollout
 from ._size import SEEN, Size
-from ._stacking import repeat, stack, unstack
-from ._tasks import double_compartment
-from ._train import lung_environment
-from ._waveform import at_pip, BreathWaveform
 
 
 _SYSTEM = "dynamics.dynamics.system."

@@ -13,10 +13,10 @@ from ...controllers import LQR, Zero
 from ...costs import Quadratic
 from ...dynamics import Discretized, linearize
 from ...environments import Environment
+from ...experiments._statistics import mean_and_half_width, paired_ratio
 from ...planning import ilqr
 from ...simulation import rollout
 from ...systems import Pendulum
-from .._statistics import mean_and_half_width, paired_ratio
 from ._finding import Claim, Finding
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from ..._extras import extra
-from .._provenance import device, provenance
-from .._report import _document, _table
+from ...experiments._provenance import device, provenance
+from ...experiments._report import _document, _table
 from ._estimator_variance import estimator_variance
 from ._finding import Claim, Finding
 from ._lq_perturbations import lq_perturbations
@@ -53,7 +53,7 @@ def reproduce(
         `lq-perturbations`.
     - `out`: the folder to write to, `"paper"` by default: `report.html`, `claims.csv`,
         the figures, and in `lung` or `lung-small` what
-        [`delucax.lung.lung_study`][] writes, which goes on there if it was cut off.
+        [`delucax.studies.lung_study`][] writes, which goes on there if it was cut off.
     - `small`: fewer seeds and steps; false by default.
     - `say`: what to do with a line of text; `print` by default.
 
@@ -72,7 +72,7 @@ def reproduce(
         from delucax import experiments
 
         with tempfile.TemporaryDirectory() as folder:
-            claims = experiments.reproduce("wall-clock", folder, small=True)
+            claims = studies.reproduce("wall-clock", folder, small=True)
         ```
     """
     pd = extra("pandas", "reproduce")

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._fields import check_parameters
+from .._module import check_parameters
 from .._typing import PRNGKey, RealScalar
 
 
@@ -24,7 +24,7 @@ class Belief(NamedTuple):
         import delucax as dlx
         import jax.numpy as jnp
 
-        dlx.controllers.Belief(jnp.zeros(2), jnp.eye(2)).mean
+        dlx.estimators.Belief(jnp.zeros(2), jnp.eye(2)).mean
         ```
     """
 
@@ -38,7 +38,7 @@ class AbstractEstimator(eqx.Module):
     At each step, in this order: `update` takes in the observation at `t`; `predict`
     moves the belief on over the step from `t`, with the control that was really
     applied. [`delucax.controllers.OutputFeedback`][] makes the calls in a closed loop,
-    and [`delucax.controllers.run_filter`][] on a record.
+    and [`delucax.estimators.run_filter`][] on a record.
 
     !!! example
 
@@ -47,13 +47,13 @@ class AbstractEstimator(eqx.Module):
         import jax.numpy as jnp
         from jaxtyping import Array
 
-        class Luenberger(dlx.controllers.AbstractEstimator):
+        class Luenberger(dlx.estimators.AbstractEstimator):
             dynamics: dlx.AbstractDynamics
             L: Array = dlx.weight()
 
             def init(self, *, key=None):
                 n = self.dynamics.state_size
-                return dlx.controllers.Belief(jnp.zeros(n), jnp.eye(n))
+                return dlx.estimators.Belief(jnp.zeros(n), jnp.eye(n))
 
             def update(self, t, y, belief):
                 error = y - self.dynamics.observe(t, belief.mean)
@@ -76,7 +76,7 @@ class AbstractEstimator(eqx.Module):
 
         **Arguments:** `key`: a random key, for estimators that draw.
 
-        **Returns:** a [`delucax.controllers.Belief`][].
+        **Returns:** a [`delucax.estimators.Belief`][].
         """
 
     @abc.abstractmethod

@@ -14,7 +14,7 @@ from .._controller import wrong_observation
 from .._typing import RealScalar
 from ..dynamics import AbstractDynamics
 from ..math import matvec
-from ._estimator import AbstractEstimator, Belief
+from ._base import AbstractEstimator, Belief
 from ._moments import AbstractJoint, log_density
 
 

@@ -7,15 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._check import as_vector
-from .._fields import function_field, parameter, weight
+from .._module import function_field, parameter, weight
 from ..dynamics import LinearDynamics
 from ..riccati import filter_dare
 from ..riccati._solution import checked
-from ._gaussian_filter import (
-    AbstractGaussianFilter,
-    first_belief,
-    noise_covariances,
-)
+from ._gaussian import AbstractGaussianFilter, first_belief, noise_covariances
 from ._moments import congruence, LinearJoint
 
 
@@ -67,7 +63,7 @@ class KalmanFilter(AbstractGaussianFilter):
 
         A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
         dynamics = dlx.LinearDynamics(A, B, C=jnp.array([[1.0, 0.0]]))
-        kalman = dlx.controllers.KalmanFilter(dynamics, 0.1 * jnp.eye(2), jnp.eye(1))
+        kalman = dlx.estimators.KalmanFilter(dynamics, 0.1 * jnp.eye(2), jnp.eye(1))
         belief = kalman.update(0.0, jnp.array([0.5]), kalman.init())
         belief = kalman.predict(0.0, jnp.zeros(1), belief)
         ```

@@ -24,9 +24,9 @@ import jax.random as jr
 import numpy as np
 from jax.core import Tracer
 
-from ._check import as_path
+from .._check import as_path
+from .._results import Result
 from ._qualified import name_of, thing_of
-from ._results import Result
 
 
 _MAGIC = "delucax-file"

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from .._serialise import load, save
+from ..._module import load, save
 
 
 class Stages:

@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
-from ._csv import COMPLIANCES, RESISTANCES
-from ._data import PIPS
+from ...lung._csv import COMPLIANCES, RESISTANCES
+from ...lung._data import PIPS
 
 
 SEEN = PIPS

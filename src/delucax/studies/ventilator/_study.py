@@ -13,8 +13,15 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
-from .._check import check_count
-from ..environments import Environment
+from ..._check import check_count
+from ...environments import Environment
+from ...lung._csv import read_breaths
+from ...lung._data import Breaths
+from ...lung._grid import least_error
+from ...lung._stacking import repeat, stack, unstack
+from ...lung._tasks import double_compartment
+from ...lung._train import lung_environment
+from ...lung._waveform import BreathWaveform
 from ._contenders import (
     bang_bang,
     Contender,
@@ -29,16 +36,7 @@ from ._contenders import (
     Trainer,
     zero,
 )
-from ._csv import read_breaths
-from ._data import Breaths
-from ._grid import least_error
-from ._report import (
-    best_pid,
-    bound_rows,
-    error_rows,
-    save_controllers,
-    summarise,
-)
+from ._report import best_pid, bound_rows, error_rows, save_controllers, summarise
 from ._simulators import (
     closed_loop_errors,
     divided,
@@ -50,12 +48,8 @@ from ._simulators import (
     open_loop_rows,
 )
 from ._size import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, UNSEEN
-from ._stacking import repeat, stack, unstack
 from ._stages import Stages
-from ._tasks import double_compartment
-from ._train import lung_environment
 from ._tuned import tuned_pids
-from ._waveform import BreathWaveform
 
 
 def lung_study(
@@ -108,7 +102,7 @@ def lung_study(
     !!! example
 
         ```python
-        from delucax.lung import lung_study  # then: lung_study("out", small=True)
+        from delucax.studies import lung_study  # then: lung_study("out", small=True)
         ```
     """
     size = SMALL if small else FULL

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
-from ..environments import Environment
-from ._grid import make_pid
-from ._policies import FeedForward, Summed
+from ...environments import Environment
+from ...lung._grid import make_pid
+from ...lung._policies import FeedForward, Summed
+from ...lung._stacking import joined, taken
+from ...lung._train import breath_error, train_controllers
+from ...lung._waveform import BreathWaveform
 from ._size import SEEN, Size
-from ._stacking import joined, taken
-from ._train import breath_error, train_controllers
-from ._waveform import BreathWaveform
 
 
 _STARTS = 4

@@ -1,0 +1,23 @@
+"""What the fields of a module are: their kinds, paths, names and files."""
+
+from ._fields import (
+    AbstractConstraint as AbstractConstraint,
+    as_float_array as as_float_array,
+    as_module as as_module,
+    bounded as bounded,
+    check_parameters as check_parameters,
+    function_field as function_field,
+    marked_leaves as marked_leaves,
+    parameter as parameter,
+    positive as positive,
+    StaticFunction as StaticFunction,
+    weight as weight,
+)
+from ._names import indexed_names as indexed_names
+from ._paths import (
+    check_paths as check_paths,
+    get_path as get_path,
+    path_string as path_string,
+    replace as replace,
+)
+from ._serialise import load as load, save as save

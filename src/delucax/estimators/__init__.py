@@ -1,0 +1,14 @@
+"""Estimates of the state from observations."""
+
+from ._base import AbstractEstimator as AbstractEstimator, Belief as Belief
+from ._kalman import KalmanFilter as KalmanFilter
+from ._nonlinear import (
+    ExtendedKalmanFilter as ExtendedKalmanFilter,
+    UnscentedKalmanFilter as UnscentedKalmanFilter,
+)
+from ._smoother import (
+    Filtered as Filtered,
+    run_filter as run_filter,
+    smooth as smooth,
+    Smoothed as Smoothed,
+)
