@@ -13,9 +13,16 @@ from ..math._size import size
 from ._arguments import riccati_arguments
 from ._dare import double
 from ._lyapunov import lyapunov
-from ._newton import attainable, found_tangent, outside, polish, settled, solution_of
+from ._newton import (
+    attainable,
+    found_tangent,
+    outside,
+    polish,
+    solution_in_units,
+    solution_of,
+)
 from ._residual import riccati_residual
-from ._search import Attempt, Found, search, SECOND, verdict, weights
+from ._search import Attempt, Found, search, SECOND, weights
 from ._solution import checked, RiccatiSolution
 from ._spectrum import abscissa_and_size
 
@@ -64,10 +71,10 @@ def care(
         look at `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][] with a `spectral_abscissa`. It
-    is successful if the `residual` is at most 1e-12 (1e-5 in single precision), or what
-    rounding of `X` alone may leave, and the
-    closed loop is stable: a small residual alone is no certificate. Else `result` is
-    one of `RESULTS.not_stabilisable`, `not_stabilising` (no such solution),
+    is successful if the residual, in units of the states that balance the equation, is
+    at most 1e-12 (1e-5 in single precision), or up to a hundred times that if rounding
+    of `X` alone may leave it; and if the closed loop is stable: a small residual alone
+    is no certificate. Else `result` is one of `RESULTS.not_stabilisable`, `not_stabilising` (no such solution),
     `on_boundary` (eigenvalues on the imaginary axis, or so close that data changed by
     rounding have no stabilising solution), `not_converged` and `ill_posed`.
 
@@ -75,7 +82,8 @@ def care(
     symmetric or (`R`) not definite; an error at run time as `throw` says.
 
     Source: Roberts, 1971 (sign); Byers, 1987 (scaling); Chu, Fan and Lin, 2005
-    (doubling); Kleinman, 1968 (Newton).
+    (doubling); Kleinman, 1968 (Newton); Benner, 2001
+    (balancing).
 
     !!! example
 
@@ -100,19 +108,7 @@ def continuous_solution(A, B, Q, R, S, E) -> RiccatiSolution:
 @eqx.filter_jit
 @full_precision
 def _solution(A, B, Q, R, S, E):
-    found = _find(A, B, Q, R, S, E)
-    arguments = A, B, Q, R, S, E, found.X
-    K, closed_loop = settled(found.differentiable, _terms, *arguments)
-    return RiccatiSolution(
-        X=found.X,
-        K=K,
-        residual=lax.stop_gradient(found.residual),
-        closed_loop=closed_loop,
-        spectral_radius=None,
-        spectral_abscissa=lax.stop_gradient(found.bound),
-        iterations=found.iterations,
-        result=verdict(found),
-    )
+    return solution_in_units(_find, _terms, "spectral_abscissa", A, B, Q, R, S, E)
 
 
 def _terms(A, B, R, S, E, X):
@@ -134,7 +130,7 @@ def _equation(A, B, Q, R, S, E, X):
 
 
 @jax.custom_jvp
-def _find(A, B, Q, R, S, E) -> Found:
+def _find(A, B, Q, R, S, E, d) -> Found:
     """The stabilising `X`, and what is known about it."""
     n, m, dtype = A.shape[0], B.shape[1], A.dtype
     eps = float(jnp.finfo(dtype).eps)
@@ -150,7 +146,7 @@ def _find(A, B, Q, R, S, E) -> Found:
         q, r, s, size_Q = weights(kind, Q, R, S)
         X, size_G, iterations = _start(plain_A, plain_B, q, r, s, kind == SECOND)
         X, left = polish(
-            lambda *at: riccati_residual(False, A, B, q, r, s, E, *at),
+            lambda *at: riccati_residual(False, A, B, q, r, s, E, *at, d=d),
             lambda loop, error: outside(E, lyapunov(loop, error)),
             outside(E, X),
         )
@@ -161,6 +157,7 @@ def _find(A, B, Q, R, S, E) -> Found:
         return Attempt(
             X=X,
             residual=left.bound,
+            given=left.given,
             bound=abscissa,
             gap=-abscissa,
             rounding=rounding,
@@ -253,7 +250,7 @@ def _by_doubling(A, G, Q, wanted):
 @full_precision
 def _find_jvp(primals, tangents):
     found = _find(*primals)
-    E = primals[-1]
+    E = primals[5]
 
     def correction(closed_loop, error):
         return outside(E, lyapunov(closed_loop, error))

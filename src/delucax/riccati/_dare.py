@@ -10,9 +10,16 @@ import jax.numpy as jnp
 from ..math._linear_solve import full_precision, is_definite, solve, symmetric
 from ..math._size import size
 from ._arguments import riccati_arguments
-from ._newton import attainable, found_tangent, outside, polish, settled, solution_of
+from ._newton import (
+    attainable,
+    found_tangent,
+    outside,
+    polish,
+    solution_in_units,
+    solution_of,
+)
 from ._residual import riccati_residual
-from ._search import Attempt, Found, search, SECOND, verdict, weights
+from ._search import Attempt, Found, search, SECOND, weights
 from ._solution import checked, RiccatiSolution
 from ._spectrum import spectral_radius
 from ._stein import MAX_DOUBLINGS, stein
@@ -64,8 +71,10 @@ def dare(
         look at `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][]. It is successful if the
-    `residual` is at most 1e-12 (1e-5 in single precision) and the closed loop is
-    stable: a small residual alone is no certificate. Else `result` is one of
+    residual, in units of the states that balance the equation, is at most 1e-12 (1e-5
+    in single precision), or up to a hundred times that if rounding of `X` alone may
+    leave it; and if the closed loop is stable: a small residual alone is no
+    certificate. Else `result` is one of
     `RESULTS.not_stabilisable`, `not_stabilising` (no such solution), `on_boundary`
     (eigenvalues on the unit circle, or so close that data changed by rounding have no
     stabilising solution), `not_converged` and `ill_posed`.
@@ -73,7 +82,7 @@ def dare(
     **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
     symmetric or (`R`) not semidefinite; an error at run time as `throw` says.
 
-    Source: Chu, Fan, Lin and Wang, 2004 (doubling).
+    Source: Chu, Fan, Lin and Wang, 2004 (doubling); Benner, 2001 (balancing).
 
     !!! example
 
@@ -98,18 +107,7 @@ def discrete_solution(A, B, Q, R, S, E) -> RiccatiSolution:
 @eqx.filter_jit
 @full_precision
 def _solution(A, B, Q, R, S, E):
-    found = _find(A, B, Q, R, S, E)
-    arguments = A, B, Q, R, S, E, found.X
-    K, closed_loop = settled(found.differentiable, _terms, *arguments)
-    return RiccatiSolution(
-        X=found.X,
-        K=K,
-        residual=lax.stop_gradient(found.residual),
-        closed_loop=closed_loop,
-        spectral_radius=lax.stop_gradient(found.bound),
-        iterations=found.iterations,
-        result=verdict(found),
-    )
+    return solution_in_units(_find, _terms, "spectral_radius", A, B, Q, R, S, E)
 
 
 def _terms(A, B, R, S, E, X):
@@ -131,7 +129,7 @@ def _equation(A, B, Q, R, S, E, X):
 
 
 @jax.custom_jvp
-def _find(A, B, Q, R, S, E) -> Found:
+def _find(A, B, Q, R, S, E, d) -> Found:
     """The stabilising `X`, and what is known about it."""
     n, dtype = A.shape[0], A.dtype
     eps = float(jnp.finfo(dtype).eps)
@@ -147,7 +145,7 @@ def _find(A, B, Q, R, S, E) -> Found:
         height = size_Q * jnp.where(kind == SECOND, _SECOND_START, 1)
         X, iterations = _start(plain_A, plain_B, q, r, s, height)
         X, left = polish(
-            lambda *at: riccati_residual(True, A, B, q, r, s, E, *at),
+            lambda *at: riccati_residual(True, A, B, q, r, s, E, *at, d=d),
             lambda loop, error: outside(E, stein(loop, error)),
             outside(E, X),
         )
@@ -157,6 +155,7 @@ def _find(A, B, Q, R, S, E) -> Found:
         return Attempt(
             X=X,
             residual=left.bound,
+            given=left.given,
             bound=radius,
             gap=gap,
             rounding=jnp.asarray(n * eps, dtype),
@@ -231,7 +230,7 @@ def double(A, G, H, X0, wanted):
 @full_precision
 def _find_jvp(primals, tangents):
     found = _find(*primals)
-    E = primals[-1]
+    E = primals[5]
 
     def correction(closed_loop, error):
         return outside(E, stein(closed_loop, error))

@@ -12,8 +12,9 @@ from ..math._linear_solve import full_precision, no_tangent, solve, symmetric
 from ..math._size import size
 from ._arguments import complex_form, is_complex, real_form
 from ._residual import Residual, riccati_residual
-from ._search import Found, tolerance
+from ._search import Found, tolerance, verdict
 from ._solution import RiccatiSolution
+from ._units import units
 
 
 _NEWTON_STEPS = 8
@@ -101,6 +102,7 @@ def found_tangent(
     `equation` takes the data and `X`. It is zero in members that are not solved.
     """
     ok = found.differentiable
+    primals, tangents = primals[:-1], tangents[:-1]
     # Guarded at both ends: what is not finite in a failed member stays in it.
     tangents = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents)
 
@@ -137,6 +139,31 @@ def settled(ok: Array, terms: Callable, *data) -> tuple[Array, Array]:
     A, B, _, R, S, E, X = harmless(ok, *data)
     *_, live_K, live_loop = terms(A, B, R, S, E, X)
     return jnp.where(ok, live_K, K), jnp.where(ok, live_loop, closed_loop)
+
+
+def solution_in_units(
+    find: Callable, terms: Callable, name: str, A, B, Q, R, S, E
+) -> RiccatiSolution:
+    """The solution, found with states in units that fit.
+
+    `find` takes the data and the units, and `name` is that of the bound that it tells.
+    """
+    d = units(A, B, Q, E)
+    up, down, across = d[:, None], 1 / d[:, None], d[:, None] / d
+    data = A * across, B * up, Q * (down * down.T), R, S * down
+    data = *data, None if E is None else E * across
+    found = find(*data, d)
+    K, closed_loop = settled(found.differentiable, terms, *data, found.X)
+    bounds = dict.fromkeys(("spectral_radius", "spectral_abscissa"))
+    return RiccatiSolution(
+        X=found.X * (up * up.T),
+        K=K * d,
+        residual=lax.stop_gradient(found.given),
+        closed_loop=closed_loop / across,
+        iterations=found.iterations,
+        result=verdict(found),
+        **(bounds | {name: lax.stop_gradient(found.bound)}),
+    )
 
 
 def outside(E: Array | None, Y: Array) -> Array:

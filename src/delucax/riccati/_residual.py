@@ -22,6 +22,7 @@ class Residual(NamedTuple):
     - `error`: the left side, with the gain in place of the best one.
     - `relative`: its norm over the sum of those of the terms.
     - `bound`: an upper bound on what this is at the best gain and without rounding.
+    - `given`: the same, in the units that the problem was given in.
     - `closed_loop`: `A - B K`, or `E^-1 (A - B K)`.
     - `terms`: the sum of the norms of the terms.
     - `K`: the gain.
@@ -30,6 +31,7 @@ class Residual(NamedTuple):
     error: Array
     relative: Array
     bound: Array
+    given: Array
     closed_loop: Array
     terms: Array
     K: Array
@@ -46,6 +48,7 @@ def riccati_residual(
     X: Float[Array, "n n"],
     accurately: Bool[Array, ""] | bool,
     players: int = 0,
+    d: Float[Array, " n"] | None = None,
 ) -> Residual:
     r"""What is left of the Riccati equation at `X`.
 
@@ -59,7 +62,8 @@ def riccati_residual(
     square. The rounding of each product is bounded by that of the absolute values of
     its factors. Where that is too wide they are evaluated `accurately`.
 
-    The last `players` controls are a second player's, whose terms count apart.
+    The last `players` controls are a second player's, whose terms count apart. The
+    states are `d` times those that were given.
     """
     n, m = B.shape
     dtype = A.dtype
@@ -95,9 +99,12 @@ def riccati_residual(
     error, lost, gap, gap_lost = left
     gap = jnp.abs(gap) + gap_lost
     bound = jnp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
-    bound = _MARGIN * relative_size(bound, *terms)
+    given = bound = bound, *terms
+    if d is not None:
+        given = tuple(M * jnp.outer(d, d) for M in bound)
+    given, bound = (_MARGIN * relative_size(*both) for both in (given, bound))
     relative = jnp.where(needed, bound, relative_size(error, *terms))
-    return Residual(error, relative, bound, closed_loop, size(*terms), K)
+    return Residual(error, relative, bound, given, closed_loop, size(*terms), K)
 
 
 class _Left(NamedTuple):

@@ -27,6 +27,7 @@ class Attempt(NamedTuple):
 
     X: Array
     residual: Array
+    given: Array  # the residual in the units that the problem was given in
     bound: Array  # spectral radius or abscissa of the closed loop
     gap: Array  # the distance from the boundary, positive if it is stable
     rounding: Array  # of the gap
@@ -42,6 +43,7 @@ class Found(NamedTuple):
 
     X: Array
     residual: Array
+    given: Array
     bound: Array
     iterations: Array
     solved: Array
@@ -96,6 +98,7 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
         found = found._replace(
             X=pick(new.X, found.X),
             residual=pick(new.residual, found.residual),
+            given=pick(new.given, found.given),
             bound=pick(new.bound, found.bound),
             iterations=found.iterations + jnp.where(given, new.iterations, 0),
             solved=pick(solved, found.solved),
@@ -129,6 +132,7 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
     nothing = Found(
         X=X,
         residual=number,
+        given=number,
         bound=number,
         iterations=jnp.asarray(0),
         solved=no,
