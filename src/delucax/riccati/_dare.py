@@ -74,10 +74,10 @@ def dare(
     residual, in units of the states that balance the equation, is at most 1e-12 (1e-5
     in single precision), or up to a hundred times that if rounding of `X` alone may
     leave it; and if the closed loop is stable: a small residual alone is no
-    certificate. Else `result` is one of
-    `RESULTS.not_stabilisable`, `not_stabilising` (no such solution), `on_boundary`
-    (eigenvalues on the unit circle, or so close that data changed by rounding have no
-    stabilising solution), `not_converged` and `ill_posed`.
+    certificate. Else `result` is one of `RESULTS.not_stabilisable`, `not_stabilising`
+    (no such solution), `on_boundary` (eigenvalues on the unit circle, or so close that
+    data changed by rounding have no stabilising solution), `not_converged` and
+    `ill_posed`.
 
     **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
     symmetric or (`R`) not semidefinite; an error at run time as `throw` says.
