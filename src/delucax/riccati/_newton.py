@@ -54,7 +54,8 @@ def polish(
         rest = best[1].relative
         again = helped | patient & (rest > wide)
         again &= (rest > fine) & (k < _NEWTON_STEPS)
-        hidden = ~again & ~accurately & (best[1].bound > wide)
+        most = jnp.maximum(best[1].bound, best[1].given)
+        hidden = ~again & ~accurately & (most > wide)
         X = jnp.where(hidden, best[0], X)
         k = jnp.where(hidden, 0, k + 1)
         last = new.closed_loop, new.error
