@@ -25,6 +25,7 @@ from ._residual import riccati_residual
 from ._search import Attempt, Found, search, SECOND, weights
 from ._solution import checked, RiccatiSolution
 from ._spectrum import abscissa_and_size
+from ._units import in_units
 
 
 _SIGN_STEPS = 60
@@ -143,21 +144,25 @@ def _find(A, B, Q, R, S, E, d) -> Found:
 
     magnified = 1 if E is None else size(E) ** 2
 
-    def attempt(kind):
-        q, r, s, size_Q = weights(kind, Q, R, S)
-        X, size_G, iterations = _start(plain_A, plain_B, q, r, s, kind == SECOND)
+    def attempt(kind, balanced):
+        # From the units that balance the problem to those of the attempt.
+        e = jnp.where(balanced, 1, 1 / d)
+        a, b, q, r, s, f = in_units(e, A, B, Q, R, S, E)
+        q, r, s, size_Q = weights(kind, q, r, s)
+        plain_a, plain_b, *_ = in_units(e, plain_A, plain_B, Q, R, S, None)
+        X, size_G, iterations = _start(plain_a, plain_b, q, r, s, kind == SECOND)
         X, left = polish(
-            lambda *at: riccati_residual(False, A, B, q, r, s, E, *at, d=d),
-            lambda loop, error: outside(E, lyapunov(loop, error)),
-            outside(E, X),
+            lambda *at: riccati_residual(False, a, b, q, r, s, f, *at, 0, d * e, e),
+            lambda loop, error: outside(f, lyapunov(loop, error)),
+            outside(f, X),
         )
         abscissa, scale = abscissa_and_size(left.closed_loop)
         rounding = n * eps * scale
         # A change of Q by rounding moves eigenvalues on the axis off it by its root.
         reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
         return Attempt(
-            X=X,
-            residual=left.bound,
+            X=X * (e[:, None] * e),
+            residual=left.balanced,
             given=left.given,
             bound=abscissa,
             gap=-abscissa,
@@ -169,7 +174,7 @@ def _find(A, B, Q, R, S, E, d) -> Found:
             iterations=iterations,
         )
 
-    return search(attempt, jnp.full_like(Q, jnp.nan), posed)
+    return search(attempt, jnp.full_like(Q, jnp.nan), posed, jnp.any(d != 1))
 
 
 def _start(A, B, Q, R, S, second):

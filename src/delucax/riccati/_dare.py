@@ -23,6 +23,7 @@ from ._search import Attempt, Found, search, SECOND, weights
 from ._solution import checked, RiccatiSolution
 from ._spectrum import spectral_radius
 from ._stein import MAX_DOUBLINGS, stein
+from ._units import in_units
 
 
 _SECOND_START = 1e4
@@ -140,21 +141,25 @@ def _find(A, B, Q, R, S, E, d) -> Found:
 
     magnified = 1 if E is None else size(E) ** 2
 
-    def attempt(kind):
-        q, r, s, size_Q = weights(kind, Q, R, S)
+    def attempt(kind, balanced):
+        # From the units that balance the problem to those of the attempt.
+        e = jnp.where(balanced, 1, 1 / d)
+        a, b, q, r, s, f = in_units(e, A, B, Q, R, S, E)
+        q, r, s, size_Q = weights(kind, q, r, s)
+        plain_a, plain_b, *_ = in_units(e, plain_A, plain_B, Q, R, S, None)
         height = size_Q * jnp.where(kind == SECOND, _SECOND_START, 1)
-        X, iterations = _start(plain_A, plain_B, q, r, s, height)
+        X, iterations = _start(plain_a, plain_b, q, r, s, height)
         X, left = polish(
-            lambda *at: riccati_residual(True, A, B, q, r, s, E, *at, d=d),
-            lambda loop, error: outside(E, stein(loop, error)),
-            outside(E, X),
+            lambda *at: riccati_residual(True, a, b, q, r, s, f, *at, 0, d * e, e),
+            lambda loop, error: outside(f, stein(loop, error)),
+            outside(f, X),
         )
         radius = spectral_radius(left.closed_loop)
         # A stable loop may belong to a stationary point of a cost without a minimum.
-        gap = jnp.where(_is_semidefinite(r + B.T @ X @ B), 1 - radius, -jnp.inf)
+        gap = jnp.where(_is_semidefinite(r + b.T @ X @ b), 1 - radius, -jnp.inf)
         return Attempt(
-            X=X,
-            residual=left.bound,
+            X=X * (e[:, None] * e),
+            residual=left.balanced,
             given=left.given,
             bound=radius,
             gap=gap,
@@ -168,7 +173,7 @@ def _find(A, B, Q, R, S, E, d) -> Found:
             iterations=iterations,
         )
 
-    return search(attempt, jnp.full_like(Q, jnp.nan), posed)
+    return search(attempt, jnp.full_like(Q, jnp.nan), posed, jnp.any(d != 1))
 
 
 def _is_semidefinite(weight):

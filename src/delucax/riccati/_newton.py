@@ -14,7 +14,7 @@ from ._arguments import complex_form, is_complex, real_form
 from ._residual import Residual, riccati_residual
 from ._search import Found, tolerance, verdict
 from ._solution import RiccatiSolution
-from ._units import units
+from ._units import in_units, units
 
 
 _NEWTON_STEPS = 8
@@ -54,7 +54,7 @@ def polish(
         rest = best[1].relative
         again = helped | patient & (rest > wide)
         again &= (rest > fine) & (k < _NEWTON_STEPS)
-        most = jnp.maximum(best[1].bound, best[1].given)
+        most = jnp.maximum(best[1].given, best[1].balanced)
         hidden = ~again & ~accurately & (most > wide)
         X = jnp.where(hidden, best[0], X)
         k = jnp.where(hidden, 0, k + 1)
@@ -150,17 +150,15 @@ def solution_in_units(
     `find` takes the data and the units, and `name` is that of the bound that it tells.
     """
     d = units(A, B, Q, E)
-    up, down, across = d[:, None], 1 / d[:, None], d[:, None] / d
-    data = A * across, B * up, Q * (down * down.T), R, S * down
-    data = *data, None if E is None else E * across
+    data = in_units(d, A, B, Q, R, S, E)
     found = find(*data, d)
     K, closed_loop = settled(found.differentiable, terms, *data, found.X)
     bounds = dict.fromkeys(("spectral_radius", "spectral_abscissa"))
     return RiccatiSolution(
-        X=found.X * (up * up.T),
+        X=found.X * (d[:, None] * d),
         K=K * d,
         residual=lax.stop_gradient(found.given),
-        closed_loop=closed_loop / across,
+        closed_loop=closed_loop / (d[:, None] / d),
         iterations=found.iterations,
         result=verdict(found),
         **(bounds | {name: lax.stop_gradient(found.bound)}),

@@ -22,7 +22,8 @@ class Residual(NamedTuple):
     - `error`: the left side, with the gain in place of the best one.
     - `relative`: its norm over the sum of those of the terms.
     - `bound`: an upper bound on what this is at the best gain and without rounding.
-    - `given`: the same, in the units that the problem was given in.
+    - `given`, `balanced`: the same, in the units that the problem was given in, and in
+      those that balance it.
     - `closed_loop`: `A - B K`, or `E^-1 (A - B K)`.
     - `terms`: the sum of the norms of the terms.
     - `K`: the gain.
@@ -32,6 +33,7 @@ class Residual(NamedTuple):
     relative: Array
     bound: Array
     given: Array
+    balanced: Array
     closed_loop: Array
     terms: Array
     K: Array
@@ -48,7 +50,8 @@ def riccati_residual(
     X: Float[Array, "n n"],
     accurately: Bool[Array, ""] | bool,
     players: int = 0,
-    d: Float[Array, " n"] | None = None,
+    to_given: Float[Array, " n"] | float = 1.0,
+    to_balanced: Float[Array, " n"] | float = 1.0,
 ) -> Residual:
     r"""What is left of the Riccati equation at `X`.
 
@@ -62,8 +65,9 @@ def riccati_residual(
     square. The rounding of each product is bounded by that of the absolute values of
     its factors. Where that is too wide they are evaluated `accurately`.
 
-    The last `players` controls are a second player's, whose terms count apart. The
-    states are `d` times those that were given.
+    The last `players` controls are a second player's, whose terms count apart. In other
+    units of the states the equation is this one, with rows and columns times
+    `to_given` or `to_balanced`.
     """
     n, m = B.shape
     dtype = A.dtype
@@ -99,12 +103,16 @@ def riccati_residual(
     error, lost, gap, gap_lost = left
     gap = jnp.abs(gap) + gap_lost
     bound = jnp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
-    given = bound = bound, *terms
-    if d is not None:
-        given = tuple(M * jnp.outer(d, d) for M in bound)
-    given, bound = (_MARGIN * relative_size(*both) for both in (given, bound))
+    # Powers of two: their products have no rounding.
+    units = jnp.ones(n, dtype)
+    bound, given, balanced = (
+        _MARGIN * relative_size(*(M * (d[:, None] * d) for M in (bound, *terms)))
+        for d in (units, to_given * units, to_balanced * units)
+    )
     relative = jnp.where(needed, bound, relative_size(error, *terms))
-    return Residual(error, relative, bound, given, closed_loop, size(*terms), K)
+    return Residual(
+        error, relative, bound, given, balanced, closed_loop, size(*terms), K
+    )
 
 
 class _Left(NamedTuple):

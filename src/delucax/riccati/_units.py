@@ -52,3 +52,10 @@ def units(
     d = jnp.round(d - jnp.mean(d))
     apart = jnp.max(d) - jnp.min(d) > jnp.log2(_APART)
     return lax.stop_gradient(jnp.exp2(jnp.where(apart, d, 0)))
+
+
+def in_units(d: Float[Array, " n"], A, B, Q, R, S, E) -> tuple:
+    """The data of the equation in states that are `d` times those of these."""
+    up, across = d[:, None], d[:, None] / d
+    E = None if E is None else E * across
+    return A * across, B * up, Q / (up * up.T), R, S / up, E
