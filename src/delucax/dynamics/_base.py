@@ -87,6 +87,10 @@ class AbstractDynamics(eqx.Module):
     ) -> tuple[Array, Result]:
         """One step, with what became of it.
 
+        `result` is that of the solver alone. The numbers are not checked: from NaN, or
+        from a finite state so large that it overflows, `x_next` is not finite although
+        `result` is a success. [`delucax.rollout`][] checks for that.
+
         **Arguments:**
 
         - `t`: time at the start of the step.

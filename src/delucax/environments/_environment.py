@@ -383,9 +383,10 @@ class Environment(eqx.Module):
             `actions`.
         - `w`: disturbance, shape `(disturbance_size,)`; `None` for zero.
 
-        It is the bare map: of a state or a control that is not finite comes one that
-        is not finite, and `result` says what became of the dynamics alone.
-        [`delucax.rollout`][] and what else takes steps check the numbers themselves.
+        A step does not check its numbers, and `result` is that of the solver alone: NaN
+        in the state or the control gives NaN, and a state that is finite but huge may
+        overflow to infinity or NaN, while `result` is a success.
+        [`delucax.rollout`][] and whatever else takes steps check for that.
 
         **Returns:** a [`delucax.environments.Step`][].
 
