@@ -187,12 +187,12 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
         terms, added = [(L, Z), (Z, L), (S.T, N), (N, T)], [Q]
         of_X = [] if E is None else [(E, Z, 2 * L)]
     # Pairs of what is left out and a bound on what this leaves out again.
-    found = product(stacked([B, R]), N, stacked([A, S.T]), -stacked([L, T]))
-    rests = list(zip(*(jnp.split(M, [n]) for M in found), strict=True))
+    pair = product(stacked([B, R]), N, stacked([A, S.T]), -stacked([L, T]))
+    rests = list(zip(*(jnp.split(M, [n]) for M in pair), strict=True))
     if of_X:
         rights, wholes, _ = (stacked(M, axis=1) for M in zip(*of_X, strict=True))
-        found = product(X, rights, -wholes)
-        rests += zip(*(jnp.split(M, len(of_X), axis=1) for M in found), strict=True)
+        pair = product(X, rights, -wholes)
+        rests += zip(*(jnp.split(M, len(of_X), axis=1) for M in pair), strict=True)
     factor = stacked([2 * Y, N, *(M for *_, M in of_X)]).T
     rest, rest_lost = (stacked(M) for M in zip(*rests, strict=True))
     sizes = jnp.abs(rest)
