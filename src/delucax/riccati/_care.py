@@ -162,8 +162,8 @@ def _find(A, B, Q, R, S, E, d) -> Found:
         reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
         return Attempt(
             X=X * (e[:, None] * e),
-            residual=left.balanced,
-            given=left.given,
+            residual=left.bounds[2],
+            given=left.bounds[1],
             bound=abscissa,
             gap=-abscissa,
             rounding=rounding,

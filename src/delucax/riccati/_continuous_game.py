@@ -90,7 +90,7 @@ def continuous_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     holds = is_semidefinite(X) & is_clearly_definite(R)
     holds &= jnp.all(jax.vmap(spectral_abscissa)(loops) < -slack)
     solved = left.relative < rounding(n, A.dtype)
-    return Game(X, left.bound, holds, solved, iterations)
+    return Game(X, left.bounds[0], holds, solved, iterations)
 
 
 @jax.custom_jvp

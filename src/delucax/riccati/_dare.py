@@ -159,8 +159,8 @@ def _find(A, B, Q, R, S, E, d) -> Found:
         gap = jnp.where(_is_semidefinite(r + b.T @ X @ b), 1 - radius, -jnp.inf)
         return Attempt(
             X=X * (e[:, None] * e),
-            residual=left.balanced,
-            given=left.given,
+            residual=left.bounds[2],
+            given=left.bounds[1],
             bound=radius,
             gap=gap,
             rounding=jnp.asarray(n * eps, dtype),

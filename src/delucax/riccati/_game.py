@@ -74,7 +74,7 @@ def discrete_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     holds = is_semidefinite(X) & is_saddle(pivot, D.shape[1])
     holds &= jnp.all(jax.vmap(spectral_radius)(loops) < bound)
     solved = left.relative < rounding(n, A.dtype)
-    return Game(X, left.bound, holds, solved, iterations)
+    return Game(X, left.bounds[0], holds, solved, iterations)
 
 
 def double(element, X0):

@@ -54,8 +54,7 @@ def polish(
         rest = best[1].relative
         again = helped | patient & (rest > wide)
         again &= (rest > fine) & (k < _NEWTON_STEPS)
-        most = jnp.maximum(best[1].given, best[1].balanced)
-        hidden = ~again & ~accurately & (most > wide)
+        hidden = ~again & ~accurately & (jnp.max(best[1].bounds) > wide)
         X = jnp.where(hidden, best[0], X)
         k = jnp.where(hidden, 0, k + 1)
         last = new.closed_loop, new.error
@@ -189,6 +188,6 @@ def _as_complex(solution: RiccatiSolution, discrete: bool, data: tuple):
         lambda s: (s.X, s.K, s.closed_loop), solution, replace_fn=complex_form
     )
     A, B, Q, R, S, E, X = lax.stop_gradient((*data, real_form(solution.X)))
-    bound = riccati_residual(discrete, A, B, Q, R, S, E, X, True).bound
+    bound = riccati_residual(discrete, A, B, Q, R, S, E, X, True).bounds[0]
     bound = jnp.where(jnp.isfinite(bound), bound, solution.residual)
     return eqx.tree_at(lambda s: s.residual, solution, bound)

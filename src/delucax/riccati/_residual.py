@@ -21,9 +21,8 @@ class Residual(NamedTuple):
 
     - `error`: the left side, with the gain in place of the best one.
     - `relative`: its norm over the sum of those of the terms.
-    - `bound`: an upper bound on what this is at the best gain and without rounding.
-    - `given`, `balanced`: the same, in the units that the problem was given in, and in
-      those that balance it.
+    - `bounds`: an upper bound on what this is at the best gain and without rounding, in
+      each of the units that were asked for.
     - `closed_loop`: `A - B K`, or `E^-1 (A - B K)`.
     - `terms`: the sum of the norms of the terms.
     - `K`: the gain.
@@ -31,9 +30,7 @@ class Residual(NamedTuple):
 
     error: Array
     relative: Array
-    bound: Array
-    given: Array
-    balanced: Array
+    bounds: Array
     closed_loop: Array
     terms: Array
     K: Array
@@ -50,8 +47,7 @@ def riccati_residual(
     X: Float[Array, "n n"],
     accurately: Bool[Array, ""] | bool,
     players: int = 0,
-    to_given: Float[Array, " n"] | float = 1.0,
-    to_balanced: Float[Array, " n"] | float = 1.0,
+    *others: Float[Array, " n"],
 ) -> Residual:
     r"""What is left of the Riccati equation at `X`.
 
@@ -66,8 +62,8 @@ def riccati_residual(
     its factors. Where that is too wide they are evaluated `accurately`.
 
     The last `players` controls are a second player's, whose terms count apart. In other
-    units of the states the equation is this one, with rows and columns times
-    `to_given` or `to_balanced`.
+    units of the states the equation is this one, with rows and columns times those of
+    `others`.
     """
     n, m = B.shape
     dtype = A.dtype
@@ -103,16 +99,14 @@ def riccati_residual(
     error, lost, gap, gap_lost = left
     gap = jnp.abs(gap) + gap_lost
     bound = jnp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
+
+    def in_units(d):
+        return relative_size(*(M * (d[:, None] * d) for M in (bound, *terms)))
+
     # Powers of two: their products have no rounding.
-    units = jnp.ones(n, dtype)
-    bound, given, balanced = (
-        _MARGIN * relative_size(*(M * (d[:, None] * d) for M in (bound, *terms)))
-        for d in (units, to_given * units, to_balanced * units)
-    )
-    relative = jnp.where(needed, bound, relative_size(error, *terms))
-    return Residual(
-        error, relative, bound, given, balanced, closed_loop, size(*terms), K
-    )
+    bounds = _MARGIN * jax.vmap(in_units)(jnp.stack([jnp.ones(n, dtype), *others]))
+    relative = jnp.where(needed, bounds[0], relative_size(error, *terms))
+    return Residual(error, relative, bounds, closed_loop, size(*terms), K)
 
 
 class _Left(NamedTuple):
