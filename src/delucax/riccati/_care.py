@@ -152,7 +152,7 @@ def _find(A, B, Q, R, S, E, d) -> Found:
         plain_a, plain_b, *_ = in_units(e, plain_A, plain_B, Q, R, S, None)
         X, size_G, iterations = _start(plain_a, plain_b, q, r, s, kind == SECOND)
         X, left = polish(
-            lambda *at: riccati_residual(False, a, b, q, r, s, f, *at, 0, d * e, e),
+            lambda *at: riccati_residual(False, a, b, q, r, s, f, *at, d * e, e),
             lambda loop, error: outside(f, lyapunov(loop, error)),
             outside(f, X),
         )

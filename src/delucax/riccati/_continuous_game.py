@@ -80,7 +80,7 @@ def continuous_game(problem: tuple, gamma: Array, X0: Array) -> Game:
 
     def equation(X):
         left = riccati_residual(
-            False, A, both, Q, weight, S, None, X, False, D.shape[1]
+            False, A, both, Q, weight, S, None, X, False, players=D.shape[1]
         )
         return left.error, left.closed_loop, left.K, left
 

@@ -150,7 +150,7 @@ def _find(A, B, Q, R, S, E, d) -> Found:
         height = size_Q * jnp.where(kind == SECOND, _SECOND_START, 1)
         X, iterations = _start(plain_a, plain_b, q, r, s, height)
         X, left = polish(
-            lambda *at: riccati_residual(True, a, b, q, r, s, f, *at, 0, d * e, e),
+            lambda *at: riccati_residual(True, a, b, q, r, s, f, *at, d * e, e),
             lambda loop, error: outside(f, stein(loop, error)),
             outside(f, X),
         )

@@ -64,7 +64,9 @@ def discrete_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     J, iterations = double((A - both @ K, G, J), X0)
 
     def equation(X):
-        left = riccati_residual(True, A, both, Q, weight, S, None, X, False, D.shape[1])
+        left = riccati_residual(
+            True, A, both, Q, weight, S, None, X, False, players=D.shape[1]
+        )
         return left.error, left.closed_loop, left.K, left
 
     X, _, loop, K, left = polish(X0 + J, equation, lambda _, *linear: stein(*linear))

@@ -46,8 +46,8 @@ def riccati_residual(
     E: Float[Array, "n n"] | None,
     X: Float[Array, "n n"],
     accurately: Bool[Array, ""] | bool,
-    players: int = 0,
     *others: Float[Array, " n"],
+    players: int = 0,
 ) -> Residual:
     r"""What is left of the Riccati equation at `X`.
 

@@ -4,6 +4,8 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..math._size import power_of_two
+
 
 _SWEEPS = 20
 _APART = 2.0**4
@@ -51,7 +53,7 @@ def units(
     d = lax.fori_loop(0, _SWEEPS, sweep, jnp.zeros(n, dtype))
     d = jnp.round(d - jnp.mean(d))
     apart = jnp.max(d) - jnp.min(d) > jnp.log2(_APART)
-    return lax.stop_gradient(jnp.exp2(jnp.where(apart, d, 0)))
+    return lax.stop_gradient(power_of_two(jnp.where(apart, d, 0)))
 
 
 def in_units(d: Float[Array, " n"], A, B, Q, R, S, E) -> tuple:
