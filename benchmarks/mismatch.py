@@ -38,7 +38,7 @@ CHECKS = (1, 3, 6, 10, 20, ITERATIONS)
 """Numbers of iterations after which the cost is looked at."""
 FEW = 15
 """Runs of the plant that are few."""
-KNOWS = "iLQR that knows the plant"
+KNOWS = "iLQR of the true plant"
 SETTINGS: dict[str, list[dict[str, float]]] = {
     "ILC": [{"step": a} for a in (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5)],
     "iGPC": [

@@ -44,12 +44,13 @@ that users of SciPy reported; then families of them over their parameters. `pyth
 benchmarks.riccati_exam` makes this page.
 
 The residual is that of the equation, over the sum of the norms of its terms, of what
-each solver finds in double precision. It is evaluated in 60 digits for all; beside it
-stands what delucax reports, which is to be no less. A residual is no certificate: the
-bound is the spectral abscissa of the closed loop (below 0 if it is stable) in
-continuous time and its spectral radius (below 1) in discrete time. In single precision
-the data are rounded first, and what counts as solved is 1e-5 instead of 1e-12; a solver
-whose precision does not suffice says so. The loop of CAREX 11 is on the boundary.
+each solver finds in double precision. It is evaluated in 60 digits for all; the
+column "reported" is the residual that delucax itself returns, and should never be the
+smaller of the two. A residual is no certificate: the bound is the spectral abscissa of
+the closed loop (below 0 if it is stable) in continuous time and its spectral radius
+(below 1) in discrete time. In single precision the data are rounded first, and what
+counts as solved is 1e-5 instead of 1e-12; a solver whose precision does not suffice
+says so. The loop of CAREX 11 is on the boundary.
 
 """
 

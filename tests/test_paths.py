@@ -248,14 +248,81 @@ def test_a_batch_of_modules(key):
 
 
 @once
-def test_a_large_batch():
-    """Of which the extreme members are looked at, and others, but not all."""
-    make = lambda high: d.Uniform(-1.0, high, size=1)
-    batch = jax.vmap(make)(jnp.ones(5000))
-    looked = len(dlx._paths._members(batch))
-    assert 100 < looked <= dlx._paths._MOST_MEMBERS
-    with user_error(match="member 4321 of a batch"):
-        dlx.replace(batch, {"high": batch.high.at[4321].set(-2.0)})
+def test_every_member_of_a_batch_is_checked():
+    """Those with no extreme number too: here the others reach further."""
+    low = jnp.tile(jnp.array([-9.0, -1.0]), 500)
+    batch = jax.vmap(lambda low: d.Uniform(low, -low, size=1))(low)
+    with user_error(match="member 777 of a batch"):
+        dlx.replace(batch, {"high": batch.high.at[777].set(-2.0).at[0].set(-8.0)})
+
+
+@once
+def test_a_large_batch(monkeypatch):
+    """Of which the extreme members are looked at, and others, and a warning says so."""
+    monkeypatch.setattr(dlx._paths, "_MOST_MEMBERS", 64)
+    batch = jax.vmap(lambda high: d.Uniform(-1.0, high, size=1))(jnp.ones(500))
+    assert 32 <= len(dlx._paths._members(batch)) <= 64
+    with user_error(match="member 321 of a batch"):
+        dlx.replace(batch, {"high": batch.high.at[321].set(-2.0)})
+    with pytest.warns(UserWarning, match="Uniform is a batch of 500 members, of which"):
+        dlx.replace(batch, {"high": 2 * batch.high})
+
+
+LEGAL = [
+    {"start": (5.0, 6.0), "stop": (7.0, 8.0)},
+    {"start": (5.0, 6.0), "stop": (6.0, 8.0)},
+    {"start": (5, 6), "stop": lambda key: 7 + jax.random.uniform(key)},
+    {"start": (0.5, 0.5), "stop": (0.5, 0.5)},
+]
+CROSSED = [
+    {"start": (-1.0, 1.5)},
+    {"start": (5.0, 7.5), "stop": (7.0, 8.0)},
+    {"start": (7.5, 8.5), "stop": (7.0, 9.0)},
+]
+
+
+def under(how, draw, key):
+    keys = jax.random.split(key, 3)
+    calls = {
+        "eager": lambda: [draw(key) for key in keys],
+        "jit": lambda: jax.jit(draw)(key),
+        "vmap": lambda: jax.vmap(draw)(keys),
+        "grad": lambda: jax.jvp(lambda x: draw(key, x), (1.0,), (1.0,)),
+    }
+    return calls[how]()
+
+
+@once
+@pytest.mark.parametrize("how", ["eager", "jit", "vmap", "grad"])
+def test_ranges_are_checked_by_their_ends(how, key):
+    def draw(ranges, make):
+        made = make(1.0)  # what is made under jit is traced, all of it
+
+        def draw(key, x=None):
+            tree = made if x is None else make(x)
+            return jax.tree.leaves(dlx.randomise(tree, key, ranges))
+
+        return draw
+
+    window = lambda x: d.Window(d.Constant(1.0 * x, size=1), 0.0, 1.0)
+    for ranges in LEGAL:
+        under(how, draw(ranges, window), key)
+    for ranges in CROSSED:
+        with user_error(match="stop must be at least.*ranges of randomise allow it"):
+            under(how, draw(ranges, window), key)
+    pendulum = lambda x: dlx.replace(
+        dlx.make("pendulum"), {"dynamics.system.length": x}
+    )
+    mass = "dynamics.system.mass"
+    under(how, draw({mass: (0.0, 1.0)}, pendulum), key)  # 0 itself is hardly drawn
+    for low, high in ((-2.0, -1.0), (-0.01, 1.0), (0.0, 0.0)):
+        with user_error(match="Pendulum: mass must be positive"):
+            under(how, draw({mass: (low, high)}, pendulum), key)
+    for low, high in ((2.0, 1.0), (1.0, np.inf), (np.nan, 1.0)):
+        with user_error(match="must be finite and have low <= high"):
+            under(how, draw({mass: (low, high)}, pendulum), key)
+    with user_error(match="control_bounds must have low <= high"):
+        under(how, draw({"control_bounds.0": (0.0, 5.0)}, pendulum), key)
 
 
 @once

@@ -24,7 +24,7 @@ def is_concrete(x: Any) -> bool:
 def output_of(function: Any, *shapes: tuple[int, ...]) -> Any:
     """The shapes of what `function` returns for arrays of `shapes`, traced once for all
     functions that differ in the values of their arrays alone."""
-    dtype = jnp.zeros(()).dtype
+    dtype = jnp.result_type(float)
     inputs = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
     leaves, structure = jax.tree.flatten(function)
     if not all(eqx.is_array(leaf) for leaf in leaves) or not _is_hashable(structure):

@@ -35,8 +35,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     on_boundary = (
         "The closed loop is on the boundary of stability, up to rounding: a mode there "
-        "is not seen by the cost, or the cost is the least that has a minimum, or the "
-        "precision is too low to tell."
+        "is not seen by the cost, or a slightly smaller weight would leave the cost "
+        "without a minimum, or the precision is too low to tell."
     )
     ill_posed = (
         "The data are not those of a well-posed problem: not finite, a weight that is "
@@ -57,12 +57,13 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "not be smooth there, or the tolerance may be below rounding."
     )
     plan_failed = (
-        "A plan of the controller did not succeed: `trajectory.incident_counts` says "
-        "how many did not."
+        'A plan of the controller did not succeed. Where "incidents" are in `keep`, '
+        "as by default, `trajectory.incident_counts` says how many did not."
     )
     update_refused = (
-        "An update of a learner was not finite and was not made: "
-        "`trajectory.incident_counts` says how many were not."
+        'An update of a learner was not finite and was not made. Where "incidents" '
+        "are in `keep`, as by default, `trajectory.incident_counts` says how many were "
+        "not."
     )
     no_equilibrium = (
         "There is no equilibrium near the guess: the least residual there is not zero. "

@@ -613,21 +613,57 @@ def test_a_learner_takes_a_wrapped_plant_that_observes_its_state(key):
     assert np.isfinite(run.total_cost)
 
 
+class ByHand(dlx.AbstractDynamics):
+    dynamics: dlx.AbstractDynamics
+    dt = property(lambda self: self.dynamics.dt)
+    state_names = property(lambda self: self.dynamics.state_names)
+    control_names = property(lambda self: self.dynamics.control_names)
+    disturbance_size = property(lambda self: self.dynamics.disturbance_size)
+
+    def advance(self, t, x, u, w):
+        return self.dynamics.advance(t, x, u, w)
+
+
 def test_noise_that_a_hand_made_wrapper_would_lose_is_an_error():
-    class ByHand(dlx.AbstractDynamics):
-        dynamics: dlx.AbstractDynamics
-        dt = property(lambda self: self.dynamics.dt)
-        state_names = property(lambda self: self.dynamics.state_names)
-        control_names = property(lambda self: self.dynamics.control_names)
-        disturbance_size = property(lambda self: self.dynamics.disturbance_size)
+    class Says(ByHand):
         is_stochastic = property(lambda self: self.dynamics.is_stochastic)
 
-        def advance(self, t, x, u, w):
-            return self.dynamics.advance(t, x, u, w)
+    class Forwards(ByHand):
+        increments = property(lambda self: self.dynamics.increments)
 
-    plant = ByHand(dlx.Discretized(Shaky(), dt=0.1, substeps=2))
+    class Quiet(ByHand):
+        increments = 0
+
+    class Euler(ByHand):
+        dynamics: dict[str, list[Shaky]]
+        dt = 0.1
+        state_names = control_names = ("x",)
+        disturbance_size = 1
+
+    noisy = dlx.Discretized(Shaky(), dt=0.1, substeps=2)
+    calm = dlx.Discretized(Spring(), dt=0.1)
+    cost = dlx.costs.Quadratic(np.eye(2), np.eye(1))
+    make = lambda dynamics: dlx.Environment(dynamics, cost)
     with user_error(match="increments must be at least 1.*AbstractWrapper"):
-        dlx.Environment(plant, dlx.costs.Quadratic(np.eye(2), np.eye(1)))
+        make(Says(noisy))
+    hidden = "Environment: ByHand hides the Brownian noise of the {} that it.*"
+    hidden += "AbstractWrapper, or give ByHand `increments`"
+    with user_error(match=hidden.format("Discretized")):
+        make(ByHand(noisy))
+    with user_error(match=hidden.format("Delayed")):
+        make(ByHand(dlx.dynamics.Delayed(noisy)))
+    with user_error(match=hidden.format("Discretized")):
+        make(Weak(Forwards(ByHand(noisy))))
+    with user_error(match="Euler hides the Brownian noise of the Shaky"):
+        make(Euler({"system": [Shaky()]}))
+    with user_error(match=hidden.format("Discretized")):
+        dlx.replace(make(calm), {"dynamics": ByHand(noisy)})
+    for legal in (ByHand(calm), Quiet(noisy), ByHand(Quiet(noisy)), Weak(Quiet(noisy))):
+        assert isinstance(make(legal).disturbance, dlx.disturbances.Zero)
+    for legal in (Forwards(noisy), Weak(Forwards(noisy))):
+        assert isinstance(make(legal).disturbance, dlx.disturbances.Brownian)
+    batch = jax.vmap(lambda dt: make(Forwards(dlx.Discretized(Shaky(), dt))))
+    assert batch(jnp.full(3, 0.1)).dt.shape == (3,)
 
 
 def test_a_delay_of_nothing_observes_the_state():

@@ -494,6 +494,10 @@ NO_POINT = dlx.Discretized(dlx.systems.Lorenz(), dt=0.01)
         (lambda: c.GPC(PLANT, COST, memory=0), "GPC: memory must be a whole"),
         (lambda: c.GPC(PLANT, COST, horizon=0), "GPC: horizon must be a whole"),
         (lambda: c.GPC(PLANT, vector), r"cost must give a scalar.*shape \(2,\)"),
+        (
+            lambda: c.GPC(LOOSE, COST, base=c.Linear([[1.0]])),
+            r"GPC: cost must take the observation, of shape \(1,\).*Q has shape",
+        ),
         (lambda: c.GPC(PLANT, 3.0), "cost must be a function"),
         (lambda: c.GPC(None, COST), "dynamics must be an AbstractDynamics.*Explore"),
         (lambda: c.GPC(PLANT, COST, base=3), "base must be an AbstractController"),

@@ -3,11 +3,13 @@
 from fractions import Fraction
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import dtype, tolerance
 
 from delucax.math._accurate import in_parts, product
+from delucax.math._size import power_of_two
 
 
 def exact(left, right, *added):
@@ -50,3 +52,9 @@ def test_in_parts(k):
     )
     assert np.all(error.astype(float) <= units * np.finfo(dtype()).eps / 2 * sizes)
     assert units <= min(k, 17)
+
+
+def test_a_power_of_two_has_no_rounding():
+    whole = np.arange(-120, 121)
+    powers = power_of_two(jnp.asarray(whole, dtype()))
+    np.testing.assert_array_equal(np.asarray(powers, float), 2.0**whole)

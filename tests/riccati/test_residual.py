@@ -22,7 +22,7 @@ N, M = 3, 2
 def measured(discrete, descriptor=False):
     def bound(accurately, A, B, Q, R, S, E, X):
         E = E if descriptor else None
-        return riccati_residual(discrete, A, B, Q, R, S, E, X, accurately).bound
+        return riccati_residual(discrete, A, B, Q, R, S, E, X, accurately).bounds[0]
 
     return jax.jit(bound)
 

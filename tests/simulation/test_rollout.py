@@ -275,6 +275,17 @@ def test_divergence_is_an_error_or_a_status(key):
         jax.block_until_ready(dlx_env_horizon)
 
 
+def test_a_step_that_overflows_is_found_by_the_rollout(key):
+    """The step checks no numbers: it succeeds with a state that is not finite."""
+    env, zero = dlx.make("van_der_pol"), dlx.controllers.Zero(1)
+    huge = jnp.full(2, float(jnp.finfo(jnp.zeros(()).dtype).max) ** 0.2)
+    step = env.step(0.0, huge, jnp.zeros(1))
+    assert step.result == dlx.RESULTS.successful
+    assert not np.all(np.isfinite(step.state))
+    run = dlx.rollout(env, zero, key=key, x0=huge, horizon=1, throw=False)
+    assert run.result == dlx.RESULTS.diverged
+
+
 def test_one_bad_lane_harms_no_other(key):
     env = dlx.make("lds", A=1e5 * jnp.eye(1), B=jnp.eye(1))
     zero = dlx.controllers.Zero(1)

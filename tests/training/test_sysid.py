@@ -2,6 +2,7 @@
 
 import re
 
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -48,6 +49,38 @@ def test_length_and_mass_within_one_percent():
         inside += np.sum((found.low < truth) & (truth < found.high))
     # Of 20 intervals of 95%: fewer than 16 has a chance below 0.3%.
     assert inside >= 16
+
+
+class Friction(dlx.AbstractSystem):
+    """A mass with linear and cubic friction; the latter can be left out."""
+
+    state_names, control_names = ("v",), ("u",)
+    b: jax.Array = dlx.parameter(1.0)
+    a: jax.Array = dlx.parameter(0.0)
+
+    def vector_field(self, t, x, u, w):
+        return -self.a * x**3 - self.b * x + u
+
+
+def test_residuals_of_a_wrong_model_are_said_to_be_correlated():
+    plant = dlx.Discretized(Friction(0.5, 1.0), dt=0.05)
+    guess = dlx.Discretized(Friction(1.0, 0.5), dt=0.05)
+    wrong = dlx.Discretized(Friction(), dt=0.05)
+    controls = 3 * jnp.repeat(jr.normal(jr.key(3), (40, 1)), 5, 0)
+    states = dlx.open_loop(plant, jnp.array([0.5]), controls)
+    for seed in range(3):
+        noise = 0.01 * jnp.std(states) * jr.normal(jr.key(seed), states.shape)
+        missing = sysid.physical(wrong, states + noise, controls, "system.b")
+        assert missing.correlation > 8
+        assert "correlated from step to step" in repr(missing)
+        found = sysid.physical(
+            guess, states + noise, controls, ("system.a", "system.b")
+        )
+        assert found.correlation < 4
+        assert "correlated" not in repr(found)
+        # Where the noise is said to be larger than all that remains nothing is known.
+        loud = sysid.physical(wrong, states + noise, controls, "system.b", noise=1.0)
+        assert loud.correlation == 0
 
 
 @thorough

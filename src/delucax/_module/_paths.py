@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import warnings
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
@@ -23,8 +24,8 @@ from ._fields import (
 
 _T = TypeVar("_T")
 
-_MOST_MEMBERS = 256
-"""Of a batch whose members are checked one by one, in a fraction of a second."""
+_MOST_MEMBERS = 4096
+"""Of a batch whose members are checked one by one, a millisecond each or less."""
 
 
 def get_path(tree: PyTree, path: str) -> Any:
@@ -75,8 +76,8 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
     in one call. What an environment has by default of its dynamics, its disturbance and
     a first state of zeros, follows new dynamics. Then every module above a change runs
     the checks of its constructor; in a batch from `jax.vmap` each member does, of more
-    than 256 those with extreme numbers and others spread evenly. Traced values cannot
-    be looked at, only their shapes.
+    than 4096 those with extreme numbers and others spread evenly, with a warning.
+    Traced values cannot be looked at, only their shapes.
 
     **Arguments:**
 
@@ -213,11 +214,20 @@ def _check_members(module: eqx.Module, before: eqx.Module) -> None:
     like = next(filter(legal, _members(before).values()), None)
     if like is None:  # no batch, or one that cannot be looked at
         return
-    for place, member in _members(module).items():
+    members = _members(module)
+    for place, member in members.items():
         try:
             _check(member, like)
         except ValueError as error:
             raise ValueError(f"{error} This is member {place} of a batch.") from error
+    count = len(jax.tree.leaves(eqx.filter(module, eqx.is_array))[0])
+    if 0 < len(members) < count:
+        warnings.warn(
+            f"replace: {type(module).__name__} is a batch of {count} members, of which "
+            f"{len(members)} were checked; all are in a batch of at most "
+            f"{_MOST_MEMBERS}.",
+            stacklevel=2,
+        )
 
 
 def _members(module: eqx.Module) -> dict[int, eqx.Module]:

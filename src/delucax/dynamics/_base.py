@@ -66,7 +66,8 @@ class AbstractDynamics(eqx.Module):
     def increments(self) -> int:
         """How many Brownian increments of equal variance `w` holds one after the other,
         each of `disturbance_size / increments` entries; 0, the default, if `w` is not
-        Brownian."""
+        Brownian. Dynamics that hold stochastic ones, or a system with a diffusion, must
+        say which it is: environments do not take the default from them."""
         return 0
 
     @property
@@ -86,6 +87,10 @@ class AbstractDynamics(eqx.Module):
         self, t: RealScalar, x: Array, u: Array, w: Array | None
     ) -> tuple[Array, Result]:
         """One step, with what became of it.
+
+        `result` is that of the solver alone. The numbers are not checked: from NaN, or
+        from a finite state so large that it overflows, `x_next` is not finite although
+        `result` is a success. [`delucax.rollout`][] checks for that.
 
         **Arguments:**
 
@@ -156,17 +161,6 @@ class AbstractDynamics(eqx.Module):
                 f"{type(self).__name__}: observe must return a vector, got {got}."
             )
         return shape[0]
-
-
-def check_increments(dynamics: "AbstractDynamics", where: str) -> None:
-    """Raise where noise would be lost: dynamics that hold others and forward by hand
-    that they are stochastic, and not how many increments they take."""
-    if dynamics.is_stochastic and not dynamics.increments:
-        raise ValueError(
-            f"{where}: {type(dynamics).__name__} says that w is Brownian, so its "
-            "increments must be at least 1, got 0. A subclass of "
-            "delucax.dynamics.AbstractWrapper forwards them."
-        )
 
 
 def check_dynamics(value: Any, where: str) -> None:

@@ -45,12 +45,13 @@ def trim(
     It is a root near the guess, not always the nearest. Where there are more free
     unknowns than equations it is the least change among its neighbours, to first order.
     The unit of each state is its guess, or where that is zero the largest guess of a
-    state, at most 1, and 1 if all are zero; so for controls. A guess below 100
-    roundings of that counts as zero, so that states as small beside larger ones want a
-    smaller unit. Where there is no root it is a point of least residual, each equation
-    in units of the size of its terms, and the result says so. What is below the
-    rounding of its unit is zero. At a multiple root the last digits may be missing, and
-    the result be `no_equilibrium`.
+    state, at most 1, and 1 if all are zero; so for controls. A guess smaller than 100
+    roundings of the largest one (or of 1, if that is less) counts as zero: measure a
+    state that is so small in a smaller unit. A free state or control that comes out
+    smaller than 4 roundings of its unit is set to zero. Where there is no root it is a
+    point of least residual, each equation in units of the size of its terms, and the
+    result says so. At a multiple root the last digits may be missing, and the result
+    be `no_equilibrium`.
 
     Levenberg and Marquardt's method in a trust region, then Newton's on the conditions
     of the nearest point. Differentiable in forward and reverse mode with respect to all
@@ -202,7 +203,7 @@ class _Problem(eqx.Module):
     def at(self, z: Array) -> Array:
         moves, units = jnp.array(self.free), self.units
         y = self.guess.at[moves].add(units[moves] * z)
-        # What is below the rounding of its unit is zero, and moves as it did.
+        # Set to zero where it is rounding alone; its derivative stays.
         tiny = jnp.abs(y) <= _ULPS * jnp.finfo(y.dtype).eps * units
         tiny = tiny & jnp.zeros(y.shape, bool).at[moves].set(True)
         return y - lax.stop_gradient(jnp.where(tiny, y, 0))

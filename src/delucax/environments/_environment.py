@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -37,7 +38,8 @@ from ..costs import AbstractCost
 from ..costs._base import check_cost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics, OperatingPoint, trim
-from ..dynamics._base import check_dynamics, check_increments
+from ..dynamics._base import check_dynamics
+from ..dynamics._noise import check_increments
 from ..dynamics._operating_point import operating_point
 from ..math import clip
 
@@ -385,9 +387,10 @@ class Environment(eqx.Module):
             `actions`.
         - `w`: disturbance, shape `(disturbance_size,)`; `None` for zero.
 
-        It is the bare map: of a state or a control that is not finite comes one that
-        is not finite, and `result` says what became of the dynamics alone.
-        [`delucax.rollout`][] and what else takes steps check the numbers themselves.
+        A step does not check its numbers, and `result` is that of the solver alone: NaN
+        in the state or the control gives NaN, and a state that is finite but huge may
+        overflow to infinity or NaN, while `result` is a success.
+        [`delucax.rollout`][] and whatever else takes steps check for that.
 
         **Returns:** a [`delucax.environments.Step`][].
 
@@ -441,7 +444,10 @@ def _check_bounds(low: Array, high: Array, shape: tuple[int, ...], what: str) ->
 def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
     """A copy with the named parameters drawn at random: domain randomisation.
 
-    Under `jax.vmap` over keys it makes a batch of plants that compiles once.
+    Under `jax.vmap` over keys it makes a batch of plants that compiles once. There the
+    values drawn cannot be looked at, so the ends of the ranges are: each with the
+    others at their lower, and at their upper ends. What a function draws is checked
+    where it is known, outside of `jax.vmap` and `jax.jit`.
 
     **Arguments:**
 
@@ -452,8 +458,8 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
 
     **Returns:** the copy.
 
-    **Raises:** `ValueError` if a path is not there or is part of another one, or a
-    range is not a pair or function.
+    **Raises:** `ValueError` if a path is not there or is part of another one, a range
+    is not a finite pair or a function, or a range holds values that are not legal.
 
     !!! example
 
@@ -479,7 +485,7 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
             f"{{'dynamics.system.length': (0.8, 1.2)}}, got {ranges!r}."
         )
     check_paths(ranges, "randomise")
-    changes = {}
+    changes, ends = {}, {}
     for (path, given), one in zip(
         ranges.items(), jr.split(key, len(ranges)), strict=True
     ):
@@ -493,17 +499,55 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
                     f"randomise: the range of {path!r} must be of numbers, got "
                     f"{shortened(given)}."
                 )
-            if is_concrete(low) and is_concrete(high) and not np.all(low <= high):
-                raise ValueError(
-                    f"randomise: the range of {path!r} must have low <= high, got "
-                    f"{given}."
-                )
             shape: Any = jnp.broadcast_shapes(jnp.shape(old), low.shape, high.shape)
-            unit = jr.uniform(one, shape, jnp.result_type(old, low, high))
+            dtype = jnp.result_type(old, low, high)
+            with jax.ensure_compile_time_eval():  # so that jit does not hide numbers
+                known = [as_float_array(end) for end in given]
+            if all(map(is_concrete, known)):
+                least, most = (np.asarray(end, dtype) for end in known)
+                if not np.all((least <= most) & np.isfinite(most - least)):
+                    raise ValueError(
+                        f"randomise: the range of {path!r} must be finite and have "
+                        f"low <= high, got {shortened(given)}."
+                    )
+                ends[path] = _inner_ends(least, most, shape)
+            unit = jr.uniform(one, shape, dtype)
             changes[path] = low + (high - low) * unit
         else:
             raise ValueError(
                 f"randomise: the range of {path!r} must be a pair (low, high) or a "
                 f"function of a key, got {shortened(given)}."
             )
+    _check_ends(tree, changes, ends)
     return replace(tree, changes)
+
+
+def _inner_ends(low: Any, high: Any, shape: tuple[int, ...]) -> tuple[Any, Any]:
+    """The ends of a range, moved inside by a rounding: an end that is itself not legal,
+    such as 0 for what is positive, is as good as never drawn."""
+    small = np.finfo(low.dtype).eps * (high - low)
+    first = np.maximum(np.nextafter(low, high), low + small)
+    last = np.minimum(np.nextafter(high, low), high - small)
+    return np.broadcast_to(first, shape), np.broadcast_to(last, shape)
+
+
+def _check_ends(tree: Any, changes: dict[str, Any], ends: dict[str, Any]) -> None:
+    """Raise where a range holds what is not legal, which under `jax.vmap` and `jax.jit`
+    a draw cannot show.
+
+    All values are set to the ends of their ranges, on one side but for one of them or
+    none. All that is tried may be drawn, so that ranges which fit together pass.
+    """
+    count = len(ends)
+    sides = {
+        tuple(side ^ (k == odd) for k in range(count))
+        for side in (False, True)
+        for odd in range(-1, count)
+    }
+    for corner in sorted(sides) if ends else ():
+        tried = {path: ends[path][at] for path, at in zip(ends, corner, strict=True)}
+        try:
+            with jax.ensure_compile_time_eval():
+                replace(tree, changes | tried)
+        except ValueError as error:
+            raise ValueError(f"{error} The ranges of randomise allow it.") from error

@@ -21,3 +21,8 @@ def _largest(*matrices):
     """The largest magnitude, or 1 if there is none. A NaN stays one."""
     largest = jnp.max(jnp.stack([jnp.max(jnp.abs(M), initial=0) for M in matrices]))
     return jnp.where(largest == 0, 1, largest)
+
+
+def power_of_two(exponent: Array) -> Array:
+    """`2^exponent` for whole exponents, to the last bit, which `jnp.exp2` is not."""
+    return jnp.ldexp(jnp.ones_like(exponent), exponent.astype(int))

@@ -91,10 +91,10 @@ def default_start(
 
     The weights of the LQR are the second derivatives of the stage cost at that point.
 
-    The gain of the first start is zero, and no LQR is among them, where the derivatives
-    at that point are not finite, the second derivative of the cost with respect to the
-    control is not positive definite, no gain stabilises the plant, or the dynamics
-    cannot be differentiated.
+    There is no such LQR where the derivatives at that point are not finite, the second
+    derivative of the cost with respect to the control is not positive definite, no gain
+    stabilises the plant, or the dynamics cannot be differentiated. The gain of the
+    first start is then zero, and no LQR is tried.
 
     A trajectory that rests at the operating point is not among the starts, for it does
     not begin at the first state. The LQR leads there.

@@ -13,11 +13,19 @@ from ..math._size import size
 from ._arguments import riccati_arguments
 from ._dare import double
 from ._lyapunov import lyapunov
-from ._newton import attainable, found_tangent, outside, polish, settled, solution_of
+from ._newton import (
+    attainable,
+    found_tangent,
+    outside,
+    polish,
+    solution_in_units,
+    solution_of,
+)
 from ._residual import riccati_residual
-from ._search import Attempt, Found, search, SECOND, verdict, weights
+from ._search import Attempt, Found, search, SECOND, weights
 from ._solution import checked, RiccatiSolution
 from ._spectrum import abscissa_and_size
+from ._units import in_units
 
 
 _SIGN_STEPS = 60
@@ -64,18 +72,20 @@ def care(
         look at `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][] with a `spectral_abscissa`. It
-    is successful if the `residual` is at most 1e-12 (1e-5 in single precision), or what
-    rounding of `X` alone may leave, and the
-    closed loop is stable: a small residual alone is no certificate. Else `result` is
-    one of `RESULTS.not_stabilisable`, `not_stabilising` (no such solution),
-    `on_boundary` (eigenvalues on the imaginary axis, or so close that data changed by
-    rounding have no stabilising solution), `not_converged` and `ill_posed`.
+    is successful if the residual, in units of the states that balance the equation, is
+    at most 1e-12 (1e-5 in single precision), or up to a hundred times that if rounding
+    of `X` alone may leave it; and if the closed loop is stable: a small residual alone
+    is no certificate. Else `result` is one of `RESULTS.not_stabilisable`,
+    `not_stabilising` (no such solution), `on_boundary` (eigenvalues on the imaginary
+    axis, or so close that data changed by rounding have no stabilising solution),
+    `not_converged` and `ill_posed`.
 
     **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
     symmetric or (`R`) not definite; an error at run time as `throw` says.
 
     Source: Roberts, 1971 (sign); Byers, 1987 (scaling); Chu, Fan and Lin, 2005
-    (doubling); Kleinman, 1968 (Newton).
+    (doubling); Kleinman, 1968 (Newton); Benner, 2001
+    (balancing).
 
     !!! example
 
@@ -100,19 +110,7 @@ def continuous_solution(A, B, Q, R, S, E) -> RiccatiSolution:
 @eqx.filter_jit
 @full_precision
 def _solution(A, B, Q, R, S, E):
-    found = _find(A, B, Q, R, S, E)
-    arguments = A, B, Q, R, S, E, found.X
-    K, closed_loop = settled(found.differentiable, _terms, *arguments)
-    return RiccatiSolution(
-        X=found.X,
-        K=K,
-        residual=lax.stop_gradient(found.residual),
-        closed_loop=closed_loop,
-        spectral_radius=None,
-        spectral_abscissa=lax.stop_gradient(found.bound),
-        iterations=found.iterations,
-        result=verdict(found),
-    )
+    return solution_in_units(_find, _terms, "spectral_abscissa", A, B, Q, R, S, E)
 
 
 def _terms(A, B, R, S, E, X):
@@ -134,7 +132,7 @@ def _equation(A, B, Q, R, S, E, X):
 
 
 @jax.custom_jvp
-def _find(A, B, Q, R, S, E) -> Found:
+def _find(A, B, Q, R, S, E, d) -> Found:
     """The stabilising `X`, and what is known about it."""
     n, m, dtype = A.shape[0], B.shape[1], A.dtype
     eps = float(jnp.finfo(dtype).eps)
@@ -146,21 +144,26 @@ def _find(A, B, Q, R, S, E) -> Found:
 
     magnified = 1 if E is None else size(E) ** 2
 
-    def attempt(kind):
-        q, r, s, size_Q = weights(kind, Q, R, S)
-        X, size_G, iterations = _start(plain_A, plain_B, q, r, s, kind == SECOND)
+    def attempt(kind, balanced):
+        # From the units that balance the problem to those of the attempt.
+        e = jnp.where(balanced, 1, 1 / d)
+        a, b, q, r, s, f = in_units(e, A, B, Q, R, S, E)
+        q, r, s, size_Q = weights(kind, q, r, s)
+        plain_a, plain_b, *_ = in_units(e, plain_A, plain_B, Q, R, S, None)
+        X, size_G, iterations = _start(plain_a, plain_b, q, r, s, kind == SECOND)
         X, left = polish(
-            lambda *at: riccati_residual(False, A, B, q, r, s, E, *at),
-            lambda loop, error: outside(E, lyapunov(loop, error)),
-            outside(E, X),
+            lambda *at: riccati_residual(False, a, b, q, r, s, f, *at, d * e, e),
+            lambda loop, error: outside(f, lyapunov(loop, error)),
+            outside(f, X),
         )
         abscissa, scale = abscissa_and_size(left.closed_loop)
         rounding = n * eps * scale
         # A change of Q by rounding moves eigenvalues on the axis off it by its root.
         reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
         return Attempt(
-            X=X,
-            residual=left.bound,
+            X=X * (e[:, None] * e),
+            residual=left.bounds[2],
+            given=left.bounds[1],
             bound=abscissa,
             gap=-abscissa,
             rounding=rounding,
@@ -171,7 +174,7 @@ def _find(A, B, Q, R, S, E) -> Found:
             iterations=iterations,
         )
 
-    return search(attempt, jnp.full_like(Q, jnp.nan), posed)
+    return search(attempt, jnp.full_like(Q, jnp.nan), posed, jnp.any(d != 1))
 
 
 def _start(A, B, Q, R, S, second):
@@ -253,7 +256,7 @@ def _by_doubling(A, G, Q, wanted):
 @full_precision
 def _find_jvp(primals, tangents):
     found = _find(*primals)
-    E = primals[-1]
+    E = primals[5]
 
     def correction(closed_loop, error):
         return outside(E, lyapunov(closed_loop, error))

@@ -80,7 +80,7 @@ def continuous_game(problem: tuple, gamma: Array, X0: Array) -> Game:
 
     def equation(X):
         left = riccati_residual(
-            False, A, both, Q, weight, S, None, X, False, D.shape[1]
+            False, A, both, Q, weight, S, None, X, False, players=D.shape[1]
         )
         return left.error, left.closed_loop, left.K, left
 
@@ -90,7 +90,7 @@ def continuous_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     holds = is_semidefinite(X) & is_clearly_definite(R)
     holds &= jnp.all(jax.vmap(spectral_abscissa)(loops) < -slack)
     solved = left.relative < rounding(n, A.dtype)
-    return Game(X, left.bound, holds, solved, iterations)
+    return Game(X, left.bounds[0], holds, solved, iterations)
 
 
 @jax.custom_jvp

@@ -10,12 +10,20 @@ import jax.numpy as jnp
 from ..math._linear_solve import full_precision, is_definite, solve, symmetric
 from ..math._size import size
 from ._arguments import riccati_arguments
-from ._newton import attainable, found_tangent, outside, polish, settled, solution_of
+from ._newton import (
+    attainable,
+    found_tangent,
+    outside,
+    polish,
+    solution_in_units,
+    solution_of,
+)
 from ._residual import riccati_residual
-from ._search import Attempt, Found, search, SECOND, verdict, weights
+from ._search import Attempt, Found, search, SECOND, weights
 from ._solution import checked, RiccatiSolution
 from ._spectrum import spectral_radius
 from ._stein import MAX_DOUBLINGS, stein
+from ._units import in_units
 
 
 _SECOND_START = 1e4
@@ -64,16 +72,18 @@ def dare(
         look at `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][]. It is successful if the
-    `residual` is at most 1e-12 (1e-5 in single precision) and the closed loop is
-    stable: a small residual alone is no certificate. Else `result` is one of
-    `RESULTS.not_stabilisable`, `not_stabilising` (no such solution), `on_boundary`
-    (eigenvalues on the unit circle, or so close that data changed by rounding have no
-    stabilising solution), `not_converged` and `ill_posed`.
+    residual, in units of the states that balance the equation, is at most 1e-12 (1e-5
+    in single precision), or up to a hundred times that if rounding of `X` alone may
+    leave it; and if the closed loop is stable: a small residual alone is no
+    certificate. Else `result` is one of `RESULTS.not_stabilisable`, `not_stabilising`
+    (no such solution), `on_boundary` (eigenvalues on the unit circle, or so close that
+    data changed by rounding have no stabilising solution), `not_converged` and
+    `ill_posed`.
 
     **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
     symmetric or (`R`) not semidefinite; an error at run time as `throw` says.
 
-    Source: Chu, Fan, Lin and Wang, 2004 (doubling).
+    Source: Chu, Fan, Lin and Wang, 2004 (doubling); Benner, 2001 (balancing).
 
     !!! example
 
@@ -98,18 +108,7 @@ def discrete_solution(A, B, Q, R, S, E) -> RiccatiSolution:
 @eqx.filter_jit
 @full_precision
 def _solution(A, B, Q, R, S, E):
-    found = _find(A, B, Q, R, S, E)
-    arguments = A, B, Q, R, S, E, found.X
-    K, closed_loop = settled(found.differentiable, _terms, *arguments)
-    return RiccatiSolution(
-        X=found.X,
-        K=K,
-        residual=lax.stop_gradient(found.residual),
-        closed_loop=closed_loop,
-        spectral_radius=lax.stop_gradient(found.bound),
-        iterations=found.iterations,
-        result=verdict(found),
-    )
+    return solution_in_units(_find, _terms, "spectral_radius", A, B, Q, R, S, E)
 
 
 def _terms(A, B, R, S, E, X):
@@ -131,7 +130,7 @@ def _equation(A, B, Q, R, S, E, X):
 
 
 @jax.custom_jvp
-def _find(A, B, Q, R, S, E) -> Found:
+def _find(A, B, Q, R, S, E, d) -> Found:
     """The stabilising `X`, and what is known about it."""
     n, dtype = A.shape[0], A.dtype
     eps = float(jnp.finfo(dtype).eps)
@@ -142,21 +141,26 @@ def _find(A, B, Q, R, S, E) -> Found:
 
     magnified = 1 if E is None else size(E) ** 2
 
-    def attempt(kind):
-        q, r, s, size_Q = weights(kind, Q, R, S)
+    def attempt(kind, balanced):
+        # From the units that balance the problem to those of the attempt.
+        e = jnp.where(balanced, 1, 1 / d)
+        a, b, q, r, s, f = in_units(e, A, B, Q, R, S, E)
+        q, r, s, size_Q = weights(kind, q, r, s)
+        plain_a, plain_b, *_ = in_units(e, plain_A, plain_B, Q, R, S, None)
         height = size_Q * jnp.where(kind == SECOND, _SECOND_START, 1)
-        X, iterations = _start(plain_A, plain_B, q, r, s, height)
+        X, iterations = _start(plain_a, plain_b, q, r, s, height)
         X, left = polish(
-            lambda *at: riccati_residual(True, A, B, q, r, s, E, *at),
-            lambda loop, error: outside(E, stein(loop, error)),
-            outside(E, X),
+            lambda *at: riccati_residual(True, a, b, q, r, s, f, *at, d * e, e),
+            lambda loop, error: outside(f, stein(loop, error)),
+            outside(f, X),
         )
         radius = spectral_radius(left.closed_loop)
         # A stable loop may belong to a stationary point of a cost without a minimum.
-        gap = jnp.where(_is_semidefinite(r + B.T @ X @ B), 1 - radius, -jnp.inf)
+        gap = jnp.where(_is_semidefinite(r + b.T @ X @ b), 1 - radius, -jnp.inf)
         return Attempt(
-            X=X,
-            residual=left.bound,
+            X=X * (e[:, None] * e),
+            residual=left.bounds[2],
+            given=left.bounds[1],
             bound=radius,
             gap=gap,
             rounding=jnp.asarray(n * eps, dtype),
@@ -169,7 +173,7 @@ def _find(A, B, Q, R, S, E) -> Found:
             iterations=iterations,
         )
 
-    return search(attempt, jnp.full_like(Q, jnp.nan), posed)
+    return search(attempt, jnp.full_like(Q, jnp.nan), posed, jnp.any(d != 1))
 
 
 def _is_semidefinite(weight):
@@ -231,7 +235,7 @@ def double(A, G, H, X0, wanted):
 @full_precision
 def _find_jvp(primals, tangents):
     found = _find(*primals)
-    E = primals[-1]
+    E = primals[5]
 
     def correction(closed_loop, error):
         return outside(E, stein(closed_loop, error))

@@ -64,7 +64,9 @@ def discrete_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     J, iterations = double((A - both @ K, G, J), X0)
 
     def equation(X):
-        left = riccati_residual(True, A, both, Q, weight, S, None, X, False, D.shape[1])
+        left = riccati_residual(
+            True, A, both, Q, weight, S, None, X, False, players=D.shape[1]
+        )
         return left.error, left.closed_loop, left.K, left
 
     X, _, loop, K, left = polish(X0 + J, equation, lambda _, *linear: stein(*linear))
@@ -74,7 +76,7 @@ def discrete_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     holds = is_semidefinite(X) & is_saddle(pivot, D.shape[1])
     holds &= jnp.all(jax.vmap(spectral_radius)(loops) < bound)
     solved = left.relative < rounding(n, A.dtype)
-    return Game(X, left.bound, holds, solved, iterations)
+    return Game(X, left.bounds[0], holds, solved, iterations)
 
 
 def double(element, X0):

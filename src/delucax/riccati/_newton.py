@@ -12,8 +12,9 @@ from ..math._linear_solve import full_precision, no_tangent, solve, symmetric
 from ..math._size import size
 from ._arguments import complex_form, is_complex, real_form
 from ._residual import Residual, riccati_residual
-from ._search import Found, tolerance
+from ._search import Found, tolerance, verdict
 from ._solution import RiccatiSolution
+from ._units import in_units, units
 
 
 _NEWTON_STEPS = 8
@@ -53,7 +54,7 @@ def polish(
         rest = best[1].relative
         again = helped | patient & (rest > wide)
         again &= (rest > fine) & (k < _NEWTON_STEPS)
-        hidden = ~again & ~accurately & (best[1].bound > wide)
+        hidden = ~again & ~accurately & (jnp.max(best[1].bounds) > wide)
         X = jnp.where(hidden, best[0], X)
         k = jnp.where(hidden, 0, k + 1)
         last = new.closed_loop, new.error
@@ -101,6 +102,7 @@ def found_tangent(
     `equation` takes the data and `X`. It is zero in members that are not solved.
     """
     ok = found.differentiable
+    primals, tangents = primals[:-1], tangents[:-1]
     # Guarded at both ends: what is not finite in a failed member stays in it.
     tangents = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents)
 
@@ -139,6 +141,29 @@ def settled(ok: Array, terms: Callable, *data) -> tuple[Array, Array]:
     return jnp.where(ok, live_K, K), jnp.where(ok, live_loop, closed_loop)
 
 
+def solution_in_units(
+    find: Callable, terms: Callable, name: str, A, B, Q, R, S, E
+) -> RiccatiSolution:
+    """The solution, found with states in units that fit.
+
+    `find` takes the data and the units, and `name` is that of the bound that it tells.
+    """
+    d = units(A, B, Q, E)
+    data = in_units(d, A, B, Q, R, S, E)
+    found = find(*data, d)
+    K, closed_loop = settled(found.differentiable, terms, *data, found.X)
+    bounds = dict.fromkeys(("spectral_radius", "spectral_abscissa"))
+    return RiccatiSolution(
+        X=found.X * (d[:, None] * d),
+        K=K * d,
+        residual=lax.stop_gradient(found.given),
+        closed_loop=closed_loop / (d[:, None] / d),
+        iterations=found.iterations,
+        result=verdict(found),
+        **(bounds | {name: lax.stop_gradient(found.bound)}),
+    )
+
+
 def outside(E: Array | None, Y: Array) -> Array:
     """The `X` of `Y = E'XE`."""
     return Y if E is None else symmetric(solve(E.T, solve(E.T, Y).T))
@@ -163,6 +188,6 @@ def _as_complex(solution: RiccatiSolution, discrete: bool, data: tuple):
         lambda s: (s.X, s.K, s.closed_loop), solution, replace_fn=complex_form
     )
     A, B, Q, R, S, E, X = lax.stop_gradient((*data, real_form(solution.X)))
-    bound = riccati_residual(discrete, A, B, Q, R, S, E, X, True).bound
+    bound = riccati_residual(discrete, A, B, Q, R, S, E, X, True).bounds[0]
     bound = jnp.where(jnp.isfinite(bound), bound, solution.residual)
     return eqx.tree_at(lambda s: s.residual, solution, bound)

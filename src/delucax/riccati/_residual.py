@@ -21,7 +21,8 @@ class Residual(NamedTuple):
 
     - `error`: the left side, with the gain in place of the best one.
     - `relative`: its norm over the sum of those of the terms.
-    - `bound`: an upper bound on what this is at the best gain and without rounding.
+    - `bounds`: an upper bound on what this is at the best gain and without rounding, in
+      each of the units that were asked for.
     - `closed_loop`: `A - B K`, or `E^-1 (A - B K)`.
     - `terms`: the sum of the norms of the terms.
     - `K`: the gain.
@@ -29,7 +30,7 @@ class Residual(NamedTuple):
 
     error: Array
     relative: Array
-    bound: Array
+    bounds: Array
     closed_loop: Array
     terms: Array
     K: Array
@@ -45,6 +46,7 @@ def riccati_residual(
     E: Float[Array, "n n"] | None,
     X: Float[Array, "n n"],
     accurately: Bool[Array, ""] | bool,
+    *others: Float[Array, " n"],
     players: int = 0,
 ) -> Residual:
     r"""What is left of the Riccati equation at `X`.
@@ -59,7 +61,9 @@ def riccati_residual(
     square. The rounding of each product is bounded by that of the absolute values of
     its factors. Where that is too wide they are evaluated `accurately`.
 
-    The last `players` controls are a second player's, whose terms count apart.
+    The last `players` controls are a second player's, whose terms count apart. In other
+    units of the states the equation is this one, with rows and columns times those of
+    `others`.
     """
     n, m = B.shape
     dtype = A.dtype
@@ -95,9 +99,14 @@ def riccati_residual(
     error, lost, gap, gap_lost = left
     gap = jnp.abs(gap) + gap_lost
     bound = jnp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
-    bound = _MARGIN * relative_size(bound, *terms)
-    relative = jnp.where(needed, bound, relative_size(error, *terms))
-    return Residual(error, relative, bound, closed_loop, size(*terms), K)
+
+    def in_units(d):
+        return relative_size(*(M * (d[:, None] * d) for M in (bound, *terms)))
+
+    # Powers of two: their products have no rounding.
+    bounds = _MARGIN * jax.vmap(in_units)(jnp.stack([jnp.ones(n, dtype), *others]))
+    relative = jnp.where(needed, bounds[0], relative_size(error, *terms))
+    return Residual(error, relative, bounds, closed_loop, size(*terms), K)
 
 
 class _Left(NamedTuple):
@@ -172,12 +181,12 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
         terms, added = [(L, Z), (Z, L), (S.T, N), (N, T)], [Q]
         of_X = [] if E is None else [(E, Z, 2 * L)]
     # Pairs of what is left out and a bound on what this leaves out again.
-    found = product(stacked([B, R]), N, stacked([A, S.T]), -stacked([L, T]))
-    rests = list(zip(*(jnp.split(M, [n]) for M in found), strict=True))
+    pair = product(stacked([B, R]), N, stacked([A, S.T]), -stacked([L, T]))
+    rests = list(zip(*(jnp.split(M, [n]) for M in pair), strict=True))
     if of_X:
         rights, wholes, _ = (stacked(M, axis=1) for M in zip(*of_X, strict=True))
-        found = product(X, rights, -wholes)
-        rests += zip(*(jnp.split(M, len(of_X), axis=1) for M in found), strict=True)
+        pair = product(X, rights, -wholes)
+        rests += zip(*(jnp.split(M, len(of_X), axis=1) for M in pair), strict=True)
     factor = stacked([2 * Y, N, *(M for *_, M in of_X)]).T
     rest, rest_lost = (stacked(M) for M in zip(*rests, strict=True))
     sizes = jnp.abs(rest)

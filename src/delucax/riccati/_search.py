@@ -12,8 +12,9 @@ from ..math._size import size
 
 
 # What an attempt is made at.
-FIRST, SECOND, SHAKEN, PLAIN, LIFTED, DONE = range(6)
-"""The problem; the problem from another start; the problem with a state weight less by
+FIRST, BALANCED, SECOND, SHAKEN, PLAIN, LIFTED, DONE = range(7)
+"""The problem; the problem in units of the states that balance it, which the attempts
+after it keep; the problem from another start; the problem with a state weight less by
 rounding, of which a solution on the boundary makes another or none; the problem with
 unit weights, which has a solution if and only if the pair is stabilisable; the problem
 with a state weight more by the root of rounding, whose loop tells by being close to the
@@ -26,7 +27,8 @@ class Attempt(NamedTuple):
     """One candidate for the stabilising solution."""
 
     X: Array
-    residual: Array
+    residual: Array  # in units that balance the problem
+    given: Array  # the residual in the units that the problem was given in
     bound: Array  # spectral radius or abscissa of the closed loop
     gap: Array  # the distance from the boundary, positive if it is stable
     rounding: Array  # of the gap
@@ -42,6 +44,7 @@ class Found(NamedTuple):
 
     X: Array
     residual: Array
+    given: Array
     bound: Array
     iterations: Array
     solved: Array
@@ -50,6 +53,7 @@ class Found(NamedTuple):
     fragile: Array
     stabilisable: Array
     on_edge: Array
+    balanced: Array
     posed: Array
 
     @property
@@ -62,8 +66,12 @@ def tolerance(dtype: Any) -> float:
     return 1e-12 if jnp.finfo(dtype).bits == 64 else 1e-5
 
 
-def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found:
+def search(
+    attempt: Callable[[Array, Array], Attempt], X: Array, posed: Array, apart: Array
+) -> Found:
     """Make attempts at the kinds of problem above, as few as are needed.
+
+    An attempt is of a kind, in balanced units or in those given, which may be `apart`.
 
     Most problems are solved by the first. In a batch, the others are made if any member
     has need of them.
@@ -76,11 +84,16 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
 
     def body(carry):
         kind, found = carry
-        new = attempt(kind)
+        balanced = found.balanced | (kind == BALANCED)
+        new = attempt(kind, balanced)
         stable = new.gap > new.rounding
         # No X of this precision may come closer; a hundred times is looked past.
         enough = jnp.clip(new.least, close, 100 * close)
-        solved = stable & (new.residual <= enough)
+        # In units that do not fit, a wrong X may leave little.
+        unfit = apart & ~balanced
+        enough = jnp.where(unfit, close, enough)
+        left = jnp.where(unfit, jnp.maximum(new.residual, new.given), new.residual)
+        solved = stable & (left <= enough)
         given = kind <= SECOND
         # A second start that fails replaces the first only by being stable.
         take = given & (solved | (kind == FIRST) | stable & ~found.stable)
@@ -96,12 +109,16 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
         found = found._replace(
             X=pick(new.X, found.X),
             residual=pick(new.residual, found.residual),
+            given=pick(new.given, found.given),
             bound=pick(new.bound, found.bound),
             iterations=found.iterations + jnp.where(given, new.iterations, 0),
             solved=pick(solved, found.solved),
             gap=pick(new.gap, found.gap),
             stable=pick(stable, found.stable),
-            fragile=jnp.where(kind == SHAKEN, ~(survives & same), found.fragile),
+            balanced=balanced,
+            fragile=jnp.where(
+                kind == SHAKEN, ~(survives & same), found.fragile & ~take
+            ),
             stabilisable=jnp.where(
                 kind == PLAIN,
                 survives | undecided | found.stable,
@@ -116,9 +133,14 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
         after_given = jnp.where(
             solved,
             jnp.where(new.near, SHAKEN, DONE),
-            jnp.where(kind == FIRST, SECOND, PLAIN),
+            jnp.where(
+                kind == SECOND,
+                PLAIN,
+                jnp.where((kind == FIRST) & apart, BALANCED, SECOND),
+            ),
         )
-        after_shaken = jnp.where(found.fragile, PLAIN, DONE)
+        fragile = jnp.where(unfit, BALANCED, PLAIN)
+        after_shaken = jnp.where(found.fragile, fragile, DONE)
         after_plain = jnp.where(survives & ~found.fragile, LIFTED, DONE)
         after = jnp.where(kind == PLAIN, after_plain, DONE)
         after = jnp.where(kind == SHAKEN, after_shaken, after)
@@ -129,6 +151,7 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
     nothing = Found(
         X=X,
         residual=number,
+        given=number,
         bound=number,
         iterations=jnp.asarray(0),
         solved=no,
@@ -137,6 +160,7 @@ def search(attempt: Callable[[Array], Attempt], X: Array, posed: Array) -> Found
         fragile=no,
         stabilisable=yes,
         on_edge=no,
+        balanced=no,
         posed=posed,
     )
     start = jnp.where(posed, FIRST, DONE)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..math._size import size
+from ..math._size import power_of_two, size
 
 
 _SQUARINGS = 60
@@ -136,6 +136,6 @@ def balanced(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
         return scale / jnp.exp2(jnp.round(jnp.mean(jnp.log2(scale))))
 
     scale = lax.fori_loop(0, 24, sweep, jnp.ones(A.shape[0], A.dtype))
-    scale = jnp.exp2(jnp.round(jnp.log2(scale)))
-    scale = jnp.where(jnp.isfinite(scale) & (scale > 0), scale, 1)
+    usable = jnp.isfinite(scale) & (scale > 0)
+    scale = power_of_two(jnp.round(jnp.log2(jnp.where(usable, scale, 1))))
     return A * scale[None, :] / scale[:, None]

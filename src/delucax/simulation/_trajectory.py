@@ -158,8 +158,8 @@ class Trajectory(eqx.Module):
     def _incidents(self) -> dict[str, Array]:
         if self.incidents is None:
             raise ValueError(
-                "Trajectory: incidents must be kept to be counted; got keep= without "
-                "them."
+                "Trajectory: incidents must be kept to be counted: give keep= with "
+                "'incidents', got it without."
             )
         return self.incidents
 

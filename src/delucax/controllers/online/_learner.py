@@ -237,7 +237,13 @@ class OnlineLearner(AbstractLearner):
 def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None:
     """Raise unless a cost of what `dynamics` show is a scalar."""
     y, u = (dynamics.observation_size,), (dynamics.control_size,)
-    value = output_of(cost, (), y, u)
+    try:
+        value = output_of(cost, (), y, u)
+    except ValueError as error:
+        raise ValueError(
+            f"{where}: cost must take the observation, of shape {y}, where a state is "
+            f"asked for, and a control of shape {u}: {error}"
+        ) from error
     if getattr(value, "shape", None) != ():
         got = getattr(value, "shape", None)
         got = type(value).__name__ if got is None else f"an array of shape {got}"

@@ -13,6 +13,9 @@ from ..._module import as_float_array
 from ..._results import choose, first_failure, promote, Result, RESULTS
 
 
+CORRELATED = 4.0
+"""The standard deviations by which white noise hardly ever seems correlated."""
+
 _LOADS = 0.02
 """The share of an unknown direction in a parameter that makes the parameter unknown."""
 
@@ -43,12 +46,20 @@ class Identified(eqx.Module):
     - `identifiable`: of each direction, shape `(p,)`; false where the fit did not
         converge.
     - `noise`: the standard deviation of what remains of each output.
+    - `correlation`: of what remains from one step to the next, `sqrt(N) r`, with r the
+        correlation coefficient over N steps, that of the output where it is largest;
+        `None` in linear fits. In white noise it is about normal with variance 1. Above
+        4 the model misses something or the noise is correlated; either way the
+        intervals are too narrow, and the report says so. 0 where what remains is less
+        than half of the `noise` that was given, or rounding.
     - `x0`: the estimated state at the beginning, shape `(n,)`, or `(runs, n)`; `None`
         where it is not estimated, in linear fits.
     - `result`: success; `RESULTS.unexciting` if a direction is not identifiable; or the
         failure of the solver.
 
     Printed, it is the table of `report`.
+
+    Source: Ljung, 1999 (section 16.6: the whiteness of residuals).
 
     !!! example
 
@@ -74,6 +85,7 @@ class Identified(eqx.Module):
     spread: Float[Array, " p"]
     identifiable: Bool[Array, " p"]
     noise: Float[Array, " y"]
+    correlation: Float[Array, ""] | None
     x0: Float[Array, "*runs n"] | None
     result: Result
 
@@ -84,7 +96,8 @@ class Identified(eqx.Module):
         return super().__repr__()
 
     def report(self) -> str:
-        """A table of the parameters and of what is not identifiable, in words.
+        """A table of the parameters, with what is not identifiable in words, and
+        whether what remains is correlated.
 
         **Returns:** text of several lines. Where the fit did not converge it says why,
         and gives no intervals.
@@ -114,6 +127,11 @@ class Identified(eqx.Module):
                 lines.append("not identifiable: " + " ".join(parts))
         if np.all(self.identifiable):
             lines.append("all directions are identifiable")
+        if self.correlation is not None and self.correlation > CORRELATED:
+            lines.append(
+                "what remains is correlated from step to step: the model may be wrong, "
+                "and the intervals are too narrow"
+            )
         return "\n".join(lines)
 
 

@@ -233,6 +233,7 @@ def _identified(model, names, fit, reach) -> Identified:
         spread=certainty.spread,
         identifiable=known,
         noise=noise,
+        correlation=None,
         x0=None,
         result=RESULTS.successful,
     )

@@ -16,15 +16,12 @@ from ..._module import as_float_array
 from ..._results import choose, Result, RESULTS
 from ...dynamics import AbstractDynamics, open_loop
 from .._trainable import take_apart
-from ._identified import Certainty, checked, Identified, quantile
+from ._identified import Certainty, checked, CORRELATED, Identified, quantile
 from ._linear import runs_of
 
 
 _NEAR = 0.05
 """The standard deviations from the minimum within which a fit has converged."""
-
-_CORRELATED = 4.0
-"""The standard deviations by which white noise hardly ever seems correlated."""
 
 _SHORT = 2
 """The steps of a window in which not even a wild model grows much."""
@@ -187,6 +184,7 @@ def physical(
         spread=certainty.spread,
         identifiable=certainty.identifiable & (not few),
         noise=solved.noise,
+        correlation=solved.correlation,
         x0=starts if is_batch else starts[0],
         # Where many values fit as well the iteration wanders: the data are to be
         # blamed.
@@ -201,7 +199,7 @@ def _is_doubtful(solved):
     if not is_concrete(solved.cost):
         return False
     failed = solved.result != RESULTS.successful
-    return bool(failed | (solved.correlation > _CORRELATED))
+    return bool(failed | (solved.correlation > CORRELATED))
 
 
 def _windows(guesses, observations, controls, window):
@@ -368,7 +366,9 @@ def _solve(assembly, values, starts, problem, max_steps):
     rest = rest.reshape(problem.observations.shape)
     each = jnp.sum(rest**2, axis=(0, 1))
     paired = jnp.sum(rest[:, 1:] * rest[:, :-1], axis=(0, 1))
-    correlation = jnp.sqrt(jnp.sum(problem.counts)) * jnp.max(paired / each)
+    correlation = jnp.sqrt(jnp.sum(problem.counts)) * jnp.max(
+        paired / jnp.where(each > 0, each, 1)
+    )
     # Rounding is correlated as it likes.
     correlation = jnp.where(sigma < 0.5, 0, correlation)
     noise = problem.noise * jnp.sqrt(each * problem.observations.shape[2] / free)

@@ -1,0 +1,83 @@
+"""Equations whose states are in other units have the same solutions in these."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import riccati_systems
+from helpers import dtype, tolerance
+
+import delucax as dlx
+
+
+N, M = 4, 2
+
+
+@functools.cache
+def solved(name):
+    solve = getattr(dlx.riccati, name)
+    return jax.jit(lambda *data: solve(*data, throw=False))
+
+
+def problem(seed, descriptor):
+    rng = np.random.default_rng(seed)
+    A, B = rng.normal(size=(N, N)), rng.normal(size=(N, M))
+    E = np.eye(N) + rng.normal(size=(N, N)) / 8 if descriptor else None
+    return A, B, np.eye(N), np.eye(M), None, E
+
+
+def in_units(units, A, B, Q, R, S, E):
+    """The same in states that are `units` times the first."""
+    up, across = units[:, None], units[:, None] / units
+    E = None if E is None else E * across
+    return A * across, B * up, Q / (up * up.T), R, S, E
+
+
+def as_dtype(data):
+    return tuple(None if D is None else jnp.asarray(D, dtype()) for D in data)
+
+
+@pytest.mark.parametrize("descriptor", [False, True])
+@pytest.mark.parametrize("name", ["dare", "care"])
+def test_the_gain_is_that_of_the_plain_problem(name, descriptor):
+    rng = np.random.default_rng(0)
+    for seed in range(8):
+        plain = problem(seed, descriptor)
+        power = tolerance(2, 5)
+        units = 10.0 ** rng.uniform(-power, power, N)
+        data = as_dtype(in_units(units, *plain))
+        wanted, solution = solved(name)(*as_dtype(plain)), solved(name)(*data)
+        assert solution.result == wanted.result == dlx.RESULTS.successful
+        error = jnp.max(jnp.abs(solution.K * units - wanted.K))
+        assert error < tolerance(1e-3, 1e-11) * jnp.max(jnp.abs(wanted.K))
+        A, B, Q, R, S, E = data
+        true = riccati_systems.true_residual(
+            name == "dare", A, B, Q, R, solution.X, S, E
+        )
+        assert true <= solution.residual
+
+
+def test_derivatives():
+    plain = problem(0, False)
+    units = np.array([1e-3, 1.0, 1e2, 1e3])
+
+    @jax.jit
+    @jax.grad
+    def slope(size, A, B, Q, R):
+        return dlx.riccati.care(size * A, B, Q, R, throw=False).K[0, 0]
+
+    here, there = (
+        slope(1.0, *as_dtype(data)[:4]) for data in (plain, in_units(units, *plain))
+    )
+    np.testing.assert_allclose(there * units[0], here, rtol=tolerance(1e-2, 1e-10))
+
+
+def test_a_gain_in_single_precision():
+    """A double integrator whose velocity is in units of a few millionths."""
+    s = 10**5.6
+    A = jnp.array([[1.0025, 0.0497 / s], [0.0995 * s, 0.9877]])
+    B, Q = jnp.array([[0.00125], [0.05 * s]]), jnp.diag(jnp.array([1.0, s**-2]))
+    K = solved("dare")(A, B, Q, jnp.eye(1)).K
+    np.testing.assert_allclose(K * jnp.array([1, s]), [[4.067, 2.676]], rtol=1e-3)
