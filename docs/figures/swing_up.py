@@ -16,7 +16,7 @@ import numpy as np  # noqa: E402
 from PIL import Image  # noqa: E402
 
 import delucax as dlx  # noqa: E402
-from delucax.studies import (train_swing_up)
+from delucax.studies import train_swing_up
 
 
 TARGET = Path(__file__).parents[1] / "assets" / "swing_up.gif"
