@@ -567,21 +567,17 @@ def test_variance_behind_a_wrapper(wrappers):
 
 
 def test_a_wrapper_forwards_every_property():
-    """Those that `AbstractDynamics` declares and does not derive from others."""
-    derived = {
-        "is_stochastic",
-        "state_size",
-        "control_size",
-        "observation_size",
-        "advance",
-        "_abc_impl",
-    }
+    """Those that the base classes declare and do not derive from others."""
+    derived = {"state_size", "control_size", "observation_size", "advance"}
+    bases = dlx.AbstractDynamics, dlx.systems.AbstractPlant
     declared = {
         name
-        for name in vars(dlx.AbstractDynamics)
+        for base in bases
+        for name in vars(base)
         if not name.startswith("_") and name not in derived
     } | {"dt", "state_names", "control_names"}
-    assert declared <= set(vars(dlx.dynamics.AbstractWrapper))
+    own = [k for k in dlx.dynamics.AbstractWrapper.__mro__ if k not in bases]
+    assert declared <= {name for kind in own for name in vars(kind)}
 
 
 def test_a_wrapper_that_observes_otherwise_says_so():
@@ -626,13 +622,15 @@ class ByHand(dlx.AbstractDynamics):
 
 def test_noise_that_a_hand_made_wrapper_would_lose_is_an_error():
     class Says(ByHand):
-        is_stochastic = property(lambda self: self.dynamics.is_stochastic)
+        noise = property(lambda self: self.dynamics.noise)
+        increments = 0
 
     class Forwards(ByHand):
+        noise = property(lambda self: self.dynamics.noise)
         increments = property(lambda self: self.dynamics.increments)
 
     class Quiet(ByHand):
-        increments = 0
+        noise = None
 
     class Euler(ByHand):
         dynamics: dict[str, list[Shaky]]
@@ -647,7 +645,7 @@ def test_noise_that_a_hand_made_wrapper_would_lose_is_an_error():
     with user_error(match="increments must be at least 1.*AbstractWrapper"):
         make(Says(noisy))
     hidden = "Environment: ByHand hides the Brownian noise of the {} that it.*"
-    hidden += "AbstractWrapper, or give ByHand `increments`"
+    hidden += "AbstractWrapper, or give ByHand `noise`"
     with user_error(match=hidden.format("Discretized")):
         make(ByHand(noisy))
     with user_error(match=hidden.format("Delayed")):

@@ -143,7 +143,7 @@ def test_what_is_passed_on_from_the_system():
     assert_close(step(0.0, x, u), x, rtol=1e-6)
     assert (step.state_units, step.control_units) == (("m",), ("N",))
     assert (step.state_names, step.control_names) == (("x",), ("u",))
-    assert not step.is_stochastic and step.disturbance_size == 1
+    assert step.noise is None and step.disturbance_size == 1
 
 
 def test_precision_follows_the_state():
@@ -248,7 +248,7 @@ def test_a_root_finder_with_tolerances_of_its_own_is_kept():
 )
 def test_stochastic_steps_by_hand(solver, full, weight, corrected):
     step = dlx.Discretized(Growth(full), 0.1, solver)
-    assert step.is_stochastic and step.disturbance_size == 1
+    assert step.noise == "brownian" and step.disturbance_size == 1
     x, u, dB = 0.8, 0.3, 0.17
     g, slope = 0.2 * (1 + x**2), 0.4 * x
     expected = x + 0.1 * (u - x) + g * dB + g * slope * (weight * dB**2)
@@ -527,5 +527,7 @@ def test_shapes():
     with user_error(match=r"w \(the disturbance\) must have shape \(2,\)"):
         step(0.0, X, U, jnp.zeros(1))
     wrong = dlx.Discretized(scalar(lambda x: jnp.zeros(2)), 0.05)
-    with user_error(match=r"vector_field must return shape \(1,\).*got \(2,\)"):
+    with user_error(
+        match=r"vector_field must return an array of shape \(1,\).*got \(2,\)"
+    ):
         wrong(0.0, jnp.zeros(1), jnp.zeros(1))

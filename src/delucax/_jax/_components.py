@@ -45,18 +45,9 @@ def by_components(function: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     def replayed(*args):
-        leaves, structure = jax.tree.flatten(args)
-        out_structure = None
-
-        def flat(*leaves):
-            nonlocal out_structure
-            out = function(*jax.tree.unflatten(structure, leaves))
-            out_leaves, out_structure = jax.tree.flatten(out)
-            return out_leaves
-
-        closed = jax.make_jaxpr(flat)(*leaves)
-        outs = _replay(closed.jaxpr, closed.consts, leaves)
-        return jax.tree.unflatten(out_structure, [_whole(out) for out in outs])
+        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+        outs = _replay(closed.jaxpr, closed.consts, jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(shapes), map(_whole, outs))
 
     return replayed
 

@@ -12,4 +12,7 @@ from ._operating_point import OperatingPoint as OperatingPoint
 from ._runge_kutta import RK4 as RK4
 from ._trim import trim as trim
 from ._worst_case import WorstCase as WorstCase
-from ._wrapper import AbstractWrapper as AbstractWrapper
+from ._wrapper import (
+    AbstractDiscretization as AbstractDiscretization,
+    AbstractWrapper as AbstractWrapper,
+)

@@ -13,8 +13,7 @@ from .._jax import by_components
 from .._module import parameter
 from .._results import choose, first_of, or_none, promote, RESULTS
 from ..systems import AbstractSystem
-from ..systems._base import zeros_if_none
-from ._base import AbstractDynamics
+from ..systems._plant import zeros_if_none
 from ._runge_kutta import (
     join_state,
     RK4,
@@ -33,6 +32,7 @@ from ._solvers import (
     outcome,
 )
 from ._start import Start
+from ._wrapper import AbstractDiscretization
 
 
 _SDE_SOLVERS = (
@@ -46,7 +46,7 @@ _SDE_SOLVERS = (
 )
 
 
-class Discretized(AbstractDynamics):
+class Discretized(AbstractDiscretization):
     r"""The exact-at-the-switch, zero-order-hold discretisation of a system.
 
     `x_next = x + integral over [t, t + dt] of f(s, x(s), u, w) ds`, the control (and a
@@ -134,7 +134,7 @@ class Discretized(AbstractDynamics):
         self.dt = dt
         self.substeps = check_count(substeps, "substeps", where)
         if solver is None:
-            noisy = isinstance(system, AbstractSystem) and has_diffusion(system)
+            noisy = isinstance(system, AbstractSystem) and system.noise == "brownian"
             solver = diffrax.Euler() if noisy else RK4()
         if stepsize_controller is not None:
             if adjoint is None:
@@ -154,7 +154,7 @@ class Discretized(AbstractDynamics):
                 f"{where}: system must be an AbstractSystem (wrap a function with "
                 f"`delucax.system`), got {type(system).__name__}."
             )
-        noisy = has_diffusion(system)
+        noisy = system.noise == "brownian"
         check_solver(solver, where)
         if self.stepsize_controller is None:
             if self.adjoint is not None:
@@ -193,96 +193,73 @@ class Discretized(AbstractDynamics):
             check_adjoint(self.adjoint, where)
 
     @property
-    def state_names(self) -> tuple[str, ...]:
-        """Those of the system."""
-        return self.system.state_names
-
-    @property
-    def control_names(self) -> tuple[str, ...]:
-        """Those of the system."""
-        return self.system.control_names
-
-    @property
-    def state_units(self) -> tuple[str, ...]:
-        """Those of the system."""
-        return self.system.state_units
-
-    @property
-    def time_unit(self) -> str:
-        """That of the system."""
-        return self.system.time_unit
-
-    @property
-    def control_units(self) -> tuple[str, ...]:
-        """Those of the system."""
-        return self.system.control_units
-
-    @property
-    def disturbance_size(self) -> int:
+    def disturbance_size(self):
         """That of the system; of a diffusion, its Brownian motions times the substeps,
         of each of which `w` holds the increments.
         """
-        motions = brownian_size(self.system)
-        if motions is None:
-            return self.system.disturbance_size
-        return motions * self.substeps
+        return self.system.disturbance_size * (self.increments or 1)
 
     @property
-    def increments(self) -> int:
+    def increments(self):
         """One a substep, where the system has a diffusion."""
-        return self.substeps if has_diffusion(self.system) else 0
-
-    def observe(self, t, x):
-        return self.system.observe(t, x)
-
-    def difference(self, x, x_ref):
-        return self.system.difference(x, x_ref)
-
-    def equilibrium(self):
-        return self.system.equilibrium()
+        return self.substeps if self.noise == "brownian" else 0
 
     def advance(self, t, x, u, w):
-        system = self.system
-        if self.is_stochastic:
-            held, added = None, None
-        elif system.disturbance_names:
-            held, added = zeros_if_none(w, system.disturbance_size, x), None
+        system, noise = self.system, self.noise
+        added = held = increments = None
+        if noise == "additive":
+            added = w
+        elif noise is None:
+            held = zeros_if_none(w, self.disturbance_size, x)
         else:
-            held, added = None, w
-
+            increments = zeros_if_none(w, self.disturbance_size, x)
+            increments = increments.reshape(self.substeps, -1)
         # An interval is integrated from 0 to dt: where t is large, t + dt is rounded.
         t = jnp.asarray(t, x.dtype)
         start = Start(t, lambda t: evaluate_field(system, t, x, u, held))
-        args = (system, start, u, held)
-        if self.is_stochastic:
-            x_next, result = self._noisy(x, args, w)
-        elif self.stepsize_controller is not None:
+        args = system, start, u, held
+        if self.stepsize_controller is not None:
             x_next, result = self._adaptive(x, args)
         else:
-            x_next, result = self._fixed(x, args)
-        x_next = _array(system, "project", system.project(x_next), x.shape)
+            noisy = increments is not None
+            step = self._noisy_step(x, args) if noisy else self._fixed_step(args)
+            if self.substeps == 1:
+                x_next, result = step(0, x, increments[0] if noisy else None)
+            else:
+                x_next, result = self._repeat(step, x, increments)
+        x_next = system.project(x_next)
+        check_returned(x_next, x, system, "project")
         if added is not None:
             x_next = x_next + added
         return x_next.astype(x.dtype), result
 
-    def _fixed(self, x, args):
-        tableau = tableau_of(self.solver)
-        solver = for_fixed_steps(self.solver) if tableau is None else None
-        h = self.dt / self.substeps
+    def _fixed_step(self, args):
+        """A step, as a function of the time in the interval and the state."""
+        system, start, u, held = args
+        h, tableau = self.dt / self.substeps, tableau_of(self.solver)
+        if tableau is None:
+            solver, term = for_fixed_steps(self.solver), diffrax.ODETerm(_field)
+            return lambda s, x, _: _solver_step(solver, term, s, x, h, args)
+
+        def at_late_time(s, x):
+            return _field(s, x, args)
+
+        def field(s, x):
+            dx = system.vector_field(start.t + s, x, u, held)
+            check_returned(dx, x, system, "vector_field")
+            return dx
+
+        rhs = at_late_time if start.is_corrected else field
 
         def step(s, x, _):
-            if tableau is None:
-                return _solver_step(solver, diffrax.ODETerm(_field), s, x, h, args)
-            rhs = lambda s, y: _field(s, y, args)
             return runge_kutta_step(tableau, rhs, s, x, h), RESULTS.successful
 
-        return self._substep(step, x, None)
+        return step
 
-    def _noisy(self, x, args, w):
-        increments = zeros_if_none(w, self.disturbance_size, x)
-        increments = increments.reshape(self.substeps, -1)
-        h = self.dt / self.substeps
+    def _noisy_step(self, x, args):
+        """The same with an increment of the Brownian motions."""
         system, start, u, _ = args
+        h = self.dt / self.substeps
         start = Start(start.t, lambda t: system.diffusion(t, x, u))
 
         def g(s, x):
@@ -290,26 +267,24 @@ class Discretized(AbstractDynamics):
 
         def step(s, x, dB):
             if type(self.solver) is diffrax.Euler:
-                noise = _apply(g(s, x), dB)
-                return x + h * _field(s, x, args) + noise, RESULTS.successful
+                x_next = x + h * _field(s, x, args) + _apply(g(s, x), dB)
+                return x_next, RESULTS.successful
             term = diffrax.MultiTerm(diffrax.ODETerm(_field), _BrownianTerm(g, dB))
             return _solver_step(self.solver, term, s, x, h, args)
 
-        return self._substep(step, x, increments)
+        return step
 
-    def _substep(self, step, x, inputs):
+    def _repeat(self, step, x, increments):
         """`substeps` steps one after the other, the state carried by its components."""
-        if self.substeps == 1:
-            return step(0, x, None if inputs is None else inputs[0])
         h = self.dt / self.substeps
 
         @by_components
-        def body(parts, index_and_input):
-            i, given = index_and_input
-            x_next, result = step(i * h, join_state(parts, x.shape[0]), given)
+        def body(parts, index_and_increment):
+            i, increment = index_and_increment
+            x_next, result = step(i * h, join_state(parts, x.shape[0]), increment)
             return split_state(x_next.astype(x.dtype)), or_none(result)
 
-        xs = (jnp.arange(self.substeps), inputs)
+        xs = jnp.arange(self.substeps), increments
         parts, results = lax.scan(body, split_state(x), xs)
         return join_state(parts, x.shape[0]), first_of(results)
 
@@ -331,39 +306,6 @@ class Discretized(AbstractDynamics):
         assert solution.ys is not None
         result = outcome(solution, self.stepsize_controller, x.dtype)
         return solution.ys[0], result
-
-
-def has_diffusion(system: AbstractSystem) -> bool:
-    """Whether `system` has noise inside."""
-    return brownian_size(system) is not None
-
-
-def brownian_size(system: AbstractSystem) -> int | None:
-    """The number of Brownian motions of `system`; `None` if it has no noise inside."""
-    if type(system).diffusion is AbstractSystem.diffusion:
-        return None
-    t, x, u = (
-        jnp.zeros(()),
-        jnp.zeros(system.state_size),
-        jnp.zeros(system.control_size),
-    )
-    g: Any = eqx.filter_eval_shape(system.diffusion, t, x, u)
-    if g is None:
-        return None
-    name, n, names = type(system).__name__, system.state_size, system.disturbance_names
-    shape = getattr(g, "shape", None)
-    if shape is None or len(shape) not in (1, 2) or shape[0] != n:
-        got = f"a {type(g).__name__}" if shape is None else f"shape {shape}"
-        raise ValueError(
-            f"{name}: diffusion must return an array of shape ({n}, k), of k Brownian "
-            f"motions, or ({n},), a diagonal, got {got}."
-        )
-    if names and len(names) != shape[-1]:
-        raise ValueError(
-            f"{name}: disturbance_names must name the {shape[-1]} Brownian motions of "
-            f"the diffusion, or be left out, got {names}."
-        )
-    return shape[-1]
 
 
 def _apply(g: Array, dB: Array) -> Array:
@@ -399,25 +341,21 @@ def _field(s, x, args):
 def evaluate_field(system: AbstractSystem, t: Any, x: Array, u: Array, w: Any) -> Array:
     """The vector field of `system`, with its shape checked."""
     dx = system.vector_field(t, x, u, w)
-    shape = getattr(dx, "shape", None)
+    check_returned(dx, x, system, "vector_field")
+    return dx
+
+
+def check_returned(value: Any, x: Array, system: AbstractSystem, method: str) -> None:
+    """Raise unless what a method of `system` returned has the shape of the state."""
+    shape = getattr(value, "shape", None)
     if shape == x.shape:
-        return dx
-    got = f"a {type(dx).__name__}" if shape is None else shape
-    hint = " (jnp.stack makes one of a list)" if isinstance(dx, tuple | list) else ""
+        return
+    got = f"a {type(value).__name__}" if shape is None else shape
+    listed = isinstance(value, tuple | list)
+    hint = " (jnp.stack makes an array of a list)" if listed else ""
     raise ValueError(
-        f"{type(system).__name__}: vector_field must return shape {x.shape}, as the "
-        f"state has, got {got}; it must be an array{hint}."
-    )
-
-
-def _array(system: Any, method: str, found: Any, shape: tuple[int, ...]) -> Array:
-    """What a method of `system` returned, if it has the shape that it should."""
-    if getattr(found, "shape", None) == shape:
-        return found
-    got = getattr(found, "shape", f"a {type(found).__name__}")
-    raise ValueError(
-        f"{type(system).__name__}: {method} must return an array of shape {shape}, got "
-        f"{got}."
+        f"{type(system).__name__}: {method} must return an array of shape {x.shape}, "
+        f"as the state has, got {got}{hint}."
     )
 
 

@@ -13,7 +13,7 @@ from .._check import as_vector, check_step
 from .._message import shortened
 from .._typing import RealScalar
 from ..systems import AbstractSystem, LinearSystem
-from ..systems._base import zeros_if_none
+from ..systems._plant import zeros_if_none
 from ._base import AbstractDynamics
 from ._discretized import evaluate_field
 from ._linear import LinearDynamics

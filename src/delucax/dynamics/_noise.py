@@ -1,53 +1,55 @@
-"""Whether dynamics that hold others say what becomes of their noise."""
+"""Whether plants that hold others say what becomes of their noise."""
 
 import jax
 
-from ..systems import AbstractSystem
+from ..systems import AbstractPlant, AbstractSystem
 from ._base import AbstractDynamics
-from ._discretized import has_diffusion
 
 
-def check_increments(dynamics: AbstractDynamics, where: str) -> None:
-    """Raise where noise would be lost: `dynamics`, or others that they hold, do not say
-    how many increments they take, while something in them takes some."""
-    name = type(dynamics).__name__
-    if dynamics.is_stochastic and not dynamics.increments:
-        raise ValueError(
-            f"{where}: {name} says that w is Brownian, so its increments must be at "
-            "least 1, got 0. A subclass of delucax.dynamics.AbstractWrapper forwards "
-            "them."
-        )
-    held = _held(dynamics)
-    for part in held:
-        if isinstance(part, AbstractDynamics):
-            check_increments(part, where)
-    if type(dynamics).increments is not AbstractDynamics.increments:
-        return
-    for part in filter(_is_noisy, held):
-        raise ValueError(
-            f"{where}: {name} hides the Brownian noise of the {type(part).__name__} "
-            "that it holds. Derive it from delucax.dynamics.AbstractWrapper, or give "
-            f"{name} `increments` of its own: those of what it holds, or "
-            "`increments = 0` where w is not Brownian."
-        )
+def check_noise(plant: AbstractPlant, where: str) -> None:
+    """Raise where noise would be lost: `plant`, or another inside it, does not say how
+    `w` acts, while something in it takes Brownian increments."""
+    name, noise = type(plant).__name__, plant.noise
+    if isinstance(plant, AbstractDynamics):
+        if (plant.increments > 0) != (noise == "brownian"):
+            raise ValueError(
+                f"{where}: {name} has noise = {noise!r} and increments = "
+                f"{plant.increments}, but increments must be at least 1 where w is "
+                "Brownian, and 0 where it is not. A subclass of "
+                "delucax.dynamics.AbstractWrapper forwards both."
+            )
+    for part in _inside(plant):
+        check_noise(part, where)
+        if _is_noisy(part) and not _says(plant):
+            raise ValueError(
+                f"{where}: {name} hides the Brownian noise of the "
+                f"{type(part).__name__} that it holds. Derive it from "
+                f"delucax.dynamics.AbstractWrapper, or give {name} `noise` of its own: "
+                "that of what it holds, or `noise = None` where w is not Brownian."
+            )
 
 
-def _held(dynamics: AbstractDynamics) -> list[AbstractDynamics | AbstractSystem]:
-    """The outermost dynamics and systems inside."""
+def _says(plant: AbstractPlant) -> bool:
+    kind = type(plant)
+    if issubclass(kind, AbstractSystem):
+        own = kind.diffusion is not AbstractSystem.diffusion
+        return own or kind.noise is not AbstractSystem.noise
+    return kind.noise is not AbstractPlant.noise
 
-    def is_held(node):
-        either = isinstance(node, AbstractDynamics | AbstractSystem)
-        return either and node is not dynamics
+
+def _inside(plant: AbstractPlant) -> list[AbstractPlant]:
+    """The outermost plants inside."""
+
+    def is_inside(node):
+        return isinstance(node, AbstractPlant) and node is not plant
 
     return [
-        part for part in jax.tree.leaves(dynamics, is_leaf=is_held) if is_held(part)
+        part for part in jax.tree.leaves(plant, is_leaf=is_inside) if is_inside(part)
     ]
 
 
-def _is_noisy(part: AbstractDynamics | AbstractSystem) -> bool:
+def _is_noisy(part: AbstractPlant) -> bool:
     try:
-        if isinstance(part, AbstractDynamics):
-            return part.is_stochastic
-        return has_diffusion(part)
+        return part.noise == "brownian"
     except (TypeError, ValueError):  # a batch: what has no diffusion does not fail
         return True

@@ -1,13 +1,121 @@
-"""Dynamics that change something about others."""
+"""Dynamics that are made of another plant."""
 
+import abc
 from typing import Any, ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 
+from ..systems import AbstractPlant, AbstractSystem
 from ._base import AbstractDynamics, check_dynamics
 
 
-class AbstractWrapper(AbstractDynamics):
+class _Forwarding(AbstractDynamics):
+    """Whatever a subclass does not say is asked of the plant inside."""
+
+    @property
+    @abc.abstractmethod
+    def _inside(self) -> AbstractPlant: ...
+
+    @property
+    def state_names(self):
+        """Those of the plant inside."""
+        return self._inside.state_names
+
+    @property
+    def control_names(self):
+        """Those of the plant inside."""
+        return self._inside.control_names
+
+    if not TYPE_CHECKING:  # properties in place of class attributes
+
+        @property
+        def disturbance_names(self):
+            """Those of the plant inside."""
+            return self._inside.disturbance_names
+
+        @property
+        def state_units(self):
+            """Those of the plant inside, where the states are its own."""
+            same = self.state_names == self._inside.state_names
+            return self._inside.state_units if same else ()
+
+        @property
+        def control_units(self):
+            """Those of the plant inside, where the controls are its own."""
+            same = self.control_names == self._inside.control_names
+            return self._inside.control_units if same else ()
+
+        @property
+        def time_unit(self):
+            """That of the plant inside."""
+            return self._inside.time_unit
+
+    @property
+    def disturbance_size(self):
+        """That of the plant inside."""
+        return self._inside.disturbance_size
+
+    @property
+    def noise(self):
+        """That of the plant inside."""
+        return self._inside.noise
+
+    @property
+    def observes_state(self):
+        """Whether `observe` returns the state itself."""
+        own = type(self).observe is not _Forwarding.observe
+        if own or self.state_size != self._inside.state_size:
+            return super().observes_state
+        return self._inside.observes_state
+
+    def observe(self, t, x):
+        return self._inside.observe(t, x)
+
+    def difference(self, x, x_ref):
+        return self._inside.difference(x, x_ref)
+
+    def equilibrium(self):
+        return self._inside.equilibrium()
+
+
+class AbstractDiscretization(_Forwarding):
+    """Dynamics that step a continuous-time system, in a field `system`, whose names,
+    units, sensor and equilibrium they have.
+
+    A subclass gives `dt` and writes `advance`. [`delucax.Discretized`][] is the one
+    that takes any system and any solver.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        from jaxtyping import Array
+
+        class Euler(dlx.dynamics.AbstractDiscretization):
+            system: dlx.AbstractSystem
+            dt: Array = dlx.parameter(0.05)
+
+            def advance(self, t, x, u, w):
+                x_next = x + self.dt * self.system.vector_field(t, x, u, None)
+                x_next = x_next if w is None else x_next + w
+                return x_next, dlx.RESULTS.successful
+
+        Euler(dlx.systems.Pendulum())(0.0, jnp.array([0.1, 0.0]), jnp.ones(1))
+        ```
+    """
+
+    if TYPE_CHECKING:  # as in AbstractPlant
+        system: ClassVar[Any]
+    else:
+        system: eqx.AbstractVar[AbstractSystem]
+
+    @property
+    def _inside(self):
+        return self.system
+
+
+class AbstractWrapper(_Forwarding):
     """Dynamics with a field `dynamics`, like which they are in all that a subclass does
     not say otherwise.
 
@@ -33,63 +141,24 @@ class AbstractWrapper(AbstractDynamics):
         ```
     """
 
-    if TYPE_CHECKING:  # as in AbstractDynamics
+    if TYPE_CHECKING:  # as in AbstractPlant
         dynamics: ClassVar[Any]
-        state_units: ClassVar[Any]
-        control_units: ClassVar[Any]
-        time_unit: ClassVar[Any]
     else:
         dynamics: eqx.AbstractVar[AbstractDynamics]
-
-        @property
-        def state_units(self):
-            same = self.state_names == self.dynamics.state_names
-            return self.dynamics.state_units if same else ()
-
-        @property
-        def time_unit(self):
-            return self.dynamics.time_unit
-
-        @property
-        def control_units(self):
-            same = self.control_names == self.dynamics.control_names
-            return self.dynamics.control_units if same else ()
 
     def __check_init__(self):
         check_dynamics(self.dynamics, type(self).__name__)
 
     @property
+    def _inside(self):
+        return self.dynamics
+
+    @property
     def dt(self):
+        """That of the dynamics inside."""
         return self.dynamics.dt
 
     @property
-    def state_names(self):
-        return self.dynamics.state_names
-
-    @property
-    def control_names(self):
-        return self.dynamics.control_names
-
-    @property
-    def disturbance_size(self):
-        return self.dynamics.disturbance_size
-
-    @property
     def increments(self):
+        """Those of the dynamics inside."""
         return self.dynamics.increments
-
-    @property
-    def observes_state(self):
-        own = type(self).observe is not AbstractWrapper.observe
-        if own or self.state_size != self.dynamics.state_size:
-            return super().observes_state
-        return self.dynamics.observes_state
-
-    def observe(self, t, x):
-        return self.dynamics.observe(t, x)
-
-    def difference(self, x, x_ref):
-        return self.dynamics.difference(x, x_ref)
-
-    def equilibrium(self):
-        return self.dynamics.equilibrium()

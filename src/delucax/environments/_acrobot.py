@@ -1,6 +1,6 @@
 """Swing the tip of a two-link arm above a line: Gym's Acrobot-v1."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -14,7 +14,7 @@ from .._results import RESULTS
 from .._typing import RealScalar
 from ..costs import Arrival
 from ..disturbances import Uniform
-from ..dynamics import AbstractDynamics, RK4
+from ..dynamics import AbstractDiscretization, RK4
 from ..dynamics._runge_kutta import runge_kutta_step
 from ..math import clip, cos, sin, wrap
 from ..systems import Acrobot
@@ -23,7 +23,7 @@ from ._environment import Environment, UniformState
 from ._registry import finish
 
 
-class GymAcrobot(AbstractDynamics):
+class GymAcrobot(AbstractDiscretization):
     """Gym's arithmetic for the acrobot: one Runge-Kutta step of order 4, the torque
     held with `w` added to it; then the angles are wrapped to +-pi and the velocities
     clipped.
@@ -62,16 +62,6 @@ class GymAcrobot(AbstractDynamics):
     max_velocity_1: Array = parameter(4 * np.pi, constraint=positive)
     max_velocity_2: Array = parameter(9 * np.pi, constraint=positive)
 
-    state_names: ClassVar = Acrobot.state_names
-    control_names: ClassVar = Acrobot.control_names
-    state_units = Acrobot.state_units
-    control_units = Acrobot.control_units
-
-    @property
-    def disturbance_size(self) -> int:
-        """That of the system."""
-        return self.system.disturbance_size
-
     def __check_init__(self):
         check_positive(self.max_velocity_1, "max_velocity_1", "GymAcrobot")
         check_positive(self.max_velocity_2, "max_velocity_2", "GymAcrobot")
@@ -88,12 +78,6 @@ class GymAcrobot(AbstractDynamics):
             ]
         )
         return x_next.astype(x.dtype), RESULTS.successful
-
-    def difference(self, x, x_ref):
-        return self.system.difference(x, x_ref)
-
-    def equilibrium(self):
-        return self.system.equilibrium()
 
 
 def acrobot_features(x: Array) -> Array:

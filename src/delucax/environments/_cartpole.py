@@ -1,6 +1,6 @@
 """Balance a pole on a cart: Gym's CartPole-v1, and the paper's linear one."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -14,14 +14,14 @@ from .._module import as_float_array, parameter, positive
 from .._results import RESULTS
 from .._typing import RealScalar
 from ..costs import Arrival, Quadratic
-from ..dynamics import AbstractDynamics, LinearDynamics
+from ..dynamics import AbstractDiscretization, LinearDynamics
 from ..systems import CartPole
 from ._arithmetic import own_or_solver
 from ._environment import Environment, UniformState
 from ._registry import finish
 
 
-class GymCartPole(AbstractDynamics):
+class GymCartPole(AbstractDiscretization):
     """Gym's arithmetic for the cart-pole: an explicit Euler step; then `w` is added.
 
     Smooth. The angle is not wrapped.
@@ -52,11 +52,6 @@ class GymCartPole(AbstractDynamics):
     dt: Array = parameter(0.02, constraint=positive)
     semi_implicit: bool = eqx.field(static=True, default=False)
 
-    state_names: ClassVar = CartPole.state_names
-    control_names: ClassVar = CartPole.control_names
-    state_units = CartPole.state_units
-    control_units = CartPole.control_units
-
     def __check_init__(self):
         if not isinstance(self.semi_implicit, bool):
             raise ValueError(
@@ -76,12 +71,6 @@ class GymCartPole(AbstractDynamics):
         if w is not None:
             x_next = x_next + w
         return x_next.astype(x.dtype), RESULTS.successful
-
-    def difference(self, x, x_ref):
-        return self.system.difference(x, x_ref)
-
-    def equilibrium(self):
-        return self.system.equilibrium()
 
 
 class _Fallen(eqx.Module):

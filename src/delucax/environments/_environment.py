@@ -39,7 +39,7 @@ from ..costs._base import check_cost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics, OperatingPoint, trim
 from ..dynamics._base import check_dynamics
-from ..dynamics._noise import check_increments
+from ..dynamics._noise import check_noise
 from ..dynamics._operating_point import operating_point
 from ..math import clip
 
@@ -194,7 +194,7 @@ class Environment(eqx.Module):
     def __check_init__(self):
         where, dynamics = "Environment", self.dynamics
         check_dynamics(dynamics, where)
-        check_increments(dynamics, where)
+        check_noise(dynamics, where)
         sizes = dynamics.state_size, dynamics.control_size
         check_cost(self.cost, "cost", where, sizes)
         for name, given, size in (
@@ -397,11 +397,18 @@ class Environment(eqx.Module):
         **Raises:** `ValueError` on a wrong shape or kind.
         """
         x = as_vector(x, self.state_size, "x (the state)", "Environment.step")
-        u = self.saturate(as_float_array(u) if self.actions is None else u)
-        u = as_vector(u, self.control_size, "u (the control)", "Environment.step")
         if w is not None:
             size = self.disturbance_size
             w = as_vector(w, size, "w (the disturbance)", "Environment.step")
+        return self._advance(t, x, self._applied(u), w)
+
+    def _applied(self, u: Any) -> Array:
+        """The control or action `u` as a control within the bounds."""
+        u = self.saturate(as_float_array(u) if self.actions is None else u)
+        return as_vector(u, self.control_size, "u (the control)", "Environment.step")
+
+    def _advance(self, t: Any, x: Array, u: Array, w: Array | None) -> Step:
+        """A step with arguments that were checked."""
         cost = jnp.asarray(self.cost(t, x, u))
         if cost.shape != ():
             raise ValueError(

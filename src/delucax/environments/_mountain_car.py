@@ -13,7 +13,7 @@ from .._module import parameter, positive
 from .._results import RESULTS
 from .._typing import RealScalar
 from ..costs import AbstractCost, Arrival
-from ..dynamics import AbstractDynamics
+from ..dynamics import AbstractDiscretization
 from ..math import clip
 from ..systems import MountainCar
 from ._arithmetic import own_or_solver
@@ -21,7 +21,7 @@ from ._environment import Environment, UniformState
 from ._registry import finish
 
 
-class GymMountainCar(AbstractDynamics):
+class GymMountainCar(AbstractDiscretization):
     """Gym's arithmetic for the mountain car, a semi-implicit Euler step with limits:
 
     `velocity_next = clip(velocity + acceleration dt, -max_speed, max_speed)`,
@@ -86,12 +86,6 @@ class GymMountainCar(AbstractDynamics):
         if w is not None:
             x_next = x_next + w
         return x_next.astype(x.dtype), RESULTS.successful
-
-    def difference(self, x, x_ref):
-        return self.system.difference(x, x_ref)
-
-    def equilibrium(self):
-        return self.system.equilibrium()
 
 
 class _AtGoal(eqx.Module):

@@ -1,6 +1,6 @@
 """Swing up and hold a pendulum: Gym's Pendulum-v1."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import diffrax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from .._check import check_positive, check_range
 from .._module import parameter, positive
 from .._results import RESULTS
 from ..costs import PendulumCost
-from ..dynamics import AbstractDynamics
+from ..dynamics import AbstractDiscretization
 from ..math import clip, cos, sin
 from ..systems import Pendulum
 from ._arithmetic import own_or_solver
@@ -19,7 +19,7 @@ from ._environment import Environment, UniformState
 from ._registry import finish
 
 
-class GymPendulum(AbstractDynamics):
+class GymPendulum(AbstractDiscretization):
     """Gym's arithmetic for the pendulum, which clips between its half-steps:
 
     `velocity_next = clip(velocity + acceleration dt, -max_speed, max_speed)`,
@@ -54,11 +54,6 @@ class GymPendulum(AbstractDynamics):
     dt: Array = parameter(0.05, constraint=positive)
     max_speed: Array = parameter(8.0, constraint=positive)
 
-    state_names: ClassVar = Pendulum.state_names
-    control_names: ClassVar = Pendulum.control_names
-    state_units = Pendulum.state_units
-    control_units = Pendulum.control_units
-
     def __check_init__(self):
         check_positive(self.max_speed, "max_speed", "GymPendulum")
 
@@ -72,12 +67,6 @@ class GymPendulum(AbstractDynamics):
         if w is not None:
             x_next = x_next + w
         return x_next.astype(x.dtype), RESULTS.successful
-
-    def difference(self, x, x_ref):
-        return self.system.difference(x, x_ref)
-
-    def equilibrium(self):
-        return self.system.equilibrium()
 
 
 def pendulum_features(x: Array) -> Array:

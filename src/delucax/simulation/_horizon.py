@@ -11,7 +11,6 @@ from .._check import check_finite, check_positive, is_concrete
 from .._controller import AbstractController
 from .._message import shortened
 from .._module import as_float_array
-from ..dynamics._discretized import has_diffusion
 from ..dynamics._solvers import (
     check_adaptive,
     check_adjoint,
@@ -35,7 +34,7 @@ def check_system(system: Any, where: str) -> None:
             "solve cannot do; use `delucax.open_loop` or `delucax.rollout` with "
             "delucax.Discretized(system, dt)."
         )
-    if has_diffusion(system):
+    if system.noise == "brownian":
         raise ValueError(
             f"{where}: system {name} has a diffusion; use `delucax.open_loop` or "
             "`delucax.rollout` with delucax.Discretized(system, dt), which takes its "

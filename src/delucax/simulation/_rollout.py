@@ -218,7 +218,7 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
             x = live(x, lax.stop_gradient(x0))
         u, after = answer(controller, t, seen, eqx.combine(memory, static))
         _check_control(controller, u, env)
-        step = env.step(t, x, u, w)
+        step = env._advance(t, x, env._applied(u), w)
         cost, x_next, result = step.cost.astype(dtype), step.state, step.result
         applied = step.control
         if x_next.shape != x.shape or cost.shape != ():

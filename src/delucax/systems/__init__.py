@@ -16,6 +16,7 @@ from ._mountain_car import MountainCar as MountainCar
 from ._neural import NeuralSystem as NeuralSystem
 from ._pendulum import Pendulum as Pendulum
 from ._planar_quadrotor import PlanarQuadrotor as PlanarQuadrotor
+from ._plant import AbstractPlant as AbstractPlant
 from ._quadrotor import Quadrotor as Quadrotor
 from ._reacher import Reacher as Reacher
 from ._two_tank import TwoTank as TwoTank

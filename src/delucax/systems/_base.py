@@ -1,18 +1,18 @@
 """The continuous-time system: a vector field and its names."""
 
 import abc
-from typing import Any, ClassVar, TYPE_CHECKING
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_vector
 from .._module import check_parameters
 from .._typing import RealScalar
+from ._plant import AbstractPlant, Noise
 
 
-class AbstractSystem(eqx.Module):
+class AbstractSystem(AbstractPlant):
     r"""A system in continuous time, `dx/dt = f(t, x, u, w)`.
 
     Subclass it, name the states and controls, and write `vector_field`. States,
@@ -53,17 +53,6 @@ class AbstractSystem(eqx.Module):
         ```
     """
 
-    if TYPE_CHECKING:  # a static checker would ask for abstract fields as arguments
-        state_names: ClassVar[Any]
-        control_names: ClassVar[Any]
-    else:
-        state_names: eqx.AbstractVar[tuple[str, ...]]
-        control_names: eqx.AbstractVar[tuple[str, ...]]
-    disturbance_names: ClassVar[Any] = ()
-    state_units: ClassVar[Any] = ()
-    control_units: ClassVar[Any] = ()
-    time_unit: ClassVar[str] = "s"
-
     def __check_init__(self):
         for name in ("state_names", "control_names", "disturbance_names"):
             names = getattr(self, name)
@@ -77,19 +66,17 @@ class AbstractSystem(eqx.Module):
         check_parameters(self)
 
     @property
-    def state_size(self) -> int:
-        """The number of states."""
-        return len(self.state_names)
-
-    @property
-    def control_size(self) -> int:
-        """The number of controls."""
-        return len(self.control_names)
+    def noise(self) -> Noise:
+        """`"brownian"` with a `diffusion`; else `None` with `disturbance_names`, and
+        `"additive"` without."""
+        return super().noise if brownian_size(self) is None else "brownian"
 
     @property
     def disturbance_size(self) -> int:
-        """The size of `w`: that of its names, or of the state if there are none."""
-        return len(self.disturbance_names) or self.state_size
+        """The size of `w`: that of its Brownian motions or of its names, or of the
+        state if there are neither."""
+        motions = brownian_size(self)
+        return super().disturbance_size if motions is None else motions
 
     @abc.abstractmethod
     def vector_field(self, t: RealScalar, x: Array, u: Array, w: Array | None) -> Array:
@@ -106,16 +93,6 @@ class AbstractSystem(eqx.Module):
         **Returns:** dx/dt, shape `(state_size,)`.
         """
 
-    def observe(self, t: RealScalar, x: Array) -> Array:
-        """What the plant's sensor reads; the state by default.
-
-        **Arguments:** `t`: time. `x`: state.
-
-        **Returns:** the observation, rank 1.
-        """
-        del t
-        return x
-
     def project(self, x: Array) -> Array:
         """Brings the state back to its manifold after each control interval; the
         identity by default. Normalise a quaternion or wrap an angle here.
@@ -125,27 +102,6 @@ class AbstractSystem(eqx.Module):
         **Returns:** the projected state.
         """
         return x
-
-    def difference(self, x: Array, x_ref: Array) -> Array:
-        """The deviation of `x` from `x_ref`; `x - x_ref` by default. Angles wrap here.
-
-        **Arguments:** `x`: state. `x_ref`: the state to measure from.
-
-        **Returns:** the deviation, a vector.
-        """
-        return x - x_ref
-
-    def equilibrium(self) -> tuple[Array, Array]:
-        """A state and a control at which the system rests.
-
-        **Returns:** `(x, u)`.
-
-        **Raises:** `ValueError` if the system names none.
-        """
-        raise ValueError(
-            f"{type(self).__name__} names no equilibrium: override `equilibrium`, or "
-            "give the state and control yourself."
-        )
 
     def diffusion(self, t: RealScalar, x: Array, u: Array) -> Array | None:
         """The matrix g of `dx = f dt + g dB`; none by default.
@@ -162,16 +118,29 @@ class AbstractSystem(eqx.Module):
         return None
 
 
-def validate_io(owner: Any, x: Any, u: Any, w: Any) -> tuple[Array, Array, Any]:
-    """State, control and disturbance with the sizes that `owner` names, or an error."""
-    where = type(owner).__name__
-    x = as_vector(x, owner.state_size, "x (the state)", where)
-    u = as_vector(u, owner.control_size, "u (the control)", where)
-    if w is not None:
-        w = as_vector(w, owner.disturbance_size, "w (the disturbance)", where)
-    return x, u, w
-
-
-def zeros_if_none(w: Array | None, size: int, like: Array) -> Array:
-    """A zero disturbance where none is given."""
-    return jnp.zeros(size, like.dtype) if w is None else w
+def brownian_size(system: AbstractSystem) -> int | None:
+    """The number of Brownian motions of `system`; `None` if it has no noise inside."""
+    if type(system).diffusion is AbstractSystem.diffusion:
+        return None
+    t, x, u = (
+        jnp.zeros(()),
+        jnp.zeros(system.state_size),
+        jnp.zeros(system.control_size),
+    )
+    g: Any = eqx.filter_eval_shape(system.diffusion, t, x, u)
+    if g is None:
+        return None
+    name, n, names = type(system).__name__, system.state_size, system.disturbance_names
+    shape = getattr(g, "shape", None)
+    if shape is None or len(shape) not in (1, 2) or shape[0] != n:
+        got = f"a {type(g).__name__}" if shape is None else f"shape {shape}"
+        raise ValueError(
+            f"{name}: diffusion must return an array of shape ({n}, k), of k Brownian "
+            f"motions, or ({n},), a diagonal, got {got}."
+        )
+    if names and len(names) != shape[-1]:
+        raise ValueError(
+            f"{name}: disturbance_names must name the {shape[-1]} Brownian motions of "
+            f"the diffusion, or be left out, got {names}."
+        )
+    return shape[-1]
