@@ -10,8 +10,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from ..environments import Environment
-from ._drawings import drawing_for
-from ._plant import Plant
+from ._plant_artist import PlantArtist
 from ._plot import draw_panel
 from ._runs import HELD, last_seen, Panel, panels_of, Run, time_label
 
@@ -48,9 +47,8 @@ class Scene:
         if traces:
             stack = grid[0, 1].subgridspec(len(panels), 1)
             self.lines = self._panels(panels, stack)
-        self.plant = Plant(
+        self.plant = PlantArtist(
             self.figure.add_subplot(grid[0, 0]),
-            drawing_for(environment),
             environment,
             run.trajectory,
             map(self._moment, indices),
