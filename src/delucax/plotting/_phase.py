@@ -14,11 +14,11 @@ from .._check import as_vector
 from .._module import as_float_array
 from ..systems import AbstractSystem
 from ._figure import (
-    color_of,
-    line_style_of,
+    line_style,
     NEUTRAL,
     NotebookFigure,
     style_axes,
+    top_legend,
     with_unit,
     wrapped,
 )
@@ -111,9 +111,9 @@ def phase_portrait(
             arrowsize=0.8,
             zorder=1,
         )
-    handles, labels = [], []
+    entries = []
     for i, run in enumerate(runs):
-        style: dict[str, Any] = {"color": color_of(i), "linestyle": line_style_of(i)}
+        style = line_style(i)
         members = run.series["states"]
         alpha = 1.0 if len(members) == 1 else max(0.2, 0.9 - 0.02 * len(members))
         for path in members:
@@ -121,21 +121,16 @@ def phase_portrait(
                 xs, vs = (path + turn).T
                 ax.plot(xs, vs, linewidth=1.8, alpha=alpha, zorder=2, **style)
                 ax.plot(xs[:1], vs[:1], "o", color=style["color"], ms=5, zorder=3)
-        handles.append(Line2D([], [], linewidth=1.8, **style))
-        labels.append(wrapped(run.label, 40))
+        handle = Line2D([], [], linewidth=1.8, **style)
+        entries.append((handle, wrapped(run.label, 40)))
     ax.set(xlim=limits[0], ylim=limits[1])
     units = system.state_units or ("", "")
-    ax.set_xlabel(wrapped(with_unit(system.state_names[0], units[0]), 60), size=SIZE)
-    ax.set_ylabel(wrapped(with_unit(system.state_names[1], units[1]), 45), size=SIZE)
-    if isinstance(trajectories, dict):
-        figure.legend(
-            handles,
-            labels,
-            loc="outside upper center",
-            ncols=max(1, 60 // (6 + max(map(len, labels)))),
-            frameon=False,
-            fontsize=SIZE,
-        )
+    x_label, y_label = map(with_unit, system.state_names, units)
+    ax.set_xlabel(wrapped(x_label, 60), size=SIZE)
+    ax.set_ylabel(wrapped(y_label, 45), size=SIZE)
+    if isinstance(trajectories, dict) and entries:
+        columns = max(1, 60 // (6 + max(len(label) for _, label in entries)))
+        top_legend(figure, entries, ncols=columns, fontsize=SIZE)
     return figure
 
 
