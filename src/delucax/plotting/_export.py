@@ -14,15 +14,15 @@ from typing import Any, TypeAlias
 
 import matplotlib
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import Int, Num, UInt8
 from PIL import Image
 
 from ._figure import quantised
 
 
-Pixels: TypeAlias = UInt8[np.ndarray, "*shape 3"]
-Indices: TypeAlias = Int[np.ndarray, "*shape"]
-Palette: TypeAlias = UInt8[np.ndarray, "colours 3"]
+Pixels: TypeAlias = UInt8[np.ndarray, "... 3"]
+Indices: TypeAlias = Int[np.ndarray, "..."]
+Palette: TypeAlias = UInt8[np.ndarray, "_ 3"]
 
 TRANSPARENT = 63  # the palette's index that stands for "as in the first frame"
 # Its script waits a moment: some notebooks run it before the rest is on the page.
@@ -58,7 +58,7 @@ def _ffmpeg() -> str:
 
 
 def reduced_palette(
-    colours: Palette, counts: Indices, most: int
+    colours: Palette, counts: Num[np.ndarray, " _"], most: int
 ) -> tuple[Indices, Palette]:
     """A palette of at most `most` colours, and the entry in it for each of `colours`.
 
@@ -131,10 +131,10 @@ def write(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
 def _write_gif(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
     # One palette for all frames, so that nothing flickers.
     entries = [np.asarray(image) for image in frames]
-    palettes = np.stack([np.resize(image.getpalette(), (256, 3)) for image in frames])
+    tables = [np.resize(image.getpalette(), (256, 3)) for image in frames]
     used = np.stack([np.bincount(entry.ravel(), minlength=256) for entry in entries])
     used[1:, TRANSPARENT] = 0
-    colours, which, _ = _distinct(palettes)
+    colours, which, _ = _distinct(np.stack(tables).astype(np.uint8))
     counts = np.bincount(which.ravel(), used.ravel(), len(colours))
     present = np.flatnonzero(counts)
     shared = np.zeros(len(colours), int)
