@@ -1,11 +1,12 @@
 """The phase portrait of a planar system."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -24,6 +25,8 @@ from ._figure import (
 )
 from ._runs import as_runs, Trajectories
 
+
+Limits: TypeAlias = Float[np.ndarray, "2 2"]
 
 GRID = 60
 SIZE = 10.0
@@ -76,7 +79,7 @@ def phase_portrait(
         raise ValueError(
             f"{where}: system must have two states, got {system.state_names}."
         )
-    limits = _limits(limits, where)
+    limits = _checked_limits(limits, where)
     runs = []
     if not isinstance(trajectories, tuple | list | dict) or len(trajectories):
         runs = as_runs(trajectories, None, "trajectories", where)
@@ -100,17 +103,10 @@ def phase_portrait(
     speed = np.linalg.norm(field / extent, axis=-1)
     top = np.nanmax(np.where(np.isfinite(speed), speed, 0.0), initial=0.0) or 1.0
     if np.any(speed > 0):
-        ax.streamplot(
-            x,
-            v,
-            field[..., 0],
-            field[..., 1],
-            color=to_rgba(NEUTRAL, 0.6),
-            linewidth=0.5 + 0.9 * np.sqrt(speed / top),
-            density=1.3,
-            arrowsize=0.8,
-            zorder=1,
-        )
+        width = 0.5 + 0.9 * np.sqrt(speed / top)
+        style: dict[str, Any] = {"color": to_rgba(NEUTRAL, 0.6), "arrowsize": 0.8}
+        style |= {"linewidth": width, "density": 1.3, "zorder": 1}
+        ax.streamplot(x, v, field[..., 0], field[..., 1], **style)
     entries = []
     for i, run in enumerate(runs):
         style = line_style(i)
@@ -134,7 +130,7 @@ def phase_portrait(
     return figure
 
 
-def _limits(limits: Any, where: str) -> tuple[tuple[float, float], ...]:
+def _checked_limits(limits: Any, where: str) -> Limits:
     try:
         array = np.asarray(limits, float)
     except (TypeError, ValueError):
@@ -145,10 +141,15 @@ def _limits(limits: Any, where: str) -> tuple[tuple[float, float], ...]:
         )
     if not np.all(array[:, 0] < array[:, 1]):
         raise ValueError(f"{where}: limits must have low < high, got {limits!r}.")
-    return tuple((float(low), float(high)) for low, high in array)
+    return array
 
 
-def _field(system: AbstractSystem, control: Any, states: Any, where: str) -> Any:
+def _field(
+    system: AbstractSystem,
+    control: Any,
+    states: Float[Array, "n 2"],
+    where: str,
+) -> Float[Array, "n 2"]:
     """dx/dt at each row of `states`."""
     size = system.control_size
     law: Callable[[Any], Any]
@@ -163,7 +164,9 @@ def _field(system: AbstractSystem, control: Any, states: Any, where: str) -> Any
     return jax.vmap(lambda x: system.vector_field(0.0, x, law(x), w))(states)
 
 
-def _turns(system: AbstractSystem, path: np.ndarray, limits: Any) -> list[np.ndarray]:
+def _turns(
+    system: AbstractSystem, path: Float[np.ndarray, "times 2"], limits: Limits
+) -> list[np.ndarray]:
     """The shifts by whole turns of its angles that bring `path` into the limits."""
     turns = [np.zeros(2)]
     for i, (low, high) in enumerate(limits):
