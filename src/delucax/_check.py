@@ -47,6 +47,16 @@ def _is_hashable(value: Any) -> bool:
     return True
 
 
+def check_instance(value: Any, cls: type, name: str, where: str) -> None:
+    """Raise unless `value` is an instance of `cls`."""
+    if not isinstance(value, cls):
+        article = "an" if cls.__name__[0] in "AEIOU" else "a"
+        raise ValueError(
+            f"{where}: {name} must be {article} {cls.__name__}, got "
+            f"{type(value).__name__}."
+        )
+
+
 def check_key(key: Any, where: str) -> Any:
     """`key`, if it is one random key, or an error."""
     if eqx.is_array(key):

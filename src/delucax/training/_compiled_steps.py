@@ -142,13 +142,13 @@ def run_block(
         row = {"loss": strong(cost), "gradient_norm": norm, **metrics}
         return values, state, memory, order, fault, row
 
-    def step(values, state, memory, order, before, k):
+    def step_of_all(values, state, memory, order, before, k):
         stepped = _over_seeds(step_of_one, seeds, last=None)
         return stepped(assembly, key, values, state, memory, order, before, k)
 
     first, stop = span[0], span[1]
     # Traced once, here: the loop needs the shapes of a row before it begins.
-    step: Any = eqx.filter_closure_convert(step, *carry, first)
+    step: Any = eqx.filter_closure_convert(step_of_all, *carry, first)
     row = step.out_struct[5]
     rows = {n: jnp.zeros((CAPACITY, *s.shape), s.dtype) for n, s in row.items()}
 

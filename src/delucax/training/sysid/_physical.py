@@ -11,7 +11,14 @@ import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array
 
-from ..._check import as_vector, check_bool, check_count, check_positive, is_concrete
+from ..._check import (
+    as_vector,
+    check_bool,
+    check_count,
+    check_instance,
+    check_positive,
+    is_concrete,
+)
 from ..._module import as_float_array
 from ..._results import choose, Result, RESULTS
 from ...dynamics import AbstractDynamics, open_loop
@@ -106,11 +113,7 @@ def physical(
         ```
     """
     where = "sysid.physical"
-    if not isinstance(dynamics, AbstractDynamics):
-        raise ValueError(
-            f"{where}: dynamics must be an AbstractDynamics, got "
-            f"{type(dynamics).__name__}."
-        )
+    check_instance(dynamics, AbstractDynamics, "dynamics", where)
     is_batch = jnp.ndim(as_float_array(controls)) == 3
     observations, controls = runs_of(observations, controls, "observations", where)
     size, n = dynamics.observation_size, dynamics.state_size
