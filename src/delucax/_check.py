@@ -197,6 +197,25 @@ def check_number(value: Any, name: str, where: str) -> None:
     check_finite(array, name, where)
 
 
+def as_number(value: Any, name: str, where: str) -> Any:
+    """`value` as a scalar: a Python number if it is known, so that it stays known
+    while other things are being traced.
+    """
+    if isinstance(value, Tracer):
+        array = as_float_array(value)
+        if array.shape != ():
+            raise ValueError(
+                f"{where}: {name} must be a number, got shape {array.shape}."
+            )
+        return array
+    number = np.asarray(value)
+    if number.shape != () or number.dtype.kind not in "iuf":
+        raise ValueError(f"{where}: {name} must be a number, got {shortened(value)}.")
+    if not np.isfinite(number):
+        raise ValueError(f"{where}: {name} must be finite, got {shortened(value)}.")
+    return float(number)
+
+
 def check_range(
     value: Any, name: str, where: str, low: Any = 0, high: float | int = np.inf
 ) -> None:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_count, check_instance, check_key
+from .._check import as_number, check_count, check_instance, check_key
 from .._controller import (
     AbstractController,
     AbstractStochasticPolicy,
@@ -18,11 +18,9 @@ from .._controller import (
     replay,
 )
 from .._module import as_float_array
-from .._typing import PRNGKey
+from .._typing import Checkpoint, PRNGKey
 from ..environments import Environment
 from ..simulation import rollout, Trajectory
-from ..simulation._horizon import as_number
-from ..simulation._rollout import Checkpoint
 
 
 class _ExpectedCost(eqx.Module):

@@ -11,11 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._check import check_count, check_instance, check_key, check_positive, check_step
-from ..._module import as_module, parameter, positive, weight
+from ..._module import as_module, names_of, parameter, positive, weight
 from ..._results import Result, RESULTS
 from ..._typing import PRNGKey, RealScalar
 from ...dynamics import AbstractDynamics
-from ...systems._function import names_of
 from ._linear import runs_of
 
 
