@@ -308,6 +308,35 @@ def test_surrogate_goes_on_from_a_checkpoint(tmp_path):
     assert np.array_equal(whole.history.loss, again.history.loss)
 
 
+class Dithered(dlx.AbstractStochasticPolicy):
+    """A policy that does not know its entropy."""
+
+    gain: jax.Array = dlx.weight(0.2)
+
+    def init(self, *, key=None):
+        return key
+
+    def __call__(self, t, y, state):
+        state, now = jr.split(state)
+        return -self.gain * y[:1] + 0.1 * jr.normal(now, (1,), y.dtype), state
+
+    def log_prob(self, t, y, state, u):
+        return -0.5 * jnp.sum(((u + self.gain * y[:1]) / 0.1) ** 2)
+
+
+@once
+def test_log_probability_stands_for_an_entropy_that_is_not_known():
+    model = ActorCritic(Dithered(), model_of().critic)
+    assert model.policy.has_memory  # as no policy is asked what it remembers
+    env = environment()
+    ppo = PPO(env, 2, 3, epochs=1, minibatches=1)
+    memory = started(ppo, model)
+    assert memory.rows.times.shape == (2, 3)
+    _, metrics = eqx.filter_jit(ppo)(model, memory, jr.key(0))
+    assert_close(metrics["entropy"], -jnp.mean(memory.rows.log_prob), rtol=1e-5)
+    assert not model_of().policy.has_memory
+
+
 @once
 def test_bad_input():
     env = environment()
