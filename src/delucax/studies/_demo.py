@@ -64,7 +64,7 @@ def demo(
 
         ```python
         import tempfile
-        from delucax import experiments
+        from delucax import studies
 
         with tempfile.TemporaryDirectory() as folder:
             table = studies.demo(folder, seeds=1, steps=20)

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..controllers import Sequence, Zero
-from ..environments import Environment, registered
-from ..experiments._experiment import experiment
+from ..environments import Environment
+from ..experiments import experiment
 from ..planning import ilqr
 from ..simulation import rollout
+from ._listing import task_names
 from ._methods import agent_of, FAMILIES, Pump, task_of, Unsuitable
 
 
@@ -31,11 +32,6 @@ TIMED = 0.3
 # What the plan begins at, beside no control.
 GUIDES = ("MLP", "GRU", "MPC")
 PUMPED = ("mountain_car", "mountain_car_discrete")
-
-
-def tasks() -> tuple[str, ...]:
-    """The named tasks, each once."""
-    return tuple(name for name in registered() if "/" not in name)
 
 
 def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
@@ -106,7 +102,7 @@ def _batch(task: str, method: str, block: int) -> tuple[list[float], float | Non
     return costs.tolist(), 1e6 * best / (BATCH * env.horizon)
 
 
-@experiment.parametrize("task", tasks())
+@experiment.parametrize("task", task_names())
 @experiment.parametrize("method", METHODS)
 @experiment.seeds(BATCH)
 def scoreboard(task: str, method: str, seed: int) -> dict[str, Any]:

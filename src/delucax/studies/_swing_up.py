@@ -49,7 +49,7 @@ def train_swing_up(
 
         ```python
         import jax
-        from delucax import experiments
+        from delucax import studies
 
         fitted = studies.train_swing_up(key=jax.random.key(0), steps=20)
         ```
@@ -106,7 +106,7 @@ def holds_upright(
         ```python
         import delucax as dlx
         import jax
-        from delucax import experiments
+        from delucax import studies
 
         env = dlx.make("pendulum")
         zero = dlx.controllers.Zero(1)

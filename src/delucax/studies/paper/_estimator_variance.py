@@ -20,7 +20,7 @@ from ...training import (
     LikelihoodRatio,
     scored_cost,
 )
-from ._finding import Claim, Finding
+from ._finding import Claim, draw_panels, Finding
 
 
 BUDGET, HORIZON = 128, 20
@@ -34,8 +34,6 @@ DRAWN = 8
 
 def estimator_variance(small: bool = False) -> Finding:
     """Networks of growing width, of one pendulum's control."""
-    import matplotlib.pyplot as plt
-
     # Nearly all of the time is compilation, of each estimator at each width.
     widths = (4, 64) if small else (4, 8, 16, 32, 64, 128, 256)
     draws = 64 if small else 256
@@ -111,19 +109,17 @@ def estimator_variance(small: bool = False) -> Finding:
             bool(lost),
         ),
     ]
-    figure, (ax, long) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    ax, long = draw_panels(2, (9, 3.4))
     for name, values in found.items():
         if min(values) > 0:
             ax.loglog(sizes, values, "o-", ms=3, label=name)
     ax.set(xlabel="parameters", ylabel="variance / squared gradient")
     ax.xaxis.set_minor_formatter("")
-    ax.grid(alpha=0.25, lw=0.5)
     ax.legend(frameon=False, fontsize=8)
     for name in ("analytic", "REINFORCE"):
         each = [row[name] for row in over]
         long.loglog([row["horizon"] for row in over], each, "o-", ms=3, label=name)
     long.set(xlabel="horizon, steps", ylabel="variance")
-    long.grid(alpha=0.25, lw=0.5)
     long.legend(frameon=False, fontsize=8)
     notes = (
         f"Networks of one layer, {widths[0]} to {widths[-1]} wide, for the pendulum, "
@@ -137,7 +133,7 @@ def estimator_variance(small: bool = False) -> Finding:
         "Variance of gradient estimators",
         claims,
         {"Variance / squared gradient": rows, "Against the horizon": over},
-        {"estimator_variance": figure},
+        {"estimator_variance": ax.figure},
         notes,
     )
 

@@ -13,11 +13,10 @@ from ...controllers import LQR, Zero
 from ...costs import Quadratic
 from ...dynamics import Discretized, linearize
 from ...environments import Environment
-from ...experiments._statistics import mean_and_half_width, paired_ratio
 from ...planning import ilqr
 from ...simulation import rollout
 from ...systems import Pendulum
-from ._finding import Claim, Finding
+from ._finding import Claim, draw_panels, Finding, mean_and_half_width, paired_ratio
 
 
 DT, STEPS, BOUND, AHEAD = 0.05, 600, 10.0, 20
@@ -25,8 +24,6 @@ DT, STEPS, BOUND, AHEAD = 0.05, 600, 10.0, 20
 
 def pendulum_shock(small: bool = False) -> Finding:
     """Regulate the inverted pendulum from off upright."""
-    import matplotlib.pyplot as plt
-
     seeds, steps = (4, 300) if small else (20, STEPS)
     dynamics = Discretized(Pendulum(), dt=DT, solver=diffrax.Euler())
     cost = Quadratic(jnp.eye(2), jnp.eye(1))
@@ -136,9 +133,7 @@ def pendulum_shock(small: bool = False) -> Finding:
             bool(both[2] < 1),
         ),
     ]
-    figure, axes = plt.subplots(
-        1, 2, figsize=(9, 3.2), layout="constrained", sharey=True
-    )
+    axes = draw_panels(2, (9, 3.2), sharey=True)
     times = DT * np.arange(steps)
     for ax, world in zip(axes, worlds, strict=True):
         for name in contenders:
@@ -149,12 +144,10 @@ def pendulum_shock(small: bool = False) -> Finding:
                 mean_cost = found[name, world].mean(axis=0)
                 ax.semilogy(times, mean_cost, style, lw=1.4, label=name)
         ax.set(title=world, xlabel="time, s", ylim=(1e-4, 50))
-        ax.grid(alpha=0.25, lw=0.5)
     axes[1].axvspan(DT * (steps // 3), DT * (2 * steps // 3), color="0.5", alpha=0.15)
     axes[0].set_ylabel("cost of a step")
-    figure.legend(
-        *axes[0].get_legend_handles_labels(), loc="outside right", frameon=False
-    )
+    labels = axes[0].get_legend_handles_labels()
+    axes[0].figure.legend(*labels, loc="outside right", frameon=False)
     notes = (
         "Without feedback rounding alone lets the pendulum fall. "
         f"Upright, g = 10, explicit Euler of {DT} s, torque at most {BOUND:g}, Q = R = "
@@ -168,6 +161,6 @@ def pendulum_shock(small: bool = False) -> Finding:
         "Adaptive control for the inverted pendulum",
         claims,
         {"Average cost": rows},
-        {"pendulum_shock": figure},
+        {"pendulum_shock": axes[0].figure},
         notes,
     )

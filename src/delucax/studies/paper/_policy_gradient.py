@@ -11,7 +11,7 @@ import optax
 from ...controllers import Linear
 from ...environments import pendulum
 from ...training import analytic, EvolutionStrategies, expected_cost, fit
-from ._finding import Claim, Finding
+from ._finding import Claim, draw_panels, Finding
 
 
 HORIZON, RATE, GOAL = 50, 0.01, 2.0
@@ -20,8 +20,6 @@ TWICE = 2 * RATE
 
 def policy_gradient(small: bool = False) -> Finding:
     """A linear policy of the pendulum, hanging at first, with torque up to 10."""
-    import matplotlib.pyplot as plt
-
     env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
     mean_cost = expected_cost(env, batch=1, horizon=HORIZON)
 
@@ -79,7 +77,7 @@ def policy_gradient(small: bool = False) -> Finding:
             least is None or (first is not None and least > first),
         ),
     ]
-    figure, ax = plt.subplots(figsize=(7.5, 3.4), layout="constrained")
+    ax = draw_panels(1, (7.5, 3.4))
     ax.plot(np.arange(1, steps + 1), exact, "k", lw=2, label="through the rollout")
     for (scale, count), runs in curves.items():
         x = 2 * count * np.arange(1, steps + 1)
@@ -94,8 +92,7 @@ def policy_gradient(small: bool = False) -> Finding:
         )
     ax.axhline(GOAL, color="0.5", lw=0.8, ls=":")
     ax.set(xscale="log", xlabel="rollouts", ylabel="mean cost of a step")
-    ax.grid(alpha=0.25, lw=0.5)
-    figure.legend(frameon=False, fontsize=7, loc="outside right center")
+    ax.figure.legend(frameon=False, fontsize=7, loc="outside right center")
     notes = (
         f"u = -K (angle, velocity), the angle not wrapped; {HORIZON} steps of 0.05 s "
         f"from hanging at rest, torque at most 10; descent with rate {RATE} on the "
@@ -106,7 +103,7 @@ def policy_gradient(small: bool = False) -> Finding:
         "Policy gradient of the pendulum",
         claims,
         {"Rollouts to cost 2.0": rows},
-        {"policy_gradient": figure},
+        {"policy_gradient": ax.figure},
         notes,
     )
 
