@@ -1,7 +1,6 @@
 """One case after another, in the process that it is called in."""
 
 import contextlib
-import dataclasses
 import inspect
 import os
 import threading
@@ -9,7 +8,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from ._experiment import arguments_of, Experiment, RESERVED
+from ._experiment import arguments_of, Experiment
 from ._memory_maps import release_programs
 from ._provenance import device
+from ._store import RESERVED
 
 
 # Programs that are kept compiled. A sweep over something static would fill the memory.
@@ -30,13 +30,12 @@ _LONGEST = 8000
 _TRACED_KINDS = (bool, int, float, complex), (float, complex), ()
 
 
-@dataclasses.dataclass(frozen=True)
-class Outcome:
-    """What became of a case: values for each seed, or an error."""
+class Outcome(NamedTuple):
+    """What became of a case, as it is stored, and the process that ran it."""
 
     values: dict[str, list]
     error: str | None
-    trace: str | None
+    traceback: str | None
     compile_seconds: float
     run_seconds: float
     device: str | None
@@ -75,9 +74,8 @@ class Runner:
             values = {}
         if clock.compiling:
             release_programs()
-        return Outcome(
-            values, error, trace, clock.compiling, clock.running, where, os.getpid()
-        )
+        seconds = round(clock.compiling, 6), round(clock.running, 6)
+        return Outcome(values, error, trace, *seconds, where, os.getpid())
 
     def close(self) -> None:
         """Let the fixtures of the process go; one that fails harms no result."""

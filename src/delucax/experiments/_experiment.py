@@ -14,27 +14,10 @@ from ._axes import Axis, axis_of, hashes_of, Mark, Marks, Param, shown_values
 from ._hash import fingerprint
 from ._provenance import version
 from ._select import selector, words
+from ._store import RESERVED
 
 
 _SCOPES = ("case", "process")
-# Names that the table gives to columns of its own.
-RESERVED = (
-    "experiment",
-    "case",
-    "seed",
-    "status",
-    "error",
-    "traceback",
-    "compile_seconds",
-    "run_seconds",
-    "commit",
-    "dirty",
-    "date",
-    "device",
-    "dtype",
-    "hash",
-    "versions",
-)
 
 
 @dataclasses.dataclass(frozen=True)

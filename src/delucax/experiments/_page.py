@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from .._files import replaced
 from ._provenance import device, provenance
 from ._tables import as_text, escape
 
@@ -157,7 +158,8 @@ class Page:
 
         **Raises:** `OSError` if it cannot be written.
         """
-        Path(path).write_text(str(self), encoding="utf-8")
+        with replaced(Path(path)) as file:
+            file.write(str(self).encode())
 
 
 def _svg(figure: Any) -> str:

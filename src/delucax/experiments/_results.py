@@ -9,17 +9,13 @@ from typing import Any
 
 from .._check import as_path
 from .._extras import extra
-from ._store import Store
+from .._files import replaced
+from ._store import CASE_COLUMNS, RUN_COLUMNS, Store
 from ._tables import as_text, FORMS
 
 
 PASSED = ("passed", "passed unexpectedly")
 FAILED = ("failed", "passed unexpectedly")
-_OF_A_CASE = (
-    *("error", "traceback", "compile_seconds", "run_seconds"),
-    *("device", "hash"),
-)
-_MADE_WITH = ("date", "commit", "dirty", "dtype")
 # Columns that differ between two runs of the same thing.
 TIMES = ("compile_seconds", "run_seconds", "date")
 
@@ -90,7 +86,10 @@ class Results:
         for case, seeds in asked:
             key = case.experiment, case.id
             if case.mark("skip"):
-                record = dict.fromkeys(_OF_A_CASE) | {"values": {}, "status": "skipped"}
+                record = dict.fromkeys(CASE_COLUMNS) | {
+                    "values": {},
+                    "status": "skipped",
+                }
                 record |= {"parameters": case.shown, "hash": case.hash}
                 stored = dict.fromkeys(seeds, (record, 0))
             else:
@@ -116,8 +115,8 @@ class Results:
                     "seed": seed,
                     "status": record["status"],
                     **values,
-                    **{name: record[name] for name in _OF_A_CASE},
-                    **{name: run.get(name) for name in _MADE_WITH},
+                    **{name: record[name] for name in CASE_COLUMNS},
+                    **{name: run.get(name) for name in RUN_COLUMNS},
                     "versions": run.get("versions", {}),
                 }
                 rows.append(row)
@@ -131,12 +130,9 @@ class Results:
     @property
     def columns(self) -> tuple[str, ...]:
         """The names of the columns, each once."""
-        last = [
-            *("error", "compile_seconds", "run_seconds"),
-            *("device", "hash", *_MADE_WITH),
-        ]
         middle = ("seed", "status", *self.metrics)
-        return ("experiment", "case", *self.parameters, *middle, *last)
+        last = [name for name in CASE_COLUMNS if name != "traceback"]
+        return ("experiment", "case", *self.parameters, *middle, *last, *RUN_COLUMNS)
 
     @property
     def table(self) -> Any:
@@ -205,7 +201,8 @@ class Results:
         body = [[row.get(name) for name in columns] for row in rows]
         text = as_text(form, list(columns), body, digits)
         if ending is not None:
-            Path(to).write_text(text, encoding="utf-8")
+            with replaced(Path(to)) as file:
+                file.write(text.encode())
         return text
 
     def report(self, path: str | os.PathLike, *, title: str = "Results") -> None:

@@ -120,11 +120,14 @@ def run(
             asked.append((case, wanted))
             if case.mark("skip"):
                 continue
-            missing = _missing(book, case, wanted, fresh, retry)
+            stored = {} if fresh else book.stored(case.experiment, case.id, case.hash)
+            if retry:
+                stored = {s: r for s, r in stored.items() if r[0]["error"] is None}
+            missing = tuple(seed for seed in wanted if seed not in stored)
             if missing:
                 jobs.append(Job(len(jobs), one, case, missing))
-            kept = [seed for seed in wanted if seed not in missing]
-            judged += _judged_again(book, case, kept)
+            kept = {seed: stored[seed] for seed in wanted if seed in stored}
+            judged += _judged_again(case, kept)
     if jobs or judged:
         book.open()
     try:
@@ -150,58 +153,44 @@ def _run_jobs(
     bars = _progress(len(jobs), workers, progress)
     with bars as tick, contextlib.closing(outcomes):
         for job, outcome in outcomes:
-            status = _status(job.case, outcome.error)
+            case, status = job.case, _status(job.case, outcome.error)
+            fields = outcome._asdict()
+            worker = fields.pop("worker")
             record = {
                 "kind": "case",
                 "run": number,
-                "experiment": job.case.experiment,
-                "case": job.case.id,
-                "order": job.case.index,
-                "hash": job.case.hash,
-                "parameters": job.case.shown,
+                "experiment": case.experiment,
+                "case": case.id,
+                "order": case.index,
+                "hash": case.hash,
+                "parameters": case.shown,
                 "seeds": job.seeds,
                 "status": status,
-                "values": outcome.values,
-                "error": outcome.error,
-                "traceback": outcome.trace,
-                "compile_seconds": round(outcome.compile_seconds, 6),
-                "run_seconds": round(outcome.run_seconds, 6),
-                "device": outcome.device,
+                **fields,
             }
             book.append(record)
-            tick(outcome.worker, job.case.id, status)
+            tick(worker, case.id, status)
 
 
-def _missing(book, case, wanted, fresh, retry) -> tuple[int, ...]:
-    entry = book.cases.get((case.experiment, case.id))
-    if fresh or entry is None or entry["hash"] != case.hash:
-        return wanted
-    done = {
-        seed
-        for seed, (record, _) in entry["seeds"].items()
-        if not (retry and record["error"] is not None)
-    }
-    return tuple(seed for seed in wanted if seed not in done)
-
-
-def _judged_again(book, case, kept) -> list[dict[str, Any]]:
+def _judged_again(
+    case: Case, stored: dict[int, tuple[dict[str, Any], int]]
+) -> list[dict[str, Any]]:
     """Lines for what is not run again, where a mark came or went since."""
-    found: dict[int, tuple[dict[str, Any], list[tuple[int, int]]]] = {}
-    for seed in kept:
-        record, place = book.cases[case.experiment, case.id]["seeds"][seed]
+    groups: dict[int, tuple[dict[str, Any], dict[int, int]]] = {}
+    for seed, (record, place) in stored.items():
         if record["status"] != _status(case, record["error"]):
-            found.setdefault(id(record), (record, []))[1].append((seed, place))
+            groups.setdefault(id(record), (record, {}))[1][seed] = place
     return [
         {
             **record,
-            "seeds": [seed for seed, _ in places],
+            "seeds": list(places),
             "status": _status(case, record["error"]),
             "values": {
-                name: [column[place] for _, place in places]
+                name: [column[place] for place in places.values()]
                 for name, column in record["values"].items()
             },
         }
-        for record, places in found.values()
+        for record, places in groups.values()
     ]
 
 

@@ -18,6 +18,18 @@ from .._check import as_path
 _FORMAT = "delucax-results"
 _VERSION = 1
 _HEADER = {"format": _FORMAT, "version": _VERSION}
+# What a line `case` and a line `run` tell of each row of the table.
+CASE_COLUMNS = (
+    *("error", "traceback", "compile_seconds", "run_seconds"),
+    *("device", "hash"),
+)
+RUN_COLUMNS = ("date", "commit", "dirty", "dtype")
+RESERVED = (
+    *("experiment", "case", "seed", "status", "versions"),
+    *CASE_COLUMNS,
+    *RUN_COLUMNS,
+)
+"""Names that neither a parameter nor a result can have."""
 
 
 class Store:
@@ -96,6 +108,14 @@ class Store:
                 raise KeyError(name)
         for place, seed in enumerate(record["seeds"]):
             entry["seeds"][seed] = (record, place)
+
+    def stored(
+        self, experiment: str, case: str, hash: str
+    ) -> dict[int, tuple[dict[str, Any], int]]:
+        """The lines of a case that count, and the place there, by seed: of the code
+        and the values that have this hash."""
+        entry = self.cases.get((experiment, case), {"hash": None})
+        return entry["seeds"] if entry["hash"] == hash else {}
 
     def open(self) -> None:
         """Make ready to write: alone, after what is whole."""

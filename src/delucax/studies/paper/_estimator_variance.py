@@ -9,7 +9,6 @@ import jax.random as jr
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ..._module import replace
 from ...controllers import Deep, Gaussian, MLP
 from ...environments import pendulum
 from ...simulation import rollout
@@ -20,6 +19,7 @@ from ...training import (
     LikelihoodRatio,
     scored_cost,
 )
+from .._swing_up import spread_starts
 from ._finding import Claim, draw_panels, Finding
 
 
@@ -140,10 +140,7 @@ def estimator_variance(small: bool = False) -> Finding:
 
 def _at_horizon(horizon: int, draws: int) -> dict[str, Any]:
     """Variances over a horizon, the start drawn, and how large the gradient is."""
-    corner = np.array([np.pi, 8.0])
-    env = replace(
-        pendulum(), {"initial_state.low": -corner, "initial_state.high": corner}
-    )
+    env = spread_starts(pendulum())
     policy = Deep(env, width=32, depth=1, key=jr.key(0))
     noisy = Gaussian(policy, -1.0, bounds=env.control_bounds)
     one = expected_cost(env, batch=1, horizon=horizon)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from jaxtyping import Float
 
 from ... import controllers
 from ...controllers import LQR, Zero
@@ -85,52 +86,39 @@ def pendulum_shock(small: bool = False) -> Finding:
             row |= {f"{world}: cost": mean, f"{world}: +-": half}
         row["during the shock"] = during[name, "shock"].mean()
         rows.append(row)
-    gpc = paired_ratio(during["GPC", "shock"], during["LQR", "shock"])
-    ada = paired_ratio(means["AdaGPC", "shock"], means["GPC", "shock"])
-    plan = paired_ratio(means["iLQR, with gains", "no noise"], means["GPC", "no noise"])
-    late = paired_ratio(during["GPC", "shock"], during["iLQR, with gains", "shock"])
-    again = paired_ratio(
-        means["MPC", "no noise"], means["iLQR, with gains", "no noise"]
-    )
-    unaware = paired_ratio(during["GPC", "shock"], during["MPC", "shock"])
-    both = paired_ratio(
-        during["GPC around the plan", "shock"], during["iLQR, with gains", "shock"]
-    )
+    quiet = {name: means[name, "no noise"] for name in contenders}
+    shocked = {name: during[name, "shock"] for name in contenders}
+    over_all = {name: means[name, "shock"] for name in contenders}
+    plan = paired_ratio(quiet["iLQR, with gains"], quiet["GPC"])
     claims = [
         Claim(
             "Without noise the plan of iLQR costs no more than online control",
             f"{plan[0]:.3f} times GPC",
             bool(plan[2] <= 1.001),
         ),
-        Claim(
+        _at_most(
             "Without noise MPC costs at most 1.01 times what the plan does",
-            f"{again[0]:.4f} times ({again[1]:.4f} to {again[2]:.4f})",
-            bool(again[2] <= 1.01),
+            *(quiet["MPC"], quiet["iLQR, with gains"], 1.01, 4),
         ),
-        Claim(
+        _at_most(
             "During the shock GPC costs less than LQR",
-            f"{gpc[0]:.3f} times ({gpc[1]:.3f} to {gpc[2]:.3f})",
-            bool(gpc[2] < 1),
+            *(shocked["GPC"], shocked["LQR"]),
         ),
-        Claim(
+        _at_most(
             "During the shock GPC costs less than iLQR with its gains",
-            f"{late[0]:.3f} times ({late[1]:.3f} to {late[2]:.3f})",
-            bool(late[2] < 1),
+            *(shocked["GPC"], shocked["iLQR, with gains"]),
         ),
-        Claim(
+        _at_most(
             "During the shock GPC costs less than MPC, which plans again at each step",
-            f"{unaware[0]:.3f} times ({unaware[1]:.3f} to {unaware[2]:.3f})",
-            bool(unaware[2] < 1),
+            *(shocked["GPC"], shocked["MPC"]),
         ),
-        Claim(
+        _at_most(
             "AdaGPC costs at most 1.02 times what GPC does over the run with the shock",
-            f"{ada[0]:.3f} times ({ada[1]:.3f} to {ada[2]:.3f})",
-            bool(ada[2] <= 1.02),
+            *(over_all["AdaGPC"], over_all["GPC"], 1.02),
         ),
-        Claim(
+        _at_most(
             "GPC around the plan costs less during the shock than the plan alone",
-            f"{both[0]:.3f} times ({both[1]:.3f} to {both[2]:.3f})",
-            bool(both[2] < 1),
+            *(shocked["GPC around the plan"], shocked["iLQR, with gains"]),
         ),
     ]
     axes = draw_panels(2, (9, 3.2), sharey=True)
@@ -164,3 +152,17 @@ def pendulum_shock(small: bool = False) -> Finding:
         {"pendulum_shock": axes[0].figure},
         notes,
     )
+
+
+def _at_most(
+    statement: str,
+    costs: Float[np.ndarray, " n"],
+    others: Float[np.ndarray, " n"],
+    limit: float | None = None,
+    digits: int = 3,
+) -> Claim:
+    """A claim that the ratio of costs is at most `limit`, or below 1."""
+    interval = paired_ratio(costs, others)
+    ratio, low, high = (f"{end:.{digits}f}" for end in interval)
+    holds = interval[2] < 1 if limit is None else interval[2] <= limit
+    return Claim(statement, f"{ratio} times ({low} to {high})", bool(holds))

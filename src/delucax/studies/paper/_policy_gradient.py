@@ -1,6 +1,8 @@
 """The first figure, right: the gradient through the rollout beside evolution
 strategies."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -10,7 +12,13 @@ import optax
 
 from ...controllers import Linear
 from ...environments import pendulum
-from ...training import analytic, EvolutionStrategies, expected_cost, fit
+from ...training import (
+    analytic,
+    EvolutionStrategies,
+    expected_cost,
+    fit,
+    Fitted,
+)
 from ._finding import Claim, draw_panels, Finding
 
 
@@ -20,22 +28,12 @@ TWICE = 2 * RATE
 
 def policy_gradient(small: bool = False) -> Finding:
     """A linear policy of the pendulum, hanging at first, with torque up to 10."""
-    env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
-    mean_cost = expected_cost(env, batch=1, horizon=HORIZON)
-
-    def loss(controller, key):
-        return mean_cost(controller, key) / HORIZON
-
     steps, seeds = (400, 3) if small else (1500, 5)
     scales, pairs = ((0.1,), (1, 16)) if small else ((0.05, 0.1, 0.3), (1, 4, 16, 64))
-    start = Linear(jnp.zeros((1, 2)))
 
     def train(estimator, seed, rate=RATE):
-        key = jax.random.key(seed)
-        options: Any = dict(key=key, gradient=estimator, progress=False)
-        return np.asarray(
-            fit(loss, start, optax.sgd(rate), steps, **options).history.loss
-        )
+        options: Any = dict(gradient=estimator, progress=False)
+        return np.asarray(train_linear(steps, seed, rate, **options).history.loss)
 
     exact = train(analytic, 0)
     first, faster = _first(exact), _first(train(analytic, 0, TWICE))
@@ -106,6 +104,23 @@ def policy_gradient(small: bool = False) -> Finding:
         {"policy_gradient": ax.figure},
         notes,
     )
+
+
+@functools.cache
+def _mean_cost() -> Callable[..., Any]:
+    """Of a step from hanging. One object, so that a second seed does not compile."""
+    env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
+    total = expected_cost(env, batch=1, horizon=HORIZON)
+    return lambda controller, key: total(controller, key) / HORIZON
+
+
+def train_linear(
+    steps: int, seed: int = 0, rate: float = RATE, **options: Any
+) -> Fitted:
+    """Descend with a linear policy from zero; with the options of `fit`."""
+    options["key"] = jax.random.key(seed)
+    start = Linear(jnp.zeros((1, 2)))
+    return fit(_mean_cost(), start, optax.sgd(rate), steps, **options)
 
 
 def descent_claim(first: int | None, faster: int | None) -> Claim:
