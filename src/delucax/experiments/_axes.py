@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ._hash import fingerprint
+from ._fingerprint import fingerprint
 
 
 @dataclasses.dataclass(frozen=True)

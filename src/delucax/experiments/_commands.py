@@ -77,18 +77,18 @@ def report_diff(
         raise ValueError(f"report: --diff needs two results files, got {len(paths)}.")
     if exports:
         raise ValueError("report: --export goes with one results file, not --diff.")
-    found = diff(*(_read(path, select) for path in paths))
-    if found.changed:
-        print(as_text("markdown", DIFFERENCES, found.changed))
-    for _, case, *states in found.status:
+    difference = diff(*(_read(path, select) for path in paths))
+    if difference.changed:
+        print(as_text("markdown", DIFFERENCES, difference.changed))
+    for _, case, *states in difference.status:
         print(f"{case}: {states[0]} in {paths[0]}, {states[1]} in {paths[1]}")
-    for name, cases in zip(paths, found.only, strict=True):
+    for name, cases in zip(paths, difference.only, strict=True):
         for _, case in cases:
             print(f"{case}: only in {name}")
-    differ = {tuple(line[:2]) for line in found.changed}
-    print(f"{found.same} cases are the same, {len(differ)} differ")
+    differ = {tuple(line[:2]) for line in difference.changed}
+    print(f"{difference.same} cases are the same, {len(differ)} differ")
     if html is not None:
-        found.page((paths[0], paths[1])).write(html)
+        difference.page((paths[0], paths[1])).write(html)
         print(f"report in {html}")
     return 0
 

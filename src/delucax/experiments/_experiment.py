@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from ._axes import Axis, axis_of, hashes_of, Mark, Marks, Param, shown_values
-from ._hash import fingerprint
+from ._fingerprint import fingerprint
 from ._provenance import version
 from ._select import selector, words
 from ._store import RESERVED

@@ -97,8 +97,8 @@ def summary(results: Results) -> tuple[list[str], list[list]]:
 
 
 def _numbers(rows: list[dict[str, Any]], metric: str) -> list[float]:
-    found = (_number(row.get(metric)) for row in rows)
-    return [value for value in found if value is not None]
+    values = (_number(row.get(metric)) for row in rows)
+    return [value for value in values if value is not None]
 
 
 def _varies(rows: list[dict[str, Any]], metric: str) -> bool:
@@ -177,10 +177,10 @@ def diff(first: Results, second: Results, *, resamples: int = 2000) -> Differenc
 
 
 def _by_case(results: Results) -> dict[tuple[str, str], dict[int, dict[str, Any]]]:
-    found: dict[tuple[str, str], dict[int, dict[str, Any]]] = {}
+    cases: dict[tuple[str, str], dict[int, dict[str, Any]]] = {}
     for row in results.rows:
-        found.setdefault((row["experiment"], row["case"]), {})[row["seed"]] = row
-    return found
+        cases.setdefault((row["experiment"], row["case"]), {})[row["seed"]] = row
+    return cases
 
 
 def _number(value: Any) -> float | None:

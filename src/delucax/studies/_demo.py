@@ -160,8 +160,8 @@ def demo(
 def _say_held(claims: list[dict[str, Any]], say: Callable[[str], Any]) -> None:
     """How many claims of each study hold, and which do not."""
     pd = extra("pandas", "demo")
-    found = pd.DataFrame(claims).astype({"holds": int}).groupby("study", sort=False)
-    table = found["holds"].agg(claims="count", hold="sum").reset_index()
+    claims_of = pd.DataFrame(claims).astype({"holds": int}).groupby("study", sort=False)
+    table = claims_of["holds"].agg(claims="count", hold="sum").reset_index()
     say(f"\n{table.to_string(index=False)}\n")
     for claim in claims:
         if not claim["holds"]:

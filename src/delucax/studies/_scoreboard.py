@@ -53,9 +53,9 @@ def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
             throw=False,
         )
         for controls in (guess, plan.controls):
-            found = float(_cost(env, Sequence(controls), key))
-            if np.isfinite(found) and found < least:
-                best, least = controls, found
+            cost = float(_cost(env, Sequence(controls), key))
+            if np.isfinite(cost) and cost < least:
+                best, least = controls, cost
     if best is None:
         raise Unsuitable("no plan was found")
     return Sequence(best)
@@ -90,8 +90,8 @@ def _batch(task: str, method: str, block: int) -> tuple[list[float], float | Non
         if task in PUMPED:
             guides.append(Pump(jnp.ones(1)))
         plans = [_planned(env, guides, key) for key in keys]
-        found = [_cost(env, plan, key) for plan, key in zip(plans, keys, strict=True)]
-        return [float(cost) for cost in found], None
+        pairs = zip(plans, keys, strict=True)
+        return [float(_cost(env, plan, key)) for plan, key in pairs], None
     agent, best, spent = agent_of(task, method), np.inf, 0.0
     costs = np.asarray(_costs(env, agent, keys))
     while spent < TIMED:

@@ -43,7 +43,7 @@ def estimator_variance(small: bool = False) -> Finding:
     def loss(controller, key):
         return rollout(env, controller, key=key, keep=(), throw=False).total_cost
 
-    found: dict[str, list[float]] = {}
+    ratios: dict[str, list[float]] = {}
     rows, sizes = [], []
     for width in widths:
         policy = MLP(2, 1, width, 1, key=jr.key(0))
@@ -69,11 +69,11 @@ def estimator_variance(small: bool = False) -> Finding:
         row: dict[str, Any] = {"parameters": len(exact)}
         for name, drawn in samples.items():
             row[name] = float(jnp.sum(jnp.var(drawn, axis=0)) / (exact @ exact))
-            found.setdefault(name, []).append(row[name])
+            ratios.setdefault(name, []).append(row[name])
         rows.append(row)
     slope = {
         name: float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
-        for name, values in found.items()
+        for name, values in ratios.items()
         if min(values) > 0
     }
     over = [_at_horizon(T, draws) for T in (LONGER[::4] if small else LONGER)]
@@ -83,8 +83,8 @@ def estimator_variance(small: bool = False) -> Finding:
         Claim(
             "The analytic gradient has no variance in a deterministic system (below "
             "1e-9 of its squared norm)",
-            f"{max(found['analytic']):.1e}",
-            bool(max(found["analytic"]) < 1e-9),
+            f"{max(ratios['analytic']):.1e}",
+            bool(max(ratios["analytic"]) < 1e-9),
         ),
         Claim(
             "That of evolution strategies grows in proportion to the parameters "
@@ -95,9 +95,9 @@ def estimator_variance(small: bool = False) -> Finding:
         Claim(
             "That of REINFORCE does not depend on the number of parameters (slope -0.2 "
             "to 0.2), but adds to the problem's own",
-            f"slope {slope['REINFORCE']:.2f}, {found['REINFORCE'][-1]:.3g} times the "
+            f"slope {slope['REINFORCE']:.2f}, {ratios['REINFORCE'][-1]:.3g} times the "
             "squared gradient",
-            bool(abs(slope["REINFORCE"]) <= 0.2 and found["REINFORCE"][-1] > 0),
+            bool(abs(slope["REINFORCE"]) <= 0.2 and ratios["REINFORCE"][-1] > 0),
         ),
         Claim(
             "Over a long horizon, with starts at random, the analytic gradient loses: "
@@ -110,7 +110,7 @@ def estimator_variance(small: bool = False) -> Finding:
         ),
     ]
     ax, long = draw_panels(2, (9, 3.4))
-    for name, values in found.items():
+    for name, values in ratios.items():
         if min(values) > 0:
             ax.loglog(sizes, values, "o-", ms=3, label=name)
     ax.set(xlabel="parameters", ylabel="variance / squared gradient")

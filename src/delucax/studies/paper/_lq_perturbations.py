@@ -46,12 +46,12 @@ def lq_perturbations(small: bool = False) -> Finding:
 
         return jax.vmap(one)(w)
 
-    found = {
+    costs_of = {
         (name, kind): np.asarray(costs(controller, jnp.asarray(w, A.dtype)))
         for name, controller in contenders.items()
         for kind, w in kinds.items()
     }
-    rows, means = [], {key: value.mean(axis=1) for key, value in found.items()}
+    rows, means = [], {key: value.mean(axis=1) for key, value in costs_of.items()}
     for kind in kinds:
         for name in contenders:
             mean, half = mean_and_half_width(means[name, kind])
@@ -82,7 +82,7 @@ def lq_perturbations(small: bool = False) -> Finding:
     axes = draw_panels(3, (10, 3))
     for ax, kind in zip(axes, kinds, strict=True):
         for name in contenders:
-            average = np.cumsum(found[name, kind], axis=1) / np.arange(1, steps + 1)
+            average = np.cumsum(costs_of[name, kind], axis=1) / np.arange(1, steps + 1)
             ax.plot(average.mean(axis=0), label=name, lw=1.5)
         ax.set(title=kind, xlabel="step", yscale="log")
     axes[0].set_ylabel("average cost so far")

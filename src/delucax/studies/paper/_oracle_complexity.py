@@ -46,9 +46,9 @@ def oracle_complexity(small: bool = False) -> Finding:
         f"{samples} samples": lambda d, samples=samples: solve(_Sampled(d, samples))
         for samples in drawn
     }
-    found = {name: count_evaluations(f, dynamics) for name, f in kinds.items()}
-    best = float(found["automatic"][0].cost)
-    above = {name: float(plan.cost) / best - 1 for name, (plan, _) in found.items()}
+    solved = {name: count_evaluations(f, dynamics) for name, f in kinds.items()}
+    best = float(solved["automatic"][0].cost)
+    above = {name: float(plan.cost) / best - 1 for name, (plan, _) in solved.items()}
     rows = [
         {
             "derivatives": name,
@@ -58,7 +58,7 @@ def oracle_complexity(small: bool = False) -> Finding:
             "tangents": count.tangent,
             "cotangents": count.cotangent,
         }
-        for name, (plan, count) in found.items()
+        for name, (plan, count) in solved.items()
     ]
     knot = {
         name: _calls_of_a_knot(dynamics, x0, hover, spacing)
@@ -89,7 +89,7 @@ def oracle_complexity(small: bool = False) -> Finding:
         ),
     ]
     ax = draw_panels(1, (5.5, 3.4))
-    for name, (plan, count) in found.items():
+    for name, (plan, count) in solved.items():
         trace = np.asarray(plan.trace)[: int(plan.iterations) + 1]
         calls = np.linspace(0, count.primal, len(trace) + 1)[1:]
         style: Any = {"lw": 1} if name in sampled else {"marker": "o", "ms": 3}

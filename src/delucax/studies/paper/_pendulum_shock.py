@@ -61,7 +61,7 @@ def pendulum_shock(small: bool = False) -> Finding:
             dynamics, cost, base=plan, horizon=learner.loop.horizon
         ),
     }
-    found = {}
+    costs_of = {}
     for name, make in contenders.items():
 
         @jax.jit
@@ -75,9 +75,9 @@ def pendulum_shock(small: bool = False) -> Finding:
 
         for world, w in worlds.items():
             w = jnp.asarray(w, starts.dtype)
-            found[name, world] = np.asarray(costs(plans, starts, w))
-    during = {key: value[:, middle].mean(axis=1) for key, value in found.items()}
-    means = {key: value.mean(axis=1) for key, value in found.items()}
+            costs_of[name, world] = np.asarray(costs(plans, starts, w))
+    during = {key: value[:, middle].mean(axis=1) for key, value in costs_of.items()}
+    means = {key: value.mean(axis=1) for key, value in costs_of.items()}
     rows = []
     for name in contenders:
         row: dict[str, Any] = {"controller": name}
@@ -129,7 +129,7 @@ def pendulum_shock(small: bool = False) -> Finding:
                 # Some lie on top of others.
                 dashed = "gains" in name or "around" in name or name == "MPC"
                 style = "--" if dashed else "-"
-                mean_cost = found[name, world].mean(axis=0)
+                mean_cost = costs_of[name, world].mean(axis=0)
                 ax.semilogy(times, mean_cost, style, lw=1.4, label=name)
         ax.set(title=world, xlabel="time, s", ylim=(1e-4, 50))
     axes[1].axvspan(DT * (steps // 3), DT * (2 * steps // 3), color="0.5", alpha=0.15)
