@@ -9,27 +9,19 @@ import textwrap
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 
-class _Command(NamedTuple):
-    """What `call` is given the options of, and whose exit status it returns."""
-
-    call: Callable[[Any], int | None]
-    help: str
-    more: str
-    options: tuple[tuple[tuple[str, ...], dict[str, Any]], ...]
-
-
-_COMMANDS: dict[str, _Command] = {}
-"""By name, in the order in which they are shown."""
+_COMMANDS: list[tuple[Callable, str, str, tuple]] = []
+"""What is called with the options, its help, more of it, and what options it has; in
+the order in which they are shown."""
 
 
 def _command(help: str, *options: tuple, more: str = "") -> Callable:
-    """Make a command of a function, by its name."""
+    """Make a command of a function that returns the exit status, by its name."""
 
     def register(call: Callable[[Any], int | None]) -> Callable:
-        _COMMANDS[call.__name__.lstrip("_")] = _Command(call, help, more, options)
+        _COMMANDS.append((call, help, more, options))
         return call
 
     return register
@@ -38,6 +30,12 @@ def _command(help: str, *options: tuple, more: str = "") -> Callable:
 def _option(*names: str, **settings: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
     """What `add_argument` is given."""
     return names, settings
+
+
+def _expression(flag: str, name: str, help: str) -> tuple:
+    """The option of an expression that selects cases."""
+    help = f"{help} (default: all)"
+    return _option(flag, dest=name, default="", metavar="EXPR", help=help)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -69,16 +67,16 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         title="commands", dest="command", metavar="COMMAND"
     )
-    for name, command in _COMMANDS.items():
+    for call, help, more, command_options in _COMMANDS:
         added = commands.add_parser(
-            name,
-            help=command.help,
-            description=f"{command.help[0].upper()}{command.help[1:]}.",
-            epilog=textwrap.dedent(command.more).strip() or None,
+            call.__name__.removeprefix("_"),
+            help=help,
+            description=f"{help[0].upper()}{help[1:]}.",
+            epilog=textwrap.dedent(more).strip() or None,
             formatter_class=_Formatter,
         )
-        added.set_defaults(call=command.call)
-        for names, settings in command.options:
+        added.set_defaults(call=call)
+        for names, settings in command_options:
             added.add_argument(*names, **settings)
     return parser
 
@@ -94,12 +92,9 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 
 
 _FILE = "a Python file of experiments, a module, or a suite that `list` names"
-_SELECT, _MARKS = (
-    _option(flag, dest=dest, default="", metavar="EXPR", help=f"{help} (default: all)")
-    for flag, dest, help in (
-        ("-k", "select", "cases by name, such as 'lqr and not cartpole'"),
-        ("-m", "marks", "cases by their marks"),
-    )
+_CASES = (
+    _expression("-k", "select", "cases by name, such as 'lqr and not cartpole'"),
+    _expression("-m", "marks", "cases by their marks"),
 )
 
 
@@ -163,8 +158,7 @@ def _lung(options: Any) -> None:
 @_command(
     "name the tasks, controllers and suites, or the cases of FILE",
     _option("file", nargs="?", metavar="FILE", help=f"{_FILE}; its cases are listed"),
-    _SELECT,
-    _MARKS,
+    *_CASES,
 )
 def _list(options: Any) -> int | None:
     from .studies._listing import list_names, SUITES
@@ -179,8 +173,7 @@ def _list(options: Any) -> int | None:
 @_command(
     "run the experiments of FILE",
     _option("file", metavar="FILE", help=_FILE),
-    _SELECT,
-    _MARKS,
+    *_CASES,
     _option("--slow", action="store_true", help="also cases marked slow"),
     _option("--seeds", type=int, help="how many seeds (default: as FILE says)"),
     _option(
@@ -233,13 +226,7 @@ def _run(options: Any) -> int:
         metavar="TABLE",
         help="write all rows to a .csv, .parquet, .md or .tex file",
     ),
-    _option(
-        "-k",
-        dest="select",
-        default="",
-        metavar="EXPR",
-        help="only these cases (default: all)",
-    ),
+    _expression("-k", "select", "only these cases"),
     more="""
         examples:
           python -m delucax report results/sweep.jsonl --html sweep.html
