@@ -12,7 +12,7 @@ from helpers import assert_close, once, thorough, user_error
 import delucax as dlx
 from delucax import lung, studies
 from delucax.__main__ import main
-from delucax.lung import _study
+from delucax.studies.ventilator import _study
 from delucax.studies.ventilator._contenders import Contender
 from delucax.studies.ventilator._report import save_controllers
 from delucax.studies.ventilator._simulators import grouped, left_out
