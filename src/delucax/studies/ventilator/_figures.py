@@ -5,13 +5,13 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
+from matplotlib.axes import Axes
 
 from ...environments import Environment
-from ...lung._stacking import unstack
-from ...lung._waveform import at_pip
+from ...lung import at_pip, unstack
 from ...plotting import animate
 from ...plotting._figure import color_of, NEUTRAL, NotebookFigure, style_axes
-from ._report import PID_ROWS
+from ._report import mean_error, PID_ROWS
 from ._size import SHOWN
 
 
@@ -55,17 +55,22 @@ def tracking_figure(
     bars = {"best PID": np.min(pids, axis=0)}
     chosen = ("MLP for all", "MPC", "CNN", "PID + MLP", "MLP", "least error")
     bars |= {label: error[label] for label in chosen if label in error}
-    width = 0.8 / len(bars)
-    for k, (label, values) in enumerate(bars.items()):
-        color = NEUTRAL if label == "least error" else _color(label, k)
-        place = np.arange(count) + (k - (len(bars) - 1) / 2) * width
-        ax.bar(place, values, width, color=color, label=label)
-    style_axes(ax, size=_SIZE)
+    colors = {label: _color(label, k) for k, label in enumerate(bars)}
+    _draw_bars(ax, bars, colors | {"least error": NEUTRAL})
     ax.set_xticks(np.arange(count), names)
     ax.set_ylabel("mean |error| [cmH2O]", fontsize=_SIZE)
     ax.legend(fontsize=_SIZE - 1, frameon=False, ncols=len(bars), loc="upper center")
     ax.set_ylim(0, 1.25 * float(np.max(list(bars.values()))))
     return figure
+
+
+def _draw_bars(ax: Axes, bars: dict[str, Any], colors: dict[str, str]) -> None:
+    """Bars of several labels side by side, a group for each lung."""
+    width = 0.8 / len(bars)
+    for k, (label, values) in enumerate(bars.items()):
+        place = np.arange(len(values)) + (k - (len(bars) - 1) / 2) * width
+        ax.bar(place, values, width, color=colors[label], label=label)
+    style_axes(ax, size=_SIZE)
 
 
 def _color(label: str, index: int) -> str:
@@ -75,14 +80,10 @@ def _color(label: str, index: int) -> str:
 
 def _errors(rows: list[dict[str, Any]], names: list[str]) -> dict[str, np.ndarray]:
     """The error at unseen peak pressures, of each controller in each lung."""
-    found: dict[str, dict[str, list[float]]] = {}
-    for row in rows:
-        if row["split"] == "unseen":
-            of = found.setdefault(row["controller"], {})
-            of.setdefault(row["lung"], []).append(row["mae"])
+    labels = dict.fromkeys(r["controller"] for r in rows if r["split"] == "unseen")
     return {
-        label: np.array([np.mean(of[name]) for name in names])
-        for label, of in found.items()
+        label: np.array([mean_error(rows, label, "unseen", name) for name in names])
+        for label in labels
     }
 
 
@@ -114,13 +115,9 @@ def simulator_figure(
     left.set_ylabel("pressure [cmH2O]", fontsize=_SIZE)
     left.legend(fontsize=_SIZE - 1, frameon=False)
     style_axes(left, size=_SIZE)
-    width = 0.8 / len(models)
-    for k, label in enumerate(models):
-        of = {r["lung"]: r["mae"] for r in table if r["simulator"] == label}
-        place = np.arange(len(names)) + (k - (len(models) - 1) / 2) * width
-        values = [of[name] for name in names]
-        right.bar(place, values, width, color=color_of(k), label=label)
-    style_axes(right, size=_SIZE)
+    errors = {(row["simulator"], row["lung"]): row["mae"] for row in table}
+    bars = {label: [errors[label, name] for name in names] for label in models}
+    _draw_bars(right, bars, {label: color_of(k) for k, label in enumerate(models)})
     right.set_yscale("log")
     right.set_xticks(np.arange(len(names)), names, rotation=30)
     right.set_ylabel("open-loop mean |error| [cmH2O]", fontsize=_SIZE)

@@ -2,17 +2,18 @@
 
 from typing import NamedTuple
 
-from ...lung._csv import COMPLIANCES, RESISTANCES
-from ...lung._data import PIPS
 
-
-SEEN = PIPS
+SEEN = (10.0, 15.0, 20.0, 25.0, 30.0, 35.0)
 """Peak pressures that controllers are trained at."""
 UNSEEN = (12.5, 17.5, 22.5, 27.5, 32.5)
 SHOWN = 27.5
 """The peak pressure of the breaths in the figures, one of those."""
-BREATH = 100
-"""Steps of a whole breath."""
+INSPIRATION, BREATH = 29, 100
+"""Steps of what is learned from of an inspiration, and of a whole breath."""
+ABORT = 60.0
+"""The pressure that no controller is to reach [cmH2O]."""
+LUNGS = tuple((R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0))
+"""Lungs of the public data set, (R, C)."""
 BETWEEN = ((10.0, 15.0), (10.0, 35.0), (35.0, 15.0), (35.0, 35.0))
 """Lungs between those that are trained on, (R, C)."""
 SENSOR_DELAY = 2
@@ -66,7 +67,7 @@ FULL = Size(
     bound_steps=500,
     seeds=3,
     noises=5,
-    lungs=tuple((R, C) for R in RESISTANCES for C in COMPLIANCES),
+    lungs=LUNGS,
     between=BETWEEN,
     physics=PHYSICS,
     extras=True,

@@ -14,17 +14,23 @@ import jax.random as jr
 import numpy as np
 
 from ..._check import check_count
+from ..._typing import PRNGKey
 from ...environments import Environment
-from ...lung._csv import read_breaths
-from ...lung._data import Breaths
-from ...lung._grid import least_error
-from ...lung._stacking import repeat, stack, unstack
-from ...lung._tasks import double_compartment
-from ...lung._train import lung_environment
-from ...lung._waveform import BreathWaveform
+from ...lung import (
+    Breaths,
+    BreathWaveform,
+    double_compartment,
+    LearnedLung,
+    least_error,
+    lung_environment,
+    LungModel,
+    read_breaths,
+    stack,
+    unstack,
+)
 from ._contenders import (
-    bang_bang,
     Contender,
+    designed,
     networks,
     networks_for_all,
     networks_on_pids,
@@ -34,7 +40,6 @@ from ._contenders import (
     searched_pids,
     trained_pids,
     Trainer,
-    zero,
 )
 from ._report import best_pid, bound_rows, error_rows, save_controllers, summarise
 from ._simulators import (
@@ -48,6 +53,7 @@ from ._simulators import (
     open_loop_rows,
 )
 from ._size import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, UNSEEN
+from ._stacks import repeated
 from ._stages import Stages
 from ._tuned import tuned_pids
 
@@ -177,7 +183,7 @@ def lung_study(
     place = stages.out / "controllers"
     unsafe = save_controllers(place, contenders, names, waveform, rows)
     summary = summarise(rows, table, stages.seconds, judge, unsafe)
-    (stages.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+    stages.write("summary.json", json.dumps(summary, indent=1) + "\n")
     for line in summary["words"]:
         say(line)
     chosen = {"best PID": best_pid(rows), "MLP": "MLP", "MLP for all": "MLP for all"}
@@ -197,24 +203,18 @@ def _lung_name(resistance: float, compliance: float) -> str:
     return f"R{resistance:g}C{compliance:g}"
 
 
-def _simulators(stages: Stages, train: Breaths, size: Size, key: Any) -> dict[str, Any]:
+def _simulators(
+    stages: Stages, train: Breaths, size: Size, key: PRNGKey
+) -> dict[str, LearnedLung | LungModel]:
     """Simulators of each kind, stacked over the lungs, by name."""
-    count = f"all {train.pressure.shape[0]} at once"
-    models = {
-        "learned": stages.stage(
-            "simulators",
-            f"Learned lungs, {count}",
-            lambda: learned(train, size, key, stages.fitting("simulators")),
-        )
-    }
+    count, data = f"all {train.pressure.shape[0]} at once", (train, size, key)
+    models: dict[str, Any] = {}
+    models["learned"] = stages.training(
+        "simulators", f"Learned lungs, {count}", learned, *data
+    )
     for kind in size.physics:
-        name = kind.replace(" ", "_")
-        models[kind] = stages.stage(
-            name,
-            f"Fitted {kind}, {count}",
-            lambda kind=kind, name=name: fitted(
-                kind, train, size, key, stages.fitting(name)
-            ),
+        models[kind] = stages.training(
+            kind.replace(" ", "_"), f"Fitted {kind}, {count}", fitted, kind, *data
         )
     return models
 
@@ -225,70 +225,48 @@ def _contenders(
     train: Breaths,
     trainer: Trainer,
     size: Size,
-    key: Any,
+    key: PRNGKey,
 ) -> list[Contender]:
     """All controllers, in the order of the report."""
-
-    def trained(name: str, words: str, train: Callable[[dict[str, Any]], Any]) -> Any:
-        return stages.stage(name, words, lambda: train(stages.fitting(name)))
-
+    training, study = stages.training, (trainer, size, key)
+    by_hand = designed(trainer)
     pids = stages.stage("pids", "PID grids", lambda: searched_pids(envs, trainer, key))
-    found = [zero(trainer), *pid_contenders(pids, trainer)]
-    own = trained(
-        "own",
-        f"A network for each lung, {size.seeds} seeds at once",
-        lambda options: networks(trainer, size, key, options),
-    )
-    shared = trained(
-        "shared",
-        f"A network for all lungs, {size.seeds} seeds at once",
-        lambda options: networks_for_all(trainer, size, key, options),
-    )
+    contenders = [by_hand["zero"], *pid_contenders(pids, trainer)]
+    words = f"A network for each lung, {size.seeds} seeds at once"
+    own = training("own", words, networks, "mlp", size.seeds, *study)
+    words = f"A network for all lungs, {size.seeds} seeds at once"
+    shared = training("shared", words, networks_for_all, *study)
     if size.tuned:
-        tuned = trained(
-            "tuned_pids",
-            "PIDs with feed-forward tuned on the lungs",
-            lambda options: tuned_pids(
-                envs, trainer.waveform, size, key, options, stages.say
-            ),
-        )
-        found += pid_contenders(tuned, trainer)
+        words = "PIDs with feed-forward tuned on the lungs"
+        inputs = envs, trainer.waveform, size, key, stages.say
+        tuned = training("tuned_pids", words, tuned_pids, *inputs)
+        contenders += pid_contenders(tuned, trainer)
     if size.extras:
-        one = size._replace(seeds=1)
-        more = trained(
-            "trained_pids",
-            "PIDs trained on",
-            lambda options: trained_pids(pids, trainer, size, key, options),
-        )
-        convolved = trained(
-            "own_cnn",
-            "A convolutional network for each lung",
-            lambda options: networks(trainer, one, key, options, "cnn"),
-        )
-        residual = trained(
-            "residual",
-            "A PID and a network for each lung",
-            lambda options: networks_on_pids(pids, trainer, size, key, options),
-        )
+        words = "PIDs trained on"
+        more = training("trained_pids", words, trained_pids, pids, *study)
+        words = "A convolutional network for each lung"
+        convolved = training("own_cnn", words, networks, "cnn", 1, *study)
+        words = "A PID and a network for each lung"
+        residual = training("residual", words, networks_on_pids, pids, *study)
         online = stages.stage(
             "online",
             "GPC around the best PIDs",
             lambda: online_learners(train, pids, trainer, size.sensor_delay),
         )
-        found += pid_contenders(more, trainer)
-        found += [
-            bang_bang(trainer),
+        contenders += pid_contenders(more, trainer)
+        contenders += [
+            by_hand["bang-bang"],
             Contender("GPC", 0, online, False),
             planners(trainer),
             Contender("CNN", 0, unstack(convolved)[0], False),
             Contender("PID + MLP", 0, unstack(residual)[0], False),
         ]
     for seed, controllers in enumerate(unstack(own)):
-        found.append(Contender("MLP", seed, controllers, False))
+        contenders.append(Contender("MLP", seed, controllers, False))
     for seed, controller in enumerate(unstack(shared)):
-        alike = repeat(controller, trainer.count)
-        found.append(Contender("MLP for all", seed, alike, True))
-    return found
+        alike = repeated(controller, trainer.count)
+        contenders.append(Contender("MLP for all", seed, alike, True))
+    return contenders
 
 
 def _least_errors(envs: Environment, steps: int) -> Any:

@@ -11,8 +11,8 @@ from jaxtyping import Array
 from .._check import check_count, check_key
 from .._typing import PRNGKey
 from ..training import fit, Fitted
-from ._data import Breaths
-from ._learned import LearnedLung
+from ._breaths import Breaths
+from ._learned_lung import LearnedLung
 from ._stacking import stack, unstack
 
 

@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 from .._check import check_bool, check_count, check_key
 from .._module import as_module, parameter, positive, weight
 from .._results import RESULTS
-from .._typing import PRNGKey
+from .._typing import PRNGKey, RealScalar, State
 from ..dynamics import AbstractDynamics
-from ._data import Breaths
+from ._breaths import Breaths
 
 
 class LearnedLung(AbstractDynamics):
@@ -174,16 +174,16 @@ class LearnedLung(AbstractDynamics):
         """
         return self.p_mean + self.p_std * x[self.window]
 
-    def drawn(self, x: Array, pressure: Any, share: Any) -> Array:
-        """The state with its newest pressure drawn to another one.
+    def corrected(self, x: State, pressure: RealScalar, gain: RealScalar) -> State:
+        """The state with its newest pressure corrected by a measured one.
 
-        **Arguments:** `x`: the state. `pressure`: such as what a sensor read [cmH2O].
-        `share`: how far it is drawn there, from 0 to 1.
+        **Arguments:** `x`: the state. `pressure`: what a sensor read [cmH2O]. `gain`:
+        how much of the difference is made up for, from 0 to 1.
 
         **Returns:** the state.
         """
-        surplus = (pressure - self.pressure(x)) / self.p_std
-        return x.at[self.window].add((share * surplus).astype(x.dtype))
+        innovation = (pressure - self.pressure(x)) / self.p_std
+        return x.at[self.window].add((gain * innovation).astype(x.dtype))
 
     def observe(self, t, x):
         return jnp.reshape(self.pressure(x), (1,)).astype(x.dtype)

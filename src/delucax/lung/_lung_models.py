@@ -12,8 +12,7 @@ from jaxtyping import Array
 from .._check import check_count, check_key, check_step
 from .._module import as_module, parameter, positive, weight
 from .._typing import PRNGKey
-from ..dynamics import Discretized
-from ._environment import PressureSensor
+from ..dynamics import Delayed, Discretized
 from ._lungs import AbstractLung, SingleCompartment
 from ._valves import Valves
 
@@ -43,7 +42,7 @@ class LungModel(eqx.Module):
         ```
     """
 
-    dynamics: PressureSensor
+    dynamics: Delayed
     peep: Array = parameter()
 
     def __init__(
@@ -60,7 +59,8 @@ class LungModel(eqx.Module):
                 f"{where}: system must be an AbstractLung, got {type(system).__name__}."
             )
         check_step(dt, where)
-        self.dynamics = PressureSensor(Discretized(system, dt, solver), sensor_delay)
+        delay = check_count(sensor_delay, "sensor_delay", where, least=0)
+        self.dynamics = Delayed(Discretized(system, dt, solver), sensor=delay)
         self.peep = peep
 
     @property
@@ -165,9 +165,6 @@ class NeuralLung(AbstractLung):
     def pressure(self, x):
         return self.p_mean + self.p_std * x[0]
 
-    def outflow(self, x):
-        return 0 * x[0]
-
     def resting(self, pressure):
         first = jnp.reshape((pressure - self.p_mean) / self.p_std, (1,))
         return jnp.concatenate([first, jnp.zeros(self.hidden)])
@@ -254,9 +251,6 @@ class GreyBoxLung(AbstractLung):
     def pressure(self, x):
         rest = self.network(self._inputs(x))
         return self.single.pressure(x[:3]) + self.p_std * rest
-
-    def outflow(self, x):
-        return self.single.outflow(x[:3])
 
     def resting(self, pressure):
         physical = self.single.resting(pressure)

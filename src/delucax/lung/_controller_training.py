@@ -1,4 +1,4 @@
-"""Training controllers in fitted lungs."""
+"""Training controllers of breaths."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,75 +9,18 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from .._check import (
-    check_bool,
-    check_count,
-    check_key,
-    check_positive,
-    check_range,
-)
+from .._check import check_bool, check_count, check_key, check_positive
 from .._controller import AbstractController
-from .._module import function_field, parameter
+from .._module import function_field
 from .._typing import PRNGKey
-from ..costs import AbstractCost
-from ..dynamics import AbstractDynamics
 from ..environments import Environment
 from ..simulation import rollout
 from ..training import analytic, fit, Fitted
-from ..training._loss import cost_and_metrics
-from ._data import _waveform_of, LENGTH, PIPS
-from ._environment import BreathCost, ventilation
-from ._fitting import kept_at
-from ._learned import LearnedLung
-from ._models import LungModel
-from ._policies import Breathing
+from ._breath_controllers import Breathing
+from ._lung_fitting import kept_at
 from ._stacking import count_of
-from ._waveform import as_pips, at_pip, BreathWaveform, check_waveform
-
-
-def lung_environment(
-    model: Any,
-    waveform: BreathWaveform | None = None,
-    *,
-    noise: Any = 0.2,
-    horizon: int = LENGTH,
-) -> Environment:
-    """A task in a fitted lung: where controllers are trained.
-
-    **Arguments:**
-
-    - `model`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][].
-    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]; the default one by
-        default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
-    - `horizon`: steps an episode, 29 by default.
-
-    **Returns:** an [`delucax.Environment`][].
-
-    **Raises:** `ValueError` if it is no such model, or `waveform` is none.
-
-    !!! example
-
-        ```python
-        from delucax import lung
-
-        env = lung.lung_environment(lung.LungModel(lung.SingleCompartment()))
-        ```
-    """
-    if isinstance(model, LungModel):
-        inner, delay = model.dynamics.dynamics, model.dynamics.delay
-        rest = model.system.resting(model.peep)
-    elif isinstance(model, LearnedLung):
-        inner, delay, rest = model, 0, model.resting()
-    else:
-        raise ValueError(
-            "lung_environment: model must be a LearnedLung or a LungModel, got "
-            f"{type(model).__name__}."
-        )
-    arguments = ventilation(
-        inner, waveform, rest=rest, sensor_delay=delay, noise=noise, horizon=horizon
-    )
-    return Environment(**arguments)
+from ._ventilation import waveform_of
+from ._waveform import as_pips, at_pip, LENGTH, PIPS
 
 
 def breath_error(
@@ -120,7 +63,7 @@ def breath_error(
         ```
     """
     where = "breath_error"
-    waveform = _waveform_of(env, where)
+    waveform = waveform_of(env, where)
     if not isinstance(controller, AbstractController):
         raise ValueError(
             f"{where}: controller must be an AbstractController, got "
@@ -143,110 +86,81 @@ def breath_error(
     return jax.vmap(one)(pips, keys)
 
 
-class _Careful(AbstractCost):
-    """A cost of breaths, and ten times what the pressure is above a limit."""
-
-    inner: BreathCost
-    limit: Array = parameter()
-
-    @property
-    def waveform(self) -> BreathWaveform:
-        """That of the cost."""
-        return self.inner.waveform
-
-    def __call__(self, t, x, u):
-        excess = jnp.maximum(x[self.inner.index] - self.limit, 0)
-        return (self.inner(t, x, u) + 10 * excess).astype(x.dtype)
-
-
-class _Ventilated(eqx.Module):
+class _TrackingError(eqx.Module):
     """The mean error of a batch of controllers, each in its own lungs."""
 
-    models: Any
-    waveform: BreathWaveform
+    envs: Environment
     pips: Array
-    noise: Array
-    limit: Array | None
     horizon: int = eqx.field(static=True)
     shared: bool = eqx.field(static=True)
     throw: bool = eqx.field(static=True)
 
-    def _counted(self, errors):
+    def _counted(self, errors: Array) -> Array:
         """Errors, 0 for those that are not finite and are not to raise."""
         return errors if self.throw else jnp.where(jnp.isfinite(errors), errors, 0)
 
-    def __call__(self, controllers, key):
-        def one(model, controller, key):
-            env = model
-            if not isinstance(model, Environment):
-                env = lung_environment(
-                    model, self.waveform, noise=self.noise, horizon=self.horizon
-                )
-            if self.limit is not None:
-                cost: Any = env.cost
-                careful = _Careful(cost, self.limit)
-                env = eqx.tree_at(lambda env: env.cost, env, careful)
-            pips = self.pips
-            options: Any = dict(pips=pips, horizon=self.horizon, key=key)
+    def __call__(self, controllers: Any, key: PRNGKey) -> Array:
+        def in_lung(env, controller, key):
+            options: Any = dict(pips=self.pips, horizon=self.horizon, key=key)
             return jnp.mean(breath_error(env, controller, **options))
 
-        over_lungs = eqx.filter_vmap(
-            one, in_axes=(eqx.if_array(0), None if self.shared else eqx.if_array(0), 0)
-        )
+        own = None if self.shared else eqx.if_array(0)
+        in_lungs = eqx.filter_vmap(in_lung, in_axes=(eqx.if_array(0), own, 0))
 
-        def of(controllers, key):
-            keys = jax.random.split(key, count_of(self.models))
-            errors = over_lungs(self.models, controllers, keys)
+        def of_seed(controllers, key):
+            keys = jax.random.split(key, count_of(self.envs))
+            errors = in_lungs(self.envs, controllers, keys)
             if not self.shared:
                 errors = self._counted(errors)
             return self._counted(jnp.mean(errors))
 
         keys = jax.random.split(key, count_of(controllers))
-        return jnp.mean(eqx.filter_vmap(of)(controllers, keys))
+        return jnp.mean(eqx.filter_vmap(of_seed)(controllers, keys))
 
 
-class _Apart(eqx.Module):
-    """A gradient that counts as 0 for a controller for which it is not finite."""
+class _FiniteGradients(eqx.Module):
+    """A gradient that counts as 0 for a controller for which it is not finite.
+
+    Controllers are stacked along the first `axes` axes of each leaf.
+    """
 
     gradient: Callable[..., Any] = function_field()
     axes: int = eqx.field(static=True)
 
-    def __call__(self, loss, values, key):
+    def __call__(self, loss: Any, values: Any, key: PRNGKey) -> tuple[Any, Any]:
         value, slope = self.gradient(loss, values, key)
-        fine: Any = True
+        finite: Any = True
         for leaf in jax.tree.leaves(slope):
             inner = tuple(range(self.axes, leaf.ndim))
-            fine = fine & jnp.all(jnp.isfinite(leaf), axis=inner)
+            finite = finite & jnp.all(jnp.isfinite(leaf), axis=inner)
 
-        def kept(leaf):
-            more = (1,) * (leaf.ndim - self.axes)
-            return jnp.where(fine.reshape(fine.shape + more), leaf, 0)
+        def finite_or_zero(leaf):
+            inner = tuple(range(self.axes, leaf.ndim))
+            return jnp.where(jnp.expand_dims(finite, inner), leaf, 0)
 
-        cost, metrics = cost_and_metrics(value, "train_controllers")
-        lost = jnp.sum(~fine).astype(cost.dtype)
-        return (cost, metrics | {"diverged": lost}), jax.tree.map(kept, slope)
+        cost, metrics = value if isinstance(value, tuple) else (value, {})
+        diverged = jnp.sum(~finite).astype(cost.dtype)
+        value = cost, metrics | {"diverged": diverged}
+        return value, jax.tree.map(finite_or_zero, slope)
 
 
 def train_controllers(
-    models: Any,
+    envs: Environment,
     controllers: Any,
     *,
     key: PRNGKey,
-    waveform: BreathWaveform | None = None,
     shared: bool = False,
     steps: int = 400,
     learning_rate: float = 1e-2,
     pips: Any = PIPS,
-    noise: Any = 0.2,
     horizon: int = LENGTH,
-    limit: Any = None,
     trainable: Any = None,
     gradient: Any = None,
     progress: bool = False,
     checkpoint: Any = None,
     throw: bool = True,
 ) -> Fitted:
-    """Train controllers through fitted lungs, by the gradient of their error.
+    """Train controllers in lungs, by the gradient of their error.
 
     The loss is [`delucax.lung.breath_error`][] over all peak pressures, with fresh
     noise in each step; Adam with a learning rate that falls to 0 along a cosine. As
@@ -254,21 +168,17 @@ def train_controllers(
 
     **Arguments:**
 
-    - `models`: lungs, stacked by [`delucax.lung.stack`][]; or tasks of lungs, stacked,
-        with a waveform and a noise of their own.
+    - `envs`: tasks of lungs, stacked by [`delucax.lung.stack`][]. Of fitted lungs
+        that are stacked, `equinox.filter_vmap(lung_environment)(models)` makes them.
     - `controllers`: of the inspiratory valve, stacked over seeds, and within a seed
         over the lungs: leaves of shape `(seeds, lungs, ...)`. With `shared`, of shape
         `(seeds, ...)`.
     - `key`: a random key, for the noise.
-    - `waveform`: a [`delucax.lung.BreathWaveform`][]; the default one by default.
     - `shared`: whether one controller is for all lungs; false by default.
     - `steps`: 400 by default.
     - `learning_rate`: 1e-2 by default.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
     - `horizon`: steps an episode, 29 by default.
-    - `limit`: a pressure above which each cmH2O counts ten times more, as an alarm is
-        worse than an error [cmH2O]; none by default.
     - `trainable`, `gradient`, `progress`, `checkpoint`: of [`delucax.training.fit`][];
         the weights, the analytic gradient, no bar and no file by default.
     - `throw`: raise if an error or its gradient is NaN or infinite (default); if false,
@@ -286,38 +196,29 @@ def train_controllers(
     !!! example
 
         ```python
-        import equinox as eqx
         import jax
         from delucax import lung
 
-        models = lung.stack([lung.LungModel(lung.SingleCompartment())])
+        envs = lung.stack([lung.single_compartment(R) for R in (5.0, 20.0)])
         forward = lung.FeedForward(lung.BreathWaveform(), gain=0.5)
-        one = lung.stack([lung.stack([forward])])
+        one = lung.stack([lung.stack([forward, forward])])
         few = dict(steps=3, horizon=2, pips=[20.0])
-        lung.train_controllers(models, one, key=jax.random.key(0), **few).history.loss
+        lung.train_controllers(envs, one, key=jax.random.key(0), **few).history.loss
         ```
     """
     where = "train_controllers"
-    one_of = LungModel | Environment
-    dynamics = models.dynamics if isinstance(models, one_of) else models
-    if not isinstance(dynamics, AbstractDynamics) or jnp.ndim(dynamics.dt) != 1:
+    if not isinstance(envs, Environment) or jnp.ndim(envs.dt) != 1:
         raise ValueError(
-            f"{where}: models must be LearnedLungs, LungModels or tasks of lungs that "
-            f"delucax.lung.stack made one of, got one {type(models).__name__}."
+            f"{where}: envs must be tasks of lungs that delucax.lung.stack made one "
+            f"of, got one {type(envs).__name__}; equinox.filter_vmap("
+            "delucax.lung.lung_environment) makes them of stacked models."
         )
-    waveform = BreathWaveform() if waveform is None else waveform
-    check_waveform(waveform, where)
+    waveform = waveform_of(envs, where, stacked=True)
     steps = check_count(steps, "steps", where)
     check_positive(learning_rate, "learning_rate", where)
-    check_range(noise, "noise", where)
-    if limit is not None:
-        check_positive(limit, "limit", where)
-    loss = _Ventilated(
-        models,
-        waveform,
+    loss = _TrackingError(
+        envs,
         as_pips(pips, (waveform, controllers), where),
-        jnp.asarray(noise, float),
-        None if limit is None else jnp.asarray(limit, float),
         check_count(horizon, "horizon", where),
         check_bool(shared, "shared", where),
         check_bool(throw, "throw", where),
@@ -330,7 +231,7 @@ def train_controllers(
         steps,
         key=check_key(key, where),
         trainable=trainable,
-        gradient=gradient if throw else _Apart(gradient, 1 if shared else 2),
+        gradient=gradient if throw else _FiniteGradients(gradient, 1 if shared else 2),
         progress=progress,
         throw=throw,
         **kept_at(checkpoint),

@@ -1,6 +1,5 @@
 """The lungs by name."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,30 +7,38 @@ import diffrax
 
 from .._check import check_count
 from .._module import load
-from ..dynamics import Delayed, Discretized
+from ..dynamics import AbstractDynamics, Delayed, Discretized
 from ..environments import Environment
-from ..environments._registry import finish
-from ._environment import ventilation
-from ._learned import LearnedLung
-from ._lungs import BalloonLung, DelayLung, DoubleCompartment, SingleCompartment
+from ._learned_lung import LearnedLung
+from ._lungs import (
+    AbstractLung,
+    BalloonLung,
+    DelayLung,
+    DoubleCompartment,
+    SingleCompartment,
+)
 from ._valves import Valves
+from ._ventilation import ventilated
 from ._waveform import BreathWaveform, check_peep
 
 
 def _task(
-    task: Callable[..., Environment],
-    plant: Any,
-    dynamics: Discretized | Delayed,
-    environment: dict[str, Any],
-    **breath: Any,
+    task: Any,
+    plant: AbstractLung,
+    dynamics: AbstractDynamics,
+    *,
+    waveform: BreathWaveform | None = None,
+    **options: Any,
 ) -> Environment:
-    """A lung that rests at PEEP and is to breathe; see `ventilation`."""
-    rest = plant.resting(plant.valves.peep)
+    """A lung that rests at the PEEP of its valves and is to breathe."""
+    waveform = BreathWaveform() if waveform is None else waveform
+    valves: Any = plant.valves  # pyright: ignore[reportAttributeAccessIssue]
+    rest = plant.resting(valves.peep)
     if isinstance(dynamics, Delayed):
         rest = dynamics.filled(rest)
-    arguments = ventilation(dynamics, rest=rest, **breath)
-    check_peep(arguments["cost"].waveform, plant.valves, task.__name__)
-    return finish(task, arguments, environment)
+    env = ventilated(task, dynamics, waveform, rest=rest, **options)
+    check_peep(waveform, valves, task.__name__)
+    return env
 
 
 def balloon_lung(
@@ -40,34 +47,26 @@ def balloon_lung(
     rest: Any = 1.5,
     *,
     valves: Valves | None = None,
-    waveform: BreathWaveform | None = None,
-    sensor_delay: int = 0,
-    noise: Any = 0.0,
     dt: Any = 0.03,
     horizon: int = 100,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **options: Any,
 ) -> Environment:
     """Make a balloon breathe as a waveform says.
 
-    The controls are (u_in [%], u_out), the observation is the pressure of the airway
-    [cmH2O], and the state holds it too, see [`delucax.lung.PressureSensor`][]. Cost
-    `|p - r(t)|` a step of the inspiratory phase, [`delucax.lung.BreathCost`][]. Starts
-    at rest at PEEP. Never terminates.
+    The controls, the observation, the state and the cost are those of
+    [`delucax.lung.ventilation`][]. Starts at rest at PEEP. Never terminates.
 
     **Arguments:**
 
     - `resistance`, `stiffness`, `rest`, `valves`: of [`delucax.lung.BalloonLung`][].
-    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
-        minute, by default.
-    - `sensor_delay`: steps until a pressure is seen, 0 by default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
     - `dt`: the control interval, 0.03 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][].
+    - `**options`: `waveform`, `sensor_delay`, `noise` and others of
+        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -90,11 +89,8 @@ def balloon_lung(
         balloon_lung,
         plant,
         Discretized(plant, dt, solver, substeps),
-        environment,
-        waveform=waveform,
-        sensor_delay=sensor_delay,
-        noise=noise,
         horizon=horizon,
+        **options,
     )
 
 
@@ -106,14 +102,11 @@ def delay_lung(
     *,
     delay: int = 5,
     valves: Valves | None = None,
-    waveform: BreathWaveform | None = None,
-    sensor_delay: int = 0,
-    noise: Any = 0.0,
     dt: Any = 0.03,
     horizon: int = 100,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 4,
-    **environment: Any,
+    **options: Any,
 ) -> Environment:
     """Make a balloon breathe through a long pipe, which what is done must first pass.
 
@@ -125,16 +118,13 @@ def delay_lung(
     - `resistance`, `stiffness`, `rest`, `pipe`, `valves`: of
         [`delucax.lung.DelayLung`][].
     - `delay`: steps until a control acts, 5 by default.
-    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
-        minute, by default.
-    - `sensor_delay`: steps until a pressure is seen, 0 by default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
     - `dt`: the control interval, 0.03 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 4 by default: air rushes out of the pipe in
         some 25 ms.
-    - `**environment`: other arguments of [`delucax.Environment`][].
+    - `**options`: `waveform`, `sensor_delay`, `noise` and others of
+        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -158,11 +148,8 @@ def delay_lung(
         delay_lung,
         plant,
         Delayed(Discretized(plant, dt, solver, substeps), controls=delay),
-        environment,
-        waveform=waveform,
-        sensor_delay=sensor_delay,
-        noise=noise,
         horizon=horizon,
+        **options,
     )
 
 
@@ -171,14 +158,11 @@ def single_compartment(
     compliance: Any = 20.0,
     *,
     valves: Valves | None = None,
-    waveform: BreathWaveform | None = None,
-    sensor_delay: int = 0,
-    noise: Any = 0.0,
     dt: Any = 0.03,
     horizon: int = 100,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **options: Any,
 ) -> Environment:
     """Make a lung of one compartment breathe as a waveform says.
 
@@ -187,15 +171,12 @@ def single_compartment(
     **Arguments:**
 
     - `resistance`, `compliance`, `valves`: of [`delucax.lung.SingleCompartment`][].
-    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
-        minute, by default.
-    - `sensor_delay`: steps until a pressure is seen, 0 by default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
     - `dt`: the control interval, 0.03 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][].
+    - `**options`: `waveform`, `sensor_delay`, `noise` and others of
+        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -215,11 +196,8 @@ def single_compartment(
         single_compartment,
         plant,
         Discretized(plant, dt, solver, substeps),
-        environment,
-        waveform=waveform,
-        sensor_delay=sensor_delay,
-        noise=noise,
         horizon=horizon,
+        **options,
     )
 
 
@@ -231,14 +209,13 @@ def double_compartment(
     imbalance: Any = 10.0,
     *,
     valves: Valves | None = None,
-    waveform: BreathWaveform | None = None,
     sensor_delay: int = 2,
     noise: Any = 0.2,
     dt: Any = 0.03,
     horizon: int = 100,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 2,
-    **environment: Any,
+    **options: Any,
 ) -> Environment:
     """Make a lung of a fast and a slow compartment breathe, seen late and with noise.
 
@@ -249,8 +226,6 @@ def double_compartment(
 
     - `resistance`, `compliance`, `central`, `share`, `imbalance`, `valves`: of
         [`delucax.lung.DoubleCompartment`][].
-    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
-        minute, by default.
     - `sensor_delay`: steps until a pressure is seen, 2 by default.
     - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
     - `dt`: the control interval, 0.03 by default.
@@ -258,7 +233,8 @@ def double_compartment(
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 2 by default: with the expiratory valve open
         the fast compartment of a narrow lung is empty within some 10 ms.
-    - `**environment`: other arguments of [`delucax.Environment`][].
+    - `**options`: `waveform`, `sensor_delay`, `noise` and others of
+        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -280,21 +256,18 @@ def double_compartment(
         double_compartment,
         plant,
         Discretized(plant, dt, solver, substeps),
-        environment,
-        waveform=waveform,
         sensor_delay=sensor_delay,
         noise=noise,
         horizon=horizon,
+        **options,
     )
 
 
 def learned_lung(
     model: LearnedLung | None = None,
     *,
-    waveform: BreathWaveform | None = None,
-    noise: Any = 0.0,
     horizon: int = 100,
-    **environment: Any,
+    **options: Any,
 ) -> Environment:
     """Make a lung breathe that was learned from breaths.
 
@@ -307,11 +280,9 @@ def learned_lung(
         library, learned from breaths of the task `lung/double_compartment`; its sensor
         is two samples late, and so is its pressure. In the repository,
         `python -m benchmarks.learned_lung` makes it.
-    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
-        minute, by default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `**environment`: other arguments of [`delucax.Environment`][].
+    - `**options`: `waveform`, `noise` and others of
+        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -334,7 +305,6 @@ def learned_lung(
         raise ValueError(
             f"learned_lung: model must be a LearnedLung, got {type(model).__name__}."
         )
-    arguments = ventilation(
-        model, waveform, rest=model.resting(), noise=noise, horizon=horizon
+    return ventilated(
+        learned_lung, model, rest=model.resting(), horizon=horizon, **options
     )
-    return finish(learned_lung, arguments, environment)

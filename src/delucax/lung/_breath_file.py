@@ -14,8 +14,10 @@ import numpy as np
 
 from .._check import as_path, check_count, check_key, check_positive
 from .._typing import PRNGKey
-from ._data import Breaths, explore, LENGTH
-from ._tasks import double_compartment
+from ._breaths import Breaths
+from ._exploration import explore
+from ._lung_tasks import double_compartment
+from ._waveform import LENGTH
 
 
 COLUMNS = ("id", "breath_id", "R", "C", "time_step", "u_in", "u_out", "pressure")
