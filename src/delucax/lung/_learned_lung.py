@@ -9,11 +9,12 @@ import jax.random as jr
 from jaxtyping import Array, Float
 
 from .._check import check_bool, check_count, check_key
-from .._module import as_module, parameter, positive, weight
+from .._module import parameter, positive, weight
 from .._results import RESULTS
 from .._typing import PRNGKey, RealScalar, State
 from ..dynamics import AbstractDynamics
 from ._breaths import Breaths
+from ._tanh_network import tanh_network
 
 
 class LearnedLung(AbstractDynamics):
@@ -108,13 +109,14 @@ class LearnedLung(AbstractDynamics):
                 f"{where}: breaths must be Breaths, got {type(breaths).__name__}."
             )
         check_key(key, where)
-        counts = dict(
-            boundary=boundary,
-            boundary_width=boundary_width,
-            u_window=u_window,
-            p_window=p_window,
-        )
-        for name, value in counts.items():
+        for name, value in (
+            ("width", width),
+            ("depth", depth),
+            ("boundary", boundary),
+            ("boundary_width", boundary_width),
+            ("u_window", u_window),
+            ("p_window", p_window),
+        ):
             check_count(value, name, where)
         hidden_key, output_key, valve_key, key = jr.split(key, 4)
         size = 2 * max(u_window, p_window, boundary)
@@ -122,17 +124,9 @@ class LearnedLung(AbstractDynamics):
         self.hidden = jr.normal(hidden_key, (*shape, size)) / size**0.5
         self.output = 0.1 * jr.normal(output_key, shape) / boundary_width**0.5
         self.line = jnp.zeros(u_window + p_window)
-        tanh, same = as_module(jnp.tanh), as_module(jax.nn.identity)
-        self.valve = eqx.nn.MLP("scalar", "scalar", 8, 1, tanh, same, key=valve_key)
-        self.network = eqx.nn.MLP(
-            u_window + p_window,
-            "scalar",
-            check_count(width, "width", where),
-            check_count(depth, "depth", where),
-            tanh,
-            same,
-            key=key,
-        )
+        self.valve = tanh_network("scalar", "scalar", 8, 1, key=valve_key)
+        inputs = u_window + p_window
+        self.network = tanh_network(inputs, "scalar", width, depth, key=key)
         closed = breaths.u_out < 0.5
         count = jnp.sum(closed)
         mean = lambda a: jnp.sum(jnp.where(closed, a, 0)) / count  # noqa: E731
@@ -197,10 +191,10 @@ class LearnedLung(AbstractDynamics):
     def _late(self, straight: Array, pressures: Array) -> Array:
         """The next pressure, after the first steps."""
         z = jnp.concatenate([straight, pressures[: self.p_window]])
-        found = self.network(z)
+        predicted = self.network(z)
         if self.published:
-            return found
-        return pressures[0] + self.line @ z + found
+            return predicted
+        return pressures[0] + self.line @ z + predicted
 
     def _early(self, history: Array, late: Any, hidden: Array, output: Array) -> Array:
         """The next pressure in one of the first steps; `late` is that afterwards."""
@@ -290,8 +284,7 @@ class LearnedLung(AbstractDynamics):
             known = _windows(jnp.append(start[:0:-1], recorded), n)[:-1]
             early = jax.vmap(begin)(known[:first], inputs)
             late = jax.vmap(go_on)(known[first:], straight[first:])
-        found = jnp.concatenate([start[:1], early, late])
-        return self.p_mean + self.p_std * found
+        return self.p_mean + self.p_std * jnp.concatenate([start[:1], early, late])
 
 
 def _windows(values: Array, size: int) -> Array:

@@ -10,10 +10,11 @@ import jax.random as jr
 from jaxtyping import Array
 
 from .._check import check_count, check_key, check_step
-from .._module import as_module, parameter, positive, weight
+from .._module import parameter, positive, weight
 from .._typing import PRNGKey
 from ..dynamics import Delayed, Discretized
 from ._lungs import AbstractLung, SingleCompartment
+from ._tanh_network import tanh_network
 from ._valves import Valves
 
 
@@ -146,15 +147,11 @@ class NeuralLung(AbstractLung):
     ):
         where = "NeuralLung"
         self.hidden = check_count(hidden, "hidden", where)
-        self.network = eqx.nn.MLP(
-            self.hidden + 3,
-            self.hidden + 1,
-            check_count(width, "width", where),
-            check_count(depth, "depth", where),
-            as_module(jnp.tanh),
-            as_module(jax.nn.identity),
-            key=check_key(key, where),
-        )
+        check_count(width, "width", where)
+        check_count(depth, "depth", where)
+        check_key(key, where)
+        sizes = self.hidden + 3, self.hidden + 1, width, depth
+        self.network = tanh_network(*sizes, key=key)
         self.p_mean, self.p_std, self.rate = p_mean, p_std, rate
         self.valves = Valves() if valves is None else valves
 
@@ -230,13 +227,11 @@ class GreyBoxLung(AbstractLung):
         check_key(key, where)
         width = check_count(width, "width", where)
         self.single = SingleCompartment() if single is None else single
-        tanh, same = as_module(jnp.tanh), as_module(jax.nn.identity)
-        network, memory = (
-            eqx.nn.MLP(3, "scalar", width, 1, tanh, same, key=k) for k in jr.split(key)
+        network, self.memory = (
+            tanh_network(3, "scalar", width, 1, key=k) for k in jr.split(key)
         )
         last = lambda mlp: mlp.layers[-1].weight  # noqa: E731
         self.network = eqx.tree_at(last, network, 0.1 * last(network))
-        self.memory = memory
         self.p_std, self.rate = p_std, rate
 
     @property

@@ -1,5 +1,6 @@
 """The lungs by name."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import diffrax
 
 from .._check import check_count
 from .._module import load
-from ..dynamics import AbstractDynamics, Delayed, Discretized
+from ..dynamics import Delayed, Discretized
 from ..environments import Environment
 from ._learned_lung import LearnedLung
 from ._lungs import (
@@ -23,20 +24,30 @@ from ._waveform import BreathWaveform, check_peep
 
 
 def _task(
-    task: Any,
+    task: Callable[..., Environment],
     plant: AbstractLung,
-    dynamics: AbstractDynamics,
-    *,
+    delay: int = 0,
+    /,
     waveform: BreathWaveform | None = None,
+    *,
+    dt: Any = 0.03,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
     **options: Any,
 ) -> Environment:
-    """A lung that rests at the PEEP of its valves and is to breathe."""
-    waveform = BreathWaveform() if waveform is None else waveform
+    """A lung that rests at the PEEP of its valves and is to breathe.
+
+    `task` is the function that a user called, which errors name, and `delay` the steps
+    until a control acts.
+    """
     valves: Any = plant.valves  # pyright: ignore[reportAttributeAccessIssue]
+    waveform = BreathWaveform() if waveform is None else waveform
     rest = plant.resting(valves.peep)
-    if isinstance(dynamics, Delayed):
+    dynamics = Discretized(plant, dt, solver, substeps)
+    if delay:
+        dynamics = Delayed(dynamics, controls=delay)
         rest = dynamics.filled(rest)
-    env = ventilated(task, dynamics, waveform, rest=rest, **options)
+    env = ventilated((task, _task), dynamics, rest, waveform, **options)
     check_peep(waveform, valves, task.__name__)
     return env
 
@@ -47,10 +58,7 @@ def balloon_lung(
     rest: Any = 1.5,
     *,
     valves: Valves | None = None,
-    dt: Any = 0.03,
     horizon: int = 100,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
     **options: Any,
 ) -> Environment:
     """Make a balloon breathe as a waveform says.
@@ -61,12 +69,10 @@ def balloon_lung(
     **Arguments:**
 
     - `resistance`, `stiffness`, `rest`, `valves`: of [`delucax.lung.BalloonLung`][].
-    - `dt`: the control interval, 0.03 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 1 by default.
-    - `**options`: `waveform`, `sensor_delay`, `noise` and others of
-        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
+    - `**options`: the control interval `dt` (0.03 by default), `solver` and `substeps`
+        of [`delucax.Discretized`][]; `waveform`, `sensor_delay`, `noise` and others of
+        [`delucax.lung.ventilation`][]; those of [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -85,13 +91,7 @@ def balloon_lung(
         ```
     """
     plant = BalloonLung(resistance, stiffness, rest, valves or Valves())
-    return _task(
-        balloon_lung,
-        plant,
-        Discretized(plant, dt, solver, substeps),
-        horizon=horizon,
-        **options,
-    )
+    return _task(balloon_lung, plant, horizon=horizon, **options)
 
 
 def delay_lung(
@@ -102,9 +102,7 @@ def delay_lung(
     *,
     delay: int = 5,
     valves: Valves | None = None,
-    dt: Any = 0.03,
     horizon: int = 100,
-    solver: diffrax.AbstractSolver | None = None,
     substeps: int = 4,
     **options: Any,
 ) -> Environment:
@@ -118,13 +116,12 @@ def delay_lung(
     - `resistance`, `stiffness`, `rest`, `pipe`, `valves`: of
         [`delucax.lung.DelayLung`][].
     - `delay`: steps until a control acts, 5 by default.
-    - `dt`: the control interval, 0.03 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 4 by default: air rushes out of the pipe in
         some 25 ms.
-    - `**options`: `waveform`, `sensor_delay`, `noise` and others of
-        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
+    - `**options`: the control interval `dt` (0.03 by default), `solver` and `substeps`
+        of [`delucax.Discretized`][]; `waveform`, `sensor_delay`, `noise` and others of
+        [`delucax.lung.ventilation`][]; those of [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -144,13 +141,8 @@ def delay_lung(
     """
     plant = DelayLung(resistance, stiffness, rest, pipe, valves or Valves())
     delay = check_count(delay, "delay", "delay_lung", least=0)
-    return _task(
-        delay_lung,
-        plant,
-        Delayed(Discretized(plant, dt, solver, substeps), controls=delay),
-        horizon=horizon,
-        **options,
-    )
+    options = dict(options, horizon=horizon, substeps=substeps)
+    return _task(delay_lung, plant, delay, **options)
 
 
 def single_compartment(
@@ -158,10 +150,7 @@ def single_compartment(
     compliance: Any = 20.0,
     *,
     valves: Valves | None = None,
-    dt: Any = 0.03,
     horizon: int = 100,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
     **options: Any,
 ) -> Environment:
     """Make a lung of one compartment breathe as a waveform says.
@@ -171,10 +160,7 @@ def single_compartment(
     **Arguments:**
 
     - `resistance`, `compliance`, `valves`: of [`delucax.lung.SingleCompartment`][].
-    - `dt`: the control interval, 0.03 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 1 by default.
     - `**options`: `waveform`, `sensor_delay`, `noise` and others of
         [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
@@ -192,13 +178,7 @@ def single_compartment(
         ```
     """
     plant = SingleCompartment(resistance, compliance, valves or Valves())
-    return _task(
-        single_compartment,
-        plant,
-        Discretized(plant, dt, solver, substeps),
-        horizon=horizon,
-        **options,
-    )
+    return _task(single_compartment, plant, horizon=horizon, **options)
 
 
 def double_compartment(
@@ -211,9 +191,7 @@ def double_compartment(
     valves: Valves | None = None,
     sensor_delay: int = 2,
     noise: Any = 0.2,
-    dt: Any = 0.03,
     horizon: int = 100,
-    solver: diffrax.AbstractSolver | None = None,
     substeps: int = 2,
     **options: Any,
 ) -> Environment:
@@ -228,9 +206,7 @@ def double_compartment(
         [`delucax.lung.DoubleCompartment`][].
     - `sensor_delay`: steps until a pressure is seen, 2 by default.
     - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
-    - `dt`: the control interval, 0.03 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 2 by default: with the expiratory valve open
         the fast compartment of a narrow lung is empty within some 10 ms.
     - `**options`: `waveform`, `sensor_delay`, `noise` and others of
@@ -252,15 +228,9 @@ def double_compartment(
     plant = DoubleCompartment(
         resistance, compliance, central, share, imbalance, valves or Valves()
     )
-    return _task(
-        double_compartment,
-        plant,
-        Discretized(plant, dt, solver, substeps),
-        sensor_delay=sensor_delay,
-        noise=noise,
-        horizon=horizon,
-        **options,
-    )
+    options = dict(options, sensor_delay=sensor_delay, noise=noise)
+    options = dict(options, horizon=horizon, substeps=substeps)
+    return _task(double_compartment, plant, **options)
 
 
 def learned_lung(
@@ -305,6 +275,5 @@ def learned_lung(
         raise ValueError(
             f"learned_lung: model must be a LearnedLung, got {type(model).__name__}."
         )
-    return ventilated(
-        learned_lung, model, rest=model.resting(), horizon=horizon, **options
-    )
+    rest = model.resting()
+    return ventilated((learned_lung,), model, rest, horizon=horizon, **options)

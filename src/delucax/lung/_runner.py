@@ -2,7 +2,7 @@
 
 import abc
 import time
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -187,7 +187,7 @@ def _step(environment, t, x, u):
     return environment.step(t, x, u).state
 
 
-class Recording(eqx.Module):
+class Recording(NamedTuple):
     """What a run at a ventilator leaves behind, in NumPy arrays.
 
     **Attributes:**
@@ -211,7 +211,7 @@ class Recording(eqx.Module):
     pressure: np.ndarray
     u_in: np.ndarray
     u_out: np.ndarray
-    aborted: bool = eqx.field(static=True)
+    aborted: bool
 
 
 def run_breaths(

@@ -136,11 +136,12 @@ class BreathCost(AbstractCost):
 
 
 def ventilated(
-    task: Callable[..., Environment],
+    tasks: tuple[Callable[..., Environment], ...],
     dynamics: AbstractDynamics,
+    rest: ArrayLike | None,
+    /,
     waveform: BreathWaveform | None = None,
     *,
-    rest: Any = None,
     sensor_delay: int = 0,
     noise: Any = 0.0,
     expiration: Any = 0.0,
@@ -148,7 +149,10 @@ def ventilated(
     horizon: int = 100,
     **environment: Any,
 ) -> Environment:
-    """The environment of a task of a lung: see `ventilation`."""
+    """The environment of a task of a lung, see `ventilation`.
+
+    `tasks` are the functions that take other arguments of it; errors name the first.
+    """
     check_range(noise, "noise", "ventilation")
     check_range(expiration, "expiration", "ventilation")
     delay = check_count(sensor_delay, "sensor_delay", "ventilation", least=0)
@@ -168,12 +172,14 @@ def ventilated(
         control_bounds=(jnp.zeros(2), jnp.array([100.0, 1.0])),
         horizon=horizon,
     )
-    return finish(task, arguments, environment, ventilated)
+    return finish(tasks[0], arguments, environment, *tasks[1:], ventilated)
 
 
 def ventilation(
     dynamics: AbstractDynamics,
     waveform: BreathWaveform | None = None,
+    *,
+    rest: ArrayLike | None = None,
     **options: Any,
 ) -> Environment:
     """A task in which a lung is ventilated.
@@ -194,7 +200,8 @@ def ventilation(
     - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
     - `expiration`, `limit`: of the cost; 0 and none by default.
     - `horizon`: steps an episode, 100 by default.
-    - other arguments of [`delucax.Environment`][], which hold instead.
+    - `**options`: of the above, and other arguments of [`delucax.Environment`][], which
+        hold instead.
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -211,7 +218,7 @@ def ventilation(
         env = lung.ventilation(dynamics, rest=plant.resting(5.0), noise=0.2)
         ```
     """
-    return ventilated(ventilation, dynamics, waveform, **options)
+    return ventilated((ventilation,), dynamics, rest, waveform, **options)
 
 
 def lung_environment(
@@ -256,7 +263,7 @@ def lung_environment(
             "lung_environment: model must be a LearnedLung or a LungModel, got "
             f"{type(model).__name__}."
         )
-    return ventilated(lung_environment, dynamics, waveform, rest=rest, **options)
+    return ventilated((lung_environment,), dynamics, rest, waveform, **options)
 
 
 def waveform_of(env: Any, where: str, *, stacked: bool = False) -> BreathWaveform:

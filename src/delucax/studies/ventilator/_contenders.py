@@ -9,26 +9,13 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
+from ... import lung
 from ..._typing import PRNGKey
 from ...controllers import GPC, LeakyPID, online_newton, OutputFeedback, PID
 from ...costs import Tracking
 from ...dynamics import LinearDynamics
 from ...environments import Environment
 from ...estimators import KalmanFilter
-from ...lung import (
-    BangBang,
-    BreathPolicy,
-    Breaths,
-    BreathWaveform,
-    FeedForward,
-    lung_environment,
-    pid_grid,
-    ShootingMPC,
-    stack,
-    Summed,
-    train_controllers,
-    unstack,
-)
 from ...training.sysid import arx
 from ._size import ABORT, Size
 from ._stacks import repeated
@@ -63,7 +50,7 @@ class Trainer(NamedTuple):
     """Trains controllers through simulators of the lungs, stacked."""
 
     simulators: Any
-    waveform: BreathWaveform
+    waveform: lung.BreathWaveform
 
     @property
     def count(self) -> int:
@@ -79,16 +66,20 @@ class Trainer(NamedTuple):
         self, start: Any, steps: int, key: PRNGKey, *, limit: Any = None, **options: Any
     ) -> Any:
         """The trained controllers: see [`delucax.lung.train_controllers`][]."""
-        in_simulator = lambda model: lung_environment(model, self.waveform, limit=limit)
+        in_simulator = lambda model: lung.lung_environment(
+            model, self.waveform, limit=limit
+        )
         envs = eqx.filter_vmap(in_simulator)(self.simulators)
-        return train_controllers(envs, start, steps=steps, key=key, **options).model
+        return lung.train_controllers(
+            envs, start, steps=steps, key=key, **options
+        ).model
 
 
 def designed(trainer: Trainer) -> dict[str, Contender]:
     """Those that need no data: no control, and the valve open or closed."""
     none = LeakyPID(0.0, 0.0, 0.0, dt=trainer.dt, reference=trainer.waveform)
     # A PID without gains, as which it compiles nothing of its own.
-    controllers = {"zero": none, "bang-bang": BangBang(trainer.waveform)}
+    controllers = {"zero": none, "bang-bang": lung.BangBang(trainer.waveform)}
     return {
         label: Contender(label, 0, repeated(one, trainer.count), True)
         for label, one in controllers.items()
@@ -102,11 +93,11 @@ def searched_pids(
     key = jr.fold_in(key, 6)
     best: dict[str, Any] = {}
     for name, kind, grid in (
-        ("leaky PID", LeakyPID, pid_grid(envs, key=key)),
-        ("PID", PID, pid_grid(envs, key=key, kind="true", **TRUE_PID)),
+        ("leaky PID", LeakyPID, lung.pid_grid(envs, key=key)),
+        ("PID", PID, lung.pid_grid(envs, key=key, kind="true", **TRUE_PID)),
     ):
         options = dict(dt=trainer.dt, reference=trainer.waveform)
-        best[name] = stack([kind(*gains, **options) for gains in grid.best()])
+        best[name] = lung.stack([kind(*gains, **options) for gains in grid.best()])
         best[f"{name} for all"] = kind(*grid.best_of_all(), **options)
     return best
 
@@ -121,16 +112,16 @@ def trained_pids(
     progress: bool,
 ) -> dict[str, Any]:
     """Those PIDs trained on, by themselves and with a feed-forward."""
-    forward = FeedForward(trainer.waveform, jnp.asarray(0.3))
+    forward = lung.FeedForward(trainer.waveform, jnp.asarray(0.3))
     starts = {f"trained {name}": pid for name, pid in pids.items()}
-    starts["PID + feed-forward"] = eqx.filter_vmap(Summed)(
+    starts["PID + feed-forward"] = eqx.filter_vmap(lung.Summed)(
         pids["PID"], repeated(forward, trainer.count)
     )
-    starts["PID + feed-forward for all"] = Summed(pids["PID for all"], forward)
+    starts["PID + feed-forward for all"] = lung.Summed(pids["PID for all"], forward)
     return {
-        name: unstack(
+        name: lung.unstack(
             trainer(
-                stack([start]),
+                lung.stack([start]),
                 size.pid_steps * (2 if "forward" in name else 1),
                 jr.fold_in(key, 6),
                 learning_rate=0.05,
@@ -160,37 +151,43 @@ def networks(
     size: Size,
     key: PRNGKey,
     **options: Any,
-) -> BreathPolicy:
+) -> lung.BreathPolicy:
     """A network for each lung, of shape `(seeds, lungs)`."""
     keys = jr.split(jr.fold_in(key, 7), (seeds, trainer.count))
     width = 32 if kind == "mlp" else 12
-    make = lambda key: BreathPolicy(trainer.waveform, trainer.dt, kind, width, key=key)
-    start = stack([stack([make(k) for k in row]) for row in keys])
+    make = lambda key: lung.BreathPolicy(
+        trainer.waveform, trainer.dt, kind, width, key=key
+    )
+    start = lung.stack([lung.stack([make(k) for k in row]) for row in keys])
     return trainer(start, size.controller_steps, jr.fold_in(key, 8), **options)
 
 
 def networks_on_pids(
     pids: dict[str, Any], trainer: Trainer, size: Size, key: PRNGKey, **options: Any
-) -> Summed:
+) -> lung.Summed:
     """A PID and a network on top of it for each lung, of shape `(1, lungs)`."""
     keys = jr.split(jr.fold_in(key, 9), trainer.count)
-    policies = stack([BreathPolicy(trainer.waveform, trainer.dt, key=k) for k in keys])
+    policies = lung.stack(
+        [lung.BreathPolicy(trainer.waveform, trainer.dt, key=k) for k in keys]
+    )
     # So that the network adds nothing before it is trained.
     offset = 100 * jax.nn.sigmoid(jnp.asarray(-2.0))
-    make = lambda a, b: Summed(a, b, offset=offset)
-    start = stack([eqx.filter_vmap(make)(pids["leaky PID"], policies)])
+    make = lambda a, b: lung.Summed(a, b, offset=offset)
+    start = lung.stack([eqx.filter_vmap(make)(pids["leaky PID"], policies)])
     return trainer(start, size.controller_steps, jr.fold_in(key, 10), **options)
 
 
 def networks_for_all(
     trainer: Trainer, size: Size, key: PRNGKey, **options: Any
-) -> BreathPolicy:
+) -> lung.BreathPolicy:
     """A network for all lungs, of shape `(seeds,)`."""
     width, controls = size.shared_network
     policy: Any = dict(width=width, controls=controls)
     keys = jr.split(jr.fold_in(key, 11), size.seeds)
-    make = lambda key: BreathPolicy(trainer.waveform, trainer.dt, key=key, **policy)
-    start = stack([make(k) for k in keys])
+    make = lambda key: lung.BreathPolicy(
+        trainer.waveform, trainer.dt, key=key, **policy
+    )
+    start = lung.stack([make(k) for k in keys])
     options = dict(options, shared=True, limit=_CAREFUL)
     return trainer(start, size.shared_steps, jr.fold_in(key, 12), **options)
 
@@ -198,12 +195,12 @@ def networks_for_all(
 def planners(trainer: Trainer) -> Contender:
     """Predictive control in the learned lungs."""
     waveforms = repeated(trainer.waveform, trainer.count)
-    plan = eqx.filter_vmap(ShootingMPC)(trainer.simulators, waveforms)
+    plan = eqx.filter_vmap(lung.ShootingMPC)(trainer.simulators, waveforms)
     return Contender("MPC", 0, plan, False)
 
 
 def online_learners(
-    train: Breaths, pids: dict[str, Any], trainer: Trainer, sensor_delay: int
+    train: lung.Breaths, pids: dict[str, Any], trainer: Trainer, sensor_delay: int
 ) -> Any:
     """GPC around the best leaky PID of each lung, stacked over the lungs.
 
@@ -212,7 +209,9 @@ def online_learners(
     """
     newton = online_newton()
     learners = []
-    for breaths, pid in zip(unstack(train), unstack(pids["leaky PID"]), strict=True):
+    for breaths, pid in zip(
+        lung.unstack(train), lung.unstack(pids["leaky PID"]), strict=True
+    ):
         outputs, controls = breaths.pressure[..., None], breaths.u_in[:, :-1, None]
         # A model to predict with: each of its numbers need not be known.
         lags: Any = dict(outputs_back=2, controls_back=4, delay=sensor_delay + 1)
@@ -231,13 +230,13 @@ def online_learners(
         mean = error.at[1].set(1.0) * trainer.waveform.peep
         kalman = KalmanFilter(identified, process, 1e-4 * jnp.eye(1), mean=mean)
         learners.append(OutputFeedback(learner, kalman))
-    return stack(learners)
+    return lung.stack(learners)
 
 
 class _Target(eqx.Module):
     """The target of the first of so many states; the others have none."""
 
-    waveform: BreathWaveform
+    waveform: lung.BreathWaveform
     size: int = eqx.field(static=True)
 
     def __call__(self, t):

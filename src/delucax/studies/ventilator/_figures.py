@@ -7,8 +7,8 @@ import equinox as eqx
 import numpy as np
 from matplotlib.axes import Axes
 
+from ... import lung
 from ...environments import Environment
-from ...lung import at_pip, unstack
 from ...plotting import animate
 from ...plotting._figure import color_of, NEUTRAL, NotebookFigure, style_axes
 from ._report import mean_error, PID_ROWS
@@ -30,7 +30,7 @@ def tracking_figure(
     lungs = sorted({0, count // 2, count - 1})
     figure = NotebookFigure(figsize=(9.5, 6.2), layout="constrained")
     axes = figure.subplots(2, len(lungs), squeeze=False, height_ratios=(1.15, 1))
-    cost: Any = unstack(envs)[0].cost
+    cost: Any = lung.unstack(envs)[0].cost
     index = cost.index
     for ax, i in zip(axes[0], lungs, strict=True):
         for k, (label, runs) in enumerate(shown.items()):
@@ -38,7 +38,7 @@ def tracking_figure(
             times = float(envs.dt[i]) * np.arange(len(pressure))
             ax.plot(times, pressure, color=_color(label, k), lw=1.5, label=label)
         times = np.linspace(0, 2.99, 600)
-        target = np.asarray(at_pip(cost.waveform, SHOWN).pressure(times))
+        target = np.asarray(lung.at_pip(cost.waveform, SHOWN).pressure(times))
         ax.plot(times, target, color="0.2", lw=1, ls=(0, (4, 2)), label="target")
         ax.set_title(names[i], fontsize=_SIZE + 1)
         ax.set_xlabel("time [s]", fontsize=_SIZE)
@@ -96,21 +96,21 @@ def simulator_figure(
     """A breath that was not learned from as simulators see it, and their errors."""
     figure = NotebookFigure(figsize=(9.5, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.5))
-    lung = len(names) // 2
+    middle = len(names) // 2
     # One that reaches a pressure that is often asked for.
-    breath = int(np.argmin(np.abs(np.max(test.pressure[lung], axis=-1) - 30)))
-    u = test.u_in[lung, breath]
+    breath = int(np.argmin(np.abs(np.max(test.pressure[middle], axis=-1) - 30)))
+    u = test.u_in[middle, breath]
     times = float(np.ravel(test.dt)[0]) * np.arange(u.shape[0])
     truth = test.pressure if test.truth is None else test.truth
-    read = np.asarray(test.pressure[lung, breath])
+    read = np.asarray(test.pressure[middle, breath])
     left.plot(times, read, ".", color=NEUTRAL, ms=4, label="read")
-    left.plot(times, np.asarray(truth[lung, breath]), color="0.2", lw=1, label="true")
+    left.plot(times, np.asarray(truth[middle, breath]), color="0.2", lw=1, label="true")
     for k, (label, model) in enumerate(models.items()):
         if label not in ("learned", "single compartment", "balloon"):
             continue
-        predicted = np.asarray(eqx.filter_jit(unstack(model)[lung].predict)(u))
+        predicted = np.asarray(eqx.filter_jit(lung.unstack(model)[middle].predict)(u))
         left.plot(times, predicted, color=color_of(k), lw=1.5, label=label)
-    left.set_title(f"{names[lung]}, from its controls alone", fontsize=_SIZE + 1)
+    left.set_title(f"{names[middle]}, from its controls alone", fontsize=_SIZE + 1)
     left.set_xlabel("time [s]", fontsize=_SIZE)
     left.set_ylabel("pressure [cmH2O]", fontsize=_SIZE)
     left.legend(fontsize=_SIZE - 1, frameon=False)
@@ -142,6 +142,6 @@ def draw_study(
     figure = simulator_figure(test, models, names, table)
     figure.savefig(out / "simulators.png", dpi=130)
     middle = len(names) // 2
-    env = at_pip(unstack(envs)[middle], SHOWN)
-    run = unstack(shown["MLP"])[middle]
+    env = lung.at_pip(lung.unstack(envs)[middle], SHOWN)
+    run = lung.unstack(shown["MLP"])[middle]
     animate(env, run, path=out / "breath.gif", max_frames=40)

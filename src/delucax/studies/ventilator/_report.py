@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ... import lung
 from ..._module import save
 from ..._typing import PRNGKey
 from ...environments import Environment
-from ...lung import at_pip, Breathing, BreathWaveform, unstack
 from ...simulation import rollout
 from ._contenders import Contender
 from ._size import ABORT, BREATH, INSPIRATION, SEEN, SHOWN, UNSEEN
@@ -46,7 +46,7 @@ def _evaluated(envs, controllers, pips, keys):
         index = env.cost.index
 
         def one(pip, key):
-            world, policy = at_pip((env, controller), pip)
+            world, policy = lung.at_pip((env, controller), pip)
             run = rollout(world, policy, key=key, horizon=BREATH, throw=False)
             assert run.costs is not None and run.states is not None
             highest = jnp.max(run.states[:, index])
@@ -61,7 +61,7 @@ def error_rows(
     contenders: list[Contender],
     envs: Environment,
     names: list[str],
-    waveform: BreathWaveform,
+    waveform: lung.BreathWaveform,
     keys: PRNGKey,
     between: tuple[Environment, list[str]] | None,
 ) -> tuple[Rows, dict[str, Any]]:
@@ -77,7 +77,7 @@ def error_rows(
     place = (SEEN + UNSEEN).index(SHOWN)
     for label, seed, controllers, shared in contenders:
         waveforms = repeated(waveform, len(names))
-        whole = eqx.filter_vmap(Breathing)(controllers, waveforms)
+        whole = eqx.filter_vmap(lung.Breathing)(controllers, waveforms)
         mae, highest, breaths = _evaluated(envs, whole, pips, keys)
         runs.setdefault(label, taken(breaths, (slice(None), 0, place)))
         for split, at in SPLITS.items():
@@ -132,13 +132,15 @@ def save_controllers(
         stem = label.lower().replace(" + ", "_").replace(" ", "_").replace("-", "_")
         runs = [r for r in rows if (r["controller"], r["seed"]) == (label, seed)]
         # One that is shared is saved once, and judged by its runs in all lungs.
-        every = zip([None] if shared else names, unstack(controllers), strict=False)
+        every = zip(
+            [None] if shared else names, lung.unstack(controllers), strict=False
+        )
         for name, controller in every:
             file = folder / f"{stem if name is None else f'{stem}_{name}'}_{seed}.dlx"
             reached = [r["highest"] for r in runs if name in (None, r["lung"])]
             # NaN is not below the limit.
             if np.max(reached) <= ABORT:
-                save(file, Breathing(controller, waveform))
+                save(file, lung.Breathing(controller, waveform))
             else:
                 file.unlink(missing_ok=True)
                 unsafe.append(file.stem)

@@ -9,31 +9,10 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
+from ... import lung
 from ..._module import positive
 from ..._typing import PRNGKey
 from ...environments import Environment
-from ...lung import (
-    AbstractLung,
-    at_pip,
-    BalloonLung,
-    Breathing,
-    Breaths,
-    BreathWaveform,
-    double_compartment,
-    DoubleCompartment,
-    explore,
-    fit_lungs,
-    GreyBoxLung,
-    LearnedLung,
-    lung_environment,
-    LungModel,
-    NeuralLung,
-    open_loop_error,
-    SingleCompartment,
-    split,
-    stack,
-    unstack,
-)
 from ...simulation import rollout
 from ._size import INSPIRATION, SEEN, Size
 from ._stacks import repeated
@@ -49,7 +28,7 @@ class Kind(NamedTuple):
     - `learning_rate`: of the fit.
     """
 
-    make: Callable[[PRNGKey], AbstractLung]
+    make: Callable[[PRNGKey], lung.AbstractLung]
     positive: tuple[str, ...] = ()
     free: tuple[str, ...] = ()
     steps: int = 1
@@ -64,25 +43,29 @@ class Kind(NamedTuple):
         return {f"{system}{name}": c for name, c in constraints.items()} or None
 
 
-def _double(key: PRNGKey) -> DoubleCompartment:
+def _double(key: PRNGKey) -> lung.DoubleCompartment:
     begin: Any = dict(central=0.5, share=0.4, imbalance=3.0)
-    return DoubleCompartment(**begin)
+    return lung.DoubleCompartment(**begin)
 
 
 KINDS = {
     "single compartment": Kind(
-        lambda key: SingleCompartment(), ("resistance", "compliance")
+        lambda key: lung.SingleCompartment(), ("resistance", "compliance")
     ),
-    "balloon": Kind(lambda key: BalloonLung(), ("resistance", "stiffness", "rest")),
+    "balloon": Kind(
+        lambda key: lung.BalloonLung(), ("resistance", "stiffness", "rest")
+    ),
     "double compartment": Kind(
         _double,
         ("resistance", "compliance", "imbalance"),
         ("central", "share"),
         steps=2,
     ),
-    "neural ODE": Kind(lambda key: NeuralLung(key=key), steps=2, learning_rate=1e-2),
+    "neural ODE": Kind(
+        lambda key: lung.NeuralLung(key=key), steps=2, learning_rate=1e-2
+    ),
     "grey box": Kind(
-        lambda key: GreyBoxLung(key=key),
+        lambda key: lung.GreyBoxLung(key=key),
         ("single.resistance", "single.compliance"),
         ("network", "memory"),
         steps=2,
@@ -91,12 +74,12 @@ KINDS = {
 }
 
 
-def explored(size: Size) -> Breaths:
+def explored(size: Size) -> lung.Breaths:
     """Breaths of the lungs of the study, stacked over them."""
     return stack_breaths(
         [
-            explore(
-                double_compartment(R, C, sensor_delay=size.sensor_delay),
+            lung.explore(
+                lung.double_compartment(R, C, sensor_delay=size.sensor_delay),
                 size.breaths,
                 key=jr.key(i),
                 resistance=R,
@@ -107,7 +90,7 @@ def explored(size: Size) -> Breaths:
     )
 
 
-def grouped(breaths: Breaths) -> Any:
+def grouped(breaths: lung.Breaths) -> Any:
     """The lungs of a file, and as many breaths of each (see `left_out`)."""
     R, C = np.asarray(breaths.resistance), np.asarray(breaths.compliance)
     lungs = sorted(set(zip(R.tolist(), C.tolist(), strict=True)))
@@ -122,7 +105,7 @@ def grouped(breaths: Breaths) -> Any:
     return np.asarray(lungs), stack_breaths(parts)
 
 
-def left_out(recorded: Breaths, breaths: Breaths) -> str:
+def left_out(recorded: lung.Breaths, breaths: lung.Breaths) -> str:
     """What there is to say of recorded breaths that are not among those of each lung,
     nothing if all are."""
     lungs, each = breaths.pressure.shape[:2]
@@ -135,38 +118,42 @@ def left_out(recorded: Breaths, breaths: Breaths) -> str:
     )
 
 
-def stack_breaths(parts: list[Breaths]) -> Breaths:
+def stack_breaths(parts: list[lung.Breaths]) -> lung.Breaths:
     """Breaths of several lungs as one: the first of each, as many as there are of the
     one with the fewest."""
     fewest = min(len(part) for part in parts)
-    return stack([part[:fewest] for part in parts])
+    return lung.stack([part[:fewest] for part in parts])
 
 
-def divided(breaths: Breaths, key: PRNGKey) -> tuple[Breaths, Breaths]:
+def divided(breaths: lung.Breaths, key: PRNGKey) -> tuple[lung.Breaths, lung.Breaths]:
     """Breaths of each lung to train on, and to test on."""
-    halves = [split(part, 1 / 6, key=key) for part in unstack(breaths)]
+    halves = [lung.split(part, 1 / 6, key=key) for part in lung.unstack(breaths)]
     train, test = (stack_breaths(list(part)) for part in zip(*halves, strict=True))
     return train, test
 
 
-def learned(train: Breaths, size: Size, key: PRNGKey, **options: Any) -> LearnedLung:
+def learned(
+    train: lung.Breaths, size: Size, key: PRNGKey, **options: Any
+) -> lung.LearnedLung:
     """A learned lung of each lung, stacked."""
     keys = jr.split(jr.fold_in(key, 2), train.pressure.shape[0])
-    parts = zip(unstack(train), keys, strict=True)
+    parts = zip(lung.unstack(train), keys, strict=True)
     options |= dict(teacher_steps=size.teacher_steps, steps=size.simulator_steps)
-    models = stack([LearnedLung(part, key=own) for part, own in parts])
-    return fit_lungs(models, train, key=jr.fold_in(key, 3), **options).model
+    models = lung.stack([lung.LearnedLung(part, key=own) for part, own in parts])
+    return lung.fit_lungs(models, train, key=jr.fold_in(key, 3), **options).model
 
 
 def fitted(
-    name: str, train: Breaths, size: Size, key: PRNGKey, **options: Any
-) -> LungModel:
+    name: str, train: lung.Breaths, size: Size, key: PRNGKey, **options: Any
+) -> lung.LungModel:
     """Models of a kind, stacked, fitted to the breaths of each lung."""
     kind = KINDS[name]
     keys = jr.split(jr.fold_in(key, 4), train.pressure.shape[0])
-    models = [LungModel(kind.make(k), train.dt[0], size.sensor_delay) for k in keys]
-    return fit_lungs(
-        stack(models),
+    models = [
+        lung.LungModel(kind.make(k), train.dt[0], size.sensor_delay) for k in keys
+    ]
+    return lung.fit_lungs(
+        lung.stack(models),
         train,
         key=jr.fold_in(key, 5),
         steps=size.physics_steps * kind.steps,
@@ -178,12 +165,12 @@ def fitted(
 
 
 def open_loop_rows(
-    names: list[str], test: Breaths, models: dict[str, Any]
+    names: list[str], test: lung.Breaths, models: dict[str, Any]
 ) -> list[dict[str, Any]]:
     """The error of each simulator on the breaths of each lung, a row each."""
     rows = []
     for kind, model in models.items():
-        errors = eqx.filter_jit(eqx.filter_vmap(open_loop_error))(model, test)
+        errors = eqx.filter_jit(eqx.filter_vmap(lung.open_loop_error))(model, test)
         for name, error in zip(names, np.asarray(errors), strict=True):
             rows.append({"lung": name, "simulator": kind, "mae": float(error)})
     return rows
@@ -195,7 +182,7 @@ def _observed(envs, controllers, pips):
 
     def in_lung(env, controller):
         def one(pip):
-            world, policy = at_pip((env, controller), pip)
+            world, policy = lung.at_pip((env, controller), pip)
             options: Any = dict(horizon=INSPIRATION, keep=("observations",))
             run: Any = rollout(world, policy, key=jr.key(0), throw=False, **options)
             return run.observations[:, 0]
@@ -209,18 +196,20 @@ def closed_loop_errors(
     envs: Environment,
     models: dict[str, Any],
     controllers: Any,
-    waveform: BreathWaveform,
+    waveform: lung.BreathWaveform,
 ) -> dict[str, Any]:
     """How far the pressures in each simulator are from those in the lung, each under
     the same controller and without noise, by kind: shape `(lungs,)`."""
     pips = jnp.asarray(SEEN)
-    whole = eqx.filter_vmap(Breathing)(controllers, repeated(waveform, len(envs.dt)))
+    whole = eqx.filter_vmap(lung.Breathing)(
+        controllers, repeated(waveform, len(envs.dt))
+    )
     silent = eqx.tree_at(lambda env: env.sensor_noise, envs, None)
     truth = _observed(silent, whole, pips)
+    silent_task = lambda model: lung.lung_environment(model, waveform, noise=0.0)
     errors = {}
-    for kind, models_of_kind in models.items():
-        in_simulator = lambda model: lung_environment(model, waveform, noise=0.0)
-        simulated = stack([in_simulator(model) for model in unstack(models_of_kind)])
+    for kind, model in models.items():
+        simulated = eqx.filter_vmap(silent_task)(model)
         pressure = _observed(simulated, whole, pips)
         errors[kind] = np.mean(np.abs(np.asarray(pressure - truth)), axis=(1, 2))
     return errors

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ...lung import stack
+from ... import lung
 
 
 _T = TypeVar("_T")
@@ -14,7 +14,7 @@ _T = TypeVar("_T")
 
 def repeated(tree: _T, count: int) -> _T:
     """One module, stacked as often as asked for."""
-    return stack([tree] * count)
+    return lung.stack([tree] * count)
 
 
 def taken(tree: _T, index: Any) -> _T:

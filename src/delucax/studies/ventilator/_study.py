@@ -13,21 +13,10 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
+from ... import lung
 from ..._check import check_count
 from ..._typing import PRNGKey
 from ...environments import Environment
-from ...lung import (
-    Breaths,
-    BreathWaveform,
-    double_compartment,
-    LearnedLung,
-    least_error,
-    lung_environment,
-    LungModel,
-    read_breaths,
-    stack,
-    unstack,
-)
 from ._contenders import (
     Contender,
     designed,
@@ -118,14 +107,14 @@ def lung_study(
         raise ValueError(f"lung: seeds must be at least 1, got {seeds}.")
     sensor_delay = check_count(sensor_delay, "sensor_delay", "lung", least=0)
     size = size._replace(sensor_delay=sensor_delay)
-    recorded = None if data is None else read_breaths(data)
+    recorded = None if data is None else lung.read_breaths(data)
     settings = dict(
         size._asdict(),
         data=None if data is None else _named(Path(data)),
         version=importlib.metadata.version("delucax"),
     )
     stages = Stages(Path(out), settings, say, progress)
-    waveform, key = BreathWaveform(), jr.key(0)
+    waveform, key = lung.BreathWaveform(), jr.key(0)
 
     if recorded is None:
         lungs = size.lungs
@@ -136,7 +125,7 @@ def lung_study(
             say(words)
         kinds = dict.fromkeys((*size.physics, "grey box"))
         size = size._replace(physics=tuple(kinds), between=())
-    names = [_lung_name(*lung) for lung in lungs]
+    names = [_lung_name(*each) for each in lungs]
     train, test = divided(breaths, jr.fold_in(key, 1))
     models = _simulators(stages, train, size, key)
     table = open_loop_rows(names, test, models)
@@ -144,18 +133,18 @@ def lung_study(
     between = None
     if recorded is None:
         late: Any = dict(sensor_delay=sensor_delay)
-        envs = stack([double_compartment(*lung, **late) for lung in lungs])
+        envs = lung.stack([lung.double_compartment(*each, **late) for each in lungs])
         around = [size.between[i % len(size.between)] for i in range(len(lungs))]
-        others = stack([double_compartment(*lung, **late) for lung in around])
-        between = others, [_lung_name(*lung) for lung in size.between]
+        others = lung.stack([lung.double_compartment(*each, **late) for each in around])
+        between = others, [_lung_name(*each) for each in size.between]
         judge = "the lungs themselves"
     else:
         # What no controller was trained in stands in for the lungs.
         made = [
-            lung_environment(model, waveform, horizon=BREATH)
-            for model in unstack(models["grey box"])
+            lung.lung_environment(model, waveform, horizon=BREATH)
+            for model in lung.unstack(models["grey box"])
         ]
-        envs = stack(made)
+        envs = lung.stack(made)
         judge = "grey-box lungs fitted to the same breaths, for want of the lungs"
     trainer = Trainer(models["learned"], waveform)
     contenders = _contenders(stages, envs, train, trainer, size, key)
@@ -204,8 +193,8 @@ def _lung_name(resistance: float, compliance: float) -> str:
 
 
 def _simulators(
-    stages: Stages, train: Breaths, size: Size, key: PRNGKey
-) -> dict[str, LearnedLung | LungModel]:
+    stages: Stages, train: lung.Breaths, size: Size, key: PRNGKey
+) -> dict[str, lung.LearnedLung | lung.LungModel]:
     """Simulators of each kind, stacked over the lungs, by name."""
     count, data = f"all {train.pressure.shape[0]} at once", (train, size, key)
     models: dict[str, Any] = {}
@@ -222,7 +211,7 @@ def _simulators(
 def _contenders(
     stages: Stages,
     envs: Environment,
-    train: Breaths,
+    train: lung.Breaths,
     trainer: Trainer,
     size: Size,
     key: PRNGKey,
@@ -258,12 +247,12 @@ def _contenders(
             by_hand["bang-bang"],
             Contender("GPC", 0, online, False),
             planners(trainer),
-            Contender("CNN", 0, unstack(convolved)[0], False),
-            Contender("PID + MLP", 0, unstack(residual)[0], False),
+            Contender("CNN", 0, lung.unstack(convolved)[0], False),
+            Contender("PID + MLP", 0, lung.unstack(residual)[0], False),
         ]
-    for seed, controllers in enumerate(unstack(own)):
+    for seed, controllers in enumerate(lung.unstack(own)):
         contenders.append(Contender("MLP", seed, controllers, False))
-    for seed, controller in enumerate(unstack(shared)):
+    for seed, controller in enumerate(lung.unstack(shared)):
         alike = repeated(controller, trainer.count)
         contenders.append(Contender("MLP for all", seed, alike, True))
     return contenders
@@ -272,7 +261,7 @@ def _contenders(
 def _least_errors(envs: Environment, steps: int) -> Any:
     """About the least error there could be, shape `(lungs, pips)`."""
     pips = jnp.asarray(SEEN + UNSEEN)
-    of = lambda env: least_error(env, pips=pips, steps=steps)  # noqa: E731
+    of = lambda env: lung.least_error(env, pips=pips, steps=steps)  # noqa: E731
     return eqx.filter_vmap(of)(envs)
 
 

@@ -10,16 +10,10 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float
 
+from ... import lung
 from ..._typing import PRNGKey
 from ...controllers import LeakyPID, PID
 from ...environments import Environment
-from ...lung import (
-    breath_error,
-    BreathWaveform,
-    FeedForward,
-    Summed,
-    train_controllers,
-)
 from ._size import SEEN, Size
 from ._stacks import joined, taken
 
@@ -32,9 +26,9 @@ def _drawn(
     kind: type[LeakyPID | PID],
     count: int,
     dt: Array,
-    waveform: BreathWaveform,
+    waveform: lung.BreathWaveform,
     key: PRNGKey,
-) -> Summed:
+) -> lung.Summed:
     """PIDs with a feed-forward, gains at random over orders of magnitude."""
 
     def one(key):
@@ -45,12 +39,12 @@ def _drawn(
         )
         kd = between(keys[1], 0.003, 0.2) * (1.0 if kind is PID else 20.0)
         gains = between(keys[2], 0.03, 8.0), between(keys[3], 0.05, 40.0), some[0] * kd
-        forward = FeedForward(
+        forward = lung.FeedForward(
             waveform,
             some[1] * jr.uniform(keys[4], maxval=3.0),
             some[2] * jr.uniform(keys[5], minval=-10.0, maxval=15.0),
         )
-        return Summed(kind(*gains, dt=dt, reference=waveform), forward)
+        return lung.Summed(kind(*gains, dt=dt, reference=waveform), forward)
 
     return eqx.filter_vmap(one)(jr.split(key, count))
 
@@ -63,7 +57,7 @@ def _errors(
     shape `(controllers,)`, or `(controllers, lungs)` if each lung has its own."""
     pips = jnp.asarray(SEEN)
     of = lambda env, one: jnp.mean(  # noqa: E731
-        breath_error(env, one, key=key, pips=pips)
+        lung.breath_error(env, one, key=key, pips=pips)
     )
     across = eqx.filter_vmap(of, in_axes=(None, eqx.if_array(0)))
     over = eqx.if_array(1) if own else None
@@ -82,7 +76,7 @@ def best_of(candidates: Any, errors: Any, shared: bool) -> Any:
 
 def tuned_pids(
     envs: Environment,
-    waveform: BreathWaveform,
+    waveform: lung.BreathWaveform,
     size: Size,
     key: PRNGKey,
     say: Callable[[str], Any],
@@ -102,7 +96,7 @@ def tuned_pids(
             ranked = jnp.mean(errors, axis=0) if shared else errors.T
             begin = taken(drawn, jnp.argsort(ranked, axis=0)[:_STARTS])
             label = f"tuned {name} + feed-forward" + (" for all" if shared else "")
-            trained = train_controllers(
+            trained = lung.train_controllers(
                 envs,
                 begin,
                 key=fit_key,
