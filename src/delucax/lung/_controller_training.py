@@ -10,7 +10,7 @@ import optax
 from jaxtyping import Array
 
 from .._check import check_bool, check_count, check_key, check_positive
-from .._controller import AbstractController
+from .._controller import AbstractController, check_controller
 from .._module import function_field
 from .._typing import PRNGKey
 from ..environments import Environment
@@ -64,16 +64,11 @@ def breath_error(
     """
     where = "breath_error"
     waveform = waveform_of(env, where)
-    if not isinstance(controller, AbstractController):
-        raise ValueError(
-            f"{where}: controller must be an AbstractController, got "
-            f"{type(controller).__name__}."
-        )
+    check_controller(controller, "controller", where)
     pips = as_pips(pips, (waveform, controller), where)
     horizon = check_count(horizon, "horizon", where)
-    whole = controller
-    if not isinstance(controller, Breathing):
-        whole = Breathing(controller, waveform)
+    is_whole = isinstance(controller, Breathing)
+    whole = controller if is_whole else Breathing(controller, waveform)
 
     def one(pip, key):
         world, policy = at_pip((env, whole), pip)

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float
 
-from .._check import check_bool, check_count, check_key
+from .._check import check_bool, check_count, check_instance, check_key
 from .._module import parameter, positive, weight
 from .._results import RESULTS
-from .._typing import PRNGKey, RealScalar, State
+from .._typing import PRNGKey, RealScalar, Scalar, State
 from ..dynamics import AbstractDynamics
 from ._breaths import Breaths
 from ._tanh_network import tanh_network
@@ -104,10 +104,7 @@ class LearnedLung(AbstractDynamics):
         key: PRNGKey,
     ):
         where = "LearnedLung"
-        if not isinstance(breaths, Breaths):
-            raise ValueError(
-                f"{where}: breaths must be Breaths, got {type(breaths).__name__}."
-            )
+        check_instance(breaths, Breaths, "breaths must be Breaths", where)
         check_key(key, where)
         for name, value in (
             ("width", width),
@@ -150,7 +147,7 @@ class LearnedLung(AbstractDynamics):
         pressures = ["pressure", *(f"pressure[-{i}]" for i in range(1, n))]
         return (*controls, *pressures, "step")
 
-    def resting(self) -> Array:
+    def resting(self) -> State:
         """The state before an inspiration."""
         n = self.window
         first = (self.start - self.p_mean) / self.p_std
@@ -159,7 +156,7 @@ class LearnedLung(AbstractDynamics):
         closed = jnp.full(n, -self.u_mean / self.u_std)
         return jnp.concatenate([closed, jnp.full(n, first), jnp.zeros(1)])
 
-    def pressure(self, x: Array) -> Array:
+    def pressure(self, x: State) -> Scalar:
         """The pressure now.
 
         **Arguments:** `x`: the state.

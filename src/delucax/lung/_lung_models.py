@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_count, check_key, check_step
+from .._check import check_count, check_instance, check_key, check_step
 from .._module import parameter, positive, weight
-from .._typing import PRNGKey
+from .._typing import PRNGKey, RealScalar, Scalar, State
 from ..dynamics import Delayed, Discretized
 from ._lungs import AbstractLung, SingleCompartment
 from ._tanh_network import tanh_network
@@ -55,10 +55,7 @@ class LungModel(eqx.Module):
         solver: diffrax.AbstractSolver | None = None,
     ):
         where = "LungModel"
-        if not isinstance(system, AbstractLung):
-            raise ValueError(
-                f"{where}: system must be an AbstractLung, got {type(system).__name__}."
-            )
+        check_instance(system, AbstractLung, "system must be an AbstractLung", where)
         check_step(dt, where)
         delay = check_count(sensor_delay, "sensor_delay", where, least=0)
         self.dynamics = Delayed(Discretized(system, dt, solver), sensor=delay)
@@ -69,7 +66,7 @@ class LungModel(eqx.Module):
         """The lung."""
         return self.dynamics.dynamics.system  # pyright: ignore[reportAttributeAccessIssue]
 
-    def resting(self) -> Array:
+    def resting(self) -> State:
         """The state of the dynamics before an inspiration."""
         return self.dynamics.filled(self.system.resting(self.peep))
 
@@ -159,10 +156,10 @@ class NeuralLung(AbstractLung):
     def state_names(self):
         return ("pressure", *(f"hidden {i}" for i in range(self.hidden)))
 
-    def pressure(self, x):
+    def pressure(self, x: State) -> Scalar:
         return self.p_mean + self.p_std * x[0]
 
-    def resting(self, pressure):
+    def resting(self, pressure: RealScalar) -> State:
         first = jnp.reshape((pressure - self.p_mean) / self.p_std, (1,))
         return jnp.concatenate([first, jnp.zeros(self.hidden)])
 
@@ -243,11 +240,11 @@ class GreyBoxLung(AbstractLung):
         inside = x[2] / (1e-3 * self.single.compliance)
         return jnp.stack([x[0], inside / self.p_std, x[3]])
 
-    def pressure(self, x):
+    def pressure(self, x: State) -> Scalar:
         rest = self.network(self._inputs(x))
         return self.single.pressure(x[:3]) + self.p_std * rest
 
-    def resting(self, pressure):
+    def resting(self, pressure: RealScalar) -> State:
         physical = self.single.resting(pressure)
         return jnp.concatenate([physical, jnp.zeros(1)])
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import diffrax
 
-from .._check import check_count
+from .._check import check_count, check_instance
 from .._module import load
 from ..dynamics import Delayed, Discretized
 from ..environments import Environment
@@ -269,11 +269,9 @@ def learned_lung(
         env = dlx.make("lung/learned_lung")
         ```
     """
+    lung: Any = model
     if model is None:
-        model = load(Path(__file__).with_name("learned_lung.dlx"))
-    if not isinstance(model, LearnedLung):
-        raise ValueError(
-            f"learned_lung: model must be a LearnedLung, got {type(model).__name__}."
-        )
-    rest = model.resting()
-    return ventilated((learned_lung,), model, rest, horizon=horizon, **options)
+        lung = load(Path(__file__).with_name("learned_lung.dlx"))
+    check_instance(lung, LearnedLung, "model must be a LearnedLung", "learned_lung")
+    rest = lung.resting()
+    return ventilated((learned_lung,), lung, rest, horizon=horizon, **options)

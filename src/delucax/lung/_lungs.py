@@ -95,14 +95,14 @@ class _AbstractCompartment(AbstractLung):
         """
 
     @abc.abstractmethod
-    def _volume(self, pressure: Any) -> Array:
+    def _volume(self, pressure: RealScalar) -> Scalar:
         """The volume at which the elastic pressure is `pressure`."""
 
-    def pressure(self, x):
+    def pressure(self, x: State) -> Scalar:
         inside = self.elastic_pressure(x[2])
         return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
 
-    def resting(self, pressure):
+    def resting(self, pressure: RealScalar) -> State:
         volume = self._volume(pressure)
         return jnp.stack([0 * volume, 0 * volume, volume])
 
@@ -152,10 +152,10 @@ class SingleCompartment(_AbstractCompartment):
     compliance: Array = parameter(20.0, constraint=positive)
     valves: Valves = Valves()
 
-    def elastic_pressure(self, volume):
+    def elastic_pressure(self, volume: Array) -> Array:
         return volume / (PER_ML * self.compliance)
 
-    def _volume(self, pressure):
+    def _volume(self, pressure: RealScalar) -> Scalar:
         return PER_ML * self.compliance * pressure
 
 
@@ -219,11 +219,11 @@ class DoubleCompartment(AbstractLung):
         p1, p2 = x[2] / (self.share * whole), x[3] / ((1 - self.share) * whole)
         return fast, slow, p1, p2, (fast * p1 + slow * p2) / (fast + slow)
 
-    def pressure(self, x):
+    def pressure(self, x: State) -> Scalar:
         inside = self._parts(x)[-1]
         return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
 
-    def resting(self, pressure):
+    def resting(self, pressure: RealScalar) -> State:
         volume = PER_ML * self.compliance * pressure
         return jnp.stack(
             [0 * volume, 0 * volume, self.share * volume, (1 - self.share) * volume]
@@ -290,10 +290,10 @@ class BalloonLung(_AbstractCompartment):
     rest: Array = parameter(1.5, constraint=positive)
     valves: Valves = Valves()
 
-    def elastic_pressure(self, volume):
+    def elastic_pressure(self, volume: Array) -> Array:
         return balloon_pressure(volume, self.rest, self.stiffness)
 
-    def _volume(self, pressure):
+    def _volume(self, pressure: RealScalar) -> Scalar:
         return _stretched(self.rest, self.stiffness, pressure)
 
 
@@ -340,10 +340,10 @@ class DelayLung(AbstractLung):
     state_names: ClassVar = ("inflow", "opening", "pipe", "volume")
     state_units: ClassVar = ("L/s", "", "cmH2O", "L")
 
-    def pressure(self, x):
+    def pressure(self, x: State) -> Scalar:
         return x[2]
 
-    def resting(self, pressure):
+    def resting(self, pressure: RealScalar) -> State:
         volume = _stretched(self.rest, self.stiffness, pressure)
         return jnp.stack([0 * volume, 0 * volume, pressure + 0 * volume, volume])
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from .._check import check_count
+from .._check import check_count, check_instance
 from .._controller import AbstractController
 from .._module import parameter, positive
 from ..environments import Environment
@@ -83,12 +83,9 @@ class ShootingMPC(AbstractController):
         self.learning_rate, self.memory = learning_rate, memory
 
     def __check_init__(self):
-        if not isinstance(self.model, LearnedLung):
-            raise ValueError(
-                "ShootingMPC: model must be a LearnedLung, got "
-                f"{type(self.model).__name__}."
-            )
-        check_waveform(self.waveform, "ShootingMPC")
+        where = "ShootingMPC"
+        check_instance(self.model, LearnedLung, "model must be a LearnedLung", where)
+        check_waveform(self.waveform, where)
 
     def init(self, *, key=None):
         lung = self.model.resting()

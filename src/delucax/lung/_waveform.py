@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from .._check import (
     check_finite,
+    check_instance,
     check_number,
     check_real,
     check_step,
@@ -168,11 +169,7 @@ def _slack(breaths: Array) -> Array:
 
 def check_waveform(waveform: Any, where: str) -> None:
     """Raise unless it is a breath waveform."""
-    if not isinstance(waveform, BreathWaveform):
-        raise ValueError(
-            f"{where}: waveform must be a BreathWaveform, got "
-            f"{type(waveform).__name__}."
-        )
+    check_instance(waveform, BreathWaveform, "waveform must be a BreathWaveform", where)
 
 
 def check_peep(waveform: BreathWaveform, valves: Any, where: str) -> None:
