@@ -69,7 +69,8 @@ class Trainer(NamedTuple):
         in_simulator = lambda model: lung.lung_environment(
             model, self.waveform, limit=limit
         )
-        envs = eqx.filter_vmap(in_simulator)(self.simulators)
+        # Compiled, as the trainings are: then the first states round as they do there.
+        envs = eqx.filter_jit(eqx.filter_vmap(in_simulator))(self.simulators)
         return lung.train_controllers(
             envs, start, steps=steps, key=key, **options
         ).model
