@@ -250,3 +250,9 @@ def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
             f"{shortened(value)}."
         )
     return int(value)
+
+
+def check_instance(value: Any, kind: Any, words: str, where: str) -> None:
+    """Raise unless `value` is of a class, such as "cost must be an AbstractCost"."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{where}: {words}, got {type(value).__name__}.")
