@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from delucax.experiments import interquartile_mean
-from delucax.experiments._statistics import Bootstrap
+from delucax.experiments import Bootstrap, interquartile_mean
 
 
 def paired(values: Mapping[str, Any], baseline: str) -> pd.DataFrame:
@@ -19,7 +18,7 @@ def paired(values: Mapping[str, Any], baseline: str) -> pd.DataFrame:
         for name, found in values.items()
     }
     rows = {
-        name: (*spread(pair[:, 0]), *Bootstrap().two([pair], ratio=True))
+        name: (*spread(pair[:, 0]), *Bootstrap().paired([pair], ratio=True))
         for name, pair in pairs.items()
     }
     return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
@@ -27,7 +26,7 @@ def paired(values: Mapping[str, Any], baseline: str) -> pd.DataFrame:
 
 def spread(values: Any) -> tuple[float, float, float]:
     """The interquartile mean, and the ends of its 95% interval by the bootstrap."""
-    return Bootstrap().one([np.asarray(values, float)])
+    return Bootstrap().interval([np.asarray(values, float)])
 
 
 def middle(values: Any) -> float:

@@ -62,8 +62,8 @@ def parts() -> dict[str, float]:
     waveform = lung.BreathWaveform()
     policy = lung.BreathPolicy(waveform, 0.03, key=jax.random.key(3))
     start = lung.stack([lung.stack([policy])])
-    models = lung.stack([model])
-    lung.train_controllers(models, start, key=jax.random.key(4))
+    envs = lung.stack([lung.lung_environment(model)])
+    lung.train_controllers(envs, start, key=jax.random.key(4))
     found["controller of one lung, s"] = time.perf_counter() - begin
 
     lungs = [(R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0)]

@@ -16,13 +16,13 @@ gc.set_threshold(200_000, 50, 100)
 
 
 @pytest.fixture(autouse=True, scope="module")
-def room():
+def released_programs():
     """Thousands of programs are compiled."""
     # Not before the tests' import hook is there.
-    from delucax.experiments._room import make_room
+    from delucax.experiments._memory_maps import release_programs
 
     yield
-    make_room()
+    release_programs()
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from . import (
 from ._controller import (
     AbstractController as AbstractController,
     AbstractLearner as AbstractLearner,
+    AbstractStochasticPolicy as AbstractStochasticPolicy,
 )
 from ._module import (
     bounded as bounded,

@@ -1,14 +1,41 @@
 """`python -m delucax`: the commands."""
 
 import argparse
+import contextlib
+import importlib.util
+import subprocess
 import sys
 import textwrap
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 
-_FILE = "a Python file of experiments, a module, or a suite that `list` names"
+_COMMANDS: list[tuple[Callable, str, str, tuple]] = []
+"""What is called with the options, its help, more of it, and what options it has; in
+the order in which they are shown."""
+
+
+def _command(help: str, *options: tuple, more: str = "") -> Callable:
+    """Make a command of a function that returns the exit status, by its name."""
+
+    def register(call: Callable[[Any], int | None]) -> Callable:
+        _COMMANDS.append((call, help, more, options))
+        return call
+
+    return register
+
+
+def _option(*names: str, **settings: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """What `add_argument` is given."""
+    return names, settings
+
+
+def _expression(flag: str, name: str, help: str) -> tuple:
+    """The option of an expression that selects cases."""
+    help = f"{help} (default: all)"
+    return _option(flag, dest=name, default="", metavar="EXPR", help=help)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -40,13 +67,17 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         title="commands", dest="command", metavar="COMMAND"
     )
-    _add_demo(commands)
-    _add_reproduce(commands)
-    _add_lung(commands)
-    _add_list(commands)
-    _add_run(commands)
-    _add_report(commands)
-    _add_bench(commands)
+    for call, help, more, command_options in _COMMANDS:
+        added = commands.add_parser(
+            call.__name__.removeprefix("_"),
+            help=help,
+            description=f"{help[0].upper()}{help[1:]}.",
+            epilog=textwrap.dedent(more).strip() or None,
+            formatter_class=_Formatter,
+        )
+        added.set_defaults(call=call)
+        for names, settings in command_options:
+            added.add_argument(*names, **settings)
     return parser
 
 
@@ -60,109 +91,103 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
         return f"{action.help} (default: %(default)s)"
 
 
-def _command(commands: Any, name: str, call: Any, help: str, more: str = "") -> Any:
-    """A command: `call` is given its options, and returns the exit status."""
-    added = commands.add_parser(
-        name,
-        help=help,
-        description=f"{help[0].upper()}{help[1:]}.",
-        epilog=textwrap.dedent(more).strip() or None,
-        formatter_class=_Formatter,
-    )
-    added.set_defaults(call=call)
-    return added
+_FILE = "a Python file of experiments, a module, or a suite that `list` names"
+_CASES = (
+    _expression("-k", "select", "cases by name, such as 'lqr and not cartpole'"),
+    _expression("-m", "marks", "cases by their marks"),
+)
 
 
-def _add_demo(commands: Any) -> None:
-    def call(options: Any) -> None:
-        from .studies import demo
+@_command(
+    "swing the pendulum up, then the paper in small; in about two minutes",
+    _option("--out", default="demo", help="folder to write to"),
+    _option("--seeds", type=int, default=2, help="how many MLPs to train"),
+)
+def _demo(options: Any) -> None:
+    from .studies import demo
 
-        demo(options.out, seeds=options.seeds)
-
-    help = "swing the pendulum up, then the paper in small; in about two minutes"
-    demo = _command(commands, "demo", call, help)
-    demo.add_argument("--out", default="demo", help="folder to write to")
-    demo.add_argument("--seeds", type=int, default=2, help="how many MLPs to train")
+    demo(options.out, seeds=options.seeds)
 
 
-def _add_reproduce(commands: Any) -> None:
-    def call(options: Any) -> int:
-        from .studies import reproduce
-
-        rows = reproduce(options.name, options.out, small=options.small)
-        return 0 if all(row["holds"] for row in rows) else 1
-
-    help = "regenerate the figures and tables of the Deluca paper, claim by claim"
-    more = """
+@_command(
+    "regenerate the figures and tables of the Deluca paper, claim by claim",
+    _option("name", nargs="+", metavar="NAME", help="all, or some of these"),
+    _option("--out", default="paper", help="folder to write to"),
+    _option("--small", action="store_true", help="fewer seeds and steps"),
+    more="""
         names: all, oracle-complexity, policy-gradient, estimator-variance,
           wall-clock, ventilator, pendulum-shock, lq-perturbations
 
         The exit status is 1 if a claim does not hold.
-        """
-    paper = _command(commands, "reproduce", call, help, more)
-    paper.add_argument("name", nargs="+", metavar="NAME", help="all, or some of these")
-    paper.add_argument("--out", default="paper", help="folder to write to")
-    paper.add_argument("--small", action="store_true", help="fewer seeds and steps")
+        """,
+)
+def _reproduce(options: Any) -> int:
+    from .studies import reproduce
+
+    rows = reproduce(options.name, options.out, small=options.small)
+    return 0 if all(row["holds"] for row in rows) else 1
 
 
-def _add_lung(commands: Any) -> None:
-    def call(options: Any) -> None:
-        from .studies import lung_study
-
-        names = ("small", "data", "seeds", "sensor_delay")
-        lung_study(options.out, **{name: getattr(options, name) for name in names})
-
-    help = "learn lungs from breaths, and controllers of a ventilator in them"
-    lung = _command(commands, "lung", call, help)
-    lung.add_argument("--out", default="lung", help="folder to write to, or go on in")
-    lung.add_argument("--small", action="store_true", help="two lungs, in a minute")
-    lung.add_argument(
+@_command(
+    "learn lungs from breaths, and controllers of a ventilator in them",
+    _option("--out", default="lung", help="folder to write to, or go on in"),
+    _option("--small", action="store_true", help="two lungs, in a minute"),
+    _option(
         "--data",
         help="breaths, as a CSV file of the public data set (default: simulated)",
-    )
-    seeds = "how many controllers of each kind to train (default: 3, or 1 if --small)"
-    lung.add_argument("--seeds", type=int, help=seeds)
-    late = "how late the sensor reads, in samples; holds for DATA too"
-    lung.add_argument("--sensor-delay", type=int, default=2, help=late)
+    ),
+    _option(
+        "--seeds",
+        type=int,
+        help="how many controllers of each kind to train (default: 3, or 1 if --small)",
+    ),
+    _option(
+        "--sensor-delay",
+        type=int,
+        default=2,
+        help="how late the sensor reads, in samples; holds for DATA too",
+    ),
+)
+def _lung(options: Any) -> None:
+    from .studies import lung_study
+
+    names = ("small", "data", "seeds", "sensor_delay")
+    lung_study(options.out, **{name: getattr(options, name) for name in names})
 
 
-def _add_list(commands: Any) -> None:
-    def call(options: Any) -> int:
-        from .experiments._cli import list_command
+@_command(
+    "name the tasks, controllers and suites, or the cases of FILE",
+    _option("file", nargs="?", metavar="FILE", help=f"{_FILE}; its cases are listed"),
+    *_CASES,
+)
+def _list(options: Any) -> int | None:
+    from .studies._listing import list_names, SUITES
 
-        return list_command(options.file, options.select, options.marks)
+    if options.file is None:
+        return list_names()
+    from .experiments._commands import list_cases
 
-    help = "name the tasks, controllers and suites, or the cases of FILE"
-    listed = _command(commands, "list", call, help)
-    listed.add_argument(
-        "file", nargs="?", metavar="FILE", help=f"{_FILE}; its cases are listed"
-    )
-    _add_selection(listed)
+    return list_cases(options.file, SUITES, options.select, options.marks)
 
 
-def _add_run(commands: Any) -> None:
-    def call(options: Any) -> int:
-        from .experiments._cli import run_command
-
-        passed = {
-            "select": options.select,
-            "marks": options.marks,
-            "slow": options.slow,
-            "seeds": options.seeds,
-            "workers": options.workers,
-            "fresh": options.fresh,
-            "retry": options.retry,
-            "progress": not options.quiet,
-        }
-        if options.dask is None:
-            return run_command(options.file, options.store, options.html, passed)
-        from .experiments._dask import client
-
-        with client(options.dask):
-            passed["backend"] = "dask"
-            return run_command(options.file, options.store, options.html, passed)
-
-    more = """
+@_command(
+    "run the experiments of FILE",
+    _option("file", metavar="FILE", help=_FILE),
+    *_CASES,
+    _option("--slow", action="store_true", help="also cases marked slow"),
+    _option("--seeds", type=int, help="how many seeds (default: as FILE says)"),
+    _option(
+        "--workers", type=int, default=1, help="processes; -1 is one for each core"
+    ),
+    _option(
+        "--dask", metavar="ADDRESS", help="run on the Dask cluster of this scheduler"
+    ),
+    _option("--store", help="results file (default: results/FILE.jsonl)"),
+    _option("--html", metavar="PAGE", help="write a report too"),
+    _option("--fresh", action="store_true", help="run also what is stored"),
+    _option("--retry", action="store_true", help="run again what failed"),
+    _option("--quiet", action="store_true", help="show no progress"),
+    more="""
         examples:
           python -m delucax run sweep.py --workers 2
           python -m delucax run sweep.py -k "lqr and not cartpole" --seeds 32
@@ -170,93 +195,68 @@ def _add_run(commands: Any) -> None:
 
         Results are stored as they arrive; the same command goes on where it was
         stopped, and runs again only what changed.
-        """
-    help = "run the experiments of FILE"
-    run = _command(commands, "run", call, help, more)
-    run.add_argument("file", metavar="FILE", help=_FILE)
-    _add_selection(run)
-    run.add_argument("--slow", action="store_true", help="also cases marked slow")
-    run.add_argument("--seeds", type=int, help="how many seeds (default: as FILE says)")
-    run.add_argument(
-        "--workers", type=int, default=1, help="processes; -1 is one for each core"
-    )
-    run.add_argument(
-        "--dask", metavar="ADDRESS", help="run on the Dask cluster of this scheduler"
-    )
-    run.add_argument("--store", help="results file (default: results/FILE.jsonl)")
-    run.add_argument("--html", metavar="PAGE", help="write a report too")
-    run.add_argument("--fresh", action="store_true", help="run also what is stored")
-    run.add_argument("--retry", action="store_true", help="run again what failed")
-    run.add_argument("--quiet", action="store_true", help="show no progress")
+        """,
+)
+def _run(options: Any) -> int:
+    from .experiments._commands import run_file
+    from .experiments._workers import dask_client
+    from .studies._listing import SUITES
+
+    names = ("select", "marks", "slow", "seeds", "workers", "fresh", "retry")
+    passed = {name: getattr(options, name) for name in names}
+    passed["progress"] = not options.quiet
+    with contextlib.ExitStack() as stack:
+        if options.dask is not None:
+            stack.enter_context(dask_client(options.dask))
+            passed["backend"] = "dask"
+        return run_file(options.file, SUITES, options.store, options.html, passed)
 
 
-def _add_report(commands: Any) -> None:
-    def call(options: Any) -> int:
-        from .experiments._cli import report_command
-
-        return report_command(
-            options.results, options.diff, options.html, options.export, options.select
-        )
-
-    more = """
-        examples:
-          python -m delucax report results/sweep.jsonl --html sweep.html
-          python -m delucax report results/sweep.jsonl --export sweep.tex
-          python -m delucax report --diff before.jsonl after.jsonl
-        """
-    help = "show a results file, or what differs between two"
-    report = _command(commands, "report", call, help, more)
-    report.add_argument("results", nargs="+", metavar="RESULTS", help="results file")
-    report.add_argument(
+@_command(
+    "show a results file, or what differs between two",
+    _option("results", nargs="+", metavar="RESULTS", help="results file"),
+    _option(
         "--diff", action="store_true", help="compare two, with paired 95%% intervals"
-    )
-    report.add_argument(
-        "--html", metavar="PAGE", help="write a page of tables, figures"
-    )
-    report.add_argument(
+    ),
+    _option("--html", metavar="PAGE", help="write a page of tables, figures"),
+    _option(
         "--export",
         action="append",
         default=[],
         metavar="TABLE",
         help="write all rows to a .csv, .parquet, .md or .tex file",
-    )
-    report.add_argument(
-        "-k",
-        dest="select",
-        default="",
-        metavar="EXPR",
-        help="only these cases (default: all)",
-    )
+    ),
+    _expression("-k", "select", "only these cases"),
+    more="""
+        examples:
+          python -m delucax report results/sweep.jsonl --html sweep.html
+          python -m delucax report results/sweep.jsonl --export sweep.tex
+          python -m delucax report --diff before.jsonl after.jsonl
+        """,
+)
+def _report(options: Any) -> int:
+    from .experiments._commands import report_diff, report_file
+
+    report = report_diff if options.diff else report_file
+    return report(options.results, options.select, options.html, options.export)
 
 
-def _add_bench(commands: Any) -> None:
-    def call(options: Any) -> int:
-        from .experiments._cli import bench_command
-
-        return bench_command(options.name)
-
-    help = "measure speed against other libraries, in a checkout"
-    bench = _command(commands, "bench", call, help)
-    bench.add_argument(
-        "name", nargs="?", help="one benchmark, such as pendulum (default: all)"
-    )
-
-
-def _add_selection(command: Any) -> None:
-    command.add_argument(
-        "-k",
-        dest="select",
-        default="",
-        metavar="EXPR",
-        help="cases by name, such as 'lqr and not cartpole' (default: all)",
-    )
-    command.add_argument(
-        "-m",
-        dest="marks",
-        default="",
-        metavar="EXPR",
-        help="cases by their marks (default: all)",
-    )
+@_command(
+    "measure speed against other libraries, in a checkout",
+    _option("name", nargs="?", help="one benchmark, such as pendulum (default: all)"),
+)
+def _bench(options: Any) -> int:
+    sys.path.insert(0, str(Path.cwd()))
+    if importlib.util.find_spec("benchmarks") is None:
+        raise ValueError(
+            "bench: the benchmarks are in the repository and not in the package: run "
+            "this in a checkout of it."
+        )
+    name = options.name
+    module = "benchmarks" if name is None else f"benchmarks.{name}"
+    if importlib.util.find_spec(module) is None:
+        raise ValueError(f"bench: there is no benchmark called {name!r}.")
+    return subprocess.run([sys.executable, "-u", "-m", module]).returncode
 
 
 if __name__ == "__main__":

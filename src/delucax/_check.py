@@ -47,6 +47,16 @@ def _is_hashable(value: Any) -> bool:
     return True
 
 
+def check_instance(value: Any, cls: type, name: str, where: str) -> None:
+    """Raise unless `value` is an instance of `cls`."""
+    if not isinstance(value, cls):
+        article = "an" if cls.__name__[0] in "AEIOU" else "a"
+        raise ValueError(
+            f"{where}: {name} must be {article} {cls.__name__}, got "
+            f"{type(value).__name__}."
+        )
+
+
 def check_key(key: Any, where: str) -> Any:
     """`key`, if it is one random key, or an error."""
     if eqx.is_array(key):
@@ -187,6 +197,25 @@ def check_number(value: Any, name: str, where: str) -> None:
     check_finite(array, name, where)
 
 
+def as_number(value: Any, name: str, where: str) -> Any:
+    """`value` as a scalar: a Python number if it is known, so that it stays known
+    while other things are being traced.
+    """
+    if isinstance(value, Tracer):
+        array = as_float_array(value)
+        if array.shape != ():
+            raise ValueError(
+                f"{where}: {name} must be a number, got shape {array.shape}."
+            )
+        return array
+    number = np.asarray(value)
+    if number.shape != () or number.dtype.kind not in "iuf":
+        raise ValueError(f"{where}: {name} must be a number, got {shortened(value)}.")
+    if not np.isfinite(number):
+        raise ValueError(f"{where}: {name} must be finite, got {shortened(value)}.")
+    return float(number)
+
+
 def check_range(
     value: Any, name: str, where: str, low: Any = 0, high: float | int = np.inf
 ) -> None:
@@ -221,3 +250,9 @@ def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
             f"{shortened(value)}."
         )
     return int(value)
+
+
+def check_instance(value: Any, kind: Any, words: str, where: str) -> None:
+    """Raise unless `value` is of a class, such as "cost must be an AbstractCost"."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{where}: {words}, got {type(value).__name__}.")

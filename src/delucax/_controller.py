@@ -1,11 +1,15 @@
 """What a controller is; the protocols alone."""
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
 from jaxtyping import Array, PyTree
 
 from ._message import shortened
@@ -127,6 +131,74 @@ class AbstractLearner(AbstractController):
         """
 
 
+class AbstractStochasticPolicy(AbstractController):
+    """A controller that draws its controls, with a probability that it can tell.
+
+    [`delucax.training.PPO`][], [`delucax.training.LikelihoodRatio`][] and
+    [`delucax.training.scored_cost`][] train such controllers.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+        from jaxtyping import Array
+
+        class Dithered(dlx.AbstractStochasticPolicy):
+            gain: Array = dlx.weight(20.0)
+
+            def init(self, *, key=None):
+                return key
+
+            def __call__(self, t, y, state):
+                state, now = jax.random.split(state)
+                return -self.gain * y[:1] + jax.random.normal(now, (1,), y.dtype), state
+
+            def log_prob(self, t, y, state, u):
+                return -0.5 * jnp.sum((u + self.gain * y[:1]) ** 2)
+
+        policy = Dithered()
+        state = policy.init(key=jax.random.key(0))
+        policy.log_prob(0.0, jnp.zeros(2), state, jnp.ones(1))
+        ```
+    """
+
+    @abc.abstractmethod
+    def log_prob(self, t: RealScalar, y: Array, state: PyTree, u: Array) -> Array:
+        """The log-probability with which `__call__(t, y, state)` gives `u`.
+
+        **Arguments:**
+
+        - `t`: time, a scalar.
+        - `y`: observation, a vector.
+        - `state`: the controller's state, before the call.
+        - `u`: a control, shape `(m,)`.
+
+        **Returns:** a scalar.
+        """
+
+    def entropy(self, t: RealScalar, y: Array, state: PyTree) -> Array | None:
+        """The entropy of the draw.
+
+        **Arguments:**
+
+        - `t`: time, a scalar.
+        - `y`: observation, a vector.
+        - `state`: the controller's state, before the call.
+
+        **Returns:** a scalar; `None` (the default) where there is no closed form, and
+        `-log_prob` of what was drawn is the estimate.
+        """
+        del t, y, state
+        return None
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether the distribution depends on `state`; true by default."""
+        return True
+
+
 class Tally(eqx.Module):
     """How often something went wrong in a controller, kept in the controller's state.
 
@@ -187,6 +259,44 @@ class Tally(eqx.Module):
         return eqx.tree_at(lambda tally: tally.count, self, self.count + happened)
 
 
+def initial_state(controller: AbstractController, key: PRNGKey | None) -> PyTree:
+    """The state that a controller begins with; arrays of NumPy become JAX's."""
+
+    def as_array(leaf):
+        return jnp.asarray(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
+
+    return jax.tree.map(as_array, controller.init(key=key))
+
+
+def has_state(controller: AbstractController) -> bool:
+    """Whether a controller carries arrays from one step to the next."""
+    start = lambda: eqx.filter(initial_state(controller, jr.key(0)), eqx.is_array)
+    return bool(jax.tree.leaves(jax.eval_shape(start)))
+
+
+def replay(
+    controller: AbstractController,
+    state: PyTree,
+    record: tuple[Array, ...],
+    act: Callable[..., tuple[PyTree, PyTree]],
+) -> PyTree:
+    """What `act` measures at each step of a recorded run.
+
+    `measured, state = act(t, y, state, u, ...)` calls the controller, from `state` on
+    and along `record`: the times, observations, applied controls and costs, and what
+    else `act` takes. Then the controller is told the control and the cost.
+    """
+    state, static = eqx.partition(state, eqx.is_array)
+
+    def step(arrays, inputs):
+        t, y, u, cost, *rest = inputs
+        measured, after = act(t, y, eqx.combine(arrays, static), u, *rest)
+        after = controller.applied(u, cost, after)
+        return eqx.filter(after, eqx.is_array), measured
+
+    return lax.scan(step, state, record)[1]
+
+
 def tallies(state: PyTree) -> dict[str, Array]:
     """The sum of the tallies of each name in a controller's state."""
     is_tally = lambda node: isinstance(node, Tally)
@@ -203,6 +313,17 @@ def wrong_observation(controller: Any, expected: int, y: Array) -> ValueError:
         f"{type(controller).__name__}: expects an observation of size {expected}, got "
         f"size {y.shape[0] if y.ndim else 0}. If it was made for the encoded "
         "observation, give it features=env.encode."
+    )
+
+
+def check_stochastic(policy: Any, name: str, where: str) -> AbstractStochasticPolicy:
+    """`policy`, if it knows the probability of what it draws, or an error."""
+    if isinstance(policy, AbstractStochasticPolicy):
+        return policy
+    raise ValueError(
+        f"{where}: the {name} must draw its controls and have "
+        "log_prob(t, y, state, u), as a delucax.AbstractStochasticPolicy, got "
+        f"{type(policy).__name__}."
     )
 
 

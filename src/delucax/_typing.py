@@ -1,6 +1,6 @@
 """Array aliases shared by every signature."""
 
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 from jaxtyping import Array, Bool, Float, Key, Num, Shaped, UInt32
 
@@ -19,4 +19,6 @@ Scalar: TypeAlias = Float[Array, ""]
 BoolScalar: TypeAlias = Bool[Array, ""]
 PRNGKey: TypeAlias = Key[Array, "..."] | UInt32[Array, "... 2"]
 """A key from `jax.random.key` (or the older `jax.random.PRNGKey`)."""
+Checkpoint: TypeAlias = Literal["step", "sqrt"] | None
+"""What the gradient of a rollout stores."""
 AnyArray: TypeAlias = Shaped[Array, "..."]

@@ -339,7 +339,7 @@ def test_what_a_class_inherits_and_a_module_imports_is_code_too(tmp_path):
         "case": "from base import Base\n\nclass Mine(Base):\n    pass\n\n"
         "def run():\n    return Mine().f()\n",
     }
-    look = "import case; from delucax.experiments._hash import fingerprint\n"
+    look = "import case; from delucax.experiments._fingerprint import fingerprint\n"
     look += "print(fingerprint(case.run))"
     found = []
     for change in (

@@ -10,9 +10,6 @@ from helpers import assert_close, once, thorough, tolerance, user_error
 
 import delucax as dlx
 from delucax import lung
-from delucax.lung._train import _Careful
-from delucax.studies.ventilator._size import FULL
-from delucax.studies.ventilator._tuned import _lost, best_of, tuned_pids
 
 
 pytestmark = once
@@ -83,10 +80,11 @@ def test_controller_learns_and_the_grid_knows_the_best():
     models = lung.stack(
         [lung.LungModel(lung.SingleCompartment(R)) for R in (5.0, 50.0)]
     )
+    simulated = eqx.filter_vmap(lung.lung_environment)(models)
     forward = lung.FeedForward(lung.BreathWaveform(), gain=1.0)
     start = lung.stack([lung.stack([forward, forward])])
     few = dict(steps=30, pips=[15.0, 30.0], learning_rate=0.1, horizon=15)
-    fitted = lung.train_controllers(models, start, key=KEY, **few)
+    fitted = lung.train_controllers(simulated, start, key=KEY, **few)
     assert fitted.history.loss[-1] < 0.8 * fitted.history.loss[0]
     gains = fitted.model.gain[0]
     assert gains[0] > gains[1]  # the narrow lung needs less flow
@@ -107,17 +105,17 @@ def test_controller_learns_and_the_grid_knows_the_best():
     assert least[0] < own[0]
 
 
-def test_a_learned_lung_is_drawn_to_what_is_read(breaths):
+def test_a_learned_lung_is_corrected_by_what_is_read(breaths):
     model = lung.LearnedLung(breaths, width=2, boundary=1, key=KEY)
     before = model.resting()
-    after = model.drawn(before, 15.0, 0.3)
+    after = model.corrected(before, 15.0, 0.3)
     expected = 0.7 * model.pressure(before) + 0.3 * 15.0
     assert_close(model.pressure(after), expected, rtol=tolerance(1e-5, 1e-12))
     assert np.sum(np.asarray(after != before)) == 1
 
 
 def test_an_alarm_costs_more_than_an_error():
-    cost = _Careful(lung.BreathCost(lung.BreathWaveform(), index=2), jnp.asarray(45.0))
+    cost = lung.BreathCost(lung.BreathWaveform(), index=2, limit=45.0)
     u = jnp.zeros(2)
     assert_close(cost(0.5, jnp.array([0.0, 0.0, 44.0]), u), 9.0)
     assert_close(cost(0.5, jnp.array([0.0, 0.0, 47.0]), u), 12.0 + 20.0)
@@ -161,22 +159,6 @@ def test_wrong_arguments(breaths):
         lung.stack([lung.SingleCompartment(), lung.BalloonLung()])
 
 
-@thorough
-def test_tuned_pids_are_the_best_that_were_tried(tmp_path):
-    waveform = lung.BreathWaveform()
-    envs = lung.stack([lung.single_compartment(R) for R in (5.0, 50.0)])
-    size = FULL._replace(tuned=20, pid_steps=3)
-    options = dict(checkpoint=tmp_path / "tuned.fit", progress=False)
-    said = []
-    found = tuned_pids(envs, waveform, size, KEY, options, said.append)
-    assert len(found) == 4 and not said
-    error = lambda env, pid: jnp.mean(lung.breath_error(env, pid, key=KEY))
-    own = eqx.filter_vmap(error)(envs, found["tuned PID + feed-forward"])
-    shared = found["tuned PID + feed-forward for all"]
-    alike = eqx.filter_vmap(error, in_axes=(eqx.if_array(0), None))(envs, shared)
-    assert jnp.all(own <= alike + 1e-3) and jnp.all(own < 10)
-
-
 class Root(dlx.AbstractController):
     """Not finite below 0, and no slope at 0."""
 
@@ -188,12 +170,13 @@ class Root(dlx.AbstractController):
 
 @pytest.mark.parametrize("shared", [False, pytest.param(True, marks=thorough)])
 def test_those_that_diverge_harm_no_other(shared):
-    models = lung.stack([lung.LungModel(lung.SingleCompartment()) for _ in range(2)])
+    env = lung.lung_environment(lung.LungModel(lung.SingleCompartment()))
+    envs = lung.stack([env, env])
 
     def trained(gains, throw):
         start = Root(jnp.array(gains))
         few = dict(shared=shared, steps=2, horizon=2, pips=[20.0], throw=throw)
-        return lung.train_controllers(models, start, key=KEY, **few)
+        return lung.train_controllers(envs, start, key=KEY, **few)
 
     begin = [1.0, -1.0, 0.0] if shared else [[1.0, -1.0], [0.0, 1.0]]
     with user_error(RuntimeError, match="is not finite at step 0"):
@@ -205,13 +188,3 @@ def test_those_that_diverge_harm_no_other(shared):
     assert_close(found.model.gain[~bad], expected.model.gain[~bad])
     assert np.all(expected.model.gain != 1)
     assert found.history["diverged"].tolist() == [2, 2]
-
-
-def test_what_has_no_finite_error_is_not_chosen():
-    candidates = dict(number=jnp.arange(6).reshape(3, 2))
-    errors = jnp.array([[jnp.inf, 2.0, 1.0], [3.0, jnp.inf, 4.0]])
-    assert best_of(candidates, errors, False)["number"].tolist() == [4, 1]
-    assert best_of(candidates, errors, True)["number"].tolist() == [4, 5]
-    assert _lost(np.zeros(5), errors[:, 2]) == ""
-    assert "2 of 6 errors are not finite" in _lost(np.zeros(5), errors)
-    assert "in 1 of 5 steps" in _lost(np.eye(5)[0], errors[:, 2])

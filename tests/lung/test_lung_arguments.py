@@ -15,12 +15,13 @@ KEY = jax.random.key(0)
 ENV = lung.single_compartment(20.0)
 WAVEFORM = ENV.cost.waveform
 PID = dlx.controllers.LeakyPID(0.5, 1.0, dt=ENV.dt, reference=WAVEFORM)
-MODELS = lung.stack([lung.LungModel(lung.SingleCompartment())])
+MODEL = lung.LungModel(lung.SingleCompartment())
 
 
 def trained(**options):
     forward = lung.stack([lung.stack([lung.FeedForward(WAVEFORM)])])
-    return lung.train_controllers(MODELS, forward, key=KEY, steps=1, **options)
+    envs = lung.stack([lung.lung_environment(MODEL)])
+    return lung.train_controllers(envs, forward, key=KEY, steps=1, **options)
 
 
 WITH_PIPS = {
@@ -65,7 +66,7 @@ def test_a_peep_below_that_of_the_valves_is_refused(task):
     with user_error(match="valves, 5.0, below which no lung empties, got 3.0"):
         make(waveform=lung.BreathWaveform(peep=3.0))
     env = make(valves=valves, waveform=lung.BreathWaveform(peep=8.0))
-    assert_close(env.dynamics.pressure(env.initial_state), 8.0, rtol=1e-6)
+    assert_close(env.initial_state[env.cost.index], 8.0, rtol=1e-6)
 
 
 def test_traced_waveforms_are_taken():
@@ -109,8 +110,8 @@ def test_a_stack_is_not_one_task():
         "Breathing": lambda w: lung.Breathing(PID, w),
         "Explorer": lambda w: lung.Explorer(dt=0.03, waveform=w),
         "BreathPolicy": lambda w: lung.BreathPolicy(w, 0.03, key=KEY),
-        "train_controllers": lambda w: trained(waveform=w),
-        "BreathCost: ": lambda w: lung.single_compartment(waveform=w),
+        "BreathCost: ": lambda w: lung.lung_environment(MODEL, w),
+        "BreathCost:": lambda w: lung.single_compartment(waveform=w),
     }.items(),
 )
 def test_a_waveform_is_one(kind, make):
@@ -128,9 +129,16 @@ def test_wrong_numbers_are_named():
     with user_error(match="ki must be numbers, got .."):
         lung.pid_grid(ENV, key=KEY, ki=[])
     with user_error(match="noise must be at least 0, got -1"):
-        trained(noise=-1.0)
-    with user_error(match="be LearnedLungs, LungModels or tasks .*stack made"):
-        lung.train_controllers(lung.unstack(MODELS)[0], PID, key=KEY)
+        lung.lung_environment(MODEL, noise=-1.0)
+    with user_error(match="limit must be positive and finite, got -1"):
+        lung.lung_environment(MODEL, limit=-1.0)
+    with user_error(match="sensor_delay must be a whole number of at least 0, got -1"):
+        lung.single_compartment(sensor_delay=-1)
+    with user_error(match="'sensor_dely'; did you mean 'sensor_delay'"):
+        lung.single_compartment(sensor_dely=1)
+    for env in (MODEL, ENV):
+        with user_error(match="envs must be tasks of lungs that .*stack made one of"):
+            lung.train_controllers(env, PID, key=KEY)
     with user_error(match="breath_error: controller must be an AbstractController"):
         lung.breath_error(ENV, print, key=KEY)
     with user_error(match="breath_error: env must be a task with a breath waveform"):

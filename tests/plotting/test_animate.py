@@ -16,10 +16,10 @@ from matplotlib.patches import Polygon
 from PIL import Image
 
 import delucax as dlx
-from delucax.plotting._drawings import drawing_for
-from delucax.plotting._drawings._arms import draw_pendulum, setup_pendulum
-from delucax.plotting._drawings._parts import arc_arrow
-from delucax.plotting._drawings._registry import _DRAWINGS
+from delucax.plotting._drawings import Canvas, drawing_for, Episode
+from delucax.plotting._drawings._arms import pendulum
+from delucax.plotting._drawings._canvas import arc_arrow
+from delucax.plotting._drawings._registry import _BY_TYPE
 from delucax.plotting._export import compressed, expanded
 from delucax.plotting._runs import as_runs
 from delucax.plotting._scene import Scene
@@ -204,20 +204,26 @@ def test_frame_says_time_and_cost_and_moves_its_dots(scene, trajectory):
     assert np.isfinite([dot.get_ydata()[0] for dot in dots]).all()
 
 
-def test_pendulum_points_where_its_angle_says():
+def pendulum_at(env, trajectory, angle, torque):
+    """The artists of a pendulum: its lines and the arrow of its torque, if any."""
+    ax = Figure().add_subplot()
+    drawing = pendulum(Canvas(ax), Episode(env, trajectory))
+    fixed = len(ax.get_lines())
+    drawing.draw(np.array([angle, 0.0]), np.array([torque]))
+    arrows = [p for p in ax.patches if isinstance(p, Polygon)]
+    return ax.get_lines()[fixed:], arrows
+
+
+def test_pendulum_points_where_its_angle_says(env, trajectory):
     for angle, tip in ((0.0, (0, 1)), (np.pi / 2, (-1, 0)), (np.pi, (0, -1))):
-        ax = Figure().add_subplot()
-        draw_pendulum(ax, np.array([angle, 0.0]), np.zeros(1))
-        (rod,) = ax.get_lines()
+        (rod,), arrows = pendulum_at(env, trajectory, angle, 0.0)
         np.testing.assert_allclose([line[1] for line in rod.get_data()], tip, atol=1e-9)
-        assert not [p for p in ax.patches if isinstance(p, Polygon)]
+        assert not arrows
 
 
-def test_torque_arrow_grows_with_the_torque_and_turns_its_way():
+def test_torque_arrow_grows_with_the_torque_and_turns_its_way(env, trajectory):
     def sweep(torque):
-        ax = Figure().add_subplot()
-        draw_pendulum(ax, np.zeros(2), np.array([torque]), largest_torque=2.0)
-        (arrow,) = [p for p in ax.patches if isinstance(p, Polygon)]
+        _, (arrow,) = pendulum_at(env, trajectory, 0.0, torque)
         return np.ptp(arrow.get_xy(), axis=0).prod(), arrow.get_xy()[:, 0].mean()
 
     sizes = [sweep(torque)[0] for torque in (0.2, 0.6, 1.2)]
@@ -229,13 +235,11 @@ def test_torque_arrow_grows_with_the_torque_and_turns_its_way():
     np.testing.assert_allclose(tip, [0, 1], atol=1e-9)
 
 
-def test_pendulum_knows_its_largest_torque(env, trajectory):
-    ax = Figure().add_subplot()
-    assert setup_pendulum(ax, env, trajectory) == {"largest_torque": 2.0}
+def test_largest_torque_is_the_bound_or_what_was_applied(env, trajectory):
+    assert Episode(env, trajectory).largest_controls == 2.0
     free = dlx.make("pendulum", max_torque=jnp.inf)
-    np.testing.assert_allclose(
-        setup_pendulum(ax, free, trajectory)["largest_torque"], 1.5
-    )
+    largest = Episode(free, trajectory).largest_controls
+    np.testing.assert_allclose(largest, 1.5)
 
 
 def test_other_plants_are_a_dot_in_a_plane_or_bars(key):
@@ -313,25 +317,25 @@ def test_drawing_without_setup_fits_all_that_it_draws():
         assert low <= np.exp(-2) and 7 <= high <= 8
         assert scene.plant.ax.get_aspect() == 1
     finally:
-        del _DRAWINGS[Tank]
+        del _BY_TYPE[Tank]
 
 
 def test_drawings_are_found_by_type(env):
     fine = dlx.make("pendulum", solver=dlx.dynamics.RK4())
-    assert drawing_for(env) is drawing_for(fine)
-    assert drawing_for(env).draw is draw_pendulum
+    assert drawing_for(env) is drawing_for(fine) is pendulum
 
     def draw(ax, x, u):
         pass
 
-    kept = dict(_DRAWINGS)
+    kept = dict(_BY_TYPE)
     try:
         dlx.plotting.register_drawing(dlx.environments.GymPendulum, draw)
-        assert drawing_for(env).draw is draw_pendulum
+        assert drawing_for(env) is pendulum
         dlx.plotting.register_drawing(dlx.systems.Pendulum, draw)
-        assert drawing_for(env).draw is draw
+        assert drawing_for(env) is _BY_TYPE[dlx.systems.Pendulum] is not pendulum
     finally:
-        _DRAWINGS.update(kept)
+        _BY_TYPE.clear()
+        _BY_TYPE.update(kept)
 
 
 def test_registration_errors():
@@ -398,10 +402,10 @@ def test_errors_name_the_argument(env, trajectory, key):
 
 def test_setup_must_return_keywords(env, trajectory):
     run = as_runs(trajectory, None, "trajectory", "test")[0]
-    kept = dict(_DRAWINGS)
+    kept = dict(_BY_TYPE)
     try:
         dlx.plotting.register_drawing(dlx.systems.Pendulum, print, lambda *args: 3)
         with user_error(match="setup of a drawing must return a dictionary or None"):
             Scene(run, env, [0], 40)
     finally:
-        _DRAWINGS.update(kept)
+        _BY_TYPE.update(kept)

@@ -11,10 +11,10 @@ from systems_catalogue import SYSTEMS
 
 import delucax as dlx
 from delucax.plotting._drawings import drawing_for
-from delucax.plotting._drawings._arms import acrobot_points, reacher_points
-from delucax.plotting._drawings._masses import spring
+from delucax.plotting._drawings._arms import arm_points
+from delucax.plotting._drawings._masses import zigzag
 from delucax.plotting._drawings._quadrotor import attitude
-from delucax.plotting._drawings._registry import _DRAWINGS
+from delucax.plotting._drawings._registry import _BY_TYPE
 from delucax.plotting._runs import as_runs
 from delucax.plotting._scene import Scene
 
@@ -95,7 +95,7 @@ def drawn(env, x, u=None):
 )
 def test_every_task_has_a_drawing_that_moves(name, arguments):
     env = dlx.make(name, **arguments)
-    generic = _DRAWINGS[dlx.AbstractDynamics]
+    generic = _BY_TYPE[dlx.AbstractDynamics]
     phase_planes = ("cstr", "lds", "neural", "van_der_pol")
     assert (drawing_for(env) is generic) == (name in phase_planes)
     rng = np.random.default_rng(0)
@@ -112,13 +112,15 @@ def test_every_task_has_a_drawing_that_moves(name, arguments):
 
 
 def test_arms_reach_where_the_systems_say():
-    arm = dlx.systems.Reacher(length_1=0.7, length_2=1.2)
+    env = dlx.make("reacher", length_1=0.7, length_2=1.2)
     for x in np.random.default_rng(1).normal(size=(3, 4)):
-        hand = reacher_points(x, (0.7, 1.2))[2]
-        np.testing.assert_allclose(hand, arm.tip(jnp.asarray(x)), atol=1e-6)
-        tip = acrobot_points(x, (1.0, 1.0))[2]
+        _, new = drawn(env, x)
+        outer, _ = (a for a in new if hasattr(a, "get_xydata") and len(a.get_xydata()))
+        hand = env.dynamics.system.tip(jnp.asarray(x))
+        np.testing.assert_allclose(outer.get_xydata()[1], hand, atol=1e-6)
+        tip = arm_points(x, (1.0, 1.0))[2]
         np.testing.assert_allclose(tip[1], -np.cos(x[0]) - np.cos(x[0] + x[1]))
-    assert acrobot_points(np.array([0.5, 0.0]), (1.0, 1.0))[2, 0] > 0
+    assert arm_points(np.array([0.5, 0.0]), (1.0, 1.0))[2, 0] > 0
 
 
 def test_poles_lean_to_their_sides_and_have_their_lengths():
@@ -183,9 +185,9 @@ def test_time_is_told_in_the_unit_of_the_plant():
 
 
 def test_spring_joins_its_ends():
-    zigzag = spring(1.0, 3.0, 0.5, 0.2)
-    np.testing.assert_allclose(zigzag[[0, -1]], [[1, 0.5], [3, 0.5]])
-    assert np.ptp(zigzag[:, 1]) == pytest.approx(0.4)
+    spring = zigzag(1.0, 3.0, 0.5, 0.2)
+    np.testing.assert_allclose(spring[[0, -1]], [[1, 0.5], [3, 0.5]])
+    assert np.ptp(spring[:, 1]) == pytest.approx(0.4)
 
 
 def test_past_is_a_line_and_the_rest_is_faint():
@@ -200,14 +202,17 @@ def test_past_is_a_line_and_the_rest_is_faint():
 
 
 def test_default_can_be_replaced():
-    kept = dict(_DRAWINGS)
-    draw = lambda ax, x, u: ax.plot([0, 1], [x[0], 1])
+    kept = dict(_BY_TYPE)
+    env, pendulum = dlx.make("lds", **NEEDED["lds"]), dlx.make("pendulum")
     try:
-        dlx.plotting.register_drawing(dlx.AbstractDynamics, draw)
-        assert drawing_for(dlx.make("lds", **NEEDED["lds"])).draw is draw
-        assert drawing_for(dlx.make("pendulum")).draw is not draw
+        dlx.plotting.register_drawing(
+            dlx.AbstractDynamics, lambda ax, x, u: ax.plot([0, 1], [x[0], 1])
+        )
+        assert drawing_for(env) is _BY_TYPE[dlx.AbstractDynamics]
+        assert drawing_for(env) is not kept[dlx.AbstractDynamics]
+        assert drawing_for(pendulum) is kept[dlx.systems.Pendulum]
     finally:
-        _DRAWINGS.update(kept)
+        _BY_TYPE.update(kept)
 
 
 @pytest.mark.parametrize(

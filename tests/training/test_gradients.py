@@ -38,7 +38,7 @@ NOISE = 0.3
 HORIZON = 4
 
 
-class Recalling(dlx.AbstractController):
+class Recalling(dlx.AbstractStochasticPolicy):
     """`h = decay h + y_0` is remembered, and `u ~ N(-gain h, exp(log_std)^2)`."""
 
     gain: Array = dlx.weight(0.8)

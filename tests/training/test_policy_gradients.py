@@ -19,11 +19,7 @@ from delucax.training import (
     PPO,
     SHAC,
 )
-from delucax.training._actor_critic import (
-    advantages,
-    episode,
-    Moments,
-)
+from delucax.training._standardisation import Moments
 
 
 A = np.array([[1.0, 0.3], [-0.2, 0.9]])
@@ -95,18 +91,19 @@ def by_hand(costs, values, ends_with, stops):
 def test_advantages_know_an_end_from_a_cut(ends, bootstrap):
     env = environment(terminated=Grows() if ends else None)
     model = model_of()
-    options = dict(horizon=6, bootstrap=bootstrap)
-    run_episode = eqx.filter_jit(lambda *given: episode(*given, **options))
-    record, run = run_episode(env, model, jr.key(3))
+    ppo = PPO(env, 1, discount=GAMMA, decay=LAMBDA, bootstrap=bootstrap)
+    batch = eqx.filter_jit(ppo._episodes)(model, jr.key(12))
+    record = jax.tree.map(lambda leaf: leaf[0], batch)
+    run = dlx.rollout(env, model.policy, key=jr.split(jr.key(12), 1)[0])
     length = int(run.length)
     assert (length < 6) == ends
-    found = advantages(record, jnp.asarray(GAMMA), jnp.asarray(LAMBDA))
     values = [float(v) for v in jax.vmap(lambda x: model.value(0.0, x))(run.states)]
     cut = bootstrap and not ends
     last = values[6] if cut else float(run.final_cost)
     costs = np.asarray(run.costs)[:length]
     expected = by_hand(costs, np.asarray(values[:length]), last, length)
-    assert_close(found[:length], expected, rtol=1e-12)
+    assert_close(record.advantages[:length], expected, rtol=1e-12)
+    assert_close(record.targets[:length], expected + values[:length], rtol=1e-12)
     assert_close(record.valid, np.arange(6) < length)
 
 
@@ -163,7 +160,7 @@ def test_window_of_shac_is_the_whole_gradient_where_it_spans_the_horizon():
     slope = gradient_of(shac, model, memory)
     total = expected_cost(env, batch=1)
     expected = eqx.filter_grad(total)(base, jr.key(5))
-    scale = 6 * memory.seen.targets.std
+    scale = 6 * memory.statistics.targets.std
     for a, b in zip(
         jax.tree.leaves(slope.policy), jax.tree.leaves(expected), strict=True
     ):
@@ -203,7 +200,7 @@ def _without_end(cost):
 def test_moments_are_those_of_all_rows():
     rows = jr.normal(jr.key(0), (20, 3)) * 4 + 2
     valid = jnp.arange(20) % 3 > 0
-    moments = Moments.none(jnp.zeros(3))
+    moments = Moments.empty(jnp.zeros(3))
     for part in (slice(0, 7), slice(7, 20)):
         moments = moments.joined(rows[part], valid[part])
     assert_close(moments.mean, jnp.mean(rows[valid], axis=0), rtol=1e-12)
@@ -309,6 +306,35 @@ def test_surrogate_goes_on_from_a_checkpoint(tmp_path):
         fit(drawn, model, optimiser, 9, **options, **kept, callbacks=[stop])
     again = fit(drawn, model, optimiser, 9, **options, **kept)
     assert np.array_equal(whole.history.loss, again.history.loss)
+
+
+class Dithered(dlx.AbstractStochasticPolicy):
+    """A policy that does not know its entropy."""
+
+    gain: jax.Array = dlx.weight(0.2)
+
+    def init(self, *, key=None):
+        return key
+
+    def __call__(self, t, y, state):
+        state, now = jr.split(state)
+        return -self.gain * y[:1] + 0.1 * jr.normal(now, (1,), y.dtype), state
+
+    def log_prob(self, t, y, state, u):
+        return -0.5 * jnp.sum(((u + self.gain * y[:1]) / 0.1) ** 2)
+
+
+@once
+def test_log_probability_stands_for_an_entropy_that_is_not_known():
+    model = ActorCritic(Dithered(), model_of().critic)
+    assert model.policy.has_memory  # as no policy is asked what it remembers
+    env = environment()
+    ppo = PPO(env, 2, 3, epochs=1, minibatches=1)
+    memory = started(ppo, model)
+    assert memory.rows.times.shape == (2, 3)
+    _, metrics = eqx.filter_jit(ppo)(model, memory, jr.key(0))
+    assert_close(metrics["entropy"], -jnp.mean(memory.rows.log_prob), rtol=1e-5)
+    assert not model_of().policy.has_memory
 
 
 @once

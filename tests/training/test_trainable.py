@@ -8,6 +8,7 @@ from helpers import assert_close, once, user_error
 from jaxtyping import Array
 
 import delucax as dlx
+from delucax._module import get_path
 from delucax.training import fit
 
 
@@ -52,9 +53,7 @@ def moved(trainable=None, start=None, steps=2, rate=0.01):
     return {
         name
         for name in ("plant.mass", "plant.friction", "gain", "fraction")
-        if not np.array_equal(
-            dlx._paths.get_path(start, name), dlx._paths.get_path(end, name)
-        )
+        if not np.array_equal(get_path(start, name), get_path(end, name))
     }
 
 

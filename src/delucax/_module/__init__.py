@@ -13,7 +13,7 @@ from ._fields import (
     StaticFunction as StaticFunction,
     weight as weight,
 )
-from ._names import indexed_names as indexed_names
+from ._names import indexed_names as indexed_names, names_of as names_of
 from ._paths import (
     check_paths as check_paths,
     get_path as get_path,

@@ -4,7 +4,6 @@ The file is three parts: a line with the format, its version and a SHA-256 of th
 a line of JSON that describes the structure; and the bytes of the arrays.
 """
 
-import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -12,7 +11,6 @@ import importlib.metadata
 import json
 import math
 import os
-import secrets
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -25,6 +23,7 @@ import numpy as np
 from jax.core import Tracer
 
 from .._check import as_path
+from .._files import replaced
 from .._results import Result
 from ._qualified import name_of, thing_of
 
@@ -71,17 +70,11 @@ def save(path: str | os.PathLike, obj: Any) -> None:
     first = f"{_MAGIC} {_VERSION} {hashlib.sha256(body).hexdigest()}\n"
     if path.is_dir():
         raise ValueError(f"save: path must be that of a file, got the folder '{path}'.")
-    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        with open(beside, "xb") as file:
+        with replaced(path) as file:
             file.write(first.encode())
             file.write(body)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            beside.unlink()
         raise type(error)(f"save: '{path}' cannot be written: {error}") from error
 
 

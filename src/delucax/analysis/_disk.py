@@ -4,14 +4,12 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from .._message import shortened
 from .._results import Result
-from ..dynamics import LinearDynamics
-from ..systems import LinearSystem
-from ._norms import peak_gain, thrown
-from ._plant import Plant, plant
+from .._typing import Scalar
+from ._norms import peak_gain
+from ._state_space import LinearModel, raise_unless_successful, state_space, StateSpace
 
 
 class DiskMargin(eqx.Module):
@@ -39,16 +37,16 @@ class DiskMargin(eqx.Module):
         ```
     """
 
-    margin: Float[Array, ""]
-    frequency: Float[Array, ""]
-    gain_low: Float[Array, ""]
-    gain_high: Float[Array, ""]
-    phase: Float[Array, ""]
+    margin: Scalar
+    frequency: Scalar
+    gain_low: Scalar
+    gain_high: Scalar
+    phase: Scalar
     result: Result
 
 
 def disk_margin(
-    loop: LinearSystem | LinearDynamics,
+    loop: LinearModel,
     skew: Any = 0.0,
     *,
     channel: int | None = None,
@@ -92,8 +90,8 @@ def disk_margin(
         ```
     """
     where = "disk_margin"
-    given = plant(loop, "controls", where)
-    p, m = given.D.shape
+    system = state_space(loop, "controls", where)
+    p, m = system.D.shape
     if p != m:
         raise ValueError(
             f"{where}: loop must have as many outputs as controls, got {p} and {m}."
@@ -105,12 +103,13 @@ def disk_margin(
                 f"{where}: channel must be a whole number from 0 to {m - 1}, or None "
                 f"for all, got {shortened(channel)}."
             )
-    found = disk_of(given, jnp.asarray(skew, given.A.dtype), channel)
-    return thrown(found, where) if throw else found
+    disk = disk_of(system, jnp.asarray(skew, system.A.dtype), channel)
+    return raise_unless_successful(disk, where) if throw else disk
 
 
 @eqx.filter_jit
-def disk_of(loop: Plant, skew: Array, channel: int | None) -> DiskMargin:
+def disk_of(loop: StateSpace, skew: Scalar, channel: int | None) -> DiskMargin:
+    """The disk margin of a loop, or of one of its channels."""
     A, B, C = loop.A, loop.B, loop.C
     if channel is not None:
         others = [i for i in range(B.shape[1]) if i != channel]
@@ -118,10 +117,11 @@ def disk_of(loop: Plant, skew: Array, channel: int | None) -> DiskMargin:
         B, C = B[:, channel, None], C[channel, None]
     eye = jnp.eye(B.shape[1], dtype=A.dtype)
     # S = I - C (s I - (A - B C))^-1 B.
-    peak = peak_gain(Plant(A - B @ C, B, -C, (1 + skew) / 2 * eye, loop.dt))
+    closed = StateSpace(A - B @ C, B, -C, (1 + skew) / 2 * eye, loop.dt)
+    peak = peak_gain(closed)
     # Each branch that is not taken has a harmless number, so that its derivative has.
-    stable, closed = jnp.isfinite(peak.gain), peak.gain > 0
-    usual = stable & closed
+    stable = jnp.isfinite(peak.gain)
+    usual = stable & (peak.gain > 0)
     alpha = 1 / jnp.where(usual, peak.gain, 1)
     up, down = 2 - alpha * (1 + skew), 2 + alpha * (1 + skew)
     low = (2 - alpha * (1 - skew)) / down

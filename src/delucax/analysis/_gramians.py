@@ -8,13 +8,12 @@ import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
-from .._check import check_count, check_positive, is_concrete
-from ..dynamics import LinearDynamics
-from ..math._linear_solve import full_precision
+from .._check import check_count, check_positive
+from .._typing import BoolScalar, Scalar
+from ..math._linear_solve import full_precision, symmetric
 from ..riccati._lyapunov import lyapunov
 from ..riccati._stein import stein
-from ..systems import LinearSystem
-from ._plant import is_stable, Plant, plant
+from ._state_space import LinearModel, raise_if, state_space, StateSpace
 
 
 _DOUBLINGS = 60
@@ -22,7 +21,7 @@ _DOUBLINGS = 60
 
 
 def controllability_matrix(
-    model: LinearSystem | LinearDynamics, *, inputs: str = "controls"
+    model: LinearModel, *, inputs: str = "controls"
 ) -> Float[Array, "n nm"]:
     """The Krylov matrix `[B, A B, ..., A^(n-1) B]`.
 
@@ -49,13 +48,10 @@ def controllability_matrix(
         dlx.analysis.controllability_matrix(upright)
         ```
     """
-    given = plant(model, inputs, "controllability_matrix")
-    return _krylov(given.A, given.B)
+    return _krylov(state_space(model, inputs, "controllability_matrix"))
 
 
-def observability_matrix(
-    model: LinearSystem | LinearDynamics,
-) -> Float[Array, "np n"]:
+def observability_matrix(model: LinearModel) -> Float[Array, "np n"]:
     """The Krylov matrix `[C; C A; ...; C A^(n-1)]`.
 
     **Arguments:** `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
@@ -74,12 +70,11 @@ def observability_matrix(
         dlx.analysis.observability_matrix(upright)
         ```
     """
-    given = plant(model, "controls", "observability_matrix")
-    return _krylov(given.A.T, given.C.T).T
+    return _krylov(state_space(model, "controls", "observability_matrix").dual).T
 
 
 def controllability_gramian(
-    model: LinearSystem | LinearDynamics,
+    model: LinearModel,
     horizon: Any = None,
     *,
     inputs: str = "controls",
@@ -119,11 +114,11 @@ def controllability_gramian(
         ```
     """
     where = "controllability_gramian"
-    return _checked_gramian(plant(model, inputs, where), horizon, throw, where)
+    return _gramian(state_space(model, inputs, where), horizon, throw, where)
 
 
 def observability_gramian(
-    model: LinearSystem | LinearDynamics, horizon: Any = None, *, throw: bool = True
+    model: LinearModel, horizon: Any = None, *, throw: bool = True
 ) -> Float[Array, "n n"]:
     """The energy `x' W x` of the outputs from a state `x`,
 
@@ -159,78 +154,65 @@ def observability_gramian(
         ```
     """
     where = "observability_gramian"
-    given = plant(model, "controls", where)
-    dual = Plant(given.A.T, given.C.T, given.B.T, given.D.T, given.dt)
-    return _checked_gramian(dual, horizon, throw, where)
+    return _gramian(state_space(model, "controls", where).dual, horizon, throw, where)
 
 
-def _checked_gramian(plant: Plant, horizon: Any, throw: bool, where: str) -> Array:
-    if horizon is not None and plant.is_discrete:
-        return _gramian_of_steps(plant, check_count(horizon, "horizon", where))
+def _gramian(
+    system: StateSpace, horizon: Any, throw: bool, where: str
+) -> Float[Array, "n n"]:
+    if horizon is not None and system.is_discrete:
+        return _gramian_of_steps(system, check_count(horizon, "horizon", where))
     if horizon is not None:
         check_positive(horizon, "horizon", where)
-        return _gramian_of_time(plant, jnp.asarray(horizon, plant.A.dtype))
-    found, stable = _infinite(plant)
-    if not throw:
-        return found
+        return _gramian_of_time(system, jnp.asarray(horizon, system.A.dtype))
+    W, stable = _gramian_of_all_time(system)
     message = (
         f"{where}: the model must be stable for a Gramian over all time. Give a "
         "horizon, or pass throw=False for infinity."
     )
-    if not is_concrete(stable):
-        return eqx.error_if(found, ~stable, message)
-    if not stable:
-        raise RuntimeError(message)
-    return found
+    return raise_if(~stable, W, message) if throw else W
 
 
 @eqx.filter_jit
-def _krylov(A, B):
-    blocks = [B]
-    for _ in range(A.shape[0] - 1):
-        blocks.append(A @ blocks[-1])
+def _krylov(system: StateSpace) -> Float[Array, "n nm"]:
+    blocks = [system.B]
+    for _ in range(system.A.shape[0] - 1):
+        blocks.append(system.A @ blocks[-1])
     return jnp.concatenate(blocks, axis=1)
 
 
 @eqx.filter_jit
-def _infinite(plant: Plant) -> tuple[Array, Array]:
-    stable = is_stable(plant)
-    harmless = -jnp.eye(plant.A.shape[0], dtype=plant.A.dtype) / 2
-    A = jnp.where(stable, plant.A, harmless)
-    found = gramian(A, plant.B, plant.is_discrete)
-    return jnp.where(stable, found, jnp.inf), stable
+def _gramian_of_all_time(system: StateSpace) -> tuple[Float[Array, "n n"], BoolScalar]:
+    stable = system.is_stable()
+    W = stable_gramian(system.stable_or_harmless(stable))
+    return jnp.where(stable, W, jnp.inf), stable
 
 
 @full_precision
-def gramian(A: Array, B: Array, is_discrete: bool) -> Array:
+def stable_gramian(system: StateSpace) -> Float[Array, "n n"]:
     """The controllability Gramian over all time of a stable model."""
-    if is_discrete:
-        return _symmetric(stein(A.T, B @ B.T))
-    return _symmetric(lyapunov(A.T, B @ B.T))
-
-
-def _symmetric(W):
-    return (W + W.T) / 2
+    equation = stein if system.is_discrete else lyapunov
+    return symmetric(equation(system.A.T, system.B @ system.B.T))
 
 
 @eqx.filter_jit
 @full_precision
-def _gramian_of_steps(plant: Plant, steps: int) -> Array:
+def _gramian_of_steps(system: StateSpace, steps: int) -> Float[Array, "n n"]:
     """By doubling: `W_2k = W_k + A^k W_k (A^k)'`, along the bits of `steps`."""
-    A, Q = plant.A, plant.B @ plant.B.T
-    W, power = jnp.zeros_like(Q), jnp.eye(A.shape[0], dtype=A.dtype)
+    A, Q = system.A, system.B @ system.B.T
+    W, power = jnp.zeros_like(Q), system.eye
     for bit in bin(steps)[2:]:
         W, power = W + power @ W @ power.T, power @ power
         if bit == "1":
             W, power = Q + A @ W @ A.T, A @ power
-    return _symmetric(W)
+    return symmetric(W)
 
 
 @eqx.filter_jit
 @full_precision
-def _gramian_of_time(plant: Plant, horizon: Array) -> Array:
+def _gramian_of_time(system: StateSpace, horizon: Scalar) -> Float[Array, "n n"]:
     """Van Loan's block exponential over a short time, and then doubling."""
-    A, Q = plant.A, plant.B @ plant.B.T
+    A, Q = system.A, system.B @ system.B.T
     n = A.shape[0]
     fastest = lax.stop_gradient(horizon * jnp.linalg.norm(A))
     doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(fastest, 1))), 0, _DOUBLINGS)
@@ -249,4 +231,4 @@ def _gramian_of_time(plant: Plant, horizon: Array) -> Array:
         return (W_next, jnp.where(more, held @ held, power)), None
 
     (W, _), _ = lax.scan(double, (W, power), jnp.arange(_DOUBLINGS))
-    return _symmetric(W)
+    return symmetric(W)

@@ -6,14 +6,19 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Complex, Float
 
 from .._results import first_of, Result
-from ..dynamics import LinearDynamics
-from ..systems import LinearSystem
+from .._typing import BoolScalar, Scalar
 from ._disk import disk_of, DiskMargin
-from ._norms import thrown
-from ._plant import is_stable, Plant, plant, response, size, solve
+from ._state_space import (
+    LinearModel,
+    raise_unless_successful,
+    size,
+    solve,
+    state_space,
+    StateSpace,
+)
 
 
 _HALVINGS = 60
@@ -52,27 +57,27 @@ class Margins(eqx.Module):
             jnp.array([[0.0, 1.0], [0.0, -1.0]]), jnp.array([[0.0], [2.0]]),
             jnp.array([[1.0, 0.0]]),
         )
-        found = dlx.analysis.margins(loop)
-        found.phase_margin, found.phase_margin_frequency
+        margins = dlx.analysis.margins(loop)
+        margins.phase_margin, margins.phase_margin_frequency
         ```
     """
 
-    gain_margin: Float[Array, ""]
-    gain_margin_frequency: Float[Array, ""]
-    gain_reduction: Float[Array, ""]
-    gain_reduction_frequency: Float[Array, ""]
-    phase_margin: Float[Array, ""]
-    phase_margin_frequency: Float[Array, ""]
-    delay_margin: Float[Array, ""]
-    delay_margin_frequency: Float[Array, ""]
+    gain_margin: Scalar
+    gain_margin_frequency: Scalar
+    gain_reduction: Scalar
+    gain_reduction_frequency: Scalar
+    phase_margin: Scalar
+    phase_margin_frequency: Scalar
+    delay_margin: Scalar
+    delay_margin_frequency: Scalar
     disk: DiskMargin
     disk_s: DiskMargin
     disk_t: DiskMargin
-    is_stable: Bool[Array, ""]
+    is_stable: BoolScalar
     result: Result
 
 
-def margins(loop: LinearSystem | LinearDynamics, *, throw: bool = True) -> Margins:
+def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
     """The gain, phase, delay and disk margins of a loop with one input and one output.
 
     The loop `L` is the linear model from `u` to `y`, closed by `u = -y`: for a state
@@ -109,39 +114,39 @@ def margins(loop: LinearSystem | LinearDynamics, *, throw: bool = True) -> Margi
         ```
     """
     where = "margins"
-    given = plant(loop, "controls", where)
-    if given.D.shape != (1, 1):
+    system = state_space(loop, "controls", where)
+    p, m = system.D.shape
+    if not p == m == 1:
         raise ValueError(
-            f"{where}: loop must have one control and one output, got "
-            f"{given.D.shape[1]} and {given.D.shape[0]}; `disk_margin` takes more."
+            f"{where}: loop must have one control and one output, got {m} and {p}; "
+            "`disk_margin` takes more."
         )
-    found = _margins(given)
-    return thrown(found, where) if throw else found
+    solution = _margins(system)
+    return raise_unless_successful(solution, where) if throw else solution
 
 
 @eqx.filter_jit
-def _margins(loop: Plant) -> Margins:
-    closed = loop.A - loop.B @ loop.C
-    stable = is_stable(eqx.tree_at(lambda p: p.A, loop, closed))
+def _margins(loop: StateSpace) -> Margins:
+    stable = loop.with_A(loop.A - loop.B @ loop.C).is_stable()
     skews = jnp.array([0, 1, -1], loop.A.dtype)
     disks = jax.vmap(lambda skew: disk_of(loop, skew, None))(skews)
-    still = lax.stop_gradient(loop)
-    omegas, found = _crossings(still)
-    values = jax.vmap(jax.vmap(lambda w: _scalar(still, w)))(omegas)
+    frozen = lax.stop_gradient(loop)
+    omegas, crosses = _crossings(frozen)
+    values = jax.vmap(jax.vmap(lambda w: _scalar(frozen, w)))(omegas)
 
     # Where the loop is real and negative, and where it is 1 in size.
     real = jnp.real(values[0])
     huge = jnp.finfo(real.dtype).eps ** -0.75
-    negative = found[0] & (real < 0) & (real > -huge)
+    negative = crosses[0] & (real < 0) & (real > -huge)
     factors = -1 / jnp.where(negative, real, -1)
     turns = jnp.angle(-values[1])
-    lags = jnp.mod(turns, 2 * jnp.pi) / jnp.where(found[1], omegas[1], 1)
+    lags = jnp.mod(turns, 2 * jnp.pi) / jnp.where(crosses[1], omegas[1], 1)
     candidates = jnp.stack(
         [
             jnp.where(negative & (factors >= 1), factors, jnp.inf),
             jnp.where(negative & (factors < 1), 1 / factors, jnp.inf),
-            jnp.where(found[1], jnp.abs(turns), jnp.inf),
-            jnp.where(found[1], lags, jnp.inf),
+            jnp.where(crosses[1], jnp.abs(turns), jnp.inf),
+            jnp.where(crosses[1], lags, jnp.inf),
         ]
     )
     kinds = jnp.array([0, 0, 1, 1])
@@ -160,25 +165,30 @@ def _margins(loop: Plant) -> Margins:
     none, unstable = jnp.array([jnp.inf, 0, jnp.inf, jnp.inf]), jnp.array([1, 1, 0, 0])
     margins = jnp.where(stable, jnp.where(exists, margins, none), unstable)
     frequencies = jnp.where(stable & exists, followed, jnp.nan)
+    names = ("gain_margin", "gain_reduction", "phase_margin", "delay_margin")
     disk, disk_s, disk_t = (jax.tree.map(lambda a, i=i: a[i], disks) for i in range(3))
-    result = first_of(disks.result)
-    pairs = zip(margins, frequencies, strict=True)
-    flat: Any = [each for pair in pairs for each in pair]
-    flat += [disk, disk_s, disk_t, stable, result]
-    return Margins(*flat)
+    return Margins(
+        **dict(zip(names, margins, strict=True)),
+        **{f"{name}_frequency": w for name, w in zip(names, frequencies, strict=True)},
+        disk=disk,
+        disk_s=disk_s,
+        disk_t=disk_t,
+        is_stable=stable,
+        result=first_of(disks.result),
+    )
 
 
-def _scalar(loop: Plant, omega: Array) -> Array:
-    return response(loop, omega)[0, 0]
+def _scalar(loop: StateSpace, omega: Scalar) -> Complex[Array, ""]:
+    return loop.response(omega)[0, 0]
 
 
-def _crossing(kind: Any, L: Array) -> Array:
+def _crossing(kind: Any, L: Complex[Array, ""]) -> Scalar:
     """Zero where `L` is real, or for the second kind where it is 1 in size."""
     length = size(L)
     return jnp.where(kind == 0, jnp.imag(L) / length, jnp.log(length))
 
 
-def _follow(loop: Plant, kind: Any, omega: Array, found: Array) -> Array:
+def _follow(loop: StateSpace, kind: Any, omega: Scalar, exists: BoolScalar) -> Scalar:
     """`omega` itself, which moves with the loop as the crossing does.
 
     Two Newton steps from where it is already: their values change nothing but rounding,
@@ -189,14 +199,11 @@ def _follow(loop: Plant, kind: Any, omega: Array, found: Array) -> Array:
     if dt is not None:
         nearly = jnp.pi * (1 - 10 * jnp.finfo(omega.dtype).eps)
         at_nyquist = omega * lax.stop_gradient(dt) > nearly
-    moves = found & (omega > 0) & ~at_nyquist
+    moves = exists & (omega > 0) & ~at_nyquist
 
     def newton(_, there):
-        g, slope = jax.jvp(
-            lambda w: _crossing(kind, _scalar(loop, w)),
-            (there,),
-            (jnp.ones_like(there),),
-        )
+        crossing = lambda w: _crossing(kind, _scalar(loop, w))
+        g, slope = jax.jvp(crossing, (there,), (jnp.ones_like(there),))
         return there - jnp.where(moves, g / jnp.where(moves, slope, 1), 0)
 
     there = lax.fori_loop(0, 2, newton, jnp.where(moves, omega, 1))
@@ -204,7 +211,9 @@ def _follow(loop: Plant, kind: Any, omega: Array, found: Array) -> Array:
     return jnp.where(moves, there, rest)
 
 
-def _crossings(loop: Plant) -> tuple[Array, Array]:
+def _crossings(
+    loop: StateSpace,
+) -> tuple[Float[Array, "2 crossings"], Bool[Array, "2 crossings"]]:
     """Frequencies where the loop is real, and where it is 1 in size.
 
     **Returns:** two rows of frequencies, and which of them are crossings.
@@ -213,11 +222,12 @@ def _crossings(loop: Plant) -> tuple[Array, Array]:
     eps = jnp.finfo(A.dtype).eps
     if loop.is_discrete:
         scale = jnp.ones((), A.dtype)
-        axis = _on_the_axis(loop)
+        # A pole at -1, on the circle, would go to infinity; now it goes far.
+        axis = loop.with_A(loop.A * (1 - 10 * eps)).on_the_axis()
     else:
         sizes = jnp.abs(jnp.linalg.eigvals(A - B @ C))
         scale = jnp.exp(jnp.mean(jnp.log(jnp.where(sizes > 0, sizes, 1))))
-        axis = Plant(A / scale, B / scale, C, loop.D, None)
+        axis = StateSpace(A / scale, B / scale, C, loop.D, None)
 
     def omega(phi):
         """The frequency of an angle in `[0, pi/2]`, one for each frequency there is."""
@@ -243,7 +253,7 @@ def _crossings(loop: Plant) -> tuple[Array, Array]:
     last = lax.cummax(jnp.where(tells, indices, -1), axis=1)[:, :-1]
     low, high = jnp.take_along_axis(between, last, axis=1), between[:, 1:]
     low_sign = jnp.sign(jnp.take_along_axis(signs, last, axis=1))
-    found = tells[:, 1:] & (last >= 0) & (low_sign != jnp.sign(signs[:, 1:]))
+    crosses = tells[:, 1:] & (last >= 0) & (low_sign != jnp.sign(signs[:, 1:]))
 
     def halve(_, bracket):
         low, high = bracket
@@ -254,44 +264,32 @@ def _crossings(loop: Plant) -> tuple[Array, Array]:
     low, high = lax.fori_loop(0, _HALVINGS, halve, (low, high))
     phi = (low + high) / 2
     # At a pole or a zero on the axis the sign jumps, and nothing is small.
-    found = found & (jnp.abs(values(phi)) < eps**0.25)
+    crosses = crosses & (jnp.abs(values(phi)) < eps**0.25)
     # At both ends a loop is real, but a strictly proper one at infinity zero.
     at_ends = jnp.array([[True, loop.is_discrete], [False, False]])
     phi = jnp.concatenate([phi, jnp.stack([ends, ends])], axis=1)
-    return omega(phi), jnp.concatenate([found, at_ends], axis=1)
+    return omega(phi), jnp.concatenate([crosses, at_ends], axis=1)
 
 
-def _on_the_axis(loop: Plant) -> Plant:
-    """With `z = (1 + s) / (1 - s)` the circle becomes the axis, value for value."""
-    A, B, C, D = loop.A, loop.B, loop.C, loop.D
-    n = A.shape[0]
-    eye = jnp.eye(n, dtype=A.dtype)
-    # A pole at -1, on the circle, would go to infinity; now it goes far.
-    A = A * (1 - 10 * jnp.finfo(A.dtype).eps)
-    both = solve(eye + A, jnp.concatenate([A - eye, B], axis=1))
-    C_axis = 2**0.5 * solve((eye + A).T, C.T).T
-    return Plant(both[:, :n], 2**0.5 * both[:, n:], C_axis, D - C @ both[:, n:], None)
-
-
-def _real_frequencies(loop: Plant) -> Array:
+def _real_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
     """Zeros of `L(s) - L(-s)`: eigenvalues, seen from two points of the real axis."""
     A, B, C = loop.A, loop.B, loop.C
     zero = jnp.zeros_like(A)
     both_A = jnp.block([[A, zero], [zero, -A]])
     both_B, both_C = jnp.concatenate([B, B]), jnp.concatenate([C, C], axis=1)
-    n = both_A.shape[0]
-    found = []
+    eye = jnp.eye(both_A.shape[0], dtype=A.dtype)
+    frequencies = []
     # Neither is likely to be a pole, or a zero itself.
     for point in (0.7368, 1.3719):
-        right = jnp.concatenate([jnp.eye(n, dtype=A.dtype), both_B], axis=1)
-        solved = solve(point * jnp.eye(n, dtype=A.dtype) - both_A, right)
-        F, FB = solved[:, :n], solved[:, n:]
+        right = jnp.concatenate([eye, both_B], axis=1)
+        solved = solve(point * eye - both_A, right)
+        F, FB = solved[:, : len(eye)], solved[:, len(eye) :]
         inverse = FB @ (both_C @ F) / (both_C @ FB) - F
-        found.append(jnp.imag(1 / jnp.linalg.eigvals(inverse)))
-    return jnp.concatenate(found)
+        frequencies.append(jnp.imag(1 / jnp.linalg.eigvals(inverse)))
+    return jnp.concatenate(frequencies)
 
 
-def _unit_frequencies(loop: Plant) -> Array:
+def _unit_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
     """Zeros of `1 - L(-s) L(s)`: eigenvalues of a Hamiltonian."""
     A, B, C, D = loop.A, loop.B, loop.C, loop.D
     rest = 1 - D[0, 0] ** 2

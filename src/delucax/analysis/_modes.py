@@ -9,9 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from .._check import check_positive
-from ..dynamics import LinearDynamics
-from ..systems import LinearSystem
-from ._plant import growth, Plant, plant
+from .._typing import BoolScalar, Scalar
+from ._state_space import LinearModel, state_space, StateSpace
 
 
 _SEARCHES = 3
@@ -48,7 +47,7 @@ class ModalTest(eqx.Module):
     modes: Complex[Array, " n"]
     distances: Float[Array, " n"]
     unstable: Bool[Array, " n"]
-    tolerance: Float[Array, ""]
+    tolerance: Scalar
 
     @property
     def out_of_reach(self) -> Bool[Array, " n"]:
@@ -57,13 +56,13 @@ class ModalTest(eqx.Module):
         return ~(self.distances > self.tolerance)
 
     @property
-    def worst(self) -> tuple[Complex[Array, ""], Float[Array, ""]]:
+    def worst(self) -> tuple[Complex[Array, ""], Scalar]:
         """The mode that is closest to being out of reach, and its distance."""
         k = jnp.argmin(self.distances)
         return self.modes[k], self.distances[k]
 
     @property
-    def worst_unstable(self) -> tuple[Complex[Array, ""], Float[Array, ""]]:
+    def worst_unstable(self) -> tuple[Complex[Array, ""], Scalar]:
         """The same among unstable modes; the distance is infinite if there is none."""
         distances = jnp.where(self.unstable, self.distances, jnp.inf)
         k = jnp.argmin(distances)
@@ -71,10 +70,7 @@ class ModalTest(eqx.Module):
 
 
 def modal_controllability(
-    model: LinearSystem | LinearDynamics,
-    *,
-    inputs: str = "controls",
-    tolerance: Any = None,
+    model: LinearModel, *, inputs: str = "controls", tolerance: Any = None
 ) -> ModalTest:
     """Which modes the inputs reach, by the test of Popov, Belevitch and Hautus,
 
@@ -105,12 +101,10 @@ def modal_controllability(
         ```
     """
     where = "modal_controllability"
-    return _modal_test(plant(model, inputs, where), _checked(tolerance, where))
+    return _modal_test(state_space(model, inputs, where), tolerance, where)
 
 
-def modal_observability(
-    model: LinearSystem | LinearDynamics, *, tolerance: Any = None
-) -> ModalTest:
+def modal_observability(model: LinearModel, *, tolerance: Any = None) -> ModalTest:
     """Which modes the outputs show, by the test of Popov, Belevitch and Hautus,
 
     `rank [A' - lambda I, C'] = n` at each eigenvalue `lambda` of `A`.
@@ -138,16 +132,12 @@ def modal_observability(
         ```
     """
     where = "modal_observability"
-    tolerance = _checked(tolerance, where)
-    return _modal_test(_dual(plant(model, "controls", where)), tolerance)
+    return _modal_test(state_space(model, "controls", where).dual, tolerance, where)
 
 
 def is_controllable(
-    model: LinearSystem | LinearDynamics,
-    *,
-    inputs: str = "controls",
-    tolerance: Any = None,
-) -> Bool[Array, ""]:
+    model: LinearModel, *, inputs: str = "controls", tolerance: Any = None
+) -> BoolScalar:
     """Whether the inputs reach every mode.
 
     **Arguments:** `model`, `inputs` and `tolerance`: as in
@@ -171,11 +161,8 @@ def is_controllable(
 
 
 def is_stabilizable(
-    model: LinearSystem | LinearDynamics,
-    *,
-    inputs: str = "controls",
-    tolerance: Any = None,
-) -> Bool[Array, ""]:
+    model: LinearModel, *, inputs: str = "controls", tolerance: Any = None
+) -> BoolScalar:
     """Whether the inputs reach every unstable mode.
 
     **Arguments:** `model`, `inputs` and `tolerance`: as in
@@ -201,9 +188,7 @@ def is_stabilizable(
     return ~jnp.any(test.out_of_reach & test.unstable)
 
 
-def is_observable(
-    model: LinearSystem | LinearDynamics, *, tolerance: Any = None
-) -> Bool[Array, ""]:
+def is_observable(model: LinearModel, *, tolerance: Any = None) -> BoolScalar:
     """Whether the outputs show every mode.
 
     **Arguments:** `model` and `tolerance`: as in
@@ -225,9 +210,7 @@ def is_observable(
     return ~jnp.any(modal_observability(model, tolerance=tolerance).out_of_reach)
 
 
-def is_detectable(
-    model: LinearSystem | LinearDynamics, *, tolerance: Any = None
-) -> Bool[Array, ""]:
+def is_detectable(model: LinearModel, *, tolerance: Any = None) -> BoolScalar:
     """Whether the outputs show every unstable mode.
 
     **Arguments:** `model` and `tolerance`: as in
@@ -252,7 +235,7 @@ def is_detectable(
     return ~jnp.any(test.out_of_reach & test.unstable)
 
 
-def poles(model: LinearSystem | LinearDynamics) -> Complex[Array, " n"]:
+def poles(model: LinearModel) -> Complex[Array, " n"]:
     """The eigenvalues of `A`.
 
     They have first derivatives, in either mode, where they are simple. There is no
@@ -275,38 +258,34 @@ def poles(model: LinearSystem | LinearDynamics) -> Complex[Array, " n"]:
         dlx.analysis.poles(upright)  # +3.87 and -3.87 per second
         ```
     """
-    return jnp.linalg.eigvals(plant(model, "controls", "poles").A)
+    return jnp.linalg.eigvals(state_space(model, "controls", "poles").A)
 
 
-def _checked(tolerance: Any, where: str) -> Any:
+def _modal_test(system: StateSpace, tolerance: Any, where: str) -> ModalTest:
     if tolerance is not None:
         check_positive(tolerance, "tolerance", where)
-    return tolerance
-
-
-def _dual(plant: Plant) -> Plant:
-    return Plant(plant.A.T, plant.C.T, plant.B.T, plant.D.T, plant.dt)
+    return _tested(system, tolerance)
 
 
 @eqx.filter_jit
-def _modal_test(plant: Plant, tolerance: Any) -> ModalTest:
-    plant = lax.stop_gradient(plant)
-    n = plant.A.shape[0]
-    eps = jnp.finfo(plant.A.dtype).eps
+def _tested(system: StateSpace, tolerance: Any) -> ModalTest:
+    system = lax.stop_gradient(system)
+    n = system.A.shape[0]
+    eps = jnp.finfo(system.A.dtype).eps
     if tolerance is None:
         tolerance = 10 * n * eps
     scale_A, scale_B = (
         jnp.where(norm > 0, norm, 1)
-        for norm in (jnp.linalg.norm(plant.A), jnp.linalg.norm(plant.B))
+        for norm in (jnp.linalg.norm(system.A), jnp.linalg.norm(system.B))
     )
-    A, B = plant.A / scale_A, plant.B / scale_B
+    A, B = system.A / scale_A, system.B / scale_B
     eigenvalues = jnp.linalg.eigvals(A)
     # A defective eigenvalue is only known to a root of the rounding.
     radius = eps ** (1 / 3)
 
     def distance(mode):
         """The smallest singular value, and the best `mode` for its vector."""
-        pencil = jnp.concatenate([A - mode * jnp.eye(n, dtype=A.dtype), B], axis=1)
+        pencil = jnp.concatenate([A - mode * system.eye, B], axis=1)
         left, values, _ = jnp.linalg.svd(pencil, full_matrices=False)
         vector = left[:, -1]
         return values[-1], jnp.vdot(vector, A.astype(vector.dtype) @ vector)
@@ -320,10 +299,10 @@ def _modal_test(plant: Plant, tolerance: Any) -> ModalTest:
             step = step * jnp.minimum(1, radius / jnp.where(length > 0, length, 1))
             mode = eigenvalue + step
             least, better = distance(mode)
-        found = least <= tolerance
-        return jnp.where(found, mode, eigenvalue), jnp.where(found, least, first)
+        reached = least <= tolerance
+        return jnp.where(reached, mode, eigenvalue), jnp.where(reached, least, first)
 
     modes, distances = jax.vmap(nearby)(eigenvalues)
     modes = modes * scale_A
-    unstable = growth(plant, modes) >= 0
+    unstable = system.growth(modes) >= 0
     return ModalTest(modes, distances, unstable, jnp.asarray(tolerance, A.dtype))

@@ -1,19 +1,21 @@
 """How large the outputs become: the H2 and H-infinity norms."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
-from .._check import is_concrete
 from .._results import choose, Result, RESULTS
-from ..dynamics import LinearDynamics
-from ..systems import LinearSystem
-from ._gramians import gramian
-from ._plant import growth, is_stable, largest_gain, Plant, plant, response, solve
+from .._typing import BoolScalar, Scalar
+from ._gramians import stable_gramian
+from ._state_space import (
+    largest_gain,
+    LinearModel,
+    raise_unless_successful,
+    solve,
+    state_space,
+    StateSpace,
+)
 
 
 _LEVELS = 30
@@ -47,14 +49,12 @@ class PeakGain(eqx.Module):
         ```
     """
 
-    gain: Float[Array, ""]
-    frequency: Float[Array, ""]
+    gain: Scalar
+    frequency: Scalar
     result: Result
 
 
-def h2_norm(
-    model: LinearSystem | LinearDynamics, *, inputs: str = "controls"
-) -> Float[Array, ""]:
+def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
     """The H2 norm: the root of the outputs' mean square under unit white noise,
 
     `sqrt(trace(C W C'))`, `W` being the controllability Gramian; the same as the root
@@ -84,26 +84,21 @@ def h2_norm(
         dlx.analysis.h2_norm(dlx.LinearDynamics(A, B))  # sqrt(4/3)
         ```
     """
-    return _h2_norm(plant(model, inputs, "h2_norm"))
+    return _h2_norm(state_space(model, inputs, "h2_norm"))
 
 
 @eqx.filter_jit
-def _h2_norm(plant: Plant) -> Array:
-    stable = is_stable(plant)
-    # Zero for what is not stable, so that its derivatives are finite beside others.
-    A = jnp.where(stable, plant.A, -jnp.eye(plant.A.shape[0], dtype=plant.A.dtype) / 2)
-    W = gramian(A, plant.B, plant.is_discrete)
-    square = jnp.trace(plant.C @ W @ plant.C.T)
+def _h2_norm(system: StateSpace) -> Scalar:
+    stable = system.is_stable()
+    W = stable_gramian(system.stable_or_harmless(stable))
+    square = jnp.trace(system.C @ W @ system.C.T)
     positive = square > 0
     norm = jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
     return jnp.where(stable, norm, jnp.inf)
 
 
 def hinf_norm(
-    model: LinearSystem | LinearDynamics,
-    *,
-    inputs: str = "controls",
-    throw: bool = True,
+    model: LinearModel, *, inputs: str = "controls", throw: bool = True
 ) -> PeakGain:
     r"""The H-infinity norm: the largest gain that any sinusoid meets,
 
@@ -148,112 +143,96 @@ def hinf_norm(
         jax.grad(peak)(0.1)
         ```
     """
-    found = peak_gain(plant(model, inputs, "hinf_norm"))
-    return thrown(found, "hinf_norm") if throw else found
-
-
-def thrown(found: Any, where: str) -> Any:
-    """Raise if the search failed: now if it can be seen, else at run time."""
-    failed = found.result != RESULTS.successful
-    if not is_concrete(failed):
-        return found.result.error_if(found, failed)
-    if failed:
-        raise RuntimeError(
-            f"{where}: {RESULTS[found.result]} Pass throw=False to look at what was "
-            "found."
-        )
-    return found
+    peak = peak_gain(state_space(model, inputs, "hinf_norm"))
+    return raise_unless_successful(peak, "hinf_norm") if throw else peak
 
 
 @eqx.filter_jit
-def peak_gain(plant: Plant) -> PeakGain:
+def peak_gain(system: StateSpace) -> PeakGain:
     """The largest gain of a model with a feed-through `D`."""
-    n = plant.A.shape[0]
-    poles = jnp.linalg.eigvals(lax.stop_gradient(plant.A))
-    stable = jnp.all(growth(plant, poles) < 0)
-    # Another in the place of what is not stable, so that its derivatives are finite.
-    harmless = jnp.where(stable, plant.A, -jnp.eye(n, dtype=plant.A.dtype) / 2)
-    safe = eqx.tree_at(lambda p: p.A, plant, harmless)
-    start, ended = _search(lax.stop_gradient(safe))
-    gain, frequency = _followed(safe, *_climb(lax.stop_gradient(safe), start))
-    least = poles[jnp.argmax(growth(plant, poles))]
-    if plant.is_discrete:
-        at_pole = jnp.abs(jnp.angle(least)) / lax.stop_gradient(plant.dt)
-    else:
+    poles = jnp.linalg.eigvals(lax.stop_gradient(system.A))
+    growth = system.growth(poles)
+    stable = jnp.all(growth < 0)
+    safe = system.stable_or_harmless(stable)
+    frozen = lax.stop_gradient(safe)
+    start, ended = _search(frozen)
+    gain, frequency = _at_top(safe, *_climb(frozen, start))
+    least = poles[jnp.argmax(growth)]
+    if system.dt is None:
         at_pole = jnp.abs(jnp.imag(least))
-    result = choose(ended, RESULTS.successful, RESULTS.not_converged)
+    else:
+        at_pole = jnp.abs(jnp.angle(least)) / lax.stop_gradient(system.dt)
     return PeakGain(
         jnp.where(stable, gain, jnp.inf),
         jnp.where(stable, frequency, at_pole),
-        result,
+        choose(ended, RESULTS.successful, RESULTS.not_converged),
     )
 
 
-def _with_slope(plant: Plant, omega: Array) -> tuple[Array, Array]:
-    one = jnp.ones_like(omega)
-    return jax.jvp(lambda w: largest_gain(response(plant, w)), (omega,), (one,))
+def _with_slope(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar]:
+    """The gain at a frequency, and its derivative."""
+    gain = lambda w: largest_gain(system.response(w))
+    return jax.jvp(gain, (omega,), (jnp.ones_like(omega),))
 
 
-def _climb(plant: Plant, omega: Array) -> tuple[Array, Array, Array]:
+def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScalar]:
     """The top by Newton steps for as long as they go up.
 
     **Returns:** its frequency, the curvature of the gain there, and whether it is a top
     that moves with the plant; at the ends of the axis it rests.
     """
+    rounding = 100 * jnp.finfo(omega.dtype).eps
 
     def step(_, carry):
-        best, flattest, top, curvature, moves, trial = carry
+        best, flattest, top, top_curvature, moves, trial = carry
         # An infinite frequency is a point like any other that has no slope.
         finite = jnp.isfinite(trial)
         at = jnp.where(finite, trial, 1)
-        one = jnp.ones_like(at)
-        there = lambda w: _with_slope(plant, w)
-        (gain, slope), (_, bend) = jax.jvp(there, (at,), (one,))
-        usable = finite & (bend < 0) & jnp.isfinite(slope) & jnp.isfinite(bend)
-        bend = jnp.where(usable, bend, -1)
+        (gain, slope), (_, curvature) = jax.jvp(
+            lambda w: _with_slope(system, w), (at,), (jnp.ones_like(at),)
+        )
+        usable = (
+            finite & (curvature < 0) & jnp.isfinite(slope) & jnp.isfinite(curvature)
+        )
+        curvature = jnp.where(usable, curvature, -1)
         # Near the top the gain is level but for rounding, and its slope decides.
         up = usable & (gain >= best) & (jnp.abs(slope) < flattest) & (trial >= 0)
         top = jnp.where(up, trial, top)
-        trial = jnp.where(up, at - slope / bend, trial)
-        best = jnp.where(up, gain * (1 - level), best)
-        flattest = jnp.where(up, jnp.abs(slope), flattest)
-        curvature = jnp.where(up, bend, curvature)
-        return best, flattest, top, curvature, jnp.where(up, top > 0, moves), trial
+        return (
+            jnp.where(up, gain * (1 - rounding), best),
+            jnp.where(up, jnp.abs(slope), flattest),
+            top,
+            jnp.where(up, curvature, top_curvature),
+            jnp.where(up, top > 0, moves),
+            jnp.where(up, at - slope / curvature, trial),
+        )
 
-    level = 100 * jnp.finfo(omega.dtype).eps
     low, steep = jnp.zeros_like(omega), jnp.full_like(omega, jnp.inf)
     start = (low, steep, omega, -jnp.ones_like(omega), jnp.asarray(False), omega)
     *_, top, curvature, moves, _ = lax.fori_loop(0, _NEWTON_STEPS, step, start)
     return top, curvature, moves
 
 
-def _followed(
-    plant: Plant, omega: Array, curvature: Array, moves: Array
-) -> tuple[Array, Array]:
+def _at_top(
+    system: StateSpace, omega: Scalar, curvature: Scalar, moves: BoolScalar
+) -> tuple[Scalar, Scalar]:
     """The gain at the top, and its frequency, which move with the plant as they do."""
     finite = jnp.isfinite(omega)
-    gain, slope = _with_slope(plant, jnp.where(finite, omega, 1))
+    gain, slope = _with_slope(system, jnp.where(finite, omega, 1))
     rise = jnp.where(moves, slope - lax.stop_gradient(slope), 0)
     # Zero, but not its derivatives: the step that Newton's method would take next.
     step = -rise / curvature
     gain = gain + step * slope + step**2 * curvature / 2
-    at_infinity = largest_gain(plant.D)
+    at_infinity = largest_gain(system.D)
     return jnp.where(finite, gain, at_infinity), omega + step
 
 
-def _search(plant: Plant) -> tuple[Array, Array]:
+def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
     """The frequency of the largest gain, and whether the search came to its end."""
-    n = plant.A.shape[0]
-    eye = jnp.eye(n, dtype=plant.A.dtype)
-    A, B, C, D = plant.A, plant.B, plant.C, plant.D
-    if plant.is_discrete:
-        # With z = (1 + s) / (1 - s) the circle becomes the axis, gain for gain.
-        both = solve(eye + A, jnp.concatenate([A - eye, B], axis=1))
-        D = D - C @ both[:, n:]
-        C = 2**0.5 * solve((eye + A).T, C.T).T
-        A, B = both[:, :n], 2**0.5 * both[:, n:]
-    axis = Plant(A, B, C, D, None)
-    gain = lambda w: largest_gain(response(axis, w))
+    axis = system.on_the_axis() if system.is_discrete else system
+    A, B, C, D = axis.A, axis.B, axis.C, axis.D
+    n = A.shape[0]
+    gain = lambda w: largest_gain(axis.response(w))
     eps = jnp.finfo(A.dtype).eps
     at_infinity = largest_gain(D)
 
@@ -262,10 +241,8 @@ def _search(plant: Plant) -> tuple[Array, Array]:
         gains = jnp.where(jnp.isnan(gains), -1, gains)
         k = jnp.argmax(gains)
         better = gains[k] > gain_now
-        return (
-            jnp.where(better, gains[k], gain_now),
-            jnp.where(better, omegas[k], omega_now),
-        )
+        gain_now = jnp.where(better, gains[k], gain_now)
+        return gain_now, jnp.where(better, omegas[k], omega_now)
 
     poles = jnp.linalg.eigvals(A)
     at_poles = jnp.concatenate([jnp.abs(poles), jnp.abs(jnp.imag(poles))])
@@ -273,7 +250,7 @@ def _search(plant: Plant) -> tuple[Array, Array]:
     sweep = jnp.exp(jnp.linspace(low, high, _SWEEP))
     starts = jnp.concatenate([jnp.zeros(1, A.dtype), at_poles, sweep])
     infinity = jnp.asarray(jnp.inf, A.dtype)
-    found = best_of(at_infinity, infinity, starts)
+    best = best_of(at_infinity, infinity, starts)
 
     def crossings(level):
         """Frequencies of the eigenvalues of the Hamiltonian at a level.
@@ -307,8 +284,6 @@ def _search(plant: Plant) -> tuple[Array, Array]:
         gain_next, omega_next = best_of(gain_now, omega_now, between)
         return gain_next, omega_next, ~(gain_next > level), k + 1
 
-    start = (*found, jnp.asarray(False), jnp.asarray(0))
+    start = (*best, jnp.asarray(False), jnp.asarray(0))
     _, omega, ended, _ = lax.while_loop(more, body, start)
-    if plant.is_discrete:
-        omega = 2 * jnp.arctan(omega) / plant.dt
-    return omega, ended
+    return omega if system.dt is None else 2 * jnp.arctan(omega) / system.dt, ended

@@ -9,13 +9,12 @@ from jaxtyping import Array, Complex, Float
 
 from .._check import is_concrete
 from .._module import as_float_array
-from ..dynamics import LinearDynamics
-from ..systems import LinearSystem
-from ._plant import Plant, plant, response, solve
+from .._typing import BoolScalar
+from ._state_space import LinearModel, raise_if, solve, state_space, StateSpace
 
 
 def frequency_response(
-    model: LinearSystem | LinearDynamics, omega: Any, *, inputs: str = "controls"
+    model: LinearModel, omega: Any, *, inputs: str = "controls"
 ) -> Complex[Array, "*frequencies p m"]:
     """The complex gain `C (s I - A)^-1 B` from inputs to outputs,
 
@@ -48,27 +47,25 @@ def frequency_response(
         ```
     """
     where = "frequency_response"
-    given = plant(model, inputs, where)
+    system = state_space(model, inputs, where)
     omega = as_float_array(omega)
     real = eqx.is_inexact_array(omega) and not jnp.iscomplexobj(omega)
     if not real or is_concrete(omega) and not bool(jnp.all(jnp.isfinite(omega))):
         raise ValueError(f"{where}: omega must be real and finite, got {omega}.")
-    return _responses(given, omega)
+    return _responses(system, omega)
 
 
 @eqx.filter_jit
-def _responses(plant: Plant, omega: Array) -> Array:
-    omega = omega.astype(plant.A.dtype)
-    found = jax.vmap(lambda w: response(plant, w))(omega.reshape(-1))
-    found = jnp.where(jnp.isfinite(found), found, jnp.inf)
-    return found.reshape(*omega.shape, *found.shape[1:])
+def _responses(
+    system: StateSpace, omega: Float[Array, "*frequencies"]
+) -> Complex[Array, "*frequencies p m"]:
+    gains = jax.vmap(system.response)(omega.astype(system.A.dtype).reshape(-1))
+    gains = jnp.where(jnp.isfinite(gains), gains, jnp.inf)
+    return gains.reshape(*omega.shape, *gains.shape[1:])
 
 
 def dcgain(
-    model: LinearSystem | LinearDynamics,
-    *,
-    inputs: str = "controls",
-    throw: bool = True,
+    model: LinearModel, *, inputs: str = "controls", throw: bool = True
 ) -> Float[Array, "p m"]:
     """What constant inputs make of the outputs in the end,
 
@@ -98,26 +95,20 @@ def dcgain(
         dlx.analysis.dcgain(dlx.systems.LinearSystem(A, B))  # 1/2 and 0
         ```
     """
-    gain, has_integrator = _dcgain(plant(model, inputs, "dcgain"))
+    gain, has_integrator = _dcgain(state_space(model, inputs, "dcgain"))
     message = (
         "dcgain: a pole is at frequency zero (an integrator), so that constant inputs "
         "come to no constant outputs. Pass throw=False for infinity."
     )
-    if not throw:
-        return gain
-    if not is_concrete(has_integrator):
-        return eqx.error_if(gain, has_integrator, message)
-    if has_integrator:
-        raise RuntimeError(message)
-    return gain
+    return raise_if(has_integrator, gain, message) if throw else gain
 
 
 @eqx.filter_jit
-def _dcgain(plant: Plant) -> tuple[Array, Array]:
-    n = plant.A.shape[0]
-    eye = jnp.eye(n, dtype=plant.A.dtype)
-    matrix = eye - plant.A if plant.is_discrete else -plant.A
+def _dcgain(system: StateSpace) -> tuple[Float[Array, "p m"], BoolScalar]:
+    matrix = system.eye - system.A if system.is_discrete else -system.A
     values = jnp.linalg.svd(jax.lax.stop_gradient(matrix), compute_uv=False)
-    singular = ~(values[-1] > n * jnp.finfo(values.dtype).eps * values[0])
-    gain = plant.C @ solve(jnp.where(singular, eye, matrix), plant.B) + plant.D
+    eps = jnp.finfo(values.dtype).eps
+    singular = ~(values[-1] > len(values) * eps * values[0])
+    invertible = jnp.where(singular, system.eye, matrix)
+    gain = system.C @ solve(invertible, system.B) + system.D
     return jnp.where(singular, jnp.inf, gain), singular

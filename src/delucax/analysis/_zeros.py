@@ -5,14 +5,10 @@ import numpy as np
 from jaxtyping import Array, Complex
 
 from .._check import is_concrete
-from ..dynamics import LinearDynamics
-from ..systems import LinearSystem
-from ._plant import plant
+from ._state_space import LinearModel, state_space
 
 
-def zeros(
-    model: LinearSystem | LinearDynamics, *, inputs: str = "controls"
-) -> Complex[Array, " zeros"]:
+def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " zeros"]:
     """The invariant zeros: where `[[A - z I, B], [C, 0]]` loses rank.
 
     Each step takes away what the outputs show at once, and then, of the transposed
@@ -44,24 +40,23 @@ def zeros(
         dlx.analysis.zeros(system)  # -5
         ```
     """
-    given = plant(model, inputs, "zeros")
-    if not all(is_concrete(M) for M in (given.A, given.B, given.C)):
+    system = state_space(model, inputs, "zeros")
+    if not all(is_concrete(M) for M in (system.A, system.B, system.C)):
         raise ValueError(
             "zeros: model must be concrete, got one that is being traced (by jax.jit, "
             "jax.vmap or jax.grad); how many zeros there are depends on its values."
         )
-    A, B, C, D = (np.asarray(M) for M in (given.A, given.B, given.C, given.D))
+    A, B, C, D = (np.asarray(M) for M in (system.A, system.B, system.C, system.D))
     total = np.linalg.norm(np.block([[A, B], [C, D]]))
     tolerance = 10 * sum(A.shape) * np.finfo(A.dtype).eps * total
     A, B, C, D = _hidden_part(A, B, C, D, tolerance)
     # Of the transposed system: D is then of full row rank, so in the end it is square.
     A, C, B, D = (M.T for M in _hidden_part(A.T, C.T, B.T, D.T, tolerance))
-    n = A.shape[0]
-    if n == 0 or 0 in D.shape:
-        # With no input or output left the modes that are left are zeros.
-        return jnp.linalg.eigvals(jnp.asarray(A)) if n else jnp.zeros(0, complex)
-    closed = A - B @ np.linalg.solve(D, C)
-    return jnp.linalg.eigvals(jnp.asarray(closed))
+    if not len(A):
+        return jnp.zeros(0, complex)
+    # With no input or output left the modes that are left are zeros.
+    left = A - B @ np.linalg.solve(D, C) if D.size else A
+    return jnp.linalg.eigvals(jnp.asarray(left))
 
 
 def _hidden_part(A, B, C, D, tolerance):
@@ -76,10 +71,10 @@ def _hidden_part(A, B, C, D, tolerance):
         _, values, right = (
             np.linalg.svd(free) if free.size else ([], [], np.eye(len(A)))
         )
-        seen = int(np.sum(np.asarray(values) > tolerance))
-        if seen == 0:
+        count = int(np.sum(np.asarray(values) > tolerance))
+        if count == 0:
             return A, B, C[:rank], D[:rank]
-        shown, hidden = right[:seen].T, right[seen:].T
+        shown, hidden = right[:count].T, right[count:].T
         C = np.concatenate([C[:rank] @ hidden, shown.T @ A @ hidden])
         D = np.concatenate([D[:rank], shown.T @ B])
         A, B = hidden.T @ A @ hidden, hidden.T @ B

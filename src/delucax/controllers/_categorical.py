@@ -9,7 +9,12 @@ import jax.random as jr
 from jaxtyping import Array, Float, PyTree
 
 from .._check import as_matrix, check_key
-from .._controller import AbstractController, check_controller
+from .._controller import (
+    AbstractController,
+    AbstractStochasticPolicy,
+    check_controller,
+    has_state,
+)
 from .._module import parameter
 from .._typing import PRNGKey, RealScalar
 
@@ -19,7 +24,7 @@ class _State(NamedTuple):
     key: PRNGKey
 
 
-class Categorical(AbstractController):
+class Categorical(AbstractStochasticPolicy):
     r"""One of several controls, drawn with the probabilities that a base gives,
 
     `u = actions[i]` with probability `softmax(base(t, y))[i]`.
@@ -99,6 +104,11 @@ class Categorical(AbstractController):
         logits, _ = self._logits(t, y, state)
         away = jnp.sum((lax.stop_gradient(self.actions) - u) ** 2, axis=1)
         return logits[jnp.argmin(away)]
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether `base` has a state, on which the logits depend."""
+        return has_state(self.base)
 
     def entropy(self, t: RealScalar, y: Array, state: PyTree) -> Array:
         """The entropy of the draw, `-sum_i p_i log p_i`.

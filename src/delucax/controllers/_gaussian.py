@@ -10,7 +10,13 @@ from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, PyTree
 
 from .._check import as_bounds, bounds_field, check_key
-from .._controller import AbstractController, check_controller
+from .._controller import (
+    AbstractController,
+    AbstractStochasticPolicy,
+    check_controller,
+    has_state,
+    replay,
+)
 from .._message import shortened
 from .._module import weight
 from .._typing import PRNGKey, RealScalar
@@ -23,7 +29,7 @@ class _State(NamedTuple):
     key: PRNGKey
 
 
-class Gaussian(AbstractController):
+class Gaussian(AbstractStochasticPolicy):
     r"""Independent normal controls around those of another controller,
 
     `u = clip(mean + std e, low, high)`, `e ~ N(0, I)`,
@@ -124,6 +130,11 @@ class Gaussian(AbstractController):
         mean, _ = self._mean(t, y, state)
         return self._log_prob(mean, u)
 
+    @property
+    def has_memory(self) -> bool:
+        """Whether `base` has a state, on which the mean depends."""
+        return has_state(self.base)
+
     def entropy(self, t: RealScalar, y: Array, state: PyTree) -> Array:
         """The entropy of the normal draw, before the bounds,
 
@@ -181,21 +192,18 @@ class Gaussian(AbstractController):
                 f"{where}: trajectory must be one run (use jax.vmap over a batch), got "
                 f"a batch of shape {trajectory.batch_shape}."
             )
-        record = (trajectory.observations, trajectory.controls, trajectory.costs)
+        record: Any = (trajectory.observations, trajectory.controls, trajectory.costs)
         if any(part is None for part in record):
             raise ValueError(
                 f"{where}: trajectory must keep observations, controls and costs; "
                 "got one that was rolled out with keep= and lacks some."
             )
-        times, record = lax.stop_gradient((trajectory.times[:-1], record))
-        first, static = eqx.partition(self.base.init(), eqx.is_array)
+        record = lax.stop_gradient((trajectory.times[:-1], *record))
 
-        def step(memory, inputs):
-            t, y, u, cost = inputs
-            mean, base = self.base(t, y, eqx.combine(memory, static))
-            base = self.base.applied(u, cost, base)
-            return eqx.filter(base, eqx.is_array), self._log_prob(mean, u)
+        def act(t, y, state, u):
+            mean, state = self.base(t, y, state)
+            return self._log_prob(mean, u), state
 
-        _, scores = lax.scan(step, first, (times, *record))
+        scores = replay(self.base, self.base.init(), record, act)
         alive = jnp.arange(trajectory.steps) < trajectory.length
         return jnp.sum(jnp.where(alive, scores, 0))

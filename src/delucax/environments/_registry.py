@@ -115,8 +115,10 @@ def finish(
     task: Callable[..., Environment],
     arguments: Mapping[str, Any],
     given: Mapping[str, Any],
+    *shared: Callable[..., Environment],
 ) -> Environment:
-    """The environment of a task that takes what else there is to give of one.
+    """The environment of a task that takes what else there is to give of one; `shared`
+    are functions that take other arguments of the task.
 
     The task's `observation_bounds` hold for the task as it is: they are left out where
     something is given that moves what is seen.
@@ -125,7 +127,8 @@ def finish(
     close ones, the task's own among them.
     """
     known = inspect.signature(Environment).parameters
-    own = inspect.signature(task).parameters.values()
+    takers = task, *shared
+    own = [p for f in takers for p in inspect.signature(f).parameters.values()]
     for name in given:
         if name not in known:
             names = [p.name for p in own if p.kind is not p.VAR_KEYWORD]

@@ -2,9 +2,11 @@
 
 from ._axes import Mark as Mark
 from ._experiment import Experiment as Experiment, experiment as experiment
+from ._page import Page as Page
 from ._results import Results as Results
 from ._run import run as run
 from ._statistics import (
+    Bootstrap as Bootstrap,
     compare as compare,
     interquartile_mean as interquartile_mean,
 )

@@ -1,12 +1,13 @@
 """Parameters: their names, values, ids and marks."""
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-from ._hash import fingerprint
+from ._fingerprint import fingerprint
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,21 +53,19 @@ class Marks:
 
 @dataclasses.dataclass(frozen=True)
 class Param:
-    """A value of each name of an axis, with an id or marks of its own."""
+    """A value of each name of an axis, with an id and marks of its own."""
 
     values: tuple
-    id: str | None
-    marks: tuple[Mark, ...]
+    id: str | None = None
+    marks: tuple[Mark, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """One `parametrize`: names, and for each of its values an id and marks."""
+    """One `parametrize`: names, and what they are called with, each with its id."""
 
     names: tuple[str, ...]
-    values: tuple[tuple, ...]
-    ids: tuple[str, ...]
-    marks: tuple[tuple[Mark, ...], ...]
+    params: tuple[Param, ...]
 
 
 def axis_of(names: Any, values: Any, ids: Any) -> Axis:
@@ -84,103 +83,105 @@ def axis_of(names: Any, values: Any, ids: Any) -> Axis:
         raise ValueError(f"{where}: a name is given twice in {names!r}.")
     if isinstance(values, str) or not isinstance(values, Iterable):
         raise ValueError(f"{where}: values must be a list, got {values!r}.")
-    found: list[Param] = []
-    for value in values:
-        if not isinstance(value, Param):
-            one = (value,) if len(names) == 1 else value
-            if not isinstance(one, tuple | list):
-                one = (one,)
-            value = Param(tuple(one), None, ())
-        if len(value.values) != len(names):
+    params = [_as_param(value, names) for value in values]
+    if not params:
+        raise ValueError(f"{where}: {', '.join(names)} must have a value.")
+    for param in params:
+        if len(param.values) != len(names):
             raise ValueError(
                 f"{where}: each value must have {len(names)} parts, for "
-                f"{', '.join(names)}; got {value.values!r}."
+                f"{', '.join(names)}; got {param.values!r}."
             )
-        found.append(value)
-    if not found:
-        raise ValueError(f"{where}: {', '.join(names)} must have a value.")
-    labels = _ids(found, names, ids, where)
-    return Axis(
-        names,
-        tuple(value.values for value in found),
-        labels,
-        tuple(value.marks for value in found),
-    )
+    labels = _ids(params, names, ids, where)
+    params = [
+        dataclasses.replace(param, id=label)
+        for param, label in zip(params, labels, strict=True)
+    ]
+    return Axis(names, tuple(params))
 
 
-def _ids(found: list[Param], names: tuple, ids: Any, where: str) -> tuple[str, ...]:
+def _as_param(value: Any, names: tuple[str, ...]) -> Param:
+    if isinstance(value, Param):
+        return value
+    several = len(names) > 1 and isinstance(value, tuple | list)
+    return Param(tuple(value) if several else (value,))
+
+
+def _ids(params: list[Param], names: tuple, ids: Any, where: str) -> list[str]:
     if callable(ids):
-        make = ids
-        ids = [make(*value.values) for value in found]
+        ids = [ids(*param.values) for param in params]
     if ids is not None:
         ids = list(ids)
-        if len(ids) != len(found) or not all(isinstance(i, str) for i in ids):
+        if len(ids) != len(params) or not all(isinstance(i, str) for i in ids):
             raise ValueError(
-                f"{where}: ids must be {len(found)} strings, one for each value, got "
+                f"{where}: ids must be {len(params)} strings, one for each value, got "
                 f"{ids!r}."
             )
     labels = []
-    for k, value in enumerate(found):
-        auto = "-".join(
-            _label(v, name, k) for v, name in zip(value.values, names, strict=True)
-        )
-        labels.append(value.id or (ids[k] if ids is not None else auto))
-    if len(set(labels)) < len(labels):
-        for label, value in zip(labels, found, strict=True):
-            if labels.count(label) > 1 and (ids is not None or value.id is not None):
-                raise ValueError(f"{where}: the id {label!r} is given twice.")
-        labels = [
-            f"{label}{labels[:k].count(label)}" if labels.count(label) > 1 else label
-            for k, label in enumerate(labels)
-        ]
-    return tuple(labels)
+    for k, param in enumerate(params):
+        pairs = zip(param.values, names, strict=True)
+        words = (f"{n}{k}" if (w := _label(v)) is None else w for v, n in pairs)
+        automatic = "-".join(words)
+        labels.append(param.id or (automatic if ids is None else ids[k]))
+    counts = Counter(labels)
+    for label, param in zip(labels, params, strict=True):
+        if counts[label] > 1 and (ids is not None or param.id is not None):
+            raise ValueError(f"{where}: the id {label!r} is given twice.")
+    return [
+        f"{label}{labels[:k].count(label)}" if counts[label] > 1 else label
+        for k, label in enumerate(labels)
+    ]
 
 
-def _label(value: Any, name: str, k: int) -> str:
-    if value is None or isinstance(value, bool | int | float | str):
-        return str(value)
+def _is_simple(value: Any) -> bool:
+    """Whether a table can hold it."""
+    return value is None or isinstance(value, bool | int | float | str)
+
+
+def _label(value: Any) -> str | None:
+    """What to call a value that has a name or is one."""
     if isinstance(value, np.generic):
         return str(value.item())
+    if _is_simple(value):
+        return str(value)
     label = getattr(value, "__name__", None)
-    if isinstance(label, str) and label != "<lambda>":
-        return label
-    return f"{name}{k}"
+    return label if isinstance(label, str) and label != "<lambda>" else None
 
 
 def shown_values(axis: Axis) -> list[dict[str, Any]]:
     """What the table shows of each value: itself if it is simple, or its id."""
-    rows = []
-    for values, label in zip(axis.values, axis.ids, strict=True):
-        row = {}
-        for name, value in zip(axis.names, values, strict=True):
-            if isinstance(value, np.generic):
-                value = value.item()
-            if value is None or isinstance(value, bool | int | float | str):
-                row[name] = value
-            elif len(axis.names) == 1:
-                row[name] = label
-            else:
-                k = len(rows)
-                alone = _label(value, name, k)
-                row[name] = label if alone == f"{name}{k}" else alone
-        rows.append(row)
-    return rows
+
+    def shown(value: Any, param: Param) -> Any:
+        value = value.item() if isinstance(value, np.generic) else value
+        if _is_simple(value):
+            return value
+        return (_label(value) if len(axis.names) > 1 else None) or param.id
+
+    return [
+        {n: shown(v, param) for n, v in zip(axis.names, param.values, strict=True)}
+        for param in axis.params
+    ]
 
 
 def hashes_of(axis: Axis, where: str) -> list[str]:
     """What tells each value from the others by its content."""
-    found = []
-    for values, label in zip(axis.values, axis.ids, strict=True):
-        for name, value in zip(axis.names, values, strict=True):
-            try:
-                found_one = fingerprint(value)
-            except (TypeError, RecursionError) as error:
-                raise ValueError(
-                    f"{where}: the parameter {name!r} of case {label!r} cannot be "
-                    f"written down: it holds {error}. Give a name instead, and make "
-                    "the thing in the function or in a fixture."
-                ) from error
-            found.append((label, name, found_one))
-    size = len(axis.names)
-    parts = [found[k : k + size] for k in range(0, len(found), size)]
-    return [fingerprint([(name, h) for _, name, h in part]) for part in parts]
+
+    def hashed(value: Any, name: str, param: Param) -> str:
+        try:
+            return fingerprint(value)
+        except (TypeError, RecursionError) as error:
+            raise ValueError(
+                f"{where}: the parameter {name!r} of case {param.id!r} cannot be "
+                f"written down: it holds {error}. Give a name instead, and make "
+                "the thing in the function or in a fixture."
+            ) from error
+
+    return [
+        fingerprint(
+            [
+                (name, hashed(value, name, param))
+                for name, value in zip(axis.names, param.values, strict=True)
+            ]
+        )
+        for param in axis.params
+    ]

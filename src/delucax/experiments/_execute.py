@@ -1,15 +1,14 @@
 """One case after another, in the process that it is called in."""
 
 import contextlib
-import dataclasses
 import inspect
 import os
 import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,39 +16,26 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from ._axes import Axis
-from ._experiment import Experiment, Fixture, RESERVED
+from ._experiment import arguments_of, Experiment
+from ._memory_maps import release_programs
 from ._provenance import device
-from ._room import make_room
+from ._store import RESERVED
 
 
 # Programs that are kept compiled. A sweep over something static would fill the memory.
 _PROGRAMS = 128
+# The characters of an error or its traceback that are stored.
 _LONGEST = 8000
+# The kinds of numbers that are traced: tried in this order.
+_TRACED_KINDS = (bool, int, float, complex), (float, complex), ()
 
 
-@dataclasses.dataclass(frozen=True)
-class Plan:
-    """All that a process needs to know to run the cases of an experiment."""
-
-    name: str
-    function: Callable
-    fixtures: dict[str, Fixture]
-    axes: tuple[Axis, ...]
-
-    @classmethod
-    def of(cls, made: Experiment) -> "Plan":
-        """The plan of an experiment."""
-        return cls(made.name, made.function, made.needed(), made.all_axes())
-
-
-@dataclasses.dataclass(frozen=True)
-class Outcome:
-    """What became of a case: values for each seed, or an error."""
+class Outcome(NamedTuple):
+    """What became of a case, as it is stored, and the process that ran it."""
 
     values: dict[str, list]
     error: str | None
-    trace: str | None
+    traceback: str | None
     compile_seconds: float
     run_seconds: float
     device: str | None
@@ -57,18 +43,16 @@ class Outcome:
 
 
 class Runner:
-    """Runs cases of a plan, and keeps what they share: programs and fixtures."""
+    """Runs cases of an experiment, and keeps what they share: programs and fixtures."""
 
-    def __init__(self, plan: Plan):
-        self.plan = plan
-        arguments = inspect.signature(plan.function).parameters
-        self.takes = "key" if "key" in arguments else "seed"
-        self.takes = self.takes if self.takes in arguments else None
-        open_ended = any(p.kind is p.VAR_KEYWORD for p in arguments.values())
-        self.names = None if open_ended else {*arguments}
+    def __init__(self, made: Experiment):
+        self.made, self.axes = made, made.all_axes()
+        self.fixtures = made.used_fixtures()
+        kinds = [p.kind for p in made.arguments.values()]
+        self.takes_any_name = inspect.Parameter.VAR_KEYWORD in kinds
         self.shared: dict[Any, Any] = {}
         self.closing = contextlib.ExitStack()
-        self.verdicts: dict[Any, bool] = {}
+        self.is_traceable: dict[Any, bool] = {}
         self.program: Any = jax.jit(self._all_seeds, static_argnums=0)
 
     def run(self, index: tuple[int, ...], seeds: tuple[int, ...], mesh: Any) -> Outcome:
@@ -78,9 +62,8 @@ class Runner:
         values: dict[str, list] = {}
         try:
             with clock, contextlib.ExitStack() as stack:
-                arguments = self._arguments(index, stack)
-                found = self._call(arguments, seeds, mesh)
-                values = _columns(found, len(seeds), self.plan)
+                returned = self._call(self._arguments(index, stack), seeds, mesh)
+                values = self._columns(returned)
             where = device()
         except KeyboardInterrupt:
             raise
@@ -90,10 +73,9 @@ class Runner:
             trace = "".join(traceback.format_exception(raised))[-_LONGEST:]
             values = {}
         if clock.compiling:
-            make_room()
-        return Outcome(
-            values, error, trace, clock.compiling, clock.running, where, os.getpid()
-        )
+            release_programs()
+        seconds = round(clock.compiling, 6), round(clock.running, 6)
+        return Outcome(values, error, trace, *seconds, where, os.getpid())
 
     def close(self) -> None:
         """Let the fixtures of the process go; one that fails harms no result."""
@@ -104,48 +86,43 @@ class Runner:
             raise
         except BaseException as raised:
             warnings.warn(
-                f"{self.plan.name}: a fixture of the process could not be let go: "
+                f"{self.made.name}: a fixture of the process could not be let go: "
                 f"{type(raised).__name__}: {raised}",
                 stacklevel=2,
             )
 
     def _arguments(self, index: tuple[int, ...], stack: Any) -> dict[str, Any]:
         given: dict[str, Any] = {}
-        params: dict[str, Any] = {}
-        place: dict[str, tuple[int, int]] = {}
-        for i, (axis, k) in enumerate(zip(self.plan.axes, index, strict=True)):
-            for name, value in zip(axis.names, axis.values[k], strict=True):
-                place[name] = (i, k)
-                (params if name in self.plan.fixtures else given)[name] = value
-        depends = {name: frozenset([at]) for name, at in place.items()}
-        # In the order in which they need each other.
-        for name, fixture in self.plan.fixtures.items():
-            wanted = inspect.signature(fixture.function).parameters
-            on = frozenset().union(
-                *(depends.get(w, frozenset()) for w in wanted),
-                depends.get(name, frozenset()),
-            )
-            depends[name] = on
+        # The places on the axes that a value follows from: those of a fixture are its
+        # own and its arguments'.
+        origins: dict[str, frozenset] = {}
+        for i, (axis, k) in enumerate(zip(self.axes, index, strict=True)):
+            given |= zip(axis.names, axis.params[k].values, strict=True)
+            origins |= dict.fromkeys(axis.names, frozenset([(i, k)]))
+        for name, fixture in self.fixtures.items():
+            wanted = arguments_of(fixture.function)
             arguments = {w: given[w] for w in wanted if w in given}
             if "param" in wanted:
-                arguments["param"] = params[name]
+                arguments["param"] = given[name]
+            known = [origins[w] for w in (*wanted, name) if w in origins]
+            origins[name] = frozenset().union(*known)
             if fixture.scope == "case":
                 given[name] = _made(fixture.function, arguments, stack)
                 continue
-            if (name, on) not in self.shared:
-                made = _made(fixture.function, arguments, self.closing)
-                self.shared[name, on] = made
-            given[name] = self.shared[name, on]
-        if self.names is None:
+            key = name, origins[name]
+            if key not in self.shared:
+                self.shared[key] = _made(fixture.function, arguments, self.closing)
+            given[name] = self.shared[key]
+        if self.takes_any_name:
             return given
-        return {name: value for name, value in given.items() if name in self.names}
+        return {n: value for n, value in given.items() if n in self.made.arguments}
 
     def _call(self, arguments: dict[str, Any], seeds: tuple[int, ...], mesh: Any):
-        function = self.plan.function
-        if self.takes == "seed":
-            return [function(**arguments, seed=seed) for seed in seeds]
-        if self.takes is None:
-            return [function(**arguments)]
+        """What the function returns: a list by seed, or all seeds at once."""
+        function, known = self.made.function, self.made.arguments
+        if "key" not in known:
+            each = [{"seed": seed} for seed in seeds] if "seed" in known else [{}]
+            return [function(**arguments, **seed) for seed in each]
         numbers = np.asarray(seeds, np.int32)
         if mesh is not None:
             spread = NamedSharding(mesh, PartitionSpec(mesh.axis_names[0]))
@@ -159,33 +136,31 @@ class Runner:
         none. What worked is remembered by what tracing depends on, so that which it is
         follows from the case alone and not from those that ran before it.
         """
-        last = None
-        for level in range(3):
-            dynamic, static = _split(arguments, level)
-            static = _Static(static)
-            if static == last:
+        previous = None
+        for kinds in _TRACED_KINDS:
+            dynamic, rest = _split(arguments, kinds)
+            static = _Static(rest)
+            if static == previous:
                 continue
-            last = static
+            previous = static
             shapes = jax.tree.map(
                 lambda x: (np.shape(x), jax.dtypes.result_type(x), type(x).__name__),
                 dynamic,
             )
             leaves, structure = jax.tree.flatten(shapes)
-            known = (static, tuple(leaves), structure, numbers.shape)
-            verdict = self.verdicts.get(known)
-            if verdict is None:
-                if len(self.verdicts) >= _PROGRAMS:
-                    self.verdicts.clear()
+            key = (static, tuple(leaves), structure, numbers.shape)
+            if key not in self.is_traceable:
+                if len(self.is_traceable) >= _PROGRAMS:
+                    self.is_traceable.clear()
                     self.program.clear_cache()
                 try:
                     self.program.trace(static, dynamic, numbers)
-                    verdict = True
+                    self.is_traceable[key] = True
                 except Exception:
-                    if level == 2 or static == _Static(_split(arguments, 2)[1]):
+                    if static == _Static(_split(arguments, ())[1]):
                         raise
-                    verdict = False
-                self.verdicts[known] = verdict
-            if verdict:
+                    self.is_traceable[key] = False
+            if self.is_traceable[key]:
                 return jax.block_until_ready(self.program(static, dynamic, numbers))
         raise AssertionError("the last level is traced or raises")
 
@@ -193,9 +168,35 @@ class Runner:
         arguments = eqx.combine(dynamic, static.tree)
 
         def one(number: Any) -> Any:
-            return self.plan.function(**arguments, key=jax.random.key(number))
+            return self.made.function(**arguments, key=jax.random.key(number))
 
         return jax.vmap(one)(numbers)
+
+    def _columns(self, returned: Any) -> dict[str, list]:
+        """Lists with an entry for each seed, by name, of things that JSON knows."""
+        where = self.made.name
+        if isinstance(returned, list):
+            rows = [_as_mapping(row) for row in returned]
+            if any(row.keys() != rows[0].keys() for row in rows):
+                raise ValueError(
+                    f"{where}: every seed must return the same names, got "
+                    f"{sorted({name for row in rows for name in row})}."
+                )
+            columns = {name: [row[name] for row in rows] for name in rows[0]}
+        else:
+            named = _as_mapping(returned)
+            columns = {name: list(np.asarray(value)) for name, value in named.items()}
+        taken = {*RESERVED}.union(*(axis.names for axis in self.axes))
+        for name in columns:
+            if not isinstance(name, str) or name in taken:
+                raise ValueError(
+                    f"{where}: a result cannot be called {name!r}, which is the name "
+                    "of a parameter or of a column of the table."
+                )
+        return {
+            name: [_simple(value, name, where) for value in values]
+            for name, values in columns.items()
+        }
 
 
 class _Static:
@@ -206,13 +207,7 @@ class _Static:
         self.leaves, self.structure = jax.tree.flatten(tree)
 
     def __hash__(self) -> int:
-        found = []
-        for leaf in self.leaves:
-            try:
-                found.append(hash(leaf))
-            except TypeError:
-                found.append(id(leaf))
-        return hash((self.structure, *found))
+        return hash((self.structure, *map(_hash, self.leaves)))
 
     def __eq__(self, other: Any) -> bool:
         if not isinstance(other, _Static) or self.structure != other.structure:
@@ -223,6 +218,13 @@ class _Static:
         )
 
 
+def _hash(leaf: Any) -> int:
+    try:
+        return hash(leaf)
+    except TypeError:
+        return id(leaf)
+
+
 def _same(a: Any, b: Any) -> bool:
     try:
         return bool(a == b)
@@ -230,20 +232,20 @@ def _same(a: Any, b: Any) -> bool:
         return False
 
 
-def _split(arguments: dict[str, Any], level: int) -> tuple[dict, dict]:
-    kinds = ((bool, int, float, complex), (float, complex), ())[level]
+def _split(arguments: dict[str, Any], kinds: tuple[type, ...]) -> tuple[dict, dict]:
+    """What is traced of the arguments, and the rest; `kinds` of numbers are traced."""
 
-    def traced(leaf: Any) -> bool:
+    def is_array(leaf: Any) -> bool:
         return isinstance(leaf, jax.Array | np.ndarray | np.generic)
 
-    def number(leaf: Any) -> bool:
-        return traced(leaf) or type(leaf) in kinds
+    def is_traced(leaf: Any) -> bool:
+        return is_array(leaf) or type(leaf) in kinds
 
     dynamic, static = {}, {}
     for name, value in arguments.items():
         # A whole number inside a module is part of its structure.
-        plain = type(value) in (bool, int, float, complex, list, tuple, dict)
-        test = number if plain else traced
+        plain = type(value) in (*_TRACED_KINDS[0], list, tuple, dict)
+        test = is_traced if plain else is_array
         dynamic[name], static[name] = eqx.partition(value, test)
     return dynamic, static
 
@@ -254,56 +256,26 @@ def _made(function: Callable, arguments: dict[str, Any], stack: Any) -> Any:
     return stack.enter_context(contextlib.contextmanager(function)(**arguments))
 
 
-def _columns(found: Any, count: int, plan: Plan) -> dict[str, list]:
-    """Lists with an entry for each seed, by name, of things that JSON knows."""
-    parameters = {name for axis in plan.axes for name in axis.names}
-    if not isinstance(found, list):
-        found = _as_mapping(found, plan)
-        columns = {name: np.asarray(value) for name, value in found.items()}
-        lists = {name: list(column) for name, column in columns.items()}
-    else:
-        rows = [_as_mapping(row, plan) for row in found]
-        if any(row.keys() != rows[0].keys() for row in rows):
-            raise ValueError(
-                f"{plan.name}: every seed must return the same names, got "
-                f"{sorted({name for row in rows for name in row})}."
-            )
-        lists = {name: [row[name] for row in rows] for name in rows[0]}
-    for name in lists:
-        if not isinstance(name, str) or name in parameters or name in RESERVED:
-            raise ValueError(
-                f"{plan.name}: a result cannot be called {name!r}, which is the name "
-                "of a parameter or of a column of the table."
-            )
-    return {
-        name: [_simple(value, name, plan) for value in values]
-        for name, values in lists.items()
-    }
-
-
-def _as_mapping(value: Any, plan: Plan) -> Mapping[str, Any]:
+def _as_mapping(value: Any) -> Mapping[str, Any]:
     if isinstance(value, Mapping):
         return value
-    if hasattr(value, "_asdict"):
-        return value._asdict()
-    return {"value": value}
+    return value._asdict() if hasattr(value, "_asdict") else {"value": value}
 
 
-def _simple(value: Any, name: str, plan: Plan) -> Any:
+def _simple(value: Any, name: str, where: str) -> Any:
     if value is None or isinstance(value, bool | str):
         return value
     try:
         array = np.asarray(value)
     except Exception:
         array = np.asarray(None, object)
-    if array.dtype.kind not in "biuf":
-        if jnp.issubdtype(array.dtype, jnp.floating):  # bfloat16 and its kin
-            array = array.astype(np.float32)
-        else:
-            raise ValueError(
-                f"{plan.name}: the result {name!r} must be a number, a string or an "
-                f"array of numbers, got {type(value).__name__}."
-            )
+    if jnp.issubdtype(array.dtype, jnp.floating):  # of bfloat16 and its kin as well
+        return (array if array.dtype.kind == "f" else array.astype(np.float32)).tolist()
+    if array.dtype.kind not in "biu":
+        raise ValueError(
+            f"{where}: the result {name!r} must be a number, a string or an "
+            f"array of numbers, got {type(value).__name__}."
+        )
     return array.tolist()
 
 
@@ -349,10 +321,3 @@ def _heard(event: str, duration_secs: float, **kwargs: str | int) -> None:
     if spans is not None and event.startswith("/jax/core/compile/"):
         now = time.perf_counter()
         spans.append((now - duration_secs, now))
-
-
-@contextlib.contextmanager
-def precision(precise: bool) -> Iterator[None]:
-    """Double precision, or single, in this thread."""
-    with jax.enable_x64(precise):
-        yield

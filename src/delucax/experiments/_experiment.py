@@ -5,36 +5,19 @@ import difflib
 import inspect
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from ._axes import Axis, axis_of, hashes_of, Mark, Marks, Param, shown_values
-from ._hash import fingerprint
+from ._fingerprint import fingerprint
 from ._provenance import version
 from ._select import selector, words
+from ._store import RESERVED
 
 
 _SCOPES = ("case", "process")
-# Names that the table gives to columns of its own.
-RESERVED = (
-    "experiment",
-    "case",
-    "seed",
-    "status",
-    "error",
-    "traceback",
-    "compile_seconds",
-    "run_seconds",
-    "commit",
-    "dirty",
-    "date",
-    "device",
-    "dtype",
-    "hash",
-    "versions",
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +32,15 @@ class Fixture:
         return self.function(*args, **kwargs)
 
 
+class Choice(NamedTuple):
+    """One of the values of an axis: its place, what the table shows, and its hash."""
+
+    index: int
+    param: Param
+    shown: Mapping[str, Any]
+    hash: str
+
+
 @dataclasses.dataclass(frozen=True)
 class Case:
     """One call of an experiment: a value of each axis, for all seeds."""
@@ -56,7 +48,6 @@ class Case:
     experiment: str
     id: str
     index: tuple[int, ...]
-    parameters: Mapping[str, Any]
     shown: Mapping[str, Any]
     marks: tuple[Mark, ...]
     hash: str
@@ -64,6 +55,10 @@ class Case:
     def mark(self, name: str) -> Mark | None:
         """The mark of that name, if it has it."""
         return next((mark for mark in self.marks if mark.name == name), None)
+
+    def matches(self, word: str) -> bool:
+        """Whether a word is in its name, whatever its case."""
+        return word.lower() in self.id.lower()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,33 +117,39 @@ class Experiment:
     @property
     def arguments(self) -> Mapping[str, inspect.Parameter]:
         """The arguments of the function."""
-        return inspect.signature(self.function).parameters
+        return arguments_of(self.function)
 
-    def needed(self) -> dict[str, Fixture]:
-        """The fixtures that it uses, directly or through others, by name."""
-        found: dict[str, Fixture] = {}
+    @property
+    def is_random(self) -> bool:
+        """Whether the function takes a key or a seed."""
+        return not {"key", "seed"}.isdisjoint(self.arguments)
+
+    def used_fixtures(self) -> dict[str, Fixture]:
+        """The fixtures that it uses, directly or through others, by name; each after
+        those that it needs itself."""
+        used: dict[str, Fixture] = {}
         known = {**getattr(self.function, "__globals__", {}), **self.fixtures}
         given = {name for axis in self.axes for name in axis.names}
 
-        def look(function: Callable, path: tuple[str, ...]) -> None:
-            for name in inspect.signature(function).parameters:
+        def visit(function: Callable, path: tuple[str, ...]) -> None:
+            for name in arguments_of(function):
                 fixture = known.get(name)
                 if name in given or not isinstance(fixture, Fixture):
                     continue
                 if name in path:
                     loop = " -> ".join((*path, name))
                     raise ValueError(f"{self.name}: fixtures need each other: {loop}.")
-                look(fixture.function, (*path, name))
-                found[name] = fixture
+                visit(fixture.function, (*path, name))
+                used[name] = fixture
 
-        look(self.function, ())
-        return found
+        visit(self.function, ())
+        return used
 
     def all_axes(self) -> tuple[Axis, ...]:
         """The axes, those of its fixtures last."""
         own = [
             dataclasses.replace(fixture.axis, names=(name,))
-            for name, fixture in self.needed().items()
+            for name, fixture in self.used_fixtures().items()
             if fixture.axis is not None
         ]
         return (*self.axes, *own)
@@ -171,49 +172,40 @@ class Experiment:
         content.
         """
         self._check()
-        axes, where = self.all_axes(), self.name
-        chosen = selector(select, "select", where)
-        marked = selector(marks, "marks", where)
+        where, code = self.name, self._code()
+        is_selected = selector(select, "select", where)
+        is_marked = selector(marks, "marks", where)
         slow = slow or "slow" in words(marks)
-        code = self._code()
-        hashes = [hashes_of(axis, where) for axis in axes]
-        shown = [shown_values(axis) for axis in axes]
-        found, seen = [], set()
-        for index in itertools.product(*(range(len(axis.values)) for axis in axes)):
-            at = list(enumerate(index))
-            ids = "-".join(axes[i].ids[k] for i, k in at)
-            name = f"{self.name}[{ids}]" if axes else self.name
-            all_marks = self.marks + tuple(m for i, k in at for m in axes[i].marks[k])
-            if name in seen:
-                raise ValueError(
-                    f"{where}: two cases are called {name!r}; give other ids."
-                )
-            seen.add(name)
-            names = {mark.name for mark in all_marks}
-            low = name.lower()
-            if not chosen(lambda word, low=low: word.lower() in low):
-                continue
-            if not marked(lambda word, names=names: word in names):
-                continue
-            if "slow" in names and not slow:
-                continue
-            parameters: dict[str, Any] = {}
-            table: dict[str, Any] = {}
-            for i, k in at:
-                parameters.update(zip(axes[i].names, axes[i].values[k], strict=True))
-                table.update(shown[i][k])
-            content = "-".join([code, *(hashes[i][k] for i, k in at)])
+        choices = [
+            map(
+                Choice,
+                itertools.count(),
+                a.params,
+                shown_values(a),
+                hashes_of(a, where),
+            )
+            for a in self.all_axes()
+        ]
+        cases, names = [], set()
+        for chosen in itertools.product(*choices):
+            ids = "-".join(str(choice.param.id) for choice in chosen)
             case = Case(
                 experiment=self.name,
-                id=name,
-                index=index,
-                parameters=parameters,
-                shown=table,
-                marks=all_marks,
-                hash=fingerprint(content),
+                id=f"{self.name}[{ids}]" if chosen else self.name,
+                index=tuple(choice.index for choice in chosen),
+                shown={k: v for choice in chosen for k, v in choice.shown.items()},
+                marks=self.marks + tuple(m for c in chosen for m in c.param.marks),
+                hash=fingerprint("-".join([code, *(c.hash for c in chosen)])),
             )
-            found.append(case)
-        return tuple(found)
+            if case.id in names:
+                raise ValueError(
+                    f"{where}: two cases are called {case.id!r}; give other ids."
+                )
+            names.add(case.id)
+            skipped = case.mark("slow") and not slow
+            if not skipped and is_selected(case.matches) and is_marked(case.mark):
+                cases.append(case)
+        return tuple(cases)
 
     def run(self, **options: Any) -> Any:
         """Run it: [`delucax.experiments.run`][] of this experiment alone.
@@ -231,20 +223,19 @@ class Experiment:
     def _code(self) -> str:
         """The hash of the code that all cases share."""
         module = getattr(self.function, "__module__", None)
-        functions = [fixture.function for fixture in self.needed().values()]
+        functions = [fixture.function for fixture in self.used_fixtures().values()]
         precise = bool(jax.config.jax_enable_x64)
         content = [self.function, functions, precise, version("delucax")]
         return fingerprint(content, root=module)
 
     def _check(self) -> None:
-        where, arguments, fixtures = self.name, self.arguments, self.needed()
-        taken = {*arguments}
-        for fixture in fixtures.values():
-            taken |= {*inspect.signature(fixture.function).parameters} - {"param"}
+        where, arguments, fixtures = self.name, self.arguments, self.used_fixtures()
+        needs = {name: {*arguments_of(f.function)} for name, f in fixtures.items()}
+        taken = {*arguments}.union(*(names - {"param"} for names in needs.values()))
         names = [name for axis in self.axes for name in axis.names]
         any_name = any(p.kind is p.VAR_KEYWORD for p in arguments.values())
         for name in names:
-            if name in RESERVED or name in ("key", "versions"):
+            if name in RESERVED or name == "key":
                 raise ValueError(f"{where}: no parameter can be called {name!r}.")
             if name not in taken and not any_name:
                 close = difflib.get_close_matches(name, taken, n=3) or sorted(taken)
@@ -252,32 +243,33 @@ class Experiment:
                     f"{where}: the function has no argument {name!r}; did you mean "
                     f"{' or '.join(repr(n) for n in close) or 'none'}?"
                 )
-        given = {*names, *fixtures, "key", "seed"}
-        functions = [(self.function, where)]
-        functions += [(f.function, f"fixture {n}") for n, f in fixtures.items()]
-        for function, label in functions:
-            for name, p in inspect.signature(function).parameters.items():
-                open_ended = p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
-                fixture = label.startswith("fixture ")
-                allowed = {*given, "param"} if fixture else given
-                if fixture and name in ("key", "seed"):
-                    raise ValueError(
-                        f"{where}: {label} cannot take {name!r}: it is made once for "
-                        "all seeds."
-                    )
-                if name not in allowed and p.default is p.empty and not open_ended:
-                    raise ValueError(
-                        f"{where}: the argument {name!r} of {label} has no value: "
-                        "parametrize it, make a fixture of that name, or give it a "
-                        "default."
-                    )
+        given = {*names, *fixtures}
+        self._check_given(self.function, where, {*given, "key", "seed"})
+        for name, fixture in fixtures.items():
+            for random in sorted({"key", "seed"} & needs[name]):
+                raise ValueError(
+                    f"{where}: fixture {name} cannot take {random!r}: it is made once "
+                    "for all seeds."
+                )
+            self._check_given(fixture.function, f"fixture {name}", {*given, "param"})
         if {"key", "seed"} <= {*arguments}:
             raise ValueError(f"{where}: the function takes both 'key' and 'seed'.")
-        if len(self.seeds) > 1 and not {"key", "seed"} & {*arguments}:
+        if len(self.seeds) > 1 and not self.is_random:
             raise ValueError(
                 f"{where}: it has {len(self.seeds)} seeds, but the function takes "
                 "neither 'key' nor 'seed'."
             )
+
+    def _check_given(self, function: Callable, label: str, given: set[str]) -> None:
+        """Raise where an argument of a function has no value."""
+        for name, p in arguments_of(function).items():
+            open_ended = p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+            if name not in given and p.default is p.empty and not open_ended:
+                raise ValueError(
+                    f"{self.name}: the argument {name!r} of {label} has no value: "
+                    "parametrize it, make a fixture of that name, or give it a "
+                    "default."
+                )
 
 
 class experiment:  # noqa: N801
@@ -369,8 +361,8 @@ class experiment:  # noqa: N801
 
         **Raises:** `ValueError` if they are no whole numbers, negative, or repeated.
         """
-        found = as_seeds(seeds, "experiment.seeds")
-        return lambda what: dataclasses.replace(as_experiment(what), seeds=found)
+        chosen = as_seeds(seeds, "experiment.seeds")
+        return lambda what: dataclasses.replace(as_experiment(what), seeds=chosen)
 
     @staticmethod
     def fixture(
@@ -441,20 +433,24 @@ def as_experiment(what: Any) -> Experiment:
     return what if isinstance(what, Experiment) else Experiment(what)
 
 
+def arguments_of(function: Callable) -> Mapping[str, inspect.Parameter]:
+    """The arguments of a function by name."""
+    return inspect.signature(function).parameters
+
+
 def as_seeds(seeds: Any, where: str) -> tuple[int, ...]:
     """Seeds from 0 on, or those given."""
-    found = range(seeds) if isinstance(seeds, int) else seeds
-    whole = isinstance(found, Iterable) and not isinstance(found, str | bytes)
-    found = tuple(found) if whole else ()
-    legal = all(
+    several = range(seeds) if isinstance(seeds, int) else seeds
+    is_list = isinstance(several, Iterable) and not isinstance(several, str | bytes)
+    chosen = tuple(several) if is_list and not isinstance(seeds, bool) else ()
+    if not chosen or not all(
         isinstance(s, int | np.integer) and not isinstance(s, bool) and 0 <= s < 2**31
-        for s in found
-    )
-    if isinstance(seeds, bool) or not found or not legal:
+        for s in chosen
+    ):
         raise ValueError(
             f"{where}: seeds must be how many, at least 1, or whole numbers from 0 to "
             f"2**31 - 1, got {seeds!r}."
         )
-    if len(set(found)) < len(found):
+    if len(set(chosen)) < len(chosen):
         raise ValueError(f"{where}: seeds must differ, got {seeds!r}.")
-    return tuple(int(s) for s in found)
+    return tuple(int(s) for s in chosen)

@@ -39,9 +39,9 @@ def provenance(folder: Path) -> dict[str, Any]:
 
 def device() -> str:
     """The kind of device that JAX computes on by default, and how many there are."""
-    found = jax.devices()
-    kind = found[0].device_kind
-    return kind if len(found) == 1 else f"{len(found)} x {kind}"
+    devices = jax.devices()
+    kind = devices[0].device_kind
+    return kind if len(devices) == 1 else f"{len(devices)} x {kind}"
 
 
 def _git(folder: Path) -> tuple[str | None, bool | None]:
@@ -61,9 +61,11 @@ def _git(folder: Path) -> tuple[str | None, bool | None]:
 
     try:
         commit = ask("rev-parse", "HEAD")
-        found = ask("status", "--porcelain", "--untracked-files=all").splitlines()
+        changed = ask("status", "--porcelain", "--untracked-files=all").splitlines()
         code = (".py", ".ipynb", '.py"', '.ipynb"')  # a name with blanks is quoted
-        dirty = any(not line.startswith("??") or line.endswith(code) for line in found)
+        dirty = any(
+            not line.startswith("??") or line.endswith(code) for line in changed
+        )
         return commit, dirty
     except (OSError, subprocess.SubprocessError):
         return None, None

@@ -1,10 +1,7 @@
 """A table of results, and what to make of it."""
 
-import csv
 import dataclasses
-import io
 import json
-import math
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -12,14 +9,13 @@ from typing import Any
 
 from .._check import as_path
 from .._extras import extra
-from ._store import Store
+from .._files import replaced
+from ._store import CASE_COLUMNS, RUN_COLUMNS, Store
+from ._tables import as_text, FORMS
 
 
-_OF_A_CASE = (
-    *("error", "traceback", "compile_seconds", "run_seconds"),
-    *("device", "hash"),
-)
-_MADE_WITH = ("date", "commit", "dirty", "dtype")
+PASSED = ("passed", "passed unexpectedly")
+FAILED = ("failed", "passed unexpectedly")
 # Columns that differ between two runs of the same thing.
 TIMES = ("compile_seconds", "run_seconds", "date")
 
@@ -76,32 +72,37 @@ class Results:
             raise FileNotFoundError(f"Results.read: there is no file '{path}'.")
         book = Store(path, "Results.read")
         names = list(dict.fromkeys(name for name, _ in book.cases))
-        keys = sorted(book.cases, key=lambda k: (names.index(k[0]), _order(book, k)))
-        return cls._from(
-            book, [(key, sorted(book.cases[key]["seeds"].items())) for key in keys]
+        cases = sorted(
+            book.cases.items(),
+            key=lambda item: (names.index(item[0][0]), item[1]["order"]),
         )
+        seeds = [(key, sorted(entry["seeds"].items())) for key, entry in cases]
+        return cls._from(book, seeds)
 
     @classmethod
     def _of(cls, book: Store, asked: Iterable) -> "Results":
         """Those of the cases and seeds asked for."""
-        found = []
+        records = []
         for case, seeds in asked:
             key = case.experiment, case.id
             if case.mark("skip"):
-                record = dict.fromkeys(_OF_A_CASE) | {"values": {}, "status": "skipped"}
+                record = dict.fromkeys(CASE_COLUMNS) | {
+                    "values": {},
+                    "status": "skipped",
+                }
                 record |= {"parameters": case.shown, "hash": case.hash}
-                found.append((key, [(seed, (record, 0)) for seed in seeds]))
+                stored = dict.fromkeys(seeds, (record, 0))
             else:
                 stored = book.cases[key]["seeds"]
-                found.append((key, [(seed, stored[seed]) for seed in seeds]))
-        return cls._from(book, found)
+            records.append((key, [(seed, stored[seed]) for seed in seeds]))
+        return cls._from(book, records)
 
     @classmethod
-    def _from(cls, book: Store, asked: list) -> "Results":
+    def _from(cls, book: Store, records: list) -> "Results":
         rows: list[dict[str, Any]] = []
         metrics: dict[str, None] = {}
         parameters: dict[str, None] = {}
-        for key, seeds in asked:
+        for key, seeds in records:
             for seed, (record, place) in seeds:
                 values = {name: v[place] for name, v in record["values"].items()}
                 metrics |= dict.fromkeys(values)
@@ -114,8 +115,8 @@ class Results:
                     "seed": seed,
                     "status": record["status"],
                     **values,
-                    **{name: record[name] for name in _OF_A_CASE},
-                    **{name: run.get(name) for name in _MADE_WITH},
+                    **{name: record[name] for name in CASE_COLUMNS},
+                    **{name: run.get(name) for name in RUN_COLUMNS},
                     "versions": run.get("versions", {}),
                 }
                 rows.append(row)
@@ -124,25 +125,20 @@ class Results:
     @property
     def failed(self) -> list[dict[str, Any]]:
         """The rows of cases that failed, or passed though they were not to."""
-        bad = ("failed", "passed unexpectedly")
-        return [row for row in self.rows if row["status"] in bad]
+        return [row for row in self.rows if row["status"] in FAILED]
 
     @property
     def columns(self) -> tuple[str, ...]:
         """The names of the columns, each once."""
-        last = [
-            *("error", "compile_seconds", "run_seconds"),
-            *("device", "hash", *_MADE_WITH),
-        ]
         middle = ("seed", "status", *self.metrics)
-        return ("experiment", "case", *self.parameters, *middle, *last)
+        last = [name for name in CASE_COLUMNS if name != "traceback"]
+        return ("experiment", "case", *self.parameters, *middle, *last, *RUN_COLUMNS)
 
     @property
     def table(self) -> Any:
         """The rows as a `pandas.DataFrame`, versions spread over columns."""
         pd = extra("pandas", "tables")
-        frame = pd.DataFrame(self._flat(), columns=[*self.columns, *self._versions()])
-        return frame
+        return pd.DataFrame(self.flat_rows(), columns=list(self.all_columns))
 
     def where(self, **values: Any) -> "Results":
         """The rows that have these values.
@@ -153,8 +149,7 @@ class Results:
 
         **Raises:** `ValueError` if there is no such column.
         """
-        known = {*self.columns, *self._versions(), "traceback", "versions"}
-        self._check_columns(values, known, "Results.where")
+        self._check_columns(values, "Results.where", ("traceback", "versions"))
         rows = [
             row
             for row in self.rows
@@ -184,35 +179,30 @@ class Results:
         **Raises:** `ValueError` on another ending or an unknown column; `OSError` if
         the file cannot be written.
         """
-        kinds = {".csv": "csv", ".parquet": "parquet", ".md": "markdown"}
-        kinds[".tex"] = "latex"
-        kind = kinds.get(Path(to).suffix)
-        if kind is None and to not in ("csv", "markdown", "latex"):
+        ending = FORMS.get(Path(to).suffix)
+        if ending is None and to not in ("csv", "markdown", "latex"):
             raise ValueError(
                 "Results.export: to must end in .csv, .parquet, .md or .tex, or be "
                 f"'csv', 'markdown' or 'latex', got {str(to)!r}."
             )
-        form = kind or str(to)
+        form = ending or str(to)
         if columns is None:
+            several = len({row["experiment"] for row in self.rows}) > 1
             short = (*self.parameters, "seed", "status", *self.metrics)
-            many = {row["experiment"] for row in self.rows}
-            short = ("experiment", *short) if len(many) > 1 else short
-            full = (*self.columns, *self._versions())
-            columns = full if form in ("csv", "parquet") else short
-        flat = self._flat()
-        known = {*self.columns, *self._versions()}
-        self._check_columns(columns, known, "Results.export")
+            short = ("experiment", *short) if several else short
+            columns = self.all_columns if form in ("csv", "parquet") else short
+        self._check_columns(columns, "Results.export")
+        rows = self.flat_rows()
         if form == "parquet":
             pd, _ = extra("pandas", "experiments"), extra("pyarrow", "experiments")
-            kept = {
-                name: _one_kind([row.get(name) for row in flat]) for name in columns
-            }
+            kept = {n: _of_one_type([row.get(n) for row in rows]) for n in columns}
             pd.DataFrame(kept).to_parquet(to, index=False)
             return ""
-        body = [[row.get(name) for name in columns] for row in flat]
-        text = _text(form, list(columns), body, digits)
-        if kind is not None:
-            Path(to).write_text(text, encoding="utf-8")
+        body = [[row.get(name) for name in columns] for row in rows]
+        text = as_text(form, list(columns), body, digits)
+        if ending is not None:
+            with replaced(Path(to)) as file:
+                file.write(text.encode())
         return text
 
     def report(self, path: str | os.PathLike, *, title: str = "Results") -> None:
@@ -225,11 +215,14 @@ class Results:
 
         **Raises:** `OSError` if it cannot be written.
         """
-        from ._report import page
+        from ._report import report
 
-        Path(path).write_text(page(self, title), encoding="utf-8")
+        report(self, title).write(path)
 
-    def _check_columns(self, names: Iterable[str], known: set, where: str) -> None:
+    def _check_columns(
+        self, names: Iterable[str], where: str, more: tuple[str, ...] = ()
+    ) -> None:
+        known = {*self.all_columns, *more}
         unknown = [name for name in names if name not in known]
         if unknown:
             raise ValueError(
@@ -237,82 +230,27 @@ class Results:
                 f"{', '.join(self.columns)}."
             )
 
-    def _versions(self) -> tuple[str, ...]:
-        return tuple(
-            dict.fromkeys(name for row in self.rows for name in row["versions"])
-        )
+    @property
+    def all_columns(self) -> tuple[str, ...]:
+        """The columns, and those of the versions."""
+        versions = [name for row in self.rows for name in row["versions"]]
+        return (*self.columns, *dict.fromkeys(versions))
 
-    def _flat(self) -> list[dict[str, Any]]:
-        """The rows with versions spread out, and arrays as JSON."""
-        found = []
+    def flat_rows(self) -> list[dict[str, Any]]:
+        """The rows with versions spread over columns, and arrays as JSON."""
+        flat = []
         for row in self.rows:
-            flat = {name: value for name, value in row.items() if name != "versions"}
+            values = {name: value for name, value in row.items() if name != "versions"}
             for name in self.metrics:
-                if isinstance(flat.get(name), list):
-                    flat[name] = json.dumps(flat[name])
-            found.append({**flat, **row["versions"]})
-        return found
+                if isinstance(values.get(name), list):
+                    values[name] = json.dumps(values[name])
+            flat.append({**values, **row["versions"]})
+        return flat
 
 
-def _one_kind(column: list) -> list:
+def _of_one_type(column: list) -> list:
     """A column as it is if a file of typed columns can hold it, or as text."""
-    kinds = {type(value) for value in column if value is not None}
-    if len(kinds) < 2 or kinds == {int, float}:
+    types = {type(value) for value in column if value is not None}
+    if len(types) < 2 or types == {int, float}:
         return column
     return [value if value is None else str(value) for value in column]
-
-
-def _order(book: Store, key: tuple[str, str]) -> tuple:
-    return book.cases[key]["order"]
-
-
-def _text(form: str, columns: list[str], body: list[list], digits: int) -> str:
-    if form == "csv":
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(body)
-        return out.getvalue()
-    cells = [[shown(value, digits) for value in row] for row in body]
-    right = [
-        any(isinstance(row[k], int | float) for row in body)
-        for k in range(len(columns))
-    ]
-    if form == "markdown":
-        rule = ["---:" if r else "---" for r in right]
-        escaped = [[c.replace("|", "\\|").replace("\n", " ") for c in r] for r in cells]
-        lines = [columns, rule, *escaped]
-        return "".join("| " + " | ".join(line) + " |\n" for line in lines)
-    spec = "".join("r" if r else "l" for r in right)
-    head = " & ".join(_latex(name) for name in columns)
-    rows = "".join(" & ".join(_latex(c) for c in row) + " \\\\\n" for row in cells)
-    return (
-        f"\\begin{{tabular}}{{{spec}}}\n\\toprule\n{head} \\\\\n\\midrule\n"
-        f"{rows}\\bottomrule\n\\end{{tabular}}\n"
-    )
-
-
-def shown(value: Any, digits: int = 4) -> str:
-    """A value as a table shows it."""
-    if value is None:
-        return ""
-    if isinstance(value, bool) or not isinstance(value, float):
-        return str(value)
-    if not math.isfinite(value):
-        return str(value)
-    return f"{value:.{digits}g}"
-
-
-_ESCAPES = str.maketrans(
-    {
-        "\\": r"\textbackslash{}",
-        **{c: "\\" + c for c in "&%$#_{}"},
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "\n": " ",
-    }
-)
-
-
-def _latex(text: str) -> str:
-    return text.translate(_ESCAPES)

@@ -1,19 +1,21 @@
 """Run experiments: here, on all cores, or on a cluster."""
 
 import contextlib
+import functools
 import inspect
+import itertools
 import os
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
 from .._check import check_count
-from ._execute import Outcome, Plan, Runner
+from ._execute import Outcome, Runner
 from ._experiment import as_experiment, as_seeds, Case, Experiment
 from ._provenance import provenance
-from ._results import Results
+from ._results import FAILED, Results
 from ._store import Store
-from ._workers import elsewhere, Job
+from ._workers import Job, run_in_workers
 
 
 BACKENDS = ("loky", "dask")
@@ -103,7 +105,7 @@ def run(
     jobs, asked, judged = [], [], []
     for one in made:
         wanted = one.seeds if chosen is None else chosen
-        wanted = wanted if {"key", "seed"} & {*one.arguments} else wanted[:1]
+        wanted = wanted if one.is_random else wanted[:1]
         if mesh is not None and "key" not in one.arguments:
             raise ValueError(
                 f"{where}: mesh spreads what takes a key, and {one.name} has no "
@@ -118,84 +120,77 @@ def run(
             asked.append((case, wanted))
             if case.mark("skip"):
                 continue
-            missing = _missing(book, case, wanted, fresh, retry)
+            stored = {} if fresh else book.stored(case.experiment, case.id, case.hash)
+            if retry:
+                stored = {s: r for s, r in stored.items() if r[0]["error"] is None}
+            missing = tuple(seed for seed in wanted if seed not in stored)
             if missing:
                 jobs.append(Job(len(jobs), one, case, missing))
-            kept = [seed for seed in wanted if seed not in missing]
-            judged += _judged_again(book, case, kept)
+            kept = {seed: stored[seed] for seed in wanted if seed in stored}
+            judged += _judged_again(case, kept)
     if jobs or judged:
         book.open()
     try:
         for record in judged:
             book.append(record)
         if jobs:
-            _work_off(jobs, book, made, workers, backend, mesh, progress)
+            _run_jobs(jobs, book, workers, backend, mesh, progress)
     finally:
         book.close()
     return Results._of(book, asked)
 
 
-def _work_off(jobs, book, made, workers, backend, mesh, progress) -> None:
-    number = book.begin(provenance(_folder(made[0])))
+def _run_jobs(
+    jobs: list[Job], book: Store, workers: int, backend: str, mesh: Any, progress: bool
+) -> None:
+    """Run the jobs, and write each result down as it arrives."""
+    number = book.begin(provenance(_folder(jobs[0].made)))
     outcomes = (
-        _here(jobs, mesh)
+        _run_here(jobs, mesh)
         if workers == 1 and backend == "loky"
-        else elsewhere(jobs, workers, backend)
+        else run_in_workers(jobs, workers, backend)
     )
-    with _Progress(len(jobs), workers, progress) as bars, contextlib.closing(outcomes):
+    bars = _progress(len(jobs), workers, progress)
+    with bars as tick, contextlib.closing(outcomes):
         for job, outcome in outcomes:
-            status = _status(job.case, outcome.error)
+            case, status = job.case, _status(job.case, outcome.error)
+            fields = outcome._asdict()
+            worker = fields.pop("worker")
             record = {
                 "kind": "case",
                 "run": number,
-                "experiment": job.case.experiment,
-                "case": job.case.id,
-                "order": job.case.index,
-                "hash": job.case.hash,
-                "parameters": job.case.shown,
+                "experiment": case.experiment,
+                "case": case.id,
+                "order": case.index,
+                "hash": case.hash,
+                "parameters": case.shown,
                 "seeds": job.seeds,
                 "status": status,
-                "values": outcome.values,
-                "error": outcome.error,
-                "traceback": outcome.trace,
-                "compile_seconds": round(outcome.compile_seconds, 6),
-                "run_seconds": round(outcome.run_seconds, 6),
-                "device": outcome.device,
+                **fields,
             }
             book.append(record)
-            bars.tick(outcome.worker, job.case.id, status)
+            tick(worker, case.id, status)
 
 
-def _missing(book, case, wanted, fresh, retry) -> tuple[int, ...]:
-    entry = book.cases.get((case.experiment, case.id))
-    if fresh or entry is None or entry["hash"] != case.hash:
-        return wanted
-    done = {
-        seed
-        for seed, (record, _) in entry["seeds"].items()
-        if not (retry and record["error"] is not None)
-    }
-    return tuple(seed for seed in wanted if seed not in done)
-
-
-def _judged_again(book, case, kept) -> list[dict[str, Any]]:
+def _judged_again(
+    case: Case, stored: dict[int, tuple[dict[str, Any], int]]
+) -> list[dict[str, Any]]:
     """Lines for what is not run again, where a mark came or went since."""
-    found: dict[int, tuple[dict[str, Any], list[tuple[int, int]]]] = {}
-    for seed in kept:
-        record, place = book.cases[case.experiment, case.id]["seeds"][seed]
+    groups: dict[int, tuple[dict[str, Any], dict[int, int]]] = {}
+    for seed, (record, place) in stored.items():
         if record["status"] != _status(case, record["error"]):
-            found.setdefault(id(record), (record, []))[1].append((seed, place))
+            groups.setdefault(id(record), (record, {}))[1][seed] = place
     return [
         {
             **record,
-            "seeds": [seed for seed, _ in places],
+            "seeds": list(places),
             "status": _status(case, record["error"]),
             "values": {
-                name: [column[place] for _, place in places]
+                name: [column[place] for place in places.values()]
                 for name, column in record["values"].items()
             },
         }
-        for record, places in found.values()
+        for record, places in groups.values()
     ]
 
 
@@ -219,57 +214,40 @@ def _workers(workers: Any, where: str) -> int:
     return check_count(workers, "workers", where)
 
 
-def _here(jobs: list[Job], mesh: Any) -> Generator[tuple[Job, Outcome], None, None]:
-    runner = None
-    plan_of = None
-    try:
-        for job in jobs:
-            if plan_of is not job.made:
-                if runner is not None:
-                    runner.close()
-                runner, plan_of = Runner(Plan.of(job.made)), job.made
-            assert runner is not None
-            yield job, runner.run(job.case.index, job.seeds, mesh)
-    finally:
-        if runner is not None:
-            runner.close()
+def _run_here(jobs: list[Job], mesh: Any) -> Generator[tuple[Job, Outcome], None, None]:
+    for _, group in itertools.groupby(jobs, key=lambda job: job.made.name):
+        same = list(group)
+        with contextlib.closing(Runner(same[0].made)) as runner:
+            for job in same:
+                yield job, runner.run(job.case.index, job.seeds, mesh)
 
 
-class _Progress:
+@contextlib.contextmanager
+def _progress(
+    total: int, workers: int, shown: bool
+) -> Iterator[Callable[[int, str, str], None]]:
     """A bar for the whole, and one for each worker that has answered."""
+    from tqdm.auto import tqdm
 
-    def __init__(self, total: int, workers: int, shown: bool):
-        self.shown, self.workers = shown, workers
-        self.bars: dict[int, Any] = {}
-        self.failed = 0
-        if shown:
-            from tqdm.auto import tqdm
+    make = functools.partial(tqdm, unit="case", disable=not shown)
+    bars: dict[int, Any] = {}
+    failed = 0
 
-            self.make = tqdm
-            self.whole = tqdm(total=total, desc="cases", unit="case")
-
-    def __enter__(self) -> "_Progress":
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        if self.shown:
-            for bar in (*self.bars.values(), self.whole):
-                bar.close()
-
-    def tick(self, worker: int, case: str, status: str) -> None:
-        """A case is done."""
-        if not self.shown:
+    def tick(worker: int, case: str, status: str) -> None:
+        nonlocal failed
+        failed += status in FAILED
+        if failed:
+            whole.set_postfix_str(f"{failed} failed", refresh=False)
+        whole.update()
+        if workers == 1:
             return
-        self.failed += status in ("failed", "passed unexpectedly")
-        if self.failed:
-            self.whole.set_postfix_str(f"{self.failed} failed", refresh=False)
-        self.whole.update()
-        if self.workers == 1:
-            return
-        if worker not in self.bars:
-            place = len(self.bars) + 1
-            bar = self.make(position=place, unit="case", leave=False)
-            self.bars[worker] = bar
-        bar = self.bars[worker]
-        bar.set_description_str(f"worker {worker}: {case[:40]}", refresh=False)
-        bar.update()
+        if worker not in bars:
+            bar = make(position=len(bars) + 1, leave=False)
+            bars[worker] = stack.enter_context(bar)
+        name = f"worker {worker}: {case[:40]}"
+        bars[worker].set_description_str(name, refresh=False)
+        bars[worker].update()
+
+    with contextlib.ExitStack() as stack:
+        whole = stack.enter_context(make(total=total, desc="cases"))
+        yield tick

@@ -2,14 +2,16 @@
 
 import re
 from collections.abc import Callable
+from typing import Any
 
 
-_TOKEN = re.compile(r"\s*(?:([()])|([^\s()]+))")
+_OPERATORS = ("and", "or", "not")
+_TOKEN = re.compile(r"[()]|[^\s()]+")
 
 
 def selector(
     expression: str, argument: str, where: str
-) -> Callable[[Callable[[str], bool]], bool]:
+) -> Callable[[Callable[[str], Any]], Any]:
     """A function of a test of single words to whether the whole holds.
 
     Words are joined by `and`, `or`, `not` and parentheses, as in pytest's `-k`. An
@@ -17,72 +19,40 @@ def selector(
 
     **Raises:** `ValueError` naming the place where the expression cannot be read.
     """
-    tokens = _tokens(expression, argument, where)
-    if not tokens:
-        return lambda holds: True
-    position = 0
-
-    def fail(expected: str) -> ValueError:
-        got = repr(tokens[position]) if position < len(tokens) else "the end"
-        return ValueError(
-            f"{where}: {argument} must be words joined by and, or, not and "
-            f"parentheses, got {expression!r}: expected {expected} instead of {got}."
-        )
-
-    def take(token: str) -> bool:
-        nonlocal position
-        if position < len(tokens) and tokens[position] == token:
-            position += 1
-            return True
-        return False
-
-    def either() -> Callable:
-        parts = [both()]
-        while take("or"):
-            parts.append(both())
-        return lambda holds: any(part(holds) for part in parts)
-
-    def both() -> Callable:
-        parts = [negated()]
-        while take("and"):
-            parts.append(negated())
-        return lambda holds: all(part(holds) for part in parts)
-
-    def negated() -> Callable:
-        nonlocal position
-        if take("not"):
-            inner = negated()
-            return lambda holds: not inner(holds)
-        if take("("):
-            inner = either()
-            if not take(")"):
-                raise fail("')'")
-            return inner
-        if position == len(tokens) or tokens[position] in ("and", "or", ")"):
-            raise fail("a word")
-        word = tokens[position]
-        position += 1
-        return lambda holds: holds(word)
-
-    found = either()
-    if position < len(tokens):
-        raise fail("'and' or 'or'")
-    return found
-
-
-def words(expression: str) -> list[str]:
-    """What an expression is made of, without its parentheses."""
-    return [word for _, word in _TOKEN.findall(expression) if word]
-
-
-def _tokens(expression: str, argument: str, where: str) -> list[str]:
     if not isinstance(expression, str):
         raise ValueError(
             f"{where}: {argument} must be a string such as 'lqr and not cartpole', got "
             f"{expression!r}."
         )
-    found = []
-    for parenthesis, word in _TOKEN.findall(expression):
-        low = word.lower()
-        found.append(parenthesis or (low if low in ("and", "or", "not") else word))
-    return found
+    tokens = [t.lower() if t.lower() in _OPERATORS else t for t in words(expression)]
+    if not tokens:
+        return lambda holds: True
+    # It becomes an expression of Python, which has the same operators; each word is
+    # quoted, so that nothing else is evaluated.
+    python: list[str | None] = []
+    depth, wants_word = 0, True
+    for token in (*tokens, None):
+        python.append(token)
+        if wants_word and token in ("not", "("):
+            depth += token == "("
+        elif wants_word and token not in ("and", "or", ")", None):
+            python[-1], wants_word = f"holds({token!r})", False
+        elif not wants_word and token in ("and", "or"):
+            wants_word = True
+        elif not wants_word and token == ")" and depth:
+            depth -= 1
+        elif wants_word or token is not None or depth:
+            joint = "')'" if depth else "'and' or 'or'"
+            got = "the end" if token is None else repr(token)
+            raise ValueError(
+                f"{where}: {argument} must be words joined by and, or, not and "
+                f"parentheses, got {expression!r}: expected "
+                f"{'a word' if wants_word else joint} instead of {got}."
+            )
+    code = compile(" ".join(filter(None, python)), "<expression>", "eval")
+    return lambda holds: eval(code, {"holds": holds})
+
+
+def words(expression: str) -> list[str]:
+    """The words and parentheses of an expression."""
+    return _TOKEN.findall(expression)

@@ -1,13 +1,13 @@
 """Interquartile means, and comparisons of pairs."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from .._extras import extra
-from ._results import Results
+from ._results import PASSED, Results
 
 
 def interquartile_mean(values: Any, axis: int | None = None) -> Any:
@@ -107,12 +107,15 @@ def compare(
     """
     pd = extra("pandas", "tables")
     where = "compare"
-    if by not in results.parameters:
-        names = ", ".join(results.parameters) or "none"
-        raise ValueError(f"{where}: by must be a parameter ({names}), got {by!r}.")
-    if metric not in results.metrics:
-        names = ", ".join(results.metrics) or "none"
-        raise ValueError(f"{where}: metric must be a result ({names}), got {metric!r}.")
+    for value, name, kind, known in (
+        (by, "by", "parameter", results.parameters),
+        (metric, "metric", "result", results.metrics),
+    ):
+        if value not in known:
+            names = ", ".join(known) or "none"
+            raise ValueError(
+                f"{where}: {name} must be a {kind} ({names}), got {value!r}."
+            )
     if not 0 < confidence < 1:
         raise ValueError(
             f"{where}: confidence must be between 0 and 1, got {confidence}."
@@ -120,7 +123,7 @@ def compare(
     samples: dict[Any, dict[tuple, dict[int, float]]] = {}
     for row in results.rows:
         value = row.get(metric)
-        if row["status"] not in ("passed", "passed unexpectedly"):
+        if row["status"] not in PASSED:
             continue
         if not isinstance(value, bool | int | float):
             raise ValueError(
@@ -128,16 +131,15 @@ def compare(
                 f"{value!r} in {row['case']}."
             )
         others = tuple(row.get(n) for n in results.parameters if n != by)
-        group = samples.setdefault(row[by], {}).setdefault(
-            (row["experiment"], others), {}
-        )
+        groups = samples.setdefault(row[by], {})
+        group = groups.setdefault((row["experiment"], others), {})
         group[row["seed"]] = float(value)
     if baseline not in samples:
         raise ValueError(
             f"{where}: baseline must be a value of {by!r} that passed "
             f"({', '.join(map(repr, samples))}), got {baseline!r}."
         )
-    draw = Bootstrap(confidence, resamples, seed)
+    bootstrap = Bootstrap(confidence, resamples, seed)
     rows = {}
     for label, groups in samples.items():
         own = [np.array(list(group.values())) for group in groups.values()]
@@ -147,10 +149,10 @@ def compare(
             common = [s for s in group if s in against]
             if common:
                 pairs.append(np.array([[group[s], against[s]] for s in common]))
-        row = dict(zip(("iqm", "low", "high"), draw.one(own), strict=True))
         name = "ratio" if ratio else "difference"
-        names = (name, f"{name}_low", f"{name}_high")
-        row |= dict(zip(names, draw.two(pairs, ratio), strict=True))
+        names = ("iqm", "low", "high", name, f"{name}_low", f"{name}_high")
+        both = *bootstrap.interval(own), *bootstrap.paired(pairs, ratio)
+        row: dict[str, Any] = dict(zip(names, both, strict=True))
         flat = np.concatenate(pairs) if pairs else np.zeros((0, 2))
         row["below"] = float(np.mean(flat[:, 0] < flat[:, 1])) if len(flat) else np.nan
         row["pairs"] = len(flat)
@@ -158,45 +160,69 @@ def compare(
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis(by)
 
 
-def mean_and_half_width(values: np.ndarray) -> tuple[float, float]:
-    """The mean, and half of its 95% interval."""
-    half = 1.96 * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
-    return float(values.mean()), float(half)
-
-
-def paired_ratio(one: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
-    """The ratio of the means over the same seeds, and its 95% interval."""
-    return Bootstrap(middle=np.mean).two([np.stack([one, other], axis=1)], ratio=True)
-
-
 @dataclasses.dataclass(frozen=True)
 class Bootstrap:
-    """The middle of groups of values and of what two have between them, with intervals;
-    the same draws for both members of a pair."""
+    """Intervals by resampling: of a statistic of groups of values, and of what lies
+    between the members of pairs, for which the same draws are made.
+
+    Source: Efron, 1979.
+
+    **Arguments:**
+
+    - `confidence`: of the intervals, 0.95 by default.
+    - `resamples`: how many, 2000 by default.
+    - `seed`: of the resampling, 0 by default.
+    - `statistic`: of an array over an `axis`; by default
+        [`delucax.experiments.interquartile_mean`][].
+
+    !!! example
+
+        ```python
+        import numpy as np
+        from delucax.experiments import Bootstrap
+
+        costs = np.random.default_rng(0).normal(2.0, 1.0, (40, 2))
+        ratio, low, high = Bootstrap(statistic=np.mean).paired([costs], ratio=True)
+        assert low < ratio < high
+        ```
+    """
 
     confidence: float = 0.95
     resamples: int = 2000
     seed: int = 0
-    middle: Callable[..., Any] = interquartile_mean
+    statistic: Callable[..., Any] = interquartile_mean
 
-    def one(self, groups: list[np.ndarray]) -> tuple[float, float, float]:
-        """Of groups of values."""
-        found = self.middle(np.concatenate(groups))
-        return float(found), *self._interval(self.middle(self._drawn(groups), axis=1))
+    def interval(self, groups: Sequence[np.ndarray]) -> tuple[float, float, float]:
+        """The statistic of all values, and its interval.
 
-    def two(self, groups: list[np.ndarray], ratio: bool) -> tuple[float, float, float]:
-        """The difference, or the ratio, of groups of pairs, each of shape `(count, 2)`;
-        NaN if there are none."""
+        **Arguments:**
+
+        - `groups`: vectors of values; each is resampled by itself.
+        """
+        value = self.statistic(np.concatenate(groups))
+        return float(value), *self._ends(self.statistic(self._drawn(groups), axis=1))
+
+    def paired(
+        self, groups: Sequence[np.ndarray], ratio: bool = False
+    ) -> tuple[float, float, float]:
+        """The statistic of the first members of pairs less that of the second, or
+        divided by it, and its interval; NaN if there are no pairs.
+
+        **Arguments:**
+
+        - `groups`: arrays of shape `(count, 2)`; each is resampled by itself.
+        - `ratio`: whether to divide; false by default.
+        """
         if not groups:
             return np.nan, np.nan, np.nan
         drawn, flat = self._drawn(groups), np.concatenate(groups)
         of = np.divide if ratio else np.subtract
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = of(*self.middle(flat, axis=0))
-            again = of(*self.middle(drawn, axis=1).T)
-        return float(found), *self._interval(again)
+            value = of(*self.statistic(flat, axis=0))
+            resampled = of(*self.statistic(drawn, axis=1).T)
+        return float(value), *self._ends(resampled)
 
-    def _drawn(self, groups: list[np.ndarray]) -> np.ndarray:
+    def _drawn(self, groups: Sequence[np.ndarray]) -> np.ndarray:
         rng = np.random.default_rng(self.seed)
         if all(len(group) == 1 for group in groups):
             groups = [np.concatenate(groups)]
@@ -206,7 +232,7 @@ class Bootstrap:
         ]
         return np.concatenate(parts, axis=1)
 
-    def _interval(self, again: np.ndarray) -> tuple[float, float]:
+    def _ends(self, resampled: np.ndarray) -> tuple[float, float]:
         tail = (1 - self.confidence) / 2
-        low, high = np.quantile(again, [tail, 1 - tail])
+        low, high = np.quantile(resampled, [tail, 1 - tail])
         return float(low), float(high)

@@ -18,6 +18,18 @@ from .._check import as_path
 _FORMAT = "delucax-results"
 _VERSION = 1
 _HEADER = {"format": _FORMAT, "version": _VERSION}
+# What a line `case` and a line `run` tell of each row of the table.
+CASE_COLUMNS = (
+    *("error", "traceback", "compile_seconds", "run_seconds"),
+    *("device", "hash"),
+)
+RUN_COLUMNS = ("date", "commit", "dirty", "dtype")
+RESERVED = (
+    *("experiment", "case", "seed", "status", "versions"),
+    *CASE_COLUMNS,
+    *RUN_COLUMNS,
+)
+"""Names that neither a parameter nor a result can have."""
 
 
 class Store:
@@ -51,36 +63,30 @@ class Store:
         lines = content.split(b"\n")
         # A line without its end was cut short by the end of its process.
         self._whole = len(content) - len(lines.pop())
-        if self._whole == 0 and not _line(_HEADER).startswith(content):
-            raise ValueError(
-                f"{self.where}: '{path}' is not a results file of delucax."
-            )
-        for number, line in enumerate(lines, 1):
+        if lines or not _line(_HEADER).startswith(content):
+            self._check_header(lines[0] if lines else content, path)
+        for number, line in enumerate(lines[1:], 2):
             try:
-                record = json.loads(line)
-                if number == 1:
-                    self._check_format(record, path)
-                else:
-                    self._take(record)
+                self._take(json.loads(line))
             except (ValueError, KeyError, TypeError, AttributeError) as error:
-                if isinstance(error, _OtherFormat) or number == 1:
-                    message = str(error)
-                    if not isinstance(error, _OtherFormat):
-                        message = (
-                            f"{self.where}: '{path}' is not a results file of delucax."
-                        )
-                    raise ValueError(message) from None
                 raise ValueError(
                     f"{self.where}: line {number} of '{path}' is damaged; remove it "
                     "to run its case again."
                 ) from error
 
-    def _check_format(self, record: Any, path: Path) -> None:
-        if not isinstance(record, dict) or record.get("format") != _FORMAT:
-            raise ValueError
-        if record["version"] != _VERSION:
-            raise _OtherFormat(
-                f"{self.where}: '{path}' has format {record['version']}, and this "
+    def _check_header(self, line: bytes, path: Path) -> None:
+        try:
+            header = json.loads(line)
+            is_ours, version = header["format"] == _FORMAT, header["version"]
+        except (ValueError, KeyError, TypeError):
+            is_ours, version = False, None
+        if not is_ours:
+            raise ValueError(
+                f"{self.where}: '{path}' is not a results file of delucax."
+            )
+        if version != _VERSION:
+            raise ValueError(
+                f"{self.where}: '{path}' has format {version}, and this "
                 f"version of delucax reads and writes {_VERSION}; it is left as it is. "
                 "Write to another file, or use the delucax that wrote it."
             )
@@ -102,6 +108,14 @@ class Store:
                 raise KeyError(name)
         for place, seed in enumerate(record["seeds"]):
             entry["seeds"][seed] = (record, place)
+
+    def stored(
+        self, experiment: str, case: str, hash: str
+    ) -> dict[int, tuple[dict[str, Any], int]]:
+        """The lines of a case that count, and the place there, by seed: of the code
+        and the values that have this hash."""
+        entry = self.cases.get((experiment, case), {"hash": None})
+        return entry["seeds"] if entry["hash"] == hash else {}
 
     def open(self) -> None:
         """Make ready to write: alone, after what is whole."""
@@ -166,10 +180,6 @@ class Store:
                 os.fsync(self._file)
             os.close(self._file)
             self._file = None
-
-
-class _OtherFormat(ValueError):
-    pass
 
 
 def _line(record: dict[str, Any]) -> bytes:

@@ -2,6 +2,7 @@
 
 import atexit
 import contextlib
+import dataclasses
 import hashlib
 import inspect
 import os
@@ -10,12 +11,12 @@ import threading
 import traceback
 from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
 from .._extras import extra
-from ._execute import Outcome, Plan, precision, Runner
+from ._execute import Outcome, Runner
 from ._experiment import Case, Experiment
 
 
@@ -28,7 +29,7 @@ class Job(NamedTuple):
     seeds: tuple[int, ...]
 
 
-def elsewhere(
+def run_in_workers(
     jobs: list[Job], workers: int, backend: str
 ) -> Generator[tuple[Job, Outcome], None, None]:
     """By joblib. If a worker dies, those that were under way are run one by one, so
@@ -38,22 +39,22 @@ def elsewhere(
     if backend == "dask":
         extra("distributed", "dask")
     pending = {job.number: job for job in jobs}
-    plans = {job.made.name: _packed(job.made) for job in jobs}
+    packed = {job.made.name: _packed(job.made) for job in jobs}
     with tempfile.TemporaryDirectory() as folder, _one_thread():
         while pending:
             marks = folder if backend == "loky" else None
             try:
                 for number, outcome in _parallel(
-                    joblib, list(pending.values()), plans, workers, backend, marks
+                    joblib, list(pending.values()), packed, workers, backend, marks
                 ):
                     yield pending.pop(number), outcome
             except Exception as error:
                 if not _died(error):
                     raise
-                begun = [n for n in pending if Path(folder, str(n)).exists()]
-                for n in begun if marks else list(pending):
+                started = [n for n in pending if Path(folder, str(n)).exists()]
+                for n in started if marks else list(pending):
                     job = pending.pop(n)
-                    yield job, _alone(joblib, job, plans, backend)
+                    yield job, _alone(joblib, job, packed, backend)
         if any(_stays_open(job.made) for job in jobs):
             _end(backend)
 
@@ -62,7 +63,7 @@ def _stays_open(made: Experiment) -> bool:
     """Whether something is to be done when its fixtures of a process are let go."""
     return any(
         fixture.scope == "process" and inspect.isgeneratorfunction(fixture.function)
-        for fixture in made.needed().values()
+        for fixture in made.used_fixtures().values()
     )
 
 
@@ -76,28 +77,21 @@ def _end(backend: str) -> None:
         loky.get_reusable_executor(reuse=True).shutdown(wait=True)
 
 
-def _parallel(joblib, jobs, plans, workers, backend, marks) -> Iterator:
+def _parallel(joblib, jobs, packed, workers, backend, marks) -> Iterator:
     precise = bool(jax.config.jax_enable_x64)
     task = joblib.delayed(work)
     with joblib.parallel_config(backend=backend, n_jobs=workers):
         parallel = joblib.Parallel(return_as="generator_unordered")
         yield from parallel(
-            task(
-                *plans[job.made.name],
-                job.number,
-                job.case.index,
-                job.seeds,
-                precise,
-                marks,
-            )
-            for job in jobs
+            task(*packed[made.name], number, case.index, seeds, precise, marks)
+            for number, made, case, seeds in jobs
         )
 
 
-def _alone(joblib, job: Job, plans, backend) -> Outcome:
+def _alone(joblib, job: Job, packed, backend) -> Outcome:
     try:
         # Two workers, for joblib runs a single one in this process.
-        ((_, outcome),) = _parallel(joblib, [job], plans, 2, backend, None)
+        ((_, outcome),) = _parallel(joblib, [job], packed, 2, backend, None)
         return outcome
     except Exception as error:
         if not _died(error):
@@ -116,10 +110,12 @@ def _died(error: Exception) -> bool:
 
 
 def _packed(made: Experiment) -> tuple[str, bytes]:
-    """The plan as bytes that any process can read, and their hash."""
+    """The experiment as bytes that any process can read, and their hash."""
     cloudpickle = extra("cloudpickle", "experiments")
     try:
-        content = cloudpickle.dumps(Plan.of(made))
+        # Its fixtures are found here: in another process it has no module's globals.
+        made = dataclasses.replace(made, fixtures=made.used_fixtures())
+        content = cloudpickle.dumps(made)
     except Exception as error:
         raise ValueError(
             f"run: {made.name} cannot be sent to another process: {error}. Make what "
@@ -153,36 +149,40 @@ def work(
     """What a worker does: one case. It keeps the runner for the next one."""
     import cloudpickle
 
-    with precision(precise):
+    with jax.enable_x64(precise):
         runners = _local.__dict__.setdefault("runners", {})
         if (name, precise) not in runners:
             for old in runners.values():
                 old.close()
                 _held.discard(old)
             runners.clear()
-            plan = cloudpickle.loads(content)
-            runners[name, precise] = Runner(plan)
-        _held.add(runners[name, precise])
+            runners[name, precise] = Runner(cloudpickle.loads(content))
+        runner = runners[name, precise]
+        _held.add(runner)
         if marks is not None:
             Path(marks, str(number)).touch()
-        return number, runners[name, precise].run(index, seeds, None)
+        return number, runner.run(index, seeds, None)
+
+
+def dask_client(address: str) -> Any:
+    """A client of the Dask scheduler at `address`, a context manager.
+
+    **Raises:** `OSError` if there is none; `ImportError` without the extra `dask`.
+    """
+    return extra("distributed", "dask").Client(address, timeout=20)
 
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
     """Processes that are started meanwhile compute with one thread each."""
-    flag = "--xla_cpu_multi_thread_eigen=false"
-    flags = os.environ.get("XLA_FLAGS", "")
-    wanted = {"XLA_FLAGS": flags if flag in flags else f"{flags} {flag}".strip()}
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        wanted[name] = "1"
-    before = {name: os.environ.get(name) for name in wanted}
-    os.environ.update(wanted)
+    flag, flags = "--xla_cpu_multi_thread_eigen=false", os.environ.get("XLA_FLAGS", "")
+    names = "XLA_FLAGS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
+    before = {name: os.environ[name] for name in names if name in os.environ}
+    os.environ.update(dict.fromkeys(names, "1"))
+    os.environ["XLA_FLAGS"] = flags if flag in flags else f"{flags} {flag}".strip()
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in names:
+            os.environ.pop(name, None)
+        os.environ.update(before)

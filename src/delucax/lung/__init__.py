@@ -1,48 +1,6 @@
 """Lungs, the breath that a ventilator is to make, and controllers that learn to."""
 
-from ._csv import (
-    read_breaths as read_breaths,
-    write_breaths as write_breaths,
-    write_example as write_example,
-)
-from ._data import (
-    Breaths as Breaths,
-    explore as explore,
-    Explorer as Explorer,
-    segment as segment,
-    split as split,
-)
-from ._environment import (
-    BreathCost as BreathCost,
-    PressureSensor as PressureSensor,
-    ventilation as ventilation,
-)
-from ._fitting import fit_lungs as fit_lungs, open_loop_error as open_loop_error
-from ._grid import (
-    least_error as least_error,
-    pid_grid as pid_grid,
-    PIDGrid as PIDGrid,
-)
-from ._learned import LearnedLung as LearnedLung
-from ._lungs import (
-    AbstractLung as AbstractLung,
-    BalloonLung as BalloonLung,
-    DelayLung as DelayLung,
-    DoubleCompartment as DoubleCompartment,
-    SingleCompartment as SingleCompartment,
-)
-from ._models import (
-    GreyBoxLung as GreyBoxLung,
-    LungModel as LungModel,
-    NeuralLung as NeuralLung,
-)
-from ._original import (
-    original_valve as original_valve,
-    OriginalBalloonLung as OriginalBalloonLung,
-    OriginalDelayLung as OriginalDelayLung,
-    OriginalSingleCompartment as OriginalSingleCompartment,
-)
-from ._policies import (
+from ._breath_controllers import (
     BangBang as BangBang,
     Breathing as Breathing,
     BreathPolicy as BreathPolicy,
@@ -50,25 +8,58 @@ from ._policies import (
     FeedForward as FeedForward,
     Summed as Summed,
 )
-from ._runner import (
-    Recording as Recording,
-    run_breaths as run_breaths,
-    Runner as Runner,
-    SimulatedRunner as SimulatedRunner,
+from ._breath_file import (
+    read_breaths as read_breaths,
+    write_breaths as write_breaths,
+    write_example as write_example,
 )
-from ._shooting import ShootingMPC as ShootingMPC
-from ._stacking import stack as stack, unstack as unstack
-from ._tasks import (
+from ._breaths import Breaths as Breaths, segment as segment, split as split
+from ._controller_training import (
+    breath_error as breath_error,
+    train_controllers as train_controllers,
+)
+from ._exploration import explore as explore, Explorer as Explorer
+from ._learned_lung import LearnedLung as LearnedLung
+from ._lung_fitting import fit_lungs as fit_lungs, open_loop_error as open_loop_error
+from ._lung_models import (
+    GreyBoxLung as GreyBoxLung,
+    LungModel as LungModel,
+    NeuralLung as NeuralLung,
+)
+from ._lung_tasks import (
     balloon_lung as balloon_lung,
     delay_lung as delay_lung,
     double_compartment as double_compartment,
     learned_lung as learned_lung,
     single_compartment as single_compartment,
 )
-from ._train import (
-    breath_error as breath_error,
-    lung_environment as lung_environment,
-    train_controllers as train_controllers,
+from ._lungs import (
+    AbstractLung as AbstractLung,
+    BalloonLung as BalloonLung,
+    DelayLung as DelayLung,
+    DoubleCompartment as DoubleCompartment,
+    SingleCompartment as SingleCompartment,
 )
+from ._original_lungs import (
+    original_valve as original_valve,
+    OriginalBalloonLung as OriginalBalloonLung,
+    OriginalDelayLung as OriginalDelayLung,
+    OriginalSingleCompartment as OriginalSingleCompartment,
+)
+from ._pid_grid import pid_grid as pid_grid, PIDGrid as PIDGrid
+from ._runner import (
+    Recording as Recording,
+    run_breaths as run_breaths,
+    Runner as Runner,
+    SimulatedRunner as SimulatedRunner,
+)
+from ._shooting import least_error as least_error, ShootingMPC as ShootingMPC
+from ._stacking import stack as stack, unstack as unstack
 from ._valves import Valves as Valves
+from ._ventilation import (
+    BreathCost as BreathCost,
+    lung_environment as lung_environment,
+    PressureSensor as PressureSensor,
+    ventilation as ventilation,
+)
 from ._waveform import at_pip as at_pip, BreathWaveform as BreathWaveform

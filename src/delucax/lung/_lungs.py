@@ -1,13 +1,15 @@
 """Lungs behind a ventilator, as differential equations."""
 
 import abc
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TYPE_CHECKING
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import is_concrete
 from .._module import bounded, parameter, positive
+from .._typing import RealScalar, Scalar, State
 from ..systems import AbstractSystem
 from ._valves import Valves
 
@@ -34,9 +36,6 @@ class AbstractLung(AbstractSystem):
             def pressure(self, x):
                 return x[0]
 
-            def outflow(self, x):
-                return 0 * x[0]
-
             def resting(self, pressure):
                 return jnp.reshape(pressure, (1,))
 
@@ -51,7 +50,7 @@ class AbstractLung(AbstractSystem):
     control_units: ClassVar = ("%", "")
 
     @abc.abstractmethod
-    def pressure(self, x: Array) -> Array:
+    def pressure(self, x: State) -> Scalar:
         """The pressure of the airway.
 
         **Arguments:** `x`: state.
@@ -60,16 +59,7 @@ class AbstractLung(AbstractSystem):
         """
 
     @abc.abstractmethod
-    def outflow(self, x: Array) -> Array:
-        """What leaves by the expiratory valve and the leak.
-
-        **Arguments:** `x`: state.
-
-        **Returns:** a scalar [L/s].
-        """
-
-    @abc.abstractmethod
-    def resting(self, pressure: Any) -> Array:
+    def resting(self, pressure: RealScalar) -> State:
         """The state of a lung that rests at a pressure, both valves closed.
 
         **Arguments:** `pressure`: everywhere [cmH2O].
@@ -82,7 +72,47 @@ class AbstractLung(AbstractSystem):
         return jnp.reshape(self.pressure(x), (1,))
 
 
-class SingleCompartment(AbstractLung):
+class _AbstractCompartment(AbstractLung):
+    """One elastic volume at the end of one resistance, `dV/dt = (p - P(V)) / R`."""
+
+    if TYPE_CHECKING:  # pyright takes an AbstractVar for the first argument
+        resistance: ClassVar[Any]
+        valves: ClassVar[Any]
+    else:
+        resistance: eqx.AbstractVar[Array]
+        valves: eqx.AbstractVar[Valves]
+
+    state_names: ClassVar = ("inflow", "opening", "volume")
+    state_units: ClassVar = ("L/s", "", "L")
+
+    @abc.abstractmethod
+    def elastic_pressure(self, volume: Array) -> Array:
+        """The pressure `P(V)` in the lung.
+
+        **Arguments:** `volume`: [L].
+
+        **Returns:** [cmH2O].
+        """
+
+    @abc.abstractmethod
+    def _volume(self, pressure: RealScalar) -> Scalar:
+        """The volume at which the elastic pressure is `pressure`."""
+
+    def pressure(self, x: State) -> Scalar:
+        inside = self.elastic_pressure(x[2])
+        return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
+
+    def resting(self, pressure: RealScalar) -> State:
+        volume = self._volume(pressure)
+        return jnp.stack([0 * volume, 0 * volume, volume])
+
+    def vector_field(self, t, x, u, w):
+        inflow, opening = self.valves.slopes(x[0], x[1], u)
+        filling = (self.pressure(x) - self.elastic_pressure(x[2])) / self.resistance
+        return jnp.stack([inflow, opening, filling])
+
+
+class SingleCompartment(_AbstractCompartment):
     r"""One elastic compartment at the end of one resistance,
 
     `dV/dt = (p - V / C) / R`,
@@ -122,25 +152,11 @@ class SingleCompartment(AbstractLung):
     compliance: Array = parameter(20.0, constraint=positive)
     valves: Valves = Valves()
 
-    state_names: ClassVar = ("inflow", "opening", "volume")
-    state_units: ClassVar = ("L/s", "", "L")
+    def elastic_pressure(self, volume: Array) -> Array:
+        return volume / (PER_ML * self.compliance)
 
-    def pressure(self, x):
-        inside = x[2] / (PER_ML * self.compliance)
-        return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
-
-    def outflow(self, x):
-        return self.valves.outflow(x[1], self.pressure(x))
-
-    def resting(self, pressure):
-        volume = PER_ML * self.compliance * pressure
-        return jnp.stack([0 * volume, 0 * volume, volume])
-
-    def vector_field(self, t, x, u, w):
-        inflow, opening = self.valves.slopes(x[0], x[1], u)
-        inside = x[2] / (PER_ML * self.compliance)
-        filling = (self.pressure(x) - inside) / self.resistance
-        return jnp.stack([inflow, opening, filling])
+    def _volume(self, pressure: RealScalar) -> Scalar:
+        return PER_ML * self.compliance * pressure
 
 
 class DoubleCompartment(AbstractLung):
@@ -193,28 +209,21 @@ class DoubleCompartment(AbstractLung):
     state_names: ClassVar = ("inflow", "opening", "fast", "slow")
     state_units: ClassVar = ("L/s", "", "L", "L")
 
-    def _parts(self, x: Array) -> tuple[Array, Array, Array, Array]:
-        """The conductances of both ways, and the pressures at their ends."""
+    def _parts(self, x: State) -> tuple[Array, Array, Array, Array, Array]:
+        """The conductances of both ways, the pressures at their ends, and the pressure
+        of the one compartment that they are to the airway."""
         parallel = (1 - self.central) * self.resistance
         fast = self.imbalance / ((1 + self.imbalance) * parallel)
         slow = 1 / ((1 + self.imbalance) * parallel)
         whole = PER_ML * self.compliance
-        return (
-            fast,
-            slow,
-            x[2] / (self.share * whole),
-            x[3] / ((1 - self.share) * whole),
-        )
+        p1, p2 = x[2] / (self.share * whole), x[3] / ((1 - self.share) * whole)
+        return fast, slow, p1, p2, (fast * p1 + slow * p2) / (fast + slow)
 
-    def pressure(self, x):
-        fast, slow, p1, p2 = self._parts(x)
-        inside = (fast * p1 + slow * p2) / (fast + slow)
+    def pressure(self, x: State) -> Scalar:
+        inside = self._parts(x)[-1]
         return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
 
-    def outflow(self, x):
-        return self.valves.outflow(x[1], self.pressure(x))
-
-    def resting(self, pressure):
+    def resting(self, pressure: RealScalar) -> State:
         volume = PER_ML * self.compliance * pressure
         return jnp.stack(
             [0 * volume, 0 * volume, self.share * volume, (1 - self.share) * volume]
@@ -222,8 +231,7 @@ class DoubleCompartment(AbstractLung):
 
     def vector_field(self, t, x, u, w):
         inflow, opening = self.valves.slopes(x[0], x[1], u)
-        fast, slow, p1, p2 = self._parts(x)
-        inside = (fast * p1 + slow * p2) / (fast + slow)
+        fast, slow, p1, p2, inside = self._parts(x)
         total = (self.pressure(x) - inside) / self.resistance
         centre = inside + (1 - self.central) * self.resistance * total
         return jnp.stack([inflow, opening, fast * (centre - p1), slow * (centre - p2)])
@@ -231,13 +239,15 @@ class DoubleCompartment(AbstractLung):
 
 def balloon_pressure(volume: Array, rest: Array, stiffness: Array) -> Array:
     """The pressure in a balloon, `stiffness (1 - (r0 / r)^6) / (r0^2 r)`, its radius
-    being that of a sphere of its volume."""
+    being that of a sphere of its volume; held below a tenth of the volume at rest."""
+    # Towards an empty balloon the pressure and its slope go to minus infinity.
+    volume = jnp.maximum(volume, 0.1 * rest)
     radius = (3 * volume / (4 * jnp.pi)) ** (1 / 3)
     unstretched = (3 * rest / (4 * jnp.pi)) ** (1 / 3)
     return stiffness * (1 - (rest / volume) ** 2) / (unstretched**2 * radius)
 
 
-class BalloonLung(AbstractLung):
+class BalloonLung(_AbstractCompartment):
     r"""A balloon at the end of a resistance,
 
     `dV/dt = (p - P(V)) / R`, `P(V) = stiffness (1 - (r0 / r)^6) / (r0^2 r)`,
@@ -280,35 +290,11 @@ class BalloonLung(AbstractLung):
     rest: Array = parameter(1.5, constraint=positive)
     valves: Valves = Valves()
 
-    state_names: ClassVar = ("inflow", "opening", "volume")
-    state_units: ClassVar = ("L/s", "", "L")
-
     def elastic_pressure(self, volume: Array) -> Array:
-        """The pressure in the balloon.
-
-        **Arguments:** `volume`: [L].
-
-        **Returns:** [cmH2O].
-        """
-        volume = jnp.maximum(volume, 0.1 * self.rest)
         return balloon_pressure(volume, self.rest, self.stiffness)
 
-    def pressure(self, x):
-        inside = self.elastic_pressure(x[2])
-        return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
-
-    def outflow(self, x):
-        return self.valves.outflow(x[1], self.pressure(x))
-
-    def resting(self, pressure):
-        volume = _stretched(self.rest, self.stiffness, pressure)
-        return jnp.stack([0 * volume, 0 * volume, volume])
-
-    def vector_field(self, t, x, u, w):
-        inflow, opening = self.valves.slopes(x[0], x[1], u)
-        inside = self.elastic_pressure(x[2])
-        filling = (self.pressure(x) - inside) / self.resistance
-        return jnp.stack([inflow, opening, filling])
+    def _volume(self, pressure: RealScalar) -> Scalar:
+        return _stretched(self.rest, self.stiffness, pressure)
 
 
 class DelayLung(AbstractLung):
@@ -354,22 +340,19 @@ class DelayLung(AbstractLung):
     state_names: ClassVar = ("inflow", "opening", "pipe", "volume")
     state_units: ClassVar = ("L/s", "", "cmH2O", "L")
 
-    def pressure(self, x):
+    def pressure(self, x: State) -> Scalar:
         return x[2]
 
-    def outflow(self, x):
-        return self.valves.outflow(x[1], x[2])
-
-    def resting(self, pressure):
+    def resting(self, pressure: RealScalar) -> State:
         volume = _stretched(self.rest, self.stiffness, pressure)
         return jnp.stack([0 * volume, 0 * volume, pressure + 0 * volume, volume])
 
     def vector_field(self, t, x, u, w):
         inflow, opening = self.valves.slopes(x[0], x[1], u)
-        volume = jnp.maximum(x[3], 0.1 * self.rest)
-        inside = balloon_pressure(volume, self.rest, self.stiffness)
+        inside = balloon_pressure(x[3], self.rest, self.stiffness)
         filling = (x[2] - inside) / self.resistance
-        rise = (x[0] - filling - self.outflow(x)) / (PER_ML * self.pipe)
+        outflow = self.valves.outflow(x[1], x[2])
+        rise = (x[0] - filling - outflow) / (PER_ML * self.pipe)
         return jnp.stack([inflow, opening, rise, filling])
 
 

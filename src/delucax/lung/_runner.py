@@ -2,7 +2,7 @@
 
 import abc
 import time
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -11,13 +11,20 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import check_bool, check_count, check_key, check_positive
-from .._controller import AbstractController
+from .._controller import AbstractController, check_controller
 from .._typing import PRNGKey
 from ..environments import Environment
 
 
 ABORT = 60.0
 """The pressure at which a run is given up [cmH2O]."""
+
+
+_step = eqx.filter_jit(Environment.step)
+_act = eqx.filter_jit(lambda controller, t, y, state: controller(t, y, state))
+_applied = eqx.filter_jit(
+    lambda controller, u, state: controller.applied(u, jnp.zeros(()), state)
+)
 
 
 @runtime_checkable
@@ -164,7 +171,7 @@ class SimulatedRunner:
         u = jnp.asarray(self.controls, self.state.dtype)
         # As an array: a number would be part of the program, which compiled each step.
         t = jnp.asarray(self.steps * self.dt)
-        return _step(self.environment, t, self.state, u)
+        return _step(self.environment, t, self.state, u).state
 
     def should_abort(self, pressure: float) -> bool:
         """Whether the pressure is above the limit, or no number.
@@ -182,12 +189,7 @@ class SimulatedRunner:
         self.is_clean = True
 
 
-@eqx.filter_jit
-def _step(environment, t, x, u):
-    return environment.step(t, x, u).state
-
-
-class Recording(eqx.Module):
+class Recording(NamedTuple):
     """What a run at a ventilator leaves behind, in NumPy arrays.
 
     **Attributes:**
@@ -211,7 +213,7 @@ class Recording(eqx.Module):
     pressure: np.ndarray
     u_in: np.ndarray
     u_out: np.ndarray
-    aborted: bool = eqx.field(static=True)
+    aborted: bool
 
 
 def run_breaths(
@@ -259,18 +261,14 @@ def run_breaths(
             f"{where}: runner must have physical, dt, observe, actuate, wait, "
             f"should_abort and cleanup, got {type(runner).__name__}."
         )
-    if not isinstance(controller, AbstractController):
-        raise ValueError(
-            f"{where}: controller must be an AbstractController, got "
-            f"{type(controller).__name__}."
-        )
+    check_controller(controller, "controller", where)
     steps = check_count(steps, "steps", where)
     rows, aborted = [], False
     try:
         state = controller.init(key=key)
         # Compiled now, and not while a valve stands open.
-        u, _ = _ask(controller, jnp.asarray(0.0), jnp.array([0.0]), state)
-        _tell(controller, jnp.array([0.0, 0.0]), state)
+        u, _ = _act(controller, jnp.asarray(0.0), jnp.array([0.0]), state)
+        _applied(controller, jnp.array([0.0, 0.0]), state)
         for k in range(steps):
             pressure = float(runner.observe())
             if runner.should_abort(pressure):
@@ -278,29 +276,18 @@ def run_breaths(
                 rows.append((k * runner.dt, pressure, 0.0, 1.0))
                 break
             now = jnp.asarray(k * runner.dt)
-            u, state = _ask(controller, now, jnp.array([pressure]), state)
-            u_in, u_out = (float(value) for value in u)
-            if not (np.isfinite(u_in) and np.isfinite(u_out)):
+            u, state = _act(controller, now, jnp.array([pressure]), state)
+            if not np.all(np.isfinite(u)):
                 raise ValueError(
-                    f"{where}: the controls must be finite, got ({u_in}, {u_out}) at "
+                    f"{where}: the controls must be finite, got ({u[0]}, {u[1]}) at "
                     f"step {k}."
                 )
-            u_in, u_out = float(np.clip(u_in, 0, 100)), float(np.clip(u_out, 0, 1))
+            u_in, u_out = np.clip(np.asarray(u), [0, 0], [100, 1]).tolist()
             runner.actuate(u_in, u_out)
-            state = _tell(controller, jnp.array([u_in, u_out]), state)
+            state = _applied(controller, jnp.array([u_in, u_out]), state)
             rows.append((k * runner.dt, pressure, u_in, u_out))
             runner.wait()
     finally:
         runner.cleanup()
     columns = np.array(rows, float).reshape(-1, 4).T
     return Recording(*columns, aborted=aborted)
-
-
-@eqx.filter_jit
-def _ask(controller, t, y, state):
-    return controller(t, y, state)
-
-
-@eqx.filter_jit
-def _tell(controller, u, state):
-    return controller.applied(u, jnp.zeros(()), state)

@@ -1,5 +1,6 @@
-"""Model predictive control in a learned lung."""
+"""Controls of a breath that are found by gradient descent through a lung."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,11 +9,13 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from .._check import check_count
+from .._check import check_count, check_instance
 from .._controller import AbstractController
 from .._module import parameter, positive
-from ._learned import LearnedLung
-from ._waveform import BreathWaveform, check_waveform
+from ..environments import Environment
+from ._learned_lung import LearnedLung
+from ._ventilation import waveform_of
+from ._waveform import as_pips, at_pip, BreathWaveform, check_waveform, LENGTH, PIPS
 
 
 class _Shooting(NamedTuple):
@@ -80,12 +83,9 @@ class ShootingMPC(AbstractController):
         self.learning_rate, self.memory = learning_rate, memory
 
     def __check_init__(self):
-        if not isinstance(self.model, LearnedLung):
-            raise ValueError(
-                "ShootingMPC: model must be a LearnedLung, got "
-                f"{type(self.model).__name__}."
-            )
-        check_waveform(self.waveform, "ShootingMPC")
+        where = "ShootingMPC"
+        check_instance(self.model, LearnedLung, "model must be a LearnedLung", where)
+        check_waveform(self.waveform, where)
 
     def init(self, *, key=None):
         lung = self.model.resting()
@@ -93,32 +93,104 @@ class ShootingMPC(AbstractController):
 
     def __call__(self, t, y, state):
         model = self.model
-        lung = model.drawn(state.lung, y[0], 1 - self.memory)
+        lung = model.corrected(state.lung, y[0], 1 - self.memory)
         ahead = t + model.dt * jnp.arange(1, self.horizon + 1)
         target = self.waveform.pressure(ahead)
 
         def error(plan):
             def body(x, z):
-                u = jnp.stack([100 * jax.nn.sigmoid(z), jnp.zeros_like(z)])
-                after, _ = model.advance(0.0, x, u, None)
+                after, _ = model.advance(0.0, x, _controls(z), None)
                 return after, model.pressure(after)
 
             return jnp.mean(jnp.abs(jax.lax.scan(body, lung, plan)[1] - target))
 
-        optimiser = optax.adam(self.learning_rate)
-
-        def improve(carry, _):
-            plan, memory = carry
-            move, memory = optimiser.update(jax.grad(error)(plan), memory)
-            return ((plan + move).astype(plan.dtype), memory), None
-
         start = jnp.append(state.plan[1:], state.plan[-1])
-        first = start, optimiser.init(start)
-        (plan, _), _ = jax.lax.scan(improve, first, None, self.iterations)
-        u = 100 * jax.nn.sigmoid(plan[:1])
-        return u.astype(y.dtype), _Shooting(lung, plan)
+        optimiser = optax.adam(self.learning_rate)
+        plan, _ = _descended(error, start, optimiser, self.iterations)
+        return _controls(plan[0])[:1].astype(y.dtype), _Shooting(lung, plan)
 
     def applied(self, u, cost, state):
         u = jnp.stack([u[0], jnp.zeros_like(u[0])])
         lung, _ = self.model.advance(0.0, state.lung, u, None)
         return state._replace(lung=lung)
+
+
+def least_error(
+    env: Environment, *, pips: Any = PIPS, steps: int = 600, horizon: int = LENGTH
+) -> Array:
+    """About the least error that any control of the inspiratory valve could have.
+
+    The controls of each breath are chosen by gradient descent with the true lung at
+    hand, nothing to measure and no noise: what a controller that is right from the
+    start would reach, to the accuracy of the descent.
+
+    **Arguments:**
+
+    - `env`: a task of a lung.
+    - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
+    - `steps`: of the descent, 600 by default.
+    - `horizon`: steps an episode, 29 by default.
+
+    **Returns:** the mean error at each of the pressures, shape `(pips,)` [cmH2O].
+
+    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    say).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        from delucax import lung
+
+        env = dlx.make("lung/single_compartment")
+        lung.least_error(env, pips=[20.0], steps=20, horizon=10)
+        ```
+    """
+    where = "least_error"
+    pips = as_pips(pips, waveform_of(env, where), where)
+    steps = check_count(steps, "steps", where)
+    horizon = check_count(horizon, "horizon", where)
+    optimiser = optax.adam(optax.cosine_decay_schedule(0.3, steps))
+
+    def of(pip):
+        world = at_pip(env, pip)
+        x0: Any = world.initial_state
+
+        def error(z):
+            @jax.checkpoint
+            def body(x, inputs):
+                k, z = inputs
+                step = world.step(k * world.dt, x, _controls(z))
+                return step.state, step.cost
+
+            _, costs = jax.lax.scan(body, x0, (jnp.arange(horizon), z))
+            return jnp.mean(costs)
+
+        z = jnp.full(horizon, -1.0)
+        _, errors = _descended(error, z, optimiser, steps)
+        return jnp.min(errors, initial=jnp.inf)
+
+    return eqx.filter_jit(jax.vmap(of))(pips)
+
+
+def _controls(z: Array) -> Array:
+    """Both valves in an inspiration, within their bounds for any number `z`."""
+    return jnp.stack([100 * jax.nn.sigmoid(z), jnp.zeros_like(z)])
+
+
+def _descended(
+    error: Callable[[Array], Array],
+    z: Array,
+    optimiser: optax.GradientTransformation,
+    steps: int,
+) -> tuple[Array, Array]:
+    """Where gradient descent ends, and the error before each of its steps."""
+
+    def descend(carry, _):
+        z, memory = carry
+        value, slope = jax.value_and_grad(error)(z)
+        change, memory = optimiser.update(slope, memory)
+        return ((z + change).astype(z.dtype), memory), value
+
+    (z, _), errors = jax.lax.scan(descend, (z, optimiser.init(z)), None, steps)
+    return z, errors

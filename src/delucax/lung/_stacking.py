@@ -74,22 +74,6 @@ def _is_plain(leaf: Any) -> bool:
     return is_concrete(leaf) and not is_key
 
 
-def repeat(tree: Any, count: int) -> Any:
-    """One module, stacked as often as asked for."""
-    return stack([tree] * count)
-
-
 def count_of(tree: Any) -> int:
     """How many modules are stacked."""
     return jax.tree.leaves(eqx.filter(tree, eqx.is_array))[0].shape[0]
-
-
-def taken(tree: Any, index: Any) -> Any:
-    """What an index takes of each array of stacked modules."""
-    return jax.tree.map(lambda a: a[index] if eqx.is_array(a) else a, tree)
-
-
-def joined(one: Any, other: Any) -> Any:
-    """Stacked modules, and others of the same structure after them."""
-    join = lambda a, b: jnp.concatenate([a, b]) if eqx.is_array(a) else a  # noqa: E731
-    return jax.tree.map(join, one, other)

@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from .._check import (
     check_finite,
+    check_instance,
     check_number,
     check_real,
     check_step,
@@ -20,6 +21,11 @@ from .._module import as_float_array, check_parameters, parameter, positive
 
 
 _T = TypeVar("_T")
+
+LENGTH = 29
+"""Samples of an inspiration that are learned from: 0.87 s."""
+PIPS = (10.0, 15.0, 20.0, 25.0, 30.0, 35.0)
+"""The peak pressures that are learned from [cmH2O]."""
 
 
 class BreathWaveform(eqx.Module):
@@ -163,11 +169,7 @@ def _slack(breaths: Array) -> Array:
 
 def check_waveform(waveform: Any, where: str) -> None:
     """Raise unless it is a breath waveform."""
-    if not isinstance(waveform, BreathWaveform):
-        raise ValueError(
-            f"{where}: waveform must be a BreathWaveform, got "
-            f"{type(waveform).__name__}."
-        )
+    check_instance(waveform, BreathWaveform, "waveform must be a BreathWaveform", where)
 
 
 def check_peep(waveform: BreathWaveform, valves: Any, where: str) -> None:
@@ -194,14 +196,16 @@ def as_pips(pips: Any, tree: Any, where: str) -> Array:
         got = f"shape {array.shape}" if eqx.is_array(array) else shortened(pips)
         raise ValueError(f"{where}: pips must be a vector of pressures, got {got}.")
     check_real(array, "pips", where)
-    for node in jax.tree.leaves(tree, is_leaf=_is_waveform):
-        if _is_waveform(node) and is_concrete(node.peep):
-            _check_pip(array, np.max(np.asarray(node.peep)), "pips", where)
+    for waveform in _waveforms(tree):
+        if is_concrete(waveform.peep):
+            _check_pip(array, np.max(np.asarray(waveform.peep)), "pips", where)
     return jnp.asarray(array, float)
 
 
-def _is_waveform(node: Any) -> bool:
-    return isinstance(node, BreathWaveform)
+def _waveforms(tree: Any) -> list[BreathWaveform]:
+    """The breath waveforms in a pytree."""
+    is_waveform = lambda node: isinstance(node, BreathWaveform)
+    return list(filter(is_waveform, jax.tree.leaves(tree, is_leaf=is_waveform)))
 
 
 def _check_pip(pip: Array, peep: Any, name: str, where: str) -> None:
@@ -239,22 +243,15 @@ def at_pip(tree: _T, pip: Any) -> _T:
         env = lung.at_pip(dlx.make("lung/single_compartment"), 20.0)
         ```
     """
-    found = 0
     pip = as_float_array(pip)
     if not eqx.is_inexact_array(pip):
         raise ValueError(f"at_pip: pip must be a number, got {pip!r}.")
-
-    def put(node):
-        nonlocal found
-        if not _is_waveform(node):
-            return node
-        found += 1
-        _check_pip(pip, node.peep, "pip", "at_pip")
-        return eqx.tree_at(lambda w: w.pip, node, pip)
-
-    tree = jax.tree.map(put, tree, is_leaf=_is_waveform)
-    if not found:
+    waveforms = _waveforms(tree)
+    if not waveforms:
         raise ValueError(
             f"at_pip: there is no BreathWaveform in the {type(tree).__name__}."
         )
-    return tree
+    for waveform in waveforms:
+        _check_pip(pip, waveform.peep, "pip", "at_pip")
+    pips = [pip] * len(waveforms)
+    return eqx.tree_at(lambda tree: [w.pip for w in _waveforms(tree)], tree, pips)

@@ -2,18 +2,17 @@
 
 import dataclasses
 import functools
-import math
 import os
 
 import numpy as np
 from PIL import Image
 
-from .._check import check_bool, check_count
+from .._check import check_bool, check_count, check_step
 from ..environments import Environment
 from ..simulation import Trajectory
 from ._export import check_path, compressed, html_player, write
 from ._plot import control_bounds
-from ._runs import as_runs, last_seen
+from ._runs import as_runs
 from ._scene import Scene
 
 
@@ -157,16 +156,11 @@ def animate(
         )
     control_bounds(environment, run, where)
     max_frames = check_count(max_frames, "max_frames", where)
-    for name, value in (("fps", fps), ("dpi", dpi)):
-        if value is None and name == "fps":
-            continue
-        number = isinstance(value, int | float | np.number)
-        if not (number and math.isfinite(value) and value > 0):
-            raise ValueError(
-                f"{where}: {name} must be positive and finite, got {value!r}."
-            )
+    check_step(dpi, where, "dpi")
+    if fps is not None:
+        check_step(fps, where, "fps")
     target = None if path is None else check_path(path, where)
-    last = int(last_seen(run)[0])
+    last = int(run.last[0])
     duration = float(run.times[0, last] - run.times[0, 0])
     frames = min(max_frames, last + 1)
     if fps is None and duration > 0:
@@ -180,7 +174,7 @@ def animate(
         tuple(indices.tolist()),
         float(FASTEST if fps is None else fps),
         float(dpi),
-        check_bool(traces, "traces", "animate"),
+        check_bool(traces, "traces", where),
     )
     if target is not None:
         write(target, animation._frames, animation.fps)

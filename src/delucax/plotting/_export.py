@@ -5,31 +5,38 @@ import hashlib
 import html
 import io
 import os
-import pathlib
 import shutil
+import string
 import subprocess
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import matplotlib
 import numpy as np
+from jaxtyping import Int, Num, UInt8
 from PIL import Image
 
 from ._figure import quantised
 
 
-ENDINGS = (".gif", ".html", ".mp4")
-CLEAR = 63  # the palette's index that stands for "as in the first frame"
+Pixels: TypeAlias = UInt8[np.ndarray, "... 3"]
+Indices: TypeAlias = Int[np.ndarray, "..."]
+Palette: TypeAlias = UInt8[np.ndarray, "_ 3"]
+
+TRANSPARENT = 63  # the palette's index that stands for "as in the first frame"
+# Its script waits a moment: some notebooks run it before the rest is on the page.
+PLAYER = string.Template(Path(__file__).with_name("_player.html").read_text("utf-8"))
 
 
-def check_path(path: Any, where: str) -> pathlib.Path:
+def check_path(path: Any, where: str) -> Path:
     """`path` as a file that can be written, or an error, before anything is drawn."""
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"{where}: path must be a path, got {path!r}.")
-    path = pathlib.Path(path)
-    if path.suffix.lower() not in ENDINGS:
+    path = Path(path)
+    if path.suffix.lower() not in _WRITERS:
         raise ValueError(
-            f"{where}: path must end in {', '.join(ENDINGS)}, got {str(path)!r}."
+            f"{where}: path must end in {', '.join(_WRITERS)}, got {str(path)!r}."
         )
     if path.is_dir() or not path.parent.is_dir():
         raise ValueError(
@@ -50,61 +57,61 @@ def _ffmpeg() -> str:
     return matplotlib.rcParams["animation.ffmpeg_path"]
 
 
-def few_colours(
-    colours: np.ndarray, counts: np.ndarray, most: int
-) -> tuple[np.ndarray, np.ndarray]:
+def reduced_palette(
+    colours: Palette, counts: Num[np.ndarray, " _"], most: int
+) -> tuple[Indices, Palette]:
     """A palette of at most `most` colours, and the entry in it for each of `colours`.
 
-    Those that are seen most are kept as they are: a tint where something was in the
-    frame before would be a ghost of it.
+    The most frequent are kept as they are: a tint where something was in the frame
+    before would be a ghost of it.
     """
     if len(colours) <= most:
         return np.arange(len(colours)), colours
     order = np.argsort(-counts, kind="stable")
     common, rest = order[: most // 2], order[most // 2 :]
     image = quantised(Image.fromarray(colours[rest][None]), most - len(common))
-    indices = np.empty(len(colours), int)
-    indices[common] = np.arange(len(common))
-    indices[rest] = len(common) + np.asarray(image)[0]
+    entries = np.empty(len(colours), int)
+    entries[common] = np.arange(len(common))
+    entries[rest] = len(common) + np.asarray(image)[0]
     table = np.reshape(image.getpalette(), (-1, 3))[: most - len(common)]
-    return indices, np.concatenate([colours[common], table.astype(np.uint8)])
+    return entries, np.concatenate([colours[common], table.astype(np.uint8)])
 
 
-def _colours(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The colours of pixels `(..., 3)`, which of them each pixel has, and how often
-    each is seen."""
+def _distinct(pixels: Pixels) -> tuple[Palette, Indices, Indices]:
+    """The distinct colours of pixels, which of them each pixel has, and how often each
+    occurs."""
     packed = pixels.reshape(-1, 3).astype(int) @ np.array([65536, 256, 1])
     packed, index, counts = np.unique(packed, return_inverse=True, return_counts=True)
     colours = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], axis=-1)
     return colours.astype(np.uint8), index.reshape(pixels.shape[:-1]), counts
 
 
-def _image(indices: np.ndarray, table: np.ndarray) -> Image.Image:
-    image = Image.fromarray(indices.astype(np.uint8))
-    image.putpalette(table.ravel().tolist())
+def _reduced(pixels: Pixels, most: int) -> tuple[Indices, Palette]:
+    """Pixels as entries in a palette of at most `most` colours."""
+    colours, index, counts = _distinct(pixels)
+    entries, palette = reduced_palette(colours, counts, most)
+    return entries[index], palette
+
+
+def _image(entries: Int[np.ndarray, "height width"], palette: Palette) -> Image.Image:
+    image = Image.fromarray(entries.astype(np.uint8))
+    image.putpalette(palette.ravel().tolist())
     return image
 
 
-def compressed(frames: Iterable[np.ndarray]) -> list[Image.Image]:
+def compressed(frames: Iterable[Pixels]) -> list[Image.Image]:
     """Frames of shape `(height, width, 3)` in few colours: the first whole, the others
     transparent where they are as the first, so that a page of them is small."""
-    images: list[Image.Image] = []
-    first: np.ndarray | None = None
+    frames = iter(frames)
+    first = next(frames)
+    images = [_image(*_reduced(first, 255))]
     for frame in frames:
-        if first is None:
-            first = frame
-            colours, which, counts = _colours(frame)
-            entry, table = few_colours(colours, counts, 255)
-            images.append(_image(entry[which], table))
-            continue
         changed = np.any(frame != first, axis=-1)
-        indices = np.full(frame.shape[:2], CLEAR)
-        colours, which, counts = _colours(frame[changed])
-        entry, table = few_colours(colours, counts, CLEAR)
-        indices[changed] = entry[which]
+        entries = np.full(changed.shape, TRANSPARENT)
+        entries[changed], palette = _reduced(frame[changed], TRANSPARENT)
         # Filled up to the clear colour: a PNG knows only of those in its palette.
-        image = _image(indices, np.resize(table, (CLEAR + 1, 3)))
-        image.info["transparency"] = CLEAR
+        image = _image(entries, np.resize(palette, (TRANSPARENT + 1, 3)))
+        image.info["transparency"] = TRANSPARENT
         images.append(image)
     return images
 
@@ -116,51 +123,48 @@ def expanded(images: Sequence[Image.Image]) -> Iterator[Image.Image]:
         yield Image.alpha_composite(first, image.convert("RGBA")).convert("RGB")
 
 
-def write(path: pathlib.Path, frames: Sequence[Image.Image], fps: float) -> None:
+def write(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
     """Write frames in the form that the ending of `path` names."""
-    ending = path.suffix.lower()
-    if ending == ".gif":
-        _write_gif(path, frames, fps)
-    elif ending == ".html":
-        page = (
-            '<!doctype html><html lang="en"><meta charset="utf-8">'
-            f"<title>{html.escape(path.stem)}</title>"
-            f"<body>{html_player(frames, fps)}</body></html>\n"
-        )
-        path.write_text(page, encoding="utf-8")
-    else:
-        _write_mp4(path, frames, fps)
+    _WRITERS[path.suffix.lower()](path, frames, fps)
 
 
-def _write_gif(path, frames, fps):
+def _write_gif(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
     # One palette for all frames, so that nothing flickers.
-    indices = [np.asarray(image) for image in frames]
+    entries = [np.asarray(image) for image in frames]
     tables = [np.resize(image.getpalette(), (256, 3)) for image in frames]
-    seen = [np.bincount(index.ravel(), minlength=256) for index in indices]
-    for count in seen[1:]:
-        count[CLEAR] = 0
-    colours, which, _ = _colours(np.stack(tables))
-    counts = np.bincount(which.ravel(), np.stack(seen).ravel(), len(colours))
-    used = np.flatnonzero(counts)
-    entry = np.zeros(len(colours), int)
-    entry[used], palette = few_colours(colours[used], counts[used], 256)
-    first = entry[which[0]][indices[0]]
+    used = np.stack([np.bincount(entry.ravel(), minlength=256) for entry in entries])
+    used[1:, TRANSPARENT] = 0
+    colours, which, _ = _distinct(np.stack(tables).astype(np.uint8))
+    counts = np.bincount(which.ravel(), used.ravel(), len(colours))
+    present = np.flatnonzero(counts)
+    shared = np.zeros(len(colours), int)
+    shared[present], palette = reduced_palette(colours[present], counts[present], 256)
+    first = shared[which[0]][entries[0]]
     images = [_image(first, palette)]
-    for index, look_up in zip(indices[1:], entry[which[1:]], strict=True):
-        images.append(_image(np.where(index == CLEAR, first, look_up[index]), palette))
-    # The format counts in hundredths of a second; browsers take less than 2 for 10.
-    duration = max(20, 10 * round(100 / fps))
+    for entry, table in zip(entries[1:], shared[which[1:]], strict=True):
+        entry = np.where(entry == TRANSPARENT, first, table[entry])
+        images.append(_image(entry, palette))
     images[0].save(
         path,
         save_all=True,
         append_images=images[1:],
-        duration=duration,
+        # The format counts in hundredths of a second; browsers take less than 2 for 10.
+        duration=max(20, 10 * round(100 / fps)),
         loop=0,
         optimize=True,
     )
 
 
-def _write_mp4(path, frames, fps):
+def _write_html(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
+    page = (
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        f"<title>{html.escape(path.stem)}</title>"
+        f"<body>{html_player(frames, fps)}</body></html>\n"
+    )
+    path.write_text(page, encoding="utf-8")
+
+
+def _write_mp4(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
     width, height = frames[0].size
     command = [_ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo"]
     command += ["-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:.6g}"]
@@ -168,75 +172,32 @@ def _write_mp4(path, frames, fps):
     even = "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white"
     command += ["-i", "-", "-vf", even, "-pix_fmt", "yuv420p", str(path)]
     data = b"".join(image.tobytes() for image in expanded(frames))
-    done = subprocess.run(command, input=data, capture_output=True)
-    if done.returncode:
-        words = done.stderr.decode(errors="replace").strip()
-        raise RuntimeError(f"ffmpeg could not write {str(path)!r}: {words[-500:]}")
+    process = subprocess.run(command, input=data, capture_output=True)
+    if process.returncode:
+        message = process.stderr.decode(errors="replace").strip()
+        raise RuntimeError(f"ffmpeg could not write {str(path)!r}: {message[-500:]}")
 
 
-# The script waits a moment: some notebooks run it before the rest is on the page.
-_PLAYER = """\
-<div class="delucax-animation" id="%(id)s" style="max-width:%(width)dpx">
-<div style="position:relative">
-<img alt="animation" src="data:image/png;base64,%(first)s"
- style="width:100%%;display:block;margin:0">
-<img alt="" hidden style="width:100%%;position:absolute;left:0;top:0;margin:0"></div>
-<div style="display:flex;align-items:center;gap:8px">
-<button type="button" style="width:4.5em">Pause</button>
-<input type="range" min="0" max="%(last)d" value="0" step="1" aria-label="frame"
- style="flex:1"></div></div>
-<script>
-setTimeout(() => {
-  const frames = [%(frames)s];
-  for (const root of document.querySelectorAll("#%(id)s:not([data-ready])")) {
-    root.dataset.ready = "1";
-    const [change, button, slider] =
-      ["img[hidden]", "button", "input"].map((name) => root.querySelector(name));
-    let timer = null;
-    const show = (i) => {
-      slider.value = i;
-      if (i > 0) change.src = "data:image/png;base64," + frames[i - 1];
-      change.hidden = i === 0;
-    };
-    const next = () => {
-      if (!root.isConnected) clearInterval(timer);
-      else show((Number(slider.value) + 1) %% (frames.length + 1));
-    };
-    const play = (on) => {
-      clearInterval(timer);
-      timer = on ? setInterval(next, %(interval)g) : null;
-      button.textContent = on ? "Pause" : "Play";
-    };
-    button.addEventListener("click", () => play(timer === null));
-    slider.addEventListener("input", () => {
-      play(false);
-      show(Number(slider.value));
-    });
-    play(true);
-  }
-}, 0);
-</script>
-"""
+_WRITERS = {".gif": _write_gif, ".html": _write_html, ".mp4": _write_mp4}
 
 
-def html_player(frames: Iterable[Image.Image], fps: float) -> str:
+def html_player(frames: Sequence[Image.Image], fps: float) -> str:
     """A player with a button and a slider, of compressed frames.
 
     It needs nothing from the network; Matplotlib's own has its icons from another site.
     """
-    width, encoded = 0, []
+    encoded = []
     for image in frames:
-        width = image.width
         buffer = io.BytesIO()
         image.save(buffer, "PNG")
         encoded.append(base64.b64encode(buffer.getvalue()).decode())
     # A name from the content: the same animation makes the same page.
     name = hashlib.sha256("".join(encoded).encode()).hexdigest()[:12]
-    return _PLAYER % {
-        "id": f"delucax-{name}",
-        "width": width,
-        "first": encoded[0],
-        "last": len(encoded) - 1,
-        "frames": ",".join(f'"{e}"' for e in encoded[1:]),
-        "interval": 1000 / fps,
-    }
+    return PLAYER.substitute(
+        id=f"delucax-{name}",
+        width=frames[0].width,
+        first=encoded[0],
+        last=len(encoded) - 1,
+        frames=",".join(f'"{each}"' for each in encoded[1:]),
+        interval=f"{1000 / fps:g}",
+    )

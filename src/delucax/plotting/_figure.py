@@ -7,6 +7,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from PIL import Image
 
@@ -44,9 +45,10 @@ def color_of(index: int) -> str:
     return PALETTE[index % len(PALETTE)]
 
 
-def line_style_of(index: int) -> Any:
-    """The line style of line `index`: solid until the colours come round again."""
-    return LINE_STYLES[index // len(PALETTE) % len(LINE_STYLES)]
+def line_style(index: int) -> dict[str, Any]:
+    """The colour and dashes of line `index`: solid until the colours come round."""
+    dashes = LINE_STYLES[index // len(PALETTE) % len(LINE_STYLES)]
+    return {"color": color_of(index), "linestyle": dashes}
 
 
 def style_axes(ax: Axes, *, size: float, ticks: tuple[int, int] = (8, 4)) -> None:
@@ -88,19 +90,10 @@ def wrapped(text: str, width: int) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def side_legend(
-    ax: Axes, handles: Sequence[Any], labels: Sequence[str], *, size: float
+def top_legend(
+    figure: Figure, entries: Sequence[tuple[Line2D, str]], **style: Any
 ) -> None:
-    """A legend beside the panel, where it covers no data."""
-    ax.legend(
-        handles,
-        labels,
-        loc="center left",
-        bbox_to_anchor=(1.0, 0.5),
-        frameon=False,
-        fontsize=size,
-        handlelength=1.4,
-        handletextpad=0.5,
-        labelspacing=0.3,
-        borderaxespad=0.3,
-    )
+    """A legend above all panels, of handles and their labels."""
+    handles, labels = zip(*entries, strict=True)
+    place = {"loc": "outside upper center", "frameon": False}
+    figure.legend(list(handles), list(labels), **place, **style)

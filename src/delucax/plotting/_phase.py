@@ -1,11 +1,12 @@
 """The phase portrait of a planar system."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -14,16 +15,18 @@ from .._check import as_vector
 from .._module import as_float_array
 from ..systems import AbstractSystem
 from ._figure import (
-    color_of,
-    line_style_of,
+    line_style,
     NEUTRAL,
     NotebookFigure,
     style_axes,
+    top_legend,
     with_unit,
     wrapped,
 )
 from ._runs import as_runs, Trajectories
 
+
+Limits: TypeAlias = Float[np.ndarray, "2 2"]
 
 GRID = 60
 SIZE = 10.0
@@ -76,7 +79,7 @@ def phase_portrait(
         raise ValueError(
             f"{where}: system must have two states, got {system.state_names}."
         )
-    limits = _limits(limits, where)
+    limits = _checked_limits(limits, where)
     runs = []
     if not isinstance(trajectories, tuple | list | dict) or len(trajectories):
         runs = as_runs(trajectories, None, "trajectories", where)
@@ -100,20 +103,13 @@ def phase_portrait(
     speed = np.linalg.norm(field / extent, axis=-1)
     top = np.nanmax(np.where(np.isfinite(speed), speed, 0.0), initial=0.0) or 1.0
     if np.any(speed > 0):
-        ax.streamplot(
-            x,
-            v,
-            field[..., 0],
-            field[..., 1],
-            color=to_rgba(NEUTRAL, 0.6),
-            linewidth=0.5 + 0.9 * np.sqrt(speed / top),
-            density=1.3,
-            arrowsize=0.8,
-            zorder=1,
-        )
-    handles, labels = [], []
+        width = 0.5 + 0.9 * np.sqrt(speed / top)
+        style: dict[str, Any] = {"color": to_rgba(NEUTRAL, 0.6), "arrowsize": 0.8}
+        style |= {"linewidth": width, "density": 1.3, "zorder": 1}
+        ax.streamplot(x, v, field[..., 0], field[..., 1], **style)
+    entries = []
     for i, run in enumerate(runs):
-        style: dict[str, Any] = {"color": color_of(i), "linestyle": line_style_of(i)}
+        style = line_style(i)
         members = run.series["states"]
         alpha = 1.0 if len(members) == 1 else max(0.2, 0.9 - 0.02 * len(members))
         for path in members:
@@ -121,25 +117,20 @@ def phase_portrait(
                 xs, vs = (path + turn).T
                 ax.plot(xs, vs, linewidth=1.8, alpha=alpha, zorder=2, **style)
                 ax.plot(xs[:1], vs[:1], "o", color=style["color"], ms=5, zorder=3)
-        handles.append(Line2D([], [], linewidth=1.8, **style))
-        labels.append(wrapped(run.label, 40))
+        handle = Line2D([], [], linewidth=1.8, **style)
+        entries.append((handle, wrapped(run.label, 40)))
     ax.set(xlim=limits[0], ylim=limits[1])
     units = system.state_units or ("", "")
-    ax.set_xlabel(wrapped(with_unit(system.state_names[0], units[0]), 60), size=SIZE)
-    ax.set_ylabel(wrapped(with_unit(system.state_names[1], units[1]), 45), size=SIZE)
-    if isinstance(trajectories, dict):
-        figure.legend(
-            handles,
-            labels,
-            loc="outside upper center",
-            ncols=max(1, 60 // (6 + max(map(len, labels)))),
-            frameon=False,
-            fontsize=SIZE,
-        )
+    x_label, y_label = map(with_unit, system.state_names, units)
+    ax.set_xlabel(wrapped(x_label, 60), size=SIZE)
+    ax.set_ylabel(wrapped(y_label, 45), size=SIZE)
+    if isinstance(trajectories, dict) and entries:
+        columns = max(1, 60 // (6 + max(len(label) for _, label in entries)))
+        top_legend(figure, entries, ncols=columns, fontsize=SIZE)
     return figure
 
 
-def _limits(limits: Any, where: str) -> tuple[tuple[float, float], ...]:
+def _checked_limits(limits: Any, where: str) -> Limits:
     try:
         array = np.asarray(limits, float)
     except (TypeError, ValueError):
@@ -150,10 +141,15 @@ def _limits(limits: Any, where: str) -> tuple[tuple[float, float], ...]:
         )
     if not np.all(array[:, 0] < array[:, 1]):
         raise ValueError(f"{where}: limits must have low < high, got {limits!r}.")
-    return tuple((float(low), float(high)) for low, high in array)
+    return array
 
 
-def _field(system: AbstractSystem, control: Any, states: Any, where: str) -> Any:
+def _field(
+    system: AbstractSystem,
+    control: Any,
+    states: Float[Array, "n 2"],
+    where: str,
+) -> Float[Array, "n 2"]:
     """dx/dt at each row of `states`."""
     size = system.control_size
     law: Callable[[Any], Any]
@@ -168,7 +164,9 @@ def _field(system: AbstractSystem, control: Any, states: Any, where: str) -> Any
     return jax.vmap(lambda x: system.vector_field(0.0, x, law(x), w))(states)
 
 
-def _turns(system: AbstractSystem, path: np.ndarray, limits: Any) -> list[np.ndarray]:
+def _turns(
+    system: AbstractSystem, path: Float[np.ndarray, "times 2"], limits: Limits
+) -> list[np.ndarray]:
     """The shifts by whole turns of its angles that bring `path` into the limits."""
     turns = [np.zeros(2)]
     for i, (low, high) in enumerate(limits):

@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -13,30 +14,28 @@ from .._results import RESULTS
 from ..environments import Environment
 from ._figure import (
     color_of,
-    line_style_of,
+    line_style,
     NEUTRAL,
     NotebookFigure,
-    side_legend,
     style_axes,
+    top_legend,
     with_unit,
     wrapped,
 )
-from ._runs import (
-    as_runs,
-    HELD,
-    last_seen,
-    Panel,
-    panels_of,
-    Run,
-    time_label,
-    Trajectories,
-)
+from ._runs import as_runs, FEW, HELD, Panel, panels_of, Run, Trajectories
 
 
-FEW = 8
+Bounds: TypeAlias = Float[np.ndarray, "2 controls"]
+Values: TypeAlias = Float[np.ndarray, "batch times"]
+
 WIDTH = 7.0
 PANEL_HEIGHT = 1.35
 SIZE = 9.0
+# What a member of a run may have done in the end.
+END_MARKS: dict[str, dict[str, Any]] = {
+    "failed": {"marker": "x"},
+    "terminated": {"marker": "o", "markerfacecolor": "none"},
+}
 
 
 def plot(
@@ -109,33 +108,26 @@ def plot(
     columns = 1 if len(panels) <= 5 else 2 if len(panels) <= 10 else 3
     columns = columns if compared else 1
     rows = math.ceil(len(panels) / columns)
-    figure = NotebookFigure(
-        figsize=(WIDTH + 1.5 * (columns - 1), PANEL_HEIGHT * rows + 0.7),
-        layout="constrained",
-    )
+    size = WIDTH + 1.5 * (columns - 1), PANEL_HEIGHT * rows + 0.7
+    figure = NotebookFigure(figsize=size, layout="constrained")
     grid = figure.add_gridspec(rows, columns)
     axes: list[Axes] = []
     for i, panel in enumerate(panels):
-        row, column = divmod(i, columns)
-        ax = figure.add_subplot(grid[row, column], sharex=axes[0] if axes else None)
+        sharex = axes[0] if axes else None
+        ax = figure.add_subplot(grid[divmod(i, columns)], sharex=sharex)
         axes.append(ax)
-        last = i + columns >= len(panels)
         draw_panel(ax, panel, runs, bounds, columns=columns)
-        ax.tick_params(labelbottom=last)
+        ax.tick_params(labelbottom=i + columns >= len(panels))
         if panel.kind == "costs" and not compared:
             ax.set_title(_total(runs[0]), loc="right", fontsize=SIZE - 1, pad=3)
-    if columns == 1:
-        axes[-1].set_xlabel(time_label(runs[0]), fontsize=SIZE)
-    else:
-        figure.supxlabel(time_label(runs[0]), fontsize=SIZE)
+    set_label = axes[-1].set_xlabel if columns == 1 else figure.supxlabel
+    set_label(runs[0].time_label, fontsize=SIZE)
     figure.align_ylabels(axes)
-    kinds = {panel.kind for panel in panels}
-    with_controls = "controls" in kinds
-    _head(figure, runs, with_costs="costs" in kinds, with_controls=with_controls)
+    _draw_head(figure, runs, {panel.kind for panel in panels})
     return figure
 
 
-def control_bounds(environment: Any, run: Run, where: str) -> Any:
+def control_bounds(environment: Any, run: Run, where: str) -> Bounds | None:
     """The bounds of each control, shape `(2, m)`, or `None`; checked against a run."""
     if not isinstance(environment, Environment):
         raise ValueError(
@@ -166,7 +158,7 @@ def draw_panel(
     ax: Axes,
     panel: Panel,
     runs: Sequence[Run],
-    bounds: Any = None,
+    bounds: Bounds | None = None,
     *,
     columns: int = 1,
     size: float = SIZE,
@@ -181,25 +173,32 @@ def draw_panel(
     handles: list[Line2D] = []
     for i, run in enumerate(runs):
         for j, column in enumerate(panel.columns):
-            index = i if compared else j + (panel.kind in HELD)
-            color = NEUTRAL if panel.kind == "costs" and not compared else None
-            style: dict[str, Any] = {
-                "color": color or color_of(index),
-                "linestyle": line_style_of(index),
-            }
+            style = line_style(i if compared else j + (panel.kind in HELD))
+            if panel.kind == "costs" and not compared:
+                style["color"] = NEUTRAL
             values = run.series[panel.kind][..., column]
-            handles.append(_draw_series(ax, run, panel.kind, values, style, faint))
+            _draw_series(ax, run, panel.kind, values, style, faint)
+            handles.append(Line2D([], [], linewidth=1.6, **style))
             if panel.kind == "states":
                 _mark_ends(ax, run, values, style["color"])
     if panel.kind == "controls":
         if bounds is not None:
             _draw_bounds(ax, panel, bounds, compared)
         _mark_incidents(ax, runs)
-    width = int(PANEL_HEIGHT * 13 * 9 / size) if columns == 1 else 16
-    _label(ax, panel, width, size)
-    if len(panel.names) > 1:
-        names = [wrapped(name, 24) for name in panel.names]
-        side_legend(ax, handles, names, size=size - 1)
+    _label(ax, panel, int(PANEL_HEIGHT * 13 * 9 / size) if columns == 1 else 16, size)
+    if len(panel.names) > 1:  # beside the panel, where it covers no data
+        ax.legend(
+            handles,
+            [wrapped(name, 24) for name in panel.names],
+            loc="center left",
+            bbox_to_anchor=(1.0, 0.5),
+            frameon=False,
+            fontsize=size - 1,
+            handlelength=1.4,
+            handletextpad=0.5,
+            labelspacing=0.3,
+            borderaxespad=0.3,
+        )
     return handles
 
 
@@ -209,8 +208,7 @@ def _label(ax: Axes, panel: Panel, width: int, size: float) -> None:
         # The names are in the legend; here the kind and the unit say enough.
         joined = panel.kind
     text = wrapped(with_unit(joined, panel.unit), width)
-    lines = text.count("\n") + 1
-    ax.set_ylabel(text, fontsize=size if lines < 3 else size - 1)
+    ax.set_ylabel(text, fontsize=size if text.count("\n") < 2 else size - 1)
 
 
 def _total(run: Run) -> str:
@@ -222,85 +220,67 @@ def _total(run: Run) -> str:
     return f"median total cost {np.median(finite) if finite.size else np.nan:.4g}"
 
 
-def _draw_series(ax, run, kind, values, style, faint):
-    """One series of a run, of shape `(batch, T + 1)`; returns the legend's handle."""
-    drawstyle = "steps-post" if kind in HELD else "default"
+def _draw_series(
+    ax: Axes, run: Run, kind: str, values: Values, style: dict[str, Any], faint: float
+) -> None:
+    """One series of a run: a line a member, or the median and a band."""
+    held = kind in HELD
+    style = style | {"drawstyle": "steps-post" if held else "default"}
+    if run.as_band:
+        low, middle, high = _quartiles(values)
+        band = {"color": style["color"], "alpha": 0.2, "linewidth": 0}
+        step = "post" if held else None
+        ax.fill_between(run.times[0], low, high, step=step, **band)
+        ax.plot(run.times[0], middle, linewidth=1.6, **style)
+        return
     members = len(values)
-    if members <= FEW or not run.same_times:
-        width = 1.6 if members == 1 else 0.9
-        alpha = faint * (1.0 if members == 1 else max(0.15, 0.75 - 0.05 * members))
-        for t, v in zip(run.times, values, strict=True):
-            ax.plot(t, v, drawstyle=drawstyle, linewidth=width, alpha=alpha, **style)
-        return Line2D([], [], linewidth=1.6, **style)
-    t = run.times[0]
-    low, middle, high = _quartiles(values)
-    step = "post" if kind in HELD else None
-    color = style["color"]
-    ax.fill_between(t, low, high, step=step, color=color, alpha=0.2, linewidth=0)
-    ax.plot(t, middle, drawstyle=drawstyle, linewidth=1.6, **style)
-    return Line2D([], [], linewidth=1.6, **style)
+    width = 1.6 if members == 1 else 0.9
+    alpha = faint * (1.0 if members == 1 else max(0.15, 0.75 - 0.05 * members))
+    for t, v in zip(run.times, values, strict=True):
+        ax.plot(t, v, linewidth=width, alpha=alpha, **style)
 
 
-def _quartiles(values: np.ndarray) -> np.ndarray:
-    """Quartiles over the members that are there, shape `(3, T + 1)`."""
+def _quartiles(values: Values) -> Float[np.ndarray, "3 times"]:
+    """Quartiles over the members that have not ended."""
     result = np.full((3, values.shape[1]), np.nan)
     some = np.any(np.isfinite(values), axis=0)
     result[:, some] = np.nanquantile(values[:, some], [0.25, 0.5, 0.75], axis=0)
     return result
 
 
-def _mark_ends(ax, run, values, color):
+def _mark_ends(ax: Axes, run: Run, values: Values, color: str) -> None:
     """A cross where a member failed, a ring where it terminated.
 
     Of a band, whose members are not drawn, the marks stand on the time axis.
     """
-    few = len(values) <= FEW or not run.same_times
-    last = last_seen(run)
-    rows = np.arange(len(values))
-    for mask, marker, face in (
-        (run.failed, "x", color),
-        (run.terminated & ~run.failed, "o", "none"),
-    ):
-        if not mask.any():
-            continue
-        times = run.times[rows, last][mask]
-        where = values[rows, last][mask] if few else np.zeros(len(times))
-        ax.plot(
-            times,
-            where,
-            marker,
-            color=color,
-            markerfacecolor=face,
-            markersize=6 if few else 4,
-            markeredgewidth=1.5 if few else 0.8,
-            alpha=1.0 if few else 0.5,
-            clip_on=False,
-            zorder=3,
-            transform=ax.transData if few else ax.get_xaxis_transform(),
-        )
+    style: dict[str, Any] = {"markersize": 6, "markeredgewidth": 1.5}
+    if run.as_band:
+        style = {"markersize": 4, "markeredgewidth": 0.8, "alpha": 0.5}
+        style["transform"] = ax.get_xaxis_transform()
+    for name, marker in END_MARKS.items():
+        ended = np.flatnonzero(getattr(run, name))
+        if len(ended):
+            at = ended, run.last[ended]
+            heights = np.zeros(len(ended)) if run.as_band else values[at]
+            style |= marker | {"linestyle": "none", "clip_on": False, "zorder": 3}
+            ax.plot(run.times[at], heights, color=color, **style)
 
 
-def _mark_incidents(ax, runs):
+def _mark_incidents(ax: Axes, runs: Sequence[Run]) -> None:
     """Ticks above the panel, a row for each kind of incident."""
-    for row, name in enumerate(incident_names(runs)):
+    style = {"markersize": 4, "markeredgewidth": 1.2, "clip_on": False}
+    style["transform"] = ax.get_xaxis_transform()
+    for row, name in enumerate(_incident_names(runs)):
         for i, run in enumerate(runs):
             steps = run.incidents.get(name)
-            if steps is None or len(steps) > FEW:
-                continue
-            times = run.times[:, :-1][steps]
-            ax.plot(
-                times,
-                np.full(len(times), 1.04 + 0.09 * row),
-                "|",
-                color=color_of(i) if len(runs) > 1 else _incident_color(name),
-                markersize=4,
-                markeredgewidth=1.2,
-                transform=ax.get_xaxis_transform(),
-                clip_on=False,
-            )
+            if steps is not None and len(steps) <= FEW:
+                times = run.times[:, :-1][steps]
+                color = color_of(i) if len(runs) > 1 else _incident_color(name)
+                heights = np.full(len(times), 1.04 + 0.09 * row)
+                ax.plot(times, heights, "|", color=color, **style)
 
 
-def incident_names(runs: Sequence[Run]) -> list[str]:
+def _incident_names(runs: Sequence[Run]) -> list[str]:
     """The kinds of incident that happened in any run. Where runs are compared, those
     of the controllers alone: every one of them may be clipped."""
     names = {name for run in runs for name in run.incidents}
@@ -324,7 +304,7 @@ def _incident_label(name: str, runs: Sequence[Run]) -> str:
     return f"{words}: {count} {plural}, first at {runs[0].times[0, first]:.3g}"
 
 
-def _draw_bounds(ax, panel, bounds, compared):
+def _draw_bounds(ax: Axes, panel: Panel, bounds: Bounds, compared: bool) -> None:
     """A dashed line a bound: neutral where the controls of the panel share it."""
     chosen = bounds[:, list(panel.columns)]
     shared = np.all(chosen == chosen[:, :1])
@@ -334,58 +314,42 @@ def _draw_bounds(ax, panel, bounds, compared):
             ax.axhline(end, color=color, linestyle="--", linewidth=1.0, zorder=1)
 
 
-def _head(
-    figure: Figure, runs: Sequence[Run], *, with_costs: bool, with_controls: bool
-) -> None:
+def _draw_head(figure: Figure, runs: Sequence[Run], kinds: set[str]) -> None:
     """The legend above the panels: the labels, and what the marks mean."""
-    handles: list[Line2D] = []
-    labels: list[str] = []
-    for i, run in enumerate(runs):
-        if len(runs) > 1:
-            style: dict[str, Any] = {
-                "color": color_of(i),
-                "linestyle": line_style_of(i),
-            }
-            handles.append(Line2D([], [], linewidth=1.6, **style))
-            cost = f" ({_total(run)})" if with_costs else ""
-            labels.append(wrapped(run.label, 40) + cost)
-    for name, marker in (("failed", "x"), ("terminated", "o")):
-        masks = [
-            run.failed if name == "failed" else run.terminated & ~run.failed
-            for run in runs
-        ]
-        count, members = sum(int(m.sum()) for m in masks), sum(m.size for m in masks)
+    compared = len(runs) > 1
+    entries: list[tuple[Line2D, str]] = []
+    for i, run in enumerate(runs if compared else ()):
+        cost = f" ({_total(run)})" if "costs" in kinds else ""
+        handle = Line2D([], [], linewidth=1.6, **line_style(i))
+        entries.append((handle, wrapped(run.label, 40) + cost))
+    members = sum(len(run.failed) for run in runs)
+    for name, marker in END_MARKS.items():
+        count = sum(int(getattr(run, name).sum()) for run in runs)
         if not count:
             continue
-        style = {"marker": marker, "markeredgewidth": 1.5, "color": NEUTRAL}
-        style |= {"markerfacecolor": "none"} if marker == "o" else {}
-        handles.append(Line2D([], [], linestyle="none", **style))
+        label = name
         if members > len(runs):
-            labels.append(f"{name}: {count} of {members}")
-        elif name == "failed" and len(runs) == 1:
-            labels.append(f"failed: {RESULTS[runs[0].trajectory.result]}")
-        else:
-            labels.append(name)
-    if with_controls:
-        for name in incident_names(runs):
-            color = NEUTRAL if len(runs) > 1 else _incident_color(name)
-            style = {"marker": "|", "color": color}
-            handles.append(Line2D([], [], linestyle="none", **style))
-            labels.append(_incident_label(name, runs))
-    title = wrapped(runs[0].label, 80) if len(runs) == 1 else ""
-    if not handles:
+            label = f"{name}: {count} of {members}"
+        elif name == "failed" and not compared:
+            label = f"failed: {RESULTS[runs[0].trajectory.result]}"
+        style = {"linestyle": "none", "markeredgewidth": 1.5, "color": NEUTRAL}
+        entries.append((Line2D([], [], **style, **marker), label))
+    for name in _incident_names(runs) if "controls" in kinds else ():
+        color = NEUTRAL if compared else _incident_color(name)
+        handle = Line2D([], [], linestyle="none", marker="|", color=color)
+        entries.append((handle, _incident_label(name, runs)))
+    title = "" if compared else wrapped(runs[0].label, 80)
+    if not entries:
         figure.suptitle(title, fontsize=SIZE + 1)
         return
     # Lengths in characters, of which eleven fit an inch, and six more for the handle.
-    lengths = [6 + max(map(len, label.split("\n"))) for label in labels]
+    lengths = [6 + max(map(len, label.split("\n"))) for _, label in entries]
     room = int(11 * figure.get_figwidth())
-    columns = len(labels) if sum(lengths) <= room else room // max(lengths)
-    figure.legend(
-        handles,
-        labels,
-        loc="outside upper center",
+    columns = len(entries) if sum(lengths) <= room else room // max(lengths)
+    top_legend(
+        figure,
+        entries,
         ncols=max(1, columns),
-        frameon=False,
         title=title or None,
         title_fontsize=SIZE + 1,
         fontsize=SIZE,

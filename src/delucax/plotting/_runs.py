@@ -1,21 +1,25 @@
-"""What there is to draw in a trajectory: plain NumPy arrays, and panels for them."""
+"""Trajectories as labelled arrays, and panels for them."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from .._check import is_concrete
 from ..simulation import Trajectory
 
 
 Trajectories: TypeAlias = Trajectory | Mapping[Any, Trajectory] | Sequence[Trajectory]
+Series: TypeAlias = Float[np.ndarray, "batch times size"]
 KINDS = ("states", "controls", "costs", "observations", "disturbances")
 HELD = ("controls", "disturbances")
 MOST_LINES = 6
+FEW = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,24 +29,53 @@ class Run:
     Every array of `series` has shape `(batch, T + 1, size)`, and is NaN where the
     trajectory has ended or is not finite. A series that is held over a step has its
     last value repeated at the end of the last step. Of `incidents` there are those that
-    happened, booleans of shape `(batch, T)`.
+    happened, booleans of shape `(batch, T)`. A member has `failed`, has `terminated`,
+    or neither.
     """
 
     label: str
-    times: np.ndarray
-    series: dict[str, np.ndarray]
-    ends: np.ndarray
-    failed: np.ndarray
-    terminated: np.ndarray
-    incidents: dict[str, np.ndarray]
-    total_costs: np.ndarray
-    batched: bool
+    times: Float[np.ndarray, "batch times"]
+    series: dict[str, Series]
+    failed: Bool[np.ndarray, " batch"]
+    terminated: Bool[np.ndarray, " batch"]
+    incidents: dict[str, Bool[np.ndarray, "batch steps"]]
+    total_costs: Float[np.ndarray, " batch"]
     trajectory: Trajectory
 
+    @functools.cached_property
+    def as_band(self) -> bool:
+        """Whether it is drawn as quartiles: a large batch whose members share times."""
+        return len(self.times) > FEW and bool(np.all(self.times == self.times[:1]))
+
+    @functools.cached_property
+    def last(self) -> Int[np.ndarray, " batch"]:
+        """The index in time of the last finite state of each member."""
+        finite = np.all(np.isfinite(self.series["states"]), axis=-1)
+        last = finite.shape[1] - 1 - np.argmax(finite[:, ::-1], axis=1)
+        return np.where(finite.any(axis=1), last, 0)
+
     @property
-    def same_times(self) -> bool:
-        """Whether all members of the batch share their times."""
-        return bool(np.all(self.times == self.times[:1]))
+    def time_label(self) -> str:
+        """`"time [s]"`, in the unit of a plant that names units; else `"time"`."""
+        trajectory = self.trajectory
+        named = any((*trajectory.state_units, *trajectory.control_units))
+        return f"time [{trajectory.time_unit}]" if named else "time"
+
+    def names_and_units(self, kind: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Those of a kind of series; `""` for a unit that is not known."""
+        trajectory = self.trajectory
+        size = self.series[kind].shape[-1]
+        units: tuple[str, ...] = ()
+        if kind == "states":
+            names, units = trajectory.state_names, trajectory.state_units
+        elif kind == "controls":
+            names, units = trajectory.control_names, trajectory.control_units
+        elif kind == "costs":
+            names = ("cost",)
+        else:
+            letter = "w" if kind == "disturbances" else "y"
+            names = tuple(f"{letter}{i}" for i in range(size))
+        return tuple(names), tuple(units) if len(units) == size else ("",) * size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,33 +91,33 @@ class Panel:
 def as_runs(given: Any, labels: Any, argument: str, where: str) -> list[Run]:
     """`given` (a trajectory, a mapping or a sequence of them) as runs, or an error."""
     if isinstance(given, Trajectory):
-        pairs = [("", given)]
+        names, trajectories = [""], [given]
     elif isinstance(given, Mapping):
         if labels is not None:
             raise ValueError(
                 f"{where}: labels must not be given with a dictionary, whose keys are "
                 f"the labels; got {labels!r}."
             )
-        pairs = [(str(label), trajectory) for label, trajectory in given.items()]
+        names, trajectories = map(str, given), list(given.values())
     elif isinstance(given, Sequence) and not isinstance(given, str):
-        pairs = [(f"trajectory {i}", trajectory) for i, trajectory in enumerate(given)]
+        names, trajectories = (f"trajectory {i}" for i in range(len(given))), given
     else:
         raise ValueError(
             f"{where}: {argument} must be a Trajectory, or a dictionary or sequence of "
             f"them, got {type(given).__name__}."
         )
-    if not pairs:
+    if not trajectories:
         raise ValueError(f"{where}: {argument} must not be empty.")
     if labels is not None:
         labels = [labels] if isinstance(labels, str) else labels
-        if not isinstance(labels, Sequence) or len(labels) != len(pairs):
+        if not isinstance(labels, Sequence) or len(labels) != len(trajectories):
             raise ValueError(
-                f"{where}: labels must be {len(pairs)} strings, one a trajectory, got "
-                f"{labels!r}."
+                f"{where}: labels must be {len(trajectories)} strings, one a "
+                f"trajectory, got {labels!r}."
             )
-        pairs = [(str(a), pair[1]) for a, pair in zip(labels, pairs, strict=True)]
+        names = map(str, labels)
     runs = []
-    for label, trajectory in pairs:
+    for label, trajectory in zip(names, trajectories, strict=True):
         what = f"{argument}[{label!r}]" if label else argument
         if not isinstance(trajectory, Trajectory):
             raise ValueError(
@@ -93,7 +126,7 @@ def as_runs(given: Any, labels: Any, argument: str, where: str) -> list[Run]:
             )
         runs.append(_run(label, trajectory, what, where))
         for name in ("state_names", "control_names"):
-            first, here = getattr(pairs[0][1], name), getattr(trajectory, name)
+            first, here = (getattr(r.trajectory, name) for r in (runs[0], runs[-1]))
             if here != first:
                 raise ValueError(
                     f"{where}: {what} has {name} {here}, but the first trajectory has "
@@ -113,46 +146,38 @@ def _run(label: str, trajectory: Trajectory, what: str, where: str) -> Run:
             f"{where}: {what} must hold values, got traced arrays; draw outside of "
             "jax.jit and jax.vmap."
         )
-    lead = len(trajectory.batch_shape)
-    steps, members = trajectory.steps, math.prod(trajectory.batch_shape)
+    batch, steps = trajectory.batch_shape, trajectory.steps
 
     def flat(array: Any) -> np.ndarray:
+        """With one axis for all those of the batch."""
         array = np.asarray(array)
-        return array.reshape((members,) + array.shape[lead:])
+        return array.reshape((math.prod(batch), *array.shape[len(batch) :]))
 
-    shape = (*trajectory.batch_shape, steps + 1)
-    times = flat(np.broadcast_to(trajectory.times, shape))
     ends = flat(trajectory.length).astype(int)
-    terminated = flat(np.broadcast_to(trajectory.ended, trajectory.batch_shape))
-    failed = flat(np.broadcast_to(trajectory.failed, trajectory.batch_shape))
-    incidents = {
-        name: flat(steps)
-        for name, steps in (trajectory.incidents or {}).items()
-        if np.any(steps)
-    }
+    failed = flat(np.broadcast_to(trajectory.failed, batch))
     series = {}
     for kind in KINDS:
         array = getattr(trajectory, kind)
-        if array is None:
-            continue
-        array = flat(array)
-        array = array[..., None] if kind == "costs" else array
-        series[kind] = _until(array, ends, steps, kind)
+        if array is not None:
+            array = flat(array)
+            array = array[..., None] if kind == "costs" else array
+            series[kind] = _until(array, ends, steps, kind)
+    incidents = trajectory.incidents or {}
     return Run(
         label=label,
-        times=times,
+        times=flat(np.broadcast_to(trajectory.times, (*batch, steps + 1))),
         series=series,
-        ends=ends,
         failed=failed,
-        terminated=terminated,
-        incidents=incidents,
+        terminated=flat(np.broadcast_to(trajectory.ended, batch)) & ~failed,
+        incidents={name: flat(at) for name, at in incidents.items() if np.any(at)},
         total_costs=flat(trajectory.total_cost),
-        batched=lead > 0,
         trajectory=trajectory,
     )
 
 
-def _until(array: np.ndarray, ends: np.ndarray, steps: int, kind: str) -> np.ndarray:
+def _until(
+    array: np.ndarray, ends: Int[np.ndarray, " batch"], steps: int, kind: str
+) -> Series:
     """`array` with `steps + 1` entries in time and NaN after the end of each member."""
     array = np.where(np.isfinite(array), array, np.nan).astype(float)
     index = np.arange(steps + 1)[None, :, None]
@@ -166,32 +191,10 @@ def _until(array: np.ndarray, ends: np.ndarray, steps: int, kind: str) -> np.nda
     return np.where(index < ends, array, np.nan)
 
 
-def last_seen(run: Run) -> np.ndarray:
-    """The index in time of the last finite state of each member, shape `(batch,)`."""
-    finite = np.all(np.isfinite(run.series["states"]), axis=-1)
-    last = finite.shape[1] - 1 - np.argmax(finite[:, ::-1], axis=1)
-    return np.where(finite.any(axis=1), last, 0)
-
-
-def names_and_units(run: Run, kind: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The names and units of a kind of series; `""` for a unit that is not known."""
-    trajectory = run.trajectory
-    size = run.series[kind].shape[-1]
-    if kind == "states":
-        names, units = trajectory.state_names, trajectory.state_units
-    elif kind == "controls":
-        names, units = trajectory.control_names, trajectory.control_units
-    elif kind == "costs":
-        names, units = ("cost",), ()
-    else:
-        names, units = tuple(f"{'yw'[kind[0] == 'd']}{i}" for i in range(size)), ()
-    return tuple(names), tuple(units) if len(units) == size else ("",) * size
-
-
 def panels_of(run: Run, show: Any, *, grouped: bool, where: str) -> list[Panel]:
     """The panels for what `show` names: one a unit if `grouped`, else one a series."""
     chosen: dict[str, list[int]] = {}
-    kept = {kind: names_and_units(run, kind) for kind in KINDS if kind in run.series}
+    kept = {kind: run.names_and_units(kind) for kind in run.series}
     if show is None:
         show = [kind for kind in ("states", "controls", "costs") if kind in kept]
     show = [show] if isinstance(show, str) else show
@@ -204,15 +207,15 @@ def panels_of(run: Run, show: Any, *, grouped: bool, where: str) -> list[Panel]:
         if name in kept:
             chosen[name] = list(range(len(kept[name][0])))
             continue
-        found = [kind for kind in kept if name in kept[kind][0]]
-        if not found:
+        kind = next((kind for kind in kept if name in kept[kind][0]), None)
+        if kind is None:
             names = [n for kind in kept for n in (kind, *kept[kind][0])]
             raise ValueError(
                 f"{where}: show must be among {', '.join(dict.fromkeys(names))} (what "
                 f"the trajectory kept), got {name!r}."
             )
-        column = kept[found[0]][0].index(name)
-        columns = chosen.setdefault(found[0], [])
+        column = kept[kind][0].index(name)
+        columns = chosen.setdefault(kind, [])
         if column not in columns:
             columns.append(column)
     panels = []
@@ -224,15 +227,8 @@ def panels_of(run: Run, show: Any, *, grouped: bool, where: str) -> list[Panel]:
         for group in groups.values():
             count = -(-len(group) // MOST_LINES)
             for part in np.array_split(group, count):
-                part = tuple(int(i) for i in part)
+                of_part = tuple(names[i] for i in part)
                 panels.append(
-                    Panel(kind, part, tuple(names[i] for i in part), units[part[0]])
+                    Panel(kind, tuple(part.tolist()), of_part, units[part[0]])
                 )
     return panels
-
-
-def time_label(run: Run) -> str:
-    """`"time [s]"`, in the unit of a plant that names units; else `"time"`."""
-    trajectory = run.trajectory
-    named = any((*trajectory.state_units, *trajectory.control_units))
-    return f"time [{trajectory.time_unit}]" if named else "time"

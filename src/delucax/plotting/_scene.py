@@ -10,10 +10,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from ..environments import Environment
-from ._drawings import drawing_for
-from ._plant import Plant
+from ._plant_artist import PlantArtist
 from ._plot import draw_panel
-from ._runs import HELD, last_seen, Panel, panels_of, Run, time_label
+from ._runs import HELD, Panel, panels_of, Run
 
 
 SIZE = 11.0
@@ -48,13 +47,12 @@ class Scene:
         if traces:
             stack = grid[0, 1].subgridspec(len(panels), 1)
             self.lines = self._panels(panels, stack)
-        self.plant = Plant(
+        self.plant = PlantArtist(
             self.figure.add_subplot(grid[0, 0]),
-            drawing_for(environment),
             environment,
             run.trajectory,
             map(self._moment, indices),
-            self.states[: int(last_seen(run)[0]) + 1],
+            self.states[: int(run.last[0]) + 1],
         )
 
         if not traces and self.plant.ax.get_aspect() == 1:  # no higher than it must be
@@ -98,14 +96,14 @@ class Scene:
                     ax.add_line(line)
                     lines.append((line, values))
             ax.tick_params(labelbottom=panel is panels[-1])
-        axes[-1].set_xlabel(time_label(self.run), fontsize=SIZE)
+        axes[-1].set_xlabel(self.run.time_label, fontsize=SIZE)
         self.figure.align_ylabels(axes)
         return lines
 
     def frame(self, k: int) -> np.ndarray:
         """The picture of step `k`, shape `(height, width, 3)`."""
         times = self.run.times[0]
-        unit = time_label(self.run).removeprefix("time").strip(" []")
+        unit = self.run.time_label.removeprefix("time").strip(" []")
         unit = f" {unit}" if unit not in ("", "steps") else ""
         self.texts[0].set_text(f"t = {times[k]:.{self.decimals}f}{unit}")
         if "costs" in self.run.series:

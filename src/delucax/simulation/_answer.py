@@ -4,21 +4,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from .._controller import AbstractController
 from .._results import choose, first_failure, INCIDENTS, Result, RESULTS
-
-
-def begun(controller: AbstractController, key: Any) -> Any:
-    """The state that a controller begins with; arrays of NumPy become JAX's."""
-
-    def as_array(leaf):
-        return jnp.asarray(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
-
-    return jax.tree.map(as_array, controller.init(key=key))
 
 
 def answer(controller: AbstractController, t: Any, y: Any, state: Any) -> Any:

@@ -5,7 +5,6 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import numpy as np
-from jax.core import Tracer
 
 from .._check import check_finite, check_positive, is_concrete
 from .._controller import AbstractController
@@ -40,25 +39,6 @@ def check_system(system: Any, where: str) -> None:
             "`delucax.rollout` with delucax.Discretized(system, dt), which takes its "
             "Brownian increments."
         )
-
-
-def as_number(value: Any, name: str, where: str) -> Any:
-    """`value` as a scalar: a Python number if it is known, so that it stays known
-    while other things are being traced.
-    """
-    if isinstance(value, Tracer):
-        array = as_float_array(value)
-        if array.shape != ():
-            raise ValueError(
-                f"{where}: {name} must be a number, got shape {array.shape}."
-            )
-        return array
-    number = np.asarray(value)
-    if number.shape != () or number.dtype.kind not in "iuf":
-        raise ValueError(f"{where}: {name} must be a number, got {shortened(value)}.")
-    if not np.isfinite(number):
-        raise ValueError(f"{where}: {name} must be finite, got {shortened(value)}.")
-    return float(number)
 
 
 def as_sequence(value: Any, size: int, name: str, where: str) -> Any:

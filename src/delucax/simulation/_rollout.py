@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,23 +10,28 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
 
-from .._check import as_vector, check_bool, check_count, check_finite, check_key
-from .._controller import AbstractController, tallies
+from .._check import (
+    as_number,
+    as_vector,
+    check_bool,
+    check_count,
+    check_finite,
+    check_key,
+)
+from .._controller import AbstractController, initial_state, tallies
 from .._jax import by_components
 from .._message import shortened
 from .._module import as_float_array
 from .._results import choose, first_failure, first_of, or_none, RESULTS
-from .._typing import PRNGKey
+from .._typing import Checkpoint, PRNGKey
 from ..disturbances import Zero
 from ..disturbances._base import times_to_draw
 from ..dynamics._runge_kutta import join_state, split_state, stack_steps
 from ..environments import Environment
-from ._answer import answer, begun, check_state, outcome_of
-from ._horizon import as_number
+from ._answer import answer, check_state, outcome_of
 from ._trajectory import checked, Trajectory
 
 
-Checkpoint = Literal["step", "sqrt"] | None
 KEEP = (
     "states",
     "observations",
@@ -191,7 +196,7 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
     ends = env.terminated is not None
     plain_sight = True  # whether the observation is the state itself, found by tracing
 
-    first = begun(controller, controller_key)
+    first = initial_state(controller, controller_key)
     first, static = eqx.partition(first, eqx.is_array)
 
     def body(carry, inputs):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import (
+    as_number,
     as_vector,
     check_bool,
     check_count,
@@ -42,7 +43,6 @@ from ._hold import (
     recorded,
 )
 from ._horizon import (
-    as_number,
     as_save_times,
     as_sequence,
     check_adjoint_fits,

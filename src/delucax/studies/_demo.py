@@ -11,7 +11,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from .. import plotting
 from .._extras import extra
@@ -21,9 +20,10 @@ from ..disturbances import Shock
 from ..dynamics import linearize
 from ..environments import Environment, pendulum
 from ..simulation import rollout, Trajectory
-from ..training import expected_cost, fit
 from ._swing_up import BATCH, holds_upright, HORIZON, STEPS, train_swing_up
 from .paper import reproduce, STUDIES
+from .paper._policy_gradient import train_linear
+from .paper._wall_clock import gymnasium_run
 
 
 EVALUATION_STEPS = 400
@@ -64,7 +64,7 @@ def demo(
 
         ```python
         import tempfile
-        from delucax import experiments
+        from delucax import studies
 
         with tempfile.TemporaryDirectory() as folder:
             table = studies.demo(folder, seeds=1, steps=20)
@@ -90,7 +90,7 @@ def demo(
     say(f"  K = {np.array2string(np.asarray(lqr.K), precision=3)}")
 
     say("\nLinear policy u = -K x by gradient descent on the rollout (torque +-10)")
-    linear = _train_linear()
+    linear = train_linear(1000).model
     controllers["linear policy"] = linear
     say(f"  K = {np.array2string(np.asarray(linear.K), precision=3)}")
 
@@ -113,9 +113,9 @@ def demo(
         if seed == 0:
             controllers["MLP"] = policy
 
-    shaken = pendulum(disturbance=_SHOCK)
+    disturbed = pendulum(disturbance=_SHOCK)
     rows, shown = [], {}
-    for world, name in ((env, "none"), (shaken, "at 10 s")):
+    for world, name in ((env, "none"), (disturbed, "at 10 s")):
         for label, controller in controllers.items():
             runs = evaluate(world, controller, starts)
             rows.append(_row(label, name, runs))
@@ -160,8 +160,8 @@ def demo(
 def _say_held(claims: list[dict[str, Any]], say: Callable[[str], Any]) -> None:
     """How many claims of each study hold, and which do not."""
     pd = extra("pandas", "demo")
-    found = pd.DataFrame(claims).astype({"holds": int}).groupby("study", sort=False)
-    table = found["holds"].agg(claims="count", hold="sum").reset_index()
+    claims_of = pd.DataFrame(claims).astype({"holds": int}).groupby("study", sort=False)
+    table = claims_of["holds"].agg(claims="count", hold="sum").reset_index()
     say(f"\n{table.to_string(index=False)}\n")
     for claim in claims:
         if not claim["holds"]:
@@ -181,18 +181,6 @@ def _writable(out: Path) -> Path:
         message = f"demo: out must be a folder to write to, got {out}: {error}"
         raise OSError(message) from error
     return out
-
-
-def _train_linear() -> Linear:
-    """The policy optimisation of the paper: one start, hanging; torque +-10."""
-    env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
-    mean_cost = expected_cost(env, batch=1, horizon=50)
-
-    def loss(controller, key):
-        return mean_cost(controller, key) / 50
-
-    gain = Linear(jnp.zeros((1, 2)))
-    return fit(loss, gain, optax.sgd(0.01), 1000, key=jax.random.key(0)).model
 
 
 def _marked(figure: Any) -> Any:
@@ -231,19 +219,14 @@ def _row(label: str, shock: str, runs: Trajectory) -> dict[str, Any]:
 
 def _beside_gymnasium(steps_per_second: float) -> str:
     """Gymnasium's own speed, measured here and now if it is installed."""
+    count = 20_000
     try:
-        import gymnasium
+        run = gymnasium_run(count)
     except ImportError:
         return "Gymnasium is not installed, so its speed was not measured."
-    env = gymnasium.make("Pendulum-v1").unwrapped
-    env.reset(seed=0)
-    action = np.zeros(1, np.float32)
-    count = 20_000
-    for _ in range(1000):
-        env.step(action)
+    run()
     begin = time.perf_counter()
-    for _ in range(count):
-        env.step(action)
+    run()
     rate = count / (time.perf_counter() - begin)
     return (
         f"Gymnasium simulates {rate / 1e6:.3f} million steps a second on this machine: "

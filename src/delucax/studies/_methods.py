@@ -98,16 +98,10 @@ def _local(name: str) -> tuple[Any, Any, Any]:
     return model, jnp.asarray(H[:n, :n]), jnp.asarray(H[n:, n:])
 
 
-def _regulator(design: Callable[..., Any]) -> Callable[[str], Any]:
-    def made(name: str) -> Any:
-        return design(*_local(name), difference=task_of(name).dynamics.difference)
-
-    return made
-
-
-def _finite(name: str) -> Any:
-    horizon = task_of(name).horizon
-    return _regulator(functools.partial(FiniteHorizonLQR, horizon=horizon))(name)
+def _regulator(name: str, design: Callable[..., Any], **options: Any) -> Any:
+    """A design from the linear model and the curvature of the cost."""
+    difference = task_of(name).dynamics.difference
+    return design(*_local(name), difference=difference, **options)
 
 
 def _following(name: str) -> Any:
@@ -119,48 +113,28 @@ def _following(name: str) -> Any:
     return Breathing(LeakyPID(dt=env.dt, reference=waveform), waveform)
 
 
-def _learning(learner: Callable[..., Any], **options: Any) -> Callable[[str], Any]:
+def _learning(name: str, learner: Callable[..., Any], **options: Any) -> Any:
     """An online learner on top of the LQR."""
-
-    def made(name: str) -> Any:
-        env = task_of(name)
-        return learner(env.dynamics, env.cost, base=agent_of(name, "LQR"), **options)
-
-    return made
+    env = task_of(name)
+    return learner(env.dynamics, env.cost, base=agent_of(name, "LQR"), **options)
 
 
-def _neural(name: str) -> Any:
-    return _learning(NeuralGPC, key=jax.random.key(0))(name)
-
-
-def _bandit(name: str) -> Any:
-    return BPC(task_of(name).dynamics, agent_of(name, "LQR"))
-
-
-def _adaptive(name: str) -> Any:
-    return Adaptive(_learning(GPC)(name))
-
-
-def _receding(planner: Callable[..., Any], **options: Any) -> Callable[[str], Any]:
+def _receding(name: str, planner: Callable[..., Any], **options: Any) -> Any:
     """MPC with the model and the cost of the task and, at the end of a plan, the cost
     to go of the LQR where there is one."""
-
-    def made(name: str) -> Any:
-        env = task_of(name)
-        if env.dynamics.observation_size != env.dynamics.state_size:
-            raise Unsuitable("the state is not observed")
-        bounds, more = env.control_bounds, dict(options)
-        if planner is not ilqr and bounds is not None:
-            low, high = (np.asarray(bound, float) for bound in bounds)
-            width = high - low
-            more["scale"] = np.where(np.isfinite(width), width / 4, 1.0)
-        how = {"planner": planner, "bounds": bounds, "throw": False}
-        return MPC(env.dynamics, _to_the_end(name), LOOKAHEAD, **how, **more)
-
-    return made
+    env = task_of(name)
+    if env.dynamics.observation_size != env.dynamics.state_size:
+        raise Unsuitable("the state is not observed")
+    bounds = env.control_bounds
+    if planner is not ilqr and bounds is not None:
+        low, high = (np.asarray(bound, float) for bound in bounds)
+        width = high - low
+        options["scale"] = np.where(np.isfinite(width), width / 4, 1.0)
+    how: dict[str, Any] = {"planner": planner, "bounds": bounds, "throw": False}
+    return MPC(env.dynamics, _with_cost_to_go(name), LOOKAHEAD, **how, **options)
 
 
-def _to_the_end(name: str) -> AbstractCost:
+def _with_cost_to_go(name: str) -> AbstractCost:
     """The cost of the task, with the LQR's cost to go for a final cost."""
     env = task_of(name)
     try:
@@ -175,23 +149,13 @@ def _to_the_end(name: str) -> AbstractCost:
     return Function(env.cost, to_go)
 
 
-def _by_gradient(network: Callable[..., Any]) -> Callable[[str], Any]:
+def _by_gradient(name: str, network: Callable[..., Any], **options: Any) -> Any:
     """A network, by gradient descent through the rollout."""
-
-    def made(name: str) -> Any:
-        env = task_of(name)
-        first, key = jax.random.split(jax.random.key(1))
-        horizon = min(env.horizon, LONGEST)
-        loss = expected_cost(env, batch=EPISODES, horizon=horizon, gradient_decay=0.95)
-        options = {"key": key, "progress": False, "throw": False}
-        start = network(env, key=first)
-        return fit(loss, start, _adam(TRAINING_STEPS), TRAINING_STEPS, **options).model
-
-    return made
-
-
-def _mlp(env: Environment, key: Any) -> Any:
-    return Deep(env, width=32, depth=1, key=key)
+    env = task_of(name)
+    first, key = jax.random.split(jax.random.key(1))
+    horizon = min(env.horizon, LONGEST)
+    loss = expected_cost(env, batch=EPISODES, horizon=horizon, gradient_decay=0.95)
+    return _fitted(loss, network(env, key=first, **options), TRAINING_STEPS, key)
 
 
 def _gru(env: Environment, key: Any) -> Any:
@@ -202,64 +166,59 @@ def _gru(env: Environment, key: Any) -> Any:
     return GRU(*sizes, 32, features=env.encode, bounds=bounds, key=key)
 
 
-def _affine(env: Environment, key: Any) -> Any:
-    return Deep(env, width=1, depth=0, key=key)
-
-
-def _by_actor_critic(method: type[PPO] | type[SHAC]) -> Callable[[str], Any]:
+def _by_actor_critic(name: str, method: type[PPO] | type[SHAC]) -> Any:
     """The MLP by reinforcement learning."""
-
-    def made(name: str) -> Any:
-        env, head = task_of(name), "gaussian" if method is PPO else "deterministic"
-        first, key = jax.random.split(jax.random.key(1))
-        model = actor_critic(env, width=32, depth=1, head=head, key=first)
-        loss = method(env, EPISODES, min(env.horizon, LONGEST), discount=0.95)
-        steps = TRAINING_STEPS
-        if isinstance(loss, PPO):
-            steps *= loss.epochs * loss.minibatches
-        options = {"key": key, "progress": False, "throw": False}
-        fitted = fit(loss, model, _adam(steps), steps, **options)
-        policy = fitted.model.policy
-        return policy.base if method is PPO else policy
-
-    return made
+    env, head = task_of(name), "gaussian" if method is PPO else "deterministic"
+    first, key = jax.random.split(jax.random.key(1))
+    model = actor_critic(env, width=32, depth=1, head=head, key=first)
+    loss = method(env, EPISODES, min(env.horizon, LONGEST), discount=0.95)
+    steps = TRAINING_STEPS
+    if isinstance(loss, PPO):
+        steps *= loss.epochs * loss.minibatches
+    policy = _fitted(loss, model, steps, key).policy
+    return policy.base if method is PPO else policy
 
 
-def _adam(steps: int) -> optax.GradientTransformation:
-    return optax.chain(
+def _fitted(loss: Any, model: Any, steps: int, key: Any) -> Any:
+    """The model, trained by Adam."""
+    optimiser = optax.chain(
         optax.clip_by_global_norm(1.0),
         optax.adam(optax.cosine_decay_schedule(0.01, steps)),
     )
+    quiet: dict[str, Any] = {"progress": False, "throw": False}
+    return fit(loss, model, optimiser, steps, key=key, **quiet).model
 
 
 FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
     "Feedback": {
         "zero": lambda name: Zero(task_of(name).control_size),
         "PID": _following,
-        "LQR": _regulator(LQR),
-        "FiniteHorizonLQR": _finite,
-        "HInfinity": _regulator(HInfinity),
+        "LQR": lambda name: _regulator(name, LQR),
+        "FiniteHorizonLQR": lambda name: _regulator(
+            name, FiniteHorizonLQR, horizon=task_of(name).horizon
+        ),
+        "HInfinity": lambda name: _regulator(name, HInfinity),
     },
     "Online learning": {
-        "GPC": _learning(GPC),
-        "Adaptive": _adaptive,
-        "NeuralGPC": _neural,
-        "DRC": _learning(DRC),
-        "SFC": _learning(SFC),
-        "DSC": _learning(DSC),
-        "BPC": _bandit,
+        "GPC": lambda name: _learning(name, GPC),
+        "Adaptive": lambda name: Adaptive(agent_of(name, "GPC")),
+        "NeuralGPC": lambda name: _learning(name, NeuralGPC, key=jax.random.key(0)),
+        "DRC": lambda name: _learning(name, DRC),
+        "SFC": lambda name: _learning(name, SFC),
+        "DSC": lambda name: _learning(name, DSC),
+        "BPC": lambda name: BPC(task_of(name).dynamics, agent_of(name, "LQR")),
     },
     "Planning": {
-        "MPC": _receding(ilqr, max_iterations=8),
-        "MPPI": _receding(mppi, samples=128, iterations=3),
-        "CEM": _receding(cem, samples=128, iterations=3),
+        "MPC": lambda name: _receding(name, ilqr, max_iterations=8),
+        "MPPI": lambda name: _receding(name, mppi, samples=128, iterations=3),
+        "CEM": lambda name: _receding(name, cem, samples=128, iterations=3),
     },
     "Training": {
-        "affine": _by_gradient(_affine),
-        "MLP": _by_gradient(_mlp),
-        "GRU": _by_gradient(_gru),
-        "SHAC": _by_actor_critic(SHAC),
-        "PPO": _by_actor_critic(PPO),
+        "affine": lambda name: _by_gradient(name, Deep, width=1, depth=0),
+        "MLP": lambda name: _by_gradient(name, Deep, width=32, depth=1),
+        "GRU": lambda name: _by_gradient(name, _gru),
+        "SHAC": lambda name: _by_actor_critic(name, SHAC),
+        "PPO": lambda name: _by_actor_critic(name, PPO),
     },
 }
 """What is compared: how each controller is made for the task of a name."""

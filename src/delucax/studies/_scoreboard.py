@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..controllers import Sequence, Zero
-from ..environments import Environment, registered
-from ..experiments._experiment import experiment
+from ..environments import Environment
+from ..experiments import experiment
 from ..planning import ilqr
 from ..simulation import rollout
+from ._listing import task_names
 from ._methods import agent_of, FAMILIES, Pump, task_of, Unsuitable
 
 
@@ -31,11 +32,6 @@ TIMED = 0.3
 # What the plan begins at, beside no control.
 GUIDES = ("MLP", "GRU", "MPC")
 PUMPED = ("mountain_car", "mountain_car_discrete")
-
-
-def tasks() -> tuple[str, ...]:
-    """The named tasks, each once."""
-    return tuple(name for name in registered() if "/" not in name)
 
 
 def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
@@ -57,9 +53,9 @@ def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
             throw=False,
         )
         for controls in (guess, plan.controls):
-            found = float(_cost(env, Sequence(controls), key))
-            if np.isfinite(found) and found < least:
-                best, least = controls, found
+            cost = float(_cost(env, Sequence(controls), key))
+            if np.isfinite(cost) and cost < least:
+                best, least = controls, cost
     if best is None:
         raise Unsuitable("no plan was found")
     return Sequence(best)
@@ -94,8 +90,8 @@ def _batch(task: str, method: str, block: int) -> tuple[list[float], float | Non
         if task in PUMPED:
             guides.append(Pump(jnp.ones(1)))
         plans = [_planned(env, guides, key) for key in keys]
-        found = [_cost(env, plan, key) for plan, key in zip(plans, keys, strict=True)]
-        return [float(cost) for cost in found], None
+        pairs = zip(plans, keys, strict=True)
+        return [float(_cost(env, plan, key)) for plan, key in pairs], None
     agent, best, spent = agent_of(task, method), np.inf, 0.0
     costs = np.asarray(_costs(env, agent, keys))
     while spent < TIMED:
@@ -106,7 +102,7 @@ def _batch(task: str, method: str, block: int) -> tuple[list[float], float | Non
     return costs.tolist(), 1e6 * best / (BATCH * env.horizon)
 
 
-@experiment.parametrize("task", tasks())
+@experiment.parametrize("task", task_names())
 @experiment.parametrize("method", METHODS)
 @experiment.seeds(BATCH)
 def scoreboard(task: str, method: str, seed: int) -> dict[str, Any]:

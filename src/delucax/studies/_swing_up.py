@@ -49,7 +49,7 @@ def train_swing_up(
 
         ```python
         import jax
-        from delucax import experiments
+        from delucax import studies
 
         fitted = studies.train_swing_up(key=jax.random.key(0), steps=20)
         ```
@@ -59,7 +59,7 @@ def train_swing_up(
     policy = Deep(environment, width=32, depth=1, key=init_key)
     return fit(
         expected_cost(
-            _spread(environment),
+            spread_starts(environment),
             batch=BATCH,
             horizon=HORIZON,
             gradient_decay=0.92,
@@ -72,8 +72,9 @@ def train_swing_up(
     )
 
 
-def _spread(environment: Environment) -> Environment:
-    """Starts over all angles and speeds, so that no part of the swing is new."""
+def spread_starts(environment: Environment) -> Environment:
+    """The pendulum with starts over all angles and speeds, so that no part of the swing
+    is new."""
     corner = jnp.asarray(np.array([np.pi, 8.0]))
     starts = {"initial_state.low": -corner, "initial_state.high": corner}
     return replace(environment, starts)
@@ -106,7 +107,7 @@ def holds_upright(
         ```python
         import delucax as dlx
         import jax
-        from delucax import experiments
+        from delucax import studies
 
         env = dlx.make("pendulum")
         zero = dlx.controllers.Zero(1)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 from jaxtyping import Array
 
-from .._module import function_field, indexed_names
+from .._module import function_field, names_of
 from ._base import AbstractSystem
 
 
@@ -51,20 +51,6 @@ class FunctionSystem(AbstractSystem):
 
     def vector_field(self, t, x, u, w):
         return self.function(t, x, u, w)
-
-
-def names_of(
-    given: int | Sequence[str], letter: str, argument: str, where: str
-) -> tuple[str, ...]:
-    """Names, indexed if it is their number that is given, or an error."""
-    if isinstance(given, int) and not isinstance(given, bool) and given >= 0:
-        return indexed_names(letter, given)
-    if isinstance(given, tuple | list) and all(isinstance(n, str) for n in given):
-        return tuple(given)
-    raise ValueError(
-        f"{where}: {argument} must be a whole number or a tuple of names, got "
-        f"{given!r}."
-    )
 
 
 def system(

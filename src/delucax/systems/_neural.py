@@ -8,10 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_count, check_key
-from .._module import as_module, weight
+from .._module import as_module, names_of, weight
 from .._typing import PRNGKey
 from ._base import AbstractSystem
-from ._function import names_of
 
 
 class NeuralSystem(AbstractSystem):

@@ -9,14 +9,18 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_count, check_key
-from .._controller import AbstractController
+from .._check import as_number, check_count, check_instance, check_key
+from .._controller import (
+    AbstractController,
+    AbstractStochasticPolicy,
+    check_stochastic,
+    initial_state,
+    replay,
+)
 from .._module import as_float_array
+from .._typing import Checkpoint, PRNGKey
 from ..environments import Environment
 from ..simulation import rollout, Trajectory
-from ..simulation._answer import begun
-from ..simulation._horizon import as_number
-from ..simulation._rollout import Checkpoint
 
 
 class _ExpectedCost(eqx.Module):
@@ -107,7 +111,7 @@ def expected_cost(
         ```
     """
     where = "expected_cost"
-    _check_environment(environment, where)
+    check_instance(environment, Environment, "environment", where)
     if checkpoint not in ("step", "sqrt", None):
         raise ValueError(
             f"{where}: checkpoint must be 'step', 'sqrt' or None, got {checkpoint!r}."
@@ -126,11 +130,11 @@ def expected_cost(
     )
 
 
-class _Replayed(AbstractController):
-    """A controller whose episode draws with a key known beforehand."""
+class _WithKey(AbstractController):
+    """A controller whose episode begins with a known key, for its replay."""
 
     base: AbstractController
-    key: Any
+    key: PRNGKey
 
     def init(self, *, key=None):
         del key
@@ -147,18 +151,15 @@ class _ScoredCost(eqx.Module):
     environment: Environment
     horizon: int = eqx.field(static=True)
 
-    def __call__(self, controller, key):
+    def __call__(
+        self, controller: AbstractStochasticPolicy, key: PRNGKey
+    ) -> tuple[Array, dict[str, Array]]:
         check_key(key, "scored_cost")
-        if not hasattr(controller, "log_prob"):
-            raise ValueError(
-                "scored_cost: the controller must draw its controls and have "
-                "log_prob(t, y, state, u), got "
-                f"{type(controller).__name__}."
-            )
+        check_stochastic(controller, "controller", "scored_cost")
         run_key, controller_key = jr.split(key)
-        trajectory = rollout(
+        run: Any = rollout(
             self.environment,
-            _Replayed(controller, controller_key),
+            _WithKey(controller, controller_key),
             key=run_key,
             horizon=self.horizon,
             keep=("observations", "controls", "costs"),
@@ -169,30 +170,17 @@ class _ScoredCost(eqx.Module):
         # for a draw held fixed. So the controller is run again on what it was given:
         # its memory may depend on the weights, and keeps its gradient; the
         # observations, the controls and the costs do not.
-        def replay(state, inputs):
-            k, t, y, applied, cost = inputs
+        def act(t, y, state, applied, valid):
+            del applied
             u, after = controller(t, y, state)
-            score = controller.log_prob(t, y, state, lax.stop_gradient(u))
-            after = controller.applied(applied, cost, after)
-            return after, jnp.where(k < trajectory.length, score, 0)
+            log_prob = controller.log_prob(t, y, state, lax.stop_gradient(u))
+            return jnp.where(valid, log_prob, 0), after
 
-        inputs = lax.stop_gradient(
-            (
-                jnp.arange(self.horizon),
-                trajectory.times[:-1],
-                trajectory.observations,
-                trajectory.controls,
-                trajectory.costs,
-            )
-        )
-        first, static = eqx.partition(begun(controller, controller_key), eqx.is_array)
-
-        def body(state, inputs):
-            after, score = replay(eqx.combine(state, static), inputs)
-            return eqx.filter(after, eqx.is_array), score
-
-        _, scores = lax.scan(body, first, inputs)
-        return _cost_or_nan(trajectory), {"log_prob": jnp.sum(scores)}
+        record = (run.times[:-1], run.observations, run.controls, run.costs)
+        valid = jnp.arange(self.horizon) < run.length
+        state = initial_state(controller, controller_key)
+        scores = replay(controller, state, lax.stop_gradient((*record, valid)), act)
+        return _cost_or_nan(run), {"log_prob": jnp.sum(scores)}
 
 
 def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
@@ -209,11 +197,10 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
     - `horizon`: steps; the environment's own by default.
 
     **Returns:** a function `loss(controller, key)` to a scalar and a dictionary. The
-    controller must have a method `log_prob(t, y, state, u)`: the log-probability with
-    which `controller(t, y, state)` draws `u`.
+    controller must be a [`delucax.AbstractStochasticPolicy`][].
 
     **Raises:** `ValueError` if `horizon` is below 1 or `environment` is not an
-    environment; when it is called, if the controller has no `log_prob`.
+    environment; when it is called, if the controller does not draw its controls.
 
     !!! example
 
@@ -223,7 +210,7 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
         import jax.numpy as jnp
         from jaxtyping import Array
 
-        class Dithered(dlx.AbstractController):
+        class Dithered(dlx.AbstractStochasticPolicy):
             gain: Array = dlx.weight(20.0)
 
             def init(self, *, key=None):
@@ -242,17 +229,9 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
         ```
     """
     where = "scored_cost"
-    _check_environment(environment, where)
+    check_instance(environment, Environment, "environment", where)
     horizon = environment.horizon if horizon is None else horizon
     return _ScoredCost(environment, check_count(horizon, "horizon", where))
-
-
-def _check_environment(environment: Any, where: str) -> None:
-    if not isinstance(environment, Environment):
-        raise ValueError(
-            f"{where}: environment must be an Environment, got "
-            f"{type(environment).__name__}."
-        )
 
 
 def _cost_or_nan(trajectory: Trajectory) -> Array:

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import optax
 from jaxtyping import Array, PyTree
 
 from .._check import check_count, check_key
@@ -87,29 +88,28 @@ class EvolutionStrategies(eqx.Module):
         weights, rest = weights_of(model)
         n = self.samples // 2 if self.antithetic else self.samples
         loss_key, noise_key, pair_key = jr.split(key, 3)
-        noise = _normal(noise_key, weights, n)
-        ones = jnp.ones(n)
-        # The unperturbed weights ride in front, so that the loss is traced once.
+        draw = lambda key, shape, dtype: jr.normal(key, (n, *shape), dtype)
+        noise = optax.tree.random_like(noise_key, weights, draw)
+        # The unperturbed weights come first, so that the loss is traced once.
+        sides = 2 if self.antithetic else 1
+        ones, every = jnp.ones(n), jnp.arange(n)
+        signs = jnp.concatenate([jnp.zeros(1), ones, -ones][: 1 + sides])
+        directions = jnp.concatenate([jnp.zeros(1, int), *[every] * sides])
+        keys = None
         if self.antithetic:
-            signs = jnp.concatenate([jnp.zeros(1), ones, -ones])
             pairs = jr.split(pair_key, n)
             keys = jnp.concatenate([loss_key[None], pairs, pairs])
-            lanes = jnp.concatenate([jnp.zeros(1, int), jnp.arange(n), jnp.arange(n)])
-        else:
-            signs = jnp.concatenate([jnp.zeros(1), ones])
-            keys = None
-            lanes = jnp.concatenate([jnp.zeros(1, int), jnp.arange(n)])
 
-        def value_at(sign, lane, own_key):
+        def value_at(sign, direction, own_key):
             scale = self.sigma * sign
-            moved = jax.tree.map(
-                lambda w, e: (w + scale * e[lane]).astype(w.dtype), weights, noise
+            perturbed = jax.tree.map(
+                lambda w, e: (w + scale * e[direction]).astype(w.dtype), weights, noise
             )
             one_key = loss_key if own_key is None else own_key
-            value = loss(eqx.combine(moved, rest), one_key)
+            value = loss(eqx.combine(perturbed, rest), one_key)
             return cost_and_metrics(value, "EvolutionStrategies")
 
-        costs, metrics = jax.vmap(value_at)(signs, lanes, keys)
+        costs, metrics = jax.vmap(value_at)(signs, directions, keys)
         if self.antithetic:
             slopes = (costs[1 : n + 1] - costs[n + 1 :]) / (2 * n * self.sigma)
         else:
@@ -119,13 +119,3 @@ class EvolutionStrategies(eqx.Module):
         )
         first = {name: metric[0] for name, metric in metrics.items()}
         return (costs[0], first) if first else costs[0], gradient
-
-
-def _normal(key: PRNGKey, weights: PyTree, n: int) -> PyTree:
-    """`n` standard normal draws for each leaf, along a new leading axis."""
-    leaves, structure = jax.tree.flatten(weights)
-    draws = [
-        jr.normal(one, (n, *leaf.shape), leaf.dtype)
-        for one, leaf in zip(jr.split(key, len(leaves)), leaves, strict=True)
-    ]
-    return jax.tree.unflatten(structure, draws)

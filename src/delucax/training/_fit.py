@@ -18,9 +18,16 @@ from .._check import check_count, check_key, is_concrete
 from .._results import choose, Result, RESULTS
 from .._typing import PRNGKey
 from ._analytic import analytic
-from ._checkpoint import check_replay, Checkpoint, describe, fingerprint, prepare
+from ._checkpoint import Checkpoint, checkpoint_path, describe_run
+from ._compiled_steps import (
+    CAPACITY,
+    FAULTS,
+    finished_model,
+    first_memory,
+    first_state,
+    run_block,
+)
 from ._history import History, history_of
-from ._loop import CAPACITY, FAULTS, finished, first_memory, first_state, run_block
 from ._surrogate import AbstractSurrogate
 from ._trainable import strong, take_apart
 
@@ -189,14 +196,19 @@ def fit(
     block = check_count(block, "block", _WHERE)
     if block > CAPACITY:
         raise ValueError(f"{_WHERE}: block must be at most {CAPACITY}, got {block}.")
-    lanes = _checked_lanes(key)
+    seeds = _checked_seeds(key)
     data, data_size, batch_size = _checked_data(data, batch_size)
-    if isinstance(loss, AbstractSurrogate) and data is not None:
+    has_memory = isinstance(loss, AbstractSurrogate)
+    if has_memory and data is not None:
         raise ValueError(
             f"{_WHERE}: data must be None where the loss is a surrogate, which makes "
             "its own."
         )
-    _check_callbacks(callbacks)
+    if not isinstance(callbacks, tuple | list) or not all(map(callable, callbacks)):
+        raise ValueError(
+            f"{_WHERE}: callbacks must be a sequence of functions of (step, metrics), "
+            f"got {callbacks!r}."
+        )
     if not callable(gradient) or isinstance(gradient, type):
         raise ValueError(
             f"{_WHERE}: gradient must be an estimator such as "
@@ -209,60 +221,55 @@ def fit(
             "under jax.jit, jax.vmap or jax.grad. Train an ensemble with a batch of "
             "keys."
         )
-    _check_batched(model, lanes)
+    _check_batched(model, seeds)
     assembly, values = take_apart(model, trainable, _WHERE)
-    began_as = first_state(optimiser, values, lanes)
-    state, static = eqx.partition(began_as, eqx.is_array)
+    state, static = eqx.partition(first_state(optimiser, values, seeds), eqx.is_array)
     state = jax.tree.map(strong, state)
-    memory = None
-    if isinstance(loss, AbstractSurrogate):
-        memory = first_memory(loss, model, key, lanes)
-    history: dict[str, np.ndarray] = {}
-    seconds = 0.0
-    saved, found = None, None
+    memory = first_memory(loss, model, key, seeds) if has_memory else None
+    shape = () if seeds is None else (seeds,)
+    order = None
+    if batch_size is not None:
+        order = (
+            jnp.zeros((*shape, data_size), jnp.int32),
+            jnp.full(shape, -1, jnp.int32),
+        )
+    fault = jnp.zeros(shape, jnp.int32)
+    carry: Any = (values, state, memory, order, fault)
+    functions = (loss, gradient, optimiser, static, assembly)
+
+    def advanced(carry, first, stop):
+        span = jnp.asarray([first, stop], jnp.int32)
+        inputs = ((key, data), span, batch_size, seeds)
+        carry, outcome = run_block(functions, carry, *inputs)
+        rows, count = jax.device_get(outcome)
+        return carry, {name: column[:count] for name, column in rows.items()}
+
+    saved, blocks, seconds = None, [], 0.0
     if checkpoint is not None:
-        run = _description(model, assembly, values, state, key, steps)
-        run |= dict(batch_size=batch_size, data_size=data_size)
-        saved = Checkpoint(prepare(checkpoint, _WHERE), run)
-        found = saved.resume(_kept(values, state, memory), _WHERE)
+        options = dict(steps=steps, key=np.asarray(jr.key_data(key)).tolist())
+        options |= dict(batch_size=batch_size, data_size=data_size)
+        arrays = (values, state, memory)
+        run = describe_run(model, values, assembly.constraints, *arrays[1:], **options)
+        saved = Checkpoint(checkpoint_path(checkpoint), run)
+        if resumed := saved.resume(arrays):
+            arrays, history, seconds = resumed
+            _, rows = advanced(carry, 0, min(2, len(history["step"])))
+            saved.check_replay(history, rows)
+            carry, blocks = (*arrays, order, fault), [history]
     elif checkpoint_every is not None:
         raise ValueError(f"{_WHERE}: checkpoint_every needs checkpoint, a path.")
     every = 10 * block if checkpoint_every is None else checkpoint_every
     every = check_count(every, "checkpoint_every", _WHERE)
 
-    order = None
-    if batch_size is not None:
-        shape = () if lanes is None else (lanes,)
-        order = (
-            jnp.zeros((*shape, data_size), jnp.int32),
-            jnp.full(shape, -1, jnp.int32),
-        )
-    functions = (loss, gradient, optimiser, static, assembly)
-    fault = jnp.zeros(() if lanes is None else (lanes,), jnp.int32)
-    carry: Any = (values, state, memory, order, fault)
-    options = ((key, data), batch_size, lanes)
-
-    def advanced(carry, first, stop):
-        span = np.asarray([first, stop], np.int32)
-        carry, outcome = run_block(functions, carry, options[0], span, *options[1:])
-        rows, count = jax.device_get(outcome)
-        return carry, rows, int(count)
-
-    if found is not None:
-        kept, history, seconds = found
-        count = min(2, len(history["step"]))
-        _, rows, _ = advanced(carry, 0, count)
-        check_replay(checkpoint, history, rows, count, _WHERE)
-        carry = (*kept, *(None,) * (3 - len(kept)), order, fault)
-    done = written = len(history.get("step", ()))
-    faults, last, blocks = np.zeros(fault.shape, int), {}, [history] if history else []
+    done = written = len(blocks[0]["step"]) if blocks else 0
+    faults = np.zeros(shape, int)
     began = time.perf_counter() - seconds
     with tqdm(total=steps, initial=done, disable=not progress, desc="fit") as bar:
         while done < steps and not np.all(faults):
-            carry, rows, count = advanced(carry, done, min(done + block, steps))
+            carry, rows = advanced(carry, done, min(done + block, steps))
             faults = np.asarray(jax.device_get(carry[4]))
             seconds = time.perf_counter() - began
-            rows = {name: column[:count] for name, column in rows.items()}
+            count = len(rows["loss"])
             rows["step"] = np.arange(done, done + count)
             rows["seconds"] = np.full(count, seconds)
             blocks.append(rows)
@@ -273,32 +280,31 @@ def fit(
             is_due = done == steps or done - written >= every
             if saved is not None and is_due and not np.any(faults):
                 blocks = [_joined(blocks)]
-                saved.write(_kept(*carry[:3]), blocks[0], seconds)
+                saved.write(carry[:3], blocks[0], seconds)
                 written = done
             for callback in callbacks:
                 callback(done, last)
 
     if np.any(faults) and throw:
-        raise RuntimeError(_said(faults, blocks[-1], done))
+        raise RuntimeError(_failure(faults, blocks[-1], done))
     model = assembly(carry[0])
-    if memory is not None:
-        model = finished(loss, model, carry[2], lanes)
-    if lanes is None:
-        result = RESULTS.diverged if faults else RESULTS.successful
-    else:
+    if has_memory:
+        model = finished_model(loss, model, carry[2], seeds)
+    result = RESULTS.diverged if np.any(faults) else RESULTS.successful
+    if seeds is not None:
         result = jax.vmap(lambda d: choose(d, RESULTS.diverged, RESULTS.successful))(
             faults > 0
         )
     return Fitted(model=model, history=history_of(_joined(blocks)), result=result)
 
 
-def _said(faults, rows, done) -> str:
-    """What went wrong, in words."""
+def _failure(faults: np.ndarray, rows: dict[str, np.ndarray], done: int) -> str:
+    """What failed, in words."""
     remedy = "Pass throw=False to get the model as it was before that step."
     if faults.ndim:
-        lane = int(np.argmax(faults > 0))
+        seed = int(np.argmax(faults > 0))
         return (
-            f"{_WHERE}: the {FAULTS[faults[lane]]} of seed {lane} is not finite "
+            f"{_WHERE}: the {FAULTS[faults[seed]]} of seed {seed} is not finite "
             f"({int(np.sum(faults > 0))} of {len(faults)} seeds diverged by step "
             f"{done - 1}). {remedy}"
         )
@@ -309,12 +315,7 @@ def _said(faults, rows, done) -> str:
     )
 
 
-def _kept(values, state, memory):
-    """What a checkpoint holds."""
-    return (values, state) if memory is None else (values, state, memory)
-
-
-def _checked_lanes(key) -> int | None:
+def _checked_seeds(key: Any) -> int | None:
     """The number of seeds in a batch of keys; `None` for one key."""
     typed = eqx.is_array(key) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     raw = eqx.is_array(key) and key.dtype == jnp.uint32 and key.shape[1:] == (2,)
@@ -324,20 +325,22 @@ def _checked_lanes(key) -> int | None:
     return None
 
 
-def _check_batched(model, lanes) -> None:
+def _check_batched(model: PyTree, seeds: int | None) -> None:
     """Raise unless each array of a model has the axis of a batch of keys in front."""
-    if lanes is None:
+    if seeds is None:
         return
     for leaf in jax.tree.leaves(eqx.filter(model, eqx.is_array)):
-        if leaf.shape[:1] != (lanes,):
+        if leaf.shape[:1] != (seeds,):
             raise ValueError(
-                f"{_WHERE}: each array of model must have the axis of the {lanes} keys "
+                f"{_WHERE}: each array of model must have the axis of the {seeds} keys "
                 "in front, as equinox.filter_vmap(make)(keys) gives it, got one of "
                 f"shape {leaf.shape}."
             )
 
 
-def _checked_data(data, batch_size):
+def _checked_data(
+    data: PyTree, batch_size: Any
+) -> tuple[PyTree, int | None, int | None]:
     """`(data as JAX arrays, number of rows, batch size)`."""
     if data is None:
         if batch_size is not None:
@@ -363,15 +366,7 @@ def _checked_data(data, batch_size):
     return data, size, batch_size
 
 
-def _check_callbacks(callbacks) -> None:
-    if not isinstance(callbacks, tuple | list) or not all(map(callable, callbacks)):
-        raise ValueError(
-            f"{_WHERE}: callbacks must be a sequence of functions of (step, metrics), "
-            f"got {callbacks!r}."
-        )
-
-
-def _as_jax(tree):
+def _as_jax(tree: PyTree) -> PyTree:
     """NumPy arrays as JAX ones: they would be static under `jit`."""
     return jax.tree.map(
         lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, tree
@@ -380,17 +375,3 @@ def _as_jax(tree):
 
 def _joined(blocks: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([rows[name] for rows in blocks]) for name in blocks[0]}
-
-
-def _description(model, assembly, values, state, key, steps) -> dict[str, Any]:
-    """What tells this run from another, in words that JSON has."""
-    return dict(
-        steps=steps,
-        key=np.asarray(jr.key_data(key)).tolist(),
-        trainable={
-            path: f"{v.dtype}{list(v.shape)} {assembly.constraints.get(path, '')}"
-            for path, v in values.items()
-        },
-        optimiser=describe(state),
-        start=fingerprint(model),
-    )

@@ -1,6 +1,7 @@
 """Proximal policy optimisation."""
 
-from typing import Any, NamedTuple
+from dataclasses import KW_ONLY
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,47 +10,32 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_bool, check_count, check_positive, check_range
-from .._module import as_float_array, parameter
-from ..environments import Environment
-from ..simulation._answer import begun
-from ._actor_critic import (
-    ActorCritic,
-    advantages,
-    as_seen,
-    check_environment,
-    check_model,
-    episode,
-    Episodes,
-    more_seen,
-    nothing_seen,
-    Seen,
+from .._check import check_count, check_positive, check_range
+from .._controller import (
+    AbstractStochasticPolicy,
+    check_stochastic,
+    initial_state,
+    replay,
 )
-from ._surrogate import AbstractSurrogate
-
-
-class _Rows(NamedTuple):
-    """What is learned from: stretches of episodes, each `(rows, length, ...)`."""
-
-    times: Array
-    observations: Array
-    controls: Array
-    costs: Array
-    valid: Array
-    log_prob: Array
-    advantages: Array
-    targets: Array
+from .._module import parameter
+from .._typing import PRNGKey, RealScalar
+from ..controllers import Gaussian
+from ..environments import Environment
+from ._actor_critic import ActorCritic
+from ._actor_critic_loss import AbstractActorCriticLoss, Episodes
+from ._standardisation import Statistics
 
 
 class _Memory(NamedTuple):
-    rows: _Rows
+    rows: Episodes
+    """Whole episodes, or single steps, each `(rows, length, ...)`."""
     order: Array
     part: Array
-    seen: Seen
+    statistics: Statistics
     total_cost: Array
 
 
-class PPO(AbstractSurrogate):
+class PPO(AbstractActorCriticLoss):
     r"""Proximal policy optimisation: the clipped surrogate of the likelihood ratio.
 
     Every `epochs * minibatches` steps of [`delucax.training.fit`][] the policy runs
@@ -119,83 +105,64 @@ class PPO(AbstractSurrogate):
 
     environment: Environment
     batch: int = eqx.field(static=True)
-    horizon: int = eqx.field(static=True)
-    discount: Array = parameter()
-    decay: Array = parameter()
-    clip: Array = parameter()
-    epochs: int = eqx.field(static=True)
-    minibatches: int = eqx.field(static=True)
-    value_weight: Array = parameter()
-    entropy_weight: Array = parameter()
-    bootstrap: bool = eqx.field(static=True)
-
-    def __init__(
-        self,
-        environment: Environment,
-        batch: int,
-        horizon: int | None = None,
-        *,
-        discount: Any = 0.99,
-        decay: Any = 0.95,
-        clip: Any = 0.2,
-        epochs: int = 4,
-        minibatches: int = 8,
-        value_weight: Any = 0.5,
-        entropy_weight: Any = 0.0,
-        bootstrap: bool = True,
-    ):
-        where = "PPO"
-        check_environment(environment, where)
-        self.environment = environment
-        self.batch = check_count(batch, "batch", where)
-        horizon = environment.horizon if horizon is None else horizon
-        self.horizon = check_count(horizon, "horizon", where)
-        self.discount, self.decay = as_float_array(discount), as_float_array(decay)
-        self.clip = as_float_array(clip)
-        self.epochs = check_count(epochs, "epochs", where)
-        self.minibatches = check_count(minibatches, "minibatches", where)
-        self.value_weight = as_float_array(value_weight)
-        self.entropy_weight = as_float_array(entropy_weight)
-        self.bootstrap = check_bool(bootstrap, "bootstrap", where)
+    horizon: int = eqx.field(static=True, default=None)
+    _: KW_ONLY
+    discount: RealScalar = parameter(0.99)
+    decay: RealScalar = parameter(0.95)
+    clip: RealScalar = parameter(0.2)
+    epochs: int = eqx.field(static=True, default=4)
+    minibatches: int = eqx.field(static=True, default=8)
+    value_weight: RealScalar = parameter(0.5)
+    entropy_weight: RealScalar = parameter(0.0)
+    bootstrap: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self):
-        where = "PPO"
-        check_environment(self.environment, where)
-        check_range(self.discount, "discount", where, 0, 1)
-        check_range(self.decay, "decay", where, 0, 1)
-        check_positive(self.clip, "clip", where)
-        check_range(self.value_weight, "value_weight", where)
-        check_range(self.entropy_weight, "entropy_weight", where)
+        check_positive(self.clip, "clip", "PPO")
+        check_count(self.epochs, "epochs", "PPO")
+        check_count(self.minibatches, "minibatches", "PPO")
+        check_range(self.entropy_weight, "entropy_weight", "PPO")
 
-    def init(self, model, key):
-        check_model(model, self.environment, "PPO", drawn=True)
-        rows, total_cost = self._run(model, key)
+    def init(self, model: ActorCritic, key: PRNGKey) -> _Memory:
+        self._check_model(model)
+        policy = _policy_of(model)
+        unbounded = isinstance(policy, Gaussian) and policy.bounds is None
+        if unbounded and self.environment.control_bounds is not None:
+            raise ValueError(
+                "PPO: the policy must have the bounds of the environment, or its "
+                "log-probability is not that of what is applied: "
+                "Gaussian(..., bounds=env.control_bounds)."
+            )
+        rows, total_cost = self._rows(model, key)
         count = rows.times.shape[0]
         if count < self.minibatches:
             raise ValueError(
                 f"PPO: minibatches must be at most the {count} rows of a batch, got "
                 f"{self.minibatches}."
             )
-        seen = more_seen(model, nothing_seen(model, rows.costs), *_flat(rows))
-        order = jnp.arange(count)
-        return _Memory(rows, order, jnp.zeros((), int), seen, total_cost)
+        none = Statistics.empty(model, rows.costs.dtype)
+        statistics = _updated(none, model, rows)
+        zero = jnp.zeros((), int)
+        return _Memory(rows, jnp.arange(count), zero, statistics, total_cost)
 
-    def update(self, model, memory, step, key):
+    def update(
+        self, model: ActorCritic, memory: _Memory, step: Array, key: PRNGKey
+    ) -> _Memory:
         run_key, order_key = jr.split(key)
         part = (step % (self.epochs * self.minibatches)).astype(memory.part.dtype)
 
         def fresh():
-            rows, total_cost = self._run(as_seen(model, memory.seen), run_key)
+            standardised = memory.statistics.applied_to(model)
+            rows, total_cost = self._rows(standardised, run_key)
             return memory._replace(rows=rows, total_cost=total_cost)
 
-        def learned():
-            # What the last batch showed counts from the next one on.
-            seen = more_seen(model, memory.seen, *_flat(memory.rows))
-            return memory._replace(seen=seen)
-
-        # The batch of `init` has been counted already.
+        # The statistics of a batch are used from the next batch on. Those of the batch
+        # of `init` are in the memory already.
         again = (part == 0) & (step > 0)
-        memory = memory._replace(seen=lax.cond(again, learned, lambda: memory).seen)
+        old = memory.statistics
+        statistics = lax.cond(
+            again, lambda: _updated(old, model, memory.rows), lambda: old
+        )
+        memory = memory._replace(statistics=statistics)
         memory = lax.cond(part == 0, fresh, lambda: memory)
         order = lax.cond(
             part % self.minibatches == 0,
@@ -204,14 +171,16 @@ class PPO(AbstractSurrogate):
         )
         return memory._replace(order=order, part=part)
 
-    def __call__(self, model, memory, key):
+    def __call__(
+        self, model: ActorCritic, memory: _Memory, key: PRNGKey
+    ) -> tuple[Array, dict[str, Array]]:
         del key
-        model = as_seen(model, memory.seen)
+        model = memory.statistics.applied_to(model)
         size = memory.order.shape[0] // self.minibatches
         start = memory.part % self.minibatches * size
         chosen = lax.dynamic_slice(memory.order, (start,), (size,))
         rows = jax.tree.map(lambda leaf: leaf[chosen], memory.rows)
-        log_prob, entropy = jax.vmap(lambda row: _scored(model.policy, row))(rows)
+        log_prob, entropy = _scores(model, rows)
         raw = jax.vmap(jax.vmap(model.raw))(rows.times, rows.observations)
         weights = rows.valid / jnp.maximum(jnp.sum(rows.valid), 1)
 
@@ -237,82 +206,56 @@ class PPO(AbstractSurrogate):
         }
         return loss.astype(rows.costs.dtype), lax.stop_gradient(metrics)
 
-    def finished(self, model, memory):
-        return as_seen(model, memory.seen)
-
-    def _run(self, model: ActorCritic, key) -> tuple[_Rows, Array]:
+    def _rows(self, model: ActorCritic, key: PRNGKey) -> tuple[Episodes, Array]:
         """The rows of a fresh batch, and its mean cost."""
-
-        def one(key):
-            options: Any = dict(horizon=self.horizon, bootstrap=self.bootstrap)
-            record, _ = episode(self.environment, model, key, **options)
-            return record, advantages(record, self.discount, self.decay)
-
-        records, gains = jax.vmap(one)(jr.split(key, self.batch))
-        rows = jax.vmap(lambda *row: _row(model.policy, *row))(records, gains)
-        known = jnp.maximum(jnp.sum(rows.valid), 1)
-        mean = jnp.sum(jnp.where(rows.valid, gains, 0)) / known
-        spread = jnp.sum(jnp.where(rows.valid, (gains - mean) ** 2, 0)) / known
-        rows = rows._replace(advantages=(gains - mean) / (jnp.sqrt(spread) + 1e-8))
-        if _is_plain(model.policy):
+        runs = self._episodes(model, key)
+        log_prob, _ = _scores(model, runs)
+        count = jnp.maximum(jnp.sum(runs.valid), 1)
+        mean = jnp.sum(jnp.where(runs.valid, runs.advantages, 0)) / count
+        squares = jnp.where(runs.valid, (runs.advantages - mean) ** 2, 0)
+        deviation = jnp.sqrt(jnp.sum(squares) / count)
+        rows = runs._replace(
+            advantages=(runs.advantages - mean) / (deviation + 1e-8),
+            log_prob=log_prob,
+            continues=None,
+            following=None,
+            values=None,
+            total_cost=None,
+        )
+        if not _policy_of(model).has_memory:
             rows = jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[2:]), rows)
-        return jax.tree.map(lax.stop_gradient, rows), jnp.mean(records.total_cost)
+        return jax.tree.map(lax.stop_gradient, rows), jnp.mean(runs.total_cost)
 
 
-def _row(policy, record: Episodes, gain) -> _Rows:
-    row = _Rows(
-        times=record.times,
-        observations=record.observations,
-        controls=record.controls,
-        costs=record.costs,
-        valid=record.valid,
-        log_prob=record.costs,
-        advantages=gain,
-        targets=gain + record.values,
-    )
-    return row._replace(log_prob=_scored(policy, row)[0])
+def _policy_of(model: ActorCritic) -> AbstractStochasticPolicy:
+    """The policy of a model, which must know the probability of what it draws."""
+    return check_stochastic(model.policy, "policy", "PPO")
 
 
-def _flat(rows: _Rows):
-    """Observations, targets and whether they count, a row a step."""
-    return tuple(
-        leaf.reshape(-1, *leaf.shape[2:])
-        for leaf in (rows.observations, rows.targets, rows.valid)
-    )
+def _updated(old: Statistics, model: ActorCritic, rows: Episodes) -> Statistics:
+    return old.updated(model, rows.observations, rows.targets, rows.valid)
 
 
-def _is_plain(policy) -> bool:
-    """Whether a policy has no memory but the key that it draws with."""
-    state = jax.eval_shape(lambda: eqx.filter(_start(policy), eqx.is_array))
-    return not jax.tree.leaves(getattr(state, "base", state))
+def _scores(model: ActorCritic, rows: Episodes) -> tuple[Array, Array]:
+    """The log-probability and the entropy at each step of rows.
 
+    With a memory, a row is an episode from its beginning.
+    """
+    policy = _policy_of(model)
 
-def _start(policy):
-    return begun(policy, jr.key(0))
+    def score(t, y, state, u):
+        log_prob, entropy = policy.log_prob(t, y, state, u), policy.entropy(t, y, state)
+        return log_prob, -log_prob if entropy is None else entropy
 
+    def act(t, y, state, u):
+        return score(t, y, state, u), policy(t, y, state)[1]
 
-def _scored(policy, row: _Rows) -> tuple[Array, Array]:
-    """The log-probability and entropy at each step of a stretch from the beginning."""
+    # The key does not matter: the log-probability is that of the controls given.
+    state = initial_state(policy, jr.key(0))
 
-    def at(t, y, u, state):
-        score = policy.log_prob(t, y, state, u)
-        if hasattr(policy, "entropy"):
-            return score, policy.entropy(t, y, state)
-        return score, -score
+    def of_row(*record):
+        if policy.has_memory:
+            return replay(policy, state, record, act)
+        return jax.vmap(lambda t, y, u: score(t, y, state, u))(*record[:3])
 
-    first = _start(policy)
-    inputs = (row.times, row.observations, row.controls)
-    if _is_plain(policy):
-        return jax.vmap(lambda t, y, u: at(t, y, u, first))(*inputs)
-    first, static = eqx.partition(first, eqx.is_array)
-
-    def step(memory, inputs):
-        *now, cost = inputs
-        t, y, u = now
-        state = eqx.combine(memory, static)
-        found = at(t, y, u, state)
-        _, after = policy(t, y, state)
-        after = policy.applied(u, cost, after)
-        return eqx.filter(after, eqx.is_array), found
-
-    return lax.scan(step, first, (*inputs, row.costs))[1]
+    return jax.vmap(of_row)(rows.times, rows.observations, rows.controls, rows.costs)

@@ -1,6 +1,7 @@
 """The short-horizon actor-critic."""
 
-from typing import Any, NamedTuple
+from dataclasses import KW_ONLY
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,29 +10,22 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, PyTree
 
-from .._check import check_bool, check_count, check_range
-from .._module import as_float_array, parameter
+from .._check import check_count, check_range
+from .._module import parameter
+from .._typing import PRNGKey, RealScalar
 from ..environments import Environment
-from ._actor_critic import (
-    advantages,
-    as_seen,
-    check_environment,
-    check_model,
-    episode,
-    more_seen,
-    nothing_seen,
-    Seen,
-)
-from ._surrogate import AbstractSurrogate
+from ._actor_critic import ActorCritic
+from ._actor_critic_loss import AbstractActorCriticLoss
+from ._standardisation import Statistics
 from ._trainable import is_float
 
 
 class _Memory(NamedTuple):
     critic: PyTree
-    seen: Seen
+    statistics: Statistics
 
 
-class SHAC(AbstractSurrogate):
+class SHAC(AbstractActorCriticLoss):
     r"""The short-horizon actor-critic: the gradient through the plant over short
     windows, with a learned cost to go at the end of each.
 
@@ -68,7 +62,7 @@ class SHAC(AbstractSurrogate):
     - `decay`: lambda of the target, 0.95 by default.
     - `rate`: at which the target network follows, 0.2 by default; 1 for none.
     - `value_weight`: 1 by default.
-    - `refresh`: steps between what is seen anew, 10 by default.
+    - `refresh`: steps between two batches that set the scales, 10 by default.
     - `bootstrap`: whether the horizon is a cut (default); if false it is the end, and
         the final cost is charged there.
 
@@ -97,59 +91,33 @@ class SHAC(AbstractSurrogate):
 
     environment: Environment
     batch: int = eqx.field(static=True)
-    horizon: int = eqx.field(static=True)
-    window: int = eqx.field(static=True)
-    discount: Array = parameter()
-    decay: Array = parameter()
-    rate: Array = parameter()
-    value_weight: Array = parameter()
-    refresh: int = eqx.field(static=True)
-    bootstrap: bool = eqx.field(static=True)
-
-    def __init__(
-        self,
-        environment: Environment,
-        batch: int,
-        horizon: int | None = None,
-        *,
-        window: int = 16,
-        discount: Any = 0.99,
-        decay: Any = 0.95,
-        rate: Any = 0.2,
-        value_weight: Any = 1.0,
-        refresh: int = 10,
-        bootstrap: bool = True,
-    ):
-        where = "SHAC"
-        check_environment(environment, where)
-        self.environment = environment
-        self.batch = check_count(batch, "batch", where)
-        horizon = environment.horizon if horizon is None else horizon
-        self.horizon = check_count(horizon, "horizon", where)
-        self.window = check_count(window, "window", where)
-        self.discount, self.decay = as_float_array(discount), as_float_array(decay)
-        self.rate = as_float_array(rate)
-        self.value_weight = as_float_array(value_weight)
-        self.refresh = check_count(refresh, "refresh", where)
-        self.bootstrap = check_bool(bootstrap, "bootstrap", where)
+    horizon: int = eqx.field(static=True, default=None)
+    _: KW_ONLY
+    window: int = eqx.field(static=True, default=16)
+    discount: RealScalar = parameter(0.99)
+    decay: RealScalar = parameter(0.95)
+    rate: RealScalar = parameter(0.2)
+    value_weight: RealScalar = parameter(1.0)
+    refresh: int = eqx.field(static=True, default=10)
+    bootstrap: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self):
-        where = "SHAC"
-        check_environment(self.environment, where)
-        for name in ("discount", "decay", "rate"):
-            check_range(getattr(self, name), name, where, 0, 1)
-        check_range(self.value_weight, "value_weight", where)
+        check_count(self.window, "window", "SHAC")
+        check_range(self.rate, "rate", "SHAC", 0, 1)
+        check_count(self.refresh, "refresh", "SHAC")
 
-    def init(self, model, key):
-        check_model(model, self.environment, "SHAC", drawn=False)
-        like = jnp.zeros((), self.environment.dt.dtype)
-        seen = nothing_seen(model, like)
+    def init(self, model: ActorCritic, key: PRNGKey) -> _Memory:
+        self._check_model(model)
+        none = Statistics.empty(model, self.environment.dt.dtype)
+        statistics = none
         # Twice: what the targets are depends on the scale of the critic.
         for one in jr.split(key):
-            seen = self._seen(as_seen(model, seen), nothing_seen(model, like), one)
-        return _Memory(eqx.filter(model.critic, is_float), seen)
+            statistics = self._updated(none, statistics.applied_to(model), one)
+        return _Memory(eqx.filter(model.critic, is_float), statistics)
 
-    def update(self, model, memory, step, key):
+    def update(
+        self, model: ActorCritic, memory: _Memory, step: Array, key: PRNGKey
+    ) -> _Memory:
         new = eqx.filter(model.critic, is_float)
         critic = jax.tree.map(
             lambda old, new: (old + self.rate * (new - old)).astype(old.dtype),
@@ -157,59 +125,43 @@ class SHAC(AbstractSurrogate):
             new,
         )
         again = (step > 0) & (step % self.refresh == 0)
-        target = self._target(model, memory)
-        seen = lax.cond(
-            again, lambda: self._seen(target, memory.seen, key), lambda: memory.seen
+        old, target = memory.statistics, _with_target(model, memory)
+        statistics = lax.cond(
+            again, lambda: self._updated(old, target, key), lambda: old
         )
-        return _Memory(lax.stop_gradient(critic), seen)
+        return _Memory(lax.stop_gradient(critic), statistics)
 
-    def __call__(self, model, memory, key):
-        model = as_seen(model, memory.seen)
-        acting = self._target(model, memory)
+    def __call__(
+        self, model: ActorCritic, memory: _Memory, key: PRNGKey
+    ) -> tuple[Array, dict[str, Array]]:
+        model = memory.statistics.applied_to(model)
+        runs = self._episodes(_with_target(model, memory), key, truncate=self.window)
         steps = jnp.arange(self.horizon)
-        into = steps % self.window
-        ends = (into == self.window - 1) | (steps == self.horizon - 1)
-
-        def one(key):
-            record, run = self._episode(acting, key, self.window)
-            bonus = jnp.where(ends | ~record.going, record.following, 0)
-            costs = jnp.where(record.valid, record.costs + self.discount * bonus, 0)
-            actor = jnp.sum(self.discount**into * costs)
-            gains = advantages(record, self.discount, self.decay)
-            targets = lax.stop_gradient(gains + record.values)
-            seen = lax.stop_gradient(record.observations)
-            raw = jax.vmap(model.raw)(record.times, seen)
-            error = raw - (targets - model.shift) / model.scale
-            critic = jnp.sum(jnp.where(record.valid, error**2, 0))
-            return actor, critic, jnp.sum(record.valid), run.total_cost
-
-        keys = jr.split(key, self.batch)
-        actor, critic, count, total_cost = jax.vmap(one)(keys)
-        count = jnp.sum(count)
+        within = steps % self.window
+        ends = (within == self.window - 1) | (steps == self.horizon - 1)
+        bonus = jnp.where(ends | ~runs.continues, runs.following, 0)
+        costs = jnp.where(runs.valid, runs.costs + self.discount * bonus, 0)
+        targets, observations = lax.stop_gradient((runs.targets, runs.observations))
+        raw = jax.vmap(jax.vmap(model.raw))(runs.times, observations)
+        error = raw - (targets - model.shift) / model.scale
+        # Over each episode first.
+        actor = jnp.sum(self.discount**within * costs, axis=1)
+        critic = jnp.sum(jnp.where(runs.valid, error**2, 0), axis=1)
+        count = jnp.sum(runs.valid)
         value_loss = jnp.sum(critic) / count
         actor = jnp.sum(actor) / (count * model.scale)
-        metrics = {"total_cost": jnp.mean(total_cost), "value_loss": value_loss}
+        metrics = {"total_cost": jnp.mean(runs.total_cost), "value_loss": value_loss}
         return actor + self.value_weight * value_loss, lax.stop_gradient(metrics)
 
-    def finished(self, model, memory):
-        return as_seen(model, memory.seen)
+    def _updated(self, old: Statistics, model: ActorCritic, key: PRNGKey) -> Statistics:
+        runs = self._episodes(model, key)
+        new = old.updated(model, runs.observations, runs.targets, runs.valid)
+        return lax.stop_gradient(new)
 
-    def _target(self, model, memory):
-        """The model with the target network for a critic, held fixed."""
-        _, rest = eqx.partition(model.critic, is_float)
-        held = eqx.combine(lax.stop_gradient(memory.critic), rest)
-        return as_seen(eqx.tree_at(lambda m: m.critic, model, held), memory.seen)
 
-    def _episode(self, model, key, window=None):
-        options: Any = dict(horizon=self.horizon, bootstrap=self.bootstrap)
-        return episode(self.environment, model, key, truncate=window, **options)
-
-    def _seen(self, model, seen, key):
-        def one(key):
-            record, _ = self._episode(model, key)
-            gains = advantages(record, self.discount, self.decay)
-            return record.observations, gains + record.values, record.valid
-
-        found = jax.vmap(one)(jr.split(key, self.batch))
-        flat = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in found)
-        return lax.stop_gradient(more_seen(model, seen, *flat))
+def _with_target(model: ActorCritic, memory: _Memory) -> ActorCritic:
+    """The model with the target network for a critic, held fixed."""
+    _, rest = eqx.partition(model.critic, is_float)
+    target = eqx.combine(lax.stop_gradient(memory.critic), rest)
+    model = eqx.tree_at(lambda m: m.critic, model, target)
+    return memory.statistics.applied_to(model)

@@ -27,13 +27,18 @@ class Assembly(eqx.Module):
     constraints: dict[str, AbstractConstraint]
 
     def __call__(self, values: dict[str, Array]) -> Any:
-        leaves = list(self.leaves)
+        legal, leaves = self.constrained(values), list(self.leaves)
         for index, path, is_weak in self.holes:
-            value = values[path]
-            if path in self.constraints:
-                value = self.constraints[path].constrain(value)
-            leaves[index] = _weak(value) if is_weak else value
+            leaves[index] = _weak(legal[path]) if is_weak else legal[path]
         return jax.tree.unflatten(self.structure, leaves)
+
+    def constrained(self, values: dict[str, Array]) -> dict[str, Array]:
+        """The legal values."""
+        limits = self.constraints
+        return {
+            path: limits[path].constrain(value) if path in limits else value
+            for path, value in values.items()
+        }
 
 
 def take_apart(
@@ -130,23 +135,22 @@ def _as_paths(
 ) -> Mapping[str, AbstractConstraint | None] | None:
     """From path to constraint, or `None` if `trainable` does not name paths."""
     if isinstance(trainable, str):
-        return {trainable: None}
-    if isinstance(trainable, Mapping):
-        if not all(isinstance(path, str) for path in trainable):
-            return None
-        if all(
-            c is None or isinstance(c, AbstractConstraint) for c in trainable.values()
-        ):
-            return trainable
-        if any(isinstance(c, AbstractConstraint) for c in trainable.values()):
-            raise ValueError(
-                f"{where}: trainable must map each path to delucax.positive, "
-                f"delucax.bounded(low, high) or None, got {dict(trainable)!r}."
-            )
-    if isinstance(trainable, tuple | list | set | frozenset):
-        if all(isinstance(path, str) for path in trainable):
-            return dict.fromkeys(trainable)
-    return None
+        trainable = [trainable]
+    listed = isinstance(trainable, tuple | list | set | frozenset)
+    if not (listed or isinstance(trainable, Mapping)):
+        return None
+    if not all(isinstance(path, str) for path in trainable):
+        return None
+    if listed:
+        return dict.fromkeys(trainable)
+    given = [c for c in trainable.values() if c is not None]
+    named = [isinstance(c, AbstractConstraint) for c in given]
+    if any(named) and not all(named):
+        raise ValueError(
+            f"{where}: trainable must map each path to delucax.positive, "
+            f"delucax.bounded(low, high) or None, got {dict(trainable)!r}."
+        )
+    return trainable if all(named) else None
 
 
 def _is_under(path: str, prefix: str) -> bool:

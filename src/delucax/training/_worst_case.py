@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import as_vector, check_count, check_key, check_positive
-from .._controller import AbstractController
+from .._check import as_vector, check_count, check_instance, check_key, check_positive
+from .._controller import AbstractController, check_controller
 from .._module import as_float_array
 from .._typing import PRNGKey
 from ..environments import Environment
@@ -105,16 +105,8 @@ def worst_case(
         ```
     """
     where = "worst_case"
-    if not isinstance(environment, Environment):
-        raise ValueError(
-            f"{where}: environment must be an Environment, got "
-            f"{type(environment).__name__}."
-        )
-    if not isinstance(controller, AbstractController):
-        raise ValueError(
-            f"{where}: controller must be an AbstractController, got "
-            f"{type(controller).__name__}."
-        )
+    check_instance(environment, Environment, "environment", where)
+    check_controller(controller, "controller", where)
     if environment.disturbance_size == 0:
         raise ValueError(f"{where}: environment must take a disturbance, got none.")
     key = check_key(key, where)

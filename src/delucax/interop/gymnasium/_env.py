@@ -253,9 +253,9 @@ class GymnasiumEnv(gymnasium.Env):
         if self._given is None:
             raise ResetNeeded("GymnasiumEnv: call reset() before render().")
         if self._picture is None:
-            from ...plotting._picture import Picture
+            from ...plotting._renderer import Renderer
 
-            self._picture = Picture(self.environment, self.render_mode == "human")
+            self._picture = Renderer(self.environment, self.render_mode == "human")
         control = self._action
         if self._table is not None:
             shown = self._table[int(control[0])]

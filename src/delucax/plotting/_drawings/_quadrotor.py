@@ -1,44 +1,21 @@
 """The quadrotor in space, seen from aside and above."""
 
 import math
-from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
+from jaxtyping import Float
 from matplotlib.collections import LineCollection
 
-from ...environments import Environment
-from ...simulation import Trajectory
-from ...systems import Quadrotor
 from .._figure import color_of, NEUTRAL
-from ._parts import (
-    BODY,
-    body,
-    disc,
-    finite_states,
-    largest_controls,
-    link,
-    mark,
-    push,
-    SECOND,
-    shares,
-    target_of,
-    View,
-)
-from ._registry import add_drawing, Drawing, system_of
+from ._canvas import BODY, Canvas, SECOND, View
+from ._drawing import Drawing, Episode, Vector
 
 
 AZIMUTH, ELEVATION = math.radians(-62), math.radians(24)  # of the eye, far away
-EYE = np.array(
-    [
-        [-math.sin(AZIMUTH), math.cos(AZIMUTH), 0.0],
-        [
-            -math.cos(AZIMUTH) * math.sin(ELEVATION),
-            -math.sin(AZIMUTH) * math.sin(ELEVATION),
-            math.cos(ELEVATION),
-        ],
-    ]
-)
+HORIZONTAL = np.array([math.cos(AZIMUTH), math.sin(AZIMUTH), 0.0])
+RIGHT = np.array([-math.sin(AZIMUTH), math.cos(AZIMUTH), 0.0])
+UP = -math.sin(ELEVATION) * HORIZONTAL + np.array([0.0, 0.0, math.cos(ELEVATION)])
+SCREEN = np.stack([RIGHT, UP])  # the axes of the picture, in space
 FRONT = color_of(4)
 # Front, left, back and right, as the thrusts are ordered.
 ARMS = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], float)
@@ -47,12 +24,12 @@ RIM = np.array(
 )
 
 
-def seen(points: np.ndarray) -> np.ndarray:
-    """Points in space, `(..., 3)`, as they lie in the picture, `(..., 2)`."""
-    return points @ EYE.T
+def projected(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
+    """Points in space as they lie in the picture."""
+    return points @ SCREEN.T
 
 
-def attitude(x: np.ndarray) -> np.ndarray:
+def attitude(x: Vector) -> Float[np.ndarray, "3 3"]:
     """The rotation matrix from body to world of a state."""
     w, a, b, c = x[3:7] / (np.linalg.norm(x[3:7]) or 1.0)
     return np.array(
@@ -64,91 +41,63 @@ def attitude(x: np.ndarray) -> np.ndarray:
     )
 
 
-def setup_quadrotor(
-    ax: Axes, environment: Environment, trajectory: Trajectory
-) -> dict[str, Any]:
-    """A floor with a grid, and the goal above it."""
-    system = system_of(environment)
-    path = finite_states(trajectory)[:, :3]
-    target = target_of(environment)
+def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
+    """Two crossed arms with four rotors, the front one in amber; their thrusts, or the
+    thrust of all; a floor with a grid and the shadow on it, and the goal above it."""
+    system, target = episode.system, episode.target
+    visited = episode.states[:, :3]
     if target is not None:
-        path = np.concatenate([path, target[None, :3]])
-    arm = float(system.arm)
-    low, high = path.min(axis=0), path.max(axis=0)
-    middle = target[:3] if target is not None else path[0]
-    half = np.clip(0.5 * np.max(high - low) + 2 * arm, 5 * arm, 15 * arm)
+        visited = np.concatenate([visited, target[None, :3]])
+    length = float(system.arm)
+    low, high = visited.min(axis=0), visited.max(axis=0)
+    middle = target[:3] if target is not None else visited[0]
+    half = np.clip(0.5 * np.max(high - low) + 2 * length, 5 * length, 15 * length)
     centre = np.where(high - low < 2 * half, (low + high) / 2, middle)
-    floor = float(max(low[2], centre[2] - half) - 2.5 * arm)
+    floor = float(max(low[2], centre[2] - half) - 2.5 * length)
+    arm = max(length, 0.16 * float(half))  # seen from afar it is drawn larger
 
-    ticks = np.linspace(-half, half, 7)
     ends = np.array([-half, half])
     lines = []
-    for tick in ticks:
+    for tick in np.linspace(-half, half, 7):
         for across in (np.full(2, tick), ends), (ends, np.full(2, tick)):
             flat = np.stack([*across, np.zeros(2)], axis=-1)
-            lines.append(seen(flat + [*centre[:2], floor]))
+            lines.append(projected(flat + [*centre[:2], floor]))
     grid = LineCollection(lines, colors=NEUTRAL, alpha=0.3, linewidths=0.8, zorder=0)
-    ax.add_collection(grid, autolim=False)
-    drawn = max(arm, 0.16 * float(half))  # seen from afar it is drawn larger
+    canvas.ax.add_collection(grid, autolim=False)
     if target is not None:
-        foot = np.array([*target[:2], floor])
-        stem = seen(np.stack([foot, target[:3]]))
-        ax.plot(*stem.T, color=NEUTRAL, lw=1, ls=(0, (3, 3)), zorder=0)
-        mark(ax, seen(target[:3]), 0.35 * drawn)
-    near = np.clip(path, centre - half, centre + half)
-    corners = np.concatenate([*lines, seen(near) + [0, 2.5 * drawn]])
+        stem = projected(np.stack([[*target[:2], floor], target[:3]]))
+        canvas.line(stem, color=NEUTRAL, lw=1, ls=(0, (3, 3)), zorder=0)
+        canvas.goal(projected(target[:3]), 0.35 * arm)
+    near = np.clip(visited, centre - half, centre + half)
+    corners = np.concatenate([*lines, projected(near) + [0, 2.5 * arm]])
     low, high = corners.min(axis=0), corners.max(axis=0)
     view = View((low + high) / 2, 0.52 * (high - low))
-    view.show(ax)
-    largest = largest_controls(environment, trajectory)
-    rotors = system.inputs == "rotors"
-    keywords = {"arm": drawn, "floor": floor, "view": view, "rotors": rotors}
-    return {**keywords, "largest": largest if rotors else largest[0]}
+    view.show(canvas.ax)
 
-
-def draw_quadrotor(
-    ax: Axes,
-    x: np.ndarray,
-    u: np.ndarray,
-    arm: float,
-    floor: float,
-    view: View,
-    rotors: bool,
-    largest: Any,
-) -> None:
-    """Two crossed arms with four rotors, the front one in amber; their thrusts, or the
-    thrust of all; and the shadow on the floor."""
-    place, turned = np.asarray(x[:3], float), attitude(x)
-    hubs = place + arm * ARMS @ turned.T
-    discs = [hub + 0.48 * arm * (RIM + [0, 0, 0.3]) @ turned.T for hub in hubs]
-    for rotor in (*discs, place + 0.3 * arm * RIM @ turned.T):
-        flat = rotor * [1, 1, 0] + [0, 0, floor]
-        body(ax, seen(flat), color=NEUTRAL, alpha=0.3, zorder=1)
-    # What is farther away is drawn first.
-    away = np.cross(EYE[0], EYE[1])
-    order = np.argsort(hubs @ away)
-    for i in order:
-        color = FRONT if i == 0 else BODY
-        link(ax, seen(place), seen(hubs[i]), color=color, width=5)
-    disc(ax, seen(place), 0.24 * arm, zorder=2)
-    for i in order:
-        color = FRONT if i == 0 else SECOND
-        body(ax, seen(discs[i]), color=color, alpha=0.65)
-    up = turned[:, 2]
-    if rotors:
+    def draw(x: Vector, u: Vector) -> None:
+        place, turned = np.asarray(x[:3], float), attitude(x)
+        hubs = place + arm * ARMS @ turned.T
+        discs = [hub + 0.48 * arm * (RIM + [0, 0, 0.3]) @ turned.T for hub in hubs]
+        for rotor in (*discs, place + 0.3 * arm * RIM @ turned.T):
+            shadow = projected(rotor * [1, 1, 0] + [0, 0, floor])
+            canvas.polygon(shadow, color=NEUTRAL, alpha=0.3, zorder=1)
+        # What is farther away is drawn first.
+        order = np.argsort(hubs @ np.cross(RIGHT, UP))
         for i in order:
-            share = float(shares(u, largest)[i])
-            start = hubs[i] + 0.2 * arm * up
-            push(ax, seen(start), seen(2.8 * arm * share * up), 2.0 * arm)
-    else:
-        share = float(shares(u[:1], largest)[0])
-        push(ax, seen(place + 0.2 * arm * up), seen(3 * arm * share * up), 2 * arm)
-    view.follow(ax, seen(place), 1.5 * arm)
+            color = FRONT if i == 0 else BODY
+            canvas.link(projected(place), projected(hubs[i]), width=5, color=color)
+        canvas.disc(projected(place), 0.24 * arm)
+        for i in order:
+            color = FRONT if i == 0 else SECOND
+            canvas.polygon(projected(discs[i]), color=color, alpha=0.65)
+        up, shares = turned[:, 2], episode.shares(u)
+        if system.inputs == "rotors":
+            thrusts = [(hubs[i], 2.8 * arm * shares[i]) for i in order]
+        else:
+            thrusts = [(place, 3 * arm * shares[0])]
+        for foot, thrust in thrusts:
+            start, along = projected(foot + 0.2 * arm * up), projected(thrust * up)
+            canvas.force(start, along, 2 * arm)
+        view.follow(canvas.ax, projected(place), 1.5 * arm)
 
-
-def trace_quadrotor(states: np.ndarray, **keywords: Any) -> np.ndarray:
-    """Where it has flown, in the picture."""
-    return seen(states[:, :3])
-
-
-add_drawing(Drawing(draw_quadrotor, setup_quadrotor, trace_quadrotor), Quadrotor)
+    return Drawing(draw, lambda states: projected(states[:, :3]))

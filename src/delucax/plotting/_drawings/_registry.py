@@ -1,33 +1,66 @@
 """Which drawing belongs to which plant."""
 
+import functools
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
-
-import numpy as np
-from matplotlib.axes import Axes
+from typing import Any
 
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
-from ...simulation import Trajectory
-from ...systems import AbstractSystem
+from ...systems import (
+    AbstractSystem,
+    Acrobot,
+    CartPole,
+    DoubleIntegrator,
+    DynamicBicycle,
+    KinematicBicycle,
+    Lorenz,
+    MassSpringDamper,
+    MountainCar,
+    Pendulum,
+    PermanentMagnetMotor,
+    PlanarQuadrotor,
+    Quadrotor,
+    Reacher,
+    TwoTank,
+)
+from ._arms import acrobot, pendulum, reacher
+from ._canvas import Canvas
+from ._cars import car
+from ._cart_pole import cart_pole, linear_cart_pole
+from ._drawing import Drawing, Episode, layers, Setup
+from ._lung import lung, STATE_NAMES as LUNG_STATES
+from ._masses import double_integrator, mass_spring_damper
+from ._motor import motor
+from ._mountain_car import mountain_car
+from ._planar_quadrotor import planar_quadrotor
+from ._quadrotor import quadrotor
+from ._state_space import butterfly, state_space
+from ._tanks import two_tank
 
 
-class Drawing(NamedTuple):
-    """A draw function, what prepares the axes for it, and the path that it leaves.
-
-    `trace(states, **keywords)` is where the plant has been, shape `(n, 2)`, with the
-    keywords that `setup` returned.
-    """
-
-    draw: Callable[..., Any]
-    setup: Callable[[Axes, Environment, Trajectory], Mapping[str, Any] | None] | None
-    trace: Callable[..., np.ndarray] | None = None
-
-
-_DRAWINGS: dict[type, Drawing] = {}
+_BY_TYPE: dict[type, Setup] = {
+    Acrobot: acrobot,
+    CartPole: cart_pole,
+    DoubleIntegrator: double_integrator,
+    DynamicBicycle: car,
+    KinematicBicycle: car,
+    Lorenz: butterfly,
+    MassSpringDamper: mass_spring_damper,
+    MountainCar: mountain_car,
+    Pendulum: pendulum,
+    PermanentMagnetMotor: motor,
+    PlanarQuadrotor: planar_quadrotor,
+    Quadrotor: quadrotor,
+    Reacher: reacher,
+    TwoTank: two_tank,
+    AbstractDynamics: state_space,  # what has no drawing of its own
+}
 # A linear model keeps the names of what it was made of, and no more.
-_LINEAR: dict[tuple[tuple[str, ...], tuple[str, ...]], Drawing] = {}
+_BY_NAMES: dict[tuple[tuple[str, ...], tuple[str, ...]], Setup] = {
+    (("position", "angle", "velocity", "spin"), ("force",)): linear_cart_pole,
+    **{(states, ("u_in", "u_out")): lung for states in LUNG_STATES},
+}
 
 
 def register_drawing(
@@ -89,47 +122,37 @@ def register_drawing(
             raise ValueError(
                 f"register_drawing: {name} must be a function, got {given!r}."
             )
-    _DRAWINGS[system_class] = Drawing(draw, setup)
+    _BY_TYPE[system_class] = functools.partial(_user_drawing, draw, setup)
 
 
-def add_drawing(drawing: Drawing, *kinds: type) -> None:
-    """Register a drawing that leaves a path too, for several kinds of plants."""
-    for kind in kinds:
-        _DRAWINGS[kind] = drawing
+def _user_drawing(
+    draw: Callable[..., Any],
+    setup: Callable[..., Any] | None,
+    canvas: Canvas,
+    episode: Episode,
+) -> Drawing:
+    """A drawing of the functions that were registered for a class."""
+    if setup is None:
+        return Drawing(functools.partial(draw, canvas.ax), autoscale=True)
+    keywords = setup(canvas.ax, episode.environment, episode.trajectory)
+    if keywords is not None and not isinstance(keywords, Mapping):
+        raise ValueError(
+            "animate: the setup of a drawing must return a dictionary or None, got "
+            f"{type(keywords).__name__}."
+        )
+    return Drawing(functools.partial(draw, canvas.ax, **(keywords or {})))
 
 
-def add_linear_drawing(
-    drawing: Drawing, states: tuple[str, ...], controls: tuple[str, ...]
-) -> None:
-    """Register a drawing for linear models whose states and controls are called so."""
-    _LINEAR[states, controls] = drawing
-
-
-def _layers(environment: Environment) -> list[Any]:
-    """The dynamics and what they wrap, the innermost system last."""
-    layers: list[Any] = [environment.dynamics]
-    while True:
-        inner = getattr(layers[-1], "system", getattr(layers[-1], "dynamics", None))
-        if not isinstance(inner, AbstractSystem | AbstractDynamics):
-            return layers
-        layers.append(inner)
-
-
-def system_of(environment: Environment) -> Any:
-    """The innermost system of an environment; its dynamics if they hold none."""
-    return _layers(environment)[-1]
-
-
-def drawing_for(environment: Environment) -> Drawing:
+def drawing_for(environment: Environment) -> Setup:
     """The drawing for the plant of an environment, the most particular one first.
 
     Looks at the dynamics and at what they wrap, the innermost system first. What has no
     drawing of its own has that of all dynamics.
     """
-    layers = _layers(environment)
-    for layer in reversed(layers):
+    wrapped = layers(environment)
+    for layer in reversed(wrapped):
         for cls in type(layer).__mro__:
-            if cls in _DRAWINGS and cls is not AbstractDynamics:
-                return _DRAWINGS[cls]
-    names = tuple(layers[-1].state_names), tuple(layers[-1].control_names)
-    return _LINEAR.get(names, _DRAWINGS[AbstractDynamics])
+            if cls in _BY_TYPE and cls is not AbstractDynamics:
+                return _BY_TYPE[cls]
+    names = tuple(wrapped[-1].state_names), tuple(wrapped[-1].control_names)
+    return _BY_NAMES.get(names, _BY_TYPE[AbstractDynamics])

@@ -9,7 +9,6 @@ import jax.random as jr
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ..._module import replace
 from ...controllers import Deep, Gaussian, MLP
 from ...environments import pendulum
 from ...simulation import rollout
@@ -20,7 +19,8 @@ from ...training import (
     LikelihoodRatio,
     scored_cost,
 )
-from ._finding import Claim, Finding
+from .._swing_up import spread_starts
+from ._finding import Claim, draw_panels, Finding
 
 
 BUDGET, HORIZON = 128, 20
@@ -34,8 +34,6 @@ DRAWN = 8
 
 def estimator_variance(small: bool = False) -> Finding:
     """Networks of growing width, of one pendulum's control."""
-    import matplotlib.pyplot as plt
-
     # Nearly all of the time is compilation, of each estimator at each width.
     widths = (4, 64) if small else (4, 8, 16, 32, 64, 128, 256)
     draws = 64 if small else 256
@@ -45,7 +43,7 @@ def estimator_variance(small: bool = False) -> Finding:
     def loss(controller, key):
         return rollout(env, controller, key=key, keep=(), throw=False).total_cost
 
-    found: dict[str, list[float]] = {}
+    ratios: dict[str, list[float]] = {}
     rows, sizes = [], []
     for width in widths:
         policy = MLP(2, 1, width, 1, key=jr.key(0))
@@ -71,11 +69,11 @@ def estimator_variance(small: bool = False) -> Finding:
         row: dict[str, Any] = {"parameters": len(exact)}
         for name, drawn in samples.items():
             row[name] = float(jnp.sum(jnp.var(drawn, axis=0)) / (exact @ exact))
-            found.setdefault(name, []).append(row[name])
+            ratios.setdefault(name, []).append(row[name])
         rows.append(row)
     slope = {
         name: float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
-        for name, values in found.items()
+        for name, values in ratios.items()
         if min(values) > 0
     }
     over = [_at_horizon(T, draws) for T in (LONGER[::4] if small else LONGER)]
@@ -85,8 +83,8 @@ def estimator_variance(small: bool = False) -> Finding:
         Claim(
             "The analytic gradient has no variance in a deterministic system (below "
             "1e-9 of its squared norm)",
-            f"{max(found['analytic']):.1e}",
-            bool(max(found["analytic"]) < 1e-9),
+            f"{max(ratios['analytic']):.1e}",
+            bool(max(ratios["analytic"]) < 1e-9),
         ),
         Claim(
             "That of evolution strategies grows in proportion to the parameters "
@@ -97,9 +95,9 @@ def estimator_variance(small: bool = False) -> Finding:
         Claim(
             "That of REINFORCE does not depend on the number of parameters (slope -0.2 "
             "to 0.2), but adds to the problem's own",
-            f"slope {slope['REINFORCE']:.2f}, {found['REINFORCE'][-1]:.3g} times the "
+            f"slope {slope['REINFORCE']:.2f}, {ratios['REINFORCE'][-1]:.3g} times the "
             "squared gradient",
-            bool(abs(slope["REINFORCE"]) <= 0.2 and found["REINFORCE"][-1] > 0),
+            bool(abs(slope["REINFORCE"]) <= 0.2 and ratios["REINFORCE"][-1] > 0),
         ),
         Claim(
             "Over a long horizon, with starts at random, the analytic gradient loses: "
@@ -111,19 +109,17 @@ def estimator_variance(small: bool = False) -> Finding:
             bool(lost),
         ),
     ]
-    figure, (ax, long) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-    for name, values in found.items():
+    ax, long = draw_panels(2, (9, 3.4))
+    for name, values in ratios.items():
         if min(values) > 0:
             ax.loglog(sizes, values, "o-", ms=3, label=name)
     ax.set(xlabel="parameters", ylabel="variance / squared gradient")
     ax.xaxis.set_minor_formatter("")
-    ax.grid(alpha=0.25, lw=0.5)
     ax.legend(frameon=False, fontsize=8)
     for name in ("analytic", "REINFORCE"):
         each = [row[name] for row in over]
         long.loglog([row["horizon"] for row in over], each, "o-", ms=3, label=name)
     long.set(xlabel="horizon, steps", ylabel="variance")
-    long.grid(alpha=0.25, lw=0.5)
     long.legend(frameon=False, fontsize=8)
     notes = (
         f"Networks of one layer, {widths[0]} to {widths[-1]} wide, for the pendulum, "
@@ -137,17 +133,14 @@ def estimator_variance(small: bool = False) -> Finding:
         "Variance of gradient estimators",
         claims,
         {"Variance / squared gradient": rows, "Against the horizon": over},
-        {"estimator_variance": figure},
+        {"estimator_variance": ax.figure},
         notes,
     )
 
 
 def _at_horizon(horizon: int, draws: int) -> dict[str, Any]:
     """Variances over a horizon, the start drawn, and how large the gradient is."""
-    corner = np.array([np.pi, 8.0])
-    env = replace(
-        pendulum(), {"initial_state.low": -corner, "initial_state.high": corner}
-    )
+    env = spread_starts(pendulum())
     policy = Deep(env, width=32, depth=1, key=jr.key(0))
     noisy = Gaussian(policy, -1.0, bounds=env.control_bounds)
     one = expected_cost(env, batch=1, horizon=horizon)

@@ -3,6 +3,11 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
+from ...experiments import Bootstrap
+
 
 @dataclass(frozen=True)
 class Claim:
@@ -29,3 +34,29 @@ class Finding:
     tables: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
     figures: dict[str, Any] = field(default_factory=dict)
     notes: str = ""
+
+
+def mean_and_half_width(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """The mean, and half of its 95% interval."""
+    half = 1.96 * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+    return float(values.mean()), float(half)
+
+
+def paired_ratio(
+    one: Float[np.ndarray, " n"], other: Float[np.ndarray, " n"]
+) -> tuple[float, float, float]:
+    """The ratio of the means over the same seeds, and its 95% interval."""
+    pairs = np.stack([one, other], axis=1)
+    return Bootstrap(statistic=np.mean).paired([pairs], ratio=True)
+
+
+def draw_panels(count: int, size: tuple[float, float], **options: Any) -> Any:
+    """The axes of a figure with panels beside each other, which have faint grids; with
+    the options of Matplotlib's `subplots`."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(1, count, **options)
+    for ax in np.ravel(axes):
+        ax.grid(alpha=0.25, lw=0.5)
+    return axes

@@ -11,9 +11,8 @@ from ... import controllers
 from ...costs import Quadratic
 from ...dynamics import LinearDynamics
 from ...environments import Environment
-from ...experiments._statistics import mean_and_half_width, paired_ratio
 from ...simulation import rollout
-from ._finding import Claim, Finding
+from ._finding import Claim, draw_panels, Finding, mean_and_half_width, paired_ratio
 
 
 STEPS = 1000
@@ -21,8 +20,6 @@ STEPS = 1000
 
 def lq_perturbations(small: bool = False) -> Finding:
     """Zero control diverges on this plant: LQR is the row to beat."""
-    import matplotlib.pyplot as plt
-
     # Over fewer steps the time that GPC takes to learn would count for more.
     seeds, steps = 5 if small else 20, STEPS
     A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
@@ -49,12 +46,12 @@ def lq_perturbations(small: bool = False) -> Finding:
 
         return jax.vmap(one)(w)
 
-    found = {
+    costs_of = {
         (name, kind): np.asarray(costs(controller, jnp.asarray(w, A.dtype)))
         for name, controller in contenders.items()
         for kind, w in kinds.items()
     }
-    rows, means = [], {key: value.mean(axis=1) for key, value in found.items()}
+    rows, means = [], {key: value.mean(axis=1) for key, value in costs_of.items()}
     for kind in kinds:
         for name in contenders:
             mean, half = mean_and_half_width(means[name, kind])
@@ -82,13 +79,12 @@ def lq_perturbations(small: bool = False) -> Finding:
                 bool(ratio[kind][2] <= 0.25 and other[2] < 1),
             )
         )
-    figure, axes = plt.subplots(1, 3, figsize=(10, 3), layout="constrained")
+    axes = draw_panels(3, (10, 3))
     for ax, kind in zip(axes, kinds, strict=True):
         for name in contenders:
-            average = np.cumsum(found[name, kind], axis=1) / np.arange(1, steps + 1)
+            average = np.cumsum(costs_of[name, kind], axis=1) / np.arange(1, steps + 1)
             ax.plot(average.mean(axis=0), label=name, lw=1.5)
         ax.set(title=kind, xlabel="step", yscale="log")
-        ax.grid(alpha=0.25, lw=0.5)
     axes[0].set_ylabel("average cost so far")
     axes[0].legend(frameon=False)
     notes = (
@@ -100,6 +96,6 @@ def lq_perturbations(small: bool = False) -> Finding:
         "Linear-quadratic control with adversarial perturbations",
         claims,
         {"Average cost": rows},
-        {"lq_perturbations": figure},
+        {"lq_perturbations": axes[0].figure},
         notes,
     )

@@ -13,7 +13,7 @@ from ...dynamics import AbstractDynamics
 from ...dynamics._wrapper import AbstractWrapper
 from ...environments import planar_quadrotor
 from ...planning import count_evaluations, ilqr
-from ._finding import Claim, Finding
+from ._finding import Claim, draw_panels, Finding
 
 
 STEPS, SPACING = 100, 1e-2
@@ -22,8 +22,6 @@ SAMPLES = (16, 64, 256)
 
 def oracle_complexity(small: bool = False) -> Finding:
     """Plan a flight of the planar quadrotor with three kinds of derivatives."""
-    import matplotlib.pyplot as plt
-
     dynamics = planar_quadrotor().dynamics
     _, hover = dynamics.equilibrium()
     cost = Quadratic(
@@ -48,9 +46,9 @@ def oracle_complexity(small: bool = False) -> Finding:
         f"{samples} samples": lambda d, samples=samples: solve(_Sampled(d, samples))
         for samples in drawn
     }
-    found = {name: count_evaluations(f, dynamics) for name, f in kinds.items()}
-    best = float(found["automatic"][0].cost)
-    above = {name: float(plan.cost) / best - 1 for name, (plan, _) in found.items()}
+    solved = {name: count_evaluations(f, dynamics) for name, f in kinds.items()}
+    best = float(solved["automatic"][0].cost)
+    above = {name: float(plan.cost) / best - 1 for name, (plan, _) in solved.items()}
     rows = [
         {
             "derivatives": name,
@@ -60,7 +58,7 @@ def oracle_complexity(small: bool = False) -> Finding:
             "tangents": count.tangent,
             "cotangents": count.cotangent,
         }
-        for name, (plan, count) in found.items()
+        for name, (plan, count) in solved.items()
     ]
     knot = {
         name: _calls_of_a_knot(dynamics, x0, hover, spacing)
@@ -90,14 +88,13 @@ def oracle_complexity(small: bool = False) -> Finding:
             all(above[name] > 1e-3 for name in sampled),
         ),
     ]
-    figure, ax = plt.subplots(figsize=(5.5, 3.4), layout="constrained")
-    for name, (plan, count) in found.items():
+    ax = draw_panels(1, (5.5, 3.4))
+    for name, (plan, count) in solved.items():
         trace = np.asarray(plan.trace)[: int(plan.iterations) + 1]
         calls = np.linspace(0, count.primal, len(trace) + 1)[1:]
         style: Any = {"lw": 1} if name in sampled else {"marker": "o", "ms": 3}
         ax.loglog(calls, np.maximum(trace - best, 1e-7), label=name, **style)
     ax.set(xlabel="calls of the dynamics", ylabel="cost above the optimum")
-    ax.grid(alpha=0.25, lw=0.5)
     ax.legend(frameon=False, fontsize=8)
     notes = (
         f"The planar quadrotor, {STEPS} steps of 0.05 s from (1, 1) at rest to the "
@@ -112,7 +109,7 @@ def oracle_complexity(small: bool = False) -> Finding:
         "Dynamics calls of model-based planning",
         claims,
         {"One plan": rows},
-        {"oracle_complexity": figure},
+        {"oracle_complexity": ax.figure},
         notes,
     )
 

@@ -7,17 +7,17 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from jaxtyping import Float
 
 from ... import controllers
 from ...controllers import LQR, Zero
 from ...costs import Quadratic
 from ...dynamics import Discretized, linearize
 from ...environments import Environment
-from ...experiments._statistics import mean_and_half_width, paired_ratio
 from ...planning import ilqr
 from ...simulation import rollout
 from ...systems import Pendulum
-from ._finding import Claim, Finding
+from ._finding import Claim, draw_panels, Finding, mean_and_half_width, paired_ratio
 
 
 DT, STEPS, BOUND, AHEAD = 0.05, 600, 10.0, 20
@@ -25,8 +25,6 @@ DT, STEPS, BOUND, AHEAD = 0.05, 600, 10.0, 20
 
 def pendulum_shock(small: bool = False) -> Finding:
     """Regulate the inverted pendulum from off upright."""
-    import matplotlib.pyplot as plt
-
     seeds, steps = (4, 300) if small else (20, STEPS)
     dynamics = Discretized(Pendulum(), dt=DT, solver=diffrax.Euler())
     cost = Quadratic(jnp.eye(2), jnp.eye(1))
@@ -63,7 +61,7 @@ def pendulum_shock(small: bool = False) -> Finding:
             dynamics, cost, base=plan, horizon=learner.loop.horizon
         ),
     }
-    found = {}
+    costs_of = {}
     for name, make in contenders.items():
 
         @jax.jit
@@ -77,9 +75,9 @@ def pendulum_shock(small: bool = False) -> Finding:
 
         for world, w in worlds.items():
             w = jnp.asarray(w, starts.dtype)
-            found[name, world] = np.asarray(costs(plans, starts, w))
-    during = {key: value[:, middle].mean(axis=1) for key, value in found.items()}
-    means = {key: value.mean(axis=1) for key, value in found.items()}
+            costs_of[name, world] = np.asarray(costs(plans, starts, w))
+    during = {key: value[:, middle].mean(axis=1) for key, value in costs_of.items()}
+    means = {key: value.mean(axis=1) for key, value in costs_of.items()}
     rows = []
     for name in contenders:
         row: dict[str, Any] = {"controller": name}
@@ -88,57 +86,42 @@ def pendulum_shock(small: bool = False) -> Finding:
             row |= {f"{world}: cost": mean, f"{world}: +-": half}
         row["during the shock"] = during[name, "shock"].mean()
         rows.append(row)
-    gpc = paired_ratio(during["GPC", "shock"], during["LQR", "shock"])
-    ada = paired_ratio(means["AdaGPC", "shock"], means["GPC", "shock"])
-    plan = paired_ratio(means["iLQR, with gains", "no noise"], means["GPC", "no noise"])
-    late = paired_ratio(during["GPC", "shock"], during["iLQR, with gains", "shock"])
-    again = paired_ratio(
-        means["MPC", "no noise"], means["iLQR, with gains", "no noise"]
-    )
-    unaware = paired_ratio(during["GPC", "shock"], during["MPC", "shock"])
-    both = paired_ratio(
-        during["GPC around the plan", "shock"], during["iLQR, with gains", "shock"]
-    )
+    quiet = {name: means[name, "no noise"] for name in contenders}
+    shocked = {name: during[name, "shock"] for name in contenders}
+    over_all = {name: means[name, "shock"] for name in contenders}
+    plan = paired_ratio(quiet["iLQR, with gains"], quiet["GPC"])
     claims = [
         Claim(
             "Without noise the plan of iLQR costs no more than online control",
             f"{plan[0]:.3f} times GPC",
             bool(plan[2] <= 1.001),
         ),
-        Claim(
+        _at_most(
             "Without noise MPC costs at most 1.01 times what the plan does",
-            f"{again[0]:.4f} times ({again[1]:.4f} to {again[2]:.4f})",
-            bool(again[2] <= 1.01),
+            *(quiet["MPC"], quiet["iLQR, with gains"], 1.01, 4),
         ),
-        Claim(
+        _at_most(
             "During the shock GPC costs less than LQR",
-            f"{gpc[0]:.3f} times ({gpc[1]:.3f} to {gpc[2]:.3f})",
-            bool(gpc[2] < 1),
+            *(shocked["GPC"], shocked["LQR"]),
         ),
-        Claim(
+        _at_most(
             "During the shock GPC costs less than iLQR with its gains",
-            f"{late[0]:.3f} times ({late[1]:.3f} to {late[2]:.3f})",
-            bool(late[2] < 1),
+            *(shocked["GPC"], shocked["iLQR, with gains"]),
         ),
-        Claim(
+        _at_most(
             "During the shock GPC costs less than MPC, which plans again at each step",
-            f"{unaware[0]:.3f} times ({unaware[1]:.3f} to {unaware[2]:.3f})",
-            bool(unaware[2] < 1),
+            *(shocked["GPC"], shocked["MPC"]),
         ),
-        Claim(
+        _at_most(
             "AdaGPC costs at most 1.02 times what GPC does over the run with the shock",
-            f"{ada[0]:.3f} times ({ada[1]:.3f} to {ada[2]:.3f})",
-            bool(ada[2] <= 1.02),
+            *(over_all["AdaGPC"], over_all["GPC"], 1.02),
         ),
-        Claim(
+        _at_most(
             "GPC around the plan costs less during the shock than the plan alone",
-            f"{both[0]:.3f} times ({both[1]:.3f} to {both[2]:.3f})",
-            bool(both[2] < 1),
+            *(shocked["GPC around the plan"], shocked["iLQR, with gains"]),
         ),
     ]
-    figure, axes = plt.subplots(
-        1, 2, figsize=(9, 3.2), layout="constrained", sharey=True
-    )
+    axes = draw_panels(2, (9, 3.2), sharey=True)
     times = DT * np.arange(steps)
     for ax, world in zip(axes, worlds, strict=True):
         for name in contenders:
@@ -146,15 +129,13 @@ def pendulum_shock(small: bool = False) -> Finding:
                 # Some lie on top of others.
                 dashed = "gains" in name or "around" in name or name == "MPC"
                 style = "--" if dashed else "-"
-                mean_cost = found[name, world].mean(axis=0)
+                mean_cost = costs_of[name, world].mean(axis=0)
                 ax.semilogy(times, mean_cost, style, lw=1.4, label=name)
         ax.set(title=world, xlabel="time, s", ylim=(1e-4, 50))
-        ax.grid(alpha=0.25, lw=0.5)
     axes[1].axvspan(DT * (steps // 3), DT * (2 * steps // 3), color="0.5", alpha=0.15)
     axes[0].set_ylabel("cost of a step")
-    figure.legend(
-        *axes[0].get_legend_handles_labels(), loc="outside right", frameon=False
-    )
+    labels = axes[0].get_legend_handles_labels()
+    axes[0].figure.legend(*labels, loc="outside right", frameon=False)
     notes = (
         "Without feedback rounding alone lets the pendulum fall. "
         f"Upright, g = 10, explicit Euler of {DT} s, torque at most {BOUND:g}, Q = R = "
@@ -168,6 +149,20 @@ def pendulum_shock(small: bool = False) -> Finding:
         "Adaptive control for the inverted pendulum",
         claims,
         {"Average cost": rows},
-        {"pendulum_shock": figure},
+        {"pendulum_shock": axes[0].figure},
         notes,
     )
+
+
+def _at_most(
+    statement: str,
+    costs: Float[np.ndarray, " n"],
+    others: Float[np.ndarray, " n"],
+    limit: float | None = None,
+    digits: int = 3,
+) -> Claim:
+    """A claim that the ratio of costs is at most `limit`, or below 1."""
+    interval = paired_ratio(costs, others)
+    ratio, low, high = (f"{end:.{digits}f}" for end in interval)
+    holds = interval[2] < 1 if limit is None else interval[2] <= limit
+    return Claim(statement, f"{ratio} times ({low} to {high})", bool(holds))

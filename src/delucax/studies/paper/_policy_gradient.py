@@ -1,6 +1,8 @@
 """The first figure, right: the gradient through the rollout beside evolution
 strategies."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -10,8 +12,14 @@ import optax
 
 from ...controllers import Linear
 from ...environments import pendulum
-from ...training import analytic, EvolutionStrategies, expected_cost, fit
-from ._finding import Claim, Finding
+from ...training import (
+    analytic,
+    EvolutionStrategies,
+    expected_cost,
+    fit,
+    Fitted,
+)
+from ._finding import Claim, draw_panels, Finding
 
 
 HORIZON, RATE, GOAL = 50, 0.01, 2.0
@@ -20,24 +28,12 @@ TWICE = 2 * RATE
 
 def policy_gradient(small: bool = False) -> Finding:
     """A linear policy of the pendulum, hanging at first, with torque up to 10."""
-    import matplotlib.pyplot as plt
-
-    env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
-    mean_cost = expected_cost(env, batch=1, horizon=HORIZON)
-
-    def loss(controller, key):
-        return mean_cost(controller, key) / HORIZON
-
     steps, seeds = (400, 3) if small else (1500, 5)
     scales, pairs = ((0.1,), (1, 16)) if small else ((0.05, 0.1, 0.3), (1, 4, 16, 64))
-    start = Linear(jnp.zeros((1, 2)))
 
     def train(estimator, seed, rate=RATE):
-        key = jax.random.key(seed)
-        options: Any = dict(key=key, gradient=estimator, progress=False)
-        return np.asarray(
-            fit(loss, start, optax.sgd(rate), steps, **options).history.loss
-        )
+        options: Any = dict(gradient=estimator, progress=False)
+        return np.asarray(train_linear(steps, seed, rate, **options).history.loss)
 
     exact = train(analytic, 0)
     first, faster = _first(exact), _first(train(analytic, 0, TWICE))
@@ -79,7 +75,7 @@ def policy_gradient(small: bool = False) -> Finding:
             least is None or (first is not None and least > first),
         ),
     ]
-    figure, ax = plt.subplots(figsize=(7.5, 3.4), layout="constrained")
+    ax = draw_panels(1, (7.5, 3.4))
     ax.plot(np.arange(1, steps + 1), exact, "k", lw=2, label="through the rollout")
     for (scale, count), runs in curves.items():
         x = 2 * count * np.arange(1, steps + 1)
@@ -94,8 +90,7 @@ def policy_gradient(small: bool = False) -> Finding:
         )
     ax.axhline(GOAL, color="0.5", lw=0.8, ls=":")
     ax.set(xscale="log", xlabel="rollouts", ylabel="mean cost of a step")
-    ax.grid(alpha=0.25, lw=0.5)
-    figure.legend(frameon=False, fontsize=7, loc="outside right center")
+    ax.figure.legend(frameon=False, fontsize=7, loc="outside right center")
     notes = (
         f"u = -K (angle, velocity), the angle not wrapped; {HORIZON} steps of 0.05 s "
         f"from hanging at rest, torque at most 10; descent with rate {RATE} on the "
@@ -106,9 +101,26 @@ def policy_gradient(small: bool = False) -> Finding:
         "Policy gradient of the pendulum",
         claims,
         {"Rollouts to cost 2.0": rows},
-        {"policy_gradient": figure},
+        {"policy_gradient": ax.figure},
         notes,
     )
+
+
+@functools.cache
+def _mean_cost() -> Callable[..., Any]:
+    """Of a step from hanging. One object, so that a second seed does not compile."""
+    env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
+    total = expected_cost(env, batch=1, horizon=HORIZON)
+    return lambda controller, key: total(controller, key) / HORIZON
+
+
+def train_linear(
+    steps: int, seed: int = 0, rate: float = RATE, **options: Any
+) -> Fitted:
+    """Descend with a linear policy from zero; with the options of `fit`."""
+    options["key"] = jax.random.key(seed)
+    start = Linear(jnp.zeros((1, 2)))
+    return fit(_mean_cost(), start, optax.sgd(rate), steps, **options)
 
 
 def descent_claim(first: int | None, faster: int | None) -> Claim:

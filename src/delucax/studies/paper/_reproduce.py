@@ -1,8 +1,6 @@
 """The paper from one command."""
 
-import base64
 import html
-import io
 import time
 import traceback
 from collections.abc import Callable, Iterable
@@ -10,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..._extras import extra
-from ...experiments._provenance import device, provenance
-from ...experiments._report import _document, _table
+from ...experiments import Page
 from ._estimator_variance import estimator_variance
 from ._finding import Claim, Finding
 from ._lq_perturbations import lq_perturbations
@@ -69,7 +66,7 @@ def reproduce(
 
         ```python
         import tempfile
-        from delucax import experiments
+        from delucax import studies
 
         with tempfile.TemporaryDirectory() as folder:
             claims = studies.reproduce("wall-clock", folder, small=True)
@@ -87,21 +84,14 @@ def reproduce(
     chosen = list(STUDIES) if "all" in chosen else chosen
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    sections, rows, begun = [], [], time.perf_counter()
-    for k, name in enumerate(chosen):
-        say(f"[{k + 1}/{len(chosen)}] {name}")
-        start = time.perf_counter()
-        options = {}
-        if name == "ventilator":
-            folder = out / ("lung-small" if small else "lung")
-            options = {"out": folder, "say": say}
-        try:
-            found = STUDIES[name](small, **options)
-        except Exception as error:
-            (out / f"{name}.txt").write_text(traceback.format_exc())
-            failed = Claim("The study runs", f"{type(error).__name__}: {error}", False)
-            found = Finding(name, [failed], notes=f"The traceback is in {name}.txt.")
-        for claim in found.claims:
+    sections: list[str] = []
+    rows: list[dict[str, Any]] = []
+    start = time.perf_counter()
+    for k, name in enumerate(chosen, 1):
+        say(f"[{k}/{len(chosen)}] {name}")
+        study_start = time.perf_counter()
+        finding = _run(name, out, small, say)
+        for claim in finding.claims:
             say(f"  {'holds' if claim.holds else 'DOES NOT HOLD'}: {claim.statement}")
             say(f"    {claim.measured}")
             rows.append(
@@ -112,63 +102,57 @@ def reproduce(
                     "holds": claim.holds,
                 }
             )
-        for title, figure in found.figures.items():
+        for title, figure in finding.figures.items():
             if not isinstance(figure, Path):
                 figure.savefig(out / f"{title}.png", dpi=150)
-        sections.append(_section(found))
+        # Drawn once: figures take as long as some studies.
+        sections += _section(finding)
         pd.DataFrame(rows).to_csv(out / "claims.csv", index=False)
-        (out / "report.html").write_text(_page(sections, rows))
-        say(f"  {time.perf_counter() - start:.0f} s")
+        _page(sections, rows).write(out / "report.html")
+        say(f"  {time.perf_counter() - study_start:.0f} s")
     held = sum(row["holds"] for row in rows)
     say(
         f"{held} of {len(rows)} claims hold; {out / 'report.html'}, in "
-        f"{time.perf_counter() - begun:.0f} s"
+        f"{time.perf_counter() - start:.0f} s"
     )
     return rows
 
 
-def _page(sections: list[str], rows: list[dict[str, Any]]) -> str:
-    found = provenance(Path())
-    versions = ", ".join(f"{k} {v}" for k, v in found["versions"].items() if v)
-    made = f"{found['date'][:10]}; commit {found['commit']}; {device()}; {versions}"
+def _run(name: str, out: Path, small: bool, say: Callable[[str], Any]) -> Finding:
+    """What a study finds: if it fails, that."""
+    options = {}
+    if name == "ventilator":
+        options = {"out": out / ("lung-small" if small else "lung"), "say": say}
+    try:
+        return STUDIES[name](small, **options)
+    except Exception as error:
+        (out / f"{name}.txt").write_text(traceback.format_exc())
+        failed = Claim("The study runs", f"{type(error).__name__}: {error}", False)
+        return Finding(name, [failed], notes=f"The traceback is in {name}.txt.")
+
+
+def _page(sections: list[str], rows: list[dict[str, Any]]) -> Page:
     held = sum(row["holds"] for row in rows)
-    title = "The Deluca paper, reproduced"
-    body = [f"<h1>{title}</h1>", f"<p>{held} of {len(rows)} claims hold.</p>"]
-    body += [*sections, f"<p class='made'>{html.escape(made)}</p>"]
-    return _document(title, body)
+    page = Page("The Deluca paper, reproduced")
+    page.paragraph(f"{held} of {len(rows)} claims hold.")
+    page.parts.extend(sections)
+    page.provenance(Path())
+    return page
 
 
-def _section(found: Finding) -> str:
-    """What a study found, drawn once: figures take as long as some studies."""
-    body = [f"<h2>{html.escape(found.title)}</h2>"]
-    for claim in found.claims:
-        word = "holds" if claim.holds else "does not hold"
-        kind = "" if claim.holds else " class='bad'"
-        body.append(
-            f"<p><b{kind}>{word}</b>: {html.escape(claim.statement)}. Measured: "
-            f"{html.escape(claim.measured)}.</p>"
-        )
-    for figure in found.figures.values():
-        drawn = _image if isinstance(figure, Path) else _svg
-        body.append(f"<figure>{drawn(figure)}</figure>")
-    for title, table in found.tables.items():
+def _section(finding: Finding) -> list[str]:
+    """The parts of a page that show what a study found."""
+    section = Page(finding.title)
+    section.heading(finding.title)
+    for claim in finding.claims:
+        word = "<b>holds" if claim.holds else "<b class='bad'>does not hold"
+        text = f"{claim.statement}. Measured: {claim.measured}."
+        section.parts.append(f"<p>{word}</b>: {html.escape(text)}</p>")
+    for figure in finding.figures.values():
+        section.figure(figure)
+    for title, table in finding.tables.items():
         columns = list(table[0])
-        values = [[row.get(column) for column in columns] for row in table]
-        body += [f"<h3>{html.escape(title)}</h3>", _table(columns, values)]
-    body.append(f"<p class='made'>{html.escape(found.notes)}</p>")
-    return "\n".join(body)
-
-
-def _svg(figure: Any) -> str:
-    import matplotlib.pyplot as plt
-
-    text = io.StringIO()
-    figure.savefig(text, format="svg")
-    plt.close(figure)
-    return text.getvalue()[text.getvalue().index("<svg") :]
-
-
-def _image(path: Path) -> str:
-    content = base64.b64encode(path.read_bytes()).decode()
-    kind = path.suffix.removeprefix(".")
-    return f'<img src="data:image/{kind};base64,{content}" alt="{path.stem}">'
+        section.heading(title, 3)
+        section.table(columns, [[row.get(name) for name in columns] for row in table])
+    section.paragraph(finding.notes, "made")
+    return section.parts

@@ -13,11 +13,11 @@ from ._finding import Claim, Finding
 def ventilator(small: bool, out: Path, say: Callable[[str], Any]) -> Finding:
     """What `python -m delucax lung` finds, in the folder that it writes to."""
     lung_study(out, small=small, say=lambda line: say(f"  {line}"))
-    found = json.loads((out / "summary.json").read_text())
-    simulators = found["simulators"]
+    summary = json.loads((out / "summary.json").read_text())
+    simulators = summary["simulators"]
     worst = max(simulators["learned"].values())
-    relative = max(found["learned_over_wrong_physics"].values())
-    gains, shared = found["network_over_best_pid"], found["shared_over_best_pid"]
+    relative = max(summary["learned_over_wrong_physics"].values())
+    gains, shared = summary["network_over_best_pid"], summary["shared_over_best_pid"]
     whole = {name: value for name, value in shared.items() if math.isfinite(value)}
     claims = [
         Claim(
@@ -45,9 +45,9 @@ def ventilator(small: bool, out: Path, say: Callable[[str], Any]) -> Finding:
             bool(max(whole.values()) <= 0.8),
         ),
         Claim(
-            f"No pressure is above {found['abort']:g} cmH2O",
-            f"{found['highest_pressure']:.1f} cmH2O",
-            bool(found["highest_pressure"] <= found["abort"]),
+            f"No pressure is above {summary['abort']:g} cmH2O",
+            f"{summary['highest_pressure']:.1f} cmH2O",
+            bool(summary["highest_pressure"] <= summary["abort"]),
         ),
     ]
     rows: list[dict[str, Any]] = [

@@ -24,7 +24,7 @@ def wall_clock(small: bool = False) -> Finding:
     python_steps = 10**4 if small else 10**5
     chain_start_up, chain = _compiled(steps, None)
     batch_start_up, batch = _compiled(1000, LANES)
-    seconds = _take_turns([chain, batch, _gymnasium(python_steps)], runs)
+    seconds = _take_turns([chain, batch, gymnasium_run(python_steps)], runs)
     ours, each, theirs = (seconds / [steps, 1000 * LANES, python_steps]).T
     rows: list[dict[str, Any]] = [
         _row("delucax, one after the other", chain_start_up, ours),
@@ -70,8 +70,11 @@ def _compiled(steps: int, lanes: int | None) -> tuple[float, Callable[[], Any]]:
     return seconds, lambda: jax.block_until_ready(run(x0))
 
 
-def _gymnasium(steps: int) -> Callable[[], Any]:
-    """A run of its own pendulum."""
+def gymnasium_run(steps: int) -> Callable[[], Any]:
+    """A run of Gymnasium's own pendulum.
+
+    **Raises:** `ImportError` if it is not installed.
+    """
     env = extra("gymnasium", "gymnasium").make("Pendulum-v1").unwrapped
     env.reset(seed=0)
     action = np.zeros(1, np.float32)

@@ -1,5 +1,6 @@
 """How the controllers of the study do at the lungs: its rows, figures and words."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -8,16 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ... import lung
 from ..._module import save
+from ..._typing import PRNGKey
 from ...environments import Environment
-from ...lung._data import LENGTH
-from ...lung._policies import Breathing
-from ...lung._runner import ABORT
-from ...lung._stacking import count_of, repeat, taken, unstack
-from ...lung._waveform import at_pip, BreathWaveform
 from ...simulation import rollout
 from ._contenders import Contender
-from ._size import BREATH, SEEN, SHOWN, UNSEEN
+from ._size import ABORT, BREATH, INSPIRATION, SEEN, SHOWN, UNSEEN
+from ._stacks import repeated, taken
 
 
 Rows = list[dict[str, Any]]
@@ -33,6 +32,8 @@ PID_ROWS = (
     "tuned leaky PID + feed-forward",
 )
 FLOORS = ("zero", "bang-bang")
+SPLITS = {"seen": slice(len(SEEN)), "unseen": slice(len(SEEN), None)}
+"""Which of the peak pressures `SEEN + UNSEEN` a row of the report is of."""
 LEARNED = ("MLP", "MLP for all", "CNN", "PID + MLP", "GPC", "MPC")
 
 
@@ -45,29 +46,23 @@ def _evaluated(envs, controllers, pips, keys):
         index = env.cost.index
 
         def one(pip, key):
-            world, policy = at_pip((env, controller), pip)
+            world, policy = lung.at_pip((env, controller), pip)
             run = rollout(world, policy, key=key, horizon=BREATH, throw=False)
             assert run.costs is not None and run.states is not None
             highest = jnp.max(run.states[:, index])
-            return jnp.mean(run.costs[:LENGTH]), highest, run
+            return jnp.mean(run.costs[:INSPIRATION]), highest, run
 
         return jax.vmap(lambda key: jax.vmap(one, (0, None))(pips, key))(keys)
 
     return eqx.filter_vmap(in_lung)(envs, controllers)
 
 
-def breathing(controllers: Any, waveform: BreathWaveform) -> Any:
-    """Controllers of the inspiratory valve, stacked, made ones of both valves."""
-    waveforms = repeat(waveform, count_of(controllers))
-    return eqx.filter_vmap(Breathing)(controllers, waveforms)
-
-
 def error_rows(
     contenders: list[Contender],
     envs: Environment,
     names: list[str],
-    waveform: BreathWaveform,
-    keys: Any,
+    waveform: lung.BreathWaveform,
+    keys: PRNGKey,
     between: tuple[Environment, list[str]] | None,
 ) -> tuple[Rows, dict[str, Any]]:
     """The error of each controller in each lung, averaged over noise and pressures; and
@@ -80,21 +75,19 @@ def error_rows(
     runs: dict[str, Any] = {}
     pips = jnp.asarray(SEEN + UNSEEN)
     place = (SEEN + UNSEEN).index(SHOWN)
-    parts = (("seen", slice(len(SEEN))), ("unseen", slice(len(SEEN), None)))
     for label, seed, controllers, shared in contenders:
-        whole = breathing(controllers, waveform)
-        *found, breaths = _evaluated(envs, whole, pips, keys)
+        waveforms = repeated(waveform, len(names))
+        whole = eqx.filter_vmap(lung.Breathing)(controllers, waveforms)
+        mae, highest, breaths = _evaluated(envs, whole, pips, keys)
         runs.setdefault(label, taken(breaths, (slice(None), 0, place)))
-        for part, here in parts:
-            columns = (array[..., here] for array in found)
-            rows += _rows(names, label, seed, part, *columns)
+        for split, at in SPLITS.items():
+            rows += _rows(names, label, seed, split, mae[..., at], highest[..., at])
         if shared and between is not None:
             # As many lungs as before, so that nothing compiles again.
             others, other_names = between
-            *found, _ = _evaluated(others, whole, pips, keys)
-            here = slice(len(other_names)), Ellipsis, parts[1][1]
-            columns = (array[here] for array in found)
-            rows += _rows(other_names, label, seed, "between", *columns)
+            mae, highest, _ = _evaluated(others, whole, pips, keys)
+            at = slice(len(other_names)), Ellipsis, SPLITS["unseen"]
+            rows += _rows(other_names, label, seed, "between", mae[at], highest[at])
     return rows, runs
 
 
@@ -102,22 +95,25 @@ def bound_rows(names: list[str], bound: Any) -> Rows:
     """Rows of the least errors, shape `(lungs, pips)`."""
     return [
         row
-        for part, here in (
-            ("seen", slice(len(SEEN))),
-            ("unseen", slice(len(SEEN), None)),
-        )
-        for row in _rows(names, "least error", 0, part, bound[:, here], None)
+        for split, at in SPLITS.items()
+        for row in _rows(names, "least error", 0, split, bound[:, at], None)
     ]
 
 
-def _rows(names, label, seed, part, mae, highest) -> Rows:
-    rows = []
-    for i, name in enumerate(names):
-        row = {"lung": name, "controller": label, "seed": seed, "split": part}
-        row["mae"] = float(np.mean(mae[i]))
-        row["highest"] = "" if highest is None else float(np.max(highest[i]))
-        rows.append(row)
-    return rows
+def _rows(
+    names: list[str], label: str, seed: int, split: str, mae: Any, highest: Any
+) -> Rows:
+    return [
+        {
+            "lung": name,
+            "controller": label,
+            "seed": seed,
+            "split": split,
+            "mae": float(np.mean(mae[i])),
+            "highest": "" if highest is None else float(np.max(highest[i])),
+        }
+        for i, name in enumerate(names)
+    ]
 
 
 def save_controllers(
@@ -134,57 +130,55 @@ def save_controllers(
         if label in FLOORS:
             continue
         stem = label.lower().replace(" + ", "_").replace(" ", "_").replace("-", "_")
-        alone = unstack(controllers)
-        made = [(stem, alone[0], None)]
-        if not shared:
-            each = zip(names, alone, strict=True)
-            made = [(f"{stem}_{name}", controller, name) for name, controller in each]
-        for place, controller, name in made:
-            runs = [
-                row for row in rows if (row["controller"], row["seed"]) == (label, seed)
-            ]
-            runs = [row for row in runs if name in (None, row["lung"])]
-            file = folder / f"{place}_{seed}.dlx"
+        runs = [r for r in rows if (r["controller"], r["seed"]) == (label, seed)]
+        # One that is shared is saved once, and judged by its runs in all lungs.
+        every = zip(
+            [None] if shared else names, lung.unstack(controllers), strict=False
+        )
+        for name, controller in every:
+            file = folder / f"{stem if name is None else f'{stem}_{name}'}_{seed}.dlx"
+            reached = [r["highest"] for r in runs if name in (None, r["lung"])]
             # NaN is not below the limit.
-            if np.max([row["highest"] for row in runs]) <= ABORT:
-                save(file, Breathing(controller, waveform))
+            if np.max(reached) <= ABORT:
+                save(file, lung.Breathing(controller, waveform))
             else:
                 file.unlink(missing_ok=True)
                 unsafe.append(file.stem)
     return unsafe
 
 
-def mean_error(rows: Rows, label: str, part: str, lung: str | None = None) -> float:
+def mean_error(rows: Rows, label: str, split: str, lung: str | None = None) -> float:
     """Of a controller, over its seeds, in one lung or all; NaN if it was not run."""
-    found = [
+    errors = [
         row["mae"]
         for row in rows
-        if row["controller"] == label
-        and row["split"] == part
+        if (row["controller"], row["split"]) == (label, split)
         and lung in (None, row["lung"])
     ]
-    return float(np.mean(found)) if found else float("nan")
+    return float(np.mean(errors)) if errors else float("nan")
 
 
 def best_pid(rows: Rows) -> str:
     """The kind of PID with the least error at pressures that were not trained on."""
     errors = {label: mean_error(rows, label, "unseen") for label in PID_ROWS}
-    there = [label for label in PID_ROWS if errors[label] > 0]
-    return min(there, key=lambda label: errors[label])
+    return min((e, label) for label, e in errors.items() if e > 0)[1]
 
 
-def _least(values: Any) -> float:
-    """The least of the numbers that there are."""
-    return min((value for value in values if value == value), default=float("nan"))
+def _least_error(
+    rows: Rows, labels: Iterable[str], split: str, lung: str | None = None
+) -> float:
+    """That of the best of some controllers, of those that were run."""
+    errors = (mean_error(rows, label, split, lung) for label in labels)
+    return min((e for e in errors if not np.isnan(e)), default=float("nan"))
 
 
 def _by_kind(table: Rows, column: str) -> dict[str, dict[str, float]]:
     """A column of the table of the simulators, by kind and lung; empty without it."""
-    found: dict[str, dict[str, float]] = {}
+    columns: dict[str, dict[str, float]] = {}
     for row in table:
         if column in row:
-            found.setdefault(row["simulator"], {})[row["lung"]] = row[column]
-    return found
+            columns.setdefault(row["simulator"], {})[row["lung"]] = row[column]
+    return columns
 
 
 def summarise(
@@ -206,17 +200,18 @@ def summarise(
         for name in names
     }
     ratios = {name: learned[name] / wrong[name] for name in names}
-    gains, room = {}, {}
+    gains, bounds = {}, {}
     for name in names:
-        pid = _least(mean_error(rows, label, "unseen", name) for label in PID_ROWS)
+        pid = _least_error(rows, PID_ROWS, "unseen", name)
         gains[name] = mean_error(rows, "MLP", "unseen", name) / pid
         least = mean_error(rows, "least error", "unseen", name)
-        room |= {name: least / pid} if least > 0 else {}
-    shared = {}
-    for part in ("unseen", "between"):
-        labels = [f"{label} for all" for label in PID_ROWS]
-        pid = _least(mean_error(rows, label, part) for label in labels)
-        shared[part] = mean_error(rows, "MLP for all", part) / pid
+        bounds |= {name: least / pid} if least > 0 else {}
+    for_all = [f"{label} for all" for label in PID_ROWS]
+    shared = {
+        split: mean_error(rows, "MLP for all", split)
+        / _least_error(rows, for_all, split)
+        for split in ("unseen", "between")
+    }
     reached = [row["highest"] for row in rows if row["controller"] in LEARNED]
     highest = float(np.max(reached))
     words = [
@@ -239,7 +234,7 @@ def summarise(
         simulators_closed_loop=_by_kind(table, "closed_loop_mae"),
         learned_over_wrong_physics=ratios,
         network_over_best_pid=gains,
-        least_error_over_best_pid=room,
+        least_error_over_best_pid=bounds,
         shared_over_best_pid=shared,
         highest_pressure=highest,
         abort=ABORT,

@@ -1,6 +1,7 @@
 """The breaths of the study, and the simulators that are fitted to them."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,31 +9,77 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
+from ... import lung
 from ..._module import positive
+from ..._typing import PRNGKey
 from ...environments import Environment
-from ...lung._data import Breaths, explore, LENGTH, split
-from ...lung._fitting import fit_lungs, open_loop_error
-from ...lung._learned import LearnedLung
-from ...lung._lungs import BalloonLung, DoubleCompartment, SingleCompartment
-from ...lung._models import GreyBoxLung, LungModel, NeuralLung
-from ...lung._policies import Breathing
-from ...lung._stacking import repeat, stack, unstack
-from ...lung._tasks import double_compartment
-from ...lung._train import lung_environment
-from ...lung._waveform import at_pip, BreathWaveform
 from ...simulation import rollout
-from ._size import SEEN, Size
+from ._size import INSPIRATION, SEEN, Size
+from ._stacks import repeated
 
 
-_SYSTEM = "dynamics.dynamics.system."
+class Kind(NamedTuple):
+    """A kind of lung model, and how it is fitted.
+
+    - `make`: a function of a key to the model before it is fitted.
+    - `positive`, `free`: what is fitted of it, numbers above zero and all others; the
+        weights where none is named.
+    - `steps`: how often the steps of the study are taken.
+    - `learning_rate`: of the fit.
+    """
+
+    make: Callable[[PRNGKey], lung.AbstractLung]
+    positive: tuple[str, ...] = ()
+    free: tuple[str, ...] = ()
+    steps: int = 1
+    learning_rate: float = 0.05
+
+    @property
+    def trainable(self) -> dict[str, Any] | None:
+        """What is fitted, as [`delucax.training.fit`][] is told it."""
+        constraints = dict.fromkeys(self.positive, positive)
+        constraints |= dict.fromkeys(self.free)
+        system = "dynamics.dynamics.system."
+        return {f"{system}{name}": c for name, c in constraints.items()} or None
 
 
-def explored(size: Size) -> Breaths:
+def _double(key: PRNGKey) -> lung.DoubleCompartment:
+    begin: Any = dict(central=0.5, share=0.4, imbalance=3.0)
+    return lung.DoubleCompartment(**begin)
+
+
+KINDS = {
+    "single compartment": Kind(
+        lambda key: lung.SingleCompartment(), ("resistance", "compliance")
+    ),
+    "balloon": Kind(
+        lambda key: lung.BalloonLung(), ("resistance", "stiffness", "rest")
+    ),
+    "double compartment": Kind(
+        _double,
+        ("resistance", "compliance", "imbalance"),
+        ("central", "share"),
+        steps=2,
+    ),
+    "neural ODE": Kind(
+        lambda key: lung.NeuralLung(key=key), steps=2, learning_rate=1e-2
+    ),
+    "grey box": Kind(
+        lambda key: lung.GreyBoxLung(key=key),
+        ("single.resistance", "single.compliance"),
+        ("network", "memory"),
+        steps=2,
+        learning_rate=1e-2,
+    ),
+}
+
+
+def explored(size: Size) -> lung.Breaths:
     """Breaths of the lungs of the study, stacked over them."""
     return stack_breaths(
         [
-            explore(
-                double_compartment(R, C, sensor_delay=size.sensor_delay),
+            lung.explore(
+                lung.double_compartment(R, C, sensor_delay=size.sensor_delay),
                 size.breaths,
                 key=jr.key(i),
                 resistance=R,
@@ -43,7 +90,7 @@ def explored(size: Size) -> Breaths:
     )
 
 
-def grouped(breaths: Breaths) -> Any:
+def grouped(breaths: lung.Breaths) -> Any:
     """The lungs of a file, and as many breaths of each (see `left_out`)."""
     R, C = np.asarray(breaths.resistance), np.asarray(breaths.compliance)
     lungs = sorted(set(zip(R.tolist(), C.tolist(), strict=True)))
@@ -58,7 +105,7 @@ def grouped(breaths: Breaths) -> Any:
     return np.asarray(lungs), stack_breaths(parts)
 
 
-def left_out(recorded: Breaths, breaths: Breaths) -> str:
+def left_out(recorded: lung.Breaths, breaths: lung.Breaths) -> str:
     """What there is to say of recorded breaths that are not among those of each lung,
     nothing if all are."""
     lungs, each = breaths.pressure.shape[:2]
@@ -71,85 +118,59 @@ def left_out(recorded: Breaths, breaths: Breaths) -> str:
     )
 
 
-def stack_breaths(parts: list[Breaths]) -> Breaths:
+def stack_breaths(parts: list[lung.Breaths]) -> lung.Breaths:
     """Breaths of several lungs as one: the first of each, as many as there are of the
     one with the fewest."""
     fewest = min(len(part) for part in parts)
-    return stack([part[:fewest] for part in parts])
+    return lung.stack([part[:fewest] for part in parts])
 
 
-def divided(breaths: Breaths, key: Any) -> tuple[Breaths, Breaths]:
+def divided(breaths: lung.Breaths, key: PRNGKey) -> tuple[lung.Breaths, lung.Breaths]:
     """Breaths of each lung to train on, and to test on."""
-    halves = [split(part, 1 / 6, key=key) for part in unstack(breaths)]
+    halves = [lung.split(part, 1 / 6, key=key) for part in lung.unstack(breaths)]
     train, test = (stack_breaths(list(part)) for part in zip(*halves, strict=True))
     return train, test
 
 
-def learned(train: Breaths, size: Size, key: Any, options: Any) -> Any:
+def learned(
+    train: lung.Breaths, size: Size, key: PRNGKey, **options: Any
+) -> lung.LearnedLung:
     """A learned lung of each lung, stacked."""
     keys = jr.split(jr.fold_in(key, 2), train.pressure.shape[0])
-    parts = zip(unstack(train), keys, strict=True)
-    models = stack([LearnedLung(part, key=own) for part, own in parts])
-    return fit_lungs(
-        models,
-        train,
-        key=jr.fold_in(key, 3),
-        teacher_steps=size.teacher_steps,
-        steps=size.simulator_steps,
-        **options,
-    ).model
+    parts = zip(lung.unstack(train), keys, strict=True)
+    options |= dict(teacher_steps=size.teacher_steps, steps=size.simulator_steps)
+    models = lung.stack([lung.LearnedLung(part, key=own) for part, own in parts])
+    return lung.fit_lungs(models, train, key=jr.fold_in(key, 3), **options).model
 
 
-def fitted(kind: str, train: Breaths, size: Size, key: Any, options: Any) -> Any:
+def fitted(
+    name: str, train: lung.Breaths, size: Size, key: PRNGKey, **options: Any
+) -> lung.LungModel:
     """Models of a kind, stacked, fitted to the breaths of each lung."""
-    models, moved = _models(kind, train, size.sensor_delay, jr.fold_in(key, 4))
-    is_network = kind in ("neural ODE", "grey box")
-    is_small = kind in ("single compartment", "balloon")
-    return fit_lungs(
-        models,
+    kind = KINDS[name]
+    keys = jr.split(jr.fold_in(key, 4), train.pressure.shape[0])
+    models = [
+        lung.LungModel(kind.make(k), train.dt[0], size.sensor_delay) for k in keys
+    ]
+    return lung.fit_lungs(
+        lung.stack(models),
         train,
         key=jr.fold_in(key, 5),
-        steps=size.physics_steps * (1 if is_small else 2),
-        learning_rate=1e-2 if is_network else 0.05,
+        steps=size.physics_steps * kind.steps,
+        learning_rate=kind.learning_rate,
         batch_size=32,
-        trainable=moved,
+        trainable=kind.trainable,
         **options,
     ).model
-
-
-def _models(kind: str, train: Breaths, delay: int, key: Any) -> tuple[Any, Any]:
-    """Models of a kind before they are fitted, and what of them is."""
-    count = train.pressure.shape[0]
-    dt = train.dt[0]
-    at = lambda *names: {_SYSTEM + name: positive for name in names}  # noqa: E731
-    if kind == "single compartment":
-        systems = [SingleCompartment()] * count
-        moved: Any = at("resistance", "compliance")
-    elif kind == "balloon":
-        systems = [BalloonLung()] * count
-        moved = at("resistance", "stiffness", "rest")
-    elif kind == "double compartment":
-        begin: Any = dict(central=0.5, share=0.4, imbalance=3.0)
-        systems = [DoubleCompartment(**begin)] * count
-        moved = at("resistance", "compliance", "imbalance")
-        moved |= {_SYSTEM + "central": None, _SYSTEM + "share": None}
-    elif kind == "neural ODE":
-        systems = [NeuralLung(key=k) for k in jr.split(key, count)]
-        moved = None
-    else:
-        systems = [GreyBoxLung(key=k) for k in jr.split(key, count)]
-        moved = {_SYSTEM + name: None for name in ("network", "memory")}
-        moved |= at("single.resistance", "single.compliance")
-    return stack([LungModel(system, dt, delay) for system in systems]), moved
 
 
 def open_loop_rows(
-    names: list[str], test: Breaths, models: dict[str, Any]
+    names: list[str], test: lung.Breaths, models: dict[str, Any]
 ) -> list[dict[str, Any]]:
     """The error of each simulator on the breaths of each lung, a row each."""
     rows = []
     for kind, model in models.items():
-        errors = eqx.filter_jit(eqx.filter_vmap(open_loop_error))(model, test)
+        errors = eqx.filter_jit(eqx.filter_vmap(lung.open_loop_error))(model, test)
         for name, error in zip(names, np.asarray(errors), strict=True):
             rows.append({"lung": name, "simulator": kind, "mae": float(error)})
     return rows
@@ -161,9 +182,9 @@ def _observed(envs, controllers, pips):
 
     def in_lung(env, controller):
         def one(pip):
-            world, policy = at_pip((env, controller), pip)
-            options: Any = dict(horizon=LENGTH, keep=("observations",), throw=False)
-            run: Any = rollout(world, policy, key=jr.key(0), **options)
+            world, policy = lung.at_pip((env, controller), pip)
+            options: Any = dict(horizon=INSPIRATION, keep=("observations",))
+            run: Any = rollout(world, policy, key=jr.key(0), throw=False, **options)
             return run.observations[:, 0]
 
         return jax.vmap(one)(pips)
@@ -175,17 +196,20 @@ def closed_loop_errors(
     envs: Environment,
     models: dict[str, Any],
     controllers: Any,
-    waveform: BreathWaveform,
+    waveform: lung.BreathWaveform,
 ) -> dict[str, Any]:
     """How far the pressures in each simulator are from those in the lung, each under
     the same controller and without noise, by kind: shape `(lungs,)`."""
     pips = jnp.asarray(SEEN)
-    whole = eqx.filter_vmap(Breathing)(controllers, repeat(waveform, len(envs.dt)))
+    whole = eqx.filter_vmap(lung.Breathing)(
+        controllers, repeated(waveform, len(envs.dt))
+    )
     silent = eqx.tree_at(lambda env: env.sensor_noise, envs, None)
     truth = _observed(silent, whole, pips)
-    found = {}
+    silent_task = lambda model: lung.lung_environment(model, waveform, noise=0.0)
+    errors = {}
     for kind, model in models.items():
-        made = [lung_environment(m, waveform, noise=0.0) for m in unstack(model)]
-        seen = _observed(stack(made), whole, pips)
-        found[kind] = np.mean(np.abs(np.asarray(seen - truth)), axis=(1, 2))
-    return found
+        simulated = eqx.filter_vmap(silent_task)(model)
+        pressure = _observed(simulated, whole, pips)
+        errors[kind] = np.mean(np.abs(np.asarray(pressure - truth)), axis=(1, 2))
+    return errors

@@ -1,6 +1,7 @@
 """A study in stages: each is written when it is done, and found the next time."""
 
 import csv
+import io
 import json
 import time
 from collections.abc import Callable
@@ -35,25 +36,28 @@ class Stages:
         self.began = time.perf_counter()
         self.seconds: dict[str, float] = {}
         known = out / "settings.json"
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "controllers").mkdir(exist_ok=True)
+        (out / "controllers").mkdir(parents=True, exist_ok=True)
         if known.exists():
             _check_settings(known, settings)
         else:
-            _put(known, json.dumps(settings, indent=1) + "\n")
+            self.write("settings.json", json.dumps(settings, indent=1) + "\n")
 
-    def fitting(self, name: str) -> dict[str, Any]:
-        """Options of the training of a stage, which is kept until it is done."""
-        return dict(checkpoint=self.out / f"{name}.fit", progress=self.progress)
+    def training(
+        self, name: str, words: str, train: Callable[..., Any], *args: Any
+    ) -> Any:
+        """A stage that trains: what `train` returns for the arguments and the options
+        of `fit`. Its checkpoints are kept until it is done."""
+        options = dict(checkpoint=self.out / f"{name}.fit", progress=self.progress)
+        return self.stage(name, words, lambda: train(*args, **options))
 
     def stage(self, name: str, words: str, make: Callable[[], Any]) -> Any:
         """What `make` returns, or what it returned before, from its file."""
         path = self.out / f"{name}.dlx"
         if path.exists():
-            found = load(path)
-            self.seconds[name] = float(found["seconds"])
+            stored = load(path)
+            self.seconds[name] = float(stored["seconds"])
             self.say(f"{words}: found ({self.seconds[name]:.0f} s then)")
-            return found["value"]
+            return stored["value"]
         began = time.perf_counter()
         self.say(f"{words} ...")
         value = make()
@@ -64,15 +68,20 @@ class Stages:
         self.say(f"  {self.seconds[name]:.0f} s")
         return value
 
-    def write_table(self, name: str, rows: list[dict[str, Any]]) -> None:
-        """Write rows to a file of comma-separated values."""
+    def write(self, name: str, text: str) -> None:
+        """Write a file whole or not at all."""
         path = self.out / name
         beside = path.with_suffix(".tmp")
-        with open(beside, "w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0].keys())
-            writer.writeheader()
-            writer.writerows(rows)
+        beside.write_text(text, newline="")
         beside.replace(path)
+
+    def write_table(self, name: str, rows: list[dict[str, Any]]) -> None:
+        """Write rows to a file of comma-separated values."""
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+        self.write(name, text.getvalue())
 
     @property
     def elapsed(self) -> float:
@@ -80,27 +89,20 @@ class Stages:
         return time.perf_counter() - self.began
 
 
-def _put(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    beside = path.with_suffix(".tmp")
-    beside.write_text(text)
-    beside.replace(path)
-
-
 def _check_settings(known: Path, settings: dict[str, Any]) -> None:
     """Raise unless a study was begun with the same settings."""
     try:
-        there = json.loads(known.read_text())
+        stored = json.loads(known.read_text())
     except ValueError as error:
         raise ValueError(
             f"lung: '{known}' is damaged ({error}); delete the folder, or name "
             "another one with out."
         ) from None
-    here = json.loads(json.dumps(settings))
-    for name in sorted(here.keys() | there.keys()):
-        if here.get(name) != there.get(name):
+    given = json.loads(json.dumps(settings))
+    for name in sorted(given.keys() | stored.keys()):
+        if given.get(name) != stored.get(name):
             raise ValueError(
                 f"lung: '{known.parent}' holds a study with other settings: {name} is "
-                f"{there.get(name)} there and {here.get(name)} here. Delete the "
+                f"{stored.get(name)} there and {given.get(name)} here. Delete the "
                 "folder, or name another one with out."
             )

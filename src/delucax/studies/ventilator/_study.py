@@ -13,18 +13,13 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
+from ... import lung
 from ..._check import check_count
+from ..._typing import PRNGKey
 from ...environments import Environment
-from ...lung._csv import read_breaths
-from ...lung._data import Breaths
-from ...lung._grid import least_error
-from ...lung._stacking import repeat, stack, unstack
-from ...lung._tasks import double_compartment
-from ...lung._train import lung_environment
-from ...lung._waveform import BreathWaveform
 from ._contenders import (
-    bang_bang,
     Contender,
+    designed,
     networks,
     networks_for_all,
     networks_on_pids,
@@ -34,7 +29,6 @@ from ._contenders import (
     searched_pids,
     trained_pids,
     Trainer,
-    zero,
 )
 from ._report import best_pid, bound_rows, error_rows, save_controllers, summarise
 from ._simulators import (
@@ -48,6 +42,7 @@ from ._simulators import (
     open_loop_rows,
 )
 from ._size import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, UNSEEN
+from ._stacks import repeated
 from ._stages import Stages
 from ._tuned import tuned_pids
 
@@ -112,14 +107,14 @@ def lung_study(
         raise ValueError(f"lung: seeds must be at least 1, got {seeds}.")
     sensor_delay = check_count(sensor_delay, "sensor_delay", "lung", least=0)
     size = size._replace(sensor_delay=sensor_delay)
-    recorded = None if data is None else read_breaths(data)
+    recorded = None if data is None else lung.read_breaths(data)
     settings = dict(
         size._asdict(),
         data=None if data is None else _named(Path(data)),
         version=importlib.metadata.version("delucax"),
     )
     stages = Stages(Path(out), settings, say, progress)
-    waveform, key = BreathWaveform(), jr.key(0)
+    waveform, key = lung.BreathWaveform(), jr.key(0)
 
     if recorded is None:
         lungs = size.lungs
@@ -130,7 +125,7 @@ def lung_study(
             say(words)
         kinds = dict.fromkeys((*size.physics, "grey box"))
         size = size._replace(physics=tuple(kinds), between=())
-    names = [_lung_name(*lung) for lung in lungs]
+    names = [_lung_name(*each) for each in lungs]
     train, test = divided(breaths, jr.fold_in(key, 1))
     models = _simulators(stages, train, size, key)
     table = open_loop_rows(names, test, models)
@@ -138,18 +133,18 @@ def lung_study(
     between = None
     if recorded is None:
         late: Any = dict(sensor_delay=sensor_delay)
-        envs = stack([double_compartment(*lung, **late) for lung in lungs])
+        envs = lung.stack([lung.double_compartment(*each, **late) for each in lungs])
         around = [size.between[i % len(size.between)] for i in range(len(lungs))]
-        others = stack([double_compartment(*lung, **late) for lung in around])
-        between = others, [_lung_name(*lung) for lung in size.between]
+        others = lung.stack([lung.double_compartment(*each, **late) for each in around])
+        between = others, [_lung_name(*each) for each in size.between]
         judge = "the lungs themselves"
     else:
         # What no controller was trained in stands in for the lungs.
         made = [
-            lung_environment(model, waveform, horizon=BREATH)
-            for model in unstack(models["grey box"])
+            lung.lung_environment(model, waveform, horizon=BREATH)
+            for model in lung.unstack(models["grey box"])
         ]
-        envs = stack(made)
+        envs = lung.stack(made)
         judge = "grey-box lungs fitted to the same breaths, for want of the lungs"
     trainer = Trainer(models["learned"], waveform)
     contenders = _contenders(stages, envs, train, trainer, size, key)
@@ -177,7 +172,7 @@ def lung_study(
     place = stages.out / "controllers"
     unsafe = save_controllers(place, contenders, names, waveform, rows)
     summary = summarise(rows, table, stages.seconds, judge, unsafe)
-    (stages.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+    stages.write("summary.json", json.dumps(summary, indent=1) + "\n")
     for line in summary["words"]:
         say(line)
     chosen = {"best PID": best_pid(rows), "MLP": "MLP", "MLP for all": "MLP for all"}
@@ -197,24 +192,18 @@ def _lung_name(resistance: float, compliance: float) -> str:
     return f"R{resistance:g}C{compliance:g}"
 
 
-def _simulators(stages: Stages, train: Breaths, size: Size, key: Any) -> dict[str, Any]:
+def _simulators(
+    stages: Stages, train: lung.Breaths, size: Size, key: PRNGKey
+) -> dict[str, lung.LearnedLung | lung.LungModel]:
     """Simulators of each kind, stacked over the lungs, by name."""
-    count = f"all {train.pressure.shape[0]} at once"
-    models = {
-        "learned": stages.stage(
-            "simulators",
-            f"Learned lungs, {count}",
-            lambda: learned(train, size, key, stages.fitting("simulators")),
-        )
-    }
+    count, data = f"all {train.pressure.shape[0]} at once", (train, size, key)
+    models: dict[str, Any] = {}
+    models["learned"] = stages.training(
+        "simulators", f"Learned lungs, {count}", learned, *data
+    )
     for kind in size.physics:
-        name = kind.replace(" ", "_")
-        models[kind] = stages.stage(
-            name,
-            f"Fitted {kind}, {count}",
-            lambda kind=kind, name=name: fitted(
-                kind, train, size, key, stages.fitting(name)
-            ),
+        models[kind] = stages.training(
+            kind.replace(" ", "_"), f"Fitted {kind}, {count}", fitted, kind, *data
         )
     return models
 
@@ -222,79 +211,57 @@ def _simulators(stages: Stages, train: Breaths, size: Size, key: Any) -> dict[st
 def _contenders(
     stages: Stages,
     envs: Environment,
-    train: Breaths,
+    train: lung.Breaths,
     trainer: Trainer,
     size: Size,
-    key: Any,
+    key: PRNGKey,
 ) -> list[Contender]:
     """All controllers, in the order of the report."""
-
-    def trained(name: str, words: str, train: Callable[[dict[str, Any]], Any]) -> Any:
-        return stages.stage(name, words, lambda: train(stages.fitting(name)))
-
+    training, study = stages.training, (trainer, size, key)
+    by_hand = designed(trainer)
     pids = stages.stage("pids", "PID grids", lambda: searched_pids(envs, trainer, key))
-    found = [zero(trainer), *pid_contenders(pids, trainer)]
-    own = trained(
-        "own",
-        f"A network for each lung, {size.seeds} seeds at once",
-        lambda options: networks(trainer, size, key, options),
-    )
-    shared = trained(
-        "shared",
-        f"A network for all lungs, {size.seeds} seeds at once",
-        lambda options: networks_for_all(trainer, size, key, options),
-    )
+    contenders = [by_hand["zero"], *pid_contenders(pids, trainer)]
+    words = f"A network for each lung, {size.seeds} seeds at once"
+    own = training("own", words, networks, "mlp", size.seeds, *study)
+    words = f"A network for all lungs, {size.seeds} seeds at once"
+    shared = training("shared", words, networks_for_all, *study)
     if size.tuned:
-        tuned = trained(
-            "tuned_pids",
-            "PIDs with feed-forward tuned on the lungs",
-            lambda options: tuned_pids(
-                envs, trainer.waveform, size, key, options, stages.say
-            ),
-        )
-        found += pid_contenders(tuned, trainer)
+        words = "PIDs with feed-forward tuned on the lungs"
+        inputs = envs, trainer.waveform, size, key, stages.say
+        tuned = training("tuned_pids", words, tuned_pids, *inputs)
+        contenders += pid_contenders(tuned, trainer)
     if size.extras:
-        one = size._replace(seeds=1)
-        more = trained(
-            "trained_pids",
-            "PIDs trained on",
-            lambda options: trained_pids(pids, trainer, size, key, options),
-        )
-        convolved = trained(
-            "own_cnn",
-            "A convolutional network for each lung",
-            lambda options: networks(trainer, one, key, options, "cnn"),
-        )
-        residual = trained(
-            "residual",
-            "A PID and a network for each lung",
-            lambda options: networks_on_pids(pids, trainer, size, key, options),
-        )
+        words = "PIDs trained on"
+        more = training("trained_pids", words, trained_pids, pids, *study)
+        words = "A convolutional network for each lung"
+        convolved = training("own_cnn", words, networks, "cnn", 1, *study)
+        words = "A PID and a network for each lung"
+        residual = training("residual", words, networks_on_pids, pids, *study)
         online = stages.stage(
             "online",
             "GPC around the best PIDs",
             lambda: online_learners(train, pids, trainer, size.sensor_delay),
         )
-        found += pid_contenders(more, trainer)
-        found += [
-            bang_bang(trainer),
+        contenders += pid_contenders(more, trainer)
+        contenders += [
+            by_hand["bang-bang"],
             Contender("GPC", 0, online, False),
             planners(trainer),
-            Contender("CNN", 0, unstack(convolved)[0], False),
-            Contender("PID + MLP", 0, unstack(residual)[0], False),
+            Contender("CNN", 0, lung.unstack(convolved)[0], False),
+            Contender("PID + MLP", 0, lung.unstack(residual)[0], False),
         ]
-    for seed, controllers in enumerate(unstack(own)):
-        found.append(Contender("MLP", seed, controllers, False))
-    for seed, controller in enumerate(unstack(shared)):
-        alike = repeat(controller, trainer.count)
-        found.append(Contender("MLP for all", seed, alike, True))
-    return found
+    for seed, controllers in enumerate(lung.unstack(own)):
+        contenders.append(Contender("MLP", seed, controllers, False))
+    for seed, controller in enumerate(lung.unstack(shared)):
+        alike = repeated(controller, trainer.count)
+        contenders.append(Contender("MLP for all", seed, alike, True))
+    return contenders
 
 
 def _least_errors(envs: Environment, steps: int) -> Any:
     """About the least error there could be, shape `(lungs, pips)`."""
     pips = jnp.asarray(SEEN + UNSEEN)
-    of = lambda env: least_error(env, pips=pips, steps=steps)  # noqa: E731
+    of = lambda env: lung.least_error(env, pips=pips, steps=steps)  # noqa: E731
     return eqx.filter_vmap(of)(envs)
 
 

@@ -8,21 +8,27 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from jaxtyping import Array, Float
 
+from ... import lung
+from ..._typing import PRNGKey
+from ...controllers import LeakyPID, PID
 from ...environments import Environment
-from ...lung._grid import make_pid
-from ...lung._policies import FeedForward, Summed
-from ...lung._stacking import joined, taken
-from ...lung._train import breath_error, train_controllers
-from ...lung._waveform import BreathWaveform
 from ._size import SEEN, Size
+from ._stacks import joined, taken
 
 
 _STARTS = 4
 
 
 @eqx.filter_jit
-def _drawn(kind: Any, count: int, dt: Any, waveform: BreathWaveform, key: Any) -> Any:
+def _drawn(
+    kind: type[LeakyPID | PID],
+    count: int,
+    dt: Array,
+    waveform: lung.BreathWaveform,
+    key: PRNGKey,
+) -> lung.Summed:
     """PIDs with a feed-forward, gains at random over orders of magnitude."""
 
     def one(key):
@@ -31,30 +37,32 @@ def _drawn(kind: Any, count: int, dt: Any, waveform: BreathWaveform, key: Any) -
         between = lambda key, low, high: jnp.exp(  # noqa: E731
             jr.uniform(key, minval=jnp.log(low), maxval=jnp.log(high))
         )
-        kd = between(keys[1], 0.003, 0.2) * (1.0 if kind == "true" else 20.0)
+        kd = between(keys[1], 0.003, 0.2) * (1.0 if kind is PID else 20.0)
         gains = between(keys[2], 0.03, 8.0), between(keys[3], 0.05, 40.0), some[0] * kd
-        forward = FeedForward(
+        forward = lung.FeedForward(
             waveform,
             some[1] * jr.uniform(keys[4], maxval=3.0),
             some[2] * jr.uniform(keys[5], minval=-10.0, maxval=15.0),
         )
-        return Summed(make_pid(gains, kind, dt, waveform), forward)
+        return lung.Summed(kind(*gains, dt=dt, reference=waveform), forward)
 
     return eqx.filter_vmap(one)(jr.split(key, count))
 
 
 @eqx.filter_jit
-def _errors(envs: Environment, controllers: Any, key: Any, own: bool) -> Any:
+def _errors(
+    envs: Environment, controllers: Any, key: PRNGKey, own: bool
+) -> Float[Array, "lungs controllers"]:
     """The error of each in each lung, shape `(lungs, controllers)`; of controllers of
     shape `(controllers,)`, or `(controllers, lungs)` if each lung has its own."""
     pips = jnp.asarray(SEEN)
     of = lambda env, one: jnp.mean(  # noqa: E731
-        breath_error(env, one, key=key, pips=pips)
+        lung.breath_error(env, one, key=key, pips=pips)
     )
     across = eqx.filter_vmap(of, in_axes=(None, eqx.if_array(0)))
     over = eqx.if_array(1) if own else None
-    found = eqx.filter_vmap(across, in_axes=(eqx.if_array(0), over))(envs, controllers)
-    return jnp.where(jnp.isfinite(found), found, jnp.inf)
+    errors = eqx.filter_vmap(across, in_axes=(eqx.if_array(0), over))(envs, controllers)
+    return jnp.where(jnp.isfinite(errors), errors, jnp.inf)
 
 
 def best_of(candidates: Any, errors: Any, shared: bool) -> Any:
@@ -68,42 +76,43 @@ def best_of(candidates: Any, errors: Any, shared: bool) -> Any:
 
 def tuned_pids(
     envs: Environment,
-    waveform: BreathWaveform,
+    waveform: lung.BreathWaveform,
     size: Size,
-    key: Any,
-    options: Any,
+    key: PRNGKey,
     say: Callable[[str], Any],
+    *,
+    checkpoint: Path,
+    progress: bool,
 ) -> dict[str, Any]:
     """The best of many at random and of the best few of them trained on, in each lung
     and for all: by their errors in the lungs themselves, which no network is given."""
-    found: dict[str, Any] = {}
+    best: dict[str, Any] = {}
     dt = envs.dt[0]
-    for k, (kind, name) in enumerate((("true", "PID"), ("leaky", "leaky PID"))):
+    for k, (kind, name) in enumerate(((PID, "PID"), (LeakyPID, "leaky PID"))):
         draw_key, search_key, fit_key, judge_key = jr.split(jr.fold_in(key, 20 + k), 4)
         drawn = _drawn(kind, size.tuned, dt, waveform, draw_key)
         errors = _errors(envs, drawn, search_key, False)
         for shared in (False, True):
             ranked = jnp.mean(errors, axis=0) if shared else errors.T
-            best = jnp.argsort(ranked, axis=0)[:_STARTS]
-            begin = taken(drawn, best)
+            begin = taken(drawn, jnp.argsort(ranked, axis=0)[:_STARTS])
             label = f"tuned {name} + feed-forward" + (" for all" if shared else "")
-            trained = train_controllers(
+            trained = lung.train_controllers(
                 envs,
                 begin,
                 key=fit_key,
                 shared=shared,
                 steps=size.pid_steps,
                 learning_rate=0.03,
-                checkpoint=Path(f"{options['checkpoint']}.{label.replace(' ', '_')}"),
-                progress=options["progress"],
+                checkpoint=Path(f"{checkpoint}.{label.replace(' ', '_')}"),
+                progress=progress,
                 throw=False,
             )
             candidates = joined(begin, trained.model)
             judged = _errors(envs, candidates, judge_key, not shared)
             if words := _lost(trained.history["diverged"], judged):
                 say(f"  {label}: {words}")
-            found[label] = best_of(candidates, judged, shared)
-    return found
+            best[label] = best_of(candidates, judged, shared)
+    return best
 
 
 def _lost(diverged: Any, errors: Any) -> str:

@@ -144,7 +144,7 @@ def checked(fit: Identified, throw: bool) -> Identified:
     known = fit.identifiable & solved
     excited = choose(jnp.all(known), RESULTS.successful, RESULTS.unexciting)
     result = first_failure(solver, excited)
-    intervals = lambda fit: [fit.std, fit.low, fit.high, fit.spread]  # noqa: E731
+    intervals = lambda fit: [fit.std, fit.low, fit.high, fit.spread]
     certain = [jnp.where(solved, end, jnp.nan) for end in intervals(fit)]
     fit = eqx.tree_at(intervals, fit, certain)
     fit = eqx.tree_at(lambda fit: [fit.identifiable, fit.result], fit, [known, result])
@@ -170,9 +170,9 @@ class Certainty(eqx.Module):
             sensitivity = jnp.pad(sensitivity, ((0, p - rows), (0, 0)))
         _, size, directions = jnp.linalg.svd(sensitivity, full_matrices=False)
         eps = jnp.finfo(sensitivity.dtype).eps
-        seen = size > 10 * max(rows, p) * eps * size[0]
-        spread = jnp.where(seen, sigma / jnp.where(seen, size, 1), jnp.inf)
-        known = seen & (spread < worst)
+        sensitive = size > 10 * max(rows, p) * eps * size[0]
+        spread = jnp.where(sensitive, sigma / jnp.where(sensitive, size, 1), jnp.inf)
+        known = sensitive & (spread < worst)
         share = jnp.abs(directions)
         each = jnp.where(
             known[:, None],

@@ -1,12 +1,12 @@
 """Linear models by least squares."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
 from ..._check import check_bool, check_count, check_finite, check_step
 from ..._message import shortened
@@ -76,9 +76,8 @@ def linear(
     regressors = jnp.concatenate(parts, axis=2).reshape(-1, len(names))
     targets = states[:, 1:].reshape(-1, n)
     fit = _least_squares(regressors, targets)
-    found = fit[0]
-    A, B = found[:, :n], found[:, n : n + m]
-    x_next = found[:, -1] if affine else None
+    A, B = fit.estimate[:, :n], fit.estimate[:, n : n + m]
+    x_next = fit.estimate[:, -1] if affine else None
     model = LinearDynamics(A, B, dt=dt, x_next=x_next)
     return checked(_identified(model, names, fit, reach), throw)
 
@@ -160,7 +159,7 @@ def arx(
     regressors = jnp.concatenate(back, axis=2).reshape(-1, len(names))
     targets = outputs[:, first:].reshape(-1, p)
     fit = _least_squares(regressors, targets)
-    model = _realised(fit[0], p, m, a, b, delay, dt)
+    model = _realised(fit.estimate, p, m, a, b, delay, dt)
     return checked(_identified(model, names, fit, reach), throw)
 
 
@@ -175,12 +174,8 @@ def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, 
                 f"size), got {got}."
             )
         check_finite(array, what, where)
-    fits = outputs.ndim == controls.ndim
-    if (
-        not fits
-        or outputs.shape[:-2] != controls.shape[:-2]
-        or (outputs.shape[-2] != controls.shape[-2] + 1 or controls.shape[-2] < 1)
-    ):
+    steps = controls.shape[-2]
+    if steps < 1 or outputs.shape[:-1] != (*controls.shape[:-2], steps + 1):
         raise ValueError(
             f"{where}: {name} must have one step more than controls, got shapes "
             f"{outputs.shape} and {controls.shape}."
@@ -191,9 +186,25 @@ def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, 
     return outputs.astype(dtype), controls.astype(dtype)
 
 
+class _Fit(NamedTuple):
+    """Least squares of each output, and what the data tell of the estimate."""
+
+    estimate: Float[Array, "outputs p"]
+    certainty: Certainty
+    """In units of `scale`, of the output with the largest relative noise."""
+    scale: Float[Array, " p"]
+    """The size of each regressor."""
+    noise: Float[Array, " outputs"]
+    typical: Float[Array, " outputs"]
+    """The size of each output."""
+    enough: Bool[Array, ""]
+    """Whether there are as many rows as regressors."""
+
+
 @jax.jit
-def _least_squares(regressors, targets):
-    """`(estimate, Certainty in regressors of size 1, scale, noise)`."""
+def _least_squares(
+    regressors: Float[Array, "rows p"], targets: Float[Array, "rows outputs"]
+) -> _Fit:
     rows, p = regressors.shape
     size = jnp.sqrt(jnp.mean(regressors**2, axis=0))
     scale = jnp.where(size > 0, size, 1)
@@ -204,24 +215,27 @@ def _least_squares(regressors, targets):
     def one(target):
         return lx.linear_solve(operator, target, solver, throw=False).value
 
-    found = jax.vmap(one, in_axes=1)(targets)
-    rest = targets - scaled @ found.T
+    estimate = jax.vmap(one, in_axes=1)(targets)
+    rest = targets - scaled @ estimate.T
     noise = jnp.sqrt(jnp.sum(rest**2, axis=0) / max(rows - p, 1))
     # Unknown where its spread is the size of the outputs themselves.
     typical = jnp.sqrt(jnp.mean(targets**2, axis=0))
     typical = jnp.where(typical > 0, typical, 1)
     certainty = Certainty.of(scaled, jnp.max(noise / typical), 1.0)
-    return found / scale, certainty, scale, noise, typical, rows
+    enough = jnp.asarray(rows >= p)
+    return _Fit(estimate / scale, certainty, scale, noise, typical, enough)
 
 
-def _identified(model, names, fit, reach) -> Identified:
-    estimate, certainty, scale, noise, typical, rows = fit
+def _identified(
+    model: LinearDynamics, names: list[str], fit: _Fit, reach: Array
+) -> Identified:
+    estimate, certainty, scale, noise, typical, enough = fit
     worst = jnp.max(noise / typical)
     # All outputs share the regressors, and differ in their noise alone.
     unit = certainty.std / jnp.where(worst > 0, worst, 1)
     std = noise[:, None] * unit / scale
     std = jnp.where(jnp.isinf(certainty.std), jnp.inf, jnp.where(worst > 0, std, 0))
-    known = certainty.identifiable & (rows >= len(names))
+    known = certainty.identifiable & enough
     return Identified(
         model=model,
         names=tuple(names),
@@ -239,28 +253,20 @@ def _identified(model, names, fit, reach) -> Identified:
     )
 
 
-def _realised(found, p, m, a, b, delay, dt) -> LinearDynamics:
-    """The dynamics whose state holds what is looked back on."""
+def _realised(estimate, p, m, a, b, delay, dt) -> LinearDynamics:
+    """The dynamics whose state is the past that the estimate looks back on."""
     held = b + delay - 2
     n = a * p + held * m
-    A, B = jnp.zeros((n, n), found.dtype), jnp.zeros((n, m), found.dtype)
-    A = A.at[:p, : a * p].set(found[:, : a * p])
-    for j in range(b):
-        block = found[:, a * p + j * m : a * p + (j + 1) * m]
-        lag = delay + j
-        if lag == 1:
-            B = B.at[:p].set(block)
-        else:
-            start = a * p + (lag - 2) * m
-            A = A.at[:p, start : start + m].set(block)
-    for i in range(1, a):
-        A = A.at[i * p : (i + 1) * p, (i - 1) * p : i * p].set(jnp.eye(p))
-    for j in range(held):
-        rows = slice(a * p + j * m, a * p + (j + 1) * m)
-        if j == 0:
-            B = B.at[rows].set(jnp.eye(m))
-        else:
-            before = slice(a * p + (j - 1) * m, a * p + j * m)
-            A = A.at[rows, before].set(jnp.eye(m))
-    C = jnp.eye(p, n, dtype=found.dtype)
+    # The coefficients of u_{k-1}, u_{k-2}, ..., of which the first is not in the state.
+    of_controls = jnp.pad(estimate[:, a * p :], ((0, 0), ((delay - 1) * m, 0)))
+    rows = [
+        jnp.concatenate([estimate[:, : a * p], of_controls[:, m:]], axis=1),
+        jnp.eye(n, k=-p)[p : a * p],
+        jnp.zeros((m, n))[: held * m],
+        jnp.eye(n, k=-m)[a * p + m :],
+    ]
+    A = jnp.concatenate(rows).astype(estimate.dtype)
+    B = jnp.zeros((n, m), estimate.dtype).at[:p].set(of_controls[:, :m])
+    B = B.at[a * p : a * p + m].set(jnp.eye(m)[: held * m])
+    C = jnp.eye(p, n, dtype=estimate.dtype)
     return LinearDynamics(A, B, C, dt=dt)

@@ -10,12 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._check import check_count, check_key, check_positive, check_step
-from ..._module import as_module, parameter, positive, weight
-from ..._results import RESULTS
-from ..._typing import PRNGKey
+from ..._check import check_count, check_instance, check_key, check_positive, check_step
+from ..._module import as_module, names_of, parameter, positive, weight
+from ..._results import Result, RESULTS
+from ..._typing import PRNGKey, RealScalar
 from ...dynamics import AbstractDynamics
-from ...systems._function import names_of
 from ._linear import runs_of
 
 
@@ -111,7 +110,13 @@ class NeuralDynamics(AbstractDynamics):
                     f"shape {jnp.shape(array)}."
                 )
 
-    def advance(self, t, x, u, w):
+    def advance(
+        self,
+        t: RealScalar,
+        x: Float[Array, " n"],
+        u: Float[Array, " m"],
+        w: Float[Array, " n"] | None,
+    ) -> tuple[Float[Array, " n"], Result]:
         z = jnp.concatenate([(x - self.x_mean) / self.x_scale, u / self.u_scale])
         x_next = x + self.step_scale * self.network(z)
         if w is not None:
@@ -225,18 +230,14 @@ class PredictionError(eqx.Module):
         **Returns:** a scalar.
         """
         del key
-        if not isinstance(model, AbstractDynamics):
-            raise ValueError(
-                "PredictionError: model must be an AbstractDynamics, got "
-                f"{type(model).__name__}."
-            )
+        check_instance(model, AbstractDynamics, "model", "PredictionError")
 
         def stretch(t, states, controls):
             def step(x, inputs):
-                k, u, seen = inputs
+                k, u, recorded = inputs
                 x_next, _ = model.advance(t + k * model.dt, x, u, None)
-                off = model.difference(x_next, seen) / self.scale
-                return x_next.astype(x.dtype), jnp.sum(off**2)
+                error = model.difference(x_next, recorded) / self.scale
+                return x_next.astype(x.dtype), jnp.sum(error**2)
 
             inputs = (jnp.arange(controls.shape[0]), controls, states[1:])
             return jnp.mean(lax.scan(jax.checkpoint(step), states[0], inputs)[1])

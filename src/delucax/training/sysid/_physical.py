@@ -1,29 +1,38 @@
 """Physical parameters, through the integrator."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.flatten_util
-import jax.lax as lax
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from ..._check import as_vector, check_bool, check_count, check_positive, is_concrete
+from ..._check import (
+    as_vector,
+    check_bool,
+    check_count,
+    check_instance,
+    check_positive,
+    is_concrete,
+)
 from ..._module import as_float_array
-from ..._results import choose, Result, RESULTS
+from ..._results import RESULTS
 from ...dynamics import AbstractDynamics, open_loop
-from .._trainable import take_apart
-from ._identified import Certainty, checked, CORRELATED, Identified, quantile
+from .._trainable import Assembly, take_apart
+from ._identified import checked, CORRELATED, Identified, quantile
 from ._linear import runs_of
+from ._multiple_shooting import (
+    cut_into_windows,
+    flat_legal,
+    per_relative_change,
+    relative_unit,
+    Solution,
+    solve,
+)
 
 
-_NEAR = 0.05
-"""The standard deviations from the minimum within which a fit has converged."""
-
-_SHORT = 2
+_SHORT_WINDOW = 2
 """The steps of a window in which not even a wild model grows much."""
 
 
@@ -106,11 +115,7 @@ def physical(
         ```
     """
     where = "sysid.physical"
-    if not isinstance(dynamics, AbstractDynamics):
-        raise ValueError(
-            f"{where}: dynamics must be an AbstractDynamics, got "
-            f"{type(dynamics).__name__}."
-        )
+    check_instance(dynamics, AbstractDynamics, "dynamics", where)
     is_batch = jnp.ndim(as_float_array(controls)) == 3
     observations, controls = runs_of(observations, controls, "observations", where)
     size, n = dynamics.observation_size, dynamics.state_size
@@ -147,288 +152,68 @@ def physical(
     ]
 
     def fit(values, window):
-        starts, problem, first = _windows(guesses, observations, controls, window)
-        problem = problem._replace(noise=first if noise is None else noise)
-        solved = _solve(assembly, values, starts, problem, max_steps)
+        starts, data, spread = cut_into_windows(guesses, observations, controls, window)
+        data = data._replace(noise=spread if noise is None else noise)
+        solution = solve(assembly, values, starts, data, max_steps)
         if noise is not None:
-            return solved
+            return solution
         # Data without noise leave rounding alone, that of a whole window.
-        floor = 1e3 * float(jnp.finfo(first.dtype).eps) * first
-        problem = problem._replace(noise=jnp.maximum(solved.noise, floor))
-        return _solve(assembly, solved.values, solved.starts, problem, max_steps)
+        floor = 1e3 * float(jnp.finfo(spread.dtype).eps) * spread
+        data = data._replace(noise=jnp.maximum(solution.noise, floor))
+        return solve(assembly, solution.values, solution.starts, data, max_steps)
 
     count = steps // window
     unknown = len(names) + runs * count * n
     few = size * runs * (count * window + 1) <= unknown
-    solved = fit(values, window)
-    if x0 is None and not few and window > _SHORT and _is_doubtful(solved):
+    solution = fit(values, window)
+    if x0 is None and not few and window > _SHORT_WINDOW and _is_doubtful(solution):
         # On short windows nothing grows, so that a worse guess does, and there are
         # fewer minima that are not the least.
-        again = fit(fit(values, _SHORT).values, window)
-        failed = solved.result != RESULTS.successful
+        again = fit(fit(values, _SHORT_WINDOW).values, window)
+        failed = solution.result != RESULTS.successful
         if again.result == RESULTS.successful:
-            if failed or jnp.prod(again.noise) < jnp.prod(solved.noise):
-                solved = again
-    values, legal, certainty = solved.values, solved.legal, solved.certainty
+            if failed or jnp.prod(again.noise) < jnp.prod(solution.noise):
+                solution = again
+    values, legal, certainty = solution.values, solution.legal, solution.certainty
     std = certainty.std
     ends = [_ends(assembly, values, sign * reach * std) for sign in (-1, 1)]
-    starts = solved.starts.reshape(runs, count, n)[:, 0]
+    starts = solution.starts.reshape(runs, count, n)[:, 0]
     fitted = Identified(
         model=assembly(values),
         names=tuple(names),
         estimate=legal,
-        std=std * jnp.abs(_size(legal)),
+        std=std * jnp.abs(relative_unit(legal)),
         low=jnp.minimum(*ends),
         high=jnp.maximum(*ends),
         directions=certainty.directions,
         spread=certainty.spread,
         identifiable=certainty.identifiable & (not few),
-        noise=solved.noise,
-        correlation=solved.correlation,
+        noise=solution.noise,
+        correlation=solution.correlation,
         x0=starts if is_batch else starts[0],
         # Where many values fit as well the iteration wanders: the data are to be
         # blamed.
-        result=RESULTS.successful if few else solved.result,
+        result=RESULTS.successful if few else solution.result,
     )
     return checked(fitted, throw)
 
 
-def _is_doubtful(solved):
+def _is_doubtful(solution: Solution) -> bool:
     """Whether it is known now that the iteration did not converge, or that it ended
     where what remains is correlated from step to step, as the noise is not."""
-    if not is_concrete(solved.cost):
+    if not is_concrete(solution.cost):
         return False
-    failed = solved.result != RESULTS.successful
-    return bool(failed | (solved.correlation > CORRELATED))
+    failed = solution.result != RESULTS.successful
+    return bool(failed | (solution.correlation > CORRELATED))
 
 
-def _windows(guesses, observations, controls, window):
-    """`(starts, problem, spread of each output)`, cut into windows."""
-    runs, steps, _ = controls.shape
-    n, size = guesses.shape[2], observations.shape[2]
-    count = steps // window
-    stop = count * window
-    starts = guesses[:, :stop:window].reshape(runs * count, n)
-    inputs = controls[:, :stop].reshape(runs * count, window, -1)
-    index = np.arange(count)[:, None] * window + np.arange(window + 1)
-    observed = observations[:, index].reshape(runs * count, window + 1, size)
-    begins = np.tile(np.arange(count) * window, runs)
-    # The observation where a window ends and the next begins counts once.
-    counts = np.ones((count, window + 1), bool)
-    counts[:-1, -1] = False
-    counts = np.tile(counts, (runs, 1))
-    # An output that never moves has a spread of rounding.
-    spread, largest = jnp.std(observed, axis=(0, 1)), jnp.max(jnp.abs(observed), (0, 1))
-    moves = spread > 1e3 * float(jnp.finfo(observed.dtype).eps) * largest
-    spread = jnp.where(moves, spread, jnp.where(largest > 0, largest, 1))
-    return starts, _Problem(begins, inputs, observed, counts, spread), spread
-
-
-class _Problem(NamedTuple):
-    """Windows of data, and the scale of each output."""
-
-    begins: Any
-    controls: Array
-    observations: Array
-    counts: Any
-    noise: Array
-
-
-class _Point(NamedTuple):
-    """Residuals and sensitivities at values of the parameters and first states."""
-
-    theta: Array
-    starts: Array
-    by_theta: Array
-    by_start: Array
-    rest: Array
-    cost: Array
-
-
-class _Solution(NamedTuple):
-    values: Any
-    starts: Array
-    cost: Array
-    legal: Array
-    certainty: Certainty
-    noise: Array
-    correlation: Array
-    result: Result
-
-
-@eqx.filter_jit
-def _solve(assembly, values, starts, problem, max_steps):
-    """Levenberg and Marquardt's method, one small problem for each window.
-
-    The state at the beginning of a window moves nothing but that window, so it is
-    eliminated there, and the cost of a step is linear in the number of windows; a
-    solver of dense least squares would pay its cube. Steps are measured by the largest
-    sensitivities so far (Moré, 1978), and so do not depend on units. It has converged
-    where no step of the linear model is longer than a small part of what the noise
-    makes the estimate differ by.
-    """
-    flat, unravel = jax.flatten_util.ravel_pytree(values)
-    p = flat.size
-    dtype = problem.observations.dtype
-
-    def window(theta, x, data):
-        begin, controls, seen, counts = data
-        model = assembly(unravel(theta))
-        times = (begin + jnp.arange(controls.shape[0] + 1)) * model.dt
-
-        def step(x, inputs):
-            t, u = inputs
-            x_next, _ = model.advance(t, x, u, None)
-            return x_next.astype(x.dtype), x
-
-        last, states = lax.scan(step, x, (times[:-1], controls))
-        states = jnp.concatenate([states, last[None]])
-        rest = (seen - jax.vmap(model.observe)(times, states)) / problem.noise
-        rest = jnp.where(counts[:, None], rest, 0).ravel().astype(dtype)
-        return rest, rest
-
-    data = problem[:4]
-    slopes = jax.jacfwd(window, argnums=(0, 1), has_aux=True)
-    sensitivity = jax.vmap(slopes, in_axes=(None, 0, 0))
-
-    def scaled(point, largest):
-        """Sensitivities as multiples of the largest so far, and these."""
-        norms = jnp.linalg.norm(point.by_theta, axis=(0, 1))
-        norms = norms, jnp.linalg.norm(point.by_start, axis=1)
-        largest = jax.tree.map(jnp.maximum, largest, norms)
-        units = jax.tree.map(lambda norm: jnp.where(norm > 0, norm, 1), largest)
-        own = [point.by_theta / units[0], point.rest[..., None]]
-        by_start = point.by_start / units[1][:, None]
-        return jnp.concatenate(own, axis=2), by_start, largest, units
-
-    def projected(own, by_start, damping):
-        """First on the states at the beginnings of the windows, then on the rest."""
-        eliminate = jax.vmap(_eliminate, in_axes=(0, 0, None))
-        R_x, on_starts, left = eliminate(by_start, own, damping)
-        own = left.reshape(-1, p + 1)
-        R, on_theta, _ = _eliminate(own[:, :p], own[:, p:], damping)
-        return R_x, on_starts, R, on_theta[:, 0], own
-
-    def body(carry):
-        candidate, best, largest, damping, at_minimum, _, count = carry
-        slopes, rest = sensitivity(*candidate, data)
-        cost = jnp.sum(rest**2)
-        better = cost < best.cost
-        here = _Point(*candidate, *slopes, rest=rest, cost=cost)
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
-        damping = jnp.where(better | at_minimum, damping / 8, damping * 4)
-        damping = jnp.clip(damping, 1e-10, 1e10)
-        own, by_start, largest, units = scaled(best, largest)
-        R_x, on_starts, R, on_theta, _ = projected(own, by_start, damping)
-        step = jsl.solve_triangular(R, on_theta)
-        right = on_starts[..., p] - on_starts[..., :p] @ step
-        steps = jax.vmap(jsl.solve_triangular)(R_x, right)
-        candidate = best.theta - step / units[0], best.starts - steps / units[1]
-        # What the linear model promises of a step. A damped one falls short, so it is
-        # a minimum only where one that is hardly damped promises nothing.
-        promise = jnp.sum(on_theta**2) + jnp.sum(on_starts[..., p] ** 2)
-        at_minimum = promise <= small * best.cost
-        done = (
-            at_minimum & (damping <= 1e-5) | (damping >= 1e9) | (best.cost < rounding)
-        )
-        return candidate, best, largest, damping, at_minimum, done, count + 1
-
-    eps = jnp.finfo(dtype).eps
-    small = 1e-9 if dtype == jnp.float64 else 1e-7
-    rounding = 100 * eps**2 * problem.observations.size
-
-    def going(carry):
-        *_, done, count = carry
-        return ~done & (count <= max_steps)
-
-    rows = problem.observations[0].size
-    zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
-    point = _Point(
-        theta=flat,
-        starts=starts,
-        by_theta=zeros(len(starts), rows, p),
-        by_start=zeros(len(starts), rows, starts.shape[1]),
-        rest=zeros(len(starts), rows),
-        cost=zeros() + jnp.inf,
-    )
-    none = zeros(p), zeros(*starts.shape)
-    no = jnp.array(False)
-    carry = (flat, starts), point, none, zeros() + 8e-3, no, no, jnp.zeros((), int)
-    _, best, _, _, _, _, count = lax.while_loop(going, body, carry)
-
-    theta, starts, rest, cost = best.theta, best.starts, best.rest, best.cost
-    own, by_start, _, units = scaled(best, none)
-    # What the states at the beginnings could explain as well tells nothing.
-    _, on_starts, _, on_theta, own = projected(own, by_start, eps)
-    free = jnp.sum(problem.counts) * problem.observations.shape[2] - p - starts.size
-    free = jnp.maximum(free, 1)
-    sigma = jnp.sqrt(jnp.sum(rest**2) / free)
-    rest = rest.reshape(problem.observations.shape)
-    each = jnp.sum(rest**2, axis=(0, 1))
-    paired = jnp.sum(rest[:, 1:] * rest[:, :-1], axis=(0, 1))
-    correlation = jnp.sqrt(jnp.sum(problem.counts)) * jnp.max(
-        paired / jnp.where(each > 0, each, 1)
-    )
-    # Rounding is correlated as it likes.
-    correlation = jnp.where(sigma < 0.5, 0, correlation)
-    noise = problem.noise * jnp.sqrt(each * problem.observations.shape[2] / free)
-    values = unravel(theta)
-    # No more certain than the noise that was given, or than rounding lets it be.
-    sigma = jnp.maximum(sigma, 1)
-    slope = own[:, :p] * units[0] * _per_relative(assembly, values)
-    certainty = Certainty.of(slope, sigma, 1.0)
-    off = jnp.linalg.norm(on_starts[..., p], axis=1), jnp.linalg.norm(on_theta)
-    settled = jnp.maximum(jnp.max(off[0]), off[1]) <= _NEAR * sigma
-    stopped = choose(count <= max_steps, RESULTS.no_descent, RESULTS.not_converged)
-    stopped = choose(settled, RESULTS.successful, stopped)
-    solver = choose(jnp.isfinite(cost), stopped, RESULTS.diverged)
-    legal = _flat_legal(assembly, values)
-    noise = jnp.where(jnp.isfinite(cost), noise, jnp.nan).astype(dtype)
-    return _Solution(values, starts, cost, legal, certainty, noise, correlation, solver)
-
-
-def _eliminate(A, B, damping):
-    """Least squares `min |A z - b|^2 + damping |z|^2` for the columns b of B.
-
-    `(R, C, left)`: `R z = C`, and what is left of B, with a row more for each z.
-    """
-    n = A.shape[1]
-    A = jnp.concatenate([A, jnp.sqrt(damping) * jnp.eye(n, dtype=A.dtype)])
-    B = jnp.concatenate([B, jnp.zeros((n, B.shape[1]), B.dtype)])
-    Q, R = jnp.linalg.qr(A)
-    C = Q.T @ B
-    return R, C, B - Q @ C
-
-
-def _flat_legal(assembly, values):
-    """The legal values in one vector."""
-    legal = {
-        path: assembly.constraints[path].constrain(value)
-        if path in assembly.constraints
-        else value
-        for path, value in values.items()
-    }
-    return jax.flatten_util.ravel_pytree(legal)[0]
-
-
-def _size(legal):
-    """What a relative change of 1 of each legal value amounts to."""
-    return jnp.where(legal == 0, 1, legal)
-
-
-def _per_relative(assembly, values):
-    """The change of each unconstrained value that makes a relative change of 1."""
-    tangent = jax.tree.map(jnp.ones_like, values)
-    flat = lambda values: _flat_legal(assembly, values)  # noqa: E731
-    legal, rate = jax.jvp(flat, (values,), (tangent,))
-    return _size(legal) / rate
-
-
-def _ends(assembly, values, reach):
+def _ends(
+    assembly: Assembly, values: dict[str, Array], reach: Float[Array, " p"]
+) -> Float[Array, " p"]:
     """The legal values that far from the estimate, in relative changes."""
     flat, unravel = jax.flatten_util.ravel_pytree(values)
-    step = reach * _per_relative(assembly, values)
-    legal = _flat_legal(assembly, unravel(flat + step))
+    step = reach * per_relative_change(assembly, values)
+    legal = flat_legal(assembly, unravel(flat + step))
     # A constraint keeps numbers off the ends of its set; an interval may reach them.
     edge, size = jnp.finfo(legal.dtype), jnp.abs(legal)
     end = jnp.where(size >= edge.max, jnp.sign(legal) * jnp.inf, legal)

@@ -65,14 +65,14 @@ class _Hasher:
     def __init__(self, root: str | None):
         self.sha = hashlib.sha256()
         self.root = root
-        # What was met, with its number; held, so that no other gets its id.
-        self.seen: dict[int, tuple[int, Any]] = {}
+        # What was visited, with its number; held, so that no other gets its id.
+        self.visited: dict[int, tuple[int, Any]] = {}
 
-    def meet(self, thing: Any) -> bool:
-        """Whether it is met for the first time."""
-        if id(thing) in self.seen:
+    def visit(self, thing: Any) -> bool:
+        """Whether it is visited for the first time."""
+        if id(thing) in self.visited:
             return False
-        self.seen[id(thing)] = len(self.seen), thing
+        self.visited[id(thing)] = len(self.visited), thing
         return True
 
     def own(self, module: str | None) -> bool:
@@ -95,7 +95,7 @@ class _Hasher:
         elif isinstance(value, enum.Enum):
             self.type(kind)
             self.word(value.name)
-            self.lenient(value.value)
+            self.feed_named(value.value)
         elif isinstance(value, Mapping) and not own:
             self.word("mapping", len(value))
             for _, key in sorted((repr(key), key) for key in value):
@@ -147,7 +147,7 @@ class _Hasher:
 
     def function(self, f: types.FunctionType) -> None:
         self.word("function", f.__qualname__)
-        if not self.meet(f):
+        if not self.visit(f):
             return
         names: set[str] = set()
         if self.own(f.__module__):
@@ -160,33 +160,33 @@ class _Hasher:
         for name in sorted(names):
             if name in f.__globals__:
                 self.word(name)
-                self.lenient(f.__globals__[name])
+                self.feed_named(f.__globals__[name])
 
     def closure(self, f: types.FunctionType) -> None:
         for cell in f.__closure__ or ():
             try:
-                self.lenient(cell.cell_contents)
+                self.feed_named(cell.cell_contents)
             except ValueError:  # not yet set
                 self.word("empty")
 
-    def lenient(self, value: Any) -> None:
+    def feed_named(self, value: Any) -> None:
         """A value that the code names: one without content counts by its type."""
-        if id(value) in self.seen:
+        if id(value) in self.visited:
             return
-        before, met = self.sha.copy(), len(self.seen)
+        before, count = self.sha.copy(), len(self.visited)
         try:
             self.feed(value)
         except (TypeError, RecursionError):
             self.sha = before
-            while len(self.seen) > met:
-                self.seen.popitem()
+            while len(self.visited) > count:
+                self.visited.popitem()
             self.word("thing", type(value).__qualname__)
             if self.own(type(value).__module__):
                 self.type(type(value))
 
     def type(self, cls: type) -> None:
         self.word("type", cls.__module__, cls.__qualname__)
-        if self.own(cls.__module__) and self.meet(cls):
+        if self.own(cls.__module__) and self.visit(cls):
             try:
                 source = _plain(inspect.getsource(cls))
                 if not source.startswith(f"class {cls.__name__}"):
@@ -196,7 +196,7 @@ class _Hasher:
                     code = _functions(member)
                     if code or not name.startswith("__"):
                         self.word(name)
-                        self.lenient(code or member)
+                        self.feed_named(code or member)
             else:
                 self.word(source)
                 # What its methods name; they may be wrapped, and are read as text.
@@ -205,7 +205,7 @@ class _Hasher:
                 named = {node.id for node in nodes if isinstance(node, ast.Name)}
                 for name in sorted(named & scope.keys()):
                     self.word(name)
-                    self.lenient(scope[name])
+                    self.feed_named(scope[name])
                 for member in vars(cls).values():
                     for f in _functions(member):
                         self.closure(f)
@@ -214,7 +214,7 @@ class _Hasher:
 
     def module(self, module: types.ModuleType) -> None:
         self.word("module", module.__name__)
-        if self.own(module.__name__) and self.meet(module):
+        if self.own(module.__name__) and self.visit(module):
             try:
                 self.word(_plain(inspect.getsource(module)))
             except (OSError, TypeError, SyntaxError):
@@ -224,7 +224,7 @@ class _Hasher:
                 if isinstance(member, types.ModuleType):
                     self.module(member)
                 elif isinstance(member, types.FunctionType | type):
-                    self.lenient(member)
+                    self.feed_named(member)
 
     def other(self, value: Any) -> None:
         if isinstance(value, Iterator):
@@ -236,8 +236,8 @@ class _Hasher:
             self.feed(leaves)
             return
         kind = type(value)
-        if not self.meet(value):
-            self.word("again", self.seen[id(value)][0])
+        if not self.visit(value):
+            self.word("again", self.visited[id(value)][0])
             return
         # What pickle would write, and the code of whatever is in there.
         reduce = copyreg.dispatch_table.get(kind)
@@ -255,12 +255,10 @@ class _Hasher:
 
     def nodes(self, structure: Any) -> None:
         """The classes of the nodes of a tree, and what these hold beside leaves."""
-        found = structure.node_data()
-        if found is not None:
-            kind, beside = found
-            if isinstance(kind, type) and self.own(kind.__module__):
-                self.type(kind)
-                self.lenient(beside)
+        kind, static = structure.node_data() or (None, None)
+        if isinstance(kind, type) and self.own(kind.__module__):
+            self.type(kind)
+            self.feed_named(static)
         for child in structure.children():
             self.nodes(child)
 
@@ -269,12 +267,12 @@ def _functions(member: Any) -> list[types.FunctionType]:
     """The functions of a member of a class: a method, a property or the like."""
     if isinstance(member, staticmethod | classmethod):
         member = member.__func__
-    found = [member]
+    functions = [member]
     if isinstance(member, property):
-        found = [member.fget, member.fset, member.fdel]
+        functions = [member.fget, member.fset, member.fdel]
     elif isinstance(member, functools.cached_property):
-        found = [member.func]
-    return [f for f in found if isinstance(f, types.FunctionType)]
+        functions = [member.func]
+    return [f for f in functions if isinstance(f, types.FunctionType)]
 
 
 def source_of(f: types.FunctionType) -> str:
@@ -314,8 +312,6 @@ def _bytecode(code: types.CodeType) -> tuple:
 
 
 def _names(code: types.CodeType) -> set[str]:
-    found = set(code.co_names)
-    for constant in code.co_consts:
-        if isinstance(constant, types.CodeType):
-            found |= _names(constant)
-    return found
+    """The names that the code uses, those of functions within it too."""
+    inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
+    return {*code.co_names}.union(*map(_names, inner))

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_count, check_key, check_step
-from .._module import as_module, parameter, positive, weight
-from .._typing import PRNGKey
-from ..dynamics import Discretized
-from ._environment import PressureSensor
+from .._check import check_count, check_instance, check_key, check_step
+from .._module import parameter, positive, weight
+from .._typing import PRNGKey, RealScalar, Scalar, State
+from ..dynamics import Delayed, Discretized
 from ._lungs import AbstractLung, SingleCompartment
+from ._tanh_network import tanh_network
 from ._valves import Valves
 
 
@@ -43,7 +43,7 @@ class LungModel(eqx.Module):
         ```
     """
 
-    dynamics: PressureSensor
+    dynamics: Delayed
     peep: Array = parameter()
 
     def __init__(
@@ -55,12 +55,10 @@ class LungModel(eqx.Module):
         solver: diffrax.AbstractSolver | None = None,
     ):
         where = "LungModel"
-        if not isinstance(system, AbstractLung):
-            raise ValueError(
-                f"{where}: system must be an AbstractLung, got {type(system).__name__}."
-            )
+        check_instance(system, AbstractLung, "system must be an AbstractLung", where)
         check_step(dt, where)
-        self.dynamics = PressureSensor(Discretized(system, dt, solver), sensor_delay)
+        delay = check_count(sensor_delay, "sensor_delay", where, least=0)
+        self.dynamics = Delayed(Discretized(system, dt, solver), sensor=delay)
         self.peep = peep
 
     @property
@@ -68,7 +66,7 @@ class LungModel(eqx.Module):
         """The lung."""
         return self.dynamics.dynamics.system  # pyright: ignore[reportAttributeAccessIssue]
 
-    def resting(self) -> Array:
+    def resting(self) -> State:
         """The state of the dynamics before an inspiration."""
         return self.dynamics.filled(self.system.resting(self.peep))
 
@@ -146,15 +144,11 @@ class NeuralLung(AbstractLung):
     ):
         where = "NeuralLung"
         self.hidden = check_count(hidden, "hidden", where)
-        self.network = eqx.nn.MLP(
-            self.hidden + 3,
-            self.hidden + 1,
-            check_count(width, "width", where),
-            check_count(depth, "depth", where),
-            as_module(jnp.tanh),
-            as_module(jax.nn.identity),
-            key=check_key(key, where),
-        )
+        check_count(width, "width", where)
+        check_count(depth, "depth", where)
+        check_key(key, where)
+        sizes = self.hidden + 3, self.hidden + 1, width, depth
+        self.network = tanh_network(*sizes, key=key)
         self.p_mean, self.p_std, self.rate = p_mean, p_std, rate
         self.valves = Valves() if valves is None else valves
 
@@ -162,13 +156,10 @@ class NeuralLung(AbstractLung):
     def state_names(self):
         return ("pressure", *(f"hidden {i}" for i in range(self.hidden)))
 
-    def pressure(self, x):
+    def pressure(self, x: State) -> Scalar:
         return self.p_mean + self.p_std * x[0]
 
-    def outflow(self, x):
-        return 0 * x[0]
-
-    def resting(self, pressure):
+    def resting(self, pressure: RealScalar) -> State:
         first = jnp.reshape((pressure - self.p_mean) / self.p_std, (1,))
         return jnp.concatenate([first, jnp.zeros(self.hidden)])
 
@@ -233,13 +224,11 @@ class GreyBoxLung(AbstractLung):
         check_key(key, where)
         width = check_count(width, "width", where)
         self.single = SingleCompartment() if single is None else single
-        tanh, same = as_module(jnp.tanh), as_module(jax.nn.identity)
-        network, memory = (
-            eqx.nn.MLP(3, "scalar", width, 1, tanh, same, key=k) for k in jr.split(key)
+        network, self.memory = (
+            tanh_network(3, "scalar", width, 1, key=k) for k in jr.split(key)
         )
         last = lambda mlp: mlp.layers[-1].weight  # noqa: E731
         self.network = eqx.tree_at(last, network, 0.1 * last(network))
-        self.memory = memory
         self.p_std, self.rate = p_std, rate
 
     @property
@@ -251,14 +240,11 @@ class GreyBoxLung(AbstractLung):
         inside = x[2] / (1e-3 * self.single.compliance)
         return jnp.stack([x[0], inside / self.p_std, x[3]])
 
-    def pressure(self, x):
+    def pressure(self, x: State) -> Scalar:
         rest = self.network(self._inputs(x))
         return self.single.pressure(x[:3]) + self.p_std * rest
 
-    def outflow(self, x):
-        return self.single.outflow(x[:3])
-
-    def resting(self, pressure):
+    def resting(self, pressure: RealScalar) -> State:
         physical = self.single.resting(pressure)
         return jnp.concatenate([physical, jnp.zeros(1)])
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from .._check import check_count, check_key
+from .._check import check_count, check_instance, check_key
 from .._typing import PRNGKey
 from ..training import fit, Fitted
-from ._data import Breaths
-from ._learned import LearnedLung
+from ._breaths import Breaths
+from ._learned_lung import LearnedLung
 from ._stacking import stack, unstack
 
 
@@ -27,11 +27,9 @@ class _Simulation(eqx.Module):
         u_in, pressure = (jnp.swapaxes(column, 0, 1) for column in batch)
 
         def one(model, u_in, pressure):
-            if self.teacher:
-                found = jax.vmap(model.one_step)(u_in, pressure)
-            else:
-                found = jax.vmap(model.predict)(u_in)
-            return jnp.mean(jnp.abs(found - pressure))
+            inputs = (u_in, pressure) if self.teacher else (u_in,)
+            predict = model.one_step if self.teacher else model.predict
+            return jnp.mean(jnp.abs(jax.vmap(predict)(*inputs) - pressure))
 
         errors = eqx.filter_vmap(one)(models, u_in, pressure)
         return jnp.mean(errors / self.scale)
@@ -108,10 +106,7 @@ def fit_lungs(
     """
     where = "fit_lungs"
     check_key(key, where)
-    if not isinstance(breaths, Breaths):
-        raise ValueError(
-            f"{where}: breaths must be Breaths, got {type(breaths).__name__}."
-        )
+    check_instance(breaths, Breaths, "breaths must be Breaths", where)
     single = breaths.pressure.ndim == 2
     u_in, pressure = breaths.u_in, breaths.pressure
     if single:

@@ -1,21 +1,24 @@
 """The public data set of a ventilator, as a file of comma-separated values."""
 
+import array
 import csv
-import itertools
+import math
 import os
-import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
 from .._check import as_path, check_count, check_key, check_positive
 from .._typing import PRNGKey
-from ._data import Breaths, explore, LENGTH
-from ._tasks import double_compartment
+from ._breaths import Breaths
+from ._exploration import explore
+from ._lung_tasks import double_compartment
+from ._waveform import LENGTH
 
 
 COLUMNS = ("id", "breath_id", "R", "C", "time_step", "u_in", "u_out", "pressure")
@@ -93,7 +96,7 @@ def read_breaths(
         steps = np.diff(time)
         steps[starts[1:] - 1] = np.nan  # from one breath to the next
         dt = float(np.nanmedian(steps))
-    kept = {name: [] for name in ("u_in", "pressure", "R", "C")}
+    samples = []
     grid = dt * np.arange(length)
     for start, end in zip(starts, ends, strict=True):
         open_at = np.flatnonzero(table["u_out"][start:end] > 0)
@@ -103,7 +106,7 @@ def read_breaths(
         if stop == start or t[-1] + 0.5 * dt < grid[-1]:
             raise _wrong(
                 path,
-                start,
+                table["line"][start],
                 "u_out",
                 f"breath {table['breath_id'][start]:g} has an inspiration of "
                 f"{stop - start} rows and {t[-1] if len(t) else 0:.3g} s, too short "
@@ -111,37 +114,36 @@ def read_breaths(
             )
         rows = slice(start, stop)
         held = np.clip(np.searchsorted(t, grid + 1e-9) - 1, 0, None)
-        kept["u_in"].append(table["u_in"][rows][held])
-        kept["pressure"].append(np.interp(grid, t, table["pressure"][rows]))
-        kept["R"].append(table["R"][start])
-        kept["C"].append(table["C"][start])
-    columns = {name: jnp.asarray(np.array(values)) for name, values in kept.items()}
-    return Breaths(
-        columns["u_in"],
-        jnp.zeros_like(columns["u_in"]),
-        columns["pressure"],
-        dt,
-        columns["R"],
-        columns["C"],
-    )
+        pressure = np.interp(grid, t, table["pressure"][rows])
+        samples.append((table["u_in"][rows][held], pressure))
+    u_in, pressure = jnp.asarray(np.array(samples)).swapaxes(0, 1)
+    lungs = jnp.asarray(table["R"][starts]), jnp.asarray(table["C"][starts])
+    return Breaths(u_in, jnp.zeros_like(u_in), pressure, dt, *lungs)
+
+
+def _wrong(path: Path, line: Any, column: str, words: str) -> ValueError:
+    return ValueError(f"{_WHERE}: '{path}' row {line}, column {column}: {words}.")
 
 
 def _check_values(
     path: Path, table: dict[str, np.ndarray], known: dict[str, Sequence[float]]
 ) -> None:
     """Raise unless each value is one that there may be."""
-    for name, allowed in known.items():
-        bad = ~np.isin(table[name], np.asarray(allowed, float))
+    checks = [
+        (
+            name,
+            ~np.isin(table[name], np.asarray(allowed, float)),
+            f"one of {', '.join(f'{value:g}' for value in allowed)}",
+        )
+        for name, allowed in known.items()
+    ]
+    u_in = table["u_in"]
+    checks.append(("u_in", (u_in < 0) | (u_in > 100), "between 0 and 100"))
+    for name, bad, words in checks:
         if bad.any():
             row = int(np.argmax(bad))
-            words = ", ".join(f"{value:g}" for value in allowed)
-            got = f"must be one of {words}, got {table[name][row]:g}"
-            raise _wrong(path, row, name, got)
-    bad = (table["u_in"] < 0) | (table["u_in"] > 100)
-    if bad.any():
-        row = int(np.argmax(bad))
-        got = f"must be between 0 and 100, got {table['u_in'][row]:g}"
-        raise _wrong(path, row, "u_in", got)
+            got = f"must be {words}, got {table[name][row]:g}"
+            raise _wrong(path, table["line"][row], name, got)
 
 
 def _breaths(path: Path, table: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -149,44 +151,58 @@ def _breaths(path: Path, table: dict[str, np.ndarray]) -> tuple[np.ndarray, np.n
     number, time = table["breath_id"], table["time_step"]
     starts = np.flatnonzero(np.diff(number, prepend=np.nan) != 0)
     ends = np.append(starts[1:], len(number))
-    _, first = np.unique(number[starts], return_index=True)
-    again = np.setdiff1d(np.arange(len(starts)), first)
-    if len(again):
-        row = int(starts[again[0]])
-        got = f"must follow each other, but breath {number[row]:g} was before"
-        raise _wrong(path, row, "breath_id", f"the rows of a breath {got}")
-    alone = np.flatnonzero(ends - starts < 2)
-    if len(alone):
-        row = int(starts[alone[0]])
-        got = f"must have at least 2 rows, got 1 of breath {number[row]:g}"
-        raise _wrong(path, row, "breath_id", f"a breath {got}")
     inner = np.ones(len(number), bool)
     inner[starts] = False
-    back = inner & (np.diff(time, prepend=0.0) <= 0)
-    if back.any():
-        row = int(np.argmax(back))
-        got = f"must increase within a breath, got {time[row]:g} after"
-        raise _wrong(path, row, "time_step", f"{got} {time[row - 1]:g}")
+    _, first = np.unique(number[starts], return_index=True)
+    again = np.ones(len(starts), bool)
+    again[first] = False
+
+    def check(column: str, bad: np.ndarray, words: Callable[[int], str]) -> None:
+        if len(bad):
+            row = int(bad[0])
+            raise _wrong(path, table["line"][row], column, words(row))
+
+    check(
+        "breath_id",
+        starts[again],
+        lambda row: (
+            "the rows of a breath must follow each other, but breath "
+            f"{number[row]:g} was before"
+        ),
+    )
+    check(
+        "breath_id",
+        starts[ends - starts < 2],
+        lambda row: (
+            f"a breath must have at least 2 rows, got 1 of breath {number[row]:g}"
+        ),
+    )
+    check(
+        "time_step",
+        np.flatnonzero(inner & (np.diff(time, prepend=0.0) <= 0)),
+        lambda row: (
+            f"must increase within a breath, got {time[row]:g} after {time[row - 1]:g}"
+        ),
+    )
     for name in ("R", "C"):
         values = table[name]
-        changed = inner & (np.diff(values, prepend=values[0]) != 0)
-        if changed.any():
-            row = int(np.argmax(changed))
-            got = f"must be the same for all of breath {number[row]:g}, got"
-            words = f"{got} {values[row]:g} after {values[row - 1]:g}"
-            raise _wrong(path, row, name, words)
+        check(
+            name,
+            np.flatnonzero(inner & (np.diff(values, prepend=values[0]) != 0)),
+            lambda row, values=values: (
+                f"must be the same for all of breath "
+                f"{number[row]:g}, got {values[row]:g} after {values[row - 1]:g}"
+            ),
+        )
     return starts, ends
 
 
-def _open(path: Path) -> Any:
-    # What is no text is a value like any other that is no number.
-    return open(path, newline="", encoding="utf-8-sig", errors="replace")
-
-
 def _table(path: Path) -> dict[str, np.ndarray]:
-    """The columns by name, as numbers."""
-    with _open(path) as file:
-        header = [name.strip() for name in next(csv.reader(file), [])]
+    """The columns by name, as numbers, and of each row its `line` in the file."""
+    # What is no text is a value like any other that is no number.
+    with open(path, newline="", encoding="utf-8-sig", errors="replace") as file:
+        reader = csv.reader(file)
+        header = [name.strip() for name in next(reader, [])]
         missing = [name for name in COLUMNS if name not in header]
         twice = [name for name in COLUMNS if header.count(name) > 1]
         if twice:
@@ -201,50 +217,33 @@ def _table(path: Path) -> dict[str, np.ndarray]:
                 f"{', '.join(header)[:200] or 'nothing'}."
             )
         place = {name: header.index(name) for name in COLUMNS}
-        columns = list(place.values())
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that there are no rows
-                form: Any = dict(delimiter=",", quotechar='"', comments=None)
-                rows = np.loadtxt(file, usecols=columns, ndmin=2, **form)
-        except ValueError:
-            rows = None
-    if rows is not None and not rows.size:
-        raise ValueError(f"{_WHERE}: '{path}' must have rows after its header.")
-    if rows is None or not np.all(np.isfinite(rows)):
-        raise _first_bad_value(path, place)
-    return dict(zip(place, rows.T, strict=True))
-
-
-def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """The rows after the header that are not blank, each with its line."""
-    with _open(path) as file:
-        reader = csv.reader(file)
-        next(reader)
-        last = reader.line_num
+        numbers, lines, last = array.array("d"), array.array("q"), reader.line_num
         for row in reader:
             if row:
-                yield last + 1, row
+                lines.append(last + 1)
+                numbers.extend(_numbers(path, last + 1, row, place))
             last = reader.line_num
+    if not lines:
+        raise ValueError(f"{_WHERE}: '{path}' must have rows after its header.")
+    columns = np.array(numbers).reshape(-1, len(place)).T
+    return dict(zip(place, columns, strict=True), line=np.array(lines))
 
 
-def _wrong(path: Path, row: int, column: str, words: str) -> ValueError:
-    line, _ = next(itertools.islice(_rows(path), row, None))
-    return ValueError(f"{_WHERE}: '{path}' row {line}, column {column}: {words}.")
-
-
-def _first_bad_value(path: Path, place: dict[str, int]) -> ValueError:
-    for i, (_, row) in enumerate(_rows(path)):
-        for name, j in place.items():
-            text = row[j] if j < len(row) else ""
-            try:
-                # Python takes 1_000 for a number; no other reader of the file would.
-                fine = np.isfinite(float(text)) and "_" not in text
-            except ValueError:
-                fine = False
-            if not fine:
-                return _wrong(path, i, name, f"must be a finite number, got {text!r}")
-    return ValueError(f"{_WHERE}: '{path}' must be rows of numbers.")
+def _numbers(
+    path: Path, line: int, row: list[str], place: dict[str, int]
+) -> Iterator[float]:
+    """The numbers of a row, in the order of the columns."""
+    for name, j in place.items():
+        text = row[j] if j < len(row) else ""
+        try:
+            # Python takes 1_000 for a number; no other reader of the file would.
+            number = np.nan if "_" in text else float(text)
+        except ValueError:
+            number = np.nan
+        if not math.isfinite(number):
+            got = f"must be a finite number, got {text!r}"
+            raise _wrong(path, line, name, got)
+        yield number
 
 
 def write_breaths(path: str | os.PathLike, breaths: Breaths) -> None:
@@ -347,12 +346,8 @@ def write_example(
         )
         for (R, C), own in zip(lungs, jr.split(key, len(lungs)), strict=True)
     ]
-    joined = [
-        jnp.concatenate([getattr(part, name) for part in parts])
-        for name in ("u_in", "u_out", "pressure")
-    ]
-    known = {
-        name: jnp.concatenate([getattr(part, name) for part in parts])
-        for name in ("resistance", "compliance")
-    }
-    write_breaths(path, Breaths(*joined, dt=parts[0].dt, **known))
+    whole = jax.tree.map(
+        lambda *columns: jnp.concatenate(columns) if columns[0].ndim else columns[0],
+        *parts,
+    )
+    write_breaths(path, whole)

@@ -7,6 +7,7 @@ import pytest
 from helpers import once, user_error
 from matplotlib.figure import Figure
 
+from delucax import studies
 from delucax.studies.paper import (
     _policy_gradient,
     _reproduce,
@@ -40,12 +41,12 @@ def broken(small):
 
 
 @pytest.fixture
-def studies(monkeypatch):
+def made_up(monkeypatch):
     made = {"drawn": drawn, "ventilator": ventilator, "broken": broken}
     monkeypatch.setattr(_reproduce, "STUDIES", made)
 
 
-def test_the_report_holds_claims_tables_and_images(tmp_path, studies):
+def test_the_report_holds_claims_tables_and_images(tmp_path, made_up):
     lines = []
     rows = studies.reproduce("all", tmp_path, small=True, say=lines.append)
     assert [row["holds"] for row in rows] == [True, False, False]
@@ -65,7 +66,7 @@ def test_the_report_holds_claims_tables_and_images(tmp_path, studies):
     assert "  Breaths: 1 s" in lines and "1 of 3 claims hold" in lines[-1]
 
 
-def test_small_and_full_lungs_are_apart(tmp_path, studies):
+def test_small_and_full_lungs_are_apart(tmp_path, made_up):
     for small in (True, False):
         studies.reproduce("ventilator", tmp_path, small=small, say=len)
     assert {path.name for path in tmp_path.glob("lung*")} == {"lung", "lung-small"}

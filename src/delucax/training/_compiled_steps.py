@@ -1,5 +1,6 @@
-"""The compiled part of the training loop."""
+"""The steps of [`delucax.training.fit`][], compiled in blocks."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -8,15 +9,19 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
 import optax
+from jaxtyping import Array, Int, PyTree
 
+from .._typing import PRNGKey
 from ._history import COLUMNS
 from ._loss import cost_and_metrics
+from ._surrogate import AbstractSurrogate
 from ._trainable import strong
 
 
+Values = dict[str, Array]
 _WHERE = "fit"
-# Folded into the key for the order of the data and for the first memory of a surrogate;
-# no step counts as far.
+# Folded into the key for the order of the data and for the first memory of a surrogate.
+# They are larger than the number of any step.
 _ORDER = 2**32 - 1
 _MEMORY = 2**32 - 2
 CAPACITY = 1000
@@ -26,14 +31,19 @@ FAULTS = ("nothing", "loss", "gradient", "update")
 """What is not finite, by the number that a block returns."""
 
 
-def first_state(optimiser, values, lanes):
-    """What an optimiser begins with; `lanes` of it, or one where that is `None`."""
-    return _over_lanes(optimiser.init, lanes)(values)
+def first_state(
+    optimiser: optax.GradientTransformation, values: Values, seeds: int | None
+) -> PyTree:
+    """The state of an optimiser before the first step, of each seed if there are
+    several."""
+    return _over_seeds(optimiser.init, seeds)(values)
 
 
 @eqx.filter_jit
-def first_memory(loss, model, key, lanes):
-    """What a surrogate begins with."""
+def first_memory(
+    loss: AbstractSurrogate, model: PyTree, key: PRNGKey, seeds: int | None
+) -> PyTree:
+    """The memory of a surrogate before the first step."""
 
     def begin(model, key):
         memory = loss.init(model, jr.fold_in(key, _MEMORY))
@@ -44,23 +54,36 @@ def first_memory(loss, model, key, lanes):
             )
         return jax.tree.map(strong, memory)
 
-    return _over_lanes(begin, lanes)(model, key)
+    return _over_seeds(begin, seeds)(model, key)
 
 
 @eqx.filter_jit
-def finished(loss, model, memory, lanes):
+def finished_model(
+    loss: AbstractSurrogate, model: PyTree, memory: PyTree, seeds: int | None
+) -> PyTree:
     """The model with what a surrogate learned beside its weights."""
-    return _over_lanes(loss.finished, lanes)(model, memory)
+    return _over_seeds(loss.finished, seeds)(model, memory)
 
 
 @eqx.filter_jit
-def run_block(functions, carry, inputs, span, batch_size, lanes):
-    """The steps from `span[0]` up to `span[1]`, at most `CAPACITY` of them."""
+def run_block(
+    functions: tuple[Any, ...],
+    carry: tuple[PyTree, ...],
+    inputs: tuple[PRNGKey, PyTree],
+    span: Int[Array, "2"],
+    batch_size: int | None,
+    seeds: int | None,
+) -> tuple[tuple[PyTree, ...], tuple[dict[str, Array], Array]]:
+    """The steps from `span[0]` up to `span[1]`, at most `CAPACITY` of them.
+
+    `(carry, (rows, count))`: a row of metrics for each step, of which `count` were
+    taken.
+    """
     loss, gradient, optimiser, static, assembly = functions
     key, data = inputs
     optimiser = optax.with_extra_args_support(optimiser)
 
-    def lane(assembly, key, values, state, memory, order, before, k):
+    def step_of_one(assembly, key, values, state, memory, order, before, k):
         own_key = jr.fold_in(key, k)
         if data is None:
             arguments = ()
@@ -69,11 +92,11 @@ def run_block(functions, carry, inputs, span, batch_size, lanes):
         else:
             rows, order = _drawn_rows(jr.fold_in(key, _ORDER), order, k, batch_size)
             arguments = (jax.tree.map(lambda leaf: leaf[rows], data),)
-        known = memory
+        old_memory = memory
         if memory is not None:
             own_key, memory_key = jr.split(own_key)
             memory = loss.update(assembly(values), memory, k, memory_key)
-            _check_memory(loss, known, memory)
+            _check_memory(loss, old_memory, memory)
             arguments = (memory,)
 
         def of(values, key):
@@ -81,7 +104,7 @@ def run_block(functions, carry, inputs, span, batch_size, lanes):
 
         value, slope = gradient(of, values, own_key)
         cost, metrics = cost_and_metrics(value, _WHERE)
-        _check_like(slope, values)
+        _check_gradient(slope, values)
         slope = jax.tree.map(lambda g, v: g.astype(v.dtype), slope, values)
         if taken := sorted(set(metrics) & set(COLUMNS)):
             raise ValueError(
@@ -96,15 +119,15 @@ def run_block(functions, carry, inputs, span, batch_size, lanes):
             grad=slope,
             value_fn=lambda v: cost_and_metrics(of(v, own_key), _WHERE)[0],
         )
-        moved = jax.tree.map(lambda v, d: (v + d).astype(v.dtype), values, updates)
+        moved = optax.apply_updates(values, updates)
         norm = _norm(slope)
         fault = jnp.where(
             ~jnp.isfinite(cost),
             1,
             jnp.where(~jnp.isfinite(norm), 2, jnp.where(_is_finite(moved), 0, 3)),
         ).astype(jnp.int32)
-        # One of several that went wrong stays as it was while the others go on.
-        fault = fault if lanes is None else jnp.where(before == 0, fault, before)
+        # A seed that failed stays as it was while the others go on.
+        fault = fault if seeds is None else jnp.where(before == 0, fault, before)
         # Kept in the precision that it began with, or the loop would not close.
         after = jax.tree.map(
             lambda new, old: new if new.dtype == old.dtype else new.astype(old.dtype),
@@ -114,19 +137,19 @@ def run_block(functions, carry, inputs, span, batch_size, lanes):
         values, state, memory = jax.tree.map(
             lambda new, old: jnp.where(fault == 0, new, old),
             (moved, after, memory),
-            (values, state, known),
+            (values, state, old_memory),
         )
         row = {"loss": strong(cost), "gradient_norm": norm, **metrics}
         return values, state, memory, order, fault, row
 
-    def step(values, state, memory, order, before, k):
-        stepped = _over_lanes(lane, lanes, last=None)
+    def step_of_all(values, state, memory, order, before, k):
+        stepped = _over_seeds(step_of_one, seeds, last=None)
         return stepped(assembly, key, values, state, memory, order, before, k)
 
     first, stop = span[0], span[1]
-    # Traced once, here: the loop needs to know what a row is before it begins.
-    step = eqx.filter_closure_convert(step, *carry, first)
-    row = step.out_struct[5]  # pyright: ignore[reportFunctionMemberAccess]
+    # Traced once, here: the loop needs the shapes of a row before it begins.
+    step: Any = eqx.filter_closure_convert(step_of_all, *carry, first)
+    row = step.out_struct[5]
     rows = {n: jnp.zeros((CAPACITY, *s.shape), s.dtype) for n, s in row.items()}
 
     def going(carry):
@@ -147,25 +170,26 @@ def run_block(functions, carry, inputs, span, batch_size, lanes):
     return carry, (rows, count)
 
 
-def _over_lanes(function, lanes, last: int | None = 0):
-    """`function` over a leading axis of every argument, or as it is for one lane.
+def _over_seeds(
+    function: Callable[..., Any], seeds: int | None, last: int | None = 0
+) -> Callable[..., Any]:
+    """`function` over a leading axis of every argument, or as it is for one seed.
 
     `last` says of the last argument alone whether it has that axis.
     """
-    if lanes is None:
+    if seeds is None:
         return function
+    first = eqx.if_array(0)
 
     def mapped(*arguments):
-        axes: list[Any] = [eqx.if_array(0)] * len(arguments)
-        if last is None:
-            axes[-1] = None
+        axes = [first] * (len(arguments) - 1) + [None if last is None else first]
         return eqx.filter_vmap(function, in_axes=tuple(axes))(*arguments)
 
     return mapped
 
 
-def _check_memory(loss, old, new) -> None:
-    """Raise unless an update leaves a memory of the same make."""
+def _check_memory(loss: AbstractSurrogate, old: PyTree, new: PyTree) -> None:
+    """Raise unless an update keeps the structure, shapes and dtypes of a memory."""
     shapes = [
         jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf)), memory)
         for memory in (old, new)
@@ -177,44 +201,41 @@ def _check_memory(loss, old, new) -> None:
         )
 
 
-def _drawn_rows(key, order, k, batch_size):
+def _drawn_rows(
+    key: PRNGKey, order: tuple[Array, Array], k: Array, batch_size: int
+) -> tuple[Array, tuple[Array, Array]]:
     """The rows of the batch of step `k`, and the order of the pass it is in."""
-    order, known = order
-    size = order.shape[0]
-    batches = size // batch_size
-    now = k // batches
-    order = lax.cond(
-        now == known,
-        lambda: order,
-        lambda: jr.permutation(jr.fold_in(key, now), size).astype(jnp.int32),
+    rows, last_pass = order
+    batches = rows.shape[0] // batch_size
+    this_pass = k // batches
+    rows = lax.cond(
+        this_pass == last_pass,
+        lambda: rows,
+        lambda: jr.permutation(jr.fold_in(key, this_pass), rows.shape[0]).astype(
+            jnp.int32
+        ),
     )
     start = (k % batches) * batch_size
-    return lax.dynamic_slice(order, (start,), (batch_size,)), (order, now)
+    return lax.dynamic_slice(rows, (start,), (batch_size,)), (rows, this_pass)
 
 
-def _norm(tree):
+def _norm(tree: PyTree) -> Array:
     """The Euclidean norm, in float32 at least: squares of float16 overflow at 256."""
-    wide = [
-        leaf.astype(jnp.promote_types(leaf.dtype, jnp.float32))
-        for leaf in jax.tree.leaves(tree)
-    ]
-    return jnp.sqrt(sum(jnp.sum(jnp.square(leaf)) for leaf in wide))
+    widen = lambda leaf: leaf.astype(jnp.promote_types(leaf.dtype, jnp.float32))
+    return optax.tree.norm(jax.tree.map(widen, tree))
 
 
-def _is_finite(tree):
+def _is_finite(tree: PyTree) -> Array:
     return jnp.all(
         jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)])
     )
 
 
-def _check_like(gradient, values) -> None:
-    same = jax.tree.structure(gradient) == jax.tree.structure(values)
-    if not same or not all(
-        jnp.shape(g) == v.shape
-        for g, v in zip(jax.tree.leaves(gradient), jax.tree.leaves(values), strict=True)
-    ):
+def _check_gradient(gradient: PyTree, values: Values) -> None:
+    """Raise unless an estimator's gradient has the structure and shapes of `values`."""
+    expected, got = (jax.tree.map(jnp.shape, tree) for tree in (values, gradient))
+    if expected != got:
         raise ValueError(
             f"{_WHERE}: gradient must return (value, gradient) with a gradient like "
-            f"the values {jax.tree.map(jnp.shape, values)}, got "
-            f"{jax.tree.map(jnp.shape, gradient)}."
+            f"the values {expected}, got {got}."
         )

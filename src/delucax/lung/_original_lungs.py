@@ -91,8 +91,7 @@ class OriginalBalloonLung(AbstractDynamics):
         after = volume + flow * self.dt
         if self.leak:
             after = after + self.dt / (5 + self.dt) * (self.rest - after)
-        held = jnp.maximum(after, 0.1 * self.rest)
-        pressure = self.offset + balloon_pressure(held, self.rest, self.stiffness)
+        pressure = self.offset + balloon_pressure(after, self.rest, self.stiffness)
         after = jnp.stack([after, pressure])
         return (after if w is None else after + w).astype(x.dtype), RESULTS.successful
 

@@ -6,13 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from .._check import check_count, check_key, check_step
 from .._controller import AbstractController, check_controller
-from .._module import as_module, parameter, positive, weight
+from .._module import parameter, positive, weight
 from .._typing import PRNGKey
 from ..math import clip
+from ._tanh_network import tanh_network
 from ._waveform import BreathWaveform, check_waveform
 
 
@@ -118,31 +119,33 @@ class Breathing(AbstractController):
     def __call__(self, t, y, state):
         inhale = self.waveform.is_inspiration(t)
         begins = inhale & ~state.inhaling
-        choose = lambda yes, no: _where(begins, yes, no)  # noqa: E731
-        inner = jax.tree.map(choose, self.inspiratory.init(key=None), state.inner)
+        inner = _where(begins, self.inspiratory.init(key=None), state.inner)
         u_in, after = self.inspiratory(t, y, inner)
         u_out, valve = self.valve(t, y, state.valve)
         period = self.waveform.period
         late = jnp.maximum(self.waveform.share(t) - 0.5, 0) * period
         held = self.hold * (1 - jnp.exp(-5 * late))
         u_in = jnp.where(inhale, clip(u_in[0], 0, 100), held)
-        after = jax.tree.map(lambda a, b: _where(inhale, a, b), after, inner)
         u = jnp.stack([u_in, u_out[0]]).astype(y.dtype)
-        return u, _Phases(after, valve, inhale)
+        return u, _Phases(_where(inhale, after, inner), valve, inhale)
 
     def applied(self, u, cost, state):
         inner = self.inspiratory.applied(u[:1], cost, state.inner)
-        told = lambda a, b: _where(state.inhaling, a, b)  # noqa: E731
         return state._replace(
-            inner=jax.tree.map(told, inner, state.inner),
+            inner=_where(state.inhaling, inner, state.inner),
             valve=self.valve.applied(u[1:], cost, state.valve),
         )
 
 
-def _where(condition: Array, yes: Any, no: Any) -> Any:
-    if not eqx.is_array(no) or jnp.issubdtype(no.dtype, jax.dtypes.prng_key):
-        return no
-    return jnp.where(condition, yes, no).astype(no.dtype)
+def _where(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
+    """One of two states. Random keys are those of `no`: none is drawn from twice."""
+
+    def where(yes, no):
+        if not eqx.is_array(no) or jnp.issubdtype(no.dtype, jax.dtypes.prng_key):
+            return no
+        return jnp.where(condition, yes, no).astype(no.dtype)
+
+    return jax.tree.map(where, yes, no)
 
 
 class BangBang(AbstractController):
@@ -263,15 +266,8 @@ class BreathPolicy(AbstractController):
             self.convolution = jr.normal(filter_key, (5, width)) / 5**0.5
             size += (self.errors - 4) * width - self.errors
             depth = 0
-        self.network = eqx.nn.MLP(
-            size,
-            "scalar",
-            width,
-            check_count(depth, "depth", where, least=0),
-            as_module(jnp.tanh),
-            as_module(jax.nn.identity),
-            key=key,
-        )
+        check_count(depth, "depth", where, least=0)
+        self.network = tanh_network(size, "scalar", width, depth, key=key)
         self.shift = -2.0  # pyright: ignore[reportAttributeAccessIssue]
 
     def __check_init__(self):
@@ -288,12 +284,13 @@ class BreathPolicy(AbstractController):
         errors = jnp.concatenate([error, state.errors[:-1]])
         ahead = [self.waveform.pressure(t + k * self.dt) for k in (1, 2)]
         targets = (jnp.stack([*ahead, now]) - self.waveform.peep) / 15
-        seen = errors
+        features = errors
         if self.convolution is not None:
             means = jnp.cumsum(errors) / jnp.arange(1, self.errors + 1)
             windows = [means[i : self.errors - 4 + i] for i in range(5)]
-            seen = jnp.ravel(jnp.maximum(0, jnp.stack(windows, 1) @ self.convolution))
-        z = jnp.concatenate([seen, targets, state.controls]).astype(y.dtype)
+            convolved = jnp.stack(windows, 1) @ self.convolution
+            features = jnp.ravel(jnp.maximum(0, convolved))
+        z = jnp.concatenate([features, targets, state.controls]).astype(y.dtype)
         u = 100 * jax.nn.sigmoid(self.network(z) + self.shift)
         after = state._replace(errors=errors.astype(state.errors.dtype))
         return jnp.reshape(u, (1,)).astype(y.dtype), after

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import pytest
 from helpers import once
 
-from delucax.experiments import _execute, _room, experiment
-from delucax.experiments._room import make_room
+from delucax.experiments import _execute, _memory_maps, experiment
+from delucax.experiments._memory_maps import release_programs
 
 
 pytestmark = [
@@ -21,22 +21,23 @@ def test_programs_go_when_they_take_too_much():
     programs = [jax.jit(lambda x, n=n: jnp.sin(x) + n) for n in range(20)]
     for program in programs:
         program(0.0)
-    taken = len(_room._TAKEN.read_bytes().splitlines())
-    assert not make_room() and programs[1]._cache_size() == 1
-    assert make_room(limit=1) and programs[1]._cache_size() == 0
-    assert len(_room._TAKEN.read_bytes().splitlines()) < taken
+    taken = len(_memory_maps._IN_USE.read_bytes().splitlines())
+    assert not release_programs() and programs[1]._cache_size() == 1
+    assert release_programs(limit=1) and programs[1]._cache_size() == 0
+    assert len(_memory_maps._IN_USE.read_bytes().splitlines()) < taken
     assert programs[1](0.0) == 1.0
 
 
 def test_elsewhere_nothing_is_done(monkeypatch, tmp_path):
-    monkeypatch.setattr(_room, "_TAKEN", tmp_path / "none")
-    assert not make_room(limit=1)
+    monkeypatch.setattr(_memory_maps, "_IN_USE", tmp_path / "none")
+    assert not release_programs(limit=1)
 
 
-def test_a_sweep_makes_room_and_keeps_its_results(monkeypatch):
+def test_a_sweep_forgets_programs_and_keeps_its_results(monkeypatch):
     """Every case that compiled may be the one that leaves too little."""
     seen = []
-    monkeypatch.setattr(_execute, "make_room", lambda: seen.append(make_room(limit=1)))
+    release = lambda: seen.append(release_programs(limit=1))
+    monkeypatch.setattr(_execute, "release_programs", release)
 
     @experiment.parametrize("n", [2, 3, 4])
     @experiment.seeds(2)

@@ -11,14 +11,13 @@ from matplotlib.figure import Figure
 from ..controllers import Zero
 from ..environments import Environment
 from ..simulation import rollout
-from ._drawings import drawing_for
-from ._plant import Plant
+from ._plant_artist import PlantArtist
 
 
 _INCHES, _DPI = (5.0, 5.0), 100
 
 
-class Picture:
+class Renderer:
     """Draws the plant of an environment, state by state; in a `window` too if asked."""
 
     def __init__(self, environment: Environment, window: bool = False):
@@ -41,15 +40,10 @@ class Picture:
         # A run that says how far things move.
         idle, key = Zero(environment.control_size), jax.random.key(0)
         trajectory = rollout(environment, idle, key=key, throw=False)
-        moments = zip(
-            np.asarray(trajectory.states, float),
-            np.asarray(trajectory.controls, float),
-            strict=False,
-        )
+        states = np.asarray(trajectory.states, float)
+        moments = zip(states, np.asarray(trajectory.controls, float), strict=False)
         ax = self.figure.add_subplot()
-        self.plant = Plant(
-            ax, drawing_for(environment), environment, trajectory, moments
-        )
+        self.plant = PlantArtist(ax, environment, trajectory, moments)
 
     def frame(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """The picture at a state and a control, shape `(height, width, 3)`."""

@@ -6,32 +6,50 @@ from typing import Any
 
 import diffrax
 
-from .._check import check_count
+from .._check import check_count, check_instance
 from .._module import load
 from ..dynamics import Delayed, Discretized
 from ..environments import Environment
-from ..environments._registry import finish
-from ._environment import ventilation
-from ._learned import LearnedLung
-from ._lungs import BalloonLung, DelayLung, DoubleCompartment, SingleCompartment
+from ._learned_lung import LearnedLung
+from ._lungs import (
+    AbstractLung,
+    BalloonLung,
+    DelayLung,
+    DoubleCompartment,
+    SingleCompartment,
+)
 from ._valves import Valves
+from ._ventilation import ventilated
 from ._waveform import BreathWaveform, check_peep
 
 
 def _task(
     task: Callable[..., Environment],
-    plant: Any,
-    dynamics: Discretized | Delayed,
-    environment: dict[str, Any],
-    **breath: Any,
+    plant: AbstractLung,
+    delay: int = 0,
+    /,
+    waveform: BreathWaveform | None = None,
+    *,
+    dt: Any = 0.03,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    **options: Any,
 ) -> Environment:
-    """A lung that rests at PEEP and is to breathe; see `ventilation`."""
-    rest = plant.resting(plant.valves.peep)
-    if isinstance(dynamics, Delayed):
+    """A lung that rests at the PEEP of its valves and is to breathe.
+
+    `task` is the function that a user called, which errors name, and `delay` the steps
+    until a control acts.
+    """
+    valves: Any = plant.valves  # pyright: ignore[reportAttributeAccessIssue]
+    waveform = BreathWaveform() if waveform is None else waveform
+    rest = plant.resting(valves.peep)
+    dynamics = Discretized(plant, dt, solver, substeps)
+    if delay:
+        dynamics = Delayed(dynamics, controls=delay)
         rest = dynamics.filled(rest)
-    arguments = ventilation(dynamics, rest=rest, **breath)
-    check_peep(arguments["cost"].waveform, plant.valves, task.__name__)
-    return finish(task, arguments, environment)
+    env = ventilated((task, _task), dynamics, rest, waveform, **options)
+    check_peep(waveform, valves, task.__name__)
+    return env
 
 
 def balloon_lung(
@@ -40,34 +58,21 @@ def balloon_lung(
     rest: Any = 1.5,
     *,
     valves: Valves | None = None,
-    waveform: BreathWaveform | None = None,
-    sensor_delay: int = 0,
-    noise: Any = 0.0,
-    dt: Any = 0.03,
     horizon: int = 100,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **environment: Any,
+    **options: Any,
 ) -> Environment:
     """Make a balloon breathe as a waveform says.
 
-    The controls are (u_in [%], u_out), the observation is the pressure of the airway
-    [cmH2O], and the state holds it too, see [`delucax.lung.PressureSensor`][]. Cost
-    `|p - r(t)|` a step of the inspiratory phase, [`delucax.lung.BreathCost`][]. Starts
-    at rest at PEEP. Never terminates.
+    The controls, the observation, the state and the cost are those of
+    [`delucax.lung.ventilation`][]. Starts at rest at PEEP. Never terminates.
 
     **Arguments:**
 
     - `resistance`, `stiffness`, `rest`, `valves`: of [`delucax.lung.BalloonLung`][].
-    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
-        minute, by default.
-    - `sensor_delay`: steps until a pressure is seen, 0 by default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
-    - `dt`: the control interval, 0.03 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][].
+    - `**options`: the control interval `dt` (0.03 by default), `solver` and `substeps`
+        of [`delucax.Discretized`][]; `waveform`, `sensor_delay`, `noise` and others of
+        [`delucax.lung.ventilation`][]; those of [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -86,16 +91,7 @@ def balloon_lung(
         ```
     """
     plant = BalloonLung(resistance, stiffness, rest, valves or Valves())
-    return _task(
-        balloon_lung,
-        plant,
-        Discretized(plant, dt, solver, substeps),
-        environment,
-        waveform=waveform,
-        sensor_delay=sensor_delay,
-        noise=noise,
-        horizon=horizon,
-    )
+    return _task(balloon_lung, plant, horizon=horizon, **options)
 
 
 def delay_lung(
@@ -106,14 +102,9 @@ def delay_lung(
     *,
     delay: int = 5,
     valves: Valves | None = None,
-    waveform: BreathWaveform | None = None,
-    sensor_delay: int = 0,
-    noise: Any = 0.0,
-    dt: Any = 0.03,
     horizon: int = 100,
-    solver: diffrax.AbstractSolver | None = None,
     substeps: int = 4,
-    **environment: Any,
+    **options: Any,
 ) -> Environment:
     """Make a balloon breathe through a long pipe, which what is done must first pass.
 
@@ -125,16 +116,12 @@ def delay_lung(
     - `resistance`, `stiffness`, `rest`, `pipe`, `valves`: of
         [`delucax.lung.DelayLung`][].
     - `delay`: steps until a control acts, 5 by default.
-    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
-        minute, by default.
-    - `sensor_delay`: steps until a pressure is seen, 0 by default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
-    - `dt`: the control interval, 0.03 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 4 by default: air rushes out of the pipe in
         some 25 ms.
-    - `**environment`: other arguments of [`delucax.Environment`][].
+    - `**options`: the control interval `dt` (0.03 by default), `solver` and `substeps`
+        of [`delucax.Discretized`][]; `waveform`, `sensor_delay`, `noise` and others of
+        [`delucax.lung.ventilation`][]; those of [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -154,16 +141,8 @@ def delay_lung(
     """
     plant = DelayLung(resistance, stiffness, rest, pipe, valves or Valves())
     delay = check_count(delay, "delay", "delay_lung", least=0)
-    return _task(
-        delay_lung,
-        plant,
-        Delayed(Discretized(plant, dt, solver, substeps), controls=delay),
-        environment,
-        waveform=waveform,
-        sensor_delay=sensor_delay,
-        noise=noise,
-        horizon=horizon,
-    )
+    options = dict(options, horizon=horizon, substeps=substeps)
+    return _task(delay_lung, plant, delay, **options)
 
 
 def single_compartment(
@@ -171,14 +150,8 @@ def single_compartment(
     compliance: Any = 20.0,
     *,
     valves: Valves | None = None,
-    waveform: BreathWaveform | None = None,
-    sensor_delay: int = 0,
-    noise: Any = 0.0,
-    dt: Any = 0.03,
     horizon: int = 100,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **environment: Any,
+    **options: Any,
 ) -> Environment:
     """Make a lung of one compartment breathe as a waveform says.
 
@@ -187,15 +160,9 @@ def single_compartment(
     **Arguments:**
 
     - `resistance`, `compliance`, `valves`: of [`delucax.lung.SingleCompartment`][].
-    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
-        minute, by default.
-    - `sensor_delay`: steps until a pressure is seen, 0 by default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
-    - `dt`: the control interval, 0.03 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][].
+    - `**options`: `waveform`, `sensor_delay`, `noise` and others of
+        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -211,16 +178,7 @@ def single_compartment(
         ```
     """
     plant = SingleCompartment(resistance, compliance, valves or Valves())
-    return _task(
-        single_compartment,
-        plant,
-        Discretized(plant, dt, solver, substeps),
-        environment,
-        waveform=waveform,
-        sensor_delay=sensor_delay,
-        noise=noise,
-        horizon=horizon,
-    )
+    return _task(single_compartment, plant, horizon=horizon, **options)
 
 
 def double_compartment(
@@ -231,14 +189,11 @@ def double_compartment(
     imbalance: Any = 10.0,
     *,
     valves: Valves | None = None,
-    waveform: BreathWaveform | None = None,
     sensor_delay: int = 2,
     noise: Any = 0.2,
-    dt: Any = 0.03,
     horizon: int = 100,
-    solver: diffrax.AbstractSolver | None = None,
     substeps: int = 2,
-    **environment: Any,
+    **options: Any,
 ) -> Environment:
     """Make a lung of a fast and a slow compartment breathe, seen late and with noise.
 
@@ -249,16 +204,13 @@ def double_compartment(
 
     - `resistance`, `compliance`, `central`, `share`, `imbalance`, `valves`: of
         [`delucax.lung.DoubleCompartment`][].
-    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
-        minute, by default.
     - `sensor_delay`: steps until a pressure is seen, 2 by default.
     - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
-    - `dt`: the control interval, 0.03 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 2 by default: with the expiratory valve open
         the fast compartment of a narrow lung is empty within some 10 ms.
-    - `**environment`: other arguments of [`delucax.Environment`][].
+    - `**options`: `waveform`, `sensor_delay`, `noise` and others of
+        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -276,25 +228,16 @@ def double_compartment(
     plant = DoubleCompartment(
         resistance, compliance, central, share, imbalance, valves or Valves()
     )
-    return _task(
-        double_compartment,
-        plant,
-        Discretized(plant, dt, solver, substeps),
-        environment,
-        waveform=waveform,
-        sensor_delay=sensor_delay,
-        noise=noise,
-        horizon=horizon,
-    )
+    options = dict(options, sensor_delay=sensor_delay, noise=noise)
+    options = dict(options, horizon=horizon, substeps=substeps)
+    return _task(double_compartment, plant, **options)
 
 
 def learned_lung(
     model: LearnedLung | None = None,
     *,
-    waveform: BreathWaveform | None = None,
-    noise: Any = 0.0,
     horizon: int = 100,
-    **environment: Any,
+    **options: Any,
 ) -> Environment:
     """Make a lung breathe that was learned from breaths.
 
@@ -307,11 +250,9 @@ def learned_lung(
         library, learned from breaths of the task `lung/double_compartment`; its sensor
         is two samples late, and so is its pressure. In the repository,
         `python -m benchmarks.learned_lung` makes it.
-    - `waveform`: a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20 times a
-        minute, by default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
     - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `**environment`: other arguments of [`delucax.Environment`][].
+    - `**options`: `waveform`, `noise` and others of
+        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -328,13 +269,9 @@ def learned_lung(
         env = dlx.make("lung/learned_lung")
         ```
     """
+    lung: Any = model
     if model is None:
-        model = load(Path(__file__).with_name("learned_lung.dlx"))
-    if not isinstance(model, LearnedLung):
-        raise ValueError(
-            f"learned_lung: model must be a LearnedLung, got {type(model).__name__}."
-        )
-    arguments = ventilation(
-        model, waveform, rest=model.resting(), noise=noise, horizon=horizon
-    )
-    return finish(learned_lung, arguments, environment)
+        lung = load(Path(__file__).with_name("learned_lung.dlx"))
+    check_instance(lung, LearnedLung, "model must be a LearnedLung", "learned_lung")
+    rest = lung.resting()
+    return ventilated((learned_lung,), lung, rest, horizon=horizon, **options)

@@ -1,26 +1,22 @@
-"""Every PID of a grid at once, and the best that any control could do."""
+"""Every PID of a grid at once."""
 
 from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array
 
-from .._check import check_count, check_finite, check_key
+from .._check import check_finite, check_key
 from .._module import as_float_array
 from .._typing import PRNGKey
 from ..controllers import LeakyPID, PID
 from ..environments import Environment
-from ._data import _waveform_of, LENGTH, PIPS
+from ._controller_training import breath_error
+from ._exploration import GAINS
 from ._stacking import stack
-from ._train import breath_error
-from ._waveform import as_pips, at_pip
-
-
-GAINS = (*(i / 10 for i in range(10)), *(float(i) for i in range(1, 11)))
-"""The published grid of gains: 0, 0.1, ..., 0.9, 1, 2, ..., 10."""
+from ._ventilation import waveform_of
+from ._waveform import as_pips, PIPS
 
 
 class PIDGrid(eqx.Module):
@@ -56,23 +52,16 @@ class PIDGrid(eqx.Module):
         return self.gains[jnp.argmin(jnp.mean(self.errors, axis=0))]
 
 
-def make_pid(gains: Any, kind: str, dt: Any, waveform: Any) -> LeakyPID | PID:
-    """The PID of a kind with those gains, which follows a waveform."""
-    kp, ki, kd = gains
-    if kind == "leaky":
-        return LeakyPID(kp, ki, kd, dt=dt, reference=waveform)
-    return PID(kp, ki, kd, dt=dt, reference=waveform)
-
-
 @eqx.filter_jit
 def _searched(envs, lists, pips, key, kind):
     """All combinations of the lists of gains, and the error of each in each lung."""
+    kinds = {"leaky": LeakyPID, "true": PID}
     lists = [jnp.ravel(values).astype(float) for values in lists]
     gains = jnp.stack(jnp.meshgrid(*lists, indexing="ij"), -1).reshape(-1, 3)
 
     def in_lung(env):
         def one(gains):
-            pid = make_pid(gains, kind, env.dt, env.cost.waveform)
+            pid = kinds[kind](*gains, dt=env.dt, reference=env.cost.waveform)
             return jnp.mean(breath_error(env, pid, key=key, pips=pips))
 
         return jax.vmap(one)(gains)
@@ -120,7 +109,7 @@ def pid_grid(
         ```
     """
     where = "pid_grid"
-    pips = as_pips(pips, _waveform_of(envs, where, stacked=True), where)
+    pips = as_pips(pips, waveform_of(envs, where, stacked=True), where)
     check_key(key, where)
     if kind not in ("leaky", "true"):
         raise ValueError(f"{where}: kind must be 'leaky' or 'true', got {kind!r}.")
@@ -133,70 +122,3 @@ def pid_grid(
         lists.append(array)
     envs = envs if jnp.ndim(envs.dt) else stack([envs])
     return PIDGrid(*_searched(envs, lists, pips, key, kind), kind)
-
-
-def least_error(
-    env: Environment, *, pips: Any = PIPS, steps: int = 600, horizon: int = LENGTH
-) -> Array:
-    """About the least error that any control of the inspiratory valve could have.
-
-    The controls of each breath are chosen by gradient descent with the true lung at
-    hand, nothing to measure and no noise: what a controller that is right from the
-    start would reach, to the accuracy of the descent.
-
-    **Arguments:**
-
-    - `env`: a task of a lung.
-    - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
-    - `steps`: of the descent, 600 by default.
-    - `horizon`: steps an episode, 29 by default.
-
-    **Returns:** the mean error at each of the pressures, shape `(pips,)` [cmH2O].
-
-    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
-    say).
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        from delucax import lung
-
-        env = dlx.make("lung/single_compartment")
-        lung.least_error(env, pips=[20.0], steps=20, horizon=10)
-        ```
-    """
-    where = "least_error"
-    pips = as_pips(pips, _waveform_of(env, where), where)
-    steps = check_count(steps, "steps", where)
-    horizon = check_count(horizon, "horizon", where)
-    schedule = optax.cosine_decay_schedule(0.3, steps)
-    optimiser = optax.adam(schedule)
-
-    def of(pip):
-        world = at_pip(env, pip)
-        x0: Any = world.initial_state
-
-        def error(z):
-            @jax.checkpoint
-            def body(x, inputs):
-                k, u = inputs
-                u = jnp.stack([100 * jax.nn.sigmoid(u), jnp.zeros_like(u)])
-                step = world.step(k * world.dt, x, u)
-                return step.state, step.cost
-
-            _, costs = jax.lax.scan(body, x0, (jnp.arange(horizon), z))
-            return jnp.mean(costs)
-
-        def descend(carry, _):
-            z, memory, least = carry
-            value, slope = jax.value_and_grad(error)(z)
-            move, memory = optimiser.update(slope, memory)
-            return (z + move, memory, jnp.minimum(least, value)), None
-
-        z = jnp.full(horizon, -1.0)
-        start = z, optimiser.init(z), jnp.asarray(jnp.inf, z.dtype)
-        (_, _, least), _ = jax.lax.scan(descend, start, None, steps)
-        return least
-
-    return eqx.filter_jit(jax.vmap(of))(pips)

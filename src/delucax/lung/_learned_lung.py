@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float
 
-from .._check import check_bool, check_count, check_key
-from .._module import as_module, parameter, positive, weight
+from .._check import check_bool, check_count, check_instance, check_key
+from .._module import parameter, positive, weight
 from .._results import RESULTS
-from .._typing import PRNGKey
+from .._typing import PRNGKey, RealScalar, Scalar, State
 from ..dynamics import AbstractDynamics
-from ._data import Breaths
+from ._breaths import Breaths
+from ._tanh_network import tanh_network
 
 
 class LearnedLung(AbstractDynamics):
@@ -103,18 +104,16 @@ class LearnedLung(AbstractDynamics):
         key: PRNGKey,
     ):
         where = "LearnedLung"
-        if not isinstance(breaths, Breaths):
-            raise ValueError(
-                f"{where}: breaths must be Breaths, got {type(breaths).__name__}."
-            )
+        check_instance(breaths, Breaths, "breaths must be Breaths", where)
         check_key(key, where)
-        counts = dict(
-            boundary=boundary,
-            boundary_width=boundary_width,
-            u_window=u_window,
-            p_window=p_window,
-        )
-        for name, value in counts.items():
+        for name, value in (
+            ("width", width),
+            ("depth", depth),
+            ("boundary", boundary),
+            ("boundary_width", boundary_width),
+            ("u_window", u_window),
+            ("p_window", p_window),
+        ):
             check_count(value, name, where)
         hidden_key, output_key, valve_key, key = jr.split(key, 4)
         size = 2 * max(u_window, p_window, boundary)
@@ -122,17 +121,9 @@ class LearnedLung(AbstractDynamics):
         self.hidden = jr.normal(hidden_key, (*shape, size)) / size**0.5
         self.output = 0.1 * jr.normal(output_key, shape) / boundary_width**0.5
         self.line = jnp.zeros(u_window + p_window)
-        tanh, same = as_module(jnp.tanh), as_module(jax.nn.identity)
-        self.valve = eqx.nn.MLP("scalar", "scalar", 8, 1, tanh, same, key=valve_key)
-        self.network = eqx.nn.MLP(
-            u_window + p_window,
-            "scalar",
-            check_count(width, "width", where),
-            check_count(depth, "depth", where),
-            tanh,
-            same,
-            key=key,
-        )
+        self.valve = tanh_network("scalar", "scalar", 8, 1, key=valve_key)
+        inputs = u_window + p_window
+        self.network = tanh_network(inputs, "scalar", width, depth, key=key)
         closed = breaths.u_out < 0.5
         count = jnp.sum(closed)
         mean = lambda a: jnp.sum(jnp.where(closed, a, 0)) / count  # noqa: E731
@@ -156,7 +147,7 @@ class LearnedLung(AbstractDynamics):
         pressures = ["pressure", *(f"pressure[-{i}]" for i in range(1, n))]
         return (*controls, *pressures, "step")
 
-    def resting(self) -> Array:
+    def resting(self) -> State:
         """The state before an inspiration."""
         n = self.window
         first = (self.start - self.p_mean) / self.p_std
@@ -165,7 +156,7 @@ class LearnedLung(AbstractDynamics):
         closed = jnp.full(n, -self.u_mean / self.u_std)
         return jnp.concatenate([closed, jnp.full(n, first), jnp.zeros(1)])
 
-    def pressure(self, x: Array) -> Array:
+    def pressure(self, x: State) -> Scalar:
         """The pressure now.
 
         **Arguments:** `x`: the state.
@@ -174,16 +165,16 @@ class LearnedLung(AbstractDynamics):
         """
         return self.p_mean + self.p_std * x[self.window]
 
-    def drawn(self, x: Array, pressure: Any, share: Any) -> Array:
-        """The state with its newest pressure drawn to another one.
+    def corrected(self, x: State, pressure: RealScalar, gain: RealScalar) -> State:
+        """The state with its newest pressure corrected by a measured one.
 
-        **Arguments:** `x`: the state. `pressure`: such as what a sensor read [cmH2O].
-        `share`: how far it is drawn there, from 0 to 1.
+        **Arguments:** `x`: the state. `pressure`: what a sensor read [cmH2O]. `gain`:
+        how much of the difference is made up for, from 0 to 1.
 
         **Returns:** the state.
         """
-        surplus = (pressure - self.pressure(x)) / self.p_std
-        return x.at[self.window].add((share * surplus).astype(x.dtype))
+        innovation = (pressure - self.pressure(x)) / self.p_std
+        return x.at[self.window].add((gain * innovation).astype(x.dtype))
 
     def observe(self, t, x):
         return jnp.reshape(self.pressure(x), (1,)).astype(x.dtype)
@@ -197,10 +188,10 @@ class LearnedLung(AbstractDynamics):
     def _late(self, straight: Array, pressures: Array) -> Array:
         """The next pressure, after the first steps."""
         z = jnp.concatenate([straight, pressures[: self.p_window]])
-        found = self.network(z)
+        predicted = self.network(z)
         if self.published:
-            return found
-        return pressures[0] + self.line @ z + found
+            return predicted
+        return pressures[0] + self.line @ z + predicted
 
     def _early(self, history: Array, late: Any, hidden: Array, output: Array) -> Array:
         """The next pressure in one of the first steps; `late` is that afterwards."""
@@ -290,8 +281,7 @@ class LearnedLung(AbstractDynamics):
             known = _windows(jnp.append(start[:0:-1], recorded), n)[:-1]
             early = jax.vmap(begin)(known[:first], inputs)
             late = jax.vmap(go_on)(known[first:], straight[first:])
-        found = jnp.concatenate([start[:1], early, late])
-        return self.p_mean + self.p_std * found
+        return self.p_mean + self.p_std * jnp.concatenate([start[:1], early, late])
 
 
 def _windows(values: Array, size: int) -> Array:

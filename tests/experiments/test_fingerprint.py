@@ -13,7 +13,7 @@ import pytest
 from helpers import once, thorough
 
 from delucax.experiments import experiment
-from delucax.experiments._hash import fingerprint
+from delucax.experiments._fingerprint import fingerprint
 
 
 pytestmark = once
@@ -225,7 +225,7 @@ def test_the_content_of_objects_counts():
 OTHER = """
 import jax, jax.numpy as jnp, optax, diffrax, datetime, re
 import delucax as dlx
-from delucax.experiments._hash import fingerprint
+from delucax.experiments._fingerprint import fingerprint
 class Policy:
     def __init__(self):
         self.names, self.gain = {"b", "a", "d", "c"}, jnp.ones(3)

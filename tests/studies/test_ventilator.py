@@ -3,6 +3,7 @@
 import csv
 import json
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,14 +13,18 @@ from helpers import assert_close, once, thorough, user_error
 import delucax as dlx
 from delucax import lung, studies
 from delucax.__main__ import main
-from delucax.lung import _study
+from delucax.studies.ventilator import _study
 from delucax.studies.ventilator._contenders import Contender
 from delucax.studies.ventilator._report import save_controllers
 from delucax.studies.ventilator._simulators import grouped, left_out
+from delucax.studies.ventilator._size import FULL
 from delucax.studies.ventilator._stages import Stages
+from delucax.studies.ventilator._tuned import _lost, best_of, tuned_pids
 
 
 pytestmark = once
+
+KEY = jax.random.key(0)
 
 
 @pytest.fixture
@@ -42,22 +47,28 @@ def test_goes_on_where_it_was_cut_off(tmp_path):
         made.append("first")
         return jnp.arange(3.0)
 
-    def cut_off():
-        stages.fitting("second")["checkpoint"].write_text("half of it")
+    def cut_off(data, *, checkpoint, progress):
+        assert data == "data" and not progress
+        checkpoint.write_text("half of it")
         raise KeyboardInterrupt
 
     stages = Stages(tmp_path, {"seeds": 1}, said.append, progress=False)
     stages.stage("first", "One", first)
     with pytest.raises(KeyboardInterrupt):
-        stages.stage("second", "Two", cut_off)
+        stages.training("second", "Two", cut_off, "data")
     again = Stages(tmp_path, {"seeds": 1}, said.append, progress=False)
     assert_close(again.stage("first", "One", first), [0.0, 1.0, 2.0])
     assert made == ["first"] and said[-1].startswith("One: found")
     # What is left of its training is there to go on from, and gone at its end.
-    file = again.fitting("second")["checkpoint"]
-    assert file.read_text() == "half of it"
-    assert again.stage("second", "Two", lambda: 5.0) == 5.0
-    assert not file.exists()
+    left = []
+
+    def finish(*, checkpoint, progress):
+        left.append((checkpoint, checkpoint.read_text()))
+        return 5.0
+
+    assert again.training("second", "Two", finish) == 5.0
+    ((checkpoint, text),) = left
+    assert text == "half of it" and not checkpoint.exists()
 
 
 def test_other_settings_are_refused(begun):
@@ -121,6 +132,32 @@ def test_what_passed_the_limit_is_not_saved(tmp_path):
     unsafe = save_controllers(tmp_path, contenders, ["x"], waveform, rows)
     assert unsafe == ["a_1", "a_2"]
     assert [path.name for path in tmp_path.iterdir()] == ["a_0.dlx"]
+
+
+@thorough
+def test_tuned_pids_are_the_best_that_were_tried(tmp_path):
+    waveform = lung.BreathWaveform()
+    envs = lung.stack([lung.single_compartment(R) for R in (5.0, 50.0)])
+    size = FULL._replace(tuned=20, pid_steps=3)
+    options = dict(checkpoint=tmp_path / "tuned.fit", progress=False)
+    said = []
+    found = tuned_pids(envs, waveform, size, KEY, said.append, **options)
+    assert len(found) == 4 and not said
+    error = lambda env, pid: jnp.mean(lung.breath_error(env, pid, key=KEY))
+    own = eqx.filter_vmap(error)(envs, found["tuned PID + feed-forward"])
+    shared = found["tuned PID + feed-forward for all"]
+    alike = eqx.filter_vmap(error, in_axes=(eqx.if_array(0), None))(envs, shared)
+    assert jnp.all(own <= alike + 1e-3) and jnp.all(own < 10)
+
+
+def test_what_has_no_finite_error_is_not_chosen():
+    candidates = dict(number=jnp.arange(6).reshape(3, 2))
+    errors = jnp.array([[jnp.inf, 2.0, 1.0], [3.0, jnp.inf, 4.0]])
+    assert best_of(candidates, errors, False)["number"].tolist() == [4, 1]
+    assert best_of(candidates, errors, True)["number"].tolist() == [4, 5]
+    assert _lost(np.zeros(5), errors[:, 2]) == ""
+    assert "2 of 6 errors are not finite" in _lost(np.zeros(5), errors)
+    assert "in 1 of 5 steps" in _lost(np.eye(5)[0], errors[:, 2])
 
 
 @thorough

@@ -1,16 +1,16 @@
-"""Room for compiled programs in a long run."""
+"""The memory maps that compiled programs hold, of which a process has only so many."""
 
 from pathlib import Path
 
 import jax
 
 
-_TAKEN = Path("/proc/self/maps")
+_IN_USE = Path("/proc/self/maps")
 _LIMIT = Path("/proc/sys/vm/max_map_count")
 
 
-def make_room(limit: int | None = None) -> bool:
-    """Let all compiled programs go if they take too many memory maps.
+def release_programs(limit: int | None = None) -> bool:
+    """Forget all compiled programs if they hold too many memory maps.
 
     A program that XLA has compiled holds tens of the maps that Linux allows a process,
     65,530 unless it is told otherwise, and the compilation that finds none left is a
@@ -18,15 +18,15 @@ def make_room(limit: int | None = None) -> bool:
     on Linux nothing is done.
 
     `limit` is how many maps are too many, by default half of what is allowed. Returns
-    whether the programs were let go.
+    whether the programs were forgotten.
     """
     try:
         if limit is None:
             limit = int(_LIMIT.read_text()) // 2
-        taken = _TAKEN.read_bytes().count(b"\n")
+        used = _IN_USE.read_bytes().count(b"\n")
     except (OSError, ValueError):
         return False
-    if taken <= limit:
+    if used <= limit:
         return False
     jax.clear_caches()
     return True

@@ -1,0 +1,173 @@
+"""The matrices that every analysis is about."""
+
+from typing import Any, TypeAlias, TypeVar
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Complex, Float, Inexact
+
+from .._check import is_concrete
+from .._results import RESULTS
+from .._typing import BoolScalar, Scalar
+from ..dynamics import LinearDynamics
+from ..math import safe_norm
+from ..systems import LinearSystem
+
+
+LinearModel: TypeAlias = LinearSystem | LinearDynamics
+
+
+class StateSpace(eqx.Module):
+    """`y = (C (s I - A)^-1 B + D) u`, with `s = z` if it has a step `dt`."""
+
+    A: Float[Array, "n n"]
+    B: Float[Array, "n m"]
+    C: Float[Array, "p n"]
+    D: Float[Array, "p m"]
+    dt: Scalar | None
+
+    @property
+    def is_discrete(self) -> bool:
+        return self.dt is not None
+
+    @property
+    def eye(self) -> Float[Array, "n n"]:
+        return jnp.eye(self.A.shape[0], dtype=self.A.dtype)
+
+    @property
+    def dual(self) -> "StateSpace":
+        """The transposed system, whose inputs are what this one's outputs are."""
+        return StateSpace(self.A.T, self.C.T, self.B.T, self.D.T, self.dt)
+
+    def with_A(self, A: Float[Array, "n n"]) -> "StateSpace":
+        """The same system with other dynamics."""
+        return eqx.tree_at(lambda system: system.A, self, A)
+
+    def growth(self, poles: Complex[Array, "*poles"]) -> Float[Array, "*poles"]:
+        """Below zero for what decays: the real part, or the modulus less 1."""
+        return jnp.abs(poles) - 1 if self.is_discrete else jnp.real(poles)
+
+    def is_stable(self) -> BoolScalar:
+        """Whether all poles are inside the boundary."""
+        poles = jnp.linalg.eigvals(lax.stop_gradient(self.A))
+        return jnp.all(self.growth(poles) < 0)
+
+    def stable_or_harmless(self, stable: BoolScalar) -> "StateSpace":
+        """This system, or a stable one in the place of one that is not, so that what is
+        computed of it and then not taken has finite derivatives."""
+        return self.with_A(jnp.where(stable, self.A, -self.eye / 2))
+
+    def response(self, omega: Scalar) -> Complex[Array, "p m"]:
+        """The complex gain at one finite frequency: at the point `j omega`, or
+        `exp(j omega dt)`, of the boundary of stability."""
+        s = 1j * omega if self.dt is None else jnp.exp(1j * omega * self.dt)
+        resolvent = s * self.eye - self.A
+        return self.C @ solve(resolvent, self.B.astype(resolvent.dtype)) + self.D
+
+    def on_the_axis(self) -> "StateSpace":
+        """The system in continuous time with the gains of this one in discrete time:
+        with `z = (1 + s) / (1 - s)` the circle becomes the axis."""
+        n, eye = self.A.shape[0], self.eye
+        right = jnp.concatenate([self.A - eye, self.B], axis=1)
+        both = solve(eye + self.A, right)
+        D = self.D - self.C @ both[:, n:]
+        C = 2**0.5 * solve((eye + self.A).T, self.C.T).T
+        return StateSpace(both[:, :n], 2**0.5 * both[:, n:], C, D, None)
+
+
+def state_space(model: Any, inputs: str, where: str) -> StateSpace:
+    """The matrices from one kind of input to the outputs, or an error."""
+    if not isinstance(model, LinearModel):
+        raise ValueError(
+            f"{where}: model must be a LinearSystem or LinearDynamics "
+            "(`delucax.linearize` makes one of any system or dynamics), got "
+            f"{type(model).__name__}."
+        )
+    discrete = isinstance(model, LinearDynamics)
+    if discrete and model.is_time_varying:
+        raise ValueError(
+            f"{where}: model must be time-invariant, got matrices at "
+            f"{model.A.shape[0]} times; `dynamics.at(t)` are those at one time."
+        )
+    eye = jnp.eye(model.A.shape[0], dtype=model.A.dtype)
+    if inputs == "controls":
+        B = model.B
+    elif inputs == "disturbances":
+        if model.E is None and not discrete:
+            raise ValueError(
+                f"{where}: inputs='disturbances' needs a model with E, which says how "
+                "they enter the vector field, got a LinearSystem whose E is None."
+            )
+        B = eye if model.E is None else model.E
+    else:
+        raise ValueError(
+            f"{where}: inputs must be 'controls' or 'disturbances', got {inputs!r}."
+        )
+    C = eye if model.C is None else model.C
+    dtype = jnp.result_type(model.A, B, C)
+    A, B, C = (M.astype(dtype) for M in (model.A, B, C))
+    D = jnp.zeros((C.shape[0], B.shape[1]), dtype)
+    dt = jnp.asarray(model.dt, dtype) if isinstance(model, LinearDynamics) else None
+    return StateSpace(A, B, C, D, dt)
+
+
+def solve(matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"]) -> Array:
+    """`matrix^-1 right`, with one factorisation; NaN where `matrix` is singular."""
+    operator, solver = lx.MatrixLinearOperator(matrix), lx.LU()
+    state = solver.init(operator, {})
+
+    def column(b):
+        return lx.linear_solve(operator, b, solver, state=state, throw=False).value
+
+    return jax.vmap(column, in_axes=1, out_axes=1)(right)
+
+
+def size(M: Array) -> Array:
+    """The Frobenius norm, complex or real, with gradient 0 at 0."""
+    parts = jnp.stack([jnp.real(M), jnp.imag(M)]) if jnp.iscomplexobj(M) else M
+    return safe_norm(parts, axis=None)
+
+
+def largest_gain(G: Array) -> Array:
+    """The largest singular value, with derivatives to second order.
+
+    Those of `jnp.linalg.svd` divide by the gaps between all singular values, which are
+    zero as soon as two channels are alike. Here the singular vector follows `G` to
+    first order, across the gaps that are open, and the gain is the length that `G`
+    makes of it, which errs with the square of the vector's error.
+    """
+    if 1 in G.shape:
+        return size(G)
+    still = lax.stop_gradient(G)
+    squares, vectors = jnp.linalg.eigh(still.conj().T @ still)
+    gaps = squares[-1] - squares
+    open_gaps = gaps > jnp.finfo(gaps.dtype).eps ** 0.5 * squares[-1]
+    weights = jnp.where(open_gaps, 1 / jnp.where(open_gaps, gaps, 1), 0)
+    top = vectors[:, -1]
+    moved = vectors.conj().T @ (G.conj().T @ (G @ top))
+    follows = top + vectors @ (weights * moved)
+    return size(G @ follows) / size(follows)
+
+
+Value = TypeVar("Value")
+
+
+def raise_if(failed: BoolScalar, value: Value, message: str) -> Value:
+    """`value`, or an error: now if it can be seen, else at run time."""
+    if not is_concrete(failed):
+        return eqx.error_if(value, failed, message)
+    if failed:
+        raise RuntimeError(message)
+    return value
+
+
+def raise_unless_successful(solution: Any, where: str) -> Any:
+    """A solution that has a `result`, or an error."""
+    failed = solution.result != RESULTS.successful
+    if not is_concrete(failed):
+        return solution.result.error_if(solution, failed)
+    hint = "Pass throw=False to look at what was found."
+    return raise_if(failed, solution, f"{where}: {RESULTS[solution.result]} {hint}")

@@ -1,0 +1,158 @@
+"""What the commands `list`, `run` and `report` do."""
+
+import dataclasses
+import importlib
+import importlib.util
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from ._experiment import Experiment
+from ._report import diff, DIFFERENCES, summary
+from ._results import Results
+from ._run import run
+from ._select import selector
+from ._tables import as_text
+
+
+def list_cases(file: str, suites: Mapping[str, str], select: str, marks: str) -> int:
+    """Show the cases of a file."""
+    made = load(file, suites)
+    cases = [case for one in made for case in one.cases(select, marks, slow=True)]
+    for case in cases:
+        labels = ", ".join(mark.name for mark in case.marks)
+        print(f"{case.id}  ({labels})" if labels else case.id)
+    print(f"{len(cases)} cases")
+    return 0
+
+
+def run_file(
+    file: str,
+    suites: Mapping[str, str],
+    store: str | None,
+    html: str | None,
+    options: dict[str, Any],
+) -> int:
+    """Run the experiments of a file and show what came out."""
+    made = load(file, suites)
+    place = Path("results") / f"{Path(file).stem}.jsonl" if store is None else store
+    results = run(*made, store=place, **options)
+    done = {row["case"] for row in results.rows if row["status"] != "skipped"}
+    if not done:
+        raise ValueError(
+            f"run: no case of '{file}' is selected (-k, -m, or marked skip or slow)."
+        )
+    _show(results)
+    failed = {row["case"]: row for row in results.failed}
+    for case, row in failed.items():
+        first = str(row["error"] or "passed though it was expected to fail")
+        print(f"FAILED {case}: {first.splitlines()[0]}", file=sys.stderr)
+    print(f"{len(done)} cases in {place}")
+    _write_report(results, html, file)
+    return 1 if failed else 0
+
+
+def report_file(
+    paths: list[str], select: str, html: str | None, exports: list[str]
+) -> int:
+    """Show one results file."""
+    if len(paths) != 1:
+        raise ValueError("report: two results files are compared with --diff.")
+    results = _read(paths[0], select)
+    _show(results)
+    for path in exports:
+        results.export(path)
+        print(f"written {path}")
+    _write_report(results, html, paths[0])
+    return 0
+
+
+def report_diff(
+    paths: list[str], select: str, html: str | None, exports: list[str]
+) -> int:
+    """Show what differs between two results files."""
+    if len(paths) != 2:
+        raise ValueError(f"report: --diff needs two results files, got {len(paths)}.")
+    if exports:
+        raise ValueError("report: --export goes with one results file, not --diff.")
+    difference = diff(*(_read(path, select) for path in paths))
+    if difference.changed:
+        print(as_text("markdown", DIFFERENCES, difference.changed))
+    for _, case, *states in difference.status:
+        print(f"{case}: {states[0]} in {paths[0]}, {states[1]} in {paths[1]}")
+    for name, cases in zip(paths, difference.only, strict=True):
+        for _, case in cases:
+            print(f"{case}: only in {name}")
+    differ = {tuple(line[:2]) for line in difference.changed}
+    print(f"{difference.same} cases are the same, {len(differ)} differ")
+    if html is not None:
+        difference.page((paths[0], paths[1])).write(html)
+        print(f"report in {html}")
+    return 0
+
+
+def _show(results: Results) -> None:
+    """A table of means for each experiment."""
+    for name in dict.fromkeys(row["experiment"] for row in results.rows):
+        columns, rows = summary(results.where(experiment=name))
+        print(f"\n{name}\n\n{as_text('markdown', columns, rows)}")
+
+
+def _write_report(results: Results, html: str | None, file: str) -> None:
+    if html is not None:
+        results.report(html, title=Path(file).stem)
+        print(f"report in {html}")
+
+
+def load(file: str, suites: Mapping[str, str]) -> list[Experiment]:
+    """The experiments of a file, of a module by its dotted name, or of a suite: one of
+    the modules that have a shorter name."""
+    if file in suites:
+        module = importlib.import_module(suites[file])
+    elif file.endswith(".py"):
+        module = _module_at(Path(file))
+    else:
+        sys.path.insert(0, str(Path.cwd()))
+        try:
+            module = importlib.import_module(file)
+        except ImportError as error:
+            raise ValueError(
+                f"run: FILE must be a Python file, a module or one of "
+                f"{', '.join(suites)}; {file!r} cannot be imported: {error}."
+            ) from error
+    own = [v for v in vars(module).values() if isinstance(v, Experiment)]
+    if not own:
+        raise ValueError(f"run: there is no experiment in {file}.")
+    return list({id(made): made for made in own}.values())
+
+
+def _module_at(path: Path) -> ModuleType:
+    if not path.is_file():
+        raise ValueError(f"run: there is no file '{path}'.")
+    path = path.resolve()
+    name = path.stem if path.stem not in sys.modules else f"_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    sys.path.insert(0, str(path.parent))
+    spec.loader.exec_module(module)
+    try:
+        import cloudpickle
+    except ImportError:
+        return module
+    # Workers do not find it by its name.
+    cloudpickle.register_pickle_by_value(module)
+    return module
+
+
+def _read(path: str, select: str) -> Results:
+    results = Results.read(path)
+    is_selected = selector(select, "select", "report")
+
+    def matches(row: dict[str, Any]) -> bool:
+        return is_selected(lambda word: word.lower() in row["case"].lower())
+
+    return dataclasses.replace(results, rows=[*filter(matches, results.rows)])

@@ -1,0 +1,177 @@
+"""Recorded breaths."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array
+
+from .._check import check_count, check_finite, check_key, check_range
+from .._module import check_parameters, parameter, positive
+from .._typing import PRNGKey
+from ._waveform import LENGTH
+
+
+class Breaths(eqx.Module):
+    """Recorded breaths, `B` of them, each of `T` samples.
+
+    The pressure at a sample is what the sensor read before the control of that sample
+    acted.
+
+    **Arguments:**
+
+    - `u_in`: opening of the inspiratory valve [%], shape `(B, T)`.
+    - `u_out`: whether the expiratory valve was open, shape `(B, T)`.
+    - `pressure`: what the sensor read [cmH2O], shape `(B, T)`.
+    - `dt`: the time between samples [s].
+    - `resistance`: of the lung of each breath [cmH2O s/L], shape `(B,)`; not known by
+        default.
+    - `compliance`: of the lung of each breath [mL/cmH2O], shape `(B,)`; not known by
+        default.
+    - `truth`: what a sensor without noise would have read, shape `(B, T)`; not known by
+        default.
+
+    **Raises:** `ValueError` if shapes do not fit each other, a value is not finite, or
+    `dt` is not positive.
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax.lung import Breaths
+
+        zeros = jnp.zeros((4, 29))
+        len(Breaths(zeros, zeros, zeros + 5.0, dt=0.03))
+        ```
+    """
+
+    u_in: Array = parameter()
+    u_out: Array = parameter()
+    pressure: Array = parameter()
+    dt: Array = parameter(constraint=positive)
+    resistance: Array | None = parameter(None)
+    compliance: Array | None = parameter(None)
+    truth: Array | None = parameter(None)
+
+    def __check_init__(self):
+        check_parameters(self)
+        shape = jnp.shape(self.pressure)
+        if len(shape) < 2:
+            raise ValueError(
+                f"Breaths: pressure must have shape (breaths, samples), got {shape}."
+            )
+        for name, fits, which in (
+            ("u_in", shape, " like pressure"),
+            ("u_out", shape, " like pressure"),
+            ("truth", shape, " like pressure"),
+            ("resistance", shape[:-1], ", an entry for each breath"),
+            ("compliance", shape[:-1], ", an entry for each breath"),
+        ):
+            given = getattr(self, name)
+            if given is not None and jnp.shape(given) != fits:
+                raise ValueError(
+                    f"Breaths: {name} must have shape {fits}{which}, got "
+                    f"{jnp.shape(given)}."
+                )
+
+    def __len__(self) -> int:
+        return self.pressure.shape[0]
+
+    def __getitem__(self, index: Any) -> "Breaths":
+        """The breaths of an index, a slice or booleans."""
+        return jax.tree.map(lambda a: a[index] if a.ndim else a, self)
+
+
+def segment(
+    u_in: Any, u_out: Any, pressure: Any, *, dt: Any, length: int = LENGTH
+) -> Breaths:
+    """The inspirations of a recording, cut out of it.
+
+    An inspiration is a longest stretch with the expiratory valve closed. Those shorter
+    than `length` are left out, and the others cut to it.
+
+    **Arguments:**
+
+    - `u_in`, `u_out`, `pressure`: the recording, vectors of one size.
+    - `dt`: the time between samples [s].
+    - `length`: samples an inspiration, 29 by default.
+
+    **Returns:** a [`delucax.lung.Breaths`][].
+
+    **Raises:** `ValueError` if sizes differ, a value is not finite, or there is no
+    inspiration as long.
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax.lung import segment
+
+        u_out = jnp.tile(jnp.repeat(jnp.array([0.0, 1.0]), 30), 3)
+        segment(0 * u_out, u_out, 0 * u_out, dt=0.03).pressure.shape
+        ```
+    """
+    where = "segment"
+    length = check_count(length, "length", where)
+    columns = [np.asarray(column, float) for column in (u_in, u_out, pressure)]
+    if columns[0].ndim != 1 or len({column.shape for column in columns}) != 1:
+        raise ValueError(
+            f"{where}: u_in, u_out and pressure must be vectors of one size, got "
+            f"shapes {[column.shape for column in columns]}."
+        )
+    for name, column in zip(("u_in", "u_out", "pressure"), columns, strict=True):
+        check_finite(column, name, where)
+    closed = np.concatenate([[False], columns[1] < 0.5, [False]]).astype(int)
+    edges = np.diff(closed)
+    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    fits = starts[ends - starts >= length]
+    if not len(fits):
+        longest = int(np.max(ends - starts, initial=0))
+        raise ValueError(
+            f"{where}: u_out must be 0 for at least length = {length} samples in a "
+            f"row, but the longest inspiration of {len(starts)} has {longest}."
+        )
+    rows = fits[:, None] + np.arange(length)
+    return Breaths(*(jnp.asarray(column[rows]) for column in columns), dt=dt)
+
+
+def split(
+    breaths: Breaths, test: float = 0.1, *, key: PRNGKey
+) -> tuple[Breaths, Breaths]:
+    """Breaths to train on and breaths to test on, drawn at random.
+
+    **Arguments:**
+
+    - `breaths`: to divide.
+    - `test`: the share to test on, between 0 and 1; 0.1 by default.
+    - `key`: a random key.
+
+    **Returns:** `(train, test)`.
+
+    **Raises:** `ValueError` if either would be empty.
+
+    !!! example
+
+        ```python
+        import jax
+        import jax.numpy as jnp
+        from delucax import lung
+
+        zeros = jnp.zeros((10, 29))
+        breaths = lung.Breaths(zeros, zeros, zeros, dt=0.03)
+        train, test = lung.split(breaths, 0.2, key=jax.random.key(0))
+        ```
+    """
+    check_key(key, "split")
+    check_range(test, "test", "split", 0, 1)
+    cut = round(test * len(breaths))
+    if not 0 < cut < len(breaths):
+        raise ValueError(
+            f"split: test must leave breaths on both sides, got {test} of "
+            f"{len(breaths)} breaths."
+        )
+    order = jr.permutation(key, len(breaths))
+    return breaths[order[cut:]], breaths[order[:cut]]

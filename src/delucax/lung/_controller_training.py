@@ -1,0 +1,233 @@
+"""Training controllers of breaths."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array
+
+from .._check import check_bool, check_count, check_key, check_positive
+from .._controller import AbstractController, check_controller
+from .._module import function_field
+from .._typing import PRNGKey
+from ..environments import Environment
+from ..simulation import rollout
+from ..training import analytic, fit, Fitted
+from ._breath_controllers import Breathing
+from ._lung_fitting import kept_at
+from ._stacking import count_of
+from ._ventilation import waveform_of
+from ._waveform import as_pips, at_pip, LENGTH, PIPS
+
+
+def breath_error(
+    env: Environment,
+    controller: AbstractController,
+    *,
+    key: PRNGKey,
+    pips: Any = PIPS,
+    horizon: int = LENGTH,
+) -> Array:
+    """How far from the target a controller keeps the pressure, on average.
+
+    **Arguments:**
+
+    - `env`: a task of a lung.
+    - `controller`: of both valves ([`delucax.lung.Breathing`][]), or of the inspiratory
+        one alone.
+    - `key`: a random key, for the noise of the sensor.
+    - `pips`: the peak pressures to follow, each in an episode of its own;
+        10, 15, ..., 35 cmH2O by default.
+    - `horizon`: steps an episode, 29 by default: 0.87 s of an inspiration.
+
+    **Returns:** the mean of `|p - r|` over the steps of each episode, shape `(pips,)`
+        [cmH2O]. NaN where a run failed.
+
+    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    say).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        from delucax import lung
+
+        env = dlx.make("lung/single_compartment")
+        waveform = env.cost.waveform
+        pid = dlx.controllers.LeakyPID(dt=env.dt, reference=waveform)
+        lung.breath_error(env, pid, key=jax.random.key(0), pips=[20.0, 30.0])
+        ```
+    """
+    where = "breath_error"
+    waveform = waveform_of(env, where)
+    check_controller(controller, "controller", where)
+    pips = as_pips(pips, (waveform, controller), where)
+    horizon = check_count(horizon, "horizon", where)
+    is_whole = isinstance(controller, Breathing)
+    whole = controller if is_whole else Breathing(controller, waveform)
+
+    def one(pip, key):
+        world, policy = at_pip((env, whole), pip)
+        run: Any = rollout(
+            world, policy, key=key, horizon=horizon, keep=("costs",), throw=False
+        )
+        return jnp.mean(run.costs)
+
+    keys = jax.random.split(check_key(key, where), pips.shape[0])
+    return jax.vmap(one)(pips, keys)
+
+
+class _TrackingError(eqx.Module):
+    """The mean error of a batch of controllers, each in its own lungs."""
+
+    envs: Environment
+    pips: Array
+    horizon: int = eqx.field(static=True)
+    shared: bool = eqx.field(static=True)
+    throw: bool = eqx.field(static=True)
+
+    def _counted(self, errors: Array) -> Array:
+        """Errors, 0 for those that are not finite and are not to raise."""
+        return errors if self.throw else jnp.where(jnp.isfinite(errors), errors, 0)
+
+    def __call__(self, controllers: Any, key: PRNGKey) -> Array:
+        def in_lung(env, controller, key):
+            options: Any = dict(pips=self.pips, horizon=self.horizon, key=key)
+            return jnp.mean(breath_error(env, controller, **options))
+
+        own = None if self.shared else eqx.if_array(0)
+        in_lungs = eqx.filter_vmap(in_lung, in_axes=(eqx.if_array(0), own, 0))
+
+        def of_seed(controllers, key):
+            keys = jax.random.split(key, count_of(self.envs))
+            errors = in_lungs(self.envs, controllers, keys)
+            if not self.shared:
+                errors = self._counted(errors)
+            return self._counted(jnp.mean(errors))
+
+        keys = jax.random.split(key, count_of(controllers))
+        return jnp.mean(eqx.filter_vmap(of_seed)(controllers, keys))
+
+
+class _FiniteGradients(eqx.Module):
+    """A gradient that counts as 0 for a controller for which it is not finite.
+
+    Controllers are stacked along the first `axes` axes of each leaf.
+    """
+
+    gradient: Callable[..., Any] = function_field()
+    axes: int = eqx.field(static=True)
+
+    def __call__(self, loss: Any, values: Any, key: PRNGKey) -> tuple[Any, Any]:
+        value, slope = self.gradient(loss, values, key)
+        finite: Any = True
+        for leaf in jax.tree.leaves(slope):
+            inner = tuple(range(self.axes, leaf.ndim))
+            finite = finite & jnp.all(jnp.isfinite(leaf), axis=inner)
+
+        def finite_or_zero(leaf):
+            inner = tuple(range(self.axes, leaf.ndim))
+            return jnp.where(jnp.expand_dims(finite, inner), leaf, 0)
+
+        cost, metrics = value if isinstance(value, tuple) else (value, {})
+        diverged = jnp.sum(~finite).astype(cost.dtype)
+        value = cost, metrics | {"diverged": diverged}
+        return value, jax.tree.map(finite_or_zero, slope)
+
+
+def train_controllers(
+    envs: Environment,
+    controllers: Any,
+    *,
+    key: PRNGKey,
+    shared: bool = False,
+    steps: int = 400,
+    learning_rate: float = 1e-2,
+    pips: Any = PIPS,
+    horizon: int = LENGTH,
+    trainable: Any = None,
+    gradient: Any = None,
+    progress: bool = False,
+    checkpoint: Any = None,
+    throw: bool = True,
+) -> Fitted:
+    """Train controllers in lungs, by the gradient of their error.
+
+    The loss is [`delucax.lung.breath_error`][] over all peak pressures, with fresh
+    noise in each step; Adam with a learning rate that falls to 0 along a cosine. As
+    Adam moves each weight by itself, those of one controller do not feel the others.
+
+    **Arguments:**
+
+    - `envs`: tasks of lungs, stacked by [`delucax.lung.stack`][]. Of fitted lungs
+        that are stacked, `equinox.filter_vmap(lung_environment)(models)` makes them.
+    - `controllers`: of the inspiratory valve, stacked over seeds, and within a seed
+        over the lungs: leaves of shape `(seeds, lungs, ...)`. With `shared`, of shape
+        `(seeds, ...)`.
+    - `key`: a random key, for the noise.
+    - `shared`: whether one controller is for all lungs; false by default.
+    - `steps`: 400 by default.
+    - `learning_rate`: 1e-2 by default.
+    - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
+    - `horizon`: steps an episode, 29 by default.
+    - `trainable`, `gradient`, `progress`, `checkpoint`: of [`delucax.training.fit`][];
+        the weights, the analytic gradient, no bar and no file by default.
+    - `throw`: raise if an error or its gradient is NaN or infinite (default); if false,
+        that gradient counts as 0, the other controllers are trained as if nothing were,
+        and `history["diverged"]` says of how many it was in each step.
+
+    **Returns:** a [`delucax.training.Fitted`][].
+
+    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    say), `RuntimeError` as `throw` says.
+
+    Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
+    Zajdel, Schottdorf, Cohen and Hazan, 2021.
+
+    !!! example
+
+        ```python
+        import jax
+        from delucax import lung
+
+        envs = lung.stack([lung.single_compartment(R) for R in (5.0, 20.0)])
+        forward = lung.FeedForward(lung.BreathWaveform(), gain=0.5)
+        one = lung.stack([lung.stack([forward, forward])])
+        few = dict(steps=3, horizon=2, pips=[20.0])
+        lung.train_controllers(envs, one, key=jax.random.key(0), **few).history.loss
+        ```
+    """
+    where = "train_controllers"
+    if not isinstance(envs, Environment) or jnp.ndim(envs.dt) != 1:
+        raise ValueError(
+            f"{where}: envs must be tasks of lungs that delucax.lung.stack made one "
+            f"of, got one {type(envs).__name__}; equinox.filter_vmap("
+            "delucax.lung.lung_environment) makes them of stacked models."
+        )
+    waveform = waveform_of(envs, where, stacked=True)
+    steps = check_count(steps, "steps", where)
+    check_positive(learning_rate, "learning_rate", where)
+    loss = _TrackingError(
+        envs,
+        as_pips(pips, (waveform, controllers), where),
+        check_count(horizon, "horizon", where),
+        check_bool(shared, "shared", where),
+        check_bool(throw, "throw", where),
+    )
+    gradient = analytic if gradient is None else gradient
+    return fit(
+        loss,
+        controllers,
+        optax.adam(optax.cosine_decay_schedule(learning_rate, steps)),
+        steps,
+        key=check_key(key, where),
+        trainable=trainable,
+        gradient=gradient if throw else _FiniteGradients(gradient, 1 if shared else 2),
+        progress=progress,
+        throw=throw,
+        **kept_at(checkpoint),
+    )

@@ -1,0 +1,282 @@
+"""What makes a task of a lung: a sensor, a cost, and the bounds of the valves."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+
+from .._check import as_vector, check_count, check_positive, check_range
+from .._module import parameter
+from .._typing import Control, RealScalar, Scalar, State
+from ..costs import AbstractCost
+from ..disturbances import Gaussian
+from ..dynamics import AbstractDynamics, AbstractWrapper, Delayed
+from ..environments import Environment
+from ..environments._registry import finish
+from ._learned_lung import LearnedLung
+from ._lung_models import LungModel
+from ._waveform import BreathWaveform, check_waveform, LENGTH
+
+
+class PressureSensor(AbstractWrapper):
+    """Dynamics whose observation, a pressure, is kept at the end of the state.
+
+    A cost reads it there, and need not know the lung. A sensor that is late is a
+    [`delucax.dynamics.Delayed`][] around it.
+
+    **Arguments:** `dynamics`: of a lung; it observes one number.
+
+    **Raises:** `ValueError` if `dynamics` are none or observe more than one number.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        from delucax.lung import PressureSensor, SingleCompartment
+
+        lung = SingleCompartment()
+        dynamics = PressureSensor(dlx.Discretized(lung, dt=0.03))
+        x0 = dynamics.filled(lung.resting(5.0))
+        states = dlx.open_loop(dynamics, x0, jnp.array([[30.0, 0.0]] * 5))
+        dynamics.observe(0.0, states[-1])
+        ```
+    """
+
+    dynamics: AbstractDynamics
+
+    def __check_init__(self):
+        AbstractWrapper.__check_init__(self)
+        if self.dynamics.observation_size != 1:
+            raise ValueError(
+                "PressureSensor: dynamics must observe one pressure, got "
+                f"{self.dynamics.observation_size} numbers."
+            )
+
+    @property
+    def state_names(self):
+        return (*self.dynamics.state_names, "sensed pressure")
+
+    def filled(self, x: ArrayLike) -> State:
+        """The state of a lung that has rested.
+
+        **Arguments:** `x`: the state of the dynamics.
+
+        **Returns:** the state, with what is observed of `x`.
+
+        **Raises:** `ValueError` on a wrong shape.
+        """
+        x = as_vector(x, self.dynamics.state_size, "x", "PressureSensor.filled")
+        return jnp.append(x, self.dynamics.observe(0.0, x)).astype(x.dtype)
+
+    def advance(self, t, x, u, w):
+        after, result = self.dynamics.advance(t, x[:-1], u, w)
+        now = self.dynamics.observe(t + self.dt, after).astype(x.dtype)
+        return jnp.concatenate([after, now]), result
+
+    def observe(self, t, x):
+        return x[-1:]
+
+    def difference(self, x, x_ref):
+        own = self.dynamics.difference(x[:-1], x_ref[:-1])
+        return jnp.concatenate([own, x[-1:] - x_ref[-1:]])
+
+    def equilibrium(self):
+        x, u = self.dynamics.equilibrium()
+        return self.filled(x), u
+
+
+class BreathCost(AbstractCost):
+    r"""How far the pressure is from the target, `weight |p - r(t)|`.
+
+    The weight is 1 in the inspiratory phase and `expiration` in the other. With a limit
+    each cmH2O above it costs ten more, as an alarm is worse than an error. Not smooth
+    on the target, and at the limit.
+
+    **Arguments:**
+
+    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
+    - `index`: the place of the pressure in the state.
+    - `expiration`: 0 by default.
+    - `limit`: a pressure [cmH2O]; none by default.
+
+    **Raises:** `ValueError` if `waveform` is none, or the limit is not positive.
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax.lung import BreathCost, BreathWaveform
+
+        cost = BreathCost(BreathWaveform(), index=2)
+        cost(0.5, jnp.array([0.0, 0.0, 34.0]), jnp.zeros(2))
+        ```
+    """
+
+    waveform: BreathWaveform
+    index: int = eqx.field(static=True)
+    expiration: Array = parameter(0.0)
+    limit: Array | None = parameter(None)
+
+    def __check_init__(self):
+        check_waveform(self.waveform, "BreathCost")
+        if self.limit is not None:
+            check_positive(self.limit, "limit", "BreathCost")
+
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
+        pressure = x[self.index]
+        error = jnp.abs(pressure - self.waveform.pressure(t))
+        weight = jnp.where(self.waveform.is_inspiration(t), 1, self.expiration)
+        cost = weight * error
+        if self.limit is not None:
+            cost = cost + 10 * jnp.maximum(pressure - self.limit, 0)
+        return cost.astype(x.dtype)
+
+
+def ventilated(
+    tasks: tuple[Callable[..., Environment], ...],
+    dynamics: AbstractDynamics,
+    rest: ArrayLike | None,
+    /,
+    waveform: BreathWaveform | None = None,
+    *,
+    sensor_delay: int = 0,
+    noise: Any = 0.0,
+    expiration: Any = 0.0,
+    limit: Any = None,
+    horizon: int = 100,
+    **environment: Any,
+) -> Environment:
+    """The environment of a task of a lung, see `ventilation`.
+
+    `tasks` are the functions that take other arguments of it; errors name the first.
+    """
+    check_range(noise, "noise", "ventilation")
+    check_range(expiration, "expiration", "ventilation")
+    delay = check_count(sensor_delay, "sensor_delay", "ventilation", least=0)
+    waveform = BreathWaveform() if waveform is None else waveform
+    rest = jnp.zeros(dynamics.state_size) if rest is None else rest
+    sensor = sensed = PressureSensor(dynamics)
+    initial_state = sensor.filled(rest)
+    if delay:
+        sensed = Delayed(sensor, sensor=delay)
+        initial_state = sensed.filled(initial_state)
+    silent = isinstance(noise, int | float) and noise == 0
+    arguments = dict(
+        dynamics=sensed,
+        cost=BreathCost(waveform, dynamics.state_size, expiration, limit),
+        sensor_noise=None if silent else Gaussian(noise, size=1),
+        initial_state=initial_state,
+        control_bounds=(jnp.zeros(2), jnp.array([100.0, 1.0])),
+        horizon=horizon,
+    )
+    return finish(tasks[0], arguments, environment, *tasks[1:], ventilated)
+
+
+def ventilation(
+    dynamics: AbstractDynamics,
+    waveform: BreathWaveform | None = None,
+    *,
+    rest: ArrayLike | None = None,
+    **options: Any,
+) -> Environment:
+    """A task in which a lung is ventilated.
+
+    The controls are (u_in [%], u_out), the observation is the pressure of the airway
+    [cmH2O], and the state holds it too, see [`delucax.lung.PressureSensor`][]. Cost
+    `|p - r(t)|` a step of the inspiratory phase, [`delucax.lung.BreathCost`][]. Never
+    terminates.
+
+    **Arguments:**
+
+    - `dynamics`: of the lung; it observes the pressure of the airway and takes the
+        controls (u_in, u_out).
+    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20
+        times a minute, by default.
+    - `rest`: the first state of the dynamics; zero by default.
+    - `sensor_delay`: steps until a pressure is seen, 0 by default.
+    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
+    - `expiration`, `limit`: of the cost; 0 and none by default.
+    - `horizon`: steps an episode, 100 by default.
+    - `**options`: of the above, and other arguments of [`delucax.Environment`][], which
+        hold instead.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, or if `waveform` is none.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        from delucax import lung
+
+        plant = lung.SingleCompartment(resistance=5.0)
+        dynamics = dlx.Discretized(plant, dt=0.03)
+        env = lung.ventilation(dynamics, rest=plant.resting(5.0), noise=0.2)
+        ```
+    """
+    return ventilated((ventilation,), dynamics, rest, waveform, **options)
+
+
+def lung_environment(
+    model: LearnedLung | LungModel,
+    waveform: BreathWaveform | None = None,
+    *,
+    noise: Any = 0.2,
+    horizon: int = LENGTH,
+    **options: Any,
+) -> Environment:
+    """A task in a fitted lung: where controllers are trained.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][].
+    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]; the default one by
+        default.
+    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
+    - `horizon`: steps an episode, 29 by default.
+    - `**options`: other arguments of [`delucax.lung.ventilation`][], such as `limit`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` if it is no such model, or `waveform` is none.
+
+    !!! example
+
+        ```python
+        from delucax import lung
+
+        env = lung.lung_environment(lung.LungModel(lung.SingleCompartment()))
+        ```
+    """
+    options = dict(noise=noise, horizon=horizon) | options
+    if isinstance(model, LungModel):
+        options |= dict(sensor_delay=model.dynamics.sensor)
+        dynamics, rest = model.dynamics.dynamics, model.system.resting(model.peep)
+    elif isinstance(model, LearnedLung):
+        dynamics, rest = model, model.resting()
+    else:
+        raise ValueError(
+            "lung_environment: model must be a LearnedLung or a LungModel, got "
+            f"{type(model).__name__}."
+        )
+    return ventilated((lung_environment,), dynamics, rest, waveform, **options)
+
+
+def waveform_of(env: Any, where: str, *, stacked: bool = False) -> BreathWaveform:
+    """The waveform of a task of a lung, or of several that are stacked."""
+    waveform = getattr(getattr(env, "cost", None), "waveform", None)
+    if not isinstance(env, Environment) or not isinstance(waveform, BreathWaveform):
+        raise ValueError(
+            f"{where}: env must be a task with a breath waveform, such as "
+            f"delucax.make('lung/double_compartment'), got {type(env).__name__}."
+        )
+    if not stacked and jnp.ndim(env.dt):
+        raise ValueError(
+            f"{where}: env must be one task, got {jnp.shape(env.dt)[0]} that are "
+            "stacked: map over them with equinox.filter_vmap."
+        )
+    return waveform

@@ -1,0 +1,178 @@
+"""What drawings are made of: links, joints, bodies, arrows, marks, and the view."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle, Polygon, Rectangle
+
+from .._figure import color_of, NEUTRAL
+
+
+Number: TypeAlias = float | int
+Point: TypeAlias = Sequence[Number] | Float[np.ndarray, "2"]
+Points: TypeAlias = Float[np.ndarray, "_ 2"]
+
+BODY, ACTION, GOAL, SECOND = color_of(0), color_of(1), color_of(2), color_of(5)
+DARK = "0.3"
+LONG_DASHES, SHORT_DASHES = (0, (5, 3)), (0, (3, 2))
+FULL_TURN = math.radians(240)  # the sweep of the arrow of the largest torque
+
+
+def rotation(angle: Number) -> Float[np.ndarray, "2 2"]:
+    """The matrix that turns by an angle, anticlockwise."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def box(width: Number, height: Number, corner: Number) -> Points:
+    """The corners of a rounded rectangle about the origin."""
+    bend = np.linspace(0, np.pi / 2, 6)
+    points = []
+    for k, (x, y) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1))):
+        centre = np.array([x * (width / 2 - corner), y * (height / 2 - corner)])
+        angles = bend + k * np.pi / 2
+        points.append(centre + corner * np.stack([np.cos(angles), np.sin(angles)], -1))
+    return np.concatenate(points)
+
+
+def arc_arrow(
+    radius: Number, start: Number, sweep: Number, slimness: Number = 1.0
+) -> Points:
+    """The corners of an arrow bent about the origin: from the angle `start`, through
+    `sweep`, both in radians."""
+    width = 0.16 * radius / slimness
+    head = min(0.5 / slimness, 0.6 * abs(sweep))  # the angle that the head takes of it
+    end = start + sweep - np.sign(sweep) * head
+    angles = np.linspace(start, end, 40)
+    along = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    reach = width * (0.6 + slimness * head)
+    point = radius * np.array([[np.cos(start + sweep), np.sin(start + sweep)]])
+    outer, inner = (radius + width / 2) * along, (radius - width / 2) * along
+    base = [(radius + reach) * along[-1:], point, (radius - reach) * along[-1:]]
+    return np.concatenate([outer, *base, inner[::-1]])
+
+
+@dataclasses.dataclass(frozen=True)
+class Canvas:
+    """Axes, and the shapes that drawings put on them. Keywords are Matplotlib's."""
+
+    ax: Axes
+
+    def line(self, points: Any, **style: Any) -> None:
+        """A line through points."""
+        self.ax.plot(*np.asarray(points, float).T, **style)
+
+    def circle(self, at: Point, radius: Number, **style: Any) -> None:
+        """A circle."""
+        self.ax.add_artist(Circle((float(at[0]), float(at[1])), radius, **style))
+
+    def disc(self, at: Point, radius: Number, color: str = BODY, **style: Any) -> None:
+        """A filled circle."""
+        self.circle(at, radius, color=color, **{"lw": 0, "zorder": 2} | style)
+
+    def rectangle(
+        self, corner: Point, width: Number, height: Number, **style: Any
+    ) -> None:
+        """A rectangle from its lower left corner."""
+        x, y = corner
+        self.ax.add_artist(Rectangle((x, y), width, height, **style))
+
+    def polygon(
+        self,
+        corners: Points,
+        at: Point = (0.0, 0.0),
+        angle: Number = 0.0,
+        color: str = BODY,
+        **style: Any,
+    ) -> None:
+        """A filled shape, turned about its origin and put somewhere."""
+        points = np.asarray(at, float) + corners @ rotation(angle).T
+        style = {"lw": 0, "zorder": 2} | style
+        self.ax.add_artist(Polygon(points, color=color, **style))
+
+    def link(self, start: Point, end: Point, width: Number = 9, **style: Any) -> None:
+        """A rod with round ends, of a width in points."""
+        style = {"color": BODY, "zorder": 2} | style
+        self.line([start, end], linewidth=width, solid_capstyle="round", **style)
+
+    def joint(self, at: Point, radius: Number) -> None:
+        """A hinge."""
+        self.circle(at, radius, facecolor="white", edgecolor=NEUTRAL, zorder=4)
+
+    def wheel(self, at: Point, radius: Number) -> None:
+        """A wheel seen from the side."""
+        self.disc(at, radius, DARK, zorder=3)
+        self.disc(at, 0.4 * radius, "white", zorder=3)
+
+    def goal(self, at: Point, radius: Number) -> None:
+        """A goal in the plane: a ring around a dot."""
+        self.circle(at, radius, fill=False, edgecolor=GOAL, lw=2, zorder=1)
+        self.disc(at, 0.3 * radius, GOAL, zorder=1)
+
+    def reach(self, radius: Number) -> None:
+        """The circle about the origin that a tip goes round."""
+        self.circle((0, 0), radius, fill=False, color=NEUTRAL, alpha=0.25, lw=1)
+
+    def ground(self) -> None:
+        """The ground at height 0, across the whole view."""
+        self.ax.axhline(0, color=NEUTRAL, lw=2, zorder=0)
+
+    def torque(
+        self,
+        at: Point,
+        radius: Number,
+        start: Number,
+        share: Number,
+        color: str = ACTION,
+        slimness: Number = 1.0,
+    ) -> None:
+        """A torque, by its share of the largest: an arrow about a point of up to 240
+        degrees, from the angle `start`."""
+        if abs(share) > 0.01:
+            arrow = arc_arrow(radius, start, FULL_TURN * share, slimness)
+            self.polygon(arrow, at, color=color, zorder=3)
+
+    def force(
+        self,
+        start: Point,
+        vector: Point,
+        full: Number,
+        color: str = ACTION,
+        zorder: int = 3,
+    ) -> None:
+        """A force: a straight arrow along `vector`, its width that of one whose largest
+        length is `full`."""
+        x, y = (float(part) for part in vector)
+        length = math.hypot(x, y)
+        if length < 0.01 * full:
+            return
+        width, head = 0.11 * full, min(0.35 * full, 0.6 * length)
+        reach, neck = width * (0.4 + 1.6 * head / full), length - head
+        barb = reach + 0.2 * width
+        upper = np.array([[0, width / 2], [neck, width / 2], [neck, barb]])
+        corners = np.concatenate([upper, [[length, 0]], upper[::-1] * [1, -1]])
+        self.polygon(corners, start, math.atan2(y, x), color, zorder=zorder)
+
+
+class View(NamedTuple):
+    """A part of the plane: `centre` and half of its extent, `half`, each `(2,)`."""
+
+    centre: Float[np.ndarray, "2"]
+    half: Float[np.ndarray, "2"]
+
+    def show(self, ax: Axes) -> None:
+        """Set the limits to this part."""
+        low, high = self.centre - self.half, self.centre + self.half
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+
+    def follow(self, ax: Axes, at: Point, room: Number) -> None:
+        """Set the limits to this part, moved only as far as keeps `at` inside, `room`
+        from the edge."""
+        inner = np.maximum(self.half - room, 0.0)
+        shift = at - np.clip(at, self.centre - inner, self.centre + inner)
+        View(self.centre + shift, self.half).show(ax)

@@ -1,0 +1,143 @@
+"""What the losses of an actor and a critic share: a batch of episodes."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array, Bool, Float, PyTree
+
+from .._check import check_bool, check_count, check_instance, check_range
+from .._typing import PRNGKey, RealScalar
+from ..environments import Environment
+from ..simulation import rollout
+from ._actor_critic import ActorCritic
+from ._surrogate import AbstractSurrogate
+
+
+class Episodes(NamedTuple):
+    """A batch of episodes; a field that a loss does not use is `None`."""
+
+    times: Float[Array, "*batch steps"]
+    observations: Float[Array, "*batch steps p"]
+    controls: Float[Array, "*batch steps m"]
+    costs: Float[Array, "*batch steps"]
+    valid: Bool[Array, "*batch steps"]
+    """Whether each step was before the end of its episode."""
+    continues: Any
+    """Whether something follows each step."""
+    following: Any
+    """The cost to go after each step: V there, or the final cost of its episode."""
+    values: Any
+    """V at each observation."""
+    advantages: Float[Array, "*batch steps"]
+    total_cost: Any
+    targets: Any = None
+    """What V should be at each observation."""
+    log_prob: Any = None
+
+
+class AbstractActorCriticLoss(AbstractSurrogate):
+    """A loss of an [`delucax.training.ActorCritic`][] on fresh episodes."""
+
+    environment: eqx.AbstractVar[Environment]
+    batch: eqx.AbstractVar[int]
+    horizon: eqx.AbstractVar[int]
+    discount: eqx.AbstractVar[RealScalar]
+    decay: eqx.AbstractVar[RealScalar]
+    value_weight: eqx.AbstractVar[RealScalar]
+    bootstrap: eqx.AbstractVar[bool]
+
+    def __post_init__(self):
+        where = type(self).__name__
+        check_instance(self.environment, Environment, "environment", where)
+        if self.horizon is None:
+            self.horizon = self.environment.horizon  # pyright: ignore
+
+    def __check_init__(self):
+        where = type(self).__name__
+        check_instance(self.environment, Environment, "environment", where)
+        check_count(self.batch, "batch", where)
+        check_count(self.horizon, "horizon", where)
+        check_range(self.discount, "discount", where, 0, 1)
+        check_range(self.decay, "decay", where, 0, 1)
+        check_range(self.value_weight, "value_weight", where)
+        check_bool(self.bootstrap, "bootstrap", where)
+
+    def finished(self, model: ActorCritic, memory: Any) -> ActorCritic:
+        return memory.statistics.applied_to(model)
+
+    def _check_model(self, model: PyTree) -> None:
+        """Raise unless `model` is an actor and a critic."""
+        check_instance(model, ActorCritic, "model", type(self).__name__)
+
+    def _episodes(
+        self, model: ActorCritic, key: PRNGKey, truncate: int | None = None
+    ) -> Episodes:
+        """A batch of episodes from fresh starts.
+
+        The gradient is cut before every `truncate`-th step.
+        """
+        one = lambda key: self._episode(model, key, truncate)
+        runs = jax.vmap(one)(jr.split(key, self.batch))
+        return runs._replace(targets=runs.advantages + runs.values)
+
+    def _episode(self, model, key, truncate) -> Episodes:
+        env, horizon = self.environment, self.horizon
+        keep = ("states", "observations", "controls", "costs", "terminated")
+        options: Any = dict(horizon=horizon, truncate=truncate, keep=keep, throw=False)
+        run: Any = rollout(env, model.policy, key=key, **options)
+        ok = ~run.failed
+        costs = jnp.where(ok | ~jnp.isfinite(run.total_cost), run.costs, jnp.nan)
+        # The observations recorded by a truncated rollout have lost their derivatives
+        # at the cuts, where V is asked for. So the states are observed again, with the
+        # noise that they had.
+        observed = jax.vmap(env.dynamics.observe)(run.times, run.states)
+        noise = lax.stop_gradient(run.observations - observed[:-1])
+        observed = observed + jnp.concatenate([noise, jnp.zeros_like(noise[:1])])
+        values = jax.vmap(model.value)(run.times, observed)
+        following, values = values[1:], values[:-1]
+        if not self.bootstrap:
+            following = following.at[-1].set(run.final_cost)
+        following = jnp.where(run.terminated, run.final_cost, following)
+        steps = jnp.arange(horizon)
+        continues = ~run.terminated & (self.bootstrap | (steps < horizon - 1))
+        valid = steps < run.length
+        errors = costs + self.discount * following - values
+        errors = jnp.where(valid, errors, 0)
+        advantages = _advantages(errors, continues, self.discount, self.decay)
+        return Episodes(
+            times=run.times[:-1],
+            observations=run.observations,
+            controls=run.controls,
+            costs=costs,
+            valid=valid,
+            continues=continues,
+            following=following,
+            values=values,
+            advantages=advantages,
+            total_cost=run.total_cost,
+        )
+
+
+def _advantages(
+    errors: Float[Array, " steps"],
+    continues: Bool[Array, " steps"],
+    discount: RealScalar,
+    decay: RealScalar,
+) -> Float[Array, " steps"]:
+    """The generalised advantage estimate of each step of one episode,
+
+    `A_k = delta_k + g lambda A_{k+1}` with `delta_k = c_k + g V_{k+1} - V_k`, the
+    temporal-difference errors.
+    """
+
+    def back(later, inputs):
+        error, continues = inputs
+        now = error + discount * decay * jnp.where(continues, later, 0)
+        return now, now
+
+    start = jnp.zeros((), errors.dtype)
+    return lax.scan(back, start, (errors, continues), reverse=True)[1]

@@ -1,0 +1,271 @@
+"""Nonlinear least squares over windows of recorded data: multiple shooting."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.flatten_util
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..._results import choose, Result, RESULTS
+from .._trainable import Assembly
+from ._identified import Certainty
+
+
+_NEAR = 0.05
+"""The standard deviations from the minimum within which a fit has converged."""
+
+
+class Windows(NamedTuple):
+    """Recorded data cut into windows, and the scale of each output."""
+
+    begins: Int[Any, " windows"]
+    controls: Float[Array, "windows steps m"]
+    observations: Float[Array, "windows points y"]
+    counts: Bool[Any, "windows points"]
+    noise: Float[Array, " y"]
+
+
+class _Point(NamedTuple):
+    """Residuals and sensitivities at values of the parameters and first states."""
+
+    theta: Float[Array, " p"]
+    starts: Float[Array, "windows n"]
+    by_theta: Float[Array, "windows rows p"]
+    by_start: Float[Array, "windows rows n"]
+    residuals: Float[Array, "windows rows"]
+    cost: Float[Array, ""]
+
+
+class Solution(NamedTuple):
+    """What the least squares came to."""
+
+    values: dict[str, Array]
+    starts: Float[Array, "windows n"]
+    cost: Float[Array, ""]
+    legal: Float[Array, " p"]
+    certainty: Certainty
+    noise: Float[Array, " y"]
+    correlation: Float[Array, ""]
+    result: Result
+
+
+def cut_into_windows(
+    guesses: Float[Array, "runs points n"],
+    observations: Float[Array, "runs points y"],
+    controls: Float[Array, "runs steps m"],
+    window: int,
+) -> tuple[Float[Array, "windows n"], Windows, Float[Array, " y"]]:
+    """`(starts, windows, spread of each output)`."""
+    runs, steps, _ = controls.shape
+    n, size = guesses.shape[2], observations.shape[2]
+    count = steps // window
+    stop = count * window
+    starts = guesses[:, :stop:window].reshape(runs * count, n)
+    inputs = controls[:, :stop].reshape(runs * count, window, -1)
+    index = np.arange(count)[:, None] * window + np.arange(window + 1)
+    observed = observations[:, index].reshape(runs * count, window + 1, size)
+    begins = np.tile(np.arange(count) * window, runs)
+    # The observation where a window ends and the next begins counts once.
+    counts = np.ones((count, window + 1), bool)
+    counts[:-1, -1] = False
+    counts = np.tile(counts, (runs, 1))
+    # An output that never moves has a spread of rounding.
+    spread, largest = jnp.std(observed, axis=(0, 1)), jnp.max(jnp.abs(observed), (0, 1))
+    moves = spread > 1e3 * float(jnp.finfo(observed.dtype).eps) * largest
+    spread = jnp.where(moves, spread, jnp.where(largest > 0, largest, 1))
+    return starts, Windows(begins, inputs, observed, counts, spread), spread
+
+
+@eqx.filter_jit
+def solve(
+    assembly: Assembly,
+    values: dict[str, Array],
+    starts: Float[Array, "windows n"],
+    data: Windows,
+    max_steps: int,
+) -> Solution:
+    """The parameters and the state at the beginning of each window that fit best."""
+    flat, unravel = jax.flatten_util.ravel_pytree(values)
+    p = flat.size
+    dtype = data.observations.dtype
+
+    def window(theta, x, data):
+        begin, controls, observed, counts = data
+        model = assembly(unravel(theta))
+        times = (begin + jnp.arange(controls.shape[0] + 1)) * model.dt
+
+        def step(x, inputs):
+            t, u = inputs
+            x_next, _ = model.advance(t, x, u, None)
+            return x_next.astype(x.dtype), x
+
+        last, states = lax.scan(step, x, (times[:-1], controls))
+        states = jnp.concatenate([states, last[None]])
+        residuals = (observed - jax.vmap(model.observe)(times, states)) / noise
+        residuals = jnp.where(counts[:, None], residuals, 0).ravel().astype(dtype)
+        return residuals, residuals
+
+    *recorded, noise = data
+    slopes = jax.jacfwd(window, argnums=(0, 1), has_aux=True)
+    sensitivity = jax.vmap(slopes, in_axes=(None, 0, 0))
+
+    def linearised(theta, starts):
+        slopes, residuals = sensitivity(theta, starts, tuple(recorded))
+        cost = jnp.sum(residuals**2)
+        return _Point(theta, starts, *slopes, residuals=residuals, cost=cost)
+
+    rows = data.observations[0].size
+    zeros = lambda *shape: jnp.zeros(shape, dtype)
+    start = _Point(
+        theta=flat,
+        starts=starts,
+        by_theta=zeros(len(starts), rows, p),
+        by_start=zeros(len(starts), rows, starts.shape[1]),
+        residuals=zeros(len(starts), rows),
+        cost=zeros() + jnp.inf,
+    )
+    best, count = _levenberg_marquardt(linearised, start, max_steps)
+
+    eps = jnp.finfo(dtype).eps
+    theta, starts, cost = best.theta, best.starts, best.cost
+    by_theta, by_start, _, units = _scaled(best, (zeros(p), zeros(*starts.shape)))
+    # What the states at the beginnings could explain as well tells nothing.
+    _, on_starts, _, on_theta, by_theta = _projected(by_theta, by_start, eps)
+    size = data.observations.shape[2]
+    free = jnp.maximum(jnp.sum(data.counts) * size - p - starts.size, 1)
+    sigma = jnp.sqrt(jnp.sum(best.residuals**2) / free)
+    residuals = best.residuals.reshape(data.observations.shape)
+    each = jnp.sum(residuals**2, axis=(0, 1))
+    paired = jnp.sum(residuals[:, 1:] * residuals[:, :-1], axis=(0, 1))
+    correlation = jnp.sqrt(jnp.sum(data.counts)) * jnp.max(
+        paired / jnp.where(each > 0, each, 1)
+    )
+    # The correlation of rounding says nothing.
+    correlation = jnp.where(sigma < 0.5, 0, correlation)
+    noise = data.noise * jnp.sqrt(each * size / free)
+    values = unravel(theta)
+    # No more certain than the noise that was given, or than rounding lets it be.
+    sigma = jnp.maximum(sigma, 1)
+    slope = by_theta[:, :p] * units[0] * per_relative_change(assembly, values)
+    certainty = Certainty.of(slope, sigma, 1.0)
+    longest = jnp.max(jnp.linalg.norm(on_starts[..., p], axis=1))
+    settled = jnp.maximum(longest, jnp.linalg.norm(on_theta)) <= _NEAR * sigma
+    result = choose(count <= max_steps, RESULTS.no_descent, RESULTS.not_converged)
+    result = choose(settled, RESULTS.successful, result)
+    result = choose(jnp.isfinite(cost), result, RESULTS.diverged)
+    legal = flat_legal(assembly, values)
+    noise = jnp.where(jnp.isfinite(cost), noise, jnp.nan).astype(dtype)
+    return Solution(values, starts, cost, legal, certainty, noise, correlation, result)
+
+
+def _levenberg_marquardt(
+    linearised: Any, start: _Point, max_steps: int
+) -> tuple[_Point, Array]:
+    """`(the best point, the number of points tried)`.
+
+    The state at the beginning of a window moves nothing but that window, so it is
+    eliminated there, and the cost of a step is linear in the number of windows; a
+    solver of dense least squares would pay its cube. Steps are measured by the largest
+    sensitivities so far (Moré, 1978), and so do not depend on units. It has converged
+    where no step of the linear model is longer than a small part of what the noise
+    makes the estimate differ by.
+    """
+    p, dtype = start.theta.size, start.residuals.dtype
+    small = 1e-9 if dtype == jnp.float64 else 1e-7
+    rounding = 100 * jnp.finfo(dtype).eps ** 2 * start.residuals.size
+
+    def body(carry):
+        candidate, best, largest, damping, at_minimum, _, count = carry
+        here = linearised(*candidate)
+        better = here.cost < best.cost
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
+        damping = jnp.where(better | at_minimum, damping / 8, damping * 4)
+        damping = jnp.clip(damping, 1e-10, 1e10)
+        by_theta, by_start, largest, units = _scaled(best, largest)
+        R_x, on_starts, R, on_theta, _ = _projected(by_theta, by_start, damping)
+        step = jsl.solve_triangular(R, on_theta)
+        right = on_starts[..., p] - on_starts[..., :p] @ step
+        steps = jax.vmap(jsl.solve_triangular)(R_x, right)
+        candidate = best.theta - step / units[0], best.starts - steps / units[1]
+        # The decrease of the cost that the linear model predicts. A damped step falls
+        # short of it, so it is a minimum only where a step that is hardly damped
+        # predicts none.
+        predicted = jnp.sum(on_theta**2) + jnp.sum(on_starts[..., p] ** 2)
+        at_minimum = predicted <= small * best.cost
+        done = (
+            at_minimum & (damping <= 1e-5) | (damping >= 1e9) | (best.cost < rounding)
+        )
+        return candidate, best, largest, damping, at_minimum, done, count + 1
+
+    def running(carry):
+        *_, done, count = carry
+        return ~done & (count <= max_steps)
+
+    none = jnp.zeros(p, dtype), jnp.zeros(start.starts.shape, dtype)
+    no, first = jnp.array(False), (start.theta, start.starts)
+    damping = jnp.zeros((), dtype) + 8e-3
+    carry = first, start, none, damping, no, no, jnp.zeros((), int)
+    _, best, *_, count = lax.while_loop(running, body, carry)
+    return best, count
+
+
+def _scaled(point: _Point, largest: Any) -> tuple[Array, Array, Any, Any]:
+    """Sensitivities as multiples of the largest so far, these, and their units.
+
+    The residuals are a last column of those by the parameters.
+    """
+    norms = jnp.linalg.norm(point.by_theta, axis=(0, 1))
+    norms = norms, jnp.linalg.norm(point.by_start, axis=1)
+    largest = jax.tree.map(jnp.maximum, largest, norms)
+    units = jax.tree.map(lambda norm: jnp.where(norm > 0, norm, 1), largest)
+    by_theta = [point.by_theta / units[0], point.residuals[..., None]]
+    by_start = point.by_start / units[1][:, None]
+    return jnp.concatenate(by_theta, axis=2), by_start, largest, units
+
+
+def _projected(by_theta: Array, by_start: Array, damping: Any) -> tuple[Array, ...]:
+    """First on the states at the beginnings of the windows, then on the rest."""
+    p = by_theta.shape[2] - 1
+    eliminate = jax.vmap(_eliminate, in_axes=(0, 0, None))
+    R_x, on_starts, left = eliminate(by_start, by_theta, damping)
+    left = left.reshape(-1, p + 1)
+    R, on_theta, _ = _eliminate(left[:, :p], left[:, p:], damping)
+    return R_x, on_starts, R, on_theta[:, 0], left
+
+
+def _eliminate(A: Array, B: Array, damping: Any) -> tuple[Array, Array, Array]:
+    """Least squares `min |A z - b|^2 + damping |z|^2` for the columns b of B.
+
+    `(R, C, left)`: `R z = C`, and what is left of B, with a row more for each z.
+    """
+    n = A.shape[1]
+    A = jnp.concatenate([A, jnp.sqrt(damping) * jnp.eye(n, dtype=A.dtype)])
+    B = jnp.concatenate([B, jnp.zeros((n, B.shape[1]), B.dtype)])
+    Q, R = jnp.linalg.qr(A)
+    C = Q.T @ B
+    return R, C, B - Q @ C
+
+
+def flat_legal(assembly: Assembly, values: dict[str, Array]) -> Float[Array, " p"]:
+    """The legal values in one vector."""
+    return jax.flatten_util.ravel_pytree(assembly.constrained(values))[0]
+
+
+def relative_unit(legal: Float[Array, " p"]) -> Float[Array, " p"]:
+    """What a relative change of 1 of each legal value amounts to."""
+    return jnp.where(legal == 0, 1, legal)
+
+
+def per_relative_change(
+    assembly: Assembly, values: dict[str, Array]
+) -> Float[Array, " p"]:
+    """The change of each unconstrained value that makes a relative change of 1."""
+    tangent = jax.tree.map(jnp.ones_like, values)
+    flat = lambda values: flat_legal(assembly, values)
+    legal, rate = jax.jvp(flat, (values,), (tangent,))
+    return relative_unit(legal) / rate
