@@ -47,12 +47,27 @@ def _is_hashable(value: Any) -> bool:
     return True
 
 
-def check_instance(value: Any, cls: type, name: str, where: str) -> None:
-    """Raise unless `value` is an instance of `cls`."""
-    if not isinstance(value, cls):
-        article = "an" if cls.__name__[0] in "AEIOU" else "a"
+_HOW_TO_GET = {
+    "AbstractCost": " (wrap a function with `delucax.costs.Function`)",
+    "AbstractDynamics": " (discretise a system with `delucax.Discretized`; of an "
+    "environment give its `dynamics`)",
+    "AbstractSystem": " (wrap a function with `delucax.system`; of an environment give "
+    "its `dynamics.system`)",
+    "LinearSystem": " (`delucax.linearize` makes one)",
+}
+
+
+def check_instance(
+    value: Any, kind: type, name: str, where: str, hint: str | None = None
+) -> None:
+    """Raise unless `value` is of a class. `hint` says how to get one, if it is not how
+    one usually does."""
+    if not isinstance(value, kind):
+        called = kind.__name__
+        article = "an" if called[0] in "AEIOU" else "a"
+        hint = _HOW_TO_GET.get(called, "") if hint is None else hint
         raise ValueError(
-            f"{where}: {name} must be {article} {cls.__name__}, got "
+            f"{where}: {name} must be {article} {called}{hint}, got "
             f"{type(value).__name__}."
         )
 
@@ -250,9 +265,3 @@ def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
             f"{shortened(value)}."
         )
     return int(value)
-
-
-def check_instance(value: Any, kind: Any, words: str, where: str) -> None:
-    """Raise unless `value` is of a class, such as "cost must be an AbstractCost"."""
-    if not isinstance(value, kind):
-        raise ValueError(f"{where}: {words}, got {type(value).__name__}.")

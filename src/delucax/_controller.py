@@ -12,6 +12,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from ._check import check_instance
 from ._message import shortened
 from ._module import check_parameters
 from ._typing import PRNGKey, RealScalar
@@ -329,8 +330,4 @@ def check_stochastic(policy: Any, name: str, where: str) -> AbstractStochasticPo
 
 def check_controller(value: Any, name: str, where: str) -> None:
     """Raise unless `value` is a controller."""
-    if not isinstance(value, AbstractController):
-        raise ValueError(
-            f"{where}: {name} must be an AbstractController, got "
-            f"{type(value).__name__}."
-        )
+    check_instance(value, AbstractController, name, where)

@@ -59,16 +59,14 @@ def test_bad_input(arguments, match):
 @pytest.mark.parametrize(
     "returned, match",
     [
-        (lambda x, u: [x[1], u[0]], "got a list; it must be an array .*jnp.stack"),
-        (lambda x, u: None, "got a NoneType; it must be an array"),
+        (lambda x, u: [x[1], u[0]], "got a list .*jnp.stack"),
+        (lambda x, u: None, "got a NoneType"),
     ],
 )
 def test_a_vector_field_that_returns_no_array(returned, match):
     system = dlx.system(lambda t, x, u, w: returned(x, u), states=2, controls=1)
     dynamics, x, u = dlx.Discretized(system, 0.1), jnp.zeros(2), jnp.zeros(1)
-    match = (
-        rf"FunctionSystem: vector_field must return an array of shape \(2,\).*{match}"
-    )
+    match = rf"FunctionSystem: vector_field must return an array.*\(2,\).*{match}"
     with user_error(match=match):
         dynamics(0.0, x, u)
     with user_error(match=match):

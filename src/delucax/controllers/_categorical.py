@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float, PyTree
 
-from .._check import as_matrix, check_key
+from .._check import as_matrix, check_instance, check_key
 from .._controller import (
     AbstractController,
     AbstractStochasticPolicy,
@@ -149,11 +149,7 @@ class Likeliest(AbstractController):
     policy: Categorical
 
     def __check_init__(self):
-        if not isinstance(self.policy, Categorical):
-            raise ValueError(
-                "Likeliest: policy must be a Categorical, got "
-                f"{type(self.policy).__name__}."
-            )
+        check_instance(self.policy, Categorical, "policy", "Likeliest")
 
     def init(self, *, key=None):
         return self.policy.base.init(key=key)

@@ -9,7 +9,13 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_matrix, check_count, check_number, check_positive
+from .._check import (
+    as_matrix,
+    check_count,
+    check_instance,
+    check_number,
+    check_positive,
+)
 from .._module import as_float_array
 from .._results import choose, RESULTS
 from ..costs import AbstractCost
@@ -250,15 +256,8 @@ def as_problems(
 ) -> tuple[Problem, Problem]:
     """The problems of the plant and of its model, or an error."""
     for name, dynamics in (("plant", plant), ("model", model)):
-        if not isinstance(dynamics, AbstractDynamics):
-            raise ValueError(
-                f"{where}: {name} must be an AbstractDynamics (for an environment, its "
-                f"`dynamics`), got {type(dynamics).__name__}."
-            )
-    if not isinstance(cost, AbstractCost):
-        raise ValueError(
-            f"{where}: cost must be an AbstractCost, got {type(cost).__name__}."
-        )
+        check_instance(dynamics, AbstractDynamics, name, where)
+    check_instance(cost, AbstractCost, "cost", where)
     if not isinstance(plan, Plan):
         raise ValueError(
             f"{where}: plan must be a delucax.planning.Plan, such as ilqr makes, got "

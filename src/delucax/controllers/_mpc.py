@@ -11,7 +11,14 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_bounds, check_bool, check_count, check_finite, check_key
+from .._check import (
+    as_bounds,
+    check_bool,
+    check_count,
+    check_finite,
+    check_instance,
+    check_key,
+)
 from .._controller import AbstractController, Tally, wrong_observation
 from .._message import shortened
 from .._module import (
@@ -25,7 +32,6 @@ from .._results import Result, RESULTS
 from ..costs import AbstractCost
 from ..costs._base import check_cost
 from ..dynamics import AbstractDynamics
-from ..dynamics._base import check_dynamics
 from ..math import matvec
 from ..planning import default_start, ilqr, Start
 from ..planning._start import as_start, controls_of
@@ -175,7 +181,7 @@ class MPC(AbstractController):
         **options: Any,
     ):
         where = "MPC"
-        check_dynamics(dynamics, where)
+        check_instance(dynamics, AbstractDynamics, "dynamics", where)
         check_cost(cost, "cost", where)
         horizon = check_count(horizon, "horizon", where)
         self.draws = "key" in _known(planner, options, where)
@@ -217,7 +223,7 @@ class MPC(AbstractController):
 
     def __check_init__(self):
         where, dynamics = "MPC", self.dynamics
-        check_dynamics(dynamics, where)
+        check_instance(dynamics, AbstractDynamics, "dynamics", where)
         n, m = dynamics.state_size, dynamics.control_size
         check_cost(self.cost, "cost", where, (n, m))
         planner: Any = self.planner

@@ -9,7 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_bounds, bounds_field, check_count, check_key, is_concrete
+from .._check import (
+    as_bounds,
+    bounds_field,
+    check_count,
+    check_instance,
+    check_key,
+    is_concrete,
+)
 from .._controller import AbstractController, wrong_observation
 from .._module import as_module, function_field, weight
 from .._typing import PRNGKey
@@ -173,11 +180,7 @@ def Deep(
         ```
     """
     where = "Deep"
-    if not isinstance(environment, Environment):
-        raise ValueError(
-            f"{where}: environment must be an Environment, got "
-            f"{type(environment).__name__}."
-        )
+    check_instance(environment, Environment, "environment", where)
     if head not in ("deterministic", "gaussian"):
         raise ValueError(
             f"{where}: head must be 'deterministic' or 'gaussian', got {head!r}."

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jaxtyping import Array
 
-from .._check import as_matrix, check_positive, symmetric_matrix
+from .._check import as_matrix, check_instance, check_positive, symmetric_matrix
 from ..dynamics import c2d, linearize, OperatingPoint
 from ..systems import AbstractSystem, LinearSystem
 from ._lqr import LQR
@@ -55,11 +55,7 @@ def sampled_weights(
         ```
     """
     where = "sampled_weights"
-    if not isinstance(system, LinearSystem):
-        raise ValueError(
-            f"{where}: system must be a LinearSystem (`delucax.linearize` makes one), "
-            f"got {type(system).__name__}."
-        )
+    check_instance(system, LinearSystem, "system", where)
     check_positive(dt, "dt", where)
     A, B = system.A, system.B
     n, m = B.shape

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_step
+from .._check import check_instance, check_step
 from .._controller import AbstractController
 from .._module import parameter
 from ..math._steps import row_at, step_at
@@ -60,11 +60,13 @@ class Scheduled(AbstractController):
 
     def __check_init__(self):
         controllers = self.controllers
-        if not isinstance(controllers, AbstractController):
-            raise ValueError(
-                "Scheduled: controllers must be an AbstractController whose arrays "
-                f"have a leading axis, got {type(controllers).__name__}."
-            )
+        check_instance(
+            controllers,
+            AbstractController,
+            "controllers",
+            "Scheduled",
+            " whose arrays have a leading axis",
+        )
         check_step(self.dt, "Scheduled")
         arrays = jax.tree.leaves(eqx.filter(controllers, eqx.is_array))
         lengths = {array.shape[:1] for array in arrays}

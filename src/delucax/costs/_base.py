@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import output_of
+from .._check import check_instance, output_of
 from .._module import check_parameters
 from .._typing import RealScalar
 
@@ -111,11 +111,7 @@ def check_cost(
     value: Any, name: str, where: str, sizes: tuple[int, int] | None = None
 ) -> None:
     """Raise unless `value` is a cost, of states and controls of these `sizes`."""
-    if not isinstance(value, AbstractCost):
-        raise ValueError(
-            f"{where}: {name} must be an AbstractCost (wrap a function with "
-            f"`delucax.costs.Function`), got {type(value).__name__}."
-        )
+    check_instance(value, AbstractCost, name, where)
     if sizes is None:
         return
     n, m = sizes

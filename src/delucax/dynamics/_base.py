@@ -83,13 +83,3 @@ class AbstractDynamics(AbstractPlant):
         if result is RESULTS.successful:
             return x_next
         return result.error_if(x_next, result != RESULTS.successful)
-
-
-def check_dynamics(value: Any, where: str) -> None:
-    """Raise unless `value` is discrete-time dynamics."""
-    if not isinstance(value, AbstractDynamics):
-        raise ValueError(
-            f"{where}: dynamics must be an AbstractDynamics (discretise a system with "
-            f"`delucax.Discretized`; of an environment give its `dynamics`), got "
-            f"{type(value).__name__}."
-        )

@@ -8,7 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_count
+from .._check import check_count, check_instance
 from .._jax import by_components
 from .._module import parameter
 from .._results import choose, first_of, or_none, promote, RESULTS
@@ -149,11 +149,7 @@ class Discretized(AbstractDiscretization):
 
     def __check_init__(self):
         where, system, solver = "Discretized", self.system, self.solver
-        if not isinstance(system, AbstractSystem):
-            raise ValueError(
-                f"{where}: system must be an AbstractSystem (wrap a function with "
-                f"`delucax.system`), got {type(system).__name__}."
-            )
+        check_instance(system, AbstractSystem, "system", where)
         noisy = system.noise == "brownian"
         check_solver(solver, where)
         if self.stepsize_controller is None:

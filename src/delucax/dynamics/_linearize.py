@@ -9,7 +9,7 @@ import jax.scipy.linalg as jsl
 import lineax as lx
 from jaxtyping import Array
 
-from .._check import as_vector, check_step
+from .._check import as_vector, check_instance, check_step
 from .._message import shortened
 from .._typing import RealScalar
 from ..systems import AbstractSystem, LinearSystem
@@ -163,11 +163,7 @@ def c2d(system: LinearSystem, dt: Any, method: str = "zoh") -> LinearDynamics:
         dlx.c2d(upright, dt=0.05).A
         ```
     """
-    if not isinstance(system, LinearSystem):
-        raise ValueError(
-            "c2d: system must be a LinearSystem (see `delucax.linearize`), got "
-            f"{type(system).__name__}."
-        )
+    check_instance(system, LinearSystem, "system", "c2d")
     check_step(dt, "c2d")
     n = system.state_size
     inputs = [system.B, system.dx_ref[:, None]]

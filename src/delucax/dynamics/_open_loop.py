@@ -8,7 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_vector, check_real
+from .._check import as_vector, check_instance, check_real
 from .._jax import by_components
 from .._message import shortened
 from .._module import as_float_array
@@ -54,11 +54,7 @@ def open_loop(
         ```
     """
     where = "open_loop"
-    if not isinstance(dynamics, AbstractDynamics):
-        raise ValueError(
-            f"{where}: dynamics must be an AbstractDynamics, got "
-            f"{type(dynamics).__name__}."
-        )
+    check_instance(dynamics, AbstractDynamics, "dynamics", where)
     x0 = as_vector(x0, dynamics.state_size, "x0", where)
     controls = _sequence(controls, dynamics.control_size, "controls", where)
     if w is not None:

@@ -4,11 +4,11 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from .._check import as_matrix, check_positive
+from .._check import as_matrix, check_instance, check_positive
 from .._module import parameter
 from ..math import matvec
 from ..math._norms import within_ball
-from ._base import AbstractDynamics, check_dynamics
+from ._base import AbstractDynamics
 from ._wrapper import AbstractWrapper
 
 
@@ -59,7 +59,7 @@ class WorstCase(AbstractWrapper):
 
     def __check_init__(self):
         where, dynamics = "WorstCase", self.dynamics
-        check_dynamics(dynamics, where)
+        check_instance(dynamics, AbstractDynamics, "dynamics", where)
         dynamics.equilibrium()
         as_matrix(self.L, "L", where)
         shape = dynamics.disturbance_size, dynamics.state_size

@@ -5,8 +5,9 @@ from typing import Any, ClassVar, TYPE_CHECKING
 
 import equinox as eqx
 
+from .._check import check_instance
 from ..systems import AbstractPlant, AbstractSystem
-from ._base import AbstractDynamics, check_dynamics
+from ._base import AbstractDynamics
 
 
 class _Forwarding(AbstractDynamics):
@@ -147,7 +148,7 @@ class AbstractWrapper(_Forwarding):
         dynamics: eqx.AbstractVar[AbstractDynamics]
 
     def __check_init__(self):
-        check_dynamics(self.dynamics, type(self).__name__)
+        check_instance(self.dynamics, AbstractDynamics, "dynamics", type(self).__name__)
 
     @property
     def _inside(self):

@@ -16,6 +16,7 @@ from .._check import (
     bounds_field,
     check_count,
     check_finite,
+    check_instance,
     check_key,
     check_real,
     is_concrete,
@@ -38,7 +39,6 @@ from ..costs import AbstractCost
 from ..costs._base import check_cost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics, OperatingPoint, trim
-from ..dynamics._base import check_dynamics
 from ..dynamics._noise import check_noise
 from ..dynamics._operating_point import operating_point
 from ..math import clip
@@ -193,7 +193,7 @@ class Environment(eqx.Module):
 
     def __check_init__(self):
         where, dynamics = "Environment", self.dynamics
-        check_dynamics(dynamics, where)
+        check_instance(dynamics, AbstractDynamics, "dynamics", where)
         check_noise(dynamics, where)
         sizes = dynamics.state_size, dynamics.control_size
         check_cost(self.cost, "cost", where, sizes)
@@ -203,11 +203,7 @@ class Environment(eqx.Module):
         ):
             if given is None and name == "sensor_noise":
                 continue
-            if not isinstance(given, AbstractDisturbance):
-                raise ValueError(
-                    f"{where}: {name} must be an AbstractDisturbance, got "
-                    f"{type(given).__name__}."
-                )
+            check_instance(given, AbstractDisturbance, name, where)
             size = dynamics.observation_size if size is None else size
             if given.size != size:
                 raise ValueError(

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
-from .._check import check_count, check_key, is_concrete
+from .._check import check_count, check_instance, check_key, is_concrete
 from .._typing import PRNGKey
 from ..costs import Quadratic
 from ..dynamics import c2d, LinearDynamics
@@ -109,13 +109,11 @@ def _sampled(system: Any, dt: Any) -> LinearDynamics:
                 f"{system.dt}."
             )
         return system
-    if not isinstance(system, LinearSystem):
-        raise ValueError(
-            "lds: system must be a LinearSystem or LinearDynamics "
-            "(`delucax.interop.from_control` makes one of a python-control object, "
-            "`delucax.interop.read_linear` of a file), got "
-            f"{type(system).__name__}."
-        )
+    hint = (
+        " or LinearDynamics (`delucax.interop.from_control` makes one of a "
+        "python-control object, `delucax.interop.read_linear` of a file)"
+    )
+    check_instance(system, LinearSystem, "system", "lds", hint)
     if dt is None:
         raise ValueError(
             "lds: dt must be given for a system in continuous time, got None."

@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import check_number, check_positive, is_concrete
+from .._check import check_instance, check_number, check_positive, is_concrete
 from .._module import function_field, parameter, positive
 from .._results import RESULTS
 from ..dynamics import AbstractDynamics
-from ..dynamics._base import check_dynamics
 from ..dynamics._linearize import _jacobian
 from ._gaussian import AbstractGaussianFilter, first_belief, noise_covariances
 from ._moments import congruence, LinearJoint, SampledJoint, square_root
@@ -242,7 +241,7 @@ class UnscentedKalmanFilter(AbstractGaussianFilter):
 
 
 def _check_dynamics(dynamics: Any, where: str) -> None:
-    check_dynamics(dynamics, where)
+    check_instance(dynamics, AbstractDynamics, "dynamics", where)
     n = dynamics.state_size
     x = jnp.zeros(n)
     shape = eqx.filter_eval_shape(dynamics.difference, x, x).shape

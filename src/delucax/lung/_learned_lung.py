@@ -104,7 +104,7 @@ class LearnedLung(AbstractDynamics):
         key: PRNGKey,
     ):
         where = "LearnedLung"
-        check_instance(breaths, Breaths, "breaths must be Breaths", where)
+        check_instance(breaths, Breaths, "breaths", where)
         check_key(key, where)
         for name, value in (
             ("width", width),

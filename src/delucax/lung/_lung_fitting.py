@@ -106,7 +106,7 @@ def fit_lungs(
     """
     where = "fit_lungs"
     check_key(key, where)
-    check_instance(breaths, Breaths, "breaths must be Breaths", where)
+    check_instance(breaths, Breaths, "breaths", where)
     single = breaths.pressure.ndim == 2
     u_in, pressure = breaths.u_in, breaths.pressure
     if single:

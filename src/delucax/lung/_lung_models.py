@@ -55,7 +55,7 @@ class LungModel(eqx.Module):
         solver: diffrax.AbstractSolver | None = None,
     ):
         where = "LungModel"
-        check_instance(system, AbstractLung, "system must be an AbstractLung", where)
+        check_instance(system, AbstractLung, "system", where)
         check_step(dt, where)
         delay = check_count(sensor_delay, "sensor_delay", where, least=0)
         self.dynamics = Delayed(Discretized(system, dt, solver), sensor=delay)

@@ -272,6 +272,6 @@ def learned_lung(
     lung: Any = model
     if model is None:
         lung = load(Path(__file__).with_name("learned_lung.dlx"))
-    check_instance(lung, LearnedLung, "model must be a LearnedLung", "learned_lung")
+    check_instance(lung, LearnedLung, "model", "learned_lung")
     rest = lung.resting()
     return ventilated((learned_lung,), lung, rest, horizon=horizon, **options)

@@ -84,7 +84,7 @@ class ShootingMPC(AbstractController):
 
     def __check_init__(self):
         where = "ShootingMPC"
-        check_instance(self.model, LearnedLung, "model must be a LearnedLung", where)
+        check_instance(self.model, LearnedLung, "model", where)
         check_waveform(self.waveform, where)
 
     def init(self, *, key=None):

@@ -169,7 +169,7 @@ def _slack(breaths: Array) -> Array:
 
 def check_waveform(waveform: Any, where: str) -> None:
     """Raise unless it is a breath waveform."""
-    check_instance(waveform, BreathWaveform, "waveform must be a BreathWaveform", where)
+    check_instance(waveform, BreathWaveform, "waveform", where)
 
 
 def check_peep(waveform: BreathWaveform, valves: Any, where: str) -> None:

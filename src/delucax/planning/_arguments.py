@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_bounds, as_vector, check_count, check_finite
+from .._check import as_bounds, as_vector, check_count, check_finite, check_instance
 from .._message import shortened
 from .._module import as_float_array, as_module
 from ..costs import AbstractCost
@@ -32,15 +32,8 @@ def as_problem(
     where: str,
 ) -> tuple[Problem, Start]:
     """The problem, and what to start from, or an error."""
-    if not isinstance(dynamics, AbstractDynamics):
-        raise ValueError(
-            f"{where}: dynamics must be an AbstractDynamics (for an environment, its "
-            f"`dynamics`), got {type(dynamics).__name__}."
-        )
-    if not isinstance(cost, AbstractCost):
-        raise ValueError(
-            f"{where}: cost must be an AbstractCost, got {type(cost).__name__}."
-        )
+    check_instance(dynamics, AbstractDynamics, "dynamics", where)
+    check_instance(cost, AbstractCost, "cost", where)
     m = dynamics.control_size
     x0 = as_vector(x0, dynamics.state_size, "x0", where)
     check_finite(x0, "x0", where)

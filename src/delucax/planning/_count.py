@@ -13,6 +13,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
+from .._check import check_instance
 from ..dynamics import AbstractDynamics
 from ..dynamics._wrapper import AbstractWrapper
 
@@ -79,11 +80,7 @@ def count_evaluations(
         ```
     """
     where = "count_evaluations"
-    if not isinstance(dynamics, AbstractDynamics):
-        raise ValueError(
-            f"{where}: dynamics must be an AbstractDynamics, got "
-            f"{type(dynamics).__name__}."
-        )
+    check_instance(dynamics, AbstractDynamics, "dynamics", where)
     if not callable(function):
         raise ValueError(f"{where}: function must be a function, got {function!r}.")
     tally = _Tally()

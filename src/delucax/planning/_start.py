@@ -8,14 +8,13 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._check import check_count, check_finite
+from .._check import check_count, check_finite, check_instance
 from .._message import shortened
 from .._module import as_float_array, parameter
 from .._typing import RealScalar
 from ..costs import AbstractCost
 from ..costs._base import check_cost
 from ..dynamics import AbstractDynamics
-from ..dynamics._base import check_dynamics
 from ..dynamics._operating_point import operating_point
 from ..math._linear_solve import is_definite
 from ..riccati import dare
@@ -124,7 +123,7 @@ def default_start(
         start.gains[0, 0]
         ```
     """
-    check_dynamics(dynamics, "default_start")
+    check_instance(dynamics, AbstractDynamics, "dynamics", "default_start")
     check_cost(cost, "cost", "default_start")
     T = check_count(horizon, "horizon", "default_start")
     dynamics, cost = (_constant(tree) for tree in (dynamics, cost))

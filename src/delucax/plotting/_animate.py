@@ -7,7 +7,7 @@ import os
 import numpy as np
 from PIL import Image
 
-from .._check import check_bool, check_count, check_step
+from .._check import check_bool, check_count, check_instance, check_step
 from ..environments import Environment
 from ..simulation import Trajectory
 from ._export import check_path, compressed, html_player, write
@@ -136,11 +136,7 @@ def animate(
         ```
     """
     where = "animate"
-    if not isinstance(trajectory, Trajectory):
-        raise ValueError(
-            f"{where}: trajectory must be a Trajectory, got "
-            f"{type(trajectory).__name__}."
-        )
+    check_instance(trajectory, Trajectory, "trajectory", where)
     if trajectory.batch_shape:
         raise ValueError(
             f"{where}: trajectory must be one trajectory, got a batch of shape "

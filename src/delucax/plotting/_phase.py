@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from .._check import as_vector
+from .._check import as_vector, check_instance
 from .._module import as_float_array
 from ..systems import AbstractSystem
 from ._figure import (
@@ -70,11 +70,7 @@ def phase_portrait(
         ```
     """
     where = "phase_portrait"
-    if not isinstance(system, AbstractSystem):
-        raise ValueError(
-            f"{where}: system must be an AbstractSystem, such as "
-            f"environment.dynamics.system, got {type(system).__name__}."
-        )
+    check_instance(system, AbstractSystem, "system", where)
     if system.state_size != 2:
         raise ValueError(
             f"{where}: system must have two states, got {system.state_names}."

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from .._check import check_instance
 from .._results import RESULTS
 from ..environments import Environment
 from ._figure import (
@@ -129,11 +130,7 @@ def plot(
 
 def control_bounds(environment: Any, run: Run, where: str) -> Bounds | None:
     """The bounds of each control, shape `(2, m)`, or `None`; checked against a run."""
-    if not isinstance(environment, Environment):
-        raise ValueError(
-            f"{where}: environment must be an Environment, got "
-            f"{type(environment).__name__}."
-        )
+    check_instance(environment, Environment, "environment", where)
     for name in ("state_names", "control_names"):
         expected = getattr(run.trajectory, name)
         got = getattr(environment.dynamics, name)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._check import is_concrete
+from .._check import check_instance, is_concrete
 from ..simulation import Trajectory
 
 
@@ -119,11 +119,7 @@ def as_runs(given: Any, labels: Any, argument: str, where: str) -> list[Run]:
     runs = []
     for label, trajectory in zip(names, trajectories, strict=True):
         what = f"{argument}[{label!r}]" if label else argument
-        if not isinstance(trajectory, Trajectory):
-            raise ValueError(
-                f"{where}: {what} must be a Trajectory, got "
-                f"{type(trajectory).__name__}."
-            )
+        check_instance(trajectory, Trajectory, what, where)
         runs.append(_run(label, trajectory, what, where))
         for name in ("state_names", "control_names"):
             first, here = (getattr(r.trajectory, name) for r in (runs[0], runs[-1]))

@@ -6,7 +6,7 @@ import diffrax
 import equinox as eqx
 import numpy as np
 
-from .._check import check_finite, check_positive, is_concrete
+from .._check import check_finite, check_instance, check_positive, is_concrete
 from .._controller import AbstractController
 from .._message import shortened
 from .._module import as_float_array
@@ -21,11 +21,7 @@ from ..systems import AbstractSystem
 
 def check_system(system: Any, where: str) -> None:
     """Raise unless one solve can integrate `system`."""
-    if not isinstance(system, AbstractSystem):
-        raise ValueError(
-            f"{where}: system must be an AbstractSystem (of an environment, its "
-            f"`dynamics.system`), got {type(system).__name__}."
-        )
+    check_instance(system, AbstractSystem, "system", where)
     name = type(system).__name__
     if type(system).project is not AbstractSystem.project:
         raise ValueError(

@@ -16,6 +16,7 @@ from .._check import (
     check_bool,
     check_count,
     check_finite,
+    check_instance,
     check_key,
 )
 from .._controller import AbstractController, initial_state, tallies
@@ -119,16 +120,8 @@ def rollout(
         ```
     """
     where = "rollout"
-    if not isinstance(environment, Environment):
-        raise ValueError(
-            f"{where}: environment must be an Environment, got "
-            f"{type(environment).__name__}."
-        )
-    if not isinstance(controller, AbstractController):
-        raise ValueError(
-            f"{where}: controller must be an AbstractController, got "
-            f"{type(controller).__name__}."
-        )
+    check_instance(environment, Environment, "environment", where)
+    check_instance(controller, AbstractController, "controller", where)
     check_key(key, where)
     check_bool(throw, "throw", where)
     horizon = environment.horizon if horizon is None else horizon

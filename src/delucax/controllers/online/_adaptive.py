@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from ..._check import check_count, check_key, check_range, check_step
+from ..._check import check_count, check_instance, check_key, check_range, check_step
 from ..._controller import AbstractController, AbstractLearner
 from ..._module import parameter
 
@@ -110,11 +110,7 @@ class Adaptive(AbstractController):
 
     def __check_init__(self):
         where = "Adaptive"
-        if not isinstance(self.base, AbstractLearner):
-            raise ValueError(
-                f"{where}: base must be an AbstractLearner such as GPC makes, got "
-                f"{type(self.base).__name__}."
-            )
+        check_instance(self.base, AbstractLearner, "base", where, " such as GPC makes")
         check_step(self.rate, where, "rate")
         check_step(self.share, where, "share")
         check_range(self.share, "share", where, 0, 1)

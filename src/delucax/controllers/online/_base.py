@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._check import check_count, check_positive, is_concrete
+from ..._check import check_count, check_instance, check_positive, is_concrete
 from ...dynamics import AbstractDynamics, LinearDynamics, linearize
 from .._lqg import LQG
 from .._lqr import LQR
@@ -55,12 +55,10 @@ def memory_of(loop: Loop, memory: int | None, where: str) -> int:
 
 def _check_cost(dynamics: Any, cost: Any, where: str) -> None:
     """Raise unless the cost gives a scalar."""
-    if not isinstance(dynamics, AbstractDynamics):
-        raise ValueError(
-            f"{where}: dynamics must be an AbstractDynamics, the model that it learns "
-            "with (`delucax.controllers.Explore` identifies one), got "
-            f"{type(dynamics).__name__}."
-        )
+    hint = (
+        ", the model that it learns with (`delucax.controllers.Explore` identifies one)"
+    )
+    check_instance(dynamics, AbstractDynamics, "dynamics", where, hint)
     if not callable(cost):
         raise ValueError(
             f"{where}: cost must be a function of (t, y, u), such as one of "

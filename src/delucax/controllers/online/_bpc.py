@@ -8,7 +8,7 @@ import jax.random as jr
 import optax
 from jaxtyping import Array, Float
 
-from ..._check import check_count, check_key, check_step
+from ..._check import check_count, check_instance, check_key, check_step
 from ..._controller import AbstractController, Tally
 from ..._module import parameter, weight
 from ...dynamics import AbstractDynamics
@@ -119,11 +119,7 @@ class BPC(AbstractController):
         radius: Any = None,
     ):
         where = "BPC"
-        if not isinstance(dynamics, AbstractDynamics):
-            raise ValueError(
-                f"{where}: dynamics must be an AbstractDynamics, got "
-                f"{type(dynamics).__name__}."
-            )
+        check_instance(dynamics, AbstractDynamics, "dynamics", where)
         echoes = not dynamics.observes_state
         # A roll-out as long as it takes a control to be seen.
         loop = Loop(dynamics, base, dynamics.state_size, where, echoes=echoes)

@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..._check import check_count, is_concrete
+from ..._check import check_count, check_instance, is_concrete
 from ..._controller import AbstractController, wrong_observation
 from ..._module import parameter
 from ...dynamics import AbstractDynamics, LinearDynamics
@@ -256,10 +256,7 @@ def check_control(
     dynamics: AbstractDynamics, base: AbstractController, where: str
 ) -> None:
     """Raise unless a base controller gives a control that dynamics take."""
-    if not isinstance(base, AbstractController):
-        raise ValueError(
-            f"{where}: base must be an AbstractController, got {type(base).__name__}."
-        )
+    check_instance(base, AbstractController, "base", where)
     y = jnp.zeros(dynamics.observation_size)
     try:
         u, _ = eqx.filter_eval_shape(base, jnp.zeros(()), y, base.init(key=None))
