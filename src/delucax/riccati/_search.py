@@ -34,7 +34,7 @@ class Attempt(NamedTuple):
     rounding: Array  # of the gap
     near: Array  # whether the gap is so small that it has to be looked at
     around: Array  # whether it is small
-    least: Array  # the relative residual that rounding of X may leave
+    least: Array  # the residual that rounding of X may leave, in balanced units
     modest: Array  # whether X is far from what rounding makes of an infinite one
     iterations: Array
 
@@ -91,9 +91,7 @@ def search(
         enough = jnp.clip(new.least, close, 100 * close)
         # In units that do not fit, a wrong X may leave little.
         unfit = apart & ~balanced
-        enough = jnp.where(unfit, close, enough)
-        left = jnp.where(unfit, jnp.maximum(new.residual, new.given), new.residual)
-        solved = stable & (left <= enough)
+        solved = stable & (new.residual <= enough) & (~unfit | (new.given <= close))
         given = kind <= SECOND
         # A second start that fails replaces the first only by being stable.
         take = given & (solved | (kind == FIRST) | stable & ~found.stable)
