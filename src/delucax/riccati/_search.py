@@ -93,8 +93,10 @@ def search(
         unfit = apart & ~balanced
         solved = stable & (new.residual <= enough) & (~unfit | (new.given <= close))
         given = kind <= SECOND
-        # A second start that fails replaces the first only by being stable.
-        take = given & (solved | (kind == FIRST) | stable & ~found.stable)
+        # Of two that are solved the one with the smaller residual is kept, and of two
+        # that are not the first, unless the second alone is stable.
+        take = solved & (~found.solved | (new.given < found.given))
+        take = given & (take | (kind == FIRST) | stable & ~found.stable)
 
         def pick(now, before):
             return jnp.where(take, now, before)
@@ -115,7 +117,7 @@ def search(
             stable=pick(stable, found.stable),
             balanced=balanced,
             fragile=jnp.where(
-                kind == SHAKEN, ~(survives & same), found.fragile & ~take
+                kind == SHAKEN, ~(survives & same), found.fragile & ~(given & solved)
             ),
             stabilisable=jnp.where(
                 kind == PLAIN,
