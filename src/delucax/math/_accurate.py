@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._size import power_of_two
+
 
 _SMALL = 2**15
 """Of products of numbers. Up to here one loop over the sums, which XLA compiles in half
@@ -74,10 +76,10 @@ def _by_slices(left, right, *added):
     both = jnp.concatenate([left, right.T])
     # In units in which the k-th column and the k-th row are alike.
     across, down = (jnp.max(jnp.abs(M), axis=0) for M in (both[:n], both[n:]))
-    unit = _power(jnp.sqrt(down) / jnp.sqrt(jnp.where(across > 0, across, 1)))
+    unit = power_of_two(jnp.sqrt(down) / jnp.sqrt(jnp.where(across > 0, across, 1)))
     unit = jnp.where(unit > 0, unit, 1)
     both *= jnp.where(np.arange(n + m)[:, None] < n, unit, 1 / unit)
-    power = _power(jnp.max(jnp.abs(both), axis=1, keepdims=True))
+    power = power_of_two(jnp.max(jnp.abs(both), axis=1, keepdims=True))
     power = lax.max(power, jnp.finfo(dtype).tiny)
     # Entries as multiples of ever smaller steps, what each adds, and what is left.
     step = 2.0 ** (bits * np.arange(1, count + 1)[:, None, None] - 2)
@@ -141,9 +143,3 @@ def _halves(x: Array) -> tuple[Array, Array]:
     info = jnp.finfo(x.dtype)
     high = lax.reduce_precision(x, info.nexp, (info.nmant + 1) // 2 - 1)
     return high, x - high
-
-
-def _power(x: Array) -> Array:
-    """A power of two near each number."""
-    # Rounded to no digit of the mantissa.
-    return lax.reduce_precision(x, jnp.finfo(x.dtype).nexp, 0)

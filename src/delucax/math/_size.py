@@ -1,5 +1,6 @@
 """Sizes of matrices whose squares may overflow or underflow."""
 
+import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -23,6 +24,7 @@ def _largest(*matrices):
     return jnp.where(largest == 0, 1, largest)
 
 
-def power_of_two(exponent: Array) -> Array:
-    """`2^exponent` for whole exponents, to the last bit, which `jnp.exp2` is not."""
-    return jnp.ldexp(jnp.ones_like(exponent), exponent.astype(int))
+def power_of_two(x: Array) -> Array:
+    """A power of two near each number, to the last bit, which `jnp.exp2` is not."""
+    # Rounded to no digit of the mantissa.
+    return lax.reduce_precision(x, jnp.finfo(x.dtype).nexp, 0)

@@ -160,15 +160,17 @@ def _find(A, B, Q, R, S, E, d) -> Found:
         rounding = n * eps * scale
         # A change of Q by rounding moves eigenvalues on the axis off it by its root.
         reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
+        # The rest is said in balanced units.
+        balanced_X, loop = X * (e[:, None] * e), left.closed_loop * (e / e[:, None])
         return Attempt(
-            X=X * (e[:, None] * e),
+            X=balanced_X,
             residual=left.bounds[2],
             given=left.bounds[1],
             bound=abscissa,
             gap=-abscissa,
             rounding=rounding,
             near=jnp.abs(abscissa) < reach,
-            least=attainable(X, (2 * size(left.closed_loop)) * magnified, left.terms),
+            least=attainable(balanced_X, 2 * size(loop) * magnified, left.terms[2]),
             modest=size(X) * eps**0.5 < size_Q,
             around=jnp.abs(abscissa) < 4 * eps**0.125 * size(left.closed_loop),
             iterations=iterations,

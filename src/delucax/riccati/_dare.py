@@ -139,8 +139,6 @@ def _find(A, B, Q, R, S, E, d) -> Found:
     for M in (plain_A, plain_B, Q, R, S):
         posed = posed & jnp.all(jnp.isfinite(M))
 
-    magnified = 1 if E is None else size(E) ** 2
-
     def attempt(kind, balanced):
         # From the units that balance the problem to those of the attempt.
         e = jnp.where(balanced, 1, 1 / d)
@@ -157,17 +155,18 @@ def _find(A, B, Q, R, S, E, d) -> Found:
         radius = spectral_radius(left.closed_loop)
         # A stable loop may belong to a stationary point of a cost without a minimum.
         gap = jnp.where(_is_semidefinite(r + b.T @ X @ b), 1 - radius, -jnp.inf)
+        # The rest is said in balanced units.
+        balanced_X, loop = X * (e[:, None] * e), left.closed_loop * (e / e[:, None])
+        magnified = (1 + size(loop) ** 2) * (1 if E is None else size(E) ** 2)
         return Attempt(
-            X=X * (e[:, None] * e),
+            X=balanced_X,
             residual=left.bounds[2],
             given=left.bounds[1],
             bound=radius,
             gap=gap,
             rounding=jnp.asarray(n * eps, dtype),
             near=jnp.abs(gap) < 10 * eps**0.5,
-            least=attainable(
-                X, (1 + size(left.closed_loop) ** 2) * magnified, left.terms
-            ),
+            least=attainable(balanced_X, magnified, left.terms[2]),
             modest=size(X) * eps**0.5 < size_Q,
             around=jnp.abs(gap) < 4 * eps**0.125,
             iterations=iterations,

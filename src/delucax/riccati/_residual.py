@@ -24,7 +24,7 @@ class Residual(NamedTuple):
     - `bounds`: an upper bound on what this is at the best gain and without rounding, in
       each of the units that were asked for.
     - `closed_loop`: `A - B K`, or `E^-1 (A - B K)`.
-    - `terms`: the sum of the norms of the terms.
+    - `terms`: the sum of the norms of the terms, in each of these units.
     - `K`: the gain.
     """
 
@@ -101,12 +101,14 @@ def riccati_residual(
     bound = jnp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
 
     def in_units(d):
-        return relative_size(*(M * (d[:, None] * d) for M in (bound, *terms)))
+        rest, *parts = (M * (d[:, None] * d) for M in (bound, *terms))
+        return _MARGIN * relative_size(rest, *parts), size(*parts)
 
     # Powers of two: their products have no rounding.
-    bounds = _MARGIN * jax.vmap(in_units)(jnp.stack([jnp.ones(n, dtype), *others]))
+    units = jnp.stack([jnp.ones(n, dtype), *others])
+    bounds, sizes = jax.vmap(in_units)(units)
     relative = jnp.where(needed, bounds[0], relative_size(error, *terms))
-    return Residual(error, relative, bounds, closed_loop, size(*terms), K)
+    return Residual(error, relative, bounds, closed_loop, sizes, K)
 
 
 class _Left(NamedTuple):

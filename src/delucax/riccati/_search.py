@@ -34,7 +34,7 @@ class Attempt(NamedTuple):
     rounding: Array  # of the gap
     near: Array  # whether the gap is so small that it has to be looked at
     around: Array  # whether it is small
-    least: Array  # the relative residual that rounding of X may leave
+    least: Array  # the residual that rounding of X may leave, in balanced units
     modest: Array  # whether X is far from what rounding makes of an infinite one
     iterations: Array
 
@@ -91,12 +91,12 @@ def search(
         enough = jnp.clip(new.least, close, 100 * close)
         # In units that do not fit, a wrong X may leave little.
         unfit = apart & ~balanced
-        enough = jnp.where(unfit, close, enough)
-        left = jnp.where(unfit, jnp.maximum(new.residual, new.given), new.residual)
-        solved = stable & (left <= enough)
+        solved = stable & (new.residual <= enough) & (~unfit | (new.given <= close))
         given = kind <= SECOND
-        # A second start that fails replaces the first only by being stable.
-        take = given & (solved | (kind == FIRST) | stable & ~found.stable)
+        # Of two that are solved the one with the smaller residual is kept, and of two
+        # that are not the first, unless the second alone is stable.
+        take = solved & (~found.solved | (new.given < found.given))
+        take = given & (take | (kind == FIRST) | stable & ~found.stable)
 
         def pick(now, before):
             return jnp.where(take, now, before)
@@ -117,7 +117,7 @@ def search(
             stable=pick(stable, found.stable),
             balanced=balanced,
             fragile=jnp.where(
-                kind == SHAKEN, ~(survives & same), found.fragile & ~take
+                kind == SHAKEN, ~(survives & same), found.fragile & ~(given & solved)
             ),
             stabilisable=jnp.where(
                 kind == PLAIN,

@@ -137,5 +137,5 @@ def balanced(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
     scale = lax.fori_loop(0, 24, sweep, jnp.ones(A.shape[0], A.dtype))
     usable = jnp.isfinite(scale) & (scale > 0)
-    scale = power_of_two(jnp.round(jnp.log2(jnp.where(usable, scale, 1))))
+    scale = power_of_two(jnp.where(usable, scale, 1))
     return A * scale[None, :] / scale[:, None]

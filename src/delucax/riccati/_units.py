@@ -51,9 +51,9 @@ def units(
         return d + jnp.where(jnp.abs(change) < -lowest / 4, change, 0)
 
     d = lax.fori_loop(0, _SWEEPS, sweep, jnp.zeros(n, dtype))
-    d = jnp.round(d - jnp.mean(d))
+    d -= jnp.mean(d)
     apart = jnp.max(d) - jnp.min(d) > jnp.log2(_APART)
-    return lax.stop_gradient(power_of_two(jnp.where(apart, d, 0)))
+    return lax.stop_gradient(power_of_two(jnp.exp2(jnp.where(apart, d, 0))))
 
 
 def in_units(d: Float[Array, " n"], A, B, Q, R, S, E) -> tuple:
