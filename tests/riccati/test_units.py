@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import riccati_systems
-from helpers import dtype, tolerance
+from helpers import dtype, thorough, tolerance
 
 import delucax as dlx
 
@@ -81,3 +81,37 @@ def test_a_gain_in_single_precision():
     B, Q = jnp.array([[0.00125], [0.05 * s]]), jnp.diag(jnp.array([1.0, s**-2]))
     K = solved("dare")(A, B, Q, jnp.eye(1)).K
     np.testing.assert_allclose(K * jnp.array([1, s]), [[4.067, 2.676]], rtol=1e-3)
+
+
+CHAINS = {
+    "double": (np.diag([1.0], 1), np.array([[0.0], [1.0]])),
+    "triple": (np.diag([1.0, 1.0], 1), np.array([[0.0], [0.0], [1.0]])),
+    "triangular": (np.array([[0.5, 0.3], [0.0, 1.0]]), np.array([[0.0], [1.0]])),
+}
+
+
+@pytest.mark.parametrize("rows", [False, pytest.param(True, marks=thorough)])
+@pytest.mark.parametrize("chain", CHAINS)
+@pytest.mark.parametrize("name", ["dare", "care"])
+def test_chains_of_integrators(name, chain, rows):
+    """One state moves the next alone: nothing but the control and the cost tells how
+    their units compare. With `rows`, those of an E are in other units than the states.
+    """
+    A, B = CHAINS[chain]
+    n = len(A)
+    if name == "dare":
+        A, B = np.eye(n) + A / 10, B / 10
+    E = np.eye(n) + np.ones((n, n)) / 8 if rows else None
+    R = np.eye(1)
+    for weight in np.diag([1.0] + [0.0] * (n - 1)), np.eye(n):
+        wanted = solved(name)(*as_dtype((A, B, weight, R, None, E))).K
+        for power in tolerance((1, 2), (4, 8)):
+            d = 10.0 ** np.linspace(-power, power, n)
+            for by in (d, 1 / d, d / d[0]):
+                *data, F = in_units(by, A, B, weight, R, None, E)
+                if rows:
+                    data[0], data[1], F = (M / by[:, None] ** 2 for M in (*data[:2], F))
+                solution = solved(name)(*as_dtype((*data, F)))
+                assert solution.result == dlx.RESULTS.successful
+                error = jnp.max(jnp.abs(solution.K * by - wanted))
+                assert error < tolerance(1e-3, 1e-9) * jnp.max(jnp.abs(wanted))

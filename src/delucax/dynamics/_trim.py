@@ -45,13 +45,14 @@ def trim(
     It is a root near the guess, not always the nearest. Where there are more free
     unknowns than equations it is the least change among its neighbours, to first order.
     The unit of each state is its guess, or where that is zero the largest guess of a
-    state, at most 1, and 1 if all are zero; so for controls. A guess smaller than 100
-    roundings of the largest one (or of 1, if that is less) counts as zero: measure a
-    state that is so small in a smaller unit. A free state or control that comes out
-    smaller than 4 roundings of its unit is set to zero. Where there is no root it is a
-    point of least residual, each equation in units of the size of its terms, and the
-    result says so. At a multiple root the last digits may be missing, and the result
-    be `no_equilibrium`.
+    state, at most 1, and 1 if all are zero; so for controls. A guess counts as zero if
+    it is less than 100 roundings of the largest one, or of 1 if that is less: in
+    float32 that is 1e-5 of it. The other states then rest as far as a whole unit of
+    this one moves them, so measure a state that is so small in a smaller unit, such as
+    nmol. A free state or control that comes out smaller than 4 roundings of its unit is
+    set to zero. Where there is no root it is a point of least residual, each equation
+    in units of the size of its terms, and the result says so. At a multiple root the
+    last digits may be missing, and the result be `no_equilibrium`.
 
     Levenberg and Marquardt's method in a trust region, then Newton's on the conditions
     of the nearest point. Differentiable in forward and reverse mode with respect to all

@@ -132,7 +132,7 @@ def _equation(A, B, Q, R, S, E, X):
 
 
 @jax.custom_jvp
-def _find(A, B, Q, R, S, E, d) -> Found:
+def _find(A, B, Q, R, S, E, by) -> Found:
     """The stabilising `X`, and what is known about it."""
     n, m, dtype = A.shape[0], B.shape[1], A.dtype
     eps = float(jnp.finfo(dtype).eps)
@@ -146,22 +146,27 @@ def _find(A, B, Q, R, S, E, d) -> Found:
 
     def attempt(kind, balanced):
         # From the units that balance the problem to those of the attempt.
-        e = jnp.where(balanced, 1, 1 / d)
-        a, b, q, r, s, f = in_units(e, A, B, Q, R, S, E)
+        back = jnp.where(balanced, 1, 1 / by)
+        a, b, q, r, s, e = in_units(back, A, B, Q, R, S, E)
         q, r, s, size_Q = weights(kind, q, r, s)
-        plain_a, plain_b, *_ = in_units(e, plain_A, plain_B, Q, R, S, None)
+        # Those of E^-1 A and E^-1 B have the units of the states in their rows.
+        state, row = back
+        plain = jnp.stack([state, state])
+        plain_a, plain_b, *_ = in_units(plain, plain_A, plain_B, Q, R, S, None)
         X, size_G, iterations = _start(plain_a, plain_b, q, r, s, kind == SECOND)
+        units = by[0] * state, state
         X, left = polish(
-            lambda *at: riccati_residual(False, a, b, q, r, s, f, *at, d * e, e),
-            lambda loop, error: outside(f, lyapunov(loop, error)),
-            outside(f, X),
+            lambda *at: riccati_residual(False, a, b, q, r, s, e, *at, *units),
+            lambda loop, error: outside(e, lyapunov(loop, error)),
+            outside(e, X),
         )
         abscissa, scale = abscissa_and_size(left.closed_loop)
         rounding = n * eps * scale
         # A change of Q by rounding moves eigenvalues on the axis off it by its root.
         reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
         # The rest is said in balanced units.
-        balanced_X, loop = X * (e[:, None] * e), left.closed_loop * (e / e[:, None])
+        balanced_X = X * (row[:, None] * row)
+        loop = left.closed_loop * (state / state[:, None])
         return Attempt(
             X=balanced_X,
             residual=left.bounds[2],
@@ -176,7 +181,7 @@ def _find(A, B, Q, R, S, E, d) -> Found:
             iterations=iterations,
         )
 
-    return search(attempt, jnp.full_like(Q, jnp.nan), posed, jnp.any(d != 1))
+    return search(attempt, jnp.full_like(Q, jnp.nan), posed, jnp.any(by != 1))
 
 
 def _start(A, B, Q, R, S, second):

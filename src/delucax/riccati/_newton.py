@@ -148,13 +148,13 @@ def solution_in_units(
 
     `find` takes the data and the units, and `name` is that of the bound that it tells.
     """
-    d = units(A, B, Q, E)
-    data = in_units(d, A, B, Q, R, S, E)
-    found = find(*data, d)
+    by = d, f = units(A, B, Q, R, E)
+    data = in_units(by, A, B, Q, R, S, E)
+    found = find(*data, by)
     K, closed_loop = settled(found.differentiable, terms, *data, found.X)
     bounds = dict.fromkeys(("spectral_radius", "spectral_abscissa"))
     return RiccatiSolution(
-        X=found.X * (d[:, None] * d),
+        X=found.X * (f[:, None] * f),
         K=K * d,
         residual=lax.stop_gradient(found.given),
         closed_loop=closed_loop / (d[:, None] / d),

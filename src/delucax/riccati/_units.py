@@ -4,60 +4,77 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..math._linear_solve import solve
 from ..math._size import power_of_two
 
 
-_SWEEPS = 20
-_APART = 2.0**4
-"""Units that are no further apart are left as they are."""
+_SWEEPS = 100
+_APART = 4
+"""Units that are no more powers of two apart are left as they are."""
 
 
 def units(
     A: Float[Array, "n n"],
     B: Float[Array, "n m"],
     Q: Float[Array, "n n"],
+    R: Float[Array, "m m"],
     E: Float[Array, "n n"] | None,
-) -> Float[Array, " n"]:
-    """Powers of two, by which the states are multiplied.
+) -> Float[Array, "2 n"]:
+    """Powers of two, by which the states and the rows of A, B and E are multiplied.
 
-    In them, the size of what moves a state (its rows of A, E and B) is that of what the
-    state moves (its columns of A and E, its weight): a state in unfit units is lost in
-    the rounding of the others. States that nothing moves, or that move nothing, keep
-    their units.
+    In them a row of the Hamiltonian matrix is as large as its column: what moves a
+    state, other states and controls, is as large as what the state moves, other states
+    and costs. A state in a unit that does not fit is lost in the rounding of the
+    others. States that nothing moves, or that move nothing, keep their units. The rows
+    of an E that is given are then as large as each other.
 
-    Source: Parlett and Reinsch, 1969 (balancing); Benner, 2001 (of a Riccati equation).
+    Source: Parlett and Reinsch, 1969 (balancing); Benner, 2001 (of a Hamiltonian).
     """
     n, dtype = A.shape[0], A.dtype
-    inside = jnp.abs(A) if E is None else jnp.abs(A) + jnp.abs(E)
-    inside = inside.at[jnp.arange(n), jnp.arange(n)].set(0)
-    force, weight = jnp.max(jnp.abs(B), axis=1), jnp.sqrt(jnp.abs(jnp.diagonal(Q)))
     lowest = jnp.finfo(dtype).minexp
+    plain_A, plain_B = (A, B) if E is None else (solve(E, A), solve(E, B))
 
     def logarithm(M):
-        return jnp.where(M > 0, jnp.log2(M), lowest)
+        usable = (M > 0) & jnp.isfinite(M)
+        return jnp.where(usable, jnp.log2(jnp.where(usable, M, 1)), lowest)
 
-    def largest(M, axis):
-        return jnp.max(M, axis=axis)
+    effort = jnp.sqrt(jnp.abs(jnp.diagonal(R)))
+    force = jnp.max(jnp.abs(plain_B) / jnp.where(effort > 0, effort, 1), axis=1)
+    weight = logarithm(jnp.sqrt(jnp.abs(jnp.diagonal(Q))))
+    other = ~jnp.eye(n, dtype=bool)
+    inside, force = logarithm(jnp.abs(plain_A) * other), logarithm(force)
 
-    inside, force, weight = (logarithm(M) for M in (inside, force, weight))
+    def more(carry):
+        k, change, _ = carry
+        return (k < _SWEEPS) & (jnp.max(jnp.abs(change)) > 1 / 4)
 
-    def sweep(_, d):
+    def sweep(carry):
+        k, _, d = carry
         moved = inside + d[:, None] - d
-        most = jnp.max(moved)
         forced, weighed = force + d, weight - d
-        in_rows = jnp.maximum(largest(moved, 1) - most, forced - jnp.max(forced))
-        in_columns = jnp.maximum(largest(moved, 0) - most, weighed - jnp.max(weighed))
-        change = (in_columns - in_rows) / 2
-        return d + jnp.where(jnp.abs(change) < -lowest / 4, change, 0)
+        # The size of the cost is free: that at which both have the same weight.
+        rows = jnp.maximum(jnp.max(moved, axis=1), forced + jnp.max(weighed))
+        columns = jnp.maximum(jnp.max(moved, axis=0), weighed + jnp.max(forced))
+        # Half of the step that each state would take alone.
+        change = (columns - rows) / 4
+        change = jnp.where(jnp.abs(change) < -lowest / 8, change, 0)
+        return k + 1, change, d + change
 
-    d = lax.fori_loop(0, _SWEEPS, sweep, jnp.zeros(n, dtype))
+    start = jnp.zeros(n, dtype)
+    *_, d = lax.while_loop(more, sweep, (0, start + 1, start))
     d -= jnp.mean(d)
-    apart = jnp.max(d) - jnp.min(d) > jnp.log2(_APART)
-    return lax.stop_gradient(power_of_two(jnp.exp2(jnp.where(apart, d, 0))))
+    f = d
+    if E is not None:
+        f = -jnp.max(logarithm(jnp.abs(E)) - d, axis=1)
+    both = jnp.stack([d, f])
+    apart = jnp.any(jnp.max(both, axis=1) - jnp.min(both, axis=1) > _APART)
+    both = jnp.where(apart, both, 0)
+    return lax.stop_gradient(power_of_two(jnp.exp2(both)))
 
 
-def in_units(d: Float[Array, " n"], A, B, Q, R, S, E) -> tuple:
-    """The data of the equation in states that are `d` times those of these."""
-    up, across = d[:, None], d[:, None] / d
+def in_units(by: Float[Array, "2 n"], A, B, Q, R, S, E) -> tuple:
+    """The data of the equation with states and rows that are `by` times these."""
+    d, f = by
+    row, across = f[:, None], f[:, None] / d
     E = None if E is None else E * across
-    return A * across, B * up, Q / (up * up.T), R, S / up, E
+    return A * across, B * row, Q / (d[:, None] * d), R, S / d[:, None], E
