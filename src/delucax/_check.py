@@ -142,9 +142,10 @@ def symmetric_matrix(value: Any, name: str, where: str) -> Array:
 
 
 def as_bounds(
-    value: Any, where: str, name: str = "bounds"
+    value: Any, where: str, name: str = "bounds", size: int | None = None
 ) -> tuple[Array, Array] | None:
-    """`value` as `(low, high)`, each a number or a vector, or an error."""
+    """`value` as `(low, high)`, each a number or a vector (of `size`, if it is given),
+    or an error."""
     if value is None:
         return None
     if not isinstance(value, tuple | list) or len(value) != 2:
@@ -152,6 +153,12 @@ def as_bounds(
             f"{where}: {name} must be a pair (low, high), got {shortened(value)}."
         )
     low, high = (as_float_array(end) for end in value)
+    for end in () if size is None else (low, high):
+        if not eqx.is_inexact_array(end) or end.shape not in ((), (size,)):
+            got = end.shape if eqx.is_array(end) else shortened(end)
+            raise ValueError(
+                f"{where}: {name} must be numbers or have shape ({size},), got {got}."
+            )
     fit = all(eqx.is_inexact_array(end) and end.ndim <= 1 for end in (low, high))
     if not fit or low.ndim == high.ndim == 1 and low.shape != high.shape:
         raise ValueError(
@@ -245,6 +252,15 @@ def check_range(
         got = shortened(at)
     ends = f"at least {low}" if high == np.inf else f"between {low} and {high}"
     raise ValueError(f"{where}: {name} must be {ends}, got {got}.")
+
+
+def check_choice(value: Any, choices: tuple[Any, ...], name: str, where: str) -> None:
+    """Raise unless `value` is one of `choices`."""
+    if value not in choices:
+        *most, last = map(repr, choices)
+        raise ValueError(
+            f"{where}: {name} must be {', '.join(most)} or {last}, got {value!r}."
+        )
 
 
 def check_bool(value: Any, name: str, where: str) -> bool:

@@ -119,14 +119,23 @@ def test_angles_wrap_in_differences(task):
 @once
 def test_arguments_reach_the_physics():
     acrobot = dlx.environments.acrobot(
-        1.1, 1.2, 1.3, 0.4, 0.6, 0.7, 0.8, 9.0, "nips", dt=0.1, max_velocity_2=5.0
+        dlx.systems.Acrobot(1.1, 1.2, 1.3, 0.4, 0.6, 0.7, 0.8, 9.0, "nips"),
+        dt=0.1,
+        max_velocity_2=5.0,
     )
     s = acrobot.dynamics.system
     found = [s.mass_1, s.mass_2, s.length_1, s.center_1, s.center_2]
     found += [s.inertia_1, s.inertia_2, s.gravity, acrobot.dt]
     assert_close(found, [1.1, 1.2, 1.3, 0.4, 0.6, 0.7, 0.8, 9.0, 0.1], rtol=1e-6)
     assert s.form == "nips" and acrobot.dynamics.max_velocity_2 == 5
-    cartpole = dlx.environments.cartpole(1.1, 0.2, 0.6, 9.0, max_force=3.0, horizon=7)
+    cartpole = dlx.environments.cartpole(
+        cart_mass=1.1,
+        pole_mass=0.2,
+        half_length=0.6,
+        gravity=9.0,
+        max_force=3.0,
+        horizon=7,
+    )
     s = cartpole.dynamics.system
     found = [s.cart_mass, s.pole_mass, s.half_length, s.gravity]
     assert_close(found, [1.1, 0.2, 0.6, 9.0], rtol=1e-6)
@@ -136,7 +145,8 @@ def test_arguments_reach_the_physics():
         dlx.environments.mountain_car,
         dlx.environments.mountain_car_discrete,
     ):
-        car = task(0.002, 0.003, max_speed=0.1, min_position=-2.0, max_position=1.0)
+        limits = dict(max_speed=0.1, min_position=-2.0, max_position=1.0)
+        car = task(power=0.002, gravity=0.003, **limits)
         s, d = car.dynamics.system, car.dynamics
         found = [s.power, s.gravity, d.max_speed, d.min_position, d.max_position]
         assert_close(found, [0.002, 0.003, 0.1, -2.0, 1.0], rtol=1e-6)

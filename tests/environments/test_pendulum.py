@@ -98,7 +98,11 @@ def test_bounds_and_cost(key):
 @once
 def test_arguments_reach_the_physics():
     env = dlx.environments.pendulum(
-        2.0, 1.5, 9.81, 0.1, dt=0.02, horizon=7, max_torque=3.0, max_speed=4.0
+        dlx.systems.Pendulum(2.0, 1.5, 9.81, 0.1),
+        dt=0.02,
+        horizon=7,
+        max_torque=3.0,
+        max_speed=4.0,
     )
     system = env.dynamics.system
     found = [system.mass, system.length, system.gravity, system.damping]

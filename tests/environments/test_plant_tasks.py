@@ -1,6 +1,7 @@
 """The tasks that are not Gym's: the paper's numbers, and what each takes."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -185,6 +186,53 @@ def test_constants_reach_the_physics():
 
 
 @once
+@pytest.mark.parametrize(
+    "name, constants",
+    [
+        ("acrobot", dict(mass_2=1.2, form="nips")),
+        ("kinematic_bicycle", dict(front=1.2)),
+        ("mass_spring_damper", dict(mass=2.0, masses=2)),
+        ("mountain_car_discrete", dict(power=0.001, gravity=0.003)),
+        ("planar_quadrotor", dict(mass=0.2, wind=dlx.systems.VortexWind())),
+        ("quadrotor", dict(drag=0.1, inputs="wrench")),
+        ("two_tank", dict(upper_area=29.0)),
+    ],
+)
+def test_a_task_takes_a_system_or_its_arguments(name, constants):
+    by_name = dlx.make(name, horizon=3, **constants)
+    system = type(by_name.dynamics.system)(**constants)
+    task = getattr(dlx.environments, name)
+    assert eqx.tree_equal(task(system, horizon=3), by_name)
+    constant = next(iter(constants))
+    with user_error(match=f"{name}: give a system or its {constant}, not both"):
+        task(system, **{constant: constants[constant]})
+    with user_error(match=f"{name}: system must be an? {type(system).__name__}, got V"):
+        task(dlx.systems.VanDerPol())
+
+
+@once
+def test_defaults_of_tasks_that_are_not_those_of_their_systems():
+    weak = dlx.make("mountain_car_discrete").dynamics.system
+    assert_close(weak.power, 0.001, rtol=1e-6)
+    given = dlx.make("mountain_car_discrete", system=dlx.systems.MountainCar())
+    assert_close(given.dynamics.system.power, 0.0015, rtol=1e-6)
+    field = dlx.make("neural", key=jax.random.key(0)).dynamics.system
+    assert field.network.width_size == 32 and field.control_size == 1
+
+
+@once
+def test_all_names_of_a_task_are_known():
+    """Those of its system, its arithmetic and the environment."""
+    for name in ("powr", "max_spead", "goal_positon", "sensor_nois"):
+        with user_error(match=f"mountain_car: no argument is called '{name}'; did you"):
+            dlx.make("mountain_car", **{name: 1.0})
+    with user_error(
+        match="two_tank: no argument is called 'zzz'.*'upper_area'.*'cost'"
+    ):
+        dlx.make("two_tank", zzz=1.0)
+
+
+@once
 def test_a_linear_model_is_a_task():
     upright = dlx.linearize(dlx.systems.Pendulum())
     env = dlx.make("lds", system=upright, dt=0.05)
@@ -259,6 +307,11 @@ FLOW = dlx.systems.LinearSystem(jnp.eye(1), jnp.eye(1))
             "neural",
             dict(system=dlx.systems.VanDerPol(), key=jax.random.key(0)),
             "got both",
+        ),
+        (
+            "neural",
+            dict(system=dlx.systems.VanDerPol(), states=2),
+            "neural: give a system or its states, not both",
         ),
         ("lds", dict(system=PLANT, dt=0.1), "dt must be left out"),
         ("lds", dict(system=FLOW), "dt must be given"),

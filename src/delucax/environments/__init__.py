@@ -13,12 +13,7 @@ from ._cartpole import (
 from ._cstr import cstr as cstr
 from ._double_integrator import double_integrator as double_integrator
 from ._dynamic_bicycle import dynamic_bicycle as dynamic_bicycle
-from ._environment import (
-    Environment as Environment,
-    randomise as randomise,
-    Step as Step,
-    UniformState as UniformState,
-)
+from ._environment import Environment as Environment, Step as Step
 from ._kinematic_bicycle import kinematic_bicycle as kinematic_bicycle
 from ._lane import bicycle_features as bicycle_features
 from ._lds import lds as lds
@@ -41,7 +36,9 @@ from ._quadrotor import (
     quadrotor as quadrotor,
     quadrotor_features as quadrotor_features,
 )
+from ._randomise import randomise as randomise
 from ._reacher import reacher as reacher, ReacherCost as ReacherCost
 from ._registry import make as make, register as register, registered as registered
 from ._two_tank import two_tank as two_tank
+from ._uniform_state import UniformState as UniformState
 from ._van_der_pol import van_der_pol as van_der_pol

@@ -8,19 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_number, check_positive, check_range
+from .._check import check_number, check_range
 from .._module import parameter, positive
 from .._results import RESULTS
-from .._typing import RealScalar
+from .._typing import BoolScalar, RealScalar, State, Vector
 from ..costs import Arrival
 from ..disturbances import Uniform
 from ..dynamics import AbstractDiscretization, RK4
 from ..dynamics._runge_kutta import runge_kutta_step
 from ..math import clip, cos, sin, wrap
 from ..systems import Acrobot
-from ._arithmetic import own_or_solver
-from ._environment import Environment, UniformState
-from ._registry import finish
+from ._environment import Environment
+from ._task import gym_dynamics, task_environment
+from ._uniform_state import UniformState
 
 
 class GymAcrobot(AbstractDiscretization):
@@ -62,10 +62,6 @@ class GymAcrobot(AbstractDiscretization):
     max_velocity_1: Array = parameter(4 * np.pi, constraint=positive)
     max_velocity_2: Array = parameter(9 * np.pi, constraint=positive)
 
-    def __check_init__(self):
-        check_positive(self.max_velocity_1, "max_velocity_1", "GymAcrobot")
-        check_positive(self.max_velocity_2, "max_velocity_2", "GymAcrobot")
-
     def advance(self, t, x, u, w):
         field = lambda t, x: self.system.vector_field(t, x, u, w)
         free = runge_kutta_step(RK4.tableau, field, t, x, self.dt)
@@ -80,7 +76,7 @@ class GymAcrobot(AbstractDiscretization):
         return x_next.astype(x.dtype), RESULTS.successful
 
 
-def acrobot_features(x: Array) -> Array:
+def acrobot_features(x: State) -> Vector:
     """Cosine and sine of both angles, and the velocities: what Gymnasium users see.
 
     **Arguments:** `x`: (angle_1, angle_2, velocity_1, velocity_2).
@@ -105,31 +101,21 @@ class _AboveLine(eqx.Module):
 
     goal_height: Array = parameter()
 
-    def __call__(self, t: RealScalar, x: Array) -> Array:
+    def __call__(self, t: RealScalar, x: State) -> BoolScalar:
         return -cos(x[0]) - cos(x[1] + x[0]) > self.goal_height
 
 
 def acrobot(
-    mass_1: Any = 1.0,
-    mass_2: Any = 1.0,
-    length_1: Any = 1.0,
-    center_1: Any = 0.5,
-    center_2: Any = 0.5,
-    inertia_1: Any = 1.0,
-    inertia_2: Any = 1.0,
-    gravity: Any = 9.8,
-    form: str = "book",
+    system: Acrobot | None = None,
     *,
     dt: Any = 0.2,
     horizon: int = 500,
     max_torque: Any = 1.0,
     torque_noise: Any = None,
     goal_height: Any = 1.0,
-    max_velocity_1: Any = None,
-    max_velocity_2: Any = None,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Swing the tip of two hanging links above a line, by a torque at the elbow.
 
@@ -145,8 +131,7 @@ def acrobot(
 
     **Arguments:**
 
-    - `mass_1`, `mass_2`, `length_1`, `center_1`, `center_2`, `inertia_1`, `inertia_2`,
-        `gravity`, `form`: of [`delucax.systems.Acrobot`][].
+    - `system`: a [`delucax.systems.Acrobot`][]; made of `others` by default.
     - `dt`: the control interval, 0.2 by default.
     - `horizon`: steps an episode, 500 by default.
     - `max_torque`: 1 by default.
@@ -154,13 +139,12 @@ def acrobot(
         added, beyond the bounds too, as by Gym's `torque_noise_max`; none by default.
     - `goal_height`: of the line above the first joint, in lengths of a link, 1 by
         default.
-    - `max_velocity_1`, `max_velocity_2`: the limits of Gym's arithmetic, 4 pi and 9 pi
-        by default.
     - `solver`: a Diffrax solver in place of Gym's arithmetic; no angle is wrapped and
         no velocity clipped then.
     - `substeps`: solver steps an interval, with `solver`.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.Acrobot`][], of
+        [`delucax.environments.GymAcrobot`][], such as `max_velocity_1`, without a
+        `solver`, or of [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -187,33 +171,22 @@ def acrobot(
     """
     check_range(max_torque, "max_torque", "acrobot")
     check_number(goal_height, "goal_height", "acrobot")
-    system = Acrobot(
-        mass_1,
-        mass_2,
-        length_1,
-        center_1,
-        center_2,
-        inertia_1,
-        inertia_2,
-        gravity,
-        form,
-    )
-    options = {"max_velocity_1": max_velocity_1, "max_velocity_2": max_velocity_2}
-    dynamics = own_or_solver(
-        GymAcrobot, system, dt, solver, substeps, "acrobot", options
+    dynamics, others = gym_dynamics(
+        acrobot, Acrobot, GymAcrobot, system, others, dt, solver, substeps
     )
     noise = None
     if torque_noise is not None:
-        if "disturbance" in environment:
+        if "disturbance" in others:
             raise ValueError("acrobot: give torque_noise or a disturbance, not both.")
         check_range(torque_noise, "torque_noise", "acrobot")
         noise = Uniform(-torque_noise, torque_noise, size=1)
     fastest = np.inf, np.inf
     if isinstance(dynamics, GymAcrobot):
         fastest = dynamics.max_velocity_1, dynamics.max_velocity_2
-    seen = jnp.stack([jnp.asarray(end) for end in (1.0, 1.0, 1.0, 1.0, *fastest)])
+    feature_bound = jnp.array([1.0, 1.0, 1.0, 1.0, *fastest])
     above = _AboveLine(goal_height)
-    arguments: dict[str, Any] = dict(
+    return task_environment(
+        others,
         dynamics=dynamics,
         cost=Arrival(above, arrival_cost=-1.0),
         disturbance=noise,
@@ -223,6 +196,5 @@ def acrobot(
         terminated=above,
         actions=max_torque * jnp.array([[-1.0], [0.0], [1.0]]),
         encode=acrobot_features,
-        observation_bounds=(-seen, seen),
+        observation_bounds=(-feature_bound, feature_bound),
     )
-    return finish(acrobot, arguments, environment)

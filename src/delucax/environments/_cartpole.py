@@ -8,17 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_positive, check_range, check_step
+from .._check import check_bool, check_positive, check_range, check_step
 from .._jax import fence
 from .._module import as_float_array, parameter, positive
 from .._results import RESULTS
-from .._typing import RealScalar
+from .._typing import BoolScalar, RealScalar, State
 from ..costs import Arrival, Quadratic
 from ..dynamics import AbstractDiscretization, LinearDynamics
 from ..systems import CartPole
-from ._arithmetic import own_or_solver
-from ._environment import Environment, UniformState
-from ._registry import finish
+from ._environment import Environment
+from ._task import check_names, gym_dynamics, task_environment
+from ._uniform_state import UniformState
 
 
 class GymCartPole(AbstractDiscretization):
@@ -53,11 +53,7 @@ class GymCartPole(AbstractDiscretization):
     semi_implicit: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
-        if not isinstance(self.semi_implicit, bool):
-            raise ValueError(
-                "GymCartPole: semi_implicit must be True or False, got "
-                f"{self.semi_implicit!r}."
-            )
+        check_bool(self.semi_implicit, "semi_implicit", "GymCartPole")
 
     def advance(self, t, x, u, w):
         dt = self.dt
@@ -79,25 +75,21 @@ class _Fallen(eqx.Module):
     max_position: Array = parameter()
     max_angle: Array = parameter()
 
-    def __call__(self, t: RealScalar, x: Array) -> Array:
+    def __call__(self, t: RealScalar, x: State) -> BoolScalar:
         return (abs(x[0]) > self.max_position) | (abs(x[2]) > self.max_angle)
 
 
 def cartpole(
-    cart_mass: Any = 1.0,
-    pole_mass: Any = 0.1,
-    half_length: Any = 0.5,
-    gravity: Any = 9.8,
+    system: CartPole | None = None,
     *,
     dt: Any = 0.02,
     horizon: int = 500,
     max_force: Any = 10.0,
     max_position: Any = 2.4,
     max_angle: Any = 12 * 2 * np.pi / 360,
-    semi_implicit: bool | None = None,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Keep a pole upright on a cart that a force pushes to and fro.
 
@@ -112,19 +104,17 @@ def cartpole(
 
     **Arguments:**
 
-    - `cart_mass`, `pole_mass`, `half_length`, `gravity`: of
-        [`delucax.systems.CartPole`][].
+    - `system`: a [`delucax.systems.CartPole`][]; made of `others` by default.
     - `dt`: the control interval, 0.02 by default.
     - `horizon`: steps an episode, 500 by default.
     - `max_force`: 10 by default.
     - `max_position`: where the track ends, 2.4 by default.
     - `max_angle`: beyond which the pole has fallen, 12 degrees by default.
-    - `semi_implicit`: whether to use Gym's other integrator, see
-        [`delucax.environments.GymCartPole`][]; False by default.
     - `solver`: a Diffrax solver in place of Gym's arithmetic.
     - `substeps`: solver steps an interval, with `solver`.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.CartPole`][], of
+        [`delucax.environments.GymCartPole`][], such as `semi_implicit`, without a
+        `solver`, or of [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -147,17 +137,15 @@ def cartpole(
         ```
     """
     check_range(max_force, "max_force", "cartpole")
-    system = CartPole(cart_mass, pole_mass, half_length, gravity)
-    options = {"semi_implicit": semi_implicit}
-    dynamics = own_or_solver(
-        GymCartPole, system, dt, solver, substeps, "cartpole", options
+    dynamics, others = gym_dynamics(
+        cartpole, CartPole, GymCartPole, system, others, dt, solver, substeps
     )
     check_positive(max_position, "max_position", "cartpole")
     check_positive(max_angle, "max_angle", "cartpole")
     # Gym's own: twice where the episode ends, which no state of an episode reaches.
-    ends = (2 * jnp.asarray(max_position), np.inf, 2 * jnp.asarray(max_angle), np.inf)
-    seen = jnp.stack([jnp.asarray(end) for end in ends])
-    arguments: dict[str, Any] = dict(
+    feature_bound = jnp.array([2 * max_position, np.inf, 2 * max_angle, np.inf])
+    return task_environment(
+        others,
         dynamics=dynamics,
         cost=Arrival(step_cost=-1.0),
         initial_state=UniformState(jnp.full(4, -0.05), jnp.full(4, 0.05)),
@@ -165,9 +153,8 @@ def cartpole(
         horizon=horizon,
         terminated=_Fallen(max_position, max_angle),
         actions=max_force * jnp.array([[-1.0], [1.0]]),
-        observation_bounds=(-seen, seen),
+        observation_bounds=(-feature_bound, feature_bound),
     )
-    return finish(cartpole, arguments, environment)
 
 
 def cartpole_linear(
@@ -178,7 +165,7 @@ def cartpole_linear(
     *,
     dt: Any = 0.02,
     horizon: int = 200,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """The linear cart-pole of the Deluca paper: a point mass on a rod near the upright,
     by an Euler step, at quadratic cost `x'x + u'u`.
@@ -201,7 +188,7 @@ def cartpole_linear(
     - `dt`: the step, 0.02 by default.
     - `horizon`: steps an episode, 200 by default: 4 s, where the paper's code stops
         after 10 steps.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as `cost` and
+    - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
 
     **Returns:** an [`delucax.Environment`][] whose dynamics are
@@ -223,12 +210,10 @@ def cartpole_linear(
         ```
     """
     where = "cartpole_linear"
-    for name, value in (
-        ("cart_mass", cart_mass),
-        ("pole_mass", pole_mass),
-        ("length", length),
-    ):
-        check_positive(value, name, where)
+    check_names(cartpole_linear, others)
+    check_positive(cart_mass, "cart_mass", where)
+    check_positive(pole_mass, "pole_mass", where)
+    check_positive(length, "length", where)
     check_step(dt, where)
     M, m, l, g = (as_float_array(v) for v in (cart_mass, pole_mass, length, gravity))
     zero, one = jnp.zeros_like(M), jnp.ones_like(M)
@@ -247,10 +232,10 @@ def cartpole_linear(
         state_names=("position", "angle", "velocity", "spin"),
         control_names=("force",),
     )
-    arguments: dict[str, Any] = dict(
+    return task_environment(
+        others,
         dynamics=dynamics,
         cost=Quadratic(jnp.ones(4), jnp.ones(1)),
         initial_state=UniformState(jnp.full(4, -0.05), jnp.full(4, 0.05)),
         horizon=horizon,
     )
-    return finish(cartpole_linear, arguments, environment)

@@ -9,18 +9,13 @@ from .._check import check_positive, check_range
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import CSTR
-from ._environment import Environment, UniformState
-from ._registry import finish
+from ._environment import Environment
+from ._task import system_of, task_environment
+from ._uniform_state import UniformState
 
 
 def cstr(
-    flow: Any = 1.0,
-    feed_concentration: Any = 1.0,
-    feed_temperature: Any = 350.0,
-    rate: Any = 7.2e10,
-    activation: Any = 8750.0,
-    heat: Any = 209.2,
-    cooling: Any = 2.092,
+    system: CSTR | None = None,
     *,
     concentration: Any = 0.5,
     dt: Any = 0.05,
@@ -29,7 +24,7 @@ def cstr(
     max_coolant: Any = 320.0,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 4,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Hold a stirred-tank reactor at its unstable equilibrium.
 
@@ -40,20 +35,19 @@ def cstr(
 
     **Arguments:**
 
-    - `flow`, `feed_concentration`, `feed_temperature`, `rate`, `activation`, `heat`,
-        `cooling`: of [`delucax.systems.CSTR`][].
+    - `system`: a [`delucax.systems.CSTR`][]; made of `others` by default.
     - `concentration`: to hold [mol/l], below that of the feed; 0.5 by default.
     - `min_coolant`, `max_coolant`: what the jacket can do [K], 280 and 320 by default.
     - `dt`: the control interval [min], 0.05 by default.
     - `horizon`: steps an episode, 100 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 4 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.CSTR`][] or [`delucax.Environment`][],
+        such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Henson and Seborg, 1997.
 
@@ -69,16 +63,14 @@ def cstr(
     check_positive(concentration, "concentration", "cstr")
     check_range(min_coolant, "min_coolant", "cstr")
     check_range(max_coolant, "max_coolant", "cstr")
-    system = CSTR(
-        flow, feed_concentration, feed_temperature, rate, activation, heat, cooling
-    )
+    system, others = system_of(cstr, CSTR, system, others)
     x, u = system.equilibrium(concentration)
     about = jnp.array([0.05, 3.0])
-    arguments: dict[str, Any] = dict(
+    return task_environment(
+        others,
         dynamics=Discretized(system, dt, solver, substeps),
         cost=Quadratic([10.0, 0.01], [0.01], state_target=x, control_target=u),
         initial_state=UniformState(x - about, x + about),
         control_bounds=(min_coolant, max_coolant),
         horizon=horizon,
     )
-    return finish(cstr, arguments, environment)

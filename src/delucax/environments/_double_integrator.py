@@ -9,19 +9,20 @@ from .._check import check_range
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import DoubleIntegrator
-from ._environment import Environment, UniformState
-from ._registry import finish
+from ._environment import Environment
+from ._task import system_of, task_environment
+from ._uniform_state import UniformState
 
 
 def double_integrator(
-    mass: Any = 1.0,
+    system: DoubleIntegrator | None = None,
     *,
     dt: Any = 0.1,
     horizon: int = 100,
     max_force: Any = 1.0,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Bring a mass on a line to rest at the origin.
 
@@ -30,18 +31,18 @@ def double_integrator(
 
     **Arguments:**
 
-    - `mass`: of [`delucax.systems.DoubleIntegrator`][].
+    - `system`: a [`delucax.systems.DoubleIntegrator`][]; made of `others` by default.
     - `max_force`: 1 by default.
     - `dt`: the control interval, 0.1 by default.
     - `horizon`: steps an episode, 100 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.DoubleIntegrator`][] or
+        [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Åström and Murray, 2008.
 
@@ -54,12 +55,13 @@ def double_integrator(
         ```
     """
     check_range(max_force, "max_force", "double_integrator")
+    system, others = system_of(double_integrator, DoubleIntegrator, system, others)
     corner = jnp.array([2.0, 1.0])
-    arguments: dict[str, Any] = dict(
-        dynamics=Discretized(DoubleIntegrator(mass), dt, solver, substeps),
+    return task_environment(
+        others,
+        dynamics=Discretized(system, dt, solver, substeps),
         cost=Quadratic(jnp.ones(2), 0.1 * jnp.ones(1)),
         initial_state=UniformState(-corner, corner),
         control_bounds=(-max_force, max_force),
         horizon=horizon,
     )
-    return finish(double_integrator, arguments, environment)

@@ -3,24 +3,16 @@
 from typing import Any
 
 import diffrax
-import jax.numpy as jnp
 
-from .._check import check_number, check_range
 from ..dynamics import Discretized
 from ..systems import DynamicBicycle
-from ._environment import Environment, UniformState
-from ._lane import bicycle_features, lane_bounds, lane_cost
-from ._registry import finish
+from ._environment import Environment
+from ._lane import lane_task
+from ._task import system_of
 
 
 def dynamic_bicycle(
-    mass: Any = 1573.0,
-    inertia: Any = 2873.0,
-    front: Any = 1.1,
-    rear: Any = 1.58,
-    front_stiffness: Any = 160000.0,
-    rear_stiffness: Any = 160000.0,
-    standstill: Any = 1.0,
+    system: DynamicBicycle | None = None,
     *,
     speed: Any = 20.0,
     dt: Any = 0.05,
@@ -29,7 +21,7 @@ def dynamic_bicycle(
     max_steering: Any = 0.2,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 5,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Bring a fast car on tyres to the lane y = 0, and to a speed.
 
@@ -42,8 +34,7 @@ def dynamic_bicycle(
 
     **Arguments:**
 
-    - `mass`, `inertia`, `front`, `rear`, `front_stiffness`, `rear_stiffness`,
-        `standstill`: of [`delucax.systems.DynamicBicycle`][].
+    - `system`: a [`delucax.systems.DynamicBicycle`][]; made of `others` by default.
     - `speed`: to hold [m/s], 20 by default.
     - `max_acceleration`: and least, with a minus [m/s^2]; 5 by default.
     - `max_steering`: to either side [rad], 0.2 by default.
@@ -51,12 +42,12 @@ def dynamic_bicycle(
     - `horizon`: steps an episode, 100 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 5 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.DynamicBicycle`][] or
+        [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Rajamani, 2012.
 
@@ -68,22 +59,14 @@ def dynamic_bicycle(
         icy = dlx.make("dynamic_bicycle", front_stiffness=3e4, rear_stiffness=3e4)
         ```
     """
-    check_number(speed, "speed", "dynamic_bicycle")
-    check_range(max_acceleration, "max_acceleration", "dynamic_bicycle")
-    check_range(max_steering, "max_steering", "dynamic_bicycle")
-    system = DynamicBicycle(
-        mass, inertia, front, rear, front_stiffness, rear_stiffness, standstill
-    )
-    corner = jnp.array([0.0, 2.0, 0.1, 5.0, 0.5, 0.2])
-    middle = jnp.zeros(6).at[3].set(speed)
-    limit = jnp.stack([jnp.asarray(max_acceleration), jnp.asarray(max_steering)])
-    arguments: dict[str, Any] = dict(
-        dynamics=Discretized(system, dt, solver, substeps),
-        cost=lane_cost(speed, 6),
-        initial_state=UniformState(middle - corner, middle + corner),
-        control_bounds=(-limit, limit),
+    system, others = system_of(dynamic_bicycle, DynamicBicycle, system, others)
+    return lane_task(
+        dynamic_bicycle,
+        Discretized(system, dt, solver, substeps),
+        others,
+        spread=[0.0, 2.0, 0.1, 5.0, 0.5, 0.2],
+        speed=speed,
+        max_acceleration=max_acceleration,
+        max_steering=max_steering,
         horizon=horizon,
-        encode=bicycle_features,
-        observation_bounds=lane_bounds(6),
     )
-    return finish(dynamic_bicycle, arguments, environment)

@@ -1,12 +1,10 @@
 """The closed world that a controller acts in."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import jax.random as jr
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
@@ -27,11 +25,8 @@ from .._module import (
     as_float_array,
     as_module,
     check_parameters,
-    check_paths,
     function_field,
-    get_path,
     parameter,
-    replace,
 )
 from .._results import Result
 from .._typing import PRNGKey, RealScalar
@@ -63,39 +58,6 @@ class Step(NamedTuple):
     cost: Array
     terminated: Array
     result: Result
-
-
-class UniformState(eqx.Module):
-    """A first state drawn uniformly from a box.
-
-    **Arguments:** `low`, `high`: vectors, the corners of the box.
-
-    **Raises:** `ValueError` if the corners differ in size or `low` is above `high`.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-        import jax.numpy as jnp
-
-        start = dlx.environments.UniformState(-jnp.ones(2), jnp.ones(2))
-        start(jax.random.key(0))
-        ```
-    """
-
-    low: Array = parameter()
-    high: Array = parameter()
-
-    def __check_init__(self):
-        what = "UniformState: low and high"
-        _check_bounds(self.low, self.high, jnp.shape(self.low), what)
-
-    def __call__(self, key: PRNGKey) -> Array:
-        """A state drawn with `key`."""
-        check_key(key, "UniformState")
-        unit = jr.uniform(key, self.low.shape, self.low.dtype)
-        return self.low + (self.high - self.low) * unit
 
 
 def _as_start(value: Any) -> Any:
@@ -197,17 +159,14 @@ class Environment(eqx.Module):
         check_noise(dynamics, where)
         sizes = dynamics.state_size, dynamics.control_size
         check_cost(self.cost, "cost", where, sizes)
-        for name, given, size in (
-            ("disturbance", self.disturbance, dynamics.disturbance_size),
-            ("sensor_noise", self.sensor_noise, None),
-        ):
-            if given is None and name == "sensor_noise":
-                continue
-            check_instance(given, AbstractDisturbance, name, where)
-            size = dynamics.observation_size if size is None else size
-            if given.size != size:
+        sized = [("disturbance", self.disturbance, dynamics.disturbance_size)]
+        if self.sensor_noise is not None:
+            sized.append(("sensor_noise", self.sensor_noise, dynamics.observation_size))
+        for name, signal, size in sized:
+            check_instance(signal, AbstractDisturbance, name, where)
+            if signal.size != size:
                 raise ValueError(
-                    f"{where}: {name} has size {given.size} where {size} is expected."
+                    f"{where}: {name} has size {signal.size} where {size} is expected."
                 )
         check_parameters(self)
         m = dynamics.control_size
@@ -216,23 +175,10 @@ class Environment(eqx.Module):
                 self.initial_state, dynamics.state_size, "initial_state", where
             )
             check_finite(x0, "initial_state", where)
-        if self.control_bounds is not None:
-            as_bounds(self.control_bounds, where, "control_bounds")
-            for end in self.control_bounds:
-                if end.shape not in ((), (m,)):
-                    raise ValueError(
-                        f"{where}: control_bounds must be numbers or have shape "
-                        f"({m},), got {end.shape}."
-                    )
+        as_bounds(self.control_bounds, where, "control_bounds", m)
         if self.observation_bounds is not None:
             size = self.feature_size
-            as_bounds(self.observation_bounds, where, "observation_bounds")
-            for end in self.observation_bounds:
-                if end.shape not in ((), (size,)):
-                    raise ValueError(
-                        f"{where}: observation_bounds must be numbers or have shape "
-                        f"({size},), got {end.shape}."
-                    )
+            as_bounds(self.observation_bounds, where, "observation_bounds", size)
         if self.actions is not None:
             if self.actions.ndim != 2 or self.actions.shape[1] != m:
                 raise ValueError(
@@ -431,126 +377,3 @@ def _identity(x):
 def _default_disturbance(dynamics: AbstractDynamics) -> AbstractDisturbance:
     k, count = dynamics.disturbance_size, dynamics.increments
     return Brownian(k // count, substeps=count) if count else Zero(k)
-
-
-def _check_bounds(low: Array, high: Array, shape: tuple[int, ...], what: str) -> None:
-    for end in (low, high):
-        if not eqx.is_array(end) or end.shape not in ((), shape):
-            raise ValueError(
-                f"{what} must be numbers or have shape {shape}, got {jnp.shape(end)}."
-            )
-    if is_concrete(low) and is_concrete(high):
-        if not np.all(np.asarray(low) <= np.asarray(high)):
-            raise ValueError(f"{what} must have low <= high, got {low} and {high}.")
-
-
-def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
-    """A copy with the named parameters drawn at random: domain randomisation.
-
-    Under `jax.vmap` over keys it makes a batch of plants that compiles once. There the
-    values drawn cannot be looked at, so the ends of the ranges are: each with the
-    others at their lower, and at their upper ends. What a function draws is checked
-    where it is known, outside of `jax.vmap` and `jax.jit`.
-
-    **Arguments:**
-
-    - `tree`: an environment, or anything that [`delucax.replace`][] takes.
-    - `key`: a random key.
-    - `ranges`: from a path to `(low, high)`, drawn uniformly, or to a function of a key
-        to a value.
-
-    **Returns:** the copy.
-
-    **Raises:** `ValueError` if a path is not there or is part of another one, a range
-    is not a finite pair or a function, or a range holds values that are not legal.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-
-        env = dlx.make("pendulum")
-        ranges = {"dynamics.system.length": (0.8, 1.2)}
-
-        def cost(key):
-            plant = dlx.randomise(env, key, ranges)
-            zero = dlx.controllers.Zero(1)
-            return dlx.rollout(plant, zero, key=key).total_cost
-
-        jax.vmap(cost)(jax.random.split(jax.random.key(0), 8))
-        ```
-    """
-    check_key(key, "randomise")
-    if not isinstance(ranges, Mapping):
-        raise ValueError(
-            "randomise: ranges must be a dictionary from paths to ranges, such as "
-            f"{{'dynamics.system.length': (0.8, 1.2)}}, got {ranges!r}."
-        )
-    check_paths(ranges, "randomise")
-    changes, ends = {}, {}
-    for (path, given), one in zip(
-        ranges.items(), jr.split(key, len(ranges)), strict=True
-    ):
-        old = get_path(tree, path)
-        if callable(given):
-            changes[path] = given(one)
-        elif isinstance(given, tuple | list) and len(given) == 2:
-            low, high = (as_float_array(end) for end in given)
-            if not (eqx.is_inexact_array(low) and eqx.is_inexact_array(high)):
-                raise ValueError(
-                    f"randomise: the range of {path!r} must be of numbers, got "
-                    f"{shortened(given)}."
-                )
-            shape: Any = jnp.broadcast_shapes(jnp.shape(old), low.shape, high.shape)
-            dtype = jnp.result_type(old, low, high)
-            with jax.ensure_compile_time_eval():  # so that jit does not hide numbers
-                known = [as_float_array(end) for end in given]
-            if all(map(is_concrete, known)):
-                least, most = (np.asarray(end, dtype) for end in known)
-                if not np.all((least <= most) & np.isfinite(most - least)):
-                    raise ValueError(
-                        f"randomise: the range of {path!r} must be finite and have "
-                        f"low <= high, got {shortened(given)}."
-                    )
-                ends[path] = _inner_ends(least, most, shape)
-            unit = jr.uniform(one, shape, dtype)
-            changes[path] = low + (high - low) * unit
-        else:
-            raise ValueError(
-                f"randomise: the range of {path!r} must be a pair (low, high) or a "
-                f"function of a key, got {shortened(given)}."
-            )
-    _check_ends(tree, changes, ends)
-    return replace(tree, changes)
-
-
-def _inner_ends(low: Any, high: Any, shape: tuple[int, ...]) -> tuple[Any, Any]:
-    """The ends of a range, moved inside by a rounding: an end that is itself not legal,
-    such as 0 for what is positive, is as good as never drawn."""
-    small = np.finfo(low.dtype).eps * (high - low)
-    first = np.maximum(np.nextafter(low, high), low + small)
-    last = np.minimum(np.nextafter(high, low), high - small)
-    return np.broadcast_to(first, shape), np.broadcast_to(last, shape)
-
-
-def _check_ends(tree: Any, changes: dict[str, Any], ends: dict[str, Any]) -> None:
-    """Raise where a range holds what is not legal, which under `jax.vmap` and `jax.jit`
-    a draw cannot show.
-
-    All values are set to the ends of their ranges, on one side but for one of them or
-    none. All that is tried may be drawn, so that ranges which fit together pass.
-    """
-    count = len(ends)
-    sides = {
-        tuple(side ^ (k == odd) for k in range(count))
-        for side in (False, True)
-        for odd in range(-1, count)
-    }
-    for corner in sorted(sides) if ends else ():
-        tried = {path: ends[path][at] for path, at in zip(ends, corner, strict=True)}
-        try:
-            with jax.ensure_compile_time_eval():
-                replace(tree, changes | tried)
-        except ValueError as error:
-            raise ValueError(f"{error} The ranges of randomise allow it.") from error

@@ -3,19 +3,16 @@
 from typing import Any
 
 import diffrax
-import jax.numpy as jnp
 
-from .._check import check_number, check_range
 from ..dynamics import Discretized
 from ..systems import KinematicBicycle
-from ._environment import Environment, UniformState
-from ._lane import bicycle_features, lane_bounds, lane_cost
-from ._registry import finish
+from ._environment import Environment
+from ._lane import lane_task
+from ._task import system_of
 
 
 def kinematic_bicycle(
-    front: Any = 1.105,
-    rear: Any = 1.738,
+    system: KinematicBicycle | None = None,
     *,
     speed: Any = 10.0,
     dt: Any = 0.05,
@@ -24,7 +21,7 @@ def kinematic_bicycle(
     max_steering: Any = 0.5,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Bring a car that rolls without slip to the lane y = 0, and to a speed.
 
@@ -36,7 +33,7 @@ def kinematic_bicycle(
 
     **Arguments:**
 
-    - `front`, `rear`: of [`delucax.systems.KinematicBicycle`][].
+    - `system`: a [`delucax.systems.KinematicBicycle`][]; made of `others` by default.
     - `speed`: to hold [m/s], 10 by default.
     - `max_acceleration`: and least, with a minus [m/s^2]; 3 by default.
     - `max_steering`: to either side [rad], 0.5 by default.
@@ -44,12 +41,12 @@ def kinematic_bicycle(
     - `horizon`: steps an episode, 100 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.KinematicBicycle`][] or
+        [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Kong, Pfeiffer, Schildbach and Borrelli, 2015.
 
@@ -61,19 +58,14 @@ def kinematic_bicycle(
         env = dlx.make("kinematic_bicycle", speed=5.0)
         ```
     """
-    check_number(speed, "speed", "kinematic_bicycle")
-    check_range(max_acceleration, "max_acceleration", "kinematic_bicycle")
-    check_range(max_steering, "max_steering", "kinematic_bicycle")
-    corner = jnp.array([0.0, 2.0, 0.3, 3.0])
-    middle = jnp.zeros(4).at[3].set(speed)
-    limit = jnp.stack([jnp.asarray(max_acceleration), jnp.asarray(max_steering)])
-    arguments: dict[str, Any] = dict(
-        dynamics=Discretized(KinematicBicycle(front, rear), dt, solver, substeps),
-        cost=lane_cost(speed, 4),
-        initial_state=UniformState(middle - corner, middle + corner),
-        control_bounds=(-limit, limit),
+    system, others = system_of(kinematic_bicycle, KinematicBicycle, system, others)
+    return lane_task(
+        kinematic_bicycle,
+        Discretized(system, dt, solver, substeps),
+        others,
+        spread=[0.0, 2.0, 0.3, 3.0],
+        speed=speed,
+        max_acceleration=max_acceleration,
+        max_steering=max_steering,
         horizon=horizon,
-        encode=bicycle_features,
-        observation_bounds=lane_bounds(4),
     )
-    return finish(kinematic_bicycle, arguments, environment)

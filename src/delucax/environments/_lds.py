@@ -12,7 +12,7 @@ from ..costs import Quadratic
 from ..dynamics import c2d, LinearDynamics
 from ..systems import LinearSystem
 from ._environment import Environment
-from ._registry import finish
+from ._task import check_names, task_environment
 
 
 def lds(
@@ -28,7 +28,7 @@ def lds(
     observations: int | None = None,
     spectral_radius: Any = 0.9,
     horizon: int = 200,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """A linear dynamical system `x_next = A x + B u + w`, `y = C x`, at quadratic cost
     `x'x + u'u`.
@@ -48,7 +48,7 @@ def lds(
     - `observations`: rows of a random `C`; the identity by default.
     - `spectral_radius`: of the random `A`, 0.9 by default; below 1 is stable.
     - `horizon`: steps an episode, 200 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as `cost` and
+    - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
@@ -69,10 +69,10 @@ def lds(
         sampled = dlx.make("lds", system=upright, dt=0.05)
         ```
     """
+    check_names(lds, others)
     if system is not None:
-        others = {"A": A, "B": B, "C": C, "key": key}
-        for name, other in others.items():
-            if other is not None:
+        for name, value in {"A": A, "B": B, "C": C, "key": key}.items():
+            if value is not None:
                 raise ValueError(f"lds: give {name} or a system, not both.")
         dynamics = _sampled(system, dt)
     else:
@@ -92,12 +92,12 @@ def lds(
             raise ValueError("lds: give A and B, or a key to draw them with, not both.")
         dynamics = LinearDynamics(A, B, C, dt=1.0 if dt is None else dt)
     n, m = dynamics.state_size, dynamics.control_size
-    arguments: dict[str, Any] = dict(
+    return task_environment(
+        others,
         dynamics=dynamics,
         cost=Quadratic(jnp.ones(n), jnp.ones(m)),
         horizon=horizon,
     )
-    return finish(lds, arguments, environment)
 
 
 def _sampled(system: Any, dt: Any) -> LinearDynamics:

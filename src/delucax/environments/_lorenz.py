@@ -9,21 +9,20 @@ from .._check import check_range
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import Lorenz
-from ._environment import Environment, UniformState
-from ._registry import finish
+from ._environment import Environment
+from ._task import system_of, task_environment
+from ._uniform_state import UniformState
 
 
 def lorenz(
-    sigma: Any = 10.0,
-    rho: Any = 28.0,
-    beta: Any = 8.0 / 3.0,
+    system: Lorenz | None = None,
     *,
     dt: Any = 0.01,
     horizon: int = 500,
     max_control: Any = 50.0,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Hold Lorenz's chaotic system at the centre of its right wing.
 
@@ -32,18 +31,18 @@ def lorenz(
 
     **Arguments:**
 
-    - `sigma`, `rho`, `beta`: of [`delucax.systems.Lorenz`][].
+    - `system`: a [`delucax.systems.Lorenz`][]; made of `others` by default.
     - `max_control`: 50 by default.
     - `dt`: the control interval, 0.01 by default.
     - `horizon`: steps an episode, 500 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.Lorenz`][] or
+        [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Lorenz, 1963; Kaiser, Kutz and Brunton, 2018.
 
@@ -56,14 +55,14 @@ def lorenz(
         ```
     """
     check_range(max_control, "max_control", "lorenz")
-    system = Lorenz(sigma, rho, beta)
+    system, others = system_of(lorenz, Lorenz, system, others)
     centre, _ = system.equilibrium()
     low, high = jnp.array([-20.0, -20.0, 10.0]), jnp.array([20.0, 20.0, 40.0])
-    arguments: dict[str, Any] = dict(
+    return task_environment(
+        others,
         dynamics=Discretized(system, dt, solver, substeps),
         cost=Quadratic(jnp.ones(3), 0.001 * jnp.ones(1), state_target=centre),
         initial_state=UniformState(low, high),
         control_bounds=(-max_control, max_control),
         horizon=horizon,
     )
-    return finish(lorenz, arguments, environment)

@@ -9,22 +9,20 @@ from .._check import check_range
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import MassSpringDamper
-from ._environment import Environment, UniformState
-from ._registry import finish
+from ._environment import Environment
+from ._task import system_of, task_environment
+from ._uniform_state import UniformState
 
 
 def mass_spring_damper(
-    mass: Any = 1.0,
-    stiffness: Any = 1.0,
-    damping: Any = 0.1,
+    system: MassSpringDamper | None = None,
     *,
-    masses: int = 1,
     dt: Any = 0.1,
     horizon: int = 200,
     max_force: Any = 1.0,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Bring a mass on a spring, or a chain of them, to rest by a force on the last.
 
@@ -33,15 +31,14 @@ def mass_spring_damper(
 
     **Arguments:**
 
-    - `mass`, `stiffness`, `damping`, `masses`: of
-        [`delucax.systems.MassSpringDamper`][].
+    - `system`: a [`delucax.systems.MassSpringDamper`][]; made of `others` by default.
     - `max_force`: 1 by default.
     - `dt`: the control interval, 0.1 by default.
     - `horizon`: steps an episode, 200 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.MassSpringDamper`][] or
+        [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -58,13 +55,13 @@ def mass_spring_damper(
         ```
     """
     check_range(max_force, "max_force", "mass_spring_damper")
-    system = MassSpringDamper(mass, stiffness, damping, masses=masses)
+    system, others = system_of(mass_spring_damper, MassSpringDamper, system, others)
     corner = jnp.ones(system.state_size)
-    arguments: dict[str, Any] = dict(
+    return task_environment(
+        others,
         dynamics=Discretized(system, dt, solver, substeps),
-        cost=Quadratic(jnp.ones(system.state_size), 0.1 * jnp.ones(1)),
+        cost=Quadratic(corner, 0.1 * jnp.ones(1)),
         initial_state=UniformState(-corner, corner),
         control_bounds=(-max_force, max_force),
         horizon=horizon,
     )
-    return finish(mass_spring_damper, arguments, environment)

@@ -9,18 +9,13 @@ from .._check import check_number, check_range
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import PermanentMagnetMotor
-from ._environment import Environment, UniformState
-from ._registry import finish
+from ._environment import Environment
+from ._task import system_of, task_environment
+from ._uniform_state import UniformState
 
 
 def permanent_magnet_motor(
-    resistance: Any = 2.875,
-    d_inductance: Any = 0.0085,
-    q_inductance: Any = 0.0085,
-    flux: Any = 0.175,
-    inertia: Any = 0.0008,
-    friction: Any = 0.001,
-    pole_pairs: Any = 4.0,
+    system: PermanentMagnetMotor | None = None,
     *,
     speed: Any = 100.0,
     dt: Any = 0.0005,
@@ -28,7 +23,7 @@ def permanent_magnet_motor(
     max_voltage: Any = 150.0,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Bring a synchronous motor to a speed and hold it.
 
@@ -39,20 +34,20 @@ def permanent_magnet_motor(
 
     **Arguments:**
 
-    - `resistance`, `d_inductance`, `q_inductance`, `flux`, `inertia`, `friction`,
-        `pole_pairs`: of [`delucax.systems.PermanentMagnetMotor`][].
+    - `system`: a [`delucax.systems.PermanentMagnetMotor`][]; made of `others` by
+        default.
     - `speed`: to hold [rad/s], 100 by default.
     - `max_voltage`: 150 by default.
     - `dt`: the control interval, 0.0005 by default.
     - `horizon`: steps an episode, 200 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.PermanentMagnetMotor`][] or
+        [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Krause, Wasynczuk and Sudhoff, 2002.
 
@@ -68,17 +63,17 @@ def permanent_magnet_motor(
     """
     check_number(speed, "speed", "permanent_magnet_motor")
     check_range(max_voltage, "max_voltage", "permanent_magnet_motor")
-    system = PermanentMagnetMotor(
-        resistance, d_inductance, q_inductance, flux, inertia, friction, pole_pairs
+    system, others = system_of(
+        permanent_magnet_motor, PermanentMagnetMotor, system, others
     )
     x, u = system.equilibrium(speed)
     Q, R = jnp.array([0.01, 0.01, 0.001]), 1e-5 * jnp.ones(2)
     corner = jnp.array([1.0, 1.0, 50.0])
-    arguments: dict[str, Any] = dict(
+    return task_environment(
+        others,
         dynamics=Discretized(system, dt, solver, substeps),
         cost=Quadratic(Q, R, state_target=x, control_target=u),
         initial_state=UniformState(-corner, corner),
         control_bounds=(-max_voltage, max_voltage),
         horizon=horizon,
     )
-    return finish(permanent_magnet_motor, arguments, environment)

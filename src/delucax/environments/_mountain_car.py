@@ -1,24 +1,24 @@
 """Drive an underpowered car out of a valley: Gym's MountainCarContinuous-v0 and
 MountainCar-v0."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_number, check_positive, check_range
+from .._check import check_number, check_range
 from .._module import parameter, positive
 from .._results import RESULTS
-from .._typing import RealScalar
-from ..costs import AbstractCost, Arrival
-from ..dynamics import AbstractDiscretization
+from .._typing import BoolScalar, RealScalar, State
+from ..costs import Arrival
+from ..dynamics import AbstractDiscretization, AbstractDynamics
 from ..math import clip
 from ..systems import MountainCar
-from ._arithmetic import own_or_solver
-from ._environment import Environment, UniformState
-from ._registry import finish
+from ._environment import Environment
+from ._task import gym_dynamics, task_environment
+from ._uniform_state import UniformState
 
 
 class GymMountainCar(AbstractDiscretization):
@@ -62,16 +62,9 @@ class GymMountainCar(AbstractDiscretization):
     min_position: Array = parameter(-1.2)
     max_position: Array = parameter(0.6)
 
-    state_names: ClassVar = MountainCar.state_names
-    control_names: ClassVar = MountainCar.control_names
-    state_units = MountainCar.state_units
-    time_unit = MountainCar.time_unit
-    control_units = MountainCar.control_units
-
     def __check_init__(self):
-        where = "GymMountainCar"
-        check_positive(self.max_speed, "max_speed", where)
-        check_range(self.max_position, "max_position", where, self.min_position)
+        low = self.min_position
+        check_range(self.max_position, "max_position", "GymMountainCar", low)
 
     def advance(self, t, x, u, w):
         position, velocity = x[0], x[1]
@@ -94,24 +87,20 @@ class _AtGoal(eqx.Module):
     goal_position: Array = parameter()
     goal_velocity: Array = parameter()
 
-    def __call__(self, t: RealScalar, x: Array) -> Array:
+    def __call__(self, t: RealScalar, x: State) -> BoolScalar:
         return (x[0] >= self.goal_position) & (x[1] >= self.goal_velocity)
 
 
 def mountain_car(
-    power: Any = 0.0015,
-    gravity: Any = 0.0025,
+    system: MountainCar | None = None,
     *,
     dt: Any = 1.0,
     horizon: int = 999,
     goal_position: Any = 0.45,
     goal_velocity: Any = 0.0,
-    max_speed: Any = None,
-    min_position: Any = None,
-    max_position: Any = None,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Drive a car out of a valley by rocking it: Gym's MountainCarContinuous-v0.
 
@@ -126,17 +115,16 @@ def mountain_car(
 
     **Arguments:**
 
-    - `power`, `gravity`: of [`delucax.systems.MountainCar`][], in Gym's units a step.
+    - `system`: a [`delucax.systems.MountainCar`][]; made of `others` by default.
     - `dt`: the control interval in Gym's steps, 1 by default.
     - `horizon`: steps an episode, 999 by default.
     - `goal_position`: 0.45 by default.
     - `goal_velocity`: the least velocity at the goal, 0 by default.
-    - `max_speed`, `min_position`, `max_position`: the limits of Gym's arithmetic, 0.07,
-        -1.2 and 0.6 by default.
     - `solver`: a Diffrax solver in place of Gym's arithmetic; there are no limits then.
     - `substeps`: solver steps an interval, with `solver`.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.MountainCar`][], of
+        [`delucax.environments.GymMountainCar`][], such as `max_speed`, without a
+        `solver`, or of [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -160,40 +148,30 @@ def mountain_car(
         )
         ```
     """
-    goal = _AtGoal(goal_position, goal_velocity)
-    limits = {
-        "max_speed": max_speed,
-        "min_position": min_position,
-        "max_position": max_position,
-    }
-    arguments = _valley(
-        MountainCar(power, gravity),
-        dt,
-        solver,
-        substeps,
-        "mountain_car",
-        limits,
-        Arrival(goal, step_cost=0.0, control_weight=0.1, arrival_cost=-100.0),
-        goal,
+    goal = _goal(goal_position, goal_velocity, "mountain_car")
+    dynamics, others = gym_dynamics(
+        mountain_car, MountainCar, GymMountainCar, system, others, dt, solver, substeps
     )
-    arguments["horizon"] = horizon
-    return finish(mountain_car, arguments, environment)
+    return task_environment(
+        others,
+        dynamics=dynamics,
+        cost=Arrival(goal, step_cost=0.0, control_weight=0.1, arrival_cost=-100.0),
+        horizon=horizon,
+        terminated=goal,
+        **_valley(dynamics),
+    )
 
 
 def mountain_car_discrete(
-    power: Any = 0.001,
-    gravity: Any = 0.0025,
+    system: MountainCar | None = None,
     *,
     dt: Any = 1.0,
     horizon: int = 200,
     goal_position: Any = 0.5,
     goal_velocity: Any = 0.0,
-    max_speed: Any = None,
-    min_position: Any = None,
-    max_position: Any = None,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Drive a car out of a valley in the fewest steps: Gym's MountainCar-v0.
 
@@ -205,18 +183,17 @@ def mountain_car_discrete(
 
     **Arguments:**
 
-    - `power`, `gravity`: of [`delucax.systems.MountainCar`][]; the power is 0.001 by
-        default.
+    - `system`: a [`delucax.systems.MountainCar`][]; made of `others` by default, with a
+        power of 0.001.
     - `dt`: the control interval in Gym's steps, 1 by default.
     - `horizon`: steps an episode, 200 by default.
     - `goal_position`: 0.5 by default.
     - `goal_velocity`: the least velocity at the goal, 0 by default.
-    - `max_speed`, `min_position`, `max_position`: the limits of Gym's arithmetic, 0.07,
-        -1.2 and 0.6 by default.
     - `solver`: a Diffrax solver in place of Gym's arithmetic; there are no limits then.
     - `substeps`: solver steps an interval, with `solver`.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.MountainCar`][], of
+        [`delucax.environments.GymMountainCar`][], such as `max_speed`, without a
+        `solver`, or of [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -235,55 +212,46 @@ def mountain_car_discrete(
         env.step(0.0, jnp.array([-0.5, 0.0]), 2)
         ```
     """
-    goal = _AtGoal(goal_position, goal_velocity)
-    limits = {
-        "max_speed": max_speed,
-        "min_position": min_position,
-        "max_position": max_position,
-    }
-    arguments = _valley(
-        MountainCar(power, gravity),
+    goal = _goal(goal_position, goal_velocity, "mountain_car_discrete")
+    if system is None:
+        others.setdefault("power", 0.001)
+    dynamics, others = gym_dynamics(
+        mountain_car_discrete,
+        MountainCar,
+        GymMountainCar,
+        system,
+        others,
         dt,
         solver,
         substeps,
-        "mountain_car_discrete",
-        limits,
-        Arrival(goal),
-        goal,
     )
-    arguments["horizon"] = horizon
-    arguments["actions"] = jnp.array([[-1.0], [0.0], [1.0]])
-    return finish(mountain_car_discrete, arguments, environment)
+    return task_environment(
+        others,
+        dynamics=dynamics,
+        cost=Arrival(goal),
+        horizon=horizon,
+        terminated=goal,
+        actions=jnp.array([[-1.0], [0.0], [1.0]]),
+        **_valley(dynamics),
+    )
 
 
-def _valley(
-    system: MountainCar,
-    dt: Any,
-    solver: diffrax.AbstractSolver | None,
-    substeps: int,
-    where: str,
-    limits: dict[str, Any],
-    cost: AbstractCost,
-    goal: _AtGoal,
-) -> dict[str, Any]:
-    """What both tasks share."""
-    check_number(goal.goal_position, "goal_position", where)
-    check_number(goal.goal_velocity, "goal_velocity", where)
-    low, high = jnp.array([-0.6, 0.0]), jnp.array([-0.4, 0.0])
-    dynamics = own_or_solver(
-        GymMountainCar, system, dt, solver, substeps, where, limits
-    )
-    seen = None
+def _goal(position: Any, velocity: Any, where: str) -> _AtGoal:
+    check_number(position, "goal_position", where)
+    check_number(velocity, "goal_velocity", where)
+    return _AtGoal(position, velocity)
+
+
+def _valley(dynamics: AbstractDynamics) -> dict[str, Any]:
+    """Where a car starts, and between what it stays."""
+    bounds = None
     if isinstance(dynamics, GymMountainCar):
-        seen = (
+        bounds = (
             jnp.stack([dynamics.min_position, -dynamics.max_speed]),
             jnp.stack([dynamics.max_position, dynamics.max_speed]),
         )
     return dict(
-        dynamics=dynamics,
-        cost=cost,
-        initial_state=UniformState(low, high),
+        initial_state=UniformState(jnp.array([-0.6, 0.0]), jnp.array([-0.4, 0.0])),
         control_bounds=(-1.0, 1.0),
-        terminated=goal,
-        observation_bounds=seen,
+        observation_bounds=bounds,
     )

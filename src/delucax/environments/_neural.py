@@ -10,24 +10,21 @@ from .._typing import PRNGKey
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import AbstractSystem, NeuralSystem
-from ._environment import Environment, UniformState
-from ._registry import finish
+from ._environment import Environment
+from ._task import system_of, task_environment
+from ._uniform_state import UniformState
 
 
 def neural(
     system: AbstractSystem | None = None,
     *,
     key: PRNGKey | None = None,
-    states: int = 2,
-    controls: int = 1,
-    width: int = 32,
-    depth: int = 2,
+    max_control: Any = 1.0,
     dt: Any = 0.05,
     horizon: int = 100,
-    max_control: Any = 1.0,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Bring the state of a learned vector field to the origin.
 
@@ -39,20 +36,19 @@ def neural(
     - `system`: a [`delucax.systems.NeuralSystem`][], such as one that was fitted to
         data, or any other system. One with random weights by default.
     - `key`: a random key, for random weights.
-    - `states`, `controls`, `width`, `depth`: of a random
-        [`delucax.systems.NeuralSystem`][], 2, 1, 32 and 2 by default.
     - `max_control`: of each control, to either side; 1 by default.
     - `dt`: the control interval, 0.05 by default.
     - `horizon`: steps an episode, 100 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.Environment`][], such as `disturbance`, or,
+        without a `system`, of [`delucax.systems.NeuralSystem`][]: `states`, `controls`
+        and `width` are 2, 1 and 32 by default.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, without a system and a key, or with
-        both.
+    **Raises:** `ValueError` on illegal numbers, without a system and a key, or with a
+        system and arguments of another.
 
     Source: Chen, Rubanova, Bettencourt and Duvenaud, 2018.
 
@@ -74,15 +70,16 @@ def neural(
             f"key=jax.random.key(0), got {got}."
         )
     if system is None:
-        assert key is not None
-        system = NeuralSystem(states, controls, width, depth, key=key)
-    dynamics = Discretized(system, dt, solver, substeps)
-    n, m = dynamics.state_size, dynamics.control_size
-    arguments: dict[str, Any] = dict(
-        dynamics=dynamics,
+        others = dict(states=2, controls=1, width=32, key=key) | others
+    system, others = system_of(
+        neural, NeuralSystem, system, others, base=AbstractSystem
+    )
+    n, m = system.state_size, system.control_size
+    return task_environment(
+        others,
+        dynamics=Discretized(system, dt, solver, substeps),
         cost=Quadratic(jnp.ones(n), 0.1 * jnp.ones(m)),
         initial_state=UniformState(-jnp.ones(n), jnp.ones(n)),
         control_bounds=(-max_control, max_control),
         horizon=horizon,
     )
-    return finish(neural, arguments, environment)

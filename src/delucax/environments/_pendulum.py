@@ -7,16 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_positive, check_range
+from .._check import check_range
 from .._module import parameter, positive
 from .._results import RESULTS
+from .._typing import State, Vector
 from ..costs import PendulumCost
 from ..dynamics import AbstractDiscretization
 from ..math import clip, cos, sin
 from ..systems import Pendulum
-from ._arithmetic import own_or_solver
-from ._environment import Environment, UniformState
-from ._registry import finish
+from ._environment import Environment
+from ._task import gym_dynamics, task_environment
+from ._uniform_state import UniformState
 
 
 class GymPendulum(AbstractDiscretization):
@@ -54,9 +55,6 @@ class GymPendulum(AbstractDiscretization):
     dt: Array = parameter(0.05, constraint=positive)
     max_speed: Array = parameter(8.0, constraint=positive)
 
-    def __check_init__(self):
-        check_positive(self.max_speed, "max_speed", "GymPendulum")
-
     def advance(self, t, x, u, w):
         angle, velocity = x[0], x[1]
         acceleration = self.system.acceleration(angle, velocity, u[0])
@@ -69,7 +67,7 @@ class GymPendulum(AbstractDiscretization):
         return x_next.astype(x.dtype), RESULTS.successful
 
 
-def pendulum_features(x: Array) -> Array:
+def pendulum_features(x: State) -> Vector:
     """Cosine and sine of the angle, and the velocity: what Gymnasium users see.
 
     **Arguments:** `x`: (angle, velocity).
@@ -89,18 +87,14 @@ def pendulum_features(x: Array) -> Array:
 
 
 def pendulum(
-    mass: Any = 1.0,
-    length: Any = 1.0,
-    gravity: Any = 10.0,
-    damping: Any = 0.0,
+    system: Pendulum | None = None,
     *,
     dt: Any = 0.05,
     horizon: int = 200,
     max_torque: Any = 2.0,
-    max_speed: Any = None,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Swing up a pendulum and hold it upright with a torque too weak to lift it at
     once.
@@ -114,16 +108,16 @@ def pendulum(
 
     **Arguments:**
 
-    - `mass`, `length`, `gravity`, `damping`: of [`delucax.systems.Pendulum`][].
+    - `system`: a [`delucax.systems.Pendulum`][]; made of `others` by default.
     - `dt`: the control interval, 0.05 by default.
     - `horizon`: steps an episode, 200 by default.
     - `max_torque`: 2 by default.
-    - `max_speed`: the speed limit of Gym's arithmetic, 8 by default.
     - `solver`: a Diffrax solver in place of Gym's arithmetic; there is no speed limit
         then.
     - `substeps`: solver steps an interval, with `solver`.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.Pendulum`][], of
+        [`delucax.environments.GymPendulum`][], such as `max_speed`, without a `solver`,
+        or of [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -140,22 +134,20 @@ def pendulum(
         env = dlx.environments.pendulum(length=1.2, dt=0.02)
         ```
     """
-    system = Pendulum(mass, length, gravity, damping)
     check_range(max_torque, "max_torque", "pendulum")
-    options = {"max_speed": max_speed}
-    dynamics = own_or_solver(
-        GymPendulum, system, dt, solver, substeps, "pendulum", options
+    dynamics, others = gym_dynamics(
+        pendulum, Pendulum, GymPendulum, system, others, dt, solver, substeps
     )
     fastest = dynamics.max_speed if isinstance(dynamics, GymPendulum) else np.inf
-    seen = jnp.stack([jnp.asarray(end) for end in (1.0, 1.0, fastest)])
-    corner = np.array([np.pi, 1.0])
-    arguments: dict[str, Any] = dict(
+    feature_bound = jnp.array([1.0, 1.0, fastest])
+    corner = jnp.array([np.pi, 1.0])
+    return task_environment(
+        others,
         dynamics=dynamics,
         cost=PendulumCost(),
-        initial_state=UniformState(jnp.asarray(-corner), jnp.asarray(corner)),
+        initial_state=UniformState(-corner, corner),
         control_bounds=(-max_torque, max_torque),
         horizon=horizon,
         encode=pendulum_features,
-        observation_bounds=(-seen, seen),
+        observation_bounds=(-feature_bound, feature_bound),
     )
-    return finish(pendulum, arguments, environment)

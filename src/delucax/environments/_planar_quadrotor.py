@@ -11,7 +11,7 @@ from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import ConstantWind, DissipativeWind, PlanarQuadrotor, VortexWind
 from ._environment import Environment
-from ._registry import finish
+from ._task import system_of, task_environment
 
 
 _WINDS: dict[str, Callable[..., Any]] = {
@@ -22,9 +22,7 @@ _WINDS: dict[str, Callable[..., Any]] = {
 
 
 def planar_quadrotor(
-    mass: Any = 0.1,
-    length: Any = 0.2,
-    gravity: Any = 9.81,
+    system: PlanarQuadrotor | None = None,
     *,
     wind: str | Callable[..., Array] | None = None,
     wind_strength: Any = None,
@@ -32,7 +30,7 @@ def planar_quadrotor(
     horizon: int = 100,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Fly a planar quadrotor to the origin and hover there.
 
@@ -43,7 +41,7 @@ def planar_quadrotor(
 
     **Arguments:**
 
-    - `mass`, `length`, `gravity`: of [`delucax.systems.PlanarQuadrotor`][].
+    - `system`: a [`delucax.systems.PlanarQuadrotor`][]; made of `others` by default.
     - `wind`: `"dissipative"`, `"constant"`, `"vortices"`, or any function
         `(t, x) -> force`; none by default. What the names stand for is said at
         [`delucax.systems.DissipativeWind`][], [`delucax.systems.ConstantWind`][] and
@@ -53,8 +51,8 @@ def planar_quadrotor(
     - `horizon`: steps an episode, 100 by default.
     - `solver`: a Diffrax solver, `diffrax.Euler()` by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `control_bounds`.
+    - `**others`: arguments of [`delucax.systems.PlanarQuadrotor`][] or
+        [`delucax.Environment`][], such as `control_bounds`.
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -72,15 +70,19 @@ def planar_quadrotor(
         env = dlx.make("planar_quadrotor", wind="dissipative", wind_strength=0.4)
         ```
     """
-    system = PlanarQuadrotor(mass, length, gravity, _wind(wind, wind_strength))
-    _, hover = PlanarQuadrotor(mass, length, gravity).equilibrium()
-    arguments: dict[str, Any] = dict(
+    wind = _wind(wind, wind_strength)
+    if wind is not None:
+        others["wind"] = wind
+    system, others = system_of(planar_quadrotor, PlanarQuadrotor, system, others)
+    windless = PlanarQuadrotor(system.mass, system.length, system.gravity)
+    _, hover = windless.equilibrium()
+    return task_environment(
+        others,
         dynamics=Discretized(system, dt, solver or diffrax.Euler(), substeps),
         cost=Quadratic(jnp.ones(6), 0.1 * jnp.ones(2), control_target=hover),
         initial_state=jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0]),
         horizon=horizon,
     )
-    return finish(planar_quadrotor, arguments, environment)
 
 
 def _wind(wind: Any, strength: Any) -> Callable[..., Array] | None:

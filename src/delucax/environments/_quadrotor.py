@@ -1,6 +1,6 @@
 """Fly a quadrotor to a point in space and hover there."""
 
-from typing import Any, Literal
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -9,13 +9,14 @@ from jaxtyping import Array
 
 from .._check import check_range
 from .._module import as_float_array
-from .._typing import PRNGKey
+from .._typing import PRNGKey, State, Vector
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import Quadrotor
 from ..systems._quadrotor import attitude_difference, unit_attitude
-from ._environment import Environment, LARGEST, UniformState
-from ._registry import finish
+from ._environment import Environment, LARGEST
+from ._task import system_of, task_environment
+from ._uniform_state import UniformState
 
 
 # The entries of a rotation matrix, with room for what rounding adds.
@@ -31,7 +32,7 @@ class _Start(eqx.Module):
         return unit_attitude(self.box(key))
 
 
-def quadrotor_features(x: Array) -> Array:
+def quadrotor_features(x: State) -> Vector:
     """The state with the rotation matrix in place of the quaternion: q and -q, which
     are one attitude, look the same.
 
@@ -65,22 +66,14 @@ def quadrotor_features(x: Array) -> Array:
 
 
 def quadrotor(
-    mass: Any = 0.716,
-    arm: Any = 0.17,
-    inertia_x: Any = 0.007,
-    inertia_y: Any = 0.007,
-    inertia_z: Any = 0.012,
-    moment: Any = 0.016,
-    drag: Any = 0.0,
-    gravity: Any = 9.81,
+    system: Quadrotor | None = None,
     *,
-    inputs: Literal["rotors", "wrench"] = "rotors",
     dt: Any = 0.02,
     horizon: int = 250,
     max_thrust: Any = 6.0,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Fly a quadrotor to the origin and hover there.
 
@@ -93,20 +86,19 @@ def quadrotor(
 
     **Arguments:**
 
-    - `mass`, `arm`, `inertia_x`, `inertia_y`, `inertia_z`, `moment`, `drag`,
-        `gravity`, `inputs`: of [`delucax.systems.Quadrotor`][].
+    - `system`: a [`delucax.systems.Quadrotor`][]; made of `others` by default.
     - `max_thrust`: of a rotor, 6 by default; none is negative. A wrench is bounded by
         the largest that the rotors give on each axis.
     - `dt`: the control interval, 0.02 by default.
     - `horizon`: steps an episode, 250 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.Quadrotor`][] or
+        [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Mahony, Kumar and Corke, 2012; Furrer, Burri, Achtelik and Siegwart, 2016.
 
@@ -119,23 +111,20 @@ def quadrotor(
         ```
     """
     check_range(max_thrust, "max_thrust", "quadrotor")
-    system = Quadrotor(
-        *(mass, arm, inertia_x, inertia_y, inertia_z, moment, drag, gravity),
-        inputs=inputs,
-    )
+    system, others = system_of(quadrotor, Quadrotor, system, others)
     x, hover = system.equilibrium()
     low, high = 0.0, as_float_array(max_thrust)
-    if inputs == "wrench":
+    if system.inputs == "wrench":
         turn, yaw = system.arm * high, 2 * system.moment * high
         high = jnp.stack([4 * high, turn, turn, yaw])
         low = -high.at[0].set(0.0)
-    seen = jnp.full(18, LARGEST).at[3:12].set(_ROTATION)
+    feature_bound = jnp.full(18, LARGEST).at[3:12].set(_ROTATION)
     corner = jnp.array([1.0] * 3 + [0.0] + [0.2] * 3 + [0.5] * 6)
-    weights = jnp.array([1.0] * 7 + [0.1] * 6)
-    arguments: dict[str, Any] = dict(
+    return task_environment(
+        others,
         dynamics=Discretized(system, dt, solver, substeps),
         cost=Quadratic(
-            weights,
+            jnp.array([1.0] * 7 + [0.1] * 6),
             0.1 * jnp.ones(4),
             state_target=x,
             control_target=hover,
@@ -145,6 +134,5 @@ def quadrotor(
         control_bounds=(low, high),
         horizon=horizon,
         encode=quadrotor_features,
-        observation_bounds=(-seen, seen),
+        observation_bounds=(-feature_bound, feature_bound),
     )
-    return finish(quadrotor, arguments, environment)

@@ -15,7 +15,7 @@ from ..dynamics import Discretized
 from ..math import cos, sin
 from ..systems import Reacher
 from ._environment import Environment, LARGEST
-from ._registry import finish
+from ._task import system_of, task_environment
 
 
 class ReacherCost(AbstractCost):
@@ -81,18 +81,14 @@ class _Features(eqx.Module):
 
 
 def reacher(
-    mass_1: Any = 1.0,
-    mass_2: Any = 1.0,
-    length_1: Any = 1.0,
-    length_2: Any = 1.0,
-    gravity: Any = 0.0,
+    system: Reacher | None = None,
     *,
     goal: Any = (0.0, 1.8),
     dt: Any = 0.01,
     horizon: int = 200,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Bring the tip of an arm of two links to a goal.
 
@@ -107,15 +103,14 @@ def reacher(
 
     **Arguments:**
 
-    - `mass_1`, `mass_2`, `length_1`, `length_2`, `gravity`: of
-        [`delucax.systems.Reacher`][], where it is said which way gravity pulls.
+    - `system`: a [`delucax.systems.Reacher`][]; made of `others` by default.
     - `goal`: shape `(2,)` [m]; (0, 1.8) by default.
     - `dt`: the control interval, 0.01 by default.
     - `horizon`: steps an episode, 200 by default.
     - `solver`: a Diffrax solver, `diffrax.Euler()` by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `control_bounds`.
+    - `**others`: arguments of [`delucax.systems.Reacher`][] or
+        [`delucax.Environment`][], such as `control_bounds`.
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -133,25 +128,19 @@ def reacher(
         plant = dlx.make("reacher", gravity=-10.0)
         ```
     """
-    system = Reacher(mass_1, mass_2, length_1, length_2, gravity)
+    system, others = system_of(reacher, Reacher, system, others)
     cost = ReacherCost(system, goal)
     reach = system.length_1 + system.length_2
-    ends = [
-        jnp.stack(
-            [
-                *[jnp.full((), sign)] * 4,
-                *[jnp.full((), sign * LARGEST)] * 2,
-                *(sign * reach - cost.goal),
-            ]
-        )
+    low, high = (
+        jnp.array([sign] * 4 + [sign * LARGEST] * 2 + [*(sign * reach - cost.goal)])
         for sign in (-1.0, 1.0)
-    ]
-    arguments: dict[str, Any] = dict(
+    )
+    return task_environment(
+        others,
         dynamics=Discretized(system, dt, solver or diffrax.Euler(), substeps),
         cost=cost,
         initial_state=jnp.array([np.pi / 4, np.pi / 2, 0.0, 0.0]),
         horizon=horizon,
         encode=_Features(cost),
-        observation_bounds=tuple(ends),
+        observation_bounds=(low, high),
     )
-    return finish(reacher, arguments, environment)

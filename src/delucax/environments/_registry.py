@@ -3,59 +3,30 @@
 import difflib
 import importlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from ._environment import Environment
 
 
+_ENVIRONMENTS = """
+    acrobot cartpole cartpole_linear cstr double_integrator dynamic_bicycle
+    kinematic_bicycle lds lorenz mass_spring_damper mountain_car mountain_car_discrete
+    neural pendulum permanent_magnet_motor planar_quadrotor quadrotor reacher two_tank
+    van_der_pol
+""".split()
+_LUNGS = """
+    balloon_lung delay_lung double_compartment learned_lung single_compartment
+""".split()
+# The names of the paper.
+_CLASSIC = "acrobot cartpole mountain_car pendulum planar_quadrotor reacher".split()
+
+# The entry points. A task of ours is called like the function that makes it.
 _REGISTRY: dict[str, str] = {
-    "acrobot": "delucax.environments:acrobot",
-    "classic/acrobot": "delucax.environments:acrobot",
-    "cartpole": "delucax.environments:cartpole",
-    "classic/cartpole": "delucax.environments:cartpole",
-    "cartpole_linear": "delucax.environments:cartpole_linear",
-    "mountain_car": "delucax.environments:mountain_car",
-    "classic/mountain_car": "delucax.environments:mountain_car",
-    "mountain_car_discrete": "delucax.environments:mountain_car_discrete",
-    "pendulum": "delucax.environments:pendulum",
-    "classic/pendulum": "delucax.environments:pendulum",
-    "lds": "delucax.environments:lds",
-    "planar_quadrotor": "delucax.environments:planar_quadrotor",
-    "classic/planar_quadrotor": "delucax.environments:planar_quadrotor",
-    "reacher": "delucax.environments:reacher",
-    "classic/reacher": "delucax.environments:reacher",
-    "double_integrator": "delucax.environments:double_integrator",
-    "mass_spring_damper": "delucax.environments:mass_spring_damper",
-    "van_der_pol": "delucax.environments:van_der_pol",
-    "lorenz": "delucax.environments:lorenz",
-    "quadrotor": "delucax.environments:quadrotor",
-    "kinematic_bicycle": "delucax.environments:kinematic_bicycle",
-    "dynamic_bicycle": "delucax.environments:dynamic_bicycle",
-    "two_tank": "delucax.environments:two_tank",
-    "cstr": "delucax.environments:cstr",
-    "permanent_magnet_motor": "delucax.environments:permanent_magnet_motor",
-    "neural": "delucax.environments:neural",
-    "balloon_lung": "delucax.lung:balloon_lung",
-    "lung/balloon_lung": "delucax.lung:balloon_lung",
-    "delay_lung": "delucax.lung:delay_lung",
-    "lung/delay_lung": "delucax.lung:delay_lung",
-    "single_compartment": "delucax.lung:single_compartment",
-    "lung/single_compartment": "delucax.lung:single_compartment",
-    "double_compartment": "delucax.lung:double_compartment",
-    "lung/double_compartment": "delucax.lung:double_compartment",
-    "learned_lung": "delucax.lung:learned_lung",
-    "lung/learned_lung": "delucax.lung:learned_lung",
-}
-
-
-_MOVES_WHAT_IS_SEEN = {
-    "disturbance",
-    "dynamics",
-    "encode",
-    "initial_state",
-    "sensor_noise",
-    "terminated",
+    **{name: f"delucax.environments:{name}" for name in _ENVIRONMENTS},
+    **{f"classic/{name}": f"delucax.environments:{name}" for name in _CLASSIC},
+    **{name: f"delucax.lung:{name}" for name in _LUNGS},
+    **{f"lung/{name}": f"delucax.lung:{name}" for name in _LUNGS},
 }
 
 
@@ -87,9 +58,8 @@ def make(name: str, **kwargs: Any) -> Environment:
             f"make: no task is called {name!r}; did you mean "
             f"{' or '.join(repr(n) for n in close)}? All names: {', '.join(names)}."
         )
-    module, _, function = _REGISTRY[name].partition(":")
     try:
-        task = getattr(importlib.import_module(module), function)
+        task = _imported(_REGISTRY[name])
     except (ImportError, AttributeError) as error:
         raise ValueError(
             f"make: {name!r} is registered as {_REGISTRY[name]!r}, which cannot be "
@@ -106,42 +76,13 @@ def make(name: str, **kwargs: Any) -> Environment:
 
 def horizon_of(name: str) -> int:
     """The horizon of one of our own tasks, unless another is given."""
-    module, _, function = _REGISTRY[name].partition(":")
-    task = getattr(importlib.import_module(module), function)
-    return inspect.signature(task).parameters["horizon"].default
+    signature = inspect.signature(_imported(_REGISTRY[name]))
+    return signature.parameters["horizon"].default
 
 
-def finish(
-    task: Callable[..., Environment],
-    arguments: Mapping[str, Any],
-    given: Mapping[str, Any],
-    *shared: Callable[..., Environment],
-) -> Environment:
-    """The environment of a task that takes what else there is to give of one; `shared`
-    are functions that take other arguments of the task.
-
-    The task's `observation_bounds` hold for the task as it is: they are left out where
-    something is given that moves what is seen.
-
-    **Raises:** `ValueError` if one of `given` is no argument of `Environment`, with the
-    close ones, the task's own among them.
-    """
-    known = inspect.signature(Environment).parameters
-    takers = task, *shared
-    own = [p for f in takers for p in inspect.signature(f).parameters.values()]
-    for name in given:
-        if name not in known:
-            names = [p.name for p in own if p.kind is not p.VAR_KEYWORD]
-            names = list(dict.fromkeys([*names, *known]))
-            close = difflib.get_close_matches(name, names, n=3) or names
-            raise ValueError(
-                f"{task.__name__}: no argument is called {name!r}; did you mean "
-                f"{' or '.join(repr(n) for n in close)}?"
-            )
-    arguments = {**arguments, **given}
-    if not _MOVES_WHAT_IS_SEEN.isdisjoint(given) and "observation_bounds" not in given:
-        arguments["observation_bounds"] = None
-    return Environment(**arguments)
+def _imported(entry_point: str) -> Callable[..., Any]:
+    module, _, function = entry_point.partition(":")
+    return getattr(importlib.import_module(module), function)
 
 
 def register(name: str, entry_point: str) -> None:

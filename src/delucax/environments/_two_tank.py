@@ -9,17 +9,13 @@ from .._check import check_range
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import TwoTank
-from ._environment import Environment, UniformState
-from ._registry import finish
+from ._environment import Environment
+from ._task import system_of, task_environment
+from ._uniform_state import UniformState
 
 
 def two_tank(
-    upper_area: Any = 28.0,
-    lower_area: Any = 28.0,
-    upper_outlet: Any = 0.071,
-    lower_outlet: Any = 0.071,
-    gravity: Any = 981.0,
-    smoothing: Any = 0.01,
+    system: TwoTank | None = None,
     *,
     level: Any = 10.0,
     dt: Any = 2.0,
@@ -27,7 +23,7 @@ def two_tank(
     max_flow: Any = 30.0,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Hold the lower of two tanks at a level.
 
@@ -37,20 +33,19 @@ def two_tank(
 
     **Arguments:**
 
-    - `upper_area`, `lower_area`, `upper_outlet`, `lower_outlet`, `gravity`,
-        `smoothing`: of [`delucax.systems.TwoTank`][].
+    - `system`: a [`delucax.systems.TwoTank`][]; made of `others` by default.
     - `level`: to hold [cm], 10 by default.
     - `max_flow`: of the pump, 30 by default.
     - `dt`: the control interval, 2 by default.
     - `horizon`: steps an episode, 200 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.TwoTank`][] or
+        [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Johansson, 2000.
 
@@ -64,16 +59,14 @@ def two_tank(
     """
     check_range(max_flow, "max_flow", "two_tank")
     check_range(level, "level", "two_tank")
-    system = TwoTank(
-        upper_area, lower_area, upper_outlet, lower_outlet, gravity, smoothing
-    )
+    system, others = system_of(two_tank, TwoTank, system, others)
     x, u = system.equilibrium(level)
     Q, R = jnp.array([0.0, 1.0]), 0.01 * jnp.ones(1)
-    arguments: dict[str, Any] = dict(
+    return task_environment(
+        others,
         dynamics=Discretized(system, dt, solver, substeps),
         cost=Quadratic(Q, R, state_target=x, control_target=u),
         initial_state=UniformState(jnp.zeros(2), jnp.full(2, 20.0)),
         control_bounds=(0.0, max_flow),
         horizon=horizon,
     )
-    return finish(two_tank, arguments, environment)

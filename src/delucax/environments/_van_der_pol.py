@@ -9,19 +9,20 @@ from .._check import check_range
 from ..costs import Quadratic
 from ..dynamics import Discretized
 from ..systems import VanDerPol
-from ._environment import Environment, UniformState
-from ._registry import finish
+from ._environment import Environment
+from ._task import system_of, task_environment
+from ._uniform_state import UniformState
 
 
 def van_der_pol(
-    mu: Any = 1.0,
+    system: VanDerPol | None = None,
     *,
     dt: Any = 0.05,
     horizon: int = 200,
     max_control: Any = 3.0,
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
-    **environment: Any,
+    **others: Any,
 ) -> Environment:
     """Bring van der Pol's oscillator from its limit cycle to rest.
 
@@ -30,18 +31,18 @@ def van_der_pol(
 
     **Arguments:**
 
-    - `mu`: of [`delucax.systems.VanDerPol`][].
+    - `system`: a [`delucax.systems.VanDerPol`][]; made of `others` by default.
     - `max_control`: 3 by default.
     - `dt`: the control interval, 0.05 by default.
     - `horizon`: steps an episode, 200 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 1 by default.
-    - `**environment`: other arguments of [`delucax.Environment`][], such as
-        `disturbance`.
+    - `**others`: arguments of [`delucax.systems.VanDerPol`][] or
+        [`delucax.Environment`][], such as `disturbance`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers.
+    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: van der Pol, 1926.
 
@@ -54,12 +55,13 @@ def van_der_pol(
         ```
     """
     check_range(max_control, "max_control", "van_der_pol")
+    system, others = system_of(van_der_pol, VanDerPol, system, others)
     corner = jnp.full(2, 2.0)
-    arguments: dict[str, Any] = dict(
-        dynamics=Discretized(VanDerPol(mu), dt, solver, substeps),
+    return task_environment(
+        others,
+        dynamics=Discretized(system, dt, solver, substeps),
         cost=Quadratic(jnp.ones(2), 0.1 * jnp.ones(1)),
         initial_state=UniformState(-corner, corner),
         control_bounds=(-max_control, max_control),
         horizon=horizon,
     )
-    return finish(van_der_pol, arguments, environment)

@@ -14,7 +14,7 @@ from ..costs import AbstractCost
 from ..disturbances import Gaussian
 from ..dynamics import AbstractDynamics, AbstractWrapper, Delayed
 from ..environments import Environment
-from ..environments._registry import finish
+from ..environments._task import check_names, task_environment
 from ._learned_lung import LearnedLung
 from ._lung_models import LungModel
 from ._waveform import BreathWaveform, check_waveform, LENGTH
@@ -164,7 +164,9 @@ def ventilated(
         sensed = Delayed(sensor, sensor=delay)
         initial_state = sensed.filled(initial_state)
     silent = isinstance(noise, int | float) and noise == 0
-    arguments = dict(
+    check_names(tasks[0], environment, *tasks[1:], ventilated)
+    return task_environment(
+        environment,
         dynamics=sensed,
         cost=BreathCost(waveform, dynamics.state_size, expiration, limit),
         sensor_noise=None if silent else Gaussian(noise, size=1),
@@ -172,7 +174,6 @@ def ventilated(
         control_bounds=(jnp.zeros(2), jnp.array([100.0, 1.0])),
         horizon=horizon,
     )
-    return finish(tasks[0], arguments, environment, *tasks[1:], ventilated)
 
 
 def ventilation(

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._check import check_choice
 from .._module import parameter, positive
 from ..math import cos, sin, wrap
 from ._base import AbstractSystem
@@ -78,10 +79,7 @@ class Acrobot(AbstractSystem):
     control_units: ClassVar = ("N m",)
 
     def __check_init__(self):
-        if self.form not in ("book", "nips"):
-            raise ValueError(
-                f"Acrobot: form must be 'book' or 'nips', got {self.form!r}."
-            )
+        check_choice(self.form, ("book", "nips"), "form", "Acrobot")
 
     def vector_field(self, t, x, u, w):
         m1, m2, l1 = self.mass_1, self.mass_2, self.length_1

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import check_parameters
-from .._typing import RealScalar
+from .._typing import Control, Disturbance, RealScalar, State
 from ._plant import AbstractPlant, Noise
 
 
@@ -79,7 +79,9 @@ class AbstractSystem(AbstractPlant):
         return super().disturbance_size if motions is None else motions
 
     @abc.abstractmethod
-    def vector_field(self, t: RealScalar, x: Array, u: Array, w: Array | None) -> Array:
+    def vector_field(
+        self, t: RealScalar, x: State, u: Control, w: Disturbance | None
+    ) -> State:
         """The time derivative of the state.
 
         **Arguments:**
@@ -93,7 +95,7 @@ class AbstractSystem(AbstractPlant):
         **Returns:** dx/dt, shape `(state_size,)`.
         """
 
-    def project(self, x: Array) -> Array:
+    def project(self, x: State) -> State:
         """Brings the state back to its manifold after each control interval; the
         identity by default. Normalise a quaternion or wrap an angle here.
 
@@ -103,7 +105,7 @@ class AbstractSystem(AbstractPlant):
         """
         return x
 
-    def diffusion(self, t: RealScalar, x: Array, u: Array) -> Array | None:
+    def diffusion(self, t: RealScalar, x: State, u: Control) -> Array | None:
         """The matrix g of `dx = f dt + g dB`; none by default.
 
         If it is given then `w` holds the increments of its k Brownian motions over the

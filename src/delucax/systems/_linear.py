@@ -119,21 +119,18 @@ def check_matrices(A, B, C, E, where: str):
     n = A.shape[0]
     if A.shape != (n, n) or n == 0:
         raise ValueError(f"{where}: A must be square, got shape {A.shape}.")
-    B = as_matrix(B, "B", where)
-    if B.shape[0] != n:
-        raise ValueError(
-            f"{where}: B must have as many rows as A ({n}), got shape {B.shape}."
-        )
-    if C is not None:
-        C = as_matrix(C, "C", where)
-        if C.shape[1] != n:
-            raise ValueError(
-                f"{where}: C must have as many columns as A ({n}), got {C.shape}."
-            )
-    if E is not None:
-        E = as_matrix(E, "E", where)
-        if E.shape[0] != n:
-            raise ValueError(
-                f"{where}: E must have as many rows as A ({n}), got {E.shape}."
-            )
+    B = _as_part(B, "B", n, "rows", where)
+    C = None if C is None else _as_part(C, "C", n, "columns", where)
+    E = None if E is None else _as_part(E, "E", n, "rows", where)
     return A, B, C, E
+
+
+def _as_part(value, name: str, n: int, side: str, where: str) -> Matrix:
+    """`value` as a matrix with as many rows or columns as there are states."""
+    matrix = as_matrix(value, name, where)
+    if matrix.shape[side == "columns"] != n:
+        raise ValueError(
+            f"{where}: {name} must have as many {side} as A ({n}), got shape "
+            f"{matrix.shape}."
+        )
+    return matrix

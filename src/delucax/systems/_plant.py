@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_vector, output_of
-from .._typing import RealScalar
+from .._typing import Control, Observation, RealScalar, State
 
 
 Noise = Literal["additive", "brownian"] | None
@@ -74,7 +74,7 @@ class AbstractPlant(eqx.Module):
         traced = jax.make_jaxpr(self.observe)(jnp.zeros(()), x).jaxpr
         return list(traced.outvars) == [traced.invars[1]]
 
-    def observe(self, t: RealScalar, x: Array) -> Array:
+    def observe(self, t: RealScalar, x: State) -> Observation:
         """What the plant's sensor reads; the state by default.
 
         **Arguments:** `t`: time. `x`: state.
@@ -84,7 +84,7 @@ class AbstractPlant(eqx.Module):
         del t
         return x
 
-    def difference(self, x: Array, x_ref: Array) -> Array:
+    def difference(self, x: State, x_ref: State) -> State:
         """The deviation of `x` from `x_ref`; `x - x_ref` by default. Angles wrap here.
 
         **Arguments:** `x`: state. `x_ref`: the state to measure from.
@@ -93,7 +93,7 @@ class AbstractPlant(eqx.Module):
         """
         return x - x_ref
 
-    def equilibrium(self) -> tuple[Array, Array]:
+    def equilibrium(self) -> tuple[State, Control]:
         """A state and a control at which the plant rests.
 
         **Returns:** `(x, u)`.

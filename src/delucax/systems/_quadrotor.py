@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._check import check_choice
 from .._module import parameter, positive
 from ._base import AbstractSystem
 
@@ -85,10 +86,7 @@ class Quadrotor(AbstractSystem):
     )
 
     def __check_init__(self):
-        if self.inputs not in ("rotors", "wrench"):
-            raise ValueError(
-                f"Quadrotor: inputs must be 'rotors' or 'wrench', got {self.inputs!r}."
-            )
+        check_choice(self.inputs, ("rotors", "wrench"), "inputs", "Quadrotor")
 
     @property
     def control_names(self) -> tuple[str, ...]:

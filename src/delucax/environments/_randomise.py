@@ -1,0 +1,127 @@
+"""Parameters drawn at random."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+
+from .._check import check_key, is_concrete
+from .._message import shortened
+from .._module import as_float_array, check_paths, get_path, replace
+from .._typing import PRNGKey
+
+
+def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
+    """A copy with the named parameters drawn at random: domain randomisation.
+
+    Under `jax.vmap` over keys it makes a batch of plants that compiles once. There the
+    values drawn cannot be looked at, so the ends of the ranges are: each with the
+    others at their lower, and at their upper ends. What a function draws is checked
+    where it is known, outside of `jax.vmap` and `jax.jit`.
+
+    **Arguments:**
+
+    - `tree`: an environment, or anything that [`delucax.replace`][] takes.
+    - `key`: a random key.
+    - `ranges`: from a path to `(low, high)`, drawn uniformly, or to a function of a key
+        to a value.
+
+    **Returns:** the copy.
+
+    **Raises:** `ValueError` if a path is not there or is part of another one, a range
+    is not a finite pair or a function, or a range holds values that are not legal.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("pendulum")
+        ranges = {"dynamics.system.length": (0.8, 1.2)}
+
+        def cost(key):
+            plant = dlx.randomise(env, key, ranges)
+            zero = dlx.controllers.Zero(1)
+            return dlx.rollout(plant, zero, key=key).total_cost
+
+        jax.vmap(cost)(jax.random.split(jax.random.key(0), 8))
+        ```
+    """
+    check_key(key, "randomise")
+    if not isinstance(ranges, Mapping):
+        raise ValueError(
+            "randomise: ranges must be a dictionary from paths to ranges, such as "
+            f"{{'dynamics.system.length': (0.8, 1.2)}}, got {ranges!r}."
+        )
+    check_paths(ranges, "randomise")
+    changes, ends = {}, {}
+    for (path, given), one in zip(
+        ranges.items(), jr.split(key, len(ranges)), strict=True
+    ):
+        old = get_path(tree, path)
+        if callable(given):
+            changes[path] = given(one)
+        elif isinstance(given, tuple | list) and len(given) == 2:
+            low, high = (as_float_array(end) for end in given)
+            if not (eqx.is_inexact_array(low) and eqx.is_inexact_array(high)):
+                raise ValueError(
+                    f"randomise: the range of {path!r} must be of numbers, got "
+                    f"{shortened(given)}."
+                )
+            shape: Any = jnp.broadcast_shapes(jnp.shape(old), low.shape, high.shape)
+            dtype = jnp.result_type(old, low, high)
+            with jax.ensure_compile_time_eval():  # so that jit does not hide numbers
+                known = [as_float_array(end) for end in given]
+            if all(map(is_concrete, known)):
+                least, most = (np.asarray(end, dtype) for end in known)
+                if not np.all((least <= most) & np.isfinite(most - least)):
+                    raise ValueError(
+                        f"randomise: the range of {path!r} must be finite and have "
+                        f"low <= high, got {shortened(given)}."
+                    )
+                ends[path] = _inner_ends(least, most, shape)
+            unit = jr.uniform(one, shape, dtype)
+            changes[path] = low + (high - low) * unit
+        else:
+            raise ValueError(
+                f"randomise: the range of {path!r} must be a pair (low, high) or a "
+                f"function of a key, got {shortened(given)}."
+            )
+    _check_ends(tree, changes, ends)
+    return replace(tree, changes)
+
+
+def _inner_ends(low: Any, high: Any, shape: tuple[int, ...]) -> tuple[Any, Any]:
+    """The ends of a range, moved inside by a rounding: an end that is itself not legal,
+    such as 0 for what is positive, is as good as never drawn."""
+    small = np.finfo(low.dtype).eps * (high - low)
+    first = np.maximum(np.nextafter(low, high), low + small)
+    last = np.minimum(np.nextafter(high, low), high - small)
+    return np.broadcast_to(first, shape), np.broadcast_to(last, shape)
+
+
+def _check_ends(tree: Any, changes: dict[str, Any], ends: dict[str, Any]) -> None:
+    """Raise where a range holds what is not legal, which under `jax.vmap` and `jax.jit`
+    a draw cannot show.
+
+    All values are set to the ends of their ranges, on one side but for one of them or
+    none. All that is tried may be drawn, so that ranges which fit together pass.
+    """
+    count = len(ends)
+    sides = {
+        tuple(side ^ (k == odd) for k in range(count))
+        for side in (False, True)
+        for odd in range(-1, count)
+    }
+    for corner in sorted(sides) if ends else ():
+        tried = {path: ends[path][at] for path, at in zip(ends, corner, strict=True)}
+        try:
+            with jax.ensure_compile_time_eval():
+                replace(tree, changes | tried)
+        except ValueError as error:
+            raise ValueError(f"{error} The ranges of randomise allow it.") from error
