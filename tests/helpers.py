@@ -93,8 +93,8 @@ def original_ilqr(dynamics, cost, x0, controls, *, iterations):
     a plant that the model knows: its steps may grow, and nothing is regularised."""
     shape = eqx.filter_eval_shape(dlx.planning.ilqr, dynamics, cost, x0, controls)
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
-    given = dlx.open_loop(dynamics, x0, controls), controls, jnp.asarray(dynamics.dt)
-    start = eqx.tree_at(lambda p: (p.states, p.controls, p.dt), blank, given)
+    given = dlx.open_loop(dynamics, x0, controls), controls
+    start = eqx.tree_at(lambda p: (p.states, p.controls), blank, given)
     learn = dlx.planning.ilc
     return learn(dynamics, dynamics, cost, start, iterations=iterations, throw=False)
 

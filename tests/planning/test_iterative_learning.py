@@ -202,7 +202,7 @@ def test_bounds_disturbances_and_what_diverges(learner):
     assert lost.result == dlx.RESULTS.diverged and lost.iterations == 0
     with pytest.raises(RuntimeError, match="NaN or infinite"):
         learner(wild, sim, cost, plan)
-    with user_error(match="plan must be a delucax.planning.Plan"):
+    with user_error(match="plan must be a Plan, such as ilqr makes"):
         learner(plant, sim, cost, U)
     with user_error(match="model must have the states and controls of plan"):
         learner(plant, dlx.make("planar_quadrotor").dynamics, cost, plan)

@@ -208,25 +208,13 @@ class MPC(AbstractController):
         check_cost(self.cost, "cost", where, (n, m))
         check_instance(self.planner, AbstractPlanner, "planner", where)
         check_parameters(self)
-        if not isinstance(self.start, Start):
+        check_instance(self.start, Start, "start", where)
+        start = self.start.checked(n, m, "start", where)
+        if start.controls.ndim != 3 or start.states is None or start.gains is None:
             raise ValueError(
-                f"{where}: start must be a delucax.planning.Start, got "
-                f"{type(self.start).__name__}."
+                f"{where}: start.controls must have shape (c, horizon, {m}), with "
+                f"states and gains, got shape {start.controls.shape}."
             )
-        shape = self.start.controls.shape
-        if len(shape) != 3:
-            raise ValueError(
-                f"{where}: start.controls must have shape (c, horizon, {m}), got "
-                f"{shape}."
-            )
-        c, T, _ = shape
-        rows = dict(controls=(c, T, m), states=(c, T + 1, n), gains=(c, T, m, n))
-        for name, row in rows.items():
-            got = getattr(getattr(self.start, name), "shape", None)
-            if got != row:
-                raise ValueError(
-                    f"{where}: start.{name} must have shape {row}, got {got}."
-                )
         if self.low is not None or self.high is not None:
             check_control_bounds((self.low, self.high), m, where)
 

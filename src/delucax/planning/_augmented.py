@@ -114,7 +114,7 @@ def with_constraints(
         status=jnp.asarray(NOT_CONVERGED),
         iterations=jnp.asarray(0),
         rollouts=jnp.asarray(rollouts),
-        mu=zero,
+        regularisation=zero,
         violation=jnp.full((), jnp.inf, dtype),
         multipliers=Multipliers(*y, zero),
     )

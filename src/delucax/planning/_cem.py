@@ -53,11 +53,12 @@ class CEM(AbstractSampler):
         ```python
         import delucax as dlx
         import jax
+        import jax.numpy as jnp
 
         env = dlx.make("pendulum")
         planner = dlx.planning.CEM(samples=64, elites=8)
         plan = planner(
-            env.dynamics, env.cost, env.initial_state, 20, key=jax.random.key(0)
+            env.dynamics, env.cost, jnp.array([0.5, 0.0]), 20, key=jax.random.key(0)
         )
         plan.cost
         ```

@@ -65,7 +65,7 @@ class Constraints(eqx.Module):
                 raise ValueError("Constraints: at least one function must be given.")
 
 
-Values: TypeAlias = tuple[Float[Array, " p"], Bool[Array, " p"]]
+Values: TypeAlias = tuple[Float[Array, "*steps p"], Bool[Array, "*steps p"]]
 """The values of constraints, inequalities first, and which are of equalities."""
 
 

@@ -52,7 +52,7 @@ class Outcome(NamedTuple):
     status: Array
     iterations: Array
     rollouts: Array
-    mu: Array
+    regularisation: Array
     violation: Array
     multipliers: Multipliers | None
 

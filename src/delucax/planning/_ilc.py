@@ -247,11 +247,7 @@ def as_problems(
     for name, dynamics in (("plant", plant), ("model", model)):
         check_instance(dynamics, AbstractDynamics, name, where)
     check_instance(cost, AbstractCost, "cost", where)
-    if not isinstance(plan, Plan):
-        raise ValueError(
-            f"{where}: plan must be a delucax.planning.Plan, such as ilqr makes, got "
-            f"{type(plan).__name__}."
-        )
+    check_instance(plan, Plan, "plan", where, ", such as ilqr makes")
     T, m = plan.controls.shape
     sizes = plan.states.shape[1], m
     for name, dynamics in (("plant", plant), ("model", model)):
@@ -264,15 +260,6 @@ def as_problems(
     if w is not None:
         w = as_rows(w, T, plant.disturbance_size, "w", where)
     x0 = plan.states[0].astype(plan.controls.dtype)
-    problem = lambda dynamics, w: Problem(
-        dynamics,
-        cost,
-        x0,
-        plan.t0.astype(x0.dtype),
-        w,
-        plan.low,
-        plan.high,
-        plan.difference,
-        None,
-    )
+    t0, rest = plan.t0.astype(x0.dtype), (plan.low, plan.high, plan.difference, None)
+    problem = lambda dynamics, w: Problem(dynamics, cost, x0, t0, w, *rest)
     return problem(plant, w), problem(model, None)

@@ -284,17 +284,7 @@ def _solve(
         (INFEASIBLE, RESULTS.infeasible),
     ):
         result = choose(out.status == code, kind, result)
-    return plan_of(
-        problem,
-        out.states,
-        out.controls,
-        out.cost,
-        gains=out.gains,
-        trace=out.trace,
-        residual=out.residual,
-        violation=out.violation,
-        result=result,
-        iterations=out.iterations,
-        rollouts=out.rollouts,
-        regularisation=out.mu,
-    )
+    rest = out._asdict()
+    for name in ("status", "multipliers"):
+        del rest[name]
+    return plan_of(problem, **rest, result=result)

@@ -82,8 +82,8 @@ def _with_tangents(primals: Any, tangents: Any, options: Options) -> Any:
         problem = given(varied).with_multipliers(y)
         stages = model(problem, X, U, None, options.second_order)
         if options.parallel:
-            return in_parallel(stages, out.mu).K
-        return in_sequence(stages, out.mu, options.on_state, None, free).K
+            return in_parallel(stages, out.regularisation).K
+        return in_sequence(stages, out.regularisation, options.on_state, None, free).K
 
     _, dJ = jax.jvp(cost, (varied, X, U), (change, dX, dU))
     _, dK = jax.jvp(gains, (varied, X, U, y), (change, dX, dU, dy))

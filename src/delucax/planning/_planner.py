@@ -17,6 +17,7 @@ from .._check import (
     check_finite,
     check_instance,
     check_key,
+    check_number,
 )
 from .._message import shortened
 from .._module import as_float_array, as_module
@@ -123,10 +124,35 @@ class AbstractPlanner(eqx.Module):
         finite; an error at run time as `throw` says.
         """
         where = type(self).__name__
+        check_instance(dynamics, AbstractDynamics, "dynamics", where)
+        check_instance(cost, AbstractCost, "cost", where)
+        n, m = dynamics.state_size, dynamics.control_size
+        x0 = as_vector(x0, n, "x0", where)
+        check_finite(x0, "x0", where)
+        check_number(t0, "t0", where)
+        t0 = as_float_array(t0)
         if self.starts_from_states:
             controls = _at_rest(dynamics, cost, controls, where)
-        given = dynamics, cost, x0, controls, t0, w, bounds, difference, constraints
-        problem, start = _as_problem(*given, where)
+        start = _as_start(dynamics, cost, controls, t0, where)
+        # A default start has no precision of its own.
+        known = () if isinstance(controls, numbers.Integral) else (start.controls,)
+        dtype = jnp.result_type(x0, *known)
+        if w is not None:
+            w = as_rows(w, start.horizon, dynamics.disturbance_size, "w", where)
+        if difference is not None and not callable(difference):
+            raise ValueError(
+                f"{where}: difference must be a function, got {difference!r}."
+            )
+        if constraints is not None:
+            hint = " (`delucax.planning.Constraints`)"
+            check_instance(constraints, Constraints, "constraints", where, hint)
+        ends = check_control_bounds(bounds, m, where)
+        if ends is not None:
+            ends = (jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
+        low, high = ends or (None, None)
+        x0, t0, distance = x0.astype(dtype), t0.astype(dtype), as_module(difference)
+        given = dynamics, cost, x0, t0, w, low, high, distance, constraints
+        problem, start = Problem(*given), jax.tree.map(lambda a: a.astype(dtype), start)
         if self.is_stochastic:
             check_key(key, where)
         plan = self.solve(problem, start, key)
@@ -147,66 +173,19 @@ def _with_fallback(plan: Plan, fallback: Start | Plan) -> Plan:
     return eqx.tree_at(lambda p: (*trajectory(p), p.result), plan, (*kept, result))
 
 
-def _as_problem(
-    dynamics: Any,
-    cost: Any,
-    x0: Any,
-    controls: Any,
-    t0: Any,
-    w: Any,
-    bounds: Any,
-    difference: Any,
-    constraints: Any,
-    where: str,
-) -> tuple[Problem, Start]:
-    """The problem, and what to start from, or an error."""
-    check_instance(dynamics, AbstractDynamics, "dynamics", where)
-    check_instance(cost, AbstractCost, "cost", where)
+def _as_start(
+    dynamics: AbstractDynamics, cost: AbstractCost, controls: Any, t0: Array, where: str
+) -> Start:
+    """What to start from, or an error."""
     m = dynamics.control_size
-    x0 = as_vector(x0, dynamics.state_size, "x0", where)
-    check_finite(x0, "x0", where)
-    t0 = as_float_array(t0)
-    if not eqx.is_inexact_array(t0) or t0.shape != ():
-        raise ValueError(f"{where}: t0 must be a number, got {shortened(t0)}.")
-    check_finite(t0, "t0", where)
     if isinstance(controls, Plan):
         controls = Start(controls.controls, controls.states, controls.gains)
-    dtype = x0.dtype
     if isinstance(controls, Start):
-        start = controls.checked(dynamics.state_size, m, "controls", where)
-    elif isinstance(controls, numbers.Integral):
+        return controls.checked(dynamics.state_size, m, "controls", where)
+    if isinstance(controls, numbers.Integral):
         T = check_count(controls, "controls (the horizon)", where)
-        start = default_start(dynamics, cost, T, t0)
-    else:
-        start = Start(as_rows(controls, None, m, "controls", where))
-    if not isinstance(controls, numbers.Integral):
-        dtype = jnp.result_type(x0, start.controls)
-    T = start.horizon
-    if w is not None:
-        w = as_rows(w, T, dynamics.disturbance_size, "w", where)
-    if difference is not None and not callable(difference):
-        raise ValueError(f"{where}: difference must be a function, got {difference!r}.")
-    if constraints is not None and not isinstance(constraints, Constraints):
-        raise ValueError(
-            f"{where}: constraints must be delucax.planning.Constraints, got "
-            f"{type(constraints).__name__}."
-        )
-    low = high = None
-    ends = check_control_bounds(bounds, m, where)
-    if ends is not None:
-        low, high = (jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
-    problem = Problem(
-        dynamics,
-        cost,
-        x0.astype(dtype),
-        t0.astype(dtype),
-        w,
-        low,
-        high,
-        as_module(difference),
-        constraints,
-    )
-    return problem, jax.tree.map(lambda a: a.astype(dtype), start)
+        return default_start(dynamics, cost, T, t0)
+    return Start(as_rows(controls, None, m, "controls", where))
 
 
 def _at_rest(dynamics: Any, cost: Any, controls: Any, where: str) -> Any:

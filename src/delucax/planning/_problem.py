@@ -72,9 +72,7 @@ class Problem(eqx.Module):
         assert self.constraints is not None
         return at_end(self.constraints, t, x)
 
-    def constraints_along(
-        self, states: Array, controls: Array
-    ) -> tuple[Values, Values]:
+    def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
         """The values of the constraints of all steps, and at the end."""
         times = self.times(controls.shape[0])
         stage = jax.vmap(self.stage_constraints)(times[:-1], states[:-1], controls)
@@ -249,19 +247,25 @@ def costates_of(F: Array, h: Array, v: Array) -> Array:
     return lax.scan(back, v.astype(h.dtype), (F, h), reverse=True)[1]
 
 
-def jacobian(f: Any) -> Any:
-    """Of the first argument, in reverse: a step has fewer outputs than inputs.
-    Forward where a solver inside has only that."""
+def first_possible(*derivatives: Callable[..., Array]) -> Callable[..., Array]:
+    """The first of some ways to take a derivative that the solvers inside have: some
+    have none in reverse, others none forward."""
 
     def evaluate(*args):
-        try:
-            return jax.jacrev(f)(*args)
-        except (RuntimeError, TypeError, ValueError) as error:
-            if "everse-mode" not in str(error):
-                raise
-            return jax.jacfwd(f)(*args)
+        for derivative in derivatives[:-1]:
+            try:
+                return derivative(*args)
+            except (RuntimeError, TypeError, ValueError) as error:
+                if "-mode" not in str(error):
+                    raise
+        return derivatives[-1](*args)
 
     return evaluate
+
+
+def jacobian(f: Callable[..., Array]) -> Callable[..., Array]:
+    """Of the first argument, in reverse: a step has fewer outputs than inputs."""
+    return first_possible(jax.jacrev(f), jax.jacfwd(f))
 
 
 def central(f: Any, spacing: float, deviation: Any) -> Any:
@@ -279,24 +283,9 @@ def central(f: Any, spacing: float, deviation: Any) -> Any:
     return evaluate
 
 
-def curvature(f: Any) -> Any:
-    """The Hessian in the first argument; in reverse alone, or forward alone, where a
-    solver inside has only that."""
-
-    def evaluate(*args):
-        last: Exception | None = None
-        for outer, inner in (
-            (jax.jacfwd, jax.grad),
-            (jax.jacrev, jax.grad),
-            (jax.jacfwd, jax.jacfwd),
-        ):
-            try:
-                return outer(inner(f))(*args)
-            except (RuntimeError, TypeError, ValueError) as error:
-                if "-mode" not in str(error):
-                    raise
-                last = error
-        assert last is not None
-        raise last
-
-    return evaluate
+def curvature(f: Callable[..., Array]) -> Callable[..., Array]:
+    """The Hessian in the first argument."""
+    slope = jax.grad(f)
+    return first_possible(
+        jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(f))
+    )

@@ -38,8 +38,14 @@ class AbstractSampler(AbstractPlanner):
         mean: Float[Array, "T m"],
         width: Float[Array, "T m"],
     ) -> tuple[Float[Array, "T m"], Float[Array, "T m"]]:
-        """The next mean and standard deviation. The costs of what diverged are
-        infinite."""
+        """The next mean and standard deviation.
+
+        **Arguments:**
+
+        - `drawn`: the sequences of controls, the first of which is the mean.
+        - `costs`: of their trajectories; infinite for those that diverged.
+        - `mean`, `width`: those that they were drawn with.
+        """
 
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
         where, m = type(self).__name__, start.controls.shape[-1]
@@ -53,6 +59,7 @@ class AbstractSampler(AbstractPlanner):
                 f"{where}: scale must be a number or a vector of {m} entries, one for "
                 f"each control, got shape {self.scale.shape}."
             )
+        assert key is not None
         return _search(self, problem, start, key)
 
 
