@@ -72,6 +72,13 @@ def test_what_diverges_has_no_part_in_it(planner, options):
     lost = planned(planner, dynamics, Cliff(), x0, U + 1, throw=False, **start)
     assert lost.result == dlx.RESULTS.diverged and jnp.isinf(lost.cost)
     assert_close(lost.controls, U + 1)
+    spare = dlx.planning.Start(U, jnp.ones((9, 2)), jnp.ones((8, 1, 2)))
+    held = planner(**start)(
+        dynamics, Cliff(), x0, U + 1, key=KEY, fallback=spare, throw=False
+    )
+    assert held.result == dlx.RESULTS.diverged and not held.is_usable
+    for name in ("states", "controls", "gains"):
+        assert_close(getattr(held, name), getattr(spare, name))
     with pytest.raises(RuntimeError, match="NaN or infinite"):
         planned(planner, dynamics, Cliff(), x0, U + 1, **start)
 

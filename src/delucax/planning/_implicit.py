@@ -52,10 +52,7 @@ def _solution_jvp(primals: Any, tangents: Any, *, options: Options) -> Any:
 def _with_tangents(primals: Any, tangents: Any, options: Options) -> Any:
     out = solution(*primals, options=options)
     problem, change = primals[0], tangents[0]
-    fields = {name: None for name in Outcome._fields}
-    if out.multipliers is not None:
-        fields["multipliers"] = Multipliers(None, None, None)  # pyright: ignore
-    nothing = Outcome(**fields)  # pyright: ignore[reportArgumentType]
+    nothing = jax.tree.map(lambda _: None, out)
     if not jax.tree.leaves(change):
         return out, nothing
     is_none = lambda leaf: leaf is None

@@ -95,7 +95,8 @@ class Plan(AbstractController):
 
     @property
     def is_usable(self) -> Array:
-        """Whether it can be followed: it did not diverge, and the constraints can hold.
+        """Whether the planner has a plan to use: it did not diverge, and the
+        constraints can hold.
 
         A plan of too few iterations, or whose search failed, is the best so far.
         """

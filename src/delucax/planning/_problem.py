@@ -39,7 +39,7 @@ class Problem(eqx.Module):
     w: Array | None
     low: Array | None
     high: Array | None
-    difference: Any
+    difference: Callable[[Array, Array], Array] | None
     constraints: Constraints | None
     multipliers: Multipliers | None = None
 
@@ -58,7 +58,7 @@ class Problem(eqx.Module):
             return u
         return jnp.minimum(jnp.maximum(u, self.low), self.high)
 
-    def step(self, t: Array, x: Array, u: Array, w: Any) -> Array:
+    def step(self, t: Array, x: Array, u: Array, w: Array | None) -> Array:
         """The next state."""
         return self.dynamics.advance(t, x, u, w)[0].astype(x.dtype)
 
@@ -104,7 +104,7 @@ class Problem(eqx.Module):
         return cost + augmented(c, y, rho, equal)
 
     @property
-    def stage_multipliers(self) -> Any:
+    def stage_multipliers(self) -> Array | None:
         """Those of the steps."""
         return None if self.multipliers is None else self.multipliers.stage
 
