@@ -66,7 +66,9 @@ def with_constraints(
         y = [updated(*given) for given in each]
         missed = [jnp.max(violated(*given), initial=0.0) for given in each]
         violation = jnp.maximum(*missed)
-        return out._replace(violation=violation, multipliers=Multipliers(*y, rho))
+        return out._replace(
+            violation=violation, multipliers=Multipliers(y[0], y[1], rho)
+        )
 
     def body(before):
         out, rho = before.out, before.rho
@@ -97,7 +99,7 @@ def with_constraints(
     rollouts = 0
     if start.count > 1:
         rollouts = start.count
-        start = begin(problem.with_multipliers(Multipliers(*y, rho)), start)[0]
+        start = begin(problem.with_multipliers(Multipliers(y[0], y[1], rho)), start)[0]
     n = problem.x0.shape[0]
     states, gains = start.states if guess is None else guess, start.gains
     if states is None:
@@ -116,7 +118,7 @@ def with_constraints(
         rollouts=jnp.asarray(rollouts),
         regularisation=zero,
         violation=jnp.full((), jnp.inf, dtype),
-        multipliers=Multipliers(*y, zero),
+        multipliers=Multipliers(y[0], y[1], zero),
     )
     progress = _Progress(first, rho, loose, jnp.asarray(False))
     out = lax.while_loop(lambda progress: ~progress.done, body, progress).out

@@ -88,4 +88,5 @@ def search(
     keep = lambda new, old: jnp.where(accepted, new, old)
     gaps = None if now.gaps is None else keep((1 - length) * now.gaps, now.gaps)
     rollouts = now.rollouts + tried
-    return Iterate(*jax.tree.map(keep, candidate, last), gaps, accepted, rollouts)
+    states, controls, cost = jax.tree.map(keep, candidate, last)
+    return Iterate(states, controls, cost, gaps, accepted, rollouts)
