@@ -178,11 +178,11 @@ def figure_eight(quick: bool) -> dict[str, Any]:
             cost,
             20,
             bounds=BOUNDS,
-            max_iterations=10,
+            planner=dlx.planning.ILQR(10),
             throw=False,
             **start,
         ),
-        "MPC, wind estimated": feeling(env, cost, 20, max_iterations=10),
+        "MPC, wind estimated": feeling(env, cost, 20, planner=dlx.planning.ILQR(10)),
         "GPC around the plan": learner,
     }
     winds = jax.vmap(lambda key: wind(key, steps))(jr.split(jr.key(0), DRAWS))
@@ -318,11 +318,12 @@ def obstacles(quick: bool) -> dict[str, Any]:
     }
     rows, paths = [row], {"plan": np.asarray(states[0, :, :2])}
 
-    options: Any = dict(bounds=BOUNDS, start=hover[:ahead], max_iterations=100)
+    planner = dlx.planning.ILQR(100)
+    options: Any = dict(bounds=BOUNDS, start=hover[:ahead], planner=planner)
     blind = dlx.controllers.MPC(
         env.dynamics, cost, ahead, constraints=avoid, throw=False, **options
     )
-    options = dict(max_iterations=100, constraints=wide)
+    options = dict(planner=planner, constraints=wide)
     aware = feeling(env, Seen(cost), ahead, **options)
 
     def flown(controller):

@@ -147,7 +147,7 @@ def plans(task: Task) -> dict[str, Callable[[Any, Any], Any]]:
 
     def receding(x0, lack):
         start = np.tile(task.rest, (task.ahead, 1))
-        options: Any = dict(start=start, max_iterations=20, throw=False)
+        options: Any = dict(start=start, planner=dlx.planning.ILQR(20), throw=False)
         mpc = dlx.controllers.MPC(env.dynamics, env.cost, task.ahead, **options)
         return run(mpc, x0, lack)
 
@@ -171,7 +171,7 @@ def plans(task: Task) -> dict[str, Callable[[Any, Any], Any]]:
 def learned(task: Task, name: str, iterations: int) -> Any:
     """A function of starts, lacks and a setting to costs, runs of the plant, and
     iterations."""
-    learner = {"ILC": dlx.controllers.ILC, "iGPC": dlx.controllers.iGPC}[name]
+    learner = {"ILC": dlx.planning.ilc, "iGPC": dlx.planning.igpc}[name]
     env = task.model
 
     def one(x0, lack, setting):

@@ -137,9 +137,8 @@ def planned(case: Plans, x0: Any, controls: Any, **options: Any) -> Any:
             else lambda t, x: x - np.array(arrival),
         )
     given = Discrete(case), Charged(case), x0, controls
-    return dlx.planning.ilqr(
-        *given, bounds=bounds, constraints=constraints, throw=False, **options
-    )
+    planner = dlx.planning.ILQR(**options)
+    return planner(*given, bounds=bounds, constraints=constraints, throw=False)
 
 
 def guess_of(case: Plans, x0: Any) -> tuple[Any, Any]:
@@ -332,25 +331,25 @@ def receding(steps: int) -> Table:
     env = dlx.make("pendulum", dt=0.02)
     near = dlx.costs.Quadratic([1.0, 0.1], [0.01], final=[100.0, 10.0])
     smooth = Swung()
-    sampled = dict(iterations=2, samples=128, correlation=0.8)
+    sampled: dict[str, Any] = dict(iterations=2, samples=128, correlation=0.8)
     tried = {
         "iLQR, balancing, 50 steps": (near, 50, {}, 0.2),
         "iLQR, swing-up, 100 steps, at most 8 iterations": (
             smooth,
             100,
-            dict(max_iterations=8),
+            dict(planner=dlx.planning.ILQR(8)),
             np.pi,
         ),
         "MPPI, swing-up, 50 steps": (
             smooth,
             50,
-            dict(planner=dlx.planning.mppi, temperature=0.1, **sampled),
+            dict(planner=dlx.planning.MPPI(temperature=0.1, **sampled)),
             np.pi,
         ),
         "CEM, swing-up, 50 steps": (
             smooth,
             50,
-            dict(planner=dlx.planning.cem, elites=16, **sampled),
+            dict(planner=dlx.planning.CEM(elites=16, **sampled)),
             np.pi,
         ),
     }
@@ -407,7 +406,7 @@ def learning() -> Table:
     x0 = env.initial_state
     plan = dlx.planning.ilqr(env.dynamics, env.cost, x0, start)
     options: dict[str, Any] = dict(step=0.2, iterations=40)
-    learners = {"ILC": dlx.controllers.ILC, "iGPC": dlx.controllers.iGPC}
+    learners = {"ILC": dlx.planning.ilc, "iGPC": dlx.planning.igpc}
     for name, learner in learners.items():
         run = lambda learner=learner: learner(
             plant.dynamics, env.dynamics, env.cost, plan, **options
@@ -435,9 +434,8 @@ def calls() -> Table:
     for name, spacing in (("autodiff", None), ("differences of 1e-2", 1e-2)):
 
         def solve(dynamics, spacing=spacing):
-            return dlx.planning.ilqr(
-                dynamics, Charged(case), x0, U, finite_difference=spacing
-            )
+            planner = dlx.planning.ILQR(finite_difference=spacing)
+            return planner(dynamics, Charged(case), x0, U)
 
         plan, found = dlx.planning.count_evaluations(solve, Discrete(case))
         T = case.horizon

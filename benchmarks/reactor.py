@@ -89,11 +89,14 @@ def below(limit: float) -> Any:
     return dlx.planning.Constraints(lambda t, x, u: x[1] - limit)
 
 
-def planned(x0: Any, start: Any = T, **options: Any) -> Any:
+def planned(
+    x0: Any, start: Any = T, states: Any = None, constraints: Any = None
+) -> Any:
     """A plan of the task."""
     env, _, cost = plant()
+    planner = dlx.planning.ILQR(states=states)
     given = env.dynamics, cost, jnp.asarray(x0), start
-    return dlx.planning.ilqr(*given, bounds=BOUNDS, throw=False, **options)
+    return planner(*given, bounds=BOUNDS, constraints=constraints, throw=False)
 
 
 def first_cost(controller: Any, x0: Any) -> Any:

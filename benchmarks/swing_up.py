@@ -194,7 +194,7 @@ def receding(env: dlx.Environment, starts: Any, name: str) -> dict[str, Any]:
         ahead,
         bounds=env.control_bounds,
         start=jnp.full((ahead, 1), 0.1),
-        max_iterations=iterations,
+        planner=dlx.planning.ILQR(iterations),
         throw=False,
     )
 

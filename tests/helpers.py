@@ -71,12 +71,32 @@ def assert_refuses_nan(module):
     """Every number of `module` can be replaced by itself, and by NaN nowhere."""
     for path, leaf in jax.tree_util.tree_flatten_with_path(module)[0]:
         path = path_string(path)
-        # The options of a planner are checked when it is called.
-        if not eqx.is_inexact_array(leaf) or path.startswith("options."):
+        if not eqx.is_inexact_array(leaf):
             continue
         assert eqx.tree_equal(dlx.replace(module, {path: leaf}), module), path
         with pytest.raises(ValueError):
             dlx.replace(module, {path: jnp.full_like(leaf, jnp.nan)})
+
+
+def ilqr(
+    dynamics, cost, x0, controls, t0=0.0, w=None, bounds=None, *, throw=True, **options
+):
+    """A plan by `ILQR` with options; constraints and difference are of the problem."""
+    names = "constraints", "difference"
+    rest = {name: options.pop(name) for name in names if name in options}
+    given = dynamics, cost, x0, controls, t0, w, bounds
+    return dlx.planning.ILQR(**options)(*given, throw=throw, **rest)
+
+
+def original_ilqr(dynamics, cost, x0, controls, *, iterations):
+    """Iterative LQR with the line search of the original library, which is learning of
+    a plant that the model knows: its steps may grow, and nothing is regularised."""
+    shape = eqx.filter_eval_shape(dlx.planning.ilqr, dynamics, cost, x0, controls)
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
+    given = dlx.open_loop(dynamics, x0, controls), controls
+    start = eqx.tree_at(lambda p: (p.states, p.controls), blank, given)
+    learn = dlx.planning.ilc
+    return learn(dynamics, dynamics, cost, start, iterations=iterations, throw=False)
 
 
 class CountCalls:

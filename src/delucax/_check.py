@@ -49,6 +49,7 @@ def _is_hashable(value: Any) -> bool:
 
 _HOW_TO_GET = {
     "AbstractCost": " (wrap a function with `delucax.costs.Function`)",
+    "AbstractPlanner": " (such as `delucax.planning.ILQR()`)",
     "AbstractDynamics": " (discretise a system with `delucax.Discretized`; of an "
     "environment give its `dynamics`)",
     "AbstractSystem": " (wrap a function with `delucax.system`; of an environment give "
@@ -173,6 +174,20 @@ def as_bounds(
     return low, high
 
 
+def check_control_bounds(
+    value: Any, size: int, where: str
+) -> tuple[Array, Array] | None:
+    """`value` as bounds of `size` controls, or an error."""
+    bounds = as_bounds(value, where)
+    for end in bounds or ():
+        if end.shape not in ((), (size,)):
+            raise ValueError(
+                f"{where}: bounds must be numbers or vectors of {size} entries, one "
+                f"for each control, got shape {end.shape}."
+            )
+    return bounds
+
+
 def bounds_field(where: str, name: str = "bounds") -> Any:
     """A field that holds `(low, high)`, converted and checked by `as_bounds`."""
     return eqx.field(converter=functools.partial(as_bounds, where=where, name=name))
@@ -270,6 +285,15 @@ def check_bool(value: Any, name: str, where: str) -> bool:
             f"{where}: {name} must be True or False, got {shortened(value)}."
         )
     return bool(value)
+
+
+def check_choice(value: Any, choices: tuple[str, ...], name: str, where: str) -> None:
+    """Raise unless `value` is one of a few strings."""
+    if value not in choices:
+        raise ValueError(
+            f"{where}: {name} must be one of {', '.join(map(repr, choices))}, got "
+            f"{value!r}."
+        )
 
 
 def check_count(value: Any, name: str, where: str, least: int = 1) -> int:

@@ -139,11 +139,11 @@ def receding(size, **options):
 
 
 def drawn(size):
-    options = dict(samples=8, iterations=1, temperature=size, scale=2.0)
+    planner = dlx.planning.MPPI(8, 1, scale=2.0, temperature=size)
     # Constant controls would tie with a plan of them a step later: the cheaper of two
     # starts has a kink there.
     start = jnp.array([[0.1], [-0.2], [0.3], [0.1]])
-    return receding(size, planner=dlx.planning.mppi, start=start, **options)
+    return receding(size, planner=planner, start=start)
 
 
 def features(y):

@@ -117,7 +117,7 @@ LONG = {
     controllers.DRC controllers.Explore estimators.ExtendedKalmanFilter
     estimators.Filtered controllers.FiniteHorizonLQR controllers.FixedPolicy
     controllers.Gaussian controllers.GPC controllers.Hindsight controllers.HInfinity
-    controllers.iGPC controllers.ILC estimators.KalmanFilter controllers.Linear
+    estimators.KalmanFilter controllers.Linear
     controllers.LQG controllers.LQI controllers.LQR controllers.lqrd controllers.MLP
     controllers.MPC controllers.MPCState controllers.online_newton
     controllers.OutputFeedback controllers.regret estimators.run_filter

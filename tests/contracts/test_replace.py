@@ -154,7 +154,7 @@ def quadratic(n, m=1):
 PARTS = {
     "MPC": lambda: dlx.controllers.MPC(dynamics(2), quadratic(2), 5),
     "sampling MPC": lambda: dlx.controllers.MPC(
-        dynamics(2), quadratic(2), 5, planner=dlx.planning.cem
+        dynamics(2), quadratic(2), 5, planner=dlx.planning.CEM()
     ),
     "LQR that follows": lambda: dlx.controllers.LQR(
         dynamics(2), np.eye(2), np.eye(1), reference=np.ones(2)
@@ -192,16 +192,16 @@ def part(name):
     [
         ("MPC", {"dynamics": dynamics(3)}, "MPC: cost does not fit a state of size 3"),
         ("MPC", {"dynamics": dynamics(3), "cost": quadratic(3)},
-            r"MPC: start.states must have shape \(2, 6, 3\), got \(2, 6, 2\)"),
+            r"MPC: start.states must have shape \(2, 6, 3\), got shape \(2, 6, 2\)"),
         ("MPC", {"dynamics": dynamics(2, 2), "cost": quadratic(2, 2)},
             r"MPC: start.controls must have shape \(2, 5, 2\)"),
         ("MPC", {"dynamics": 5}, "MPC: dynamics must be an AbstractDynamics"),
         ("MPC", {"cost": quadratic(3)}, "MPC: cost does not fit a state of size 2"),
         ("MPC", {"cost": 5}, "MPC: cost must be an AbstractCost"),
-        ("MPC", {"start.states": None}, "MPC: start.states must .*got None"),
-        ("MPC", {"planner": dlx.planning.cem}, "planner must draw if the old one did"),
+        ("MPC", {"start.states": None}, "MPC: start.states must .*got none"),
+        ("MPC", {"planner": 5}, "MPC: planner must be an AbstractPlanner"),
         ("sampling MPC", {"dynamics": dynamics(3)}, "MPC: cost does not fit"),
-        ("sampling MPC", {"planner": dlx.planning.ilqr}, "planner must draw if"),
+        ("sampling MPC", {"planner.scale": -1.0}, "CEM: scale must be positive"),
         ("LQR that follows", {"feed_forward.signals.dynamics": dynamics(3)},
             "feed_forward must be that of 2 states"),
         ("LQR that follows", {"feed_forward.signals.reference": lambda t: np.ones(3)},

@@ -31,7 +31,13 @@ def regulated(**options):
 
 @needs_x64
 @pytest.mark.parametrize(
-    "options", [{}, pytest.param({"finite_difference": 1e-2}, marks=thorough)]
+    "options",
+    [
+        {},
+        pytest.param(
+            {"planner": dlx.planning.ILQR(finite_difference=1e-2)}, marks=thorough
+        ),
+    ],
 )
 def test_without_bounds_it_is_the_regulator(options):
     env, lqr = regulated(disturbance=dlx.disturbances.Gaussian(0.05, size=2))
@@ -63,23 +69,17 @@ def test_a_plan_starts_from_the_last_one():
 
 @once
 @pytest.mark.parametrize(
-    "planner, options",
+    "kind, options",
     [
-        pytest.param(dlx.planning.ilqr, dict(max_iterations=5), marks=thorough),
-        (dlx.planning.mppi, dict(iterations=2, samples=64, temperature=0.1)),
-        pytest.param(
-            dlx.planning.cem,
-            dict(iterations=3, samples=32, elites=8),
-            marks=thorough,
-        ),
+        pytest.param("ILQR", dict(max_iterations=5), marks=thorough),
+        ("MPPI", dict(iterations=2, samples=64, temperature=0.1)),
+        pytest.param("CEM", dict(iterations=3, samples=32, elites=8), marks=thorough),
     ],
-    ids=["ilqr", "mppi", "cem"],
 )
-def test_every_planner_balances(planner, options):
+def test_every_planner_balances(kind, options):
     env = dlx.make("pendulum", dt=0.02)
-    mpc = MPC(
-        env.dynamics, env.cost, 25, planner=planner, bounds=(-2.0, 2.0), **options
-    )
+    planner = getattr(dlx.planning, kind)(**options)
+    mpc = MPC(env.dynamics, env.cost, 25, planner=planner, bounds=(-2.0, 2.0))
     x0 = jnp.array([0.1, 0.0])
     held = dlx.rollout(env, mpc, key=KEY, x0=x0, horizon=60)
     fallen = dlx.rollout(env, dlx.controllers.Zero(1), key=KEY, x0=x0, horizon=60)
@@ -110,9 +110,9 @@ def explosive():
 @needs_x64
 def test_a_plan_that_fails_is_seen():
     dynamics, cost = explosive()
-    calm = MPC(dynamics, cost, 12, bounds=(-1.0, 1.0), throw=False)
-    step = jax.jit(lambda y, state: calm(0.0, y, state))
-    u, state = step(jnp.array([0.1]), calm.init())
+    mpc = MPC(dynamics, cost, 12, bounds=(-1.0, 1.0), throw=False)
+    step = jax.jit(lambda y, state: mpc(0.0, y, state))
+    u, state = step(jnp.array([0.1]), mpc.init())
     assert state.failures.count == 0 and state.result == dlx.RESULTS.successful
     last = state
     u, state = step(jnp.array([9.0]), state)
@@ -121,8 +121,8 @@ def test_a_plan_that_fails_is_seen():
     followed = last.controls[0] - last.gains[0] @ (9.0 - last.states[0])
     assert followed < -1
     assert_close(u, [-1.0])
-    assert_close(state.controls, calm.start.controls[0])
-    assert jnp.all(state.gains == calm.start.gains[0]) and jnp.all(state.gains > 0)
+    assert_close(state.controls, mpc.start.controls[0])
+    assert jnp.all(state.gains == mpc.start.gains[0]) and jnp.all(state.gains > 0)
     u, state = step(jnp.array([4.0]), state)
     assert state.failures.count == 2 and u == -1
     u, state = step(jnp.array([jnp.nan]), state)
@@ -135,11 +135,11 @@ def test_a_plan_that_fails_is_seen():
 @needs_x64
 def test_a_plan_that_fails_is_an_error():
     dynamics, cost = explosive()
-    loud = MPC(dynamics, cost, 12, bounds=(-1.0, 1.0))
+    mpc = MPC(dynamics, cost, 12, bounds=(-1.0, 1.0))
     with pytest.raises(Exception, match="NaN or infinite"):
-        jax.block_until_ready(loud(0.0, jnp.array([9.0]), loud.init())[0])
+        jax.block_until_ready(mpc(0.0, jnp.array([9.0]), mpc.init())[0])
     # Too few iterations are no failure of that kind, but are seen.
-    short = MPC(dynamics, cost, 12, max_iterations=1)
+    short = MPC(dynamics, cost, 12, planner=dlx.planning.ILQR(1))
     _, state = short(0.0, jnp.array([0.2]), short.init())
     assert state.failures.count == 1 and state.result == dlx.RESULTS.not_converged
 
@@ -188,7 +188,11 @@ def test_a_stall_at_rounding_is_no_failed_plan():
         (kinked, kinked.cost, [1.0, 0.0], 3, 3),
     ):
         mpc = MPC(
-            task.dynamics, charged, 30, bounds=task.control_bounds, max_iterations=50
+            task.dynamics,
+            charged,
+            30,
+            bounds=task.control_bounds,
+            planner=dlx.planning.ILQR(50),
         )
         run = dlx.rollout(task, mpc, key=KEY, x0=jnp.array(x0), horizon=steps)
         assert run.states.dtype == jnp.float32
@@ -286,7 +290,7 @@ def test_a_start_of_ones_own():
         "default": {},
         "other controls": dict(start=held + 5.0),
         "a law": dict(start=law),
-        "states": dict(states=line),
+        "states": dict(planner=dlx.planning.ILQR(states=line)),
         "alone": dict(start=dlx.planning.Start(held)),
     }.items():
         mpc = MPC(*given, bounds=(280.0, 320.0), throw=False, **options)
@@ -307,11 +311,7 @@ def test_bad_arguments_are_named():
         MPC(env.dynamics, lambda t, x, u: 0.0, 5)
     with user_error(match="horizon must be a whole number"):
         MPC(*given, 0)
-    with user_error(match="samples is no option of the planner; it has states"):
-        MPC(*given, 5, samples=3)
-    with user_error(match="x0 is no option"):
-        MPC(*given, 5, x0=0.0)
-    with user_error(match="planner must be a function"):
+    with user_error(match="planner must be an AbstractPlanner"):
         MPC(*given, 5, planner=3)
     with user_error(match="bounds must be numbers or vectors of 1"):
         MPC(*given, 5, bounds=(-jnp.ones(2), jnp.ones(2)))
@@ -324,7 +324,7 @@ def test_bad_arguments_are_named():
     with user_error(match=r"start.controls must have shape \(5, 1\)"):
         MPC(*given, 5, start=dlx.planning.Start(jnp.zeros((5, 2))))
     with user_error(match="one random key"):
-        MPC(*given, 5, planner=dlx.planning.cem).init()
+        MPC(*given, 5, planner=dlx.planning.CEM()).init()
 
 
 @needs_x64

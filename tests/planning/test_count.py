@@ -51,7 +51,7 @@ def test_a_whole_plan():
     """What the planner says of itself is what it did: each roll-out is T calls, and
     each iteration, and the last look, one linearisation."""
     dynamics, *rest = quadrotor()
-    solve = lambda **options: lambda d: dlx.planning.ilqr(d, *rest, **options)
+    solve = lambda **options: lambda d: dlx.planning.ILQR(**options)(d, *rest)
     exact, found = count_evaluations(solve(), dynamics)
     looks = int(exact.iterations) + 1
     assert found.primal == T * (int(exact.rollouts) + looks)
@@ -89,9 +89,9 @@ def test_modes_and_batches():
 @needs_x64
 def test_differences_and_second_order():
     with user_error(match="finite_difference goes without second_order"):
-        dlx.planning.ilqr(*quadrotor(), finite_difference=1e-2, second_order=True)
+        dlx.planning.ILQR(finite_difference=1e-2, second_order=True)
     with user_error(match="finite_difference must be positive"):
-        dlx.planning.ilqr(*quadrotor(), finite_difference=0.0)
+        dlx.planning.ILQR(finite_difference=0.0)
 
 
 @once

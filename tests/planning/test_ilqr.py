@@ -5,7 +5,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, needs_x64, thorough, tolerance, user_error
+from helpers import (
+    assert_close,
+    ilqr,
+    needs_x64,
+    original_ilqr,
+    thorough,
+    tolerance,
+    user_error,
+)
 
 import delucax as dlx
 
@@ -13,7 +21,6 @@ import delucax as dlx
 pytestmark = needs_x64
 
 
-ilqr = dlx.planning.ilqr
 START = jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -58,10 +65,8 @@ class ChargedNext(dlx.AbstractCost):
 @needs_x64
 def test_the_published_trace():
     env, _ = quadrotor()
-    options = dict(line_search="deluca", tolerance=0.0, throw=False)
-    options |= dict(max_iterations=20)
     cost = ChargedNext(env.cost)
-    plan = ilqr(env.dynamics, cost, START, jnp.zeros((100, 2)), **options)
+    plan = original_ilqr(env.dynamics, cost, START, jnp.zeros((100, 2)), iterations=20)
     # The state at the start is charged here, and was not there.
     trace = np.asarray(plan.trace) - float(START @ START)
     printed = [374122.0319, 3861.0703, 219.2560, 69.3763, 54.8095, 52.3808, 51.8737]
@@ -375,7 +380,8 @@ def test_a_bad_member_of_a_batch_harms_no_other(line_search):
         (dict(line_search="exact"), "line_search must be one of"),
         (dict(regularise="both"), "regularise must be"),
         (dict(parallel=True, bounds=(-1.0, 1.0)), "parallel"),
-        (dict(line_search="deluca", states=jnp.zeros((6, 2))), "line_search"),
+        (dict(parallel=True, regularise="state"), "parallel"),
+        (dict(finite_difference=0.1, second_order=True), "finite_difference goes"),
         (dict(max_iterations=0), "max_iterations"),
         (dict(tolerance=-1.0), "tolerance must be at least 0"),
         (dict(constraint_tolerance=-1.0), "constraint_tolerance"),

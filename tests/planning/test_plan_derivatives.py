@@ -5,13 +5,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import assert_close, central_difference, needs_x64, thorough
+from helpers import assert_close, central_difference, ilqr, needs_x64, thorough
 from jaxtyping import Array
 
 import delucax as dlx
 
 
-ilqr = dlx.planning.ilqr
 pytestmark = needs_x64
 AT = jnp.array([1.0, 1.0, 1.3])
 

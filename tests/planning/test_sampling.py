@@ -10,10 +10,12 @@ import delucax as dlx
 
 KEY = jax.random.key(0)
 X0 = jnp.array([0.5, -0.3])
-PLANNERS = {
-    "mppi": (dlx.planning.mppi, dict(temperature=0.01)),
-    "cem": (dlx.planning.cem, dict()),
-}
+MPPI, CEM = dlx.planning.MPPI, dlx.planning.CEM
+PLANNERS = {"mppi": (MPPI, dict(temperature=0.01)), "cem": (CEM, dict())}
+
+
+def planned(kind, *problem, key=KEY, bounds=None, throw=True, **options):
+    return kind(**options)(*problem, bounds=bounds, key=key, throw=throw)
 
 
 def linear():
@@ -31,7 +33,7 @@ def linear():
 def test_the_minimum_of_a_linear_problem(planner, options):
     problem = linear()
     best = dlx.planning.ilqr(*problem)
-    plan = planner(*problem, key=KEY, iterations=20, **options)
+    plan = planned(planner, *problem, iterations=20, **options)
     assert best.cost - 1e-5 <= plan.cost < 1.02 * best.cost < plan.trace[0]
     assert plan.result == dlx.RESULTS.successful and jnp.all(plan.gains == 0)
     assert plan.rollouts == 20 * 256 + 1 and plan.trace.shape == (21,)
@@ -40,10 +42,10 @@ def test_the_minimum_of_a_linear_problem(planner, options):
     assert_close(followed, plan.states, atol=1e-12)
     # A warm start goes on; other keys draw others.
     options = options | dict(iterations=1)
-    warm = planner(*problem[:3], plan.controls, key=KEY, **options)
+    warm = planned(planner, *problem[:3], plan.controls, **options)
     assert warm.trace[0] == plan.cost and warm.cost <= plan.cost
-    other = planner(*problem, key=jax.random.key(1), **options)
-    assert other.cost != planner(*problem, key=KEY, **options).cost
+    other = planned(planner, *problem, key=jax.random.key(1), **options)
+    assert other.cost != planned(planner, *problem, **options).cost
 
 
 class Cliff(dlx.AbstractCost):
@@ -61,17 +63,24 @@ class Cliff(dlx.AbstractCost):
 )
 def test_what_diverges_has_no_part_in_it(planner, options):
     dynamics, _, x0, U = linear()
-    plan = planner(dynamics, Cliff(), x0, U, key=KEY, scale=0.2, **options)
+    plan = planned(planner, dynamics, Cliff(), x0, U, scale=0.2, **options)
     assert jnp.all(jnp.isfinite(plan.controls)) and jnp.all(plan.controls <= 0.5)
     assert 0 <= plan.cost < 8 == plan.trace[0]
-    grads = jax.grad(lambda x: planner(dynamics, Cliff(), x, U, key=KEY).cost)(x0)
+    grads = jax.grad(lambda x: planned(planner, dynamics, Cliff(), x, U).cost)(x0)
     assert jnp.all(jnp.isfinite(grads))
-    start = dict(key=KEY, scale=1e-3, iterations=2)
-    lost = planner(dynamics, Cliff(), x0, U + 1, throw=False, **start)
+    start = dict(scale=1e-3, iterations=2)
+    lost = planned(planner, dynamics, Cliff(), x0, U + 1, throw=False, **start)
     assert lost.result == dlx.RESULTS.diverged and jnp.isinf(lost.cost)
     assert_close(lost.controls, U + 1)
+    spare = dlx.planning.Start(U, jnp.ones((9, 2)), jnp.ones((8, 1, 2)))
+    held = planner(**start)(
+        dynamics, Cliff(), x0, U + 1, key=KEY, fallback=spare, throw=False
+    )
+    assert held.result == dlx.RESULTS.diverged and not held.is_usable
+    for name in ("states", "controls", "gains"):
+        assert_close(getattr(held, name), getattr(spare, name))
     with pytest.raises(RuntimeError, match="NaN or infinite"):
-        planner(dynamics, Cliff(), x0, U + 1, **start)
+        planned(planner, dynamics, Cliff(), x0, U + 1, **start)
 
 
 @needs_x64
@@ -86,7 +95,7 @@ def test_bounds_batches_and_derivatives(planner, options):
     options = options | dict(bounds=(-0.2, [0.3]), correlation=0.5, samples=64)
 
     def optimal(x, key):
-        plan = planner(dynamics, cost, x, U, key=key, **options)
+        plan = planned(planner, dynamics, cost, x, U, key=key, **options)
         return plan.cost, plan.controls
 
     keys = jax.random.split(KEY, 2)
@@ -104,7 +113,6 @@ def test_bounds_batches_and_derivatives(planner, options):
 @once
 def test_bad_arguments_are_named():
     problem = linear()
-    mppi, cem = dlx.planning.mppi, dlx.planning.cem
     for name, options in {
         "samples": dict(samples=1),
         "iterations": dict(iterations=0),
@@ -114,8 +122,23 @@ def test_bad_arguments_are_named():
         "temperature": dict(temperature=0.0),
         "one random key": dict(key=3),
     }.items():
-        with user_error(match=f"mppi: .*{name}"):
-            mppi(*problem, **(dict(key=KEY) | options))
+        with user_error(match=f"MPPI: .*{name}"):
+            planned(MPPI, *problem, **options)
     for name, wrong in (("elites", 300), ("momentum", 2.0)):
-        with user_error(match=f"cem: {name}"):
-            cem(*problem, key=KEY, **{name: wrong})
+        with user_error(match=f"CEM: {name}"):
+            CEM(**{name: wrong})
+    limit = dlx.planning.Constraints(lambda t, x, u: x[0])
+    with user_error(match="CEM: constraints must be None"):
+        CEM()(*problem, key=KEY, constraints=limit)
+
+
+@once
+def test_the_short_calls():
+    problem = *linear(), 0.0, None, (-0.2, 0.3)
+    few = dict(key=KEY, samples=40, iterations=2)
+    for short, planner in (
+        (dlx.planning.mppi, MPPI(40, 2)),
+        (dlx.planning.cem, CEM(40, 2)),
+    ):
+        plan = short(*problem, **few)
+        assert_close(plan.controls, planner(*problem, key=KEY).controls, rtol=0)

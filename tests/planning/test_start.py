@@ -67,7 +67,8 @@ def test_controls_alone_lead_elsewhere():
     assert alone.cost > 500
     line = jnp.tile(dynamics.equilibrium()[0], (T + 1, 1))
     for controls in (T, held(dynamics)):
-        plan = ilqr(dynamics, cost, x0, controls, bounds=BOUNDS, states=line)
+        planner = dlx.planning.ILQR(states=line)
+        plan = planner(dynamics, cost, x0, controls, bounds=BOUNDS)
         assert_close(plan.cost, IPOPT[0], atol=1e-9)
 
 
@@ -128,13 +129,13 @@ def test_the_cheapest_start_is_taken():
 @once
 def test_samplers_start_from_it_too():
     x0, key = jnp.ones(1), jax.random.key(0)
-    few = dict(key=key, samples=4, iterations=1)
+    few = dict(samples=4, iterations=1)
     both = stacked(law(0.0), law(1.2))
     for planner, more in (
-        (dlx.planning.mppi, {}),
-        (dlx.planning.cem, dict(elites=2)),
+        (dlx.planning.MPPI, {}),
+        (dlx.planning.CEM, dict(elites=2)),
     ):
-        plan = planner(UNSTABLE, CHEAP, x0, both, **few, **more)
+        plan = planner(**few, **more)(UNSTABLE, CHEAP, x0, both, key=key)
         first = ilqr(UNSTABLE, CHEAP, x0, law(1.2), max_iterations=1, throw=False)
         assert plan.cost <= first.trace[0] * (1 + 1e-6)
 
@@ -269,7 +270,7 @@ def test_bad_starts():
         with user_error(match=match):
             ilqr(UNSTABLE, CHEAP, x0, start)
     with user_error(match="states go with an array of controls or a number of steps"):
-        ilqr(UNSTABLE, CHEAP, x0, law(1.0), states=jnp.zeros((9, 1)))
+        dlx.planning.ILQR(states=jnp.zeros((9, 1)))(UNSTABLE, CHEAP, x0, law(1.0))
     with user_error(match="horizon must be a whole number"):
         dlx.planning.default_start(UNSTABLE, CHEAP, 2.0)
     with user_error(match="default_start: dynamics must be an AbstractDynamics"):

@@ -101,7 +101,7 @@ def test_a_tally_shows_its_count():
 def test_mpc_tells_of_its_plans(key):
     env = dlx.make("pendulum", dt=0.05, horizon=6)
     cost = dlx.costs.Quadratic([1.0, 0.1], [0.1])
-    hasty = dlx.controllers.MPC(env.dynamics, cost, 10, max_iterations=1)
+    hasty = dlx.controllers.MPC(env.dynamics, cost, 10, planner=dlx.planning.ILQR(1))
     run = dlx.rollout(env, hasty, key=key, x0=jnp.array([np.pi, 0.0]))
     count = run.incident_counts["failed_plan"]
     assert count > 0 and count == run.controller_state.failures.count

@@ -12,8 +12,6 @@ from ._categorical import Categorical as Categorical, Likeliest as Likeliest
 from ._finite_horizon import FiniteHorizonLQR as FiniteHorizonLQR
 from ._gaussian import Gaussian as Gaussian
 from ._hinfinity import HInfinity as HInfinity
-from ._igpc import iGPC as iGPC
-from ._ilc import ILC as ILC
 from ._lqg import LQG as LQG
 from ._lqi import LQI as LQI
 from ._lqr import LQR as LQR

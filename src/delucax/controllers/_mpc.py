@@ -1,19 +1,17 @@
 """Model predictive control."""
 
-import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-import numpy as np
 from jaxtyping import Array
 
 from .._check import (
-    as_bounds,
     check_bool,
+    check_control_bounds,
     check_count,
     check_finite,
     check_instance,
@@ -21,24 +19,14 @@ from .._check import (
 )
 from .._controller import AbstractController, Tally, wrong_observation
 from .._message import shortened
-from .._module import (
-    as_float_array,
-    as_module,
-    function_field,
-    parameter,
-    StaticFunction,
-)
+from .._module import as_float_array, check_parameters, function_field, parameter
 from .._results import Result, RESULTS
+from .._typing import Control, Observation
 from ..costs import AbstractCost
 from ..costs._base import check_cost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
-from ..planning import default_start, ilqr, Start
-from ..planning._start import as_start, controls_of
-
-
-_OURS = ("dynamics", "cost", "x0", "controls", "t0", "w", "bounds", "key", "throw")
-"""Arguments of a planner that `MPC` gives itself."""
+from ..planning import AbstractPlanner, Constraints, default_start, ILQR, Start
 
 
 class MPCState(NamedTuple):
@@ -78,7 +66,7 @@ class MPC(AbstractController):
     and plan again.
 
     `u_k` is the first control of the plan over `T` steps from `y_k` at `t_k`. It works
-    with every planner of [`delucax.planning`][delucax.planning.ilqr], and with a cost
+    with every [`delucax.planning.AbstractPlanner`][], and with a cost
     that depends on time, such as a reference to follow.
 
     Each plan starts from the cheapest of a few trajectories from `y_k`, which are
@@ -89,7 +77,7 @@ class MPC(AbstractController):
     3. the control of that point, held.
 
     The second one keeps an unstable plant where the model is worth something, and a
-    plan of [`delucax.planning.ilqr`][] without constraints costs at most as much as
+    plan of [`delucax.planning.ILQR`][] without constraints costs at most as much as
     each of them. It is computed when the controller is made, about the point that
     [`delucax.planning.default_start`][] chooses: the targets of the cost, or the
     equilibrium of the dynamics, or zero where neither names one, as with
@@ -105,7 +93,7 @@ class MPC(AbstractController):
     Where there is none to use, since every start diverges or the constraints cannot
     hold, `throw` says what happens.
 
-    Derivatives are those of the planner: of [`delucax.planning.ilqr`][] by the implicit
+    Derivatives are those of the planner: of [`delucax.planning.ILQR`][] by the implicit
     function theorem, NaN where a plan did not converge. Of a planner that samples they
     go through the start that was taken; which one that is, is held.
 
@@ -116,9 +104,10 @@ class MPC(AbstractController):
     - `cost`: the stage and final cost. A final cost that bounds what comes after the
         horizon lets this be short.
     - `horizon`: the steps `T` of a plan.
-    - `planner`: [`delucax.planning.ilqr`][] by default, [`delucax.planning.mppi`][],
-        [`delucax.planning.cem`][], or any function with their arguments, the fourth of
-        which is a [`delucax.planning.Start`][].
+    - `planner`: any [`delucax.planning.AbstractPlanner`][], with its options;
+        [`delucax.planning.ILQR`][] by default. Floating-point numbers among the options
+        can be differentiated and changed without compiling again. With `states` each
+        plan starts from these, and from the controls of the last plan, alone.
     - `bounds`: `(low, high)` of the controls, each a number or of shape `(m,)`; none by
         default.
     - `start`: what each plan may start from besides the last one:
@@ -130,13 +119,13 @@ class MPC(AbstractController):
         last plan is followed for one more step, under its gains, and forgotten; if
         there is no plan in the next step either, the first one of `start`, by default
         the LQR, is applied.
-    - `**options`: other arguments of the planner, such as `max_iterations`, `samples`
-        or `constraints`. Floating-point numbers among them can be differentiated and
-        changed without compiling again. With `states` each plan starts from these, and
-        from the controls of the last plan, alone.
+    - `constraints`: [`delucax.planning.Constraints`][] on states and controls, for
+        planners that take them; none by default.
+    - `difference`: `(x, x_ref) -> deviation`, as for the planner; subtraction by
+        default.
 
-    **Raises:** `ValueError` on arguments of the wrong kind or shape, or options that
-    the planner does not have; an error at run time as `throw` says.
+    **Raises:** `ValueError` on arguments of the wrong kind or shape; an error at run
+    time as `throw` says.
 
     Source: Richalet, Rault, Testud and Papon, 1978; Diehl, Bock and Schloeder, 2005
     (warm start).
@@ -162,10 +151,9 @@ class MPC(AbstractController):
     start: Start
     low: Array | None = parameter()
     high: Array | None = parameter()
-    planner: Callable[..., Any] = function_field()
-    options: dict[str, Any]
-    settings: tuple[tuple[str, Any], ...] = eqx.field(static=True)
-    draws: bool = eqx.field(static=True)
+    planner: AbstractPlanner
+    constraints: Constraints | None
+    difference: Callable[[Array, Array], Array] | None = function_field()
     throw: bool = eqx.field(static=True)
 
     def __init__(
@@ -174,25 +162,25 @@ class MPC(AbstractController):
         cost: AbstractCost,
         horizon: int,
         *,
-        planner: Callable[..., Any] = ilqr,
+        planner: AbstractPlanner | None = None,
         bounds: Any = None,
         start: Any = None,
         throw: bool = True,
-        **options: Any,
+        constraints: Constraints | None = None,
+        difference: Callable[[Array, Array], Array] | None = None,
     ):
         where = "MPC"
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         check_cost(cost, "cost", where)
         horizon = check_count(horizon, "horizon", where)
-        self.draws = "key" in _known(planner, options, where)
-        ends = as_bounds(bounds, where)
         m = dynamics.control_size
+        ends = check_control_bounds(bounds, m, where)
         if isinstance(start, Start):
-            start = as_start(start, dynamics.state_size, m, "start", where)
-            if controls_of(start).shape[0] != horizon:
+            start = start.checked(dynamics.state_size, m, "start", where)
+            if start.horizon != horizon:
                 raise ValueError(
                     f"{where}: start must have {horizon} steps, as the horizon, got "
-                    f"{controls_of(start).shape[0]}."
+                    f"{start.horizon}."
                 )
         else:
             if start is not None:
@@ -209,61 +197,30 @@ class MPC(AbstractController):
         self.dynamics, self.cost = dynamics, cost
         self.start = _stacked(start, dynamics.state_size)
         self.low, self.high = (None, None) if ends is None else ends
-        self.planner = planner
+        self.planner = ILQR() if planner is None else planner
+        self.constraints, self.difference = constraints, difference
         self.throw = check_bool(throw, "throw", where)
-        kept, fixed = {}, []
-        for name, value in sorted(options.items()):
-            # The spacing of differences is part of the planner's program.
-            whole = isinstance(value, bool | int | str | None | np.integer)
-            if whole or name == "finite_difference":
-                fixed.append((name, value))
-            else:
-                kept[name] = as_module(as_float_array(value))
-        self.options, self.settings = kept, tuple(fixed)
 
     def __check_init__(self):
         where, dynamics = "MPC", self.dynamics
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         n, m = dynamics.state_size, dynamics.control_size
         check_cost(self.cost, "cost", where, (n, m))
-        planner: Any = self.planner
-        planner = planner.function if isinstance(planner, StaticFunction) else planner
-        options = self.options | dict(self.settings)
-        if self.draws != ("key" in _known(planner, options, where)):
+        check_instance(self.planner, AbstractPlanner, "planner", where)
+        check_parameters(self)
+        check_instance(self.start, Start, "start", where)
+        start = self.start.checked(n, m, "start", where)
+        if start.controls.ndim != 3 or start.states is None or start.gains is None:
             raise ValueError(
-                f"{where}: planner must draw if the old one did, and must not if it "
-                "did not; build the controller anew."
+                f"{where}: start.controls must have shape (c, horizon, {m}), with "
+                f"states and gains, got shape {start.controls.shape}."
             )
-        if not isinstance(self.start, Start):
-            raise ValueError(
-                f"{where}: start must be a delucax.planning.Start, got "
-                f"{type(self.start).__name__}."
-            )
-        shape = self.start.controls.shape
-        if len(shape) != 3:
-            raise ValueError(
-                f"{where}: start.controls must have shape (c, horizon, {m}), got "
-                f"{shape}."
-            )
-        c, T, _ = shape
-        rows = dict(controls=(c, T, m), states=(c, T + 1, n), gains=(c, T, m, n))
-        for name, row in rows.items():
-            got = getattr(getattr(self.start, name), "shape", None)
-            if got != row:
-                raise ValueError(
-                    f"{where}: start.{name} must have shape {row}, got {got}."
-                )
-        if self.low is None and self.high is None:
-            return
-        for end in as_bounds((self.low, self.high), where) or ():
-            if end.shape not in ((), (m,)):
-                raise ValueError(
-                    f"{where}: bounds must be numbers or vectors of {m} entries, one "
-                    f"for each control, got shape {end.shape}."
-                )
+        if self.low is not None or self.high is not None:
+            check_control_bounds((self.low, self.high), m, where)
 
     def init(self, *, key=None):
-        if self.draws:
+        draws = self.planner.is_stochastic
+        if draws:
             check_key(key, "MPC.init")
         result = jax.tree.map(jnp.asarray, RESULTS.successful)
         zero = jnp.zeros((), int)
@@ -275,21 +232,20 @@ class MPC(AbstractController):
             result,
             Tally("failed_plan"),
             zero,
-            key if self.draws else None,
+            key if draws else None,
         )
 
     def __call__(self, t, y, state):
         size = self.dynamics.state_size
         if y.shape != (size,):
             raise wrong_observation(self, size, y)
-        options: dict[str, Any] = dict(self.options) | dict(self.settings)
-        key = state.key
-        if self.draws:
-            key, options["key"] = jr.split(key)
+        key, draw = state.key, None
+        if self.planner.is_stochastic:
+            key, draw = jr.split(key)
         bounds = None if self.low is None else (self.low, self.high)
         last = Start(state.controls, state.states, state.gains)
         starts = state.controls
-        if "states" not in self.options:
+        if not self.planner.starts_from_states:
             join = lambda a, b: jnp.concatenate([a[None], b])
             starts = jax.tree.map(join, last, self.start)
         plan = self.planner(
@@ -297,14 +253,16 @@ class MPC(AbstractController):
             self.cost,
             y,
             starts,
-            t0=t,
+            t,
             bounds=bounds,
+            constraints=self.constraints,
+            difference=self.difference,
+            fallback=last,
+            key=draw,
             throw=False,
-            **options,
         )
-        lost = (plan.result == RESULTS.diverged) | (plan.result == RESULTS.infeasible)
-        lost = lost | ~jnp.all(jnp.isfinite(plan.controls))
-        u = jnp.where(lost, self._followed(y, state), plan.controls[0])
+        lost, u = ~plan.is_usable, plan.controls[0]
+        u = jnp.where(lost, self._followed(y, last), u)
         if self.throw:
             u = plan.result.error_if(u, lost)
         shift = lambda a: jnp.concatenate([a[1:], a[-1:]])
@@ -323,34 +281,16 @@ class MPC(AbstractController):
         )
         return u.astype(y.dtype), after
 
-    def _followed(self, y: Array, last: MPCState) -> Array:
-        """The control of the last plan, or of the first start where there is none."""
-        difference = self.options.get("difference")
-        x = last.states[0]
-        e = y - x if difference is None else difference(y, x)
-        u = last.controls[0]
+    def _followed(self, y: Observation, last: Start) -> Control:
+        """The first control of the last plan, under its gains."""
+        assert last.states is not None and last.gains is not None
+        x, u = last.states[0], last.controls[0]
+        e = y - x if self.difference is None else self.difference(y, x)
         tried = u - matvec(last.gains[0], e)
         u = jnp.where(jnp.isfinite(tried), tried, u)
         if self.low is not None and self.high is not None:
             u = jnp.minimum(jnp.maximum(u, self.low), self.high)
         return u
-
-
-def _known(planner: Any, options: Mapping[str, Any], where: str) -> tuple[str, ...]:
-    """The names of a planner's arguments, among which those of `options` are."""
-    if not callable(planner):
-        raise ValueError(
-            f"{where}: planner must be a function such as delucax.planning.ilqr, got "
-            f"{planner!r}."
-        )
-    known = tuple(inspect.signature(planner).parameters)
-    for name in options:
-        if name not in known or name in _OURS:
-            raise ValueError(
-                f"{where}: {name} is no option of the planner; it has "
-                f"{', '.join(k for k in known if k not in _OURS)}."
-            )
-    return known
 
 
 def _stacked(start: Start, n: int) -> Start:

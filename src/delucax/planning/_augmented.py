@@ -2,21 +2,12 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._constraints import (
-    final_equalities,
-    final_values,
-    Multipliers,
-    stage_equalities,
-    stage_values,
-    updated,
-    violated,
-)
+from ._constraints import Multipliers, updated, violated
 from ._descent import (
     CONVERGED,
     DIVERGED,
@@ -28,7 +19,7 @@ from ._descent import (
     Tolerances,
 )
 from ._problem import Problem
-from ._start import begin, controls_of, count_of, Start
+from ._start import begin, controls_of, Start
 
 
 FIRST_RHO = 10.0
@@ -57,40 +48,23 @@ def with_constraints(
     """
     if problem.constraints is None:
         return optimise(problem, start, guess, tolerances.gradient, options)
-    constraints, controls = problem.constraints, controls_of(start)
+    controls = controls_of(start)
     T = controls.shape[0]
     dtype = problem.x0.dtype
     most_rho = 1 / jnp.finfo(dtype).eps ** 0.6
-
-    def constrained(states, controls):
-        times = problem.times(T)
-        here = lambda t, x, u: stage_values(constraints, t, x, u)
-        stage = jax.vmap(here)(times[:-1], states[:-1], controls)
-        return stage, final_values(constraints, times[-1], states[-1])
-
-    equal = (
-        stage_equalities(constraints, problem.x0, controls[0]),
-        final_equalities(constraints, problem.x0),
-    )
-
-    def augmented(multipliers):
-        return eqx.tree_at(
-            lambda p: p.multipliers, problem, multipliers, is_leaf=lambda p: p is None
-        )
 
     def inner(before, multipliers, tolerance):
         # The gains keep an unstable plant on the trajectory that it goes on from.
         start = Start(before.controls, before.states, before.gains)
         states = None if guess is None else before.states
         tolerance = jnp.maximum(tolerance, tolerances.gradient)
-        given = augmented(multipliers), start, states, tolerance, options
-        out = optimise(*given, before)
-        values = constrained(out.states, out.controls)
-        rho = multipliers.rho
-        known = multipliers.stage, multipliers.final
-        each = list(zip(values, known, equal, strict=True))
-        y = [updated(c, y, rho, e) for c, y, e in each]
-        missed = [jnp.max(violated(c, y, rho, e), initial=0.0) for c, y, e in each]
+        given = problem.with_multipliers(multipliers), start, states, tolerance
+        out = optimise(*given, options, before)
+        values = problem.constraints_along(out.states, out.controls)
+        *known, rho = multipliers
+        each = [(c, y, rho, e) for (c, e), y in zip(values, known, strict=True)]
+        y = [updated(*given) for given in each]
+        missed = [jnp.max(violated(*given), initial=0.0) for given in each]
         violation = jnp.maximum(*missed)
         return out._replace(
             violation=violation, multipliers=Multipliers(y[0], y[1], rho)
@@ -118,13 +92,14 @@ def with_constraints(
         return _Progress(after._replace(status=status), rho, tolerance, done)
 
     zero = jnp.zeros((), dtype)
-    sizes = jax.eval_shape(constrained, jnp.zeros((T + 1, *problem.x0.shape)), controls)
-    y = tuple(jnp.zeros(c.shape, dtype) for c in sizes)
+    like = jnp.zeros((T + 1, *problem.x0.shape), dtype)
+    sizes = jax.eval_shape(problem.constraints_along, like, controls)
+    y = tuple(jnp.zeros(c.shape, dtype) for c, _ in sizes)
     rho, loose = jnp.full((), FIRST_RHO, dtype), jnp.full((), 1e-2, dtype)
     rollouts = 0
-    if count_of(start) > 1:
-        rollouts = count_of(start)
-        start = begin(augmented(Multipliers(y[0], y[1], rho)), start)[0]
+    if start.count > 1:
+        rollouts = start.count
+        start = begin(problem.with_multipliers(Multipliers(y[0], y[1], rho)), start)[0]
     n = problem.x0.shape[0]
     states, gains = start.states if guess is None else guess, start.gains
     if states is None:
@@ -141,7 +116,7 @@ def with_constraints(
         status=jnp.asarray(NOT_CONVERGED),
         iterations=jnp.asarray(0),
         rollouts=jnp.asarray(rollouts),
-        mu=zero,
+        regularisation=zero,
         violation=jnp.full((), jnp.inf, dtype),
         multipliers=Multipliers(y[0], y[1], zero),
     )

@@ -1,6 +1,5 @@
 """The cross-entropy method."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -9,34 +8,15 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_count, check_number, check_range
+from .._module import parameter
 from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ._arguments import as_problem
-from ._plan import checked, Plan
-from ._sampling import as_samples, as_spread, average, Samples, search
-from ._start import controls_of, Start
+from ._plan import Plan
+from ._sampling import AbstractSampler, average, check_sampler
 
 
-def cem(
-    dynamics: AbstractDynamics,
-    cost: AbstractCost,
-    x0: Any,
-    controls: Any,
-    t0: Any = 0.0,
-    w: Any = None,
-    bounds: Any = None,
-    *,
-    key: PRNGKey,
-    samples: int = 256,
-    elites: int = 32,
-    iterations: int = 10,
-    scale: Any = 1.0,
-    correlation: Any = 0.0,
-    momentum: Any = 0.1,
-    difference: Callable[[Any, Any], Any] | None = None,
-    throw: bool = True,
-) -> Plan:
+class CEM(AbstractSampler):
     r"""Controls by sampling, for costs and dynamics that need not be smooth: the
     cross-entropy method.
 
@@ -50,6 +30,90 @@ def cem(
     among them, so it costs no more than the start. It has no gains. Its derivatives are
     those of the elites that were drawn; which ones those are is held.
 
+    It is called as every [`delucax.planning.AbstractPlanner`][], with a `key`, and
+    without constraints.
+
+    **Arguments:**
+
+    - `samples`: sequences drawn in an iteration, 256 by default.
+    - `iterations`: 10 by default.
+    - `elites`: how many of the sequences count, 32 by default.
+    - `scale`: the standard deviation to start with, a number or of shape `(m,)`; 1 by
+        default.
+    - `correlation`: of a control drawn with the one before it, from 0, white noise, by
+        default, to 1.
+    - `momentum`: how much stays of mean and standard deviation, 0.1 by default.
+
+    **Raises:** `ValueError` on an option out of its range, or more elites than samples.
+
+    Source: Rubinstein, 1999; Chua, Calandra, McAllister and Levine, 2018 (planning).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        planner = dlx.planning.CEM(samples=64, elites=8)
+        plan = planner(
+            env.dynamics, env.cost, jnp.array([0.5, 0.0]), 20, key=jax.random.key(0)
+        )
+        plan.cost
+        ```
+    """
+
+    samples: int = eqx.field(default=256, static=True)
+    iterations: int = eqx.field(default=10, static=True)
+    elites: int = eqx.field(default=32, static=True)
+    scale: Array = parameter(1.0)
+    correlation: Array = parameter(0.0)
+    momentum: Array = parameter(0.1)
+
+    def __check_init__(self):
+        where = "CEM"
+        check_sampler(self)
+        check_count(self.elites, "elites", where)
+        if self.elites > self.samples:
+            raise ValueError(
+                f"{where}: elites must be at most samples, {self.samples}, got "
+                f"{self.elites}."
+            )
+        check_number(self.momentum, "momentum", where)
+        check_range(self.momentum, "momentum", where, 0, 1)
+
+    def update(self, drawn, costs, mean, width):
+        # Neither infinities nor what is compared need a derivative.
+        _, best = lax.top_k(-lax.stop_gradient(costs), self.elites)
+        weights = jnp.isfinite(costs[best]).astype(mean.dtype)
+        centre = average(weights, drawn[best], mean)
+        variance = average(weights, (drawn[best] - centre) ** 2, width**2)
+        # The square root has no slope at zero.
+        spreads = variance > 0
+        after = jnp.where(spreads, jnp.sqrt(jnp.where(spreads, variance, 1)), 0)
+        momentum = self.momentum.astype(mean.dtype)
+        blend = lambda old, new: momentum * old + (1 - momentum) * new
+        return blend(mean, centre), blend(width, after)
+
+
+def cem(
+    dynamics: AbstractDynamics,
+    cost: AbstractCost,
+    x0: Any,
+    controls: Any,
+    t0: Any = 0.0,
+    w: Any = None,
+    bounds: Any = None,
+    *,
+    key: PRNGKey,
+    samples: int = 256,
+    iterations: int = 10,
+    throw: bool = True,
+) -> Plan:
+    r"""Controls by the cross-entropy method: the short call of
+    [`delucax.planning.CEM`][], which has further options.
+
     **Arguments:**
 
     - `dynamics`: the discrete-time dynamics.
@@ -61,26 +125,16 @@ def cem(
     - `bounds`: `(low, high)`, each a number or of shape `(m,)`, between which every
         control is drawn; none by default.
     - `key`: a random key.
-    - `samples`: sequences drawn in an iteration, 256 by default.
-    - `elites`: how many of them count, 32 by default.
+    - `samples`: sequences drawn in an iteration, of which 32 are elites; 256 by
+        default.
     - `iterations`: 10 by default.
-    - `scale`: the standard deviation to start with, a number or of shape `(m,)`; 1 by
-        default.
-    - `correlation`: of a control drawn with the one before it, from 0, white noise, by
-        default, to 1.
-    - `momentum`: how much stays of mean and standard deviation, 0.1 by default.
-    - `difference`: `(x, x_ref) -> deviation`, which the plan keeps; subtraction by
-        default.
     - `throw`: raise if the start and all means diverge (default); if false, look at
         `plan.result`, which is `diverged` then.
 
     **Returns:** a [`delucax.planning.Plan`][].
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, out of its
-    range, or not finite, or more elites than samples; an error at run time as `throw`
-    says.
-
-    Source: Rubinstein, 1999; Chua, Calandra, McAllister and Levine, 2018 (planning).
+    range, or not finite; an error at run time as `throw` says.
 
     !!! example
 
@@ -101,45 +155,5 @@ def cem(
         plan.cost
         ```
     """
-    where = "cem"
-    problem, start = as_problem(
-        dynamics, cost, x0, controls, t0, w, bounds, difference, None, where
-    )
-    controls = controls_of(start)
-    spread = as_spread(scale, correlation, controls, key, where)
-    sizes = as_samples(samples, iterations, where)
-    elites = check_count(elites, "elites", where)
-    if elites > sizes.count:
-        raise ValueError(
-            f"{where}: elites must be at most samples, {sizes.count}, got {elites}."
-        )
-    check_number(momentum, "momentum", where)
-    check_range(momentum, "momentum", where, 0, 1)
-    momentum = jnp.asarray(momentum, controls.dtype)
-    plan = _plan(problem, start, key, spread, momentum, sizes, elites)
-    return checked(plan, where) if throw else plan
-
-
-@eqx.filter_jit
-def _plan(
-    problem: Any,
-    start: Start,
-    key: Array,
-    spread: Any,
-    momentum: Array,
-    samples: Samples,
-    elites: int,
-) -> Plan:
-    def update(tried, costs, mean, width):
-        # Neither infinities nor what is compared need a derivative.
-        _, best = lax.top_k(-lax.stop_gradient(costs), elites)
-        weights = jnp.isfinite(costs[best]).astype(mean.dtype)
-        centre = average(weights, tried[best], mean)
-        variance = average(weights, (tried[best] - centre) ** 2, width**2)
-        spreads = variance > 0
-        after = jnp.where(spreads, jnp.sqrt(jnp.where(spreads, variance, 1)), 0)
-        blend = lambda old, new: momentum * old + (1 - momentum) * new
-        return blend(mean, centre), blend(width, after)
-
-    width = jnp.broadcast_to(spread.scale, controls_of(start).shape)
-    return search(problem, start, key, spread, samples, width, update)
+    planner = CEM(samples, iterations)
+    return planner(dynamics, cost, x0, controls, t0, w, bounds, key=key, throw=throw)

@@ -1,11 +1,11 @@
 """Constraints on states and controls, and what they add to the cost."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
 from .._module import check_parameters, function_field
 
@@ -53,16 +53,20 @@ class Constraints(eqx.Module):
         ```
     """
 
-    inequality: Callable[[Any, Any, Any], Any] | None = function_field(None)
-    equality: Callable[[Any, Any, Any], Any] | None = function_field(None)
-    final_inequality: Callable[[Any, Any], Any] | None = function_field(None)
-    final_equality: Callable[[Any, Any], Any] | None = function_field(None)
+    inequality: Callable[[Array, Array, Array], Any] | None = function_field(None)
+    equality: Callable[[Array, Array, Array], Any] | None = function_field(None)
+    final_inequality: Callable[[Array, Array], Any] | None = function_field(None)
+    final_equality: Callable[[Array, Array], Any] | None = function_field(None)
 
     def __check_init__(self):
         check_parameters(self)
         if self.inequality is None and self.equality is None:
             if self.final_inequality is None and self.final_equality is None:
                 raise ValueError("Constraints: at least one function must be given.")
+
+
+Values: TypeAlias = tuple[Float[Array, "*steps p"], Bool[Array, "*steps p"]]
+"""The values of constraints, inequalities first, and which are of equalities."""
 
 
 class Multipliers(NamedTuple):
@@ -73,45 +77,24 @@ class Multipliers(NamedTuple):
     rho: Array
 
 
-def values_of(functions: tuple[Any, Any], arguments: tuple, dtype: Any) -> Array:
-    """Of the inequalities, then the equalities, as one vector."""
-    found = [jnp.zeros(0, dtype)]
-    for function in functions:
-        if function is not None:
-            found.append(jnp.ravel(jnp.asarray(function(*arguments), dtype)))
-    return jnp.concatenate(found)
+def _stacked(functions: tuple[Any, Any], arguments: tuple, dtype: Any) -> Values:
+    """Of an inequality and an equality, either of which may be none."""
+    given = (jnp.zeros(0) if f is None else f(*arguments) for f in functions)
+    inequality, equality = (jnp.ravel(jnp.asarray(c, dtype)) for c in given)
+    c = jnp.concatenate([inequality, equality])
+    return c, jnp.arange(c.size) >= inequality.size
 
 
-def stage_values(constraints: Constraints, t: Any, x: Array, u: Array) -> Array:
+def at_stage(constraints: Constraints, t: Array, x: Array, u: Array) -> Values:
     """Of the constraints of a step."""
     functions = constraints.inequality, constraints.equality
-    return values_of(functions, (t, x, u), x.dtype)
+    return _stacked(functions, (t, x, u), x.dtype)
 
 
-def final_values(constraints: Constraints, t: Any, x: Array) -> Array:
+def at_end(constraints: Constraints, t: Array, x: Array) -> Values:
     """Of the constraints at the end."""
     functions = constraints.final_inequality, constraints.final_equality
-    return values_of(functions, (t, x), x.dtype)
-
-
-def is_equality(functions: tuple[Any, Any], arguments: tuple, dtype: Any) -> Array:
-    """Which entries of `values_of` are of equalities."""
-    size = lambda pair: eqx.filter_eval_shape(values_of, pair, arguments, dtype).size
-    first, second = functions
-    above, both = size((first, None)), size((first, second))
-    return jnp.arange(both) >= above
-
-
-def stage_equalities(constraints: Constraints, x: Array, u: Array) -> Array:
-    """Which of the constraints of a step are equalities."""
-    functions = constraints.inequality, constraints.equality
-    return is_equality(functions, (jnp.zeros((), x.dtype), x, u), x.dtype)
-
-
-def final_equalities(constraints: Constraints, x: Array) -> Array:
-    """Which of the constraints at the end are equalities."""
-    functions = constraints.final_inequality, constraints.final_equality
-    return is_equality(functions, (jnp.zeros((), x.dtype), x), x.dtype)
+    return _stacked(functions, (t, x), x.dtype)
 
 
 def augmented(c: Array, y: Array, rho: Array, equal: Array) -> Array:

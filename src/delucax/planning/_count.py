@@ -87,23 +87,22 @@ def count_evaluations(
     out = function(_Counted(dynamics, tally))
     jax.block_until_ready(eqx.filter(out, eqx.is_array))
     jax.effects_barrier()
-    found = tally.found
-    return out, Evaluations(found[PRIMAL], found[TANGENT], found[COTANGENT])
+    return out, Evaluations(*(tally.counts[kind] for kind in KINDS))
 
 
-PRIMAL, TANGENT, COTANGENT = "primal", "tangent", "cotangent"
+KINDS = PRIMAL, TANGENT, COTANGENT = "primal", "tangent", "cotangent"
 
 
 class _Tally:
     """A count on the host. Compiled code calls it, from any thread."""
 
     def __init__(self):
-        self.found: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()
         self.lock = threading.Lock()
 
     def add(self, kind: str, lanes: int) -> None:
         with self.lock:
-            self.found[kind] += lanes
+            self.counts[kind] += lanes
 
 
 class _Counted(AbstractWrapper):
@@ -127,15 +126,15 @@ only if it is."""
 
 
 def _called(x: Any, where: Any, *, tally: _Tally, kind: str, lanes: int) -> Array:
-    def count(seen):
-        del seen
+    def count(flag):
+        del flag
         tally.add(kind, lanes)
         return np.zeros((), bool)
 
     # Truth values alone go to the host and back, for its thread need not have the
     # precision of this one.
-    seen = jnp.any(x > 0) | jnp.any(where > 0)
-    wrong = jax.pure_callback(count, jax.ShapeDtypeStruct((), jnp.bool), seen)
+    flag = jnp.any(x > 0) | jnp.any(where > 0)
+    wrong = jax.pure_callback(count, jax.ShapeDtypeStruct((), jnp.bool), flag)
     return jnp.where(wrong, jnp.nan, x)
 
 

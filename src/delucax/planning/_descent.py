@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ._constraints import Multipliers
+from ._line_search import Iterate, search
 from ._lq import in_parallel, in_sequence, Policy, promised, Stages
 from ._problem import gaps_of, model, Problem
-from ._search import Found, search
-from ._start import begin, controls_of, count_of, Start
+from ._start import begin, controls_of, Start
 
 
 FACTOR = 2.0
@@ -52,17 +52,17 @@ class Outcome(NamedTuple):
     status: Array
     iterations: Array
     rollouts: Array
-    mu: Array
+    regularisation: Array
     violation: Array
     multipliers: Multipliers | None
 
 
 class _Progress(NamedTuple):
-    now: Found
+    now: Iterate
     gains: Array
     mu: Array
     delta: Array
-    curved: Array
+    exact: Array
     penalty: Array
     residual: Array
     trace: Array
@@ -103,21 +103,20 @@ def optimise(
     if before is not None:
         earlier = jnp.arange(options.max_iterations + 1) < iteration
         trace = jnp.where(earlier, before.trace, trace)
-    now = Found(
+    now = Iterate(
         states,
         controls,
         cost,
         gaps,
         jnp.asarray(True),
-        jnp.ones((), dtype),
-        rollouts + (count_of(start) if guess is None else 0),
+        rollouts + (start.count if guess is None else 0),
     )
     first = _Progress(
         now=now,
         gains=jnp.zeros((T, m, n), dtype),
         mu=zero,
         delta=jnp.ones((), dtype),
-        curved=jnp.asarray(True),
+        exact=jnp.asarray(True),
         penalty=zero,
         residual=jnp.full((), jnp.inf, dtype),
         trace=trace,
@@ -142,7 +141,7 @@ def optimise(
         last.iteration,
         last.now.rollouts,
         last.mu,
-        jnp.zeros((), dtype),
+        zero,
         problem.multipliers,
     )
 
@@ -152,7 +151,7 @@ def _iterate(
 ) -> _Progress:
     now, mu = before.now, before.mu
     about = problem, now.states, now.controls, now.gaps, options.second_order
-    stages = model(*about, before.curved, options.spacing)
+    stages = model(*about, before.exact, options.spacing)
     policy, residual, settled = directions(
         problem, stages, now.controls, mu, tolerance, options
     )
@@ -169,35 +168,31 @@ def _iterate(
     converged = policy.ok & (settled | spent)
     out_of_time = before.iteration >= options.max_iterations
     rest = now._replace(accepted=jnp.asarray(False))
-    found = lax.cond(
+    after = lax.cond(
         converged | out_of_time | ~policy.ok,
         lambda: rest,
         lambda: search(options.line_search, problem, now, policy, penalty, rounding),
     )
     # Where the second derivatives make the problem concave, or mislead, it is tried
     # without them first.
-    flatten = ~found.accepted & before.curved & options.second_order
-    changed = _schedule(found.accepted, mu, before.delta)
+    flatten = ~after.accepted & before.exact & options.second_order
+    changed = _schedule(after.accepted, mu, before.delta)
     keep = lambda old, new: jnp.where(flatten, old, new)
     mu, delta = jax.tree.map(keep, (mu, before.delta), changed)
-    curved = jnp.where(flatten, False, before.curved | found.accepted)
-    if options.line_search == "deluca":
-        stuck, mu = ~found.accepted & ~flatten, jnp.zeros_like(mu)
-    else:
-        stuck = mu > MOST_MU
-    stuck = stuck & ~converged & ~out_of_time
+    exact = jnp.where(flatten, False, before.exact | after.accepted)
+    stuck = (mu > MOST_MU) & ~converged & ~out_of_time
     ended = converged | out_of_time
     status = jnp.where(converged, CONVERGED, jnp.where(stuck, NO_DESCENT, 0))
     iteration = before.iteration + jnp.where(ended, 0, 1)
     return _Progress(
-        found,
+        after,
         jnp.where(policy.ok, policy.K, before.gains),
         jnp.where(ended, before.mu, mu),
         delta,
-        curved,
+        exact,
         penalty,
         residual,
-        before.trace.at[iteration].set(found.cost),
+        before.trace.at[iteration].set(after.cost),
         iteration,
         status,
         ended | stuck,
@@ -221,8 +216,8 @@ def directions(
     else:
         policy = in_sequence(stages, mu, options.on_state, box)
     if stages.d is not None:
-        slope, bent = promised(stages, policy.K, policy.k)
-        policy = policy._replace(slope=slope, curvature=bent)
+        slope, curvature = promised(stages, policy.K, policy.k)
+        policy = policy._replace(slope=slope, curvature=curvature)
     slope, enough = policy.gradient, tolerance * (1 + policy.scale)
     if box is None:
         residual = jnp.max(jnp.abs(slope))
@@ -236,7 +231,7 @@ def directions(
     return policy, jnp.max(jnp.abs(step)), jnp.all(small | met)
 
 
-def _rounding(stages: Stages, now: Found) -> Array:
+def _rounding(stages: Stages, now: Iterate) -> Array:
     """By how much rounding may change the cost: its own, and that of the states and
     controls that it is computed from, which weighs more where targets are far from
     zero."""
@@ -246,7 +241,7 @@ def _rounding(stages: Stages, now: Found) -> Array:
     return jnp.finfo(z.dtype).eps * (jnp.abs(now.cost) + terms)
 
 
-def _penalty(before: Array, now: Found, policy: Policy) -> Array:
+def _penalty(before: Array, now: Iterate, policy: Policy) -> Array:
     """A weight of the gaps with which the step goes downhill.
 
     Source: Nocedal and Wright, 2006, equation 18.36.

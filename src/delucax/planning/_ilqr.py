@@ -1,17 +1,23 @@
 """Iterative linear-quadratic regulator, and differential dynamic programming."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from .._check import check_count, check_positive, check_range
-from .._module import as_float_array
+from .._check import (
+    check_bool,
+    check_choice,
+    check_count,
+    check_positive,
+    check_range,
+)
+from .._module import as_float_array, parameter
 from .._results import choose, RESULTS
+from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ._arguments import as_problem, as_sequence, at_rest
 from ._constraints import Constraints
 from ._descent import (
     CONVERGED,
@@ -22,33 +28,14 @@ from ._descent import (
     Tolerances,
 )
 from ._implicit import solution
-from ._plan import checked, Plan
-from ._search import SEARCHES
+from ._line_search import SEARCHES
+from ._plan import Plan, plan_of
+from ._planner import AbstractPlanner, as_rows
+from ._problem import Problem
 from ._start import Start
 
 
-def ilqr(
-    dynamics: AbstractDynamics,
-    cost: AbstractCost,
-    x0: Any,
-    controls: Any,
-    t0: Any = 0.0,
-    w: Any = None,
-    bounds: Any = None,
-    *,
-    states: Any = None,
-    constraints: Constraints | None = None,
-    second_order: bool | None = None,
-    regularise: str = "control",
-    line_search: str = "backtracking",
-    parallel: bool = False,
-    finite_difference: float | None = None,
-    max_iterations: int = 500,
-    tolerance: Any = None,
-    constraint_tolerance: Any = None,
-    difference: Callable[[Any, Any], Any] | None = None,
-    throw: bool = True,
-) -> Plan:
+class ILQR(AbstractPlanner):
     r"""Controls that locally minimise the cost over a horizon, and feedback about them:
 
     `minimise sum over k < T of c(t_k, x_k, u_k) + final(t_T, x_T)`, along
@@ -65,6 +52,9 @@ def ilqr(
     `tolerance` times one plus the size of the terms that cancel in it, or what a step
     promises is below the rounding of the cost, and of the states and controls that go
     into it.
+
+    It is called as every [`delucax.planning.AbstractPlanner`][], and takes constraints,
+    by the method of multipliers.
 
     The plan is differentiable, in either mode and to any order, with respect to every
     array in `dynamics`, `cost`, `x0`, `w`, `t0` and `bounds`, by the implicit function
@@ -85,6 +75,143 @@ def ilqr(
 
     **Arguments:**
 
+    - `max_iterations`: 500 by default.
+    - `tolerance`: the square root of the precision by default (1.5e-8 in float64), or
+        the square of `finite_difference` if that is larger. At 0 all iterations are
+        taken.
+    - `constraint_tolerance`: by how much a constraint may be violated; the precision
+        to the power 0.4 by default (5.5e-7 in float64).
+    - `second_order`: if true, with the second derivatives of dynamics and constraints
+        (differential dynamic programming), except in iterations in which they would
+        make the problem concave: fewer iterations, each dearer. If false, without
+        them (Gauss-Newton), which is slow where multipliers are large. By default true
+        if there are constraints.
+    - `regularise`: `"control"` (default), which adds `mu` to the control Hessian, or
+        `"state"`, which adds it to that of the cost-to-go.
+    - `line_search`: `"backtracking"` (default), one step after the other; or
+        `"parallel"`, all at once, for accelerators.
+    - `parallel`: if true, the linear-quadratic problems are solved in parallel over
+        time, for long horizons on accelerators; in sequence by default.
+    - `finite_difference`: the spacing of the central differences by which the dynamics
+        are linearised, two calls of them for each state and control, such as 1e-2; by
+        default they are differentiated. The derivatives of the plan are exact in both
+        cases, those of the cost too.
+    - `states`: states to start from, shape `(T+1, n)`, which need not follow from
+        `controls` (multiple shooting), which are an array or the number of steps then,
+        for those of the equilibrium. The steps close the gaps. By default the states
+        follow from `controls`.
+
+    **Raises:** `ValueError` on an option of the wrong kind or out of its range,
+    `parallel` with `regularise="state"`, or `finite_difference` with `second_order`;
+    when it is called also on `parallel` with `bounds`.
+
+    Source: Li and Todorov, 2004; Tassa, Erez and Todorov, 2012; Tassa, Mansard and
+    Todorov, 2014 (bounds); Giftthaler et al., 2018 (multiple shooting); Howell, Jackson
+    and Manchester, 2019 (constraints).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        cost = dlx.costs.Quadratic([1.0, 0.1], [0.1], final=[100.0, 10.0])
+        planner = dlx.planning.ILQR(second_order=True, tolerance=1e-4)
+        plan = planner(dynamics, cost, jnp.array([0.5, 0.0]), 40, bounds=(-6.0, 6.0))
+        plan.cost, plan.iterations
+        ```
+    """
+
+    max_iterations: int = eqx.field(default=500, static=True)
+    tolerance: Array | None = parameter(None)
+    constraint_tolerance: Array | None = parameter(None)
+    second_order: bool | None = eqx.field(default=None, static=True)
+    regularise: str = eqx.field(default="control", static=True)
+    line_search: str = eqx.field(default="backtracking", static=True)
+    parallel: bool = eqx.field(default=False, static=True)
+    finite_difference: float | None = eqx.field(default=None, static=True)
+    states: Float[Array, "steps n"] | None = parameter(None)
+
+    def __check_init__(self):
+        where = "ILQR"
+        check_count(self.max_iterations, "max_iterations", where)
+        for name in ("tolerance", "constraint_tolerance"):
+            if getattr(self, name) is not None:
+                check_range(getattr(self, name), name, where)
+        check_choice(self.regularise, ("control", "state"), "regularise", where)
+        check_choice(self.line_search, SEARCHES, "line_search", where)
+        check_bool(self.parallel, "parallel", where)
+        if self.parallel and self.regularise == "state":
+            raise ValueError(f"{where}: {_IN_SEQUENCE}")
+        if self.finite_difference is not None:
+            check_positive(self.finite_difference, "finite_difference", where)
+            if self.second_order:
+                raise ValueError(
+                    f"{where}: finite_difference goes without second_order, got both."
+                )
+
+    @property
+    def starts_from_states(self) -> bool:
+        return self.states is not None
+
+    def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
+        del key
+        where, dtype = "ILQR", start.controls.dtype
+        if self.parallel and problem.low is not None:
+            raise ValueError(f"{where}: {_IN_SEQUENCE}")
+        guess = self.states
+        if guess is not None:
+            shape = start.horizon + 1, problem.dynamics.state_size
+            guess = as_rows(guess, *shape, "states", where).astype(dtype)
+        eps, spacing = float(jnp.finfo(dtype).eps), self.finite_difference
+        tolerance, feasible = self.tolerance, self.constraint_tolerance
+        if tolerance is None:
+            # What differences leave over is no descent direction of the true cost.
+            tolerance = max(eps**0.5, (spacing or 0.0) ** 2)
+        if feasible is None:
+            feasible = eps**0.4
+        second_order = self.second_order
+        if second_order is None:
+            second_order = problem.constraints is not None and spacing is None
+        options = Options(
+            second_order=bool(second_order),
+            on_state=self.regularise == "state",
+            line_search=self.line_search,
+            parallel=self.parallel,
+            max_iterations=self.max_iterations,
+            spacing=None if spacing is None else float(spacing),
+        )
+        tolerances = (as_float_array(t).astype(dtype) for t in (tolerance, feasible))
+        return _solve(problem, start, guess, Tolerances(*tolerances), options)
+
+
+_IN_SEQUENCE = (
+    "parallel=True goes without bounds and with regularise='control'; solve in "
+    "sequence otherwise."
+)
+
+
+def ilqr(
+    dynamics: AbstractDynamics,
+    cost: AbstractCost,
+    x0: Any,
+    controls: Any,
+    t0: Any = 0.0,
+    w: Any = None,
+    bounds: Any = None,
+    *,
+    constraints: Constraints | None = None,
+    max_iterations: int = 500,
+    tolerance: Any = None,
+    throw: bool = True,
+) -> Plan:
+    r"""Controls that locally minimise the cost over a horizon, and feedback about them,
+    by the iterative linear-quadratic regulator: the short call of
+    [`delucax.planning.ILQR`][], which says how, and has further options.
+
+    **Arguments:**
+
     - `dynamics`: the discrete-time dynamics.
     - `cost`: the stage and final cost.
     - `x0`: the first state, shape `(n,)`.
@@ -96,38 +223,11 @@ def ilqr(
     - `w`: disturbances known in advance, shape `(T, k)`; zero by default.
     - `bounds`: `(low, high)`, each a number or of shape `(m,)`, between which every
         control is kept; none by default.
-    - `states`: states to start from, shape `(T+1, n)`, which need not follow from
-        `controls` (multiple shooting), which are an array or the number of steps then,
-        for those of the equilibrium. The steps close the gaps. By default the states
-        follow from `controls`.
     - `constraints`: [`delucax.planning.Constraints`][] on states and controls, by the
         method of multipliers; none by default.
-    - `second_order`: if true, with the second derivatives of dynamics and constraints
-        (differential dynamic programming), except in iterations in which they would
-        make the problem concave: fewer iterations, each dearer. If false, without
-        them (Gauss-Newton), which is slow where multipliers are large. By default true
-        if there are constraints.
-    - `regularise`: `"control"` (default), which adds `mu` to the control Hessian, or
-        `"state"`, which adds it to that of the cost-to-go.
-    - `line_search`: `"backtracking"` (default), one step after the other;
-        `"parallel"`, all at once, for accelerators; or `"deluca"`, the search of the
-        original library for comparison: ten candidates `a 1.1^(1 - j^2)`, of which the
-        first that is not worse is taken and is the next `a`, which may grow beyond 1,
-        and no regularisation.
-    - `parallel`: if true, the linear-quadratic problems are solved in parallel over
-        time, for long horizons on accelerators; in sequence by default.
-    - `finite_difference`: the spacing of the central differences by which the dynamics
-        are linearised, two calls of them for each state and control, such as 1e-2; by
-        default they are differentiated. The derivatives of the plan are exact in both
-        cases, those of the cost too.
     - `max_iterations`: 500 by default.
-    - `tolerance`: the square root of the precision by default (1.5e-8 in float64), or
-        the square of `finite_difference` if that is larger. At 0 all iterations are
-        taken.
-    - `constraint_tolerance`: by how much a constraint may be violated; the precision
-        to the power 0.4 by default (5.5e-7 in float64).
-    - `difference`: `(x, x_ref) -> deviation`, such as `system.difference`, which wraps
-        angles, for dynamics that wrap them; subtraction by default.
+    - `tolerance`: the square root of the precision by default (1.5e-8 in float64). At 0
+        all iterations are taken.
     - `throw`: raise unless converged (default); if false, look at `plan.result`, which
         is `not_converged`, `no_descent`, `infeasible` if no weight makes the
         constraints hold, or `diverged` if every start diverges: the plan is then
@@ -138,13 +238,8 @@ def ilqr(
         added to it, and its derivatives are NaN.
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, or not finite, a
-    horizon of 0, a lower bound above an upper one, `parallel` with `bounds` or
-    `regularise="state"`, or `finite_difference` with `second_order`; an error at run
-    time as `throw` says.
-
-    Source: Li and Todorov, 2004; Tassa, Erez and Todorov, 2012; Tassa, Mansard and
-    Todorov, 2014 (bounds); Giftthaler et al., 2018 (multiple shooting); Howell, Jackson
-    and Manchester, 2019 (constraints).
+    horizon of 0, or a lower bound above an upper one; an error at run time as `throw`
+    says.
 
     !!! example
 
@@ -167,68 +262,18 @@ def ilqr(
         plan.cost, jax.grad(optimal)(1.0)
         ```
     """
-    where = "ilqr"
-    if states is not None:
-        controls = at_rest(dynamics, cost, controls, where)
-    problem, start = as_problem(
-        dynamics, cost, x0, controls, t0, w, bounds, difference, constraints, where
-    )
-    guess, dtype = None, start.controls.dtype
-    if states is not None:
-        shape = start.controls.shape[0] + 1, dynamics.state_size
-        guess = as_sequence(states, *shape, "states", where).astype(dtype)
-    if regularise not in ("control", "state"):
-        raise ValueError(
-            f"{where}: regularise must be 'control' or 'state', got {regularise!r}."
-        )
-    if line_search not in SEARCHES:
-        raise ValueError(
-            f"{where}: line_search must be one of {', '.join(map(repr, SEARCHES))}, "
-            f"got {line_search!r}."
-        )
-    plain = guess is None and constraints is None
-    if line_search == "deluca" and not plain:
-        raise ValueError(
-            f"{where}: line_search='deluca' goes without states and constraints; use "
-            "'parallel' or 'backtracking'."
-        )
-    if parallel and (bounds is not None or regularise == "state"):
-        raise ValueError(
-            f"{where}: parallel=True goes without bounds and with "
-            "regularise='control'; solve in sequence otherwise."
-        )
-    eps = float(jnp.finfo(dtype).eps)
-    if tolerance is None:
-        # What differences leave over is no descent direction of the true cost.
-        tolerance = max(eps**0.5, (finite_difference or 0.0) ** 2)
-    check_range(tolerance, "tolerance", where)
-    feasible = eps**0.4 if constraint_tolerance is None else constraint_tolerance
-    check_range(feasible, "constraint_tolerance", where)
-    if finite_difference is not None:
-        check_positive(finite_difference, "finite_difference", where)
-        finite_difference = float(finite_difference)
-    if finite_difference is not None and second_order:
-        raise ValueError(
-            f"{where}: finite_difference goes without second_order, got both."
-        )
-    if second_order is None:
-        second_order = constraints is not None and finite_difference is None
-    options = Options(
-        second_order=bool(second_order),
-        on_state=regularise == "state",
-        line_search=line_search,
-        parallel=bool(parallel),
-        max_iterations=check_count(max_iterations, "max_iterations", where),
-        spacing=finite_difference,
-    )
-    tolerances = (as_float_array(t).astype(dtype) for t in (tolerance, feasible))
-    plan = _plan(problem, start, guess, Tolerances(*tolerances), options)
-    return checked(plan, where) if throw else plan
+    planner = ILQR(max_iterations, tolerance)
+    given = dynamics, cost, x0, controls, t0, w, bounds
+    return planner(*given, constraints=constraints, throw=throw)
 
 
 @eqx.filter_jit
-def _plan(
-    problem: Any, start: Start, guess: Any, tolerances: Any, options: Options
+def _solve(
+    problem: Problem,
+    start: Start,
+    guess: Array | None,
+    tolerances: Tolerances,
+    options: Options,
 ) -> Plan:
     out = solution(problem, start, guess, tolerances, options=options)
     result = RESULTS.not_converged
@@ -239,21 +284,7 @@ def _plan(
         (INFEASIBLE, RESULTS.infeasible),
     ):
         result = choose(out.status == code, kind, result)
-    return Plan(
-        states=out.states,
-        controls=out.controls,
-        gains=out.gains,
-        cost=out.cost,
-        trace=out.trace,
-        residual=out.residual,
-        violation=out.violation,
-        result=result,
-        iterations=out.iterations,
-        rollouts=out.rollouts,
-        regularisation=out.mu,
-        t0=problem.t0,
-        dt=problem.dynamics.dt,
-        low=problem.low,
-        high=problem.high,
-        difference=problem.difference,
-    )
+    rest = out._asdict()
+    for name in ("status", "multipliers"):
+        del rest[name]
+    return plan_of(problem, **rest, result=result)

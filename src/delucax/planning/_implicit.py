@@ -16,13 +16,7 @@ from jaxtyping import Array
 from .._jax import by_lanes, poison
 from ..math import matvec
 from ._augmented import with_constraints
-from ._constraints import (
-    final_equalities,
-    final_values,
-    Multipliers,
-    stage_equalities,
-    stage_values,
-)
+from ._constraints import Multipliers
 from ._descent import CONVERGED, Options, Outcome, Tolerances
 from ._lq import apply, in_parallel, in_sequence, product, solve_free, Stages
 from ._problem import costates_of, model, Problem
@@ -58,10 +52,7 @@ def _solution_jvp(primals: Any, tangents: Any, *, options: Options) -> Any:
 def _with_tangents(primals: Any, tangents: Any, options: Options) -> Any:
     out = solution(*primals, options=options)
     problem, change = primals[0], tangents[0]
-    fields = {name: None for name in Outcome._fields}
-    if out.multipliers is not None:
-        fields["multipliers"] = Multipliers(None, None, None)  # pyright: ignore
-    nothing = Outcome(**fields)  # pyright: ignore[reportArgumentType]
+    nothing = jax.tree.map(lambda _: None, out)
     if not jax.tree.leaves(change):
         return out, nothing
     is_none = lambda leaf: leaf is None
@@ -85,25 +76,17 @@ def _with_tangents(primals: Any, tangents: Any, options: Options) -> Any:
         return given(varied).total(X, U)
 
     def gains(varied, X, U, y):
-        stages = model(held_at(given(varied), y), X, U, None, options.second_order)
+        problem = given(varied).with_multipliers(y)
+        stages = model(problem, X, U, None, options.second_order)
         if options.parallel:
-            return in_parallel(stages, out.mu).K
-        return in_sequence(stages, out.mu, options.on_state, None, free).K
+            return in_parallel(stages, out.regularisation).K
+        return in_sequence(stages, out.regularisation, options.on_state, None, free).K
 
     _, dJ = jax.jvp(cost, (varied, X, U), (change, dX, dU))
     _, dK = jax.jvp(gains, (varied, X, U, y), (change, dX, dU, dy))
     ok = solved & definite
     dX, dU, dK, dJ = (poison(d, ok) for d in (dX, dU, dK, dJ))
     return out, nothing._replace(states=dX, controls=dU, gains=dK, cost=dJ)
-
-
-def held_at(problem: Problem, multipliers: Multipliers | None) -> Problem:
-    """The problem with the multipliers given."""
-    if multipliers is None:
-        return problem
-    return eqx.tree_at(
-        lambda p: p.multipliers, problem, multipliers, is_leaf=lambda p: p is None
-    )
 
 
 def _change(
@@ -114,29 +97,26 @@ def _change(
     n, T = X.shape[1], U.shape[0]
     # Without the squares the augmented Lagrangian is the Lagrangian.
     plain = None if y is None else y._replace(rho=jnp.zeros_like(y.rho))
-    stages = model(held_at(problem, plain), X, U, None, True)
+    stages = model(problem.with_multipliers(plain), X, U, None, True)
     costates = costates_of(stages.F, stages.h, stages.v)
     z = jnp.concatenate([X[:-1], U], axis=1)
 
     def conditions(varied):
-        problem = held_at(given(varied), plain)
+        problem = given(varied).with_multipliers(plain)
         times = problem.times(T)
 
         def lagrangian(z, t, w, y, costate):
             after = problem.step(t, z[:n], z[n:], w)
-            charged = problem.charged(t, z[:n], z[n:], y)
-            return charged + costate @ after, after
+            cost = problem.stage_cost(t, z[:n], z[n:], y)
+            return cost + costate @ after, after
 
         each = jax.vmap(jax.grad(lagrangian, has_aux=True))
         h, after = each(z, times[:-1], problem.w, problem.stage_multipliers, costates)
-        v = jax.grad(lambda x: problem.final(times[-1], x))(X[-1])
-        held = None
-        constraints = problem.constraints
-        if constraints is not None:
-            here = lambda z, t: stage_values(constraints, t, z[:n], z[n:])
-            last = final_values(constraints, times[-1], X[-1])
-            held = jax.vmap(here)(z, times[:-1]), last
-        return (h, after, v), problem.x0, (problem.low, problem.high), held
+        v = jax.grad(lambda x: problem.final_cost(times[-1], x))(X[-1])
+        c = None
+        if problem.constraints is not None:
+            c = [c for c, _ in problem.constraints_along(X, U)]
+        return (h, after, v), problem.x0, (problem.low, problem.high), c
 
     at, linear = jax.jvp(conditions, (varied,), (change,))
     ((slope, *_), *_), ((h, d, v), dx0, (dlow, dhigh), dc) = at, linear
@@ -158,14 +138,12 @@ def _change(
 
 def _active(problem: Problem, X: Array, U: Array, z: Array, y: Multipliers):
     """The slopes of the constraints that hold with equality; zero for the others."""
-    constraints, n = problem.constraints, X.shape[1]
-    assert constraints is not None
-    times = problem.times(U.shape[0])
-    here = lambda z, t: stage_values(constraints, t, z[:n], z[n:])
-    slope = jax.vmap(jax.jacfwd(here))(z, times[:-1])
-    last = jax.jacfwd(lambda x: final_values(constraints, times[-1], x))(X[-1])
-    on = stage_equalities(constraints, X[0], U[0]) | (y.stage > 0)
-    at_end = final_equalities(constraints, X[0]) | (y.final > 0)
+    n, times = X.shape[1], problem.times(U.shape[0])
+    stage = lambda z, t: problem.stage_constraints(t, z[:n], z[n:])
+    final = lambda x: problem.final_constraints(times[-1], x)
+    slope, equal = jax.vmap(jax.jacfwd(stage, has_aux=True))(z, times[:-1])
+    last, equal_at_end = jax.jacfwd(final, has_aux=True)(X[-1])
+    on, at_end = equal | (y.stage > 0), equal_at_end | (y.final > 0)
     slope = jnp.where(on[..., None], slope, 0)
     return (slope, on), (jnp.where(at_end[:, None], last, 0), at_end)
 

@@ -136,17 +136,17 @@ def in_sequence(
         ok = ok & jnp.all(jnp.isfinite(k))
         K, k = jnp.where(ok, K, 0), jnp.where(ok, k, 0)
         # In this form nothing is assumed of K and k.
-        bent = apply(Quu, k)
+        Quu_k = apply(Quu, k)
         D = product(K.T, product(Quu, K) - Qux)
         V = M[:n, :n] + D - product(Qux.T, K)
-        v = g[:n] + apply(K.T, bent - Qu) - apply(Qux.T, k)
-        kept = K, k, Qu, pushed[n:], bent, ok
+        v = g[:n] + apply(K.T, Quu_k - Qu) - apply(Qux.T, k)
+        kept = K, k, Qu, pushed[n:], Quu_k, ok
         return ((V + V.T) / 2, v), kept
 
     xs = (stages.F, stages.H, stages.h, stages.d, box, free)
     _, kept = lax.scan(back, (stages.V, stages.v), xs, reverse=True)
-    K, k, Qu, pushed, bent, ok = kept
-    slope, curvature = -jnp.sum(k * Qu), jnp.sum(k * bent)
+    K, k, Qu, pushed, Quu_k, ok = kept
+    slope, curvature = -jnp.sum(k * Qu), jnp.sum(k * Quu_k)
     scale = jnp.max(jnp.abs(pushed))
     return Policy(K, k, Qu, scale, slope, curvature, jnp.all(ok))
 
@@ -198,9 +198,9 @@ def box_minimum(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Arr
         newton, _ = solve_free(H, -slope[:, None], free)
         step = jnp.where(free, newton[:, 0], plain)
         tried = jnp.clip(u + lengths[:, None] * step, low, high)
-        found = jax.vmap(value)(tried)
-        best = tried[jnp.argmin(found)]
-        lower = jnp.min(found) < value(u)
+        values = jax.vmap(value)(tried)
+        best = tried[jnp.argmin(values)]
+        lower = jnp.min(values) < value(u)
         after = jnp.where(lower, best, u)
         going = lower & (left > slack * (1 + jnp.max(jnp.abs(u))))
         return after, going, count + 1

@@ -1,6 +1,5 @@
 """Model predictive path integral planning."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -8,13 +7,78 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_number, check_positive
+from .._module import parameter
 from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ._arguments import as_problem
-from ._plan import checked, Plan
-from ._sampling import above_least, as_samples, as_spread, average, Samples, search
-from ._start import controls_of, Start
+from ._plan import Plan
+from ._sampling import AbstractSampler, average, check_sampler
+
+
+class MPPI(AbstractSampler):
+    r"""Controls by sampling, for costs and dynamics that need not be smooth:
+
+    `u_k <- sum over i of v_i u_k^i`, with `v_i` proportional to
+    `exp(-cost^i / temperature)`, over sequences `u^i` drawn about the present one.
+
+    This is model predictive path integral control. The cost of a sequence is the whole
+    cost of its trajectory, without a further charge for leaving the present one. A
+    sequence that diverges has no weight. The plan is the best of the means, the start
+    among them, so it costs no more than the start. It has no gains. It is
+    differentiable in whatever the costs are, for the numbers that were drawn.
+
+    It is called as every [`delucax.planning.AbstractPlanner`][], with a `key`, and
+    without constraints.
+
+    **Arguments:**
+
+    - `samples`: sequences drawn in an iteration, 256 by default.
+    - `iterations`: 10 by default.
+    - `scale`: the standard deviation of the controls drawn, a number or of shape
+        `(m,)`; 1 by default.
+    - `correlation`: of a control drawn with the one before it, from 0, white noise, by
+        default, to 1, a constant.
+    - `temperature`: in the unit of the cost, 1 by default. The lower it is, the fewer
+        of the best sequences count.
+
+    **Raises:** `ValueError` on an option out of its range.
+
+    Source: Williams, Wagener, Goldfain, Drews, Rehg, Boots and Theodorou, 2017.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        planner = dlx.planning.MPPI(temperature=0.1, correlation=0.8)
+        plan = planner(
+            env.dynamics, env.cost, jnp.array([0.5, 0.0]), 20, key=jax.random.key(0)
+        )
+        plan.cost
+        ```
+    """
+
+    samples: int = eqx.field(default=256, static=True)
+    iterations: int = eqx.field(default=10, static=True)
+    scale: Array = parameter(1.0)
+    correlation: Array = parameter(0.0)
+    temperature: Array = parameter(1.0)
+
+    def __check_init__(self):
+        check_sampler(self)
+        check_number(self.temperature, "temperature", "MPPI")
+        check_positive(self.temperature, "temperature", "MPPI")
+
+    def update(self, drawn, costs, mean, width):
+        finite, least = jnp.isfinite(costs), jnp.min(costs)
+        least = jnp.where(jnp.isfinite(least), least, 0)
+        above = jnp.where(finite, costs, least) - least
+        temperature = self.temperature.astype(mean.dtype)
+        weights = jnp.where(finite, jnp.exp(-above / temperature), 0)
+        return average(weights, drawn, mean), width
 
 
 def mppi(
@@ -29,22 +93,10 @@ def mppi(
     key: PRNGKey,
     samples: int = 256,
     iterations: int = 10,
-    scale: Any = 1.0,
-    correlation: Any = 0.0,
-    temperature: Any = 1.0,
-    difference: Callable[[Any, Any], Any] | None = None,
     throw: bool = True,
 ) -> Plan:
-    r"""Controls by sampling, for costs and dynamics that need not be smooth:
-
-    `u_k <- sum over i of v_i u_k^i`, with `v_i` proportional to
-    `exp(-cost^i / temperature)`, over sequences `u^i` drawn about the present one.
-
-    This is model predictive path integral control. The cost of a sequence is the whole
-    cost of its trajectory, without a further charge for leaving the present one. A
-    sequence that diverges has no weight. The plan is the best of the means, the start
-    among them, so it costs no more than the start. It has no gains. It is
-    differentiable in whatever the costs are, for the numbers that were drawn.
+    r"""Controls by model predictive path integral planning: the short call of
+    [`delucax.planning.MPPI`][], which has further options.
 
     **Arguments:**
 
@@ -59,14 +111,6 @@ def mppi(
     - `key`: a random key.
     - `samples`: sequences drawn in an iteration, 256 by default.
     - `iterations`: 10 by default.
-    - `scale`: the standard deviation of the controls drawn, a number or of shape
-        `(m,)`; 1 by default.
-    - `correlation`: of a control drawn with the one before it, from 0, white noise, by
-        default, to 1, a constant.
-    - `temperature`: in the unit of the cost, 1 by default. The lower it is, the fewer
-        of the best sequences count.
-    - `difference`: `(x, x_ref) -> deviation`, which the plan keeps; subtraction by
-        default.
     - `throw`: raise if the start and all means diverge (default); if false, look at
         `plan.result`, which is `diverged` then.
 
@@ -74,8 +118,6 @@ def mppi(
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, out of its
     range, or not finite; an error at run time as `throw` says.
-
-    Source: Williams, Wagener, Goldfain, Drews, Rehg, Boots and Theodorou, 2017.
 
     !!! example
 
@@ -96,32 +138,5 @@ def mppi(
         plan.cost
         ```
     """
-    where = "mppi"
-    problem, start = as_problem(
-        dynamics, cost, x0, controls, t0, w, bounds, difference, None, where
-    )
-    controls = controls_of(start)
-    spread = as_spread(scale, correlation, controls, key, where)
-    check_number(temperature, "temperature", where)
-    check_positive(temperature, "temperature", where)
-    temperature = jnp.asarray(temperature, controls.dtype)
-    sizes = as_samples(samples, iterations, where)
-    plan = _plan(problem, start, key, spread, temperature, sizes)
-    return checked(plan, where) if throw else plan
-
-
-@eqx.filter_jit
-def _plan(
-    problem: Any,
-    start: Start,
-    key: Array,
-    spread: Any,
-    temperature: Array,
-    samples: Samples,
-) -> Plan:
-    def update(tried, costs, mean, width):
-        above, finite = above_least(costs)
-        weights = jnp.where(finite, jnp.exp(-above / temperature), 0)
-        return average(weights, tried, mean), width
-
-    return search(problem, start, key, spread, samples, spread.scale, update)
+    planner = MPPI(samples, iterations)
+    return planner(dynamics, cost, x0, controls, t0, w, bounds, key=key, throw=throw)

@@ -12,6 +12,7 @@ from .._module import function_field, parameter, weight
 from .._results import Result, RESULTS
 from ..math import matvec
 from ..math._steps import row_at, step_at
+from ._problem import Problem
 
 
 class Plan(AbstractController):
@@ -22,7 +23,7 @@ class Plan(AbstractController):
     between the bounds that it was planned with. Outside the horizon the control is NaN,
     which a rollout reports. [`delucax.planning.ilqr`][] makes it, and so do
     [`delucax.planning.mppi`][] and [`delucax.planning.cem`][], without gains, and
-    [`delucax.controllers.ILC`][] and [`delucax.controllers.iGPC`][].
+    [`delucax.planning.ilc`][] and [`delucax.planning.igpc`][].
 
     **Arguments:**
 
@@ -92,6 +93,17 @@ class Plan(AbstractController):
                     f"{self.controls.shape[1:]}, got {end.shape}."
                 )
 
+    @property
+    def is_usable(self) -> Array:
+        """Whether the planner has a plan to use: it did not diverge, and the
+        constraints can hold.
+
+        A plan of too few iterations, or whose search failed, is the best so far.
+        """
+        finite = jnp.all(jnp.isfinite(self.controls), axis=(-2, -1))
+        lost = (self.result == RESULTS.diverged) | (self.result == RESULTS.infeasible)
+        return finite & ~lost
+
     def __call__(self, t, y, state):
         size = self.states.shape[1]
         if y.shape != (size,):
@@ -106,7 +118,26 @@ class Plan(AbstractController):
         return u.astype(y.dtype), state
 
 
-def checked(plan: Plan, where: str) -> Plan:
+def plan_of(
+    problem: Problem, states: Array, controls: Array, cost: Array, **rest: Any
+) -> Plan:
+    """A plan for a problem."""
+    zero = jnp.zeros((), cost.dtype)
+    defaults = dict(violation=zero, regularisation=zero)
+    return Plan(
+        states=states,
+        controls=controls,
+        cost=cost,
+        t0=problem.t0,
+        dt=problem.dynamics.dt,
+        low=problem.low,
+        high=problem.high,
+        difference=problem.difference,
+        **(defaults | rest),
+    )
+
+
+def raise_on_failure(plan: Plan, where: str) -> Plan:
     """Raise unless the plan is a solution: now if it can be seen, else at run time."""
     failed = plan.result != RESULTS.successful
     if not is_concrete(failed):

@@ -1,5 +1,6 @@
 """What is planned: dynamics, a cost, a start; its trajectories and its local model."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -15,13 +16,12 @@ from ..dynamics import AbstractDynamics
 from ..dynamics._runge_kutta import join_state, split_state, stack_steps
 from ..math import matvec
 from ._constraints import (
+    at_end,
+    at_stage,
     augmented,
     Constraints,
-    final_equalities,
-    final_values,
     Multipliers,
-    stage_equalities,
-    stage_values,
+    Values,
 )
 from ._lq import Stages
 
@@ -39,7 +39,7 @@ class Problem(eqx.Module):
     w: Array | None
     low: Array | None
     high: Array | None
-    difference: Any
+    difference: Callable[[Array, Array], Array] | None
     constraints: Constraints | None
     multipliers: Multipliers | None = None
 
@@ -58,33 +58,53 @@ class Problem(eqx.Module):
             return u
         return jnp.minimum(jnp.maximum(u, self.low), self.high)
 
-    def step(self, t: Array, x: Array, u: Array, w: Any) -> Array:
+    def step(self, t: Array, x: Array, u: Array, w: Array | None) -> Array:
         """The next state."""
         return self.dynamics.advance(t, x, u, w)[0].astype(x.dtype)
 
-    def added(self, t: Array, x: Array, u: Array, y: Any) -> Array | float:
-        """What the constraints add to the cost of a step."""
-        if self.multipliers is None or self.constraints is None:
-            return 0.0
-        c = stage_values(self.constraints, t, x, u)
-        equal = stage_equalities(self.constraints, x, u)
-        return augmented(c, y, self.multipliers.rho, equal)
+    def stage_constraints(self, t: Array, x: Array, u: Array) -> Values:
+        """The values of the constraints of a step."""
+        assert self.constraints is not None
+        return at_stage(self.constraints, t, x, u)
 
-    def charged(self, t: Array, x: Array, u: Array, y: Any) -> Array:
-        """The cost of a step."""
-        return self.cost(t, x, u) + self.added(t, x, u, y)
+    def final_constraints(self, t: Array, x: Array) -> Values:
+        """The values of the constraints at the end."""
+        assert self.constraints is not None
+        return at_end(self.constraints, t, x)
 
-    def final(self, t: Array, x: Array) -> Array:
-        """The cost at the end."""
+    def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
+        """The values of the constraints of all steps, and at the end."""
+        times = self.times(controls.shape[0])
+        stage = jax.vmap(self.stage_constraints)(times[:-1], states[:-1], controls)
+        return stage, self.final_constraints(times[-1], states[-1])
+
+    def with_multipliers(self, multipliers: Multipliers | None) -> "Problem":
+        """The problem whose cost is the augmented Lagrangian with these, if any."""
+        if multipliers is None:
+            return self
+        return eqx.tree_at(
+            lambda p: p.multipliers, self, multipliers, is_leaf=lambda p: p is None
+        )
+
+    def stage_cost(self, t: Array, x: Array, u: Array, y: Array | None) -> Array:
+        """The cost of a step, and what the constraints add to it."""
+        cost = self.cost(t, x, u)
+        if self.multipliers is None or y is None:
+            return cost + 0.0  # an integer cost has a gradient then
+        c, equal = self.stage_constraints(t, x, u)
+        return cost + augmented(c, y, self.multipliers.rho, equal)
+
+    def final_cost(self, t: Array, x: Array) -> Array:
+        """The cost at the end, and what the constraints add to it."""
         cost = self.cost.final(t, x)
-        if self.multipliers is None or self.constraints is None:
+        if self.multipliers is None:
             return cost
-        c = final_values(self.constraints, t, x)
+        c, equal = self.final_constraints(t, x)
         _, y, rho = self.multipliers
-        return cost + augmented(c, y, rho, final_equalities(self.constraints, x))
+        return cost + augmented(c, y, rho, equal)
 
     @property
-    def stage_multipliers(self) -> Any:
+    def stage_multipliers(self) -> Array | None:
         """Those of the steps."""
         return None if self.multipliers is None else self.multipliers.stage
 
@@ -92,8 +112,8 @@ class Problem(eqx.Module):
         """The cost of a trajectory."""
         times = self.times(controls.shape[0])
         each = (times[:-1], states[:-1], controls, self.stage_multipliers)
-        final = self.final(times[-1], states[-1])
-        return (jnp.sum(jax.vmap(self.charged)(*each)) + final).astype(states.dtype)
+        final = self.final_cost(times[-1], states[-1])
+        return (jnp.sum(jax.vmap(self.stage_cost)(*each)) + final).astype(states.dtype)
 
 
 def roll_out(
@@ -151,12 +171,12 @@ def model(
     controls: Array,
     gaps: Array | None,
     second_order: bool,
-    curved: Array | None = None,
+    use_exact: Array | None = None,
     spacing: float | None = None,
 ) -> Stages:
     """The linear-quadratic model of the problem about a trajectory.
 
-    The second derivatives of dynamics and constraints are left out where `curved` is
+    The second derivatives of dynamics and constraints are left out where `use_exact` is
     false. With a `spacing` the dynamics are linearised by central differences.
     """
     horizon, size = controls.shape[0], states.shape[1]
@@ -166,56 +186,53 @@ def model(
     def step(z, t, w):
         return problem.step(t, z[:size], z[size:], w)
 
-    def charged(z, t, y):
-        return problem.charged(t, z[:size], z[size:], y)
+    def stage_cost(z, t, y):
+        return problem.stage_cost(t, z[:size], z[size:], y)
 
-    def bent(z, t, y):
-        """The cost, with the constraints as their linear parts squared."""
-        constraints = problem.constraints
-        if problem.multipliers is None or constraints is None:
-            return jax.hessian(charged)(z, t, y)
-        c = lambda z: stage_values(constraints, t, z[:size], z[size:])
-        equal = stage_equalities(constraints, z[:size], z[size:])
+    def stage_hessian(z, t, y):
+        """That of the cost, with the constraints as their linear parts squared."""
+        if problem.multipliers is None:
+            return jax.hessian(stage_cost)(z, t, y)
+        c = lambda z: problem.stage_constraints(t, z[:size], z[size:])
         cost = jax.hessian(lambda z: problem.cost(t, z[:size], z[size:]))(z)
-        return cost + squared(c, z, y, problem.multipliers.rho, equal)
+        return cost + squared(c, z, y, problem.multipliers.rho)
 
     y = problem.stage_multipliers
-    v = jax.grad(lambda x: problem.final(times[-1], x))(states[-1])
+    v = jax.grad(lambda x: problem.final_cost(times[-1], x))(states[-1])
     if spacing is None:
         slopes = jacobian(step)
     else:
         slopes = central(step, spacing, problem.deviation)
     F = jax.vmap(slopes)(z, times[:-1], problem.w)
-    h = jax.vmap(jax.grad(charged))(z, times[:-1], y)
-    H = jax.vmap(bent)(z, times[:-1], y)
+    h = jax.vmap(jax.grad(stage_cost))(z, times[:-1], y)
+    H = jax.vmap(stage_hessian)(z, times[:-1], y)
     V = jax.hessian(lambda x: problem.cost.final(times[-1], x))(states[-1])
-    constraints = problem.constraints
-    if problem.multipliers is not None and constraints is not None:
-        c = lambda x: final_values(constraints, times[-1], x)
-        equal = final_equalities(constraints, states[-1])
-        V = V + squared(c, states[-1], *problem.multipliers[1:], equal)
+    if problem.multipliers is not None:
+        c = lambda x: problem.final_constraints(times[-1], x)
+        V = V + squared(c, states[-1], *problem.multipliers[1:])
     if second_order:
         costates = costates_of(F, h, v)
 
         def lagrangian(z, t, w, y, costate):
-            return charged(z, t, y) + costate @ step(z, t, w)
+            return stage_cost(z, t, y) + costate @ step(z, t, w)
 
         each = (z, times[:-1], problem.w, y, costates)
         exact = jax.vmap(curvature(lagrangian))(*each)
-        at_end = jax.hessian(lambda x: problem.final(times[-1], x))(states[-1])
-        if curved is None:
+        at_end = jax.hessian(lambda x: problem.final_cost(times[-1], x))(states[-1])
+        if use_exact is None:
             H, V = exact, at_end
         else:
-            H, V = jnp.where(curved, exact, H), jnp.where(curved, at_end, V)
+            H, V = jnp.where(use_exact, exact, H), jnp.where(use_exact, at_end, V)
     H, V = (H + jnp.swapaxes(H, 1, 2)) / 2, (V + V.T) / 2
     stages = Stages(F, H, h, gaps, V, v)
     return jax.tree.map(lambda a: a.astype(states.dtype), stages)
 
 
-def squared(c: Any, z: Array, y: Array, rho: Array, equal: Array) -> Array:
+def squared(c: Callable[[Array], Values], z: Array, y: Array, rho: Array) -> Array:
     """The Hessian of the active constraints' squares, without second derivatives."""
-    slope = jax.jacfwd(c)(z)
-    active = equal | (y + rho * c(z) > 0)
+    slope = jax.jacfwd(lambda z: c(z)[0])(z)
+    value, equal = c(z)
+    active = equal | (y + rho * value > 0)
     return rho * slope.T @ jnp.where(active[:, None], slope, 0)
 
 
@@ -230,19 +247,25 @@ def costates_of(F: Array, h: Array, v: Array) -> Array:
     return lax.scan(back, v.astype(h.dtype), (F, h), reverse=True)[1]
 
 
-def jacobian(f: Any) -> Any:
-    """Of the first argument, in reverse: a step has fewer outputs than inputs.
-    Forward where a solver inside has only that."""
+def first_possible(*derivatives: Callable[..., Array]) -> Callable[..., Array]:
+    """The first of some ways to take a derivative that the solvers inside have: some
+    have none in reverse, others none forward."""
 
     def evaluate(*args):
-        try:
-            return jax.jacrev(f)(*args)
-        except (RuntimeError, TypeError, ValueError) as error:
-            if "everse-mode" not in str(error):
-                raise
-            return jax.jacfwd(f)(*args)
+        for derivative in derivatives[:-1]:
+            try:
+                return derivative(*args)
+            except (RuntimeError, TypeError, ValueError) as error:
+                if "-mode" not in str(error):
+                    raise
+        return derivatives[-1](*args)
 
     return evaluate
+
+
+def jacobian(f: Callable[..., Array]) -> Callable[..., Array]:
+    """Of the first argument, in reverse: a step has fewer outputs than inputs."""
+    return first_possible(jax.jacrev(f), jax.jacfwd(f))
 
 
 def central(f: Any, spacing: float, deviation: Any) -> Any:
@@ -260,24 +283,9 @@ def central(f: Any, spacing: float, deviation: Any) -> Any:
     return evaluate
 
 
-def curvature(f: Any) -> Any:
-    """The Hessian in the first argument; in reverse alone, or forward alone, where a
-    solver inside has only that."""
-
-    def evaluate(*args):
-        last: Exception | None = None
-        for outer, inner in (
-            (jax.jacfwd, jax.grad),
-            (jax.jacrev, jax.grad),
-            (jax.jacfwd, jax.jacfwd),
-        ):
-            try:
-                return outer(inner(f))(*args)
-            except (RuntimeError, TypeError, ValueError) as error:
-                if "-mode" not in str(error):
-                    raise
-                last = error
-        assert last is not None
-        raise last
-
-    return evaluate
+def curvature(f: Callable[..., Array]) -> Callable[..., Array]:
+    """The Hessian in the first argument."""
+    slope = jax.grad(f)
+    return first_possible(
+        jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(f))
+    )

@@ -66,6 +66,55 @@ class Start(eqx.Module):
     states: Float[Array, "*batch T+1 n"] | None = parameter(None)
     gains: Float[Array, "*batch T m n"] | None = parameter(None)
 
+    @property
+    def horizon(self) -> int:
+        """The number of steps."""
+        return self.controls.shape[-2]
+
+    @property
+    def count(self) -> int:
+        """How many starts there are."""
+        return self.controls.shape[0] if self.controls.ndim == 3 else 1
+
+    def checked(
+        self, state_size: int, control_size: int, name: str, where: str
+    ) -> "Start":
+        """The start with arrays that fit each other and a problem, or an error.
+
+        **Arguments:**
+
+        - `state_size`: n.
+        - `control_size`: m.
+        - `name`, `where`: of the start and of what takes it, for the message.
+        """
+        n, m = state_size, control_size
+        given = self.controls, self.states, self.gains
+        arrays: list[Any] = [as_float_array(a) for a in given]
+        shape = getattr(arrays[0], "shape", ())
+        batch, T = shape[:-2], shape[-2] if len(shape) > 1 else 0
+        if len(batch) > 1 or T < 1:
+            raise ValueError(
+                f"{where}: {name}.controls must have shape (T, {m}), or (c, T, {m}) "
+                f"for c starts, got shape {shape}."
+            )
+        rows = dict(controls=(T, m), states=(T + 1, n), gains=(T, m, n))
+        for (field, row), array in zip(rows.items(), arrays, strict=True):
+            if array is None and field != "controls":
+                continue
+            got = getattr(array, "shape", None)
+            if not eqx.is_inexact_array(array) or got != (*batch, *row):
+                got = shortened(array) if got is None else f"shape {got}"
+                raise ValueError(
+                    f"{where}: {name}.{field} must have shape {(*batch, *row)}, got "
+                    f"{got}."
+                )
+            check_finite(array, f"{name}.{field}", where)
+        if self.gains is not None and self.states is None:
+            raise ValueError(
+                f"{where}: {name}.states must be given with {name}.gains, got none."
+            )
+        return Start(*arrays)
+
 
 def default_start(
     dynamics: AbstractDynamics,
@@ -187,43 +236,9 @@ def _constant(tree: Any) -> Any:
     return eqx.combine(jax.tree.map(lax.stop_gradient, arrays), rest)
 
 
-def as_start(value: Start, n: int, m: int, name: str, where: str) -> Start:
-    """A start whose arrays fit each other and the problem, or an error."""
-    given = value.controls, value.states, value.gains
-    arrays: list[Any] = [as_float_array(a) for a in given]
-    shape = getattr(arrays[0], "shape", ())
-    batch, T = shape[:-2], shape[-2] if len(shape) > 1 else 0
-    if len(batch) > 1 or T < 1:
-        raise ValueError(
-            f"{where}: {name}.controls must have shape (T, {m}), or (c, T, {m}) for c "
-            f"starts, got shape {shape}."
-        )
-    rows = dict(controls=(T, m), states=(T + 1, n), gains=(T, m, n))
-    for (field, row), array in zip(rows.items(), arrays, strict=True):
-        if array is None and field != "controls":
-            continue
-        got = getattr(array, "shape", None)
-        if not eqx.is_inexact_array(array) or got != (*batch, *row):
-            got = shortened(array) if got is None else f"shape {got}"
-            raise ValueError(
-                f"{where}: {name}.{field} must have shape {(*batch, *row)}, got {got}."
-            )
-        check_finite(array, f"{name}.{field}", where)
-    if value.gains is not None and value.states is None:
-        raise ValueError(
-            f"{where}: {name}.states must be given with {name}.gains, got none."
-        )
-    return Start(*arrays)
-
-
 def controls_of(start: Start) -> Array:
     """The controls of the first start, shape `(T, m)`."""
     return start.controls[0] if start.controls.ndim == 3 else start.controls
-
-
-def count_of(start: Start) -> int:
-    """How many starts there are."""
-    return start.controls.shape[0] if start.controls.ndim == 3 else 1
 
 
 def begin(problem: Problem, start: Start) -> tuple[Start, Array, Array, Array]:

@@ -33,7 +33,7 @@ from ..disturbances import Gaussian
 from ..dynamics import linearize
 from ..environments import Environment, make, UniformState
 from ..lung import Breathing
-from ..planning import cem, ilqr, mppi
+from ..planning import AbstractPlanner, CEM, ILQR, MPPI
 from ..training import actor_critic, expected_cost, fit, PPO, SHAC
 
 
@@ -119,19 +119,19 @@ def _learning(name: str, learner: Callable[..., Any], **options: Any) -> Any:
     return learner(env.dynamics, env.cost, base=agent_of(name, "LQR"), **options)
 
 
-def _receding(name: str, planner: Callable[..., Any], **options: Any) -> Any:
+def _receding(name: str, kind: type[AbstractPlanner], **options: Any) -> Any:
     """MPC with the model and the cost of the task and, at the end of a plan, the cost
     to go of the LQR where there is one."""
     env = task_of(name)
     if env.dynamics.observation_size != env.dynamics.state_size:
         raise Unsuitable("the state is not observed")
     bounds = env.control_bounds
-    if planner is not ilqr and bounds is not None:
+    if kind is not ILQR and bounds is not None:
         low, high = (np.asarray(bound, float) for bound in bounds)
         width = high - low
         options["scale"] = np.where(np.isfinite(width), width / 4, 1.0)
-    how: dict[str, Any] = {"planner": planner, "bounds": bounds, "throw": False}
-    return MPC(env.dynamics, _with_cost_to_go(name), LOOKAHEAD, **how, **options)
+    how: dict[str, Any] = {"planner": kind(**options), "bounds": bounds, "throw": False}
+    return MPC(env.dynamics, _with_cost_to_go(name), LOOKAHEAD, **how)
 
 
 def _with_cost_to_go(name: str) -> AbstractCost:
@@ -209,9 +209,9 @@ FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
         "BPC": lambda name: BPC(task_of(name).dynamics, agent_of(name, "LQR")),
     },
     "Planning": {
-        "MPC": lambda name: _receding(name, ilqr, max_iterations=8),
-        "MPPI": lambda name: _receding(name, mppi, samples=128, iterations=3),
-        "CEM": lambda name: _receding(name, cem, samples=128, iterations=3),
+        "MPC": lambda name: _receding(name, ILQR, max_iterations=8),
+        "MPPI": lambda name: _receding(name, MPPI, samples=128, iterations=3),
+        "CEM": lambda name: _receding(name, CEM, samples=128, iterations=3),
     },
     "Training": {
         "affine": lambda name: _by_gradient(name, Deep, width=1, depth=0),

@@ -12,7 +12,7 @@ from ...costs import Quadratic
 from ...dynamics import AbstractDynamics
 from ...dynamics._wrapper import AbstractWrapper
 from ...environments import planar_quadrotor
-from ...planning import count_evaluations, ilqr
+from ...planning import count_evaluations, ILQR
 from ._finding import Claim, draw_panels, Finding
 
 
@@ -32,11 +32,12 @@ def oracle_complexity(small: bool = False) -> Finding:
     )
     x0 = jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     start = jnp.tile(hover, (STEPS, 1))
-    limit = {"throw": False, "max_iterations": 20 if small else 60}
+    iterations = 20 if small else 60
     drawn = SAMPLES[1:2] if small else SAMPLES
 
     def solve(dynamics, **options):
-        return ilqr(dynamics, cost, x0, start, **options, **limit)
+        planner = ILQR(iterations, **options)
+        return planner(dynamics, cost, x0, start, throw=False)
 
     kinds: dict[str, Any] = {
         "automatic": solve,
@@ -102,7 +103,7 @@ def oracle_complexity(small: bool = False) -> Finding:
         "formula printed in the paper has a plus where the difference needs a minus. "
         "Samples: evolution strategies in place of the Jacobian, the mean of rise "
         "times direction over antithetic Gaussian perturbations of the same size, "
-        f"drawn anew at each point; at most {limit['max_iterations']} iterations. "
+        f"drawn anew at each point; at most {iterations} iterations. "
         "Calls are those of the whole solve, line search included."
     )
     return Finding(

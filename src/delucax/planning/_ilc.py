@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import (
-    as_matrix,
     check_count,
     check_instance,
     check_number,
@@ -20,11 +19,12 @@ from .._module import as_float_array
 from .._results import choose, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ..planning import Plan
-from ..planning._descent import LEAST_MU, MOST_MU
-from ..planning._lq import in_sequence, Policy
-from ..planning._plan import checked
-from ..planning._problem import model as local_model, Problem, roll_out
+from ._descent import LEAST_MU, MOST_MU
+from ._line_search import first_accepted
+from ._lq import in_sequence, Policy
+from ._plan import Plan, plan_of, raise_on_failure
+from ._planner import as_rows
+from ._problem import model as local_model, Problem, roll_out
 
 
 GROWTH = 10.0
@@ -35,12 +35,13 @@ class Trials(NamedTuple):
     """What is fixed when an iterative learner is compiled."""
 
     iterations: int
-    candidates: int  # of a search
-    strict: bool  # whether a trial must be better, not only as good
-    slower: float | None  # the learning rate is multiplied by it after a failed search
+    candidates: int = 10  # of a search
+    strict: bool = False  # whether a trial must be better, not only as good
+    slower: float | None = None
+    """What a failed search multiplies the learning rate by. If none, it is the end."""
 
 
-def ILC(
+def ilc(
     plant: AbstractDynamics,
     model: AbstractDynamics,
     cost: AbstractCost,
@@ -99,19 +100,19 @@ def ILC(
         start = jnp.tile(model.dynamics.equilibrium()[1], (30, 1))
         x0 = model.initial_state
         plan = dlx.planning.ilqr(model.dynamics, model.cost, x0, start)
-        learned = dlx.controllers.ILC(
+        learned = dlx.planning.ilc(
             plant.dynamics, model.dynamics, model.cost, plan, iterations=5
         )
         learned.trace
         ```
     """
-    where = "ILC"
+    where = "ilc"
     true, known = as_problems(plant, model, cost, plan, w, where)
     check_number(step, "step", where)
     check_positive(step, "step", where)
     iterations = check_count(iterations, "iterations", where)
     out = _learn(true, known, plan, as_float_array(step), iterations)
-    return checked_run(out, where) if throw else out
+    return raise_if_diverged(out, where) if throw else out
 
 
 @eqx.filter_jit
@@ -122,8 +123,7 @@ def _learn(
         del rate
         return roll_out(plant, states, controls, policy.K, policy.k, length, None)
 
-    trials = Trials(iterations, candidates=10, strict=False, slower=None)
-    return learn(plant, model, plan, run, step, jnp.zeros(()), trials)
+    return learn(plant, model, plan, run, step, jnp.zeros(()), Trials(iterations))
 
 
 class _Progress(NamedTuple):
@@ -172,29 +172,23 @@ def learn(
         first = zero, in_sequence(stages, zero, False, box)
         return lax.while_loop(concave, more, first)
 
-    def trial(now, policy, tried):
-        shorter = jnp.asarray(1.1, dtype) ** (1.0 - tried.astype(dtype) ** 2)
-        length = now.step * shorter
-        found = run(now.states, now.controls, policy, length, now.rate)
-        good = found[2] < now.cost if trials.strict else found[2] <= now.cost
-        return length, found, good
-
     def body(now):
         _, policy = policy_of(now.states, now.controls)
-
-        def again(carry):
-            tried, *_ = carry
-            return tried + 1, *trial(now, policy, tried)
-
-        def going(carry):
-            tried, *_, good = carry
-            return ~good & (tried < trials.candidates)
-
         last = now.states, now.controls, now.cost
-        first = jnp.asarray(0), now.step, last, jnp.asarray(False)
-        tried, length, found, good = lax.while_loop(going, again, first)
+
+        def trial(tried):
+            length = now.step * jnp.asarray(1.1, dtype) ** (
+                1.0 - tried.astype(dtype) ** 2
+            )
+            after = run(now.states, now.controls, policy, length, now.rate)
+            cost = after[2]
+            good = cost < now.cost if trials.strict else cost <= now.cost
+            return (length, after), good
+
+        given = trial, trials.candidates, (now.step, last)
+        tried, (length, after), good = first_accepted(*given)
         keep = lambda new, old: jnp.where(good, new, old)
-        states, controls, cost = jax.tree.map(keep, found, last)
+        states, controls, cost = jax.tree.map(keep, after, last)
         iteration = now.iteration + 1
         rate, ended = now.rate, iteration >= trials.iterations
         if trials.slower is None:
@@ -224,31 +218,26 @@ def learn(
     result = choose(
         last.iteration < trials.iterations, RESULTS.no_descent, RESULTS.successful
     )
-    return Plan(
-        states=last.states,
-        controls=last.controls,
+    return plan_of(
+        plant,
+        last.states,
+        last.controls,
+        last.cost,
         gains=policy.K,
-        cost=last.cost,
         trace=jnp.where(reached, last.trace, last.cost),
         residual=jnp.max(jnp.abs(policy.gradient)),
-        violation=zero,
         result=choose(lost, RESULTS.diverged, result),
         iterations=last.iteration,
         rollouts=last.runs,
         regularisation=mu,
-        t0=plan.t0,
-        dt=plant.dynamics.dt,
-        low=plan.low,
-        high=plan.high,
-        difference=plan.difference,
     )
 
 
-def checked_run(plan: Plan, where: str) -> Plan:
-    """Raise if the first run diverged."""
+def raise_if_diverged(plan: Plan, where: str) -> Plan:
+    """Raise if the first run diverged. That a search failed is no failure here."""
     fine = choose(plan.result == RESULTS.diverged, RESULTS.diverged, RESULTS.successful)
-    seen = eqx.tree_at(lambda p: p.result, plan, fine)
-    return eqx.tree_at(lambda p: p.result, checked(seen, where), plan.result)
+    checked = raise_on_failure(eqx.tree_at(lambda p: p.result, plan, fine), where)
+    return eqx.tree_at(lambda p: p.result, checked, plan.result)
 
 
 def as_problems(
@@ -258,28 +247,19 @@ def as_problems(
     for name, dynamics in (("plant", plant), ("model", model)):
         check_instance(dynamics, AbstractDynamics, name, where)
     check_instance(cost, AbstractCost, "cost", where)
-    if not isinstance(plan, Plan):
-        raise ValueError(
-            f"{where}: plan must be a delucax.planning.Plan, such as ilqr makes, got "
-            f"{type(plan).__name__}."
-        )
+    check_instance(plan, Plan, "plan", where, ", such as ilqr makes")
     T, m = plan.controls.shape
     sizes = plan.states.shape[1], m
     for name, dynamics in (("plant", plant), ("model", model)):
-        found = dynamics.state_size, dynamics.control_size
-        if found != sizes:
+        got = dynamics.state_size, dynamics.control_size
+        if got != sizes:
             raise ValueError(
                 f"{where}: {name} must have the states and controls of plan, {sizes}, "
-                f"got {found}."
+                f"got {got}."
             )
     if w is not None:
-        w = as_matrix(w, "w", where)
-        if w.shape != (T, plant.disturbance_size):
-            raise ValueError(
-                f"{where}: w must have shape ({T}, {plant.disturbance_size}), got "
-                f"{w.shape}."
-            )
+        w = as_rows(w, T, plant.disturbance_size, "w", where)
     x0 = plan.states[0].astype(plan.controls.dtype)
-    rest = (plan.low, plan.high, plan.difference, None)
-    true = Problem(plant, cost, x0, plan.t0.astype(x0.dtype), w, *rest)
-    return true, Problem(model, cost, x0, plan.t0.astype(x0.dtype), None, *rest)
+    t0, rest = plan.t0.astype(x0.dtype), (plan.low, plan.high, plan.difference, None)
+    problem = lambda dynamics, w: Problem(dynamics, cost, x0, t0, w, *rest)
+    return problem(plant, w), problem(model, None)

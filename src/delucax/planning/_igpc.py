@@ -8,20 +8,26 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_bool, check_count, check_number, check_positive
+from .._check import (
+    check_bool,
+    check_choice,
+    check_count,
+    check_number,
+    check_positive,
+)
 from .._module import as_float_array
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
-from ..planning import Plan
-from ..planning._problem import Problem
-from ._ilc import as_problems, checked_run, learn, Trials
+from ._ilc import as_problems, learn, raise_if_diverged, Trials
+from ._plan import Plan
+from ._problem import Problem
 
 
 SLOWER = 0.01
 
 
-def iGPC(
+def igpc(
     plant: AbstractDynamics,
     model: AbstractDynamics,
     cost: AbstractCost,
@@ -47,7 +53,7 @@ def iGPC(
     gradient of the last cost of a roll-out of `horizon` steps, from a state that was
     met to the present one, through the model and what it left over. The next iteration
     linearises along the run, so what was learned within it stays. For the rest it is
-    [`delucax.controllers.ILC`][]. On the paper's quadrotor it needs fewer runs than
+    [`delucax.planning.ilc`][]. On the paper's quadrotor it needs fewer runs than
     that; over many winds, with the steps of both well chosen, it does not.
 
     **Arguments:**
@@ -55,7 +61,7 @@ def iGPC(
     - `plant`: the true dynamics, which are only run.
     - `model`: the dynamics that are differentiated, of the same sizes.
     - `cost`: the stage and final cost.
-    - `plan`: where to start, as in [`delucax.controllers.ILC`][].
+    - `plan`: where to start, as in [`delucax.planning.ilc`][].
     - `w`: disturbances of the plant, the same in each run, of which the model does not
         know, shape `(T, k)`; zero by default.
     - `iterations`: 40 by default.
@@ -71,7 +77,7 @@ def iGPC(
     - `throw`: raise if the first run diverges (default); if false, look at the
         `result`.
 
-    **Returns:** a [`delucax.planning.Plan`][], as from [`delucax.controllers.ILC`][]:
+    **Returns:** a [`delucax.planning.Plan`][], as from [`delucax.planning.ilc`][]:
     the best run of the plant, what was learned within it included, and feedback about
     it.
 
@@ -91,13 +97,13 @@ def iGPC(
         start = jnp.tile(model.dynamics.equilibrium()[1], (30, 1))
         x0 = model.initial_state
         plan = dlx.planning.ilqr(model.dynamics, model.cost, x0, start)
-        learned = dlx.controllers.iGPC(
+        learned = dlx.planning.igpc(
             plant.dynamics, model.dynamics, model.cost, plan, iterations=5
         )
         learned.trace
         ```
     """
-    where = "iGPC"
+    where = "igpc"
     true, known = as_problems(plant, model, cost, plan, w, where)
     for name, value in (("step", step), ("learning_rate", learning_rate)):
         check_number(value, name, where)
@@ -105,17 +111,14 @@ def iGPC(
             check_positive(value, name, where)
     memory = check_count(memory, "memory", where)
     sizes = memory, check_count(horizon, "horizon", where)
-    if indices not in ("aligned", "deluca"):
-        raise ValueError(
-            f"{where}: indices must be 'aligned' or 'deluca', got {indices!r}."
-        )
+    check_choice(indices, ("aligned", "deluca"), "indices", where)
     iterations = check_count(iterations, "iterations", where)
-    trials = Trials(iterations, candidates=10, strict=False, slower=None)
+    trials = Trials(iterations)
     if check_bool(anneal, "anneal", where):
         trials = Trials(iterations, candidates=6, strict=True, slower=SLOWER)
     numbers = as_float_array(step), as_float_array(learning_rate)
     out = _learn(true, known, plan, *numbers, sizes, indices == "aligned", trials)
-    return checked_run(out, where) if throw else out
+    return raise_if_diverged(out, where) if throw else out
 
 
 def _is_zero(value: Any) -> bool:
@@ -174,25 +177,25 @@ def perturbed(
         return cost
 
     def body(carry, inputs):
-        x, learned, met, seen = carry
+        x, learned, visited, disturbances = carry
         k, w_k = inputs
-        u = act(k, x, learned, seen[horizon:])
+        u = act(k, x, learned, disturbances[horizon:])
         after = plant.step(times[k], x, u, w_k)
         left = plant.deviation(after, model.step(times[k], x, u, None))
-        seen = jnp.concatenate([seen[1:], left[None]])
-        met = jnp.concatenate([met[1:], x[None]])
-        # The states met are those of the steps k - horizon to k.
+        disturbances = jnp.concatenate([disturbances[1:], left[None]])
+        visited = jnp.concatenate([visited[1:], x[None]])
+        # `visited` holds the states of the steps k - horizon to k.
         late = int(aligned)
         first = jnp.maximum(k - horizon + late, 0)
-        slope = jax.grad(last_cost)(learned, met[late], first, seen)
+        slope = jax.grad(last_cost)(learned, visited[late], first, disturbances)
         size = jnp.where(k >= horizon, rate / jnp.maximum(k, 1), 0)
         learned = jax.tree.map(lambda p, g: p - size * g, learned, slope)
-        return (after, learned, met, seen), (x, u)
+        return (after, learned, visited, disturbances), (x, u)
 
     learned = jnp.zeros((memory, m, n), dtype), jnp.zeros(m, dtype)
-    met = jnp.broadcast_to(plant.x0, (horizon + 1, n))
-    seen = jnp.zeros((horizon + memory, n), dtype)
-    start = plant.x0, learned, met, seen
+    visited = jnp.broadcast_to(plant.x0, (horizon + 1, n))
+    disturbances = jnp.zeros((horizon + memory, n), dtype)
+    start = plant.x0, learned, visited, disturbances
     (last, *_), (before, applied) = lax.scan(body, start, (jnp.arange(T), plant.w))
     states = jnp.concatenate([before, last[None]])
     cost = plant.total(states, applied)

@@ -1,0 +1,217 @@
+"""What every planner is: a module that is called with a problem, and returns a plan."""
+
+import abc
+import numbers
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._check import (
+    as_vector,
+    check_control_bounds,
+    check_count,
+    check_finite,
+    check_instance,
+    check_key,
+    check_number,
+)
+from .._message import shortened
+from .._module import as_float_array, as_module
+from .._results import choose, RESULTS
+from .._typing import PRNGKey
+from ..costs import AbstractCost
+from ..dynamics import AbstractDynamics
+from ._constraints import Constraints
+from ._plan import Plan, raise_on_failure
+from ._problem import Problem
+from ._start import control_at_rest, default_start, Start
+
+
+class AbstractPlanner(eqx.Module):
+    """A way to find a plan. Its fields are its options; a call gives it a problem:
+
+    `plan = planner(dynamics, cost, x0, controls, t0, w, bounds)`.
+
+    A planner of your own has the method `solve`, which gets a problem whose arguments
+    are checked. It works in [`delucax.controllers.MPC`][] then.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        given = env.dynamics, env.cost, jnp.array([0.5, 0.0]), 10
+        for planner in (dlx.planning.ILQR(), dlx.planning.CEM(samples=64)):
+            key = jax.random.key(0) if planner.is_stochastic else None
+            plan = planner(*given, bounds=(-2.0, 2.0), key=key)
+            plan.cost, plan.result
+        ```
+    """
+
+    is_stochastic: ClassVar[bool] = False
+    """Whether it draws random numbers, and so needs a key."""
+
+    @property
+    def starts_from_states(self) -> bool:
+        """Whether it has states to start from, and so takes no feedback."""
+        return False
+
+    @abc.abstractmethod
+    def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
+        """The plan, whatever became of it.
+
+        **Arguments:**
+
+        - `problem`: dynamics, cost, first state and time, known disturbances, bounds
+            and constraints; with the cost of a trajectory and so on as methods.
+        - `start`: one start, or several along a first axis.
+        - `key`: a random key if the planner draws, else `None`.
+        """
+
+    def __call__(
+        self,
+        dynamics: AbstractDynamics,
+        cost: AbstractCost,
+        x0: Any,
+        controls: Any,
+        t0: Any = 0.0,
+        w: Any = None,
+        bounds: Any = None,
+        *,
+        constraints: Constraints | None = None,
+        difference: Callable[[Array, Array], Array] | None = None,
+        fallback: Start | Plan | None = None,
+        key: PRNGKey | None = None,
+        throw: bool = True,
+    ) -> Plan:
+        """Plan.
+
+        **Arguments:**
+
+        - `dynamics`: the discrete-time dynamics.
+        - `cost`: the stage and final cost.
+        - `x0`: the first state, shape `(n,)`.
+        - `controls`: what to start from: controls, shape `(T, m)`; the number of steps
+            `T`, for [`delucax.planning.default_start`][]; feedback, or several starts
+            of which the cheapest is taken, as [`delucax.planning.Start`][]; or an
+            earlier plan, with its gains.
+        - `t0`: the time of the first state, 0 by default.
+        - `w`: disturbances known in advance, shape `(T, k)`; zero by default.
+        - `bounds`: `(low, high)`, each a number or of shape `(m,)`, between which every
+            control is kept; none by default.
+        - `constraints`: [`delucax.planning.Constraints`][] on states and controls, for
+            planners that take them; none by default.
+        - `difference`: `(x, x_ref) -> deviation`, such as `system.difference`, which
+            wraps angles, for dynamics that wrap them; subtraction by default.
+        - `fallback`: feedback of the same horizon, with states and gains, which the
+            plan holds in place of its own where that is of no use: every start
+            diverges, or the constraints cannot hold. Its `result` says so. None by
+            default.
+        - `key`: a random key, for planners that draw.
+        - `throw`: raise unless the plan is a solution (default); if false, look at
+            `plan.result`.
+
+        **Returns:** a [`delucax.planning.Plan`][].
+
+        **Raises:** `ValueError` on an argument of the wrong kind or shape, or not
+        finite; an error at run time as `throw` says.
+        """
+        where = type(self).__name__
+        check_instance(dynamics, AbstractDynamics, "dynamics", where)
+        check_instance(cost, AbstractCost, "cost", where)
+        n, m = dynamics.state_size, dynamics.control_size
+        x0 = as_vector(x0, n, "x0", where)
+        check_finite(x0, "x0", where)
+        check_number(t0, "t0", where)
+        t0 = as_float_array(t0)
+        if self.starts_from_states:
+            controls = _at_rest(dynamics, cost, controls, where)
+        start = _as_start(dynamics, cost, controls, t0, where)
+        # A default start has no precision of its own.
+        known = () if isinstance(controls, numbers.Integral) else (start.controls,)
+        dtype = jnp.result_type(x0, *known)
+        if w is not None:
+            w = as_rows(w, start.horizon, dynamics.disturbance_size, "w", where)
+        if difference is not None and not callable(difference):
+            raise ValueError(
+                f"{where}: difference must be a function, got {difference!r}."
+            )
+        if constraints is not None:
+            hint = " (`delucax.planning.Constraints`)"
+            check_instance(constraints, Constraints, "constraints", where, hint)
+        ends = check_control_bounds(bounds, m, where)
+        if ends is not None:
+            ends = (jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
+        low, high = ends or (None, None)
+        x0, t0, distance = x0.astype(dtype), t0.astype(dtype), as_module(difference)
+        given = dynamics, cost, x0, t0, w, low, high, distance, constraints
+        problem, start = Problem(*given), jax.tree.map(lambda a: a.astype(dtype), start)
+        if self.is_stochastic:
+            check_key(key, where)
+        plan = self.solve(problem, start, key)
+        if fallback is not None:
+            plan = _with_fallback(plan, fallback)
+        return raise_on_failure(plan, where) if throw else plan
+
+
+@eqx.filter_jit
+def _with_fallback(plan: Plan, fallback: Start | Plan) -> Plan:
+    trajectory = lambda p: (p.states, p.controls, p.gains)
+    usable = plan.is_usable
+    keep = lambda new, old: jnp.where(usable, new, old).astype(new.dtype)
+    # Controls that are not finite are of no use either, whatever the planner says.
+    result = choose(plan.result == RESULTS.successful, RESULTS.diverged, plan.result)
+    result = choose(usable, plan.result, result)
+    kept = jax.tree.map(keep, trajectory(plan), trajectory(fallback))
+    return eqx.tree_at(lambda p: (*trajectory(p), p.result), plan, (*kept, result))
+
+
+def _as_start(
+    dynamics: AbstractDynamics, cost: AbstractCost, controls: Any, t0: Array, where: str
+) -> Start:
+    """What to start from, or an error."""
+    m = dynamics.control_size
+    if isinstance(controls, Plan):
+        controls = Start(controls.controls, controls.states, controls.gains)
+    if isinstance(controls, Start):
+        return controls.checked(dynamics.state_size, m, "controls", where)
+    if isinstance(controls, numbers.Integral):
+        T = check_count(controls, "controls (the horizon)", where)
+        return default_start(dynamics, cost, T, t0)
+    return Start(as_rows(controls, None, m, "controls", where))
+
+
+def _at_rest(dynamics: Any, cost: Any, controls: Any, where: str) -> Any:
+    """The controls for states that are given: those at rest for a number of steps."""
+    if isinstance(controls, Start | Plan):
+        raise ValueError(
+            f"{where}: states go with an array of controls or a number of steps, got "
+            f"{type(controls).__name__}."
+        )
+    if not isinstance(controls, numbers.Integral):
+        return controls
+    T = check_count(controls, "controls (the horizon)", where)
+    return jnp.tile(control_at_rest(dynamics, cost), (T, 1))
+
+
+def as_rows(value: Any, steps: int | None, size: int, name: str, where: str) -> Array:
+    """`value` as a finite array of `steps` rows of `size` entries, or an error."""
+    array = as_float_array(value)
+    fits = eqx.is_inexact_array(array) and array.ndim == 2 and array.shape[1] == size
+    if not fits or steps is not None and array.shape[0] != steps:
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
+        rows = "steps" if steps is None else steps
+        raise ValueError(
+            f"{where}: {name} must have shape ({rows}, {size}), got {got}."
+        )
+    if array.shape[0] == 0:
+        raise ValueError(f"{where}: {name} must have at least one step, got horizon 0.")
+    check_finite(array, name, where)
+    return array
