@@ -13,12 +13,13 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ..._check import check_count, check_finite, check_real
+from ..._check import check_count, check_finite, check_instance, check_real
 from ..._message import shortened
 from ..._module import as_float_array
 from ...environments import Environment
-from ._program import FAILED, program, REWARD, TERMINATED, TRUNCATED
-from ._spaces import action_space, is_discrete, observation_space, read_options
+from .._spaces import has_discrete_actions
+from ._compiled import FAILED, program, REWARD, TERMINATED, TRUNCATED
+from ._spaces import action_space, observation_space, read_options
 
 
 class GymnasiumVectorEnv(VectorEnv):
@@ -70,10 +71,7 @@ class GymnasiumVectorEnv(VectorEnv):
         discrete: bool | None = None,
     ):
         where = "GymnasiumVectorEnv"
-        if not isinstance(env, Environment):
-            raise ValueError(
-                f"{where}: env must be a delucax.Environment, got {type(env).__name__}."
-            )
+        check_instance(env, Environment, "env", where)
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -83,7 +81,7 @@ class GymnasiumVectorEnv(VectorEnv):
             ) from None
         self.environment = env
         self.num_envs = check_count(num_envs, "num_envs", where)
-        self.discrete = is_discrete(env, discrete, where)
+        self.discrete = has_discrete_actions(env, discrete, where)
         self.metadata = {"autoreset_mode": self._mode, "render_modes": []}
         self.single_action_space = action_space(env, self.discrete)
         self.single_observation_space = observation_space(env)
@@ -198,16 +196,10 @@ class GymnasiumVectorEnv(VectorEnv):
         if self._packed is None:
             raise ResetNeeded("GymnasiumVectorEnv: call reset() before step().")
         actions = self._checked(actions)
-        made = self._program
-        seen, moved, self._signals, self._key = made.step_batch(
-            self._mode.value,
-            self._packed,
-            actions,
-            self._signals,
-            self._key,
+        self._packed, last, self._signals, self._key = self._program.step_batch(
+            self._mode.value, self._packed, actions, self._signals, self._key
         )
-        self._packed = seen
-        packed, last = np.asarray(seen), np.asarray(moved)
+        packed, last = np.asarray(self._packed), np.asarray(last)
         if last[:, FAILED].any() and packed[:, FAILED].any():
             which = np.flatnonzero(packed[:, FAILED])[:5].tolist()
             self._packed = None

@@ -9,6 +9,7 @@ import numpy as np
 from .._check import as_path
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
+from ._linear_model import check_no_feed_through, linear_model
 
 
 def read_linear(
@@ -48,11 +49,7 @@ def read_linear(
             raise ValueError(
                 f"{where}: '{path}' must hold A and B, got {', '.join(held) or 'none'}."
             )
-    if "D" in held and np.any(held["D"]):
-        raise ValueError(
-            f"{where}: D must be zero, as the models here have no feed-through, got "
-            f"{held['D'].tolist()}."
-        )
+    check_no_feed_through(held.get("D", np.zeros(())), where)
     if "dt" in held:
         step = float(held["dt"].reshape(()))
         if dt is not None and float(dt) != step:
@@ -66,10 +63,7 @@ def read_linear(
         )
     else:
         step = float(dt)
-    matrices = [held["A"], held["B"], held.get("C"), held.get("E")]
-    if step == 0:
-        return LinearSystem(*matrices)
-    return LinearDynamics(*matrices, dt=step)
+    return linear_model(held["A"], held["B"], held.get("C"), held.get("E"), step)
 
 
 def _matrices(path: Path, where: str) -> dict[str, Any]:
@@ -78,8 +72,8 @@ def _matrices(path: Path, where: str) -> dict[str, Any]:
     if path.suffix in (".npz", ".mat") and not path.is_file():
         raise FileNotFoundError(f"{where}: path must be a file, got '{path}'.")
     if path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as file:
-            held = {name: file[name] for name in names if name in file}
+        with np.load(path, allow_pickle=False) as archive:
+            file = {name: archive[name] for name in names if name in archive}
     elif path.suffix == ".mat":
         from scipy.io import loadmat
 
@@ -90,7 +84,6 @@ def _matrices(path: Path, where: str) -> dict[str, Any]:
                 f"{where}: '{path}' is a .mat file of version 7.3; save it with "
                 "'-v7' in MATLAB."
             ) from error
-        held = {name: file[name] for name in names if name in file}
     else:
         raise ValueError(f"{where}: path must end in .npz or .mat, got '{path}'.")
-    return {name: np.asarray(value, float) for name, value in held.items()}
+    return {name: np.asarray(file[name], float) for name in names if name in file}
