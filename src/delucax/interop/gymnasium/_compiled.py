@@ -80,6 +80,11 @@ def shared(size: int, dtype: Any) -> tuple[np.ndarray, jax.Array]:
     return written, jax.dlpack.from_dlpack(written, copy=False)
 
 
+def draw_key(generator: np.random.Generator) -> PRNGKey:
+    """A random key from a generator of NumPy's, which Gymnasium seeds."""
+    return jr.key(int(generator.integers(2**32)))
+
+
 @functools.lru_cache(maxsize=64)
 def _compiled(same: ByValue, discrete: bool, truncate: bool) -> Program:
     env = same.env

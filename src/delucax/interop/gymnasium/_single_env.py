@@ -14,7 +14,7 @@ from ..._message import shortened
 from ...environments import Environment
 from .._episode import has_signals
 from .._spaces import has_discrete_actions
-from ._compiled import program, REWARD, shared, STEP
+from ._compiled import draw_key, program, REWARD, shared, STEP
 from ._spaces import action_space, observation_space, read_options
 
 
@@ -90,8 +90,8 @@ class GymnasiumEnv(gymnasium.Env):
         self.action_space = action_space(env, self.discrete)
         self.observation_space = observation_space(env)
         self._program = program(env, self.discrete, self.truncate)
-        self._table = np.asarray(env.actions) if self.discrete else None
-        self._count = 0 if env.actions is None else len(env.actions)
+        self._table = np.asarray(env.actions) if self.discrete else np.zeros((0, 1))
+        self._count = len(self._table)
         self._shape = (env.control_size,)
         self._buffer: Any = None
         self._ended = True
@@ -123,8 +123,7 @@ class GymnasiumEnv(gymnasium.Env):
             state = as_vector(state, self.environment.state_size, "state", where)
             check_finite(state, "state", where)
             state = state.astype(float)
-        key = jax.random.key(int(self.np_random.integers(2**32)))
-        packed, signals = self._program.start(key, state)
+        packed, signals = self._program.start(draw_key(self.np_random), state)
         packed = np.asarray(packed)
         if self._buffer is None or self._buffer.dtype != packed.dtype:
             self._allocate(packed.dtype)
@@ -213,11 +212,10 @@ class GymnasiumEnv(gymnasium.Env):
 
     def _invalid_action(self, action: Any) -> NoReturn:
         """Say what an action must be."""
-        if self._table is not None:
+        if self.discrete:
             raise InvalidAction(
-                "GymnasiumEnv: action must be a whole number from 0 to "
-                f"{len(self._table) - 1}, "
-                f"got {shortened(action)}; discrete=False takes the "
+                f"GymnasiumEnv: action must be a whole number from 0 to "
+                f"{self._count - 1}, got {shortened(action)}; discrete=False takes the "
                 "control itself."
             )
         raise InvalidAction(
@@ -255,9 +253,8 @@ class GymnasiumEnv(gymnasium.Env):
 
             self._picture = Renderer(self.environment, self.render_mode == "human")
         control = self._action
-        if self._table is not None:
-            shown = self._table[int(control[0])]
-            control = shown if self._stepped else np.zeros_like(shown)
+        if self.discrete:
+            control = self._table[int(control[0])] * self._stepped
         frame = self._picture.frame(self.state, control)
         return frame if self.render_mode == "rgb_array" else None
 

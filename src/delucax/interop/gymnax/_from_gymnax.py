@@ -224,17 +224,16 @@ class GymnaxDynamics(AbstractDynamics):
 
         **Returns:** the next state, and the reward.
         """
-        use, words = jr.key(0), None
+        *leaves, _ = self.layout.unravel(x)
+        key, words = jr.key(0), None
         if self.draws:
-            *_, words, _ = self.layout.unravel(x)
-            use, after = jr.split(jr.wrap_key_data(words, impl="threefry2x32"))
+            key, after = jr.split(jr.wrap_key_data(leaves.pop(), impl="threefry2x32"))
             words = jr.key_data(after)
+        state = jax.tree.unflatten(self.structure, leaves)
         action = u.reshape(self.action_shape)
         if self.discrete:
             action = jnp.round(action).astype(int)
-        _, state, reward, done, _ = self.env.step_env(
-            use, self.unravel(x), action, self.params
-        )
+        _, state, reward, done, _ = self.env.step_env(key, state, action, self.params)
         x_next = self._ravel(state, words, done).astype(x.dtype)
         return x_next, jnp.reshape(reward, ()).astype(x.dtype)
 
@@ -367,7 +366,7 @@ def from_gymnax(
         shape = dynamics.action_shape
         bounds = tuple(jnp.broadcast_to(end, shape).ravel() for end in ends)
         actions = None
-    arguments: dict[str, Any] = dict(
+    defaults: dict[str, Any] = dict(
         dynamics=dynamics,
         cost=_MinusReward(dynamics),
         initial_state=_Start(dynamics),
@@ -375,7 +374,6 @@ def from_gymnax(
         terminated=_is_done,
         actions=actions,
         encode=_Observation(dynamics),
+        horizon=horizon,
     )
-    if horizon is not None:
-        arguments["horizon"] = horizon
-    return Environment(**{**arguments, **environment})
+    return Environment(**{**defaults, **environment})
