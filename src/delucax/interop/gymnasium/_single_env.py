@@ -192,12 +192,12 @@ class GymnasiumEnv(gymnasium.Env):
             self._action[0] = index
         else:
             try:
-                asked = np.asarray(action)
+                control = np.asarray(action)
             except ValueError:  # ragged
                 self._invalid_action(action)
-            if asked.shape != self._shape or asked.dtype.kind not in "iuf":
+            if control.shape != self._shape or control.dtype.kind not in "iuf":
                 self._invalid_action(action)
-            self._action[...] = asked
+            self._action[...] = control
         self._packed[...] = after = self._advance()
         reward, terminated, truncated, failed, _ = self._outcome.tolist()
         if failed:

@@ -51,8 +51,8 @@ class Discrete:
 
 
 def separates_ends() -> bool:
-    """Whether those who will step want two ends: gymnax since 1.0 does. rejax, which
-    imports any gymnax, wants one.
+    """Whether `step` is expected to return `terminated` and `truncated`: by gymnax since
+    1.0, but not by rejax, which imports any gymnax.
     """
     theirs = sys.modules.get("gymnax.environments.environment")
     two = hasattr(getattr(theirs, "Environment", None), "is_truncated")
