@@ -115,7 +115,7 @@ class AbstractEntrywise(AbstractDisturbance):
 
     def _set_entries(self, size: int | None, **values: Any) -> None:
         """Set the fields of these names, and the size that they share."""
-        self.size = _common_size(type(self).__name__, size, values)
+        values["size"] = _common_size(type(self).__name__, size, values)
         for name, value in values.items():
             setattr(self, name, value)
 

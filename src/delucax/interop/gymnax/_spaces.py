@@ -51,8 +51,8 @@ class Discrete:
 
 
 def separates_ends() -> bool:
-    """Whether `step` is expected to return `terminated` and `truncated`: by gymnax since
-    1.0, but not by rejax, which imports any gymnax.
+    """Whether `step` should return `terminated` and `truncated`: gymnax expects both
+    since 1.0, and rejax, which imports any gymnax, expects `done`.
     """
     theirs = sys.modules.get("gymnax.environments.environment")
     two = hasattr(getattr(theirs, "Environment", None), "is_truncated")
