@@ -44,25 +44,21 @@ def read_linear(
     """
     where = "read_linear"
     held = _matrices(as_path(path, "path", where), where)
-    for name in ("A", "B"):
-        if name not in held:
-            raise ValueError(
-                f"{where}: '{path}' must hold A and B, got {', '.join(held) or 'none'}."
-            )
+    if not {"A", "B"} <= held.keys():
+        raise ValueError(
+            f"{where}: '{path}' must hold A and B, got {', '.join(held) or 'none'}."
+        )
     check_no_feed_through(held.get("D", np.zeros(())), where)
-    if "dt" in held:
-        step = float(held["dt"].reshape(()))
-        if dt is not None and float(dt) != step:
-            raise ValueError(
-                f"{where}: dt must be that of '{path}', {step}, or left out, got {dt}."
-            )
-    elif dt is None:
+    if dt is None and "dt" not in held:
         raise ValueError(
             f"{where}: '{path}' holds no dt; give it: 0 for continuous time, or the "
             "step."
         )
-    else:
-        step = float(dt)
+    step = float(np.reshape(held.get("dt", dt), ()))
+    if dt is not None and float(dt) != step:
+        raise ValueError(
+            f"{where}: dt must be that of '{path}', {step}, or left out, got {dt}."
+        )
     return linear_model(held["A"], held["B"], held.get("C"), held.get("E"), step)
 
 
