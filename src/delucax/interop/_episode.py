@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, DTypeLike, Float
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
 
 from .._results import RESULTS
 from .._typing import BoolScalar, Control, PRNGKey, Scalar, State
