@@ -51,10 +51,10 @@ class EpisodeState(eqx.Module):
 class Outcome(NamedTuple):
     """What a step says of itself."""
 
-    reward: Scalar | float
-    terminated: BoolScalar | bool
-    truncated: BoolScalar | bool
-    failed: BoolScalar | bool
+    reward: Scalar
+    terminated: BoolScalar
+    truncated: BoolScalar
+    failed: BoolScalar
 
 
 def has_signals(env: Environment) -> bool:

@@ -23,4 +23,4 @@ def linear_model(
     """A system if the step is 0, which says continuous time; else dynamics."""
     if dt == 0:
         return LinearSystem(A, B, C, E, **names)
-    return LinearDynamics(A, B, C, E, dt=float(dt), **names)
+    return LinearDynamics(A, B, C, E, dt=dt, **names)

@@ -151,7 +151,7 @@ def from_control(
         system.B[:, rest],
         None if identity else system.C,
         system.B[:, chosen] if chosen else None,
-        system.dt,
+        float(system.dt),
         state_names=tuple(system.state_labels),
         control_names=tuple(labels[i] for i in rest),
     )

@@ -128,7 +128,9 @@ def _start(
         # A key that is not split saves a batch a third of the time of a reset.
         x = env.reset(key) if state is None else state
         episode = EpisodeState(x, jnp.zeros((), int))
-    return _packed(env, episode, Outcome(0.0, False, False, False)), episode.signals
+    no = jnp.zeros((), bool)
+    outcome = Outcome(jnp.zeros((), episode.state.dtype), no, no, no)
+    return _packed(env, episode, outcome), episode.signals
 
 
 def _step_batch(step, start_batch, mode, packed, actions, signals, key):
