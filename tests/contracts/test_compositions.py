@@ -241,7 +241,7 @@ WRAPPERS = {"weak": weak, "attacked": attacked, "delayed": delayed}
 def shock(k, dt, rng):
     start, count = int(rng.integers(0, 6)), int(rng.integers(0, 6))
     value = rng.normal(size=k)
-    there = dlx.disturbances.Shock(value, start=start * dt, duration=count * dt)
+    there = dlx.disturbances.shock(value, start=start * dt, duration=count * dt)
     on = lambda i: (i >= start) & (i < start + count)
     return there, lambda i: on(i)[:, None] * value
 

@@ -22,7 +22,7 @@ ALL = {
     "brownian": d.Brownian(1, dt=0.1, substeps=2),
     "sum": d.Gaussian(0.1, size=2) + d.Constant(1.0, size=2),
     "window": d.Window(d.Gaussian(0.1, size=2), 1.0, 2.0),
-    "shock": d.Shock(jnp.array([0.0, 1.0]), start=5.0, duration=0.5),
+    "shock": d.shock(jnp.array([0.0, 1.0]), start=5.0, duration=0.5),
 }
 
 
@@ -59,7 +59,7 @@ def test_deterministic_values():
     assert_close(sine[:, 0], [0, 2, 0, 0], atol=1e-6)
     square = d.Square(3.0, period=1.0, duty=0.4, size=1).sequence(None, t)
     assert_close(square[:, 0], [3, 3, -3, 3])
-    shock = d.Shock(2.0, start=0.25, duration=0.5, size=1).sequence(None, t)
+    shock = d.shock(2.0, start=0.25, duration=0.5, size=1).sequence(None, t)
     assert_close(shock[:, 0], [0, 2, 2, 0])
     recorded = d.FromArray(jnp.arange(6.0).reshape(6, 1)).sequence(None, t)
     assert_close(recorded[:, 0], [0, 1, 2, 3])
@@ -184,11 +184,11 @@ def test_ends_that_meet_are_legal(key):
         (lambda: d.RandomWalk(-0.1, size=1), "std must be at least 0, got -0.1"),
         (lambda: d.RandomWalk(bound=-1, size=1), "bound must be at least 0, got -1"),
         (lambda: d.Square(1.0, 1.0, duty=2, size=1), "duty must be between 0 and 1"),
-        (lambda: d.Shock(1.0, 1.0, duration=-1, size=1), "duration must be at least 0"),
-        (lambda: d.Shock(1.0, 1.0, "long", size=1), "at least 0, got 'long'"),
-        (lambda: d.Window(3.0, 1.0, 2.0), "disturbance must be an .*got 3.0"),
+        (lambda: d.shock(1.0, 1.0, duration=-1, size=1), "duration must be at least 0"),
+        (lambda: d.shock(1.0, 1.0, "long", size=1), "at least 0, got 'long'"),
+        (lambda: d.Window(3.0, 1.0, 2.0), "disturbance must be an .*got float"),
         (lambda: d.Window(d.Zero(1), 3.0, 2.0), "stop must be at least 3.0, got 2"),
-        (lambda: d.Sum(d.Zero(1), 1.0), "every term must be an .*got 1.0"),
+        (lambda: d.Sum(d.Zero(1), 1.0), "every term must be an .*got float"),
         (lambda: d.Brownian(1, dt="x"), "dt must be positive and finite, got 'x'"),
     ],
 )

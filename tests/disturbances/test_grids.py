@@ -73,7 +73,7 @@ def test_a_shock_acts_in_its_steps(dt, first, count, as_arrays):
     if as_arrays:
         step = jnp.asarray(dt)
         start, duration = first * step, (last - first) * step
-    shock = d.Shock(1.0, start=start, duration=duration, size=1)
+    shock = d.shock(1.0, start=start, duration=duration, size=1)
     pulse(shock.start, shock.stop, first, last, dt)
 
 
@@ -116,7 +116,7 @@ def test_a_square_wave_of_half_steps(dt, period, high):
 @given(dt=intervals, begin=st.integers(0, 100_000), first=st.integers(0, 30))
 def test_a_horizon_that_does_not_begin_at_zero(dt, begin, first):
     k = begin + jnp.arange(32)
-    shock = d.Shock(1.0, start=(begin + first) * dt, duration=5 * dt, size=1)
+    shock = d.shock(1.0, start=(begin + first) * dt, duration=5 * dt, size=1)
     w = sequence(shock, k, jnp.asarray(dt))
     steps = np.arange(32)
     np.testing.assert_array_equal(w, (steps >= first) & (steps < first + 5))
@@ -134,13 +134,13 @@ def test_a_single_time():
 
 def test_every_step_of_a_long_horizon():
     k, dt = jnp.arange(MOST), jnp.asarray(0.02)
-    w = sequence(d.Shock(1.0, 41943.04, 0.1, size=1), k, dt)
+    w = sequence(d.shock(1.0, 41943.04, 0.1, size=1), k, dt)
     np.testing.assert_array_equal(np.flatnonzero(w), 2097152 + np.arange(5))
 
 
 @needs_x32
 def test_more_steps_than_single_precision_tells_apart():
-    push = d.Shock(1.0, start=1.0, duration=1.0, size=1)
+    push = d.shock(1.0, start=1.0, duration=1.0, size=1)
     wave = d.Square(1.0, period=1.0, size=1)
     for name, disturbance in (("Window", push), ("Square", wave)):
         with user_error(match=f"{name}: the horizon has 4194305 steps.*JAX_ENABLE_X64"):
@@ -164,7 +164,7 @@ def test_late_brownian_increments_have_the_size_of_their_step(key):
 @pytest.mark.parametrize("k", [0, 7])
 def test_a_rollout_meets_a_shock_of_whole_steps(k, key):
     dynamics = dlx.LinearDynamics(jnp.eye(1), jnp.eye(1), dt=0.02)
-    push = d.Shock(1.0, start=k * 0.02, duration=5 * 0.02, size=1)
+    push = d.shock(1.0, start=k * 0.02, duration=5 * 0.02, size=1)
     cost = dlx.costs.Quadratic(jnp.eye(1), jnp.eye(1))
     env = dlx.Environment(dynamics, cost, push, horizon=20)
     run = dlx.rollout(env, dlx.controllers.Zero(1), key=key)

@@ -238,7 +238,7 @@ def test_bad_input():
         interop.GymnasiumEnv(dlx.make("pendulum"), truncate="no")
     with user_error(match="render_mode must be"):
         interop.make("pendulum", render_mode="ascii")
-    with user_error(match="must be a delucax.Environment"):
+    with user_error(match="env must be an Environment, got"):
         interop.GymnasiumEnv(gymnasium.make("Pendulum-v1"))
 
 

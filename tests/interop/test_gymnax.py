@@ -81,13 +81,13 @@ class TestToGymnax:
         task = dlx.make("cartpole")
         env = to_gymnax(task, separate_ends=True)
         assert env.num_actions == 2 and env.action_space().n == 2
-        edge = interop.GymnaxState(jnp.array([2.39, 2.0, 0.0, 0.0]), jnp.asarray(7))
+        edge = interop.EpisodeState(jnp.array([2.39, 2.0, 0.0, 0.0]), jnp.asarray(7))
         _, state, reward, terminated, truncated, info = env.step(KEY, edge, 1)
         assert terminated and not truncated and info["discount"] == 0
         assert reward == 1 and state.time == 0
         pushed = info["final_observation"]
         assert_close(pushed, task.step(0.0, edge.state, task.actions[1]).state)
-        assert env.is_terminal(interop.GymnaxState(pushed, jnp.asarray(8)))
+        assert env.is_terminal(interop.EpisodeState(pushed, jnp.asarray(8)))
         assert not env.is_terminal(edge)
         assert to_gymnax(task, discrete=False).num_actions == 1
 
@@ -110,7 +110,7 @@ class TestToGymnax:
         )
         keys = jr.split(KEY, 3)
         params = jax.vmap(draw)(keys)
-        start = interop.GymnaxState(jnp.array([0.5, 0.0]), jnp.asarray(0))
+        start = interop.EpisodeState(jnp.array([0.5, 0.0]), jnp.asarray(0))
         one = lambda params: env.step_env(KEY, start, 0.0, params)[1]
         states = jax.jit(jax.vmap(one))(params)
         lengths = params.environment.dynamics.system.length
@@ -138,7 +138,7 @@ class TestToGymnax:
 
     def test_actions_that_are_traced_are_clamped(self):
         env = to_gymnax(dlx.make("cartpole"))
-        state = interop.GymnaxState(jnp.zeros(4), jnp.asarray(0))
+        state = interop.EpisodeState(jnp.zeros(4), jnp.asarray(0))
         step = jax.jit(lambda u: env.step_env(KEY, state, u)[1].state)
         pushed = [step(u) for u in (jnp.asarray(9), jnp.asarray(1), jnp.asarray(-3))]
         assert_close(pushed[0], pushed[1])
@@ -152,7 +152,7 @@ class TestToGymnax:
             (bad, 0.0, True),
             (good, np.nan, True),
         ):
-            state = interop.GymnaxState(x, jnp.asarray(0))
+            state = interop.EpisodeState(x, jnp.asarray(0))
             assert env.step_env(KEY, state, u)[-1]["failed"] == failed
 
     def test_ends_are_those_of_the_gymnax_that_is_there(self, monkeypatch):
@@ -170,9 +170,9 @@ class TestToGymnax:
     def test_bad_input(self):
         task = dlx.make("pendulum")
         env = to_gymnax(task)
-        with user_error(match="env must be a delucax.Environment"):
+        with user_error(match="env must be an Environment, got"):
             to_gymnax(task.dynamics)
-        with user_error(match="environment must be a delucax.Environment"):
+        with user_error(match="environment must be an Environment, got"):
             GymnaxParams(task.dynamics)
         with user_error(match="discrete needs a table"):
             to_gymnax(task, discrete=True)
@@ -191,7 +191,7 @@ class TestToGymnax:
         for name in ("discrete", "separate_ends"):
             with user_error(match=f"{name} must be True or False, got 'no'"):
                 to_gymnax(task, **{name: "no"})
-        with user_error(match="params must be GymnaxParams"):
+        with user_error(match="params must be a GymnaxParams, such as default_p"):
             env.step(KEY, env.reset(KEY)[1], jnp.zeros(1), task)
         with user_error(match="being traced"):
             jax.vmap(
@@ -398,7 +398,7 @@ class TestFromGymnax:
             from_gymnax(Growing(), horizon=3)
 
 
-EXAMPLES = ("GymnaxDynamics", "GymnaxEnv", "GymnaxParams", "GymnaxState", "to_gymnax")
+EXAMPLES = ("GymnaxDynamics", "GymnaxEnv", "GymnaxParams", "EpisodeState", "to_gymnax")
 
 
 @once

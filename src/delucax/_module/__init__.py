@@ -9,6 +9,7 @@ from ._fields import (
     function_field as function_field,
     marked_leaves as marked_leaves,
     parameter as parameter,
+    parts_of as parts_of,
     positive as positive,
     StaticFunction as StaticFunction,
     weight as weight,

@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import typing
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -279,6 +279,16 @@ def _same(x):
 
 def _fields(module: Any) -> dict[str, dataclasses.Field]:
     return {f.name: f for f in dataclasses.fields(module)}
+
+
+_Part = TypeVar("_Part", bound=eqx.Module)
+
+
+def parts_of(module: eqx.Module, kind: type[_Part]) -> list[_Part]:
+    """The modules of a class inside of another one; not those inside of them."""
+    is_part = lambda node: isinstance(node, kind) and node is not module
+    nodes = jax.tree.leaves(module, is_leaf=is_part)
+    return [node for node in nodes if is_part(node)]
 
 
 def marked_leaves(

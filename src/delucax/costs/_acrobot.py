@@ -3,6 +3,7 @@
 from jaxtyping import Array
 
 from .._module import parameter
+from .._typing import Control, RealScalar, Scalar, State
 from ..math import cos
 from ._base import AbstractCost
 
@@ -36,12 +37,12 @@ class AcrobotHeight(AbstractCost):
     torque_weight: Array = parameter(0.01)
     final_weight: Array = parameter(0.0)
 
-    def _state(self, x: Array) -> Array:
+    def _state(self, x: State) -> Scalar:
         lack = 2 + cos(x[0]) + cos(x[0] + x[1])
         return lack * lack + self.velocity_weight * (x[2] * x[2] + x[3] * x[3])
 
-    def __call__(self, t, x, u):
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
         return self._state(x) + self.torque_weight * (u[0] * u[0])
 
-    def final(self, t, x):
+    def final(self, t: RealScalar, x: State) -> Scalar:
         return self.final_weight * self._state(x)

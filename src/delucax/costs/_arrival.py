@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import function_field, parameter
-from .._typing import RealScalar
+from .._typing import Control, RealScalar, Scalar, State
 from ._base import AbstractCost
 
 
@@ -56,11 +56,11 @@ class Arrival(AbstractCost):
         self.control_weight = control_weight
         self.arrival_cost = arrival_cost
 
-    def __call__(self, t, x, u):
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
         effort = self.control_weight * sum(part * part for part in tuple(u))
         return (self.step_cost + effort).astype(x.dtype)
 
-    def final(self, t, x):
+    def final(self, t: RealScalar, x: State) -> Scalar:
         if self.reached is None:
-            return jnp.zeros((), x.dtype)
+            return super().final(t, x)
         return jnp.where(self.reached(t, x), self.arrival_cost, 0.0).astype(x.dtype)

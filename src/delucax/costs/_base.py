@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_instance, output_of
-from .._module import check_parameters
-from .._typing import RealScalar
+from .._module import check_parameters, parts_of
+from .._typing import Control, RealScalar, State
 
 
 _UNTRACEABLE = (
@@ -55,9 +55,7 @@ class AbstractCost(eqx.Module):
         Where planners start by default depends on it; see
         [`delucax.planning.default_start`][].
         """
-        is_part = lambda node: isinstance(node, AbstractCost) and node is not self
-        nodes = jax.tree.leaves(self, is_leaf=is_part)
-        named = [node.targets for node in nodes if is_part(node)]
+        named = [part.targets for part in parts_of(self, AbstractCost)]
         pairs = [pair for pair in named if pair is not None]
         if not pairs:
             return None
@@ -88,7 +86,7 @@ class AbstractCost(eqx.Module):
     __rmul__ = __mul__
 
     @abc.abstractmethod
-    def __call__(self, t: RealScalar, x: Array, u: Array) -> Array:
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
         """The stage cost.
 
         **Arguments:** `t`: time. `x`: state. `u`: control that was applied.
@@ -96,7 +94,7 @@ class AbstractCost(eqx.Module):
         **Returns:** a scalar.
         """
 
-    def final(self, t: RealScalar, x: Array) -> Array:
+    def final(self, t: RealScalar, x: State) -> Array:
         """The final cost; 0 by default.
 
         **Arguments:** `t`: time. `x`: the last state.

@@ -1,13 +1,14 @@
 """Costs made of functions and of other costs."""
 
+import functools
+import operator
 from collections.abc import Callable
 
-import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_number, check_step
 from .._module import function_field, parameter
-from .._typing import RealScalar
+from .._typing import Control, RealScalar, State
 from ._base import AbstractCost, check_cost
 
 
@@ -33,12 +34,12 @@ class Function(AbstractCost):
     stage: Callable[[RealScalar, Array, Array], Array] = function_field()
     final_cost: Callable[[RealScalar, Array], Array] | None = function_field(None)
 
-    def __call__(self, t, x, u):
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
         return self.stage(t, x, u)
 
-    def final(self, t, x):
+    def final(self, t: RealScalar, x: State) -> Array:
         if self.final_cost is None:
-            return jnp.zeros((), x.dtype)
+            return super().final(t, x)
         return self.final_cost(t, x)
 
 
@@ -73,13 +74,11 @@ class Sum(AbstractCost):
         for term in self.terms:
             check_cost(term, "every term", "Sum")
 
-    def __call__(self, t, x, u):
-        first, *others = (term(t, x, u) for term in self.terms)
-        return sum(others, first)
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
+        return functools.reduce(operator.add, (c(t, x, u) for c in self.terms))
 
-    def final(self, t, x):
-        first, *others = (term.final(t, x) for term in self.terms)
-        return sum(others, first)
+    def final(self, t: RealScalar, x: State) -> Array:
+        return functools.reduce(operator.add, (c.final(t, x) for c in self.terms))
 
 
 class Scaled(AbstractCost):
@@ -109,10 +108,10 @@ class Scaled(AbstractCost):
         check_cost(self.cost, "cost", "Scaled")
         check_number(self.factor, "factor", "Scaled")
 
-    def __call__(self, t, x, u):
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
         return self.factor * self.cost(t, x, u)
 
-    def final(self, t, x):
+    def final(self, t: RealScalar, x: State) -> Array:
         return self.factor * self.cost.final(t, x)
 
 
@@ -144,8 +143,8 @@ class Rate(AbstractCost):
         check_cost(self.cost, "cost", "Rate")
         check_step(self.dt, "Rate")
 
-    def __call__(self, t, x, u):
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
         return self.cost(t, x, u) * self.dt
 
-    def final(self, t, x):
+    def final(self, t: RealScalar, x: State) -> Array:
         return self.cost.final(t, x)

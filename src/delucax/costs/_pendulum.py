@@ -3,6 +3,7 @@
 from jaxtyping import Array
 
 from .._module import parameter
+from .._typing import Control, RealScalar, Scalar, State
 from ..math import wrap
 from ._base import AbstractCost
 
@@ -32,7 +33,7 @@ class PendulumCost(AbstractCost):
     velocity_weight: Array = parameter(0.1)
     torque_weight: Array = parameter(0.001)
 
-    def __call__(self, t, x, u):
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
         angle = wrap(x[0])
         return (
             angle * angle

@@ -1,5 +1,6 @@
 """Quadratic costs about a point and about a reference."""
 
+import abc
 from collections.abc import Callable
 from typing import Any
 
@@ -10,13 +11,46 @@ from jaxtyping import Array
 from .._check import check_finite, symmetric_matrix
 from .._message import shortened
 from .._module import as_float_array, function_field, parameter
-from .._typing import Matrix, RealScalar, Vector
+from .._typing import Control, Matrix, RealScalar, Scalar, State, Vector
 from ..math import quadratic_form
 from ..math._small import dot
 from ._base import AbstractCost
 
 
-class Quadratic(AbstractCost):
+class _AbstractQuadratic(AbstractCost):
+    """Quadratic in an error of the state and one of the control."""
+
+    Q: eqx.AbstractVar[Matrix | Vector]
+    R: eqx.AbstractVar[Matrix | Vector]
+    Qf: eqx.AbstractVar[Matrix | Vector | None]
+
+    def __check_init__(self):
+        _weights(self.Q, self.R, self.Qf, type(self).__name__)
+
+    @abc.abstractmethod
+    def _state_error(self, t: RealScalar, x: State) -> Vector:
+        """What `Q` weighs."""
+
+    def _control_error(self, u: Control) -> Control:
+        """What `R` weighs."""
+        return u
+
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
+        if u.shape != self.R.shape[:1]:
+            raise ValueError(
+                f"{type(self).__name__}: R has shape {self.R.shape} but the control "
+                f"has shape {u.shape}."
+            )
+        du = self._control_error(u)
+        return _form(self.Q, self._state_error(t, x)) + _form(self.R, du)
+
+    def final(self, t: RealScalar, x: State) -> Scalar:
+        if self.Qf is None:
+            return super().final(t, x)
+        return _form(self.Qf, self._state_error(t, x))
+
+
+class Quadratic(_AbstractQuadratic):
     """`(x - x*)' Q (x - x*) + (u - u*)' R (u - u*)`, and `(x - x*)' Qf (x - x*)`.
 
     **Arguments:**
@@ -68,39 +102,29 @@ class Quadratic(AbstractCost):
         self.difference = difference
 
     def __check_init__(self):
-        _weights(self.Q, self.R, self.Qf, "Quadratic")
         _check_target(self.state_target, self.Q, "state_target")
         _check_target(self.control_target, self.R, "control_target")
 
     @property
-    def targets(self):
+    def targets(self) -> tuple[Array | None, Array | None]:
         return self.state_target, self.control_target
 
-    def _state(self, x: Array) -> Array:
+    def _state_error(self, t: RealScalar, x: State) -> Vector:
         if x.shape != self.Q.shape[:1]:
             raise ValueError(
                 f"Quadratic: Q has shape {self.Q.shape} but the state has shape "
                 f"{x.shape}."
             )
+        target = self.state_target
         if self.difference is not None:
-            target = (
-                jnp.zeros_like(x) if self.state_target is None else self.state_target
-            )
-            return self.difference(x, target)
-        return x if self.state_target is None else x - self.state_target
+            return self.difference(x, jnp.zeros_like(x) if target is None else target)
+        return x if target is None else x - target
 
-    def __call__(self, t, x, u):
-        _check_control(self.R, u, "Quadratic")
-        du = u if self.control_target is None else u - self.control_target
-        return _form(self.Q, self._state(x)) + _form(self.R, du)
-
-    def final(self, t, x):
-        if self.Qf is None:
-            return jnp.zeros((), x.dtype)
-        return _form(self.Qf, self._state(x))
+    def _control_error(self, u: Control) -> Control:
+        return u if self.control_target is None else u - self.control_target
 
 
-class Tracking(AbstractCost):
+class Tracking(_AbstractQuadratic):
     """`e' Q e + u' R u` with `e = h(x) - r(t)`, and `e' Qf e` at the end.
 
     It names no `targets`, as the reference moves.
@@ -149,14 +173,13 @@ class Tracking(AbstractCost):
         self.output = output
 
     def __check_init__(self):
-        _weights(self.Q, self.R, self.Qf, "Tracking")
         if not callable(self.reference):
             raise ValueError(
                 "Tracking: reference must be a function of time, got "
                 f"{shortened(self.reference)}."
             )
 
-    def _error(self, t: RealScalar, x: Array) -> Array:
+    def _state_error(self, t: RealScalar, x: State) -> Vector:
         y = x if self.output is None else self.output(x)
         r = self.reference(t)
         if jnp.shape(r) != y.shape or y.shape != self.Q.shape[:1]:
@@ -166,17 +189,8 @@ class Tracking(AbstractCost):
             )
         return y - r
 
-    def __call__(self, t, x, u):
-        _check_control(self.R, u, "Tracking")
-        return _form(self.Q, self._error(t, x)) + _form(self.R, u)
 
-    def final(self, t, x):
-        if self.Qf is None:
-            return jnp.zeros((), x.dtype)
-        return _form(self.Qf, self._error(t, x))
-
-
-def _form(weight: Array, d: Array) -> Array:
+def _form(weight: Matrix | Vector, d: Vector) -> Scalar:
     """`d' weight d`, the weight a matrix or its diagonal."""
     if weight.ndim == 2:
         return quadratic_form(weight, d)
@@ -209,13 +223,6 @@ def _weight(value: Any, name: str, where: str) -> Array:
             f"{where}: {name} must be a matrix or its diagonal, got {got}."
         )
     return symmetric_matrix(value, name, where)
-
-
-def _check_control(R: Array, u: Array, where: str) -> None:
-    if u.shape != R.shape[:1]:
-        raise ValueError(
-            f"{where}: R has shape {R.shape} but the control has shape {u.shape}."
-        )
 
 
 def _check_target(value: Any, weight: Array, name: str) -> None:

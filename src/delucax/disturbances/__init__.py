@@ -1,7 +1,7 @@
 """Sequences of disturbances, drawn for a whole horizon at once."""
 
 from ._base import AbstractDisturbance as AbstractDisturbance
-from ._compose import Shock as Shock, Sum as Sum, Window as Window
+from ._compose import shock as shock, Sum as Sum, Window as Window
 from ._deterministic import (
     Constant as Constant,
     FromArray as FromArray,

@@ -1,17 +1,21 @@
 """Sequences of disturbances, drawn for a whole horizon at once."""
 
 import abc
-from typing import Any, ClassVar, TYPE_CHECKING
+import dataclasses
+from typing import Any, ClassVar, TYPE_CHECKING, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._check import check_count
 from .._message import shortened
-from .._module import as_float_array, check_parameters
-from .._typing import PRNGKey
+from .._module import as_float_array, check_parameters, parts_of
+from .._typing import PRNGKey, RealScalar, Vector
+
+
+Rows: TypeAlias = Float[Array, "steps size"]
+"""The disturbance of each step."""
 
 
 class AbstractDisturbance(eqx.Module):
@@ -28,7 +32,7 @@ class AbstractDisturbance(eqx.Module):
         import jax.numpy as jnp
 
         noise = dlx.disturbances.Gaussian(0.1, size=2)
-        push = dlx.disturbances.Shock(jnp.array([0.0, 1.0]), start=2.0, duration=0.5)
+        push = dlx.disturbances.shock(jnp.array([0.0, 1.0]), start=2.0, duration=0.5)
         w = (noise + push).sequence(jax.random.key(0), 0.05 * jnp.arange(100))
         ```
     """
@@ -47,15 +51,11 @@ class AbstractDisturbance(eqx.Module):
 
         By default those of the shortest disturbance among its fields.
         """
-        is_part = lambda node: (
-            isinstance(node, AbstractDisturbance) and node is not self
-        )
-        nodes = jax.tree.leaves(self, is_leaf=is_part)
-        steps = [node.recorded_steps for node in nodes if is_part(node)]
+        steps = [part.recorded_steps for part in parts_of(self, AbstractDisturbance)]
         return min((n for n in steps if n is not None), default=None)
 
     @abc.abstractmethod
-    def sequence(self, key: PRNGKey | None, times: Array) -> Array:
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         """The disturbances at `times`.
 
         **Arguments:**
@@ -67,6 +67,34 @@ class AbstractDisturbance(eqx.Module):
 
         **Returns:** shape `(T, size)`.
         """
+
+    def draw(self, key: PRNGKey | None, dt: RealScalar, steps: int, dtype: Any) -> Rows:
+        """The disturbances of an episode, as [`delucax.rollout`][] draws them.
+
+        **Arguments:**
+
+        - `key`: of `sequence`.
+        - `dt`: the control interval.
+        - `steps`: how many steps.
+        - `dtype`: the precision of the times.
+
+        **Returns:** shape `(steps, size)`.
+
+        **Raises:** `ValueError` if `sequence` returns another shape.
+        """
+        # Of two times at least, because Brownian motion reads the interval off them;
+        # but of no more than are recorded.
+        recorded = self.recorded_steps
+        count = max(steps, 2 if recorded is None else min(recorded, 2))
+        w = self.sequence(key, (jnp.arange(count) * dt).astype(dtype))
+        shape = (count, self.size)
+        if getattr(w, "shape", None) != shape:
+            got = getattr(w, "shape", f"a {type(w).__name__}")
+            raise ValueError(
+                f"{type(self).__name__}: sequence must return an array of shape "
+                f"{shape}, got {got}."
+            )
+        return w[:steps]
 
     def __add__(self, other: "AbstractDisturbance") -> "AbstractDisturbance":
         from ._compose import Sum
@@ -80,18 +108,30 @@ class AbstractDisturbance(eqx.Module):
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
-def check_disturbance(value: Any, name: str, where: str) -> None:
-    """Raise unless `value` is a disturbance."""
-    if not isinstance(value, AbstractDisturbance):
-        raise ValueError(
-            f"{where}: {name} must be an AbstractDisturbance, got {shortened(value)}."
-        )
+class AbstractEntrywise(AbstractDisturbance):
+    """A disturbance whose arguments are numbers, the same for each entry, or vectors of
+    `size` entries.
+    """
+
+    def _set_entries(self, size: int | None, **values: Any) -> None:
+        """Set the fields of these names, and the size that they share."""
+        values["size"] = _common_size(type(self).__name__, size, values)
+        for name, value in values.items():
+            setattr(self, name, value)
+
+    def __check_init__(self):
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        _common_size(type(self).__name__, values.pop("size"), values)
+
+    def _rows(self, w: Array, times: Vector) -> Array:
+        """`w`, of one step or of all, for all `times`."""
+        return jnp.broadcast_to(w, (len(times), self.size)).astype(times.dtype)
 
 
-def common_size(where: str, size: int | None, **values: Any) -> tuple[int, dict]:
-    """The size that arrays share, and the arrays; numbers fit any size."""
-    arrays = {name: as_float_array(value) for name, value in values.items()}
-    for name, array in arrays.items():
+def _common_size(where: str, size: int | None, values: dict[str, Any]) -> int:
+    """The size that arrays share; numbers fit any size."""
+    for name, value in values.items():
+        array = as_float_array(value)
         if not eqx.is_inexact_array(array) or array.ndim > 1:
             got = array.shape if eqx.is_array(array) else shortened(array)
             raise ValueError(
@@ -110,24 +150,4 @@ def common_size(where: str, size: int | None, **values: Any) -> tuple[int, dict]
             f"{where}: size must be given when every other argument is a number, such "
             f"as {where}(..., size=2)."
         )
-    return check_count(size, "size", where), arrays
-
-
-def times_to_draw(disturbance: AbstractDisturbance, times: Array, steps: int) -> Array:
-    """The `times` to draw `steps` steps for: two at least, which tell Brownian motion
-    the step between them, unless fewer are recorded.
-    """
-    recorded = disturbance.recorded_steps
-    least = 2 if recorded is None else min(recorded, 2)
-    return times[: max(steps, least)]
-
-
-def check_common_size(disturbance: Any, *names: str) -> None:
-    """Raise unless the named fields are numbers, or have `disturbance.size` entries."""
-    values = {name: getattr(disturbance, name) for name in names}
-    common_size(type(disturbance).__name__, disturbance.size, **values)
-
-
-def spread(values: Array, steps: int, size: int) -> Array:
-    """`values` as shape `(steps, size)`."""
-    return jnp.broadcast_to(values, (steps, size))
+    return check_count(size, "size", where)

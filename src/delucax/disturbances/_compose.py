@@ -1,15 +1,18 @@
 """Disturbances made of others."""
 
+import functools
+import operator
 from typing import Any
 
 import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_key, check_range
+from .._check import check_instance, check_key, check_range
 from .._module import parameter
+from .._typing import PRNGKey, Vector
 from ..math._steps import reached, step_between
-from ._base import AbstractDisturbance, check_disturbance
+from ._base import AbstractDisturbance, Rows
 from ._deterministic import Constant
 
 
@@ -40,7 +43,7 @@ class Sum(AbstractDisturbance):
 
     def __check_init__(self):
         for term in self.terms:
-            check_disturbance(term, "every term", "Sum")
+            check_instance(term, AbstractDisturbance, "every term", "Sum")
         sizes = [term.size for term in self.terms]
         if len(set(sizes)) != 1:
             raise ValueError(f"Sum: terms must be of one size, got sizes {sizes}.")
@@ -50,13 +53,13 @@ class Sum(AbstractDisturbance):
         """The size that the terms share."""
         return self.terms[0].size
 
-    def sequence(self, key, times):
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         n = len(self.terms)
         if key is not None:
             check_key(key, "Sum")
         keys = [None] * n if key is None else list(jr.split(key, n))
-        drawn = [w.sequence(k, times) for w, k in zip(self.terms, keys, strict=True)]
-        return sum(drawn[1:], drawn[0])
+        drawn = (w.sequence(k, times) for w, k in zip(self.terms, keys, strict=True))
+        return functools.reduce(operator.add, drawn)
 
 
 class Window(AbstractDisturbance):
@@ -92,7 +95,7 @@ class Window(AbstractDisturbance):
     stop: Array = parameter()
 
     def __check_init__(self):
-        check_disturbance(self.disturbance, "disturbance", "Window")
+        check_instance(self.disturbance, AbstractDisturbance, "disturbance", "Window")
         check_range(self.stop, "stop", "Window", self.start)
 
     @property
@@ -100,7 +103,7 @@ class Window(AbstractDisturbance):
         """That of the disturbance inside."""
         return self.disturbance.size
 
-    def sequence(self, key, times):
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         w = self.disturbance.sequence(key, times)
         dt = step_between(times, "Window")
         inside = reached(times, self.start, dt) & ~reached(times, self.stop, dt)
@@ -108,9 +111,7 @@ class Window(AbstractDisturbance):
         return w if dt is None else jnp.where(jnp.isnan(dt), jnp.nan, w)
 
 
-def Shock(
-    value: Any, start: Any, duration: Any, *, size: int | None = None
-) -> AbstractDisturbance:
+def shock(value: Any, start: Any, duration: Any, *, size: int | None = None) -> Window:
     """A constant push for a while: a `Window` of a `Constant`.
 
     **Arguments:**
@@ -130,8 +131,8 @@ def Shock(
         import delucax as dlx
         import jax.numpy as jnp
 
-        push = dlx.disturbances.Shock(jnp.array([0.0, 0.5]), start=5.0, duration=0.5)
+        push = dlx.disturbances.shock(jnp.array([0.0, 0.5]), start=5.0, duration=0.5)
         ```
     """
-    check_range(duration, "duration", "Shock")
+    check_range(duration, "duration", "shock")
     return Window(Constant(value, size=size), start, start + duration)

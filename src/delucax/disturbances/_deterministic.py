@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_matrix, check_range
+from .._check import as_matrix, check_count, check_range
 from .._module import parameter, positive
+from .._typing import PRNGKey, Vector
 from ..math import sin
 from ..math._steps import coarsest, position, step_between
-from ._base import AbstractDisturbance, check_common_size, common_size, spread
+from ._base import AbstractDisturbance, AbstractEntrywise, Rows
 
 
 class Zero(AbstractDisturbance):
@@ -32,13 +33,13 @@ class Zero(AbstractDisturbance):
     size: int = eqx.field(static=True)
 
     def __init__(self, size: int):
-        self.size, _ = common_size("Zero", size)
+        self.size = check_count(size, "size", "Zero")
 
-    def sequence(self, key, times):
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         return jnp.zeros((times.shape[0], self.size), times.dtype)
 
 
-class Constant(AbstractDisturbance):
+class Constant(AbstractEntrywise):
     """`w[k] = value`.
 
     **Arguments:**
@@ -62,17 +63,13 @@ class Constant(AbstractDisturbance):
     size: int = eqx.field(static=True)
 
     def __init__(self, value: Any, *, size: int | None = None):
-        self.size, arrays = common_size("Constant", size, value=value)
-        self.value = arrays["value"]
+        self._set_entries(size, value=value)
 
-    def __check_init__(self):
-        check_common_size(self, "value")
-
-    def sequence(self, key, times):
-        return spread(self.value, times.shape[0], self.size).astype(times.dtype)
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
+        return self._rows(self.value, times)
 
 
-class Sinusoid(AbstractDisturbance):
+class Sinusoid(AbstractEntrywise):
     """`w[k] = amplitude sin(2 pi frequency t_k + phase) + offset`.
 
     **Arguments:** each a number or a vector of `size` entries.
@@ -111,27 +108,16 @@ class Sinusoid(AbstractDisturbance):
         *,
         size: int | None = None,
     ):
-        self.size, arrays = common_size(
-            "Sinusoid",
-            size,
-            amplitude=amplitude,
-            frequency=frequency,
-            phase=phase,
-            offset=offset,
+        self._set_entries(
+            size, amplitude=amplitude, frequency=frequency, phase=phase, offset=offset
         )
-        for name, array in arrays.items():
-            setattr(self, name, array)
 
-    def __check_init__(self):
-        check_common_size(self, "amplitude", "frequency", "phase", "offset")
-
-    def sequence(self, key, times):
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         angle = 2 * np.pi * self.frequency * times[:, None] + self.phase
-        w = self.amplitude * sin(angle) + self.offset
-        return spread(w, times.shape[0], self.size).astype(times.dtype)
+        return self._rows(self.amplitude * sin(angle) + self.offset, times)
 
 
-class Square(AbstractDisturbance):
+class Square(AbstractEntrywise):
     """`w[k] = amplitude` in the first part of each period and `-amplitude` in the rest.
 
     **Arguments:** each a number or a vector of `size` entries.
@@ -167,17 +153,12 @@ class Square(AbstractDisturbance):
     def __init__(
         self, amplitude: Any, period: Any, duty: Any = 0.5, *, size: int | None = None
     ):
-        self.size, arrays = common_size(
-            "Square", size, amplitude=amplitude, period=period, duty=duty
-        )
-        for name, array in arrays.items():
-            setattr(self, name, array)
+        self._set_entries(size, amplitude=amplitude, period=period, duty=duty)
 
     def __check_init__(self):
-        check_common_size(self, "amplitude", "period", "duty")
         check_range(self.duty, "duty", "Square", 0, 1)
 
-    def sequence(self, key, times):
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         dt = step_between(times, "Square")
         # Counted from 0 in steps, which late times of a few steps do not tell.
         unit = self.period if dt is None else jnp.where(times[0] == 0, dt, self.period)
@@ -192,7 +173,7 @@ class Square(AbstractDisturbance):
             phase < self.duty * period - slack, self.amplitude, -self.amplitude
         )
         w = w if dt is None else jnp.where(jnp.isnan(dt), jnp.nan, w)
-        return spread(w, times.shape[0], self.size).astype(times.dtype)
+        return self._rows(w, times)
 
 
 class FromArray(AbstractDisturbance):
@@ -230,7 +211,7 @@ class FromArray(AbstractDisturbance):
         """The number of rows of `values`."""
         return self.values.shape[0]
 
-    def sequence(self, key, times):
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         steps = times.shape[0]
         if self.values.shape[0] < steps:
             raise ValueError(

@@ -11,12 +11,13 @@ from jaxtyping import Array
 from .._check import check_count, check_key, check_range, check_step
 from .._jax import normal
 from .._module import parameter
+from .._typing import PRNGKey, Vector
 from ..math import clip
 from ..math._steps import step_between
-from ._base import AbstractDisturbance, check_common_size, common_size
+from ._base import AbstractDisturbance, AbstractEntrywise, Rows
 
 
-class Gaussian(AbstractDisturbance):
+class Gaussian(AbstractEntrywise):
     """Independent normal noise, `w[k] ~ N(mean, std^2)`.
 
     **Arguments:** each a number or a vector of `size` entries.
@@ -45,19 +46,17 @@ class Gaussian(AbstractDisturbance):
     size: int = eqx.field(static=True)
 
     def __init__(self, std: Any, mean: Any = 0.0, *, size: int | None = None):
-        self.size, arrays = common_size("Gaussian", size, std=std, mean=mean)
-        self.std, self.mean = arrays["std"], arrays["mean"]
+        self._set_entries(size, std=std, mean=mean)
 
     def __check_init__(self):
-        check_common_size(self, "std", "mean")
         check_range(self.std, "std", "Gaussian")
 
-    def sequence(self, key, times):
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         w = normal(check_key(key, "Gaussian"), (times.shape[0], self.size), times.dtype)
         return (self.std * w + self.mean).astype(times.dtype)
 
 
-class Uniform(AbstractDisturbance):
+class Uniform(AbstractEntrywise):
     """Independent uniform noise, `w[k] ~ U(low, high)`.
 
     **Arguments:** each a number or a vector of `size` entries.
@@ -85,21 +84,19 @@ class Uniform(AbstractDisturbance):
     size: int = eqx.field(static=True)
 
     def __init__(self, low: Any, high: Any, *, size: int | None = None):
-        self.size, arrays = common_size("Uniform", size, low=low, high=high)
-        self.low, self.high = arrays["low"], arrays["high"]
+        self._set_entries(size, low=low, high=high)
 
     def __check_init__(self):
-        check_common_size(self, "low", "high")
         check_range(self.high, "high", "Uniform", self.low)
 
-    def sequence(self, key, times):
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         w = jr.uniform(
             check_key(key, "Uniform"), (times.shape[0], self.size), times.dtype
         )
         return (self.low + (self.high - self.low) * w).astype(times.dtype)
 
 
-class RandomWalk(AbstractDisturbance):
+class RandomWalk(AbstractEntrywise):
     """A Gaussian random walk kept inside a bound:
     `w[k + 1] = clip(w[k] + std e[k], -bound, bound)`, `e[k] ~ N(0, 1)`, `w[-1] = 0`.
 
@@ -129,15 +126,13 @@ class RandomWalk(AbstractDisturbance):
     size: int = eqx.field(static=True)
 
     def __init__(self, std: Any = 0.3, bound: Any = 1.0, *, size: int | None = None):
-        self.size, arrays = common_size("RandomWalk", size, std=std, bound=bound)
-        self.std, self.bound = arrays["std"], arrays["bound"]
+        self._set_entries(size, std=std, bound=bound)
 
     def __check_init__(self):
-        check_common_size(self, "std", "bound")
         check_range(self.std, "std", "RandomWalk")
         check_range(self.bound, "bound", "RandomWalk")
 
-    def sequence(self, key, times):
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         shape = (times.shape[0], self.size)
         e = normal(check_key(key, "RandomWalk"), shape, times.dtype)
         std, bound = self.std.astype(e.dtype), self.bound.astype(e.dtype)
@@ -190,7 +185,7 @@ class Brownian(AbstractDisturbance):
         if self.dt is not None:
             check_step(self.dt, "Brownian")
 
-    def sequence(self, key, times):
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         if self.dt is None and times.shape[0] < 2:
             raise ValueError(
                 f"Brownian: dt must be given for {times.shape[0]} times, which do not "

@@ -268,6 +268,18 @@ class Environment(eqx.Module):
         x, u = point
         return trim(self.dynamics, x=x, u=u, fix=fix, throw=throw)
 
+    @staticmethod
+    def split_key(key: PRNGKey) -> tuple[PRNGKey, PRNGKey, PRNGKey, PRNGKey]:
+        """The keys of an episode, as [`delucax.rollout`][] splits the one it is given.
+
+        **Arguments:** `key`: a random key.
+
+        **Returns:** keys for the first state, the disturbance, the sensor noise and the
+        controller.
+        """
+        start, disturbance, noise, controller = jr.split(key, 4)
+        return start, disturbance, noise, controller
+
     def reset(self, key: PRNGKey) -> Array:
         """A first state.
 

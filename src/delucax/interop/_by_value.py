@@ -12,7 +12,7 @@ from ..environments import Environment
 class ByValue:
     """An environment that equals another if all of their numbers do.
 
-    What is compiled with the numbers as constants is found again by it.
+    A function that was compiled with the numbers as constants is looked up by it.
     """
 
     def __init__(self, env: Environment):

@@ -1,35 +1,60 @@
 """An episode, step by step: what every adapter of an environment does."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
-import jax.random as jr
-from jaxtyping import Array
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
 
 from .._results import RESULTS
-from ..disturbances import Zero
-from ..disturbances._base import times_to_draw
+from .._typing import BoolScalar, Control, PRNGKey, Scalar, State
+from ..disturbances import AbstractDisturbance, Zero
 from ..environments import Environment
 
 
 class Signals(NamedTuple):
-    """What is drawn for a whole episode."""
+    """The disturbances and the sensor noise of a whole episode, where there are any."""
 
-    disturbance: Any  # (horizon, w), or none
-    noise: Any  # (horizon + 1, y), or none
-
-
-NO_SIGNALS = Signals(None, None)
+    disturbances: Float[Array, "steps disturbances"] | None = None
+    noise: Float[Array, "times observations"] | None = None
 
 
-class Moved(NamedTuple):
-    """What a step makes."""
+NO_SIGNALS = Signals()
+
+
+class EpisodeState(eqx.Module):
+    """Where an episode is.
+
+    **Arguments:**
+
+    - `state`: of the environment, shape `(state_size,)`.
+    - `time`: steps since it began.
+    - `signals`: the disturbances and the noise of the whole episode, drawn when it
+        began; none by default.
+
+    !!! example
+
+        ```python
+        import jax.numpy as jnp
+        from delucax.interop.gymnax import EpisodeState
+
+        EpisodeState(jnp.array([0.5, 0.0]), jnp.asarray(0))
+        ```
+    """
 
     state: Array
-    reward: Array
-    terminated: Array
-    truncated: Array
-    failed: Array
+    time: Array
+    signals: Signals = NO_SIGNALS
+
+
+class Outcome(NamedTuple):
+    """What a step says of itself."""
+
+    reward: Scalar
+    terminated: BoolScalar
+    truncated: BoolScalar
+    failed: BoolScalar
 
 
 def has_signals(env: Environment) -> bool:
@@ -37,58 +62,57 @@ def has_signals(env: Environment) -> bool:
     return not isinstance(env.disturbance, Zero) or env.sensor_noise is not None
 
 
-def split_key(key: Any) -> tuple[Any, Any]:
-    """A key for the first state and one for the signals, as `rollout` splits them."""
-    keys = jr.split(key, 4)
-    return keys[0], keys[1:3]
-
-
-def draw_signals(env: Environment, keys: Any, dtype: Any) -> Signals:
-    """What is drawn for a whole episode, with the second of `split_key`."""
-    steps = env.horizon
-    times = (jnp.arange(steps + 1) * env.dt).astype(dtype)
+def begin(env: Environment, key: PRNGKey, state: State | None = None) -> EpisodeState:
+    """The start, by default that of the episode of `rollout` with the same key."""
+    start_key, w_key, noise_key, _ = env.split_key(key)
+    x = env.reset(start_key) if state is None else state
     w = noise = None
     if not isinstance(env.disturbance, Zero):
-        shown = times_to_draw(env.disturbance, times, steps)
-        w = env.disturbance.sequence(keys[0], shown).astype(dtype)
+        w = env.disturbance.draw(w_key, env.dt, env.horizon, x.dtype)
     if env.sensor_noise is not None:
-        # The state after the last step is observed too. Where what is recorded ends
-        # there, its last row is the noise of that.
-        recorded = env.sensor_noise.recorded_steps
-        ends = recorded is not None and recorded <= steps
-        shown = times_to_draw(env.sensor_noise, times, steps + (not ends))
-        noise = env.sensor_noise.sequence(keys[1], shown).astype(dtype)
-        noise = jnp.concatenate([noise, noise[-1:]]) if ends else noise
-    return Signals(w, noise)
+        noise = _draw_noise(env, env.sensor_noise, noise_key, x.dtype)
+    return EpisodeState(x, jnp.zeros((), int), Signals(w, noise))
 
 
-def time_of(env: Environment, k: Any, dtype: Any) -> Array:
-    """The time of step `k`."""
-    return (k * env.dt).astype(dtype)
+def _draw_noise(
+    env: Environment, noise: AbstractDisturbance, key: PRNGKey, dtype: DTypeLike
+) -> Float[Array, "times observations"]:
+    # The state after the last step is observed too. Where what is recorded ends there,
+    # its last row is the noise of that.
+    recorded = noise.recorded_steps
+    ends = recorded is not None and recorded <= env.horizon
+    rows = noise.draw(key, env.dt, env.horizon + (not ends), dtype)
+    return jnp.concatenate([rows, rows[-1:]]) if ends else rows
 
 
-def see(env: Environment, k: Any, x: Array, signals: Signals) -> Array:
-    """What a network is given of the state `x` at step `k`."""
-    y = env.dynamics.observe(time_of(env, k, x.dtype), x)
-    return env.encode(y if signals.noise is None else y + signals.noise[k])
+def time_of(env: Environment, episode: EpisodeState) -> Scalar:
+    """The time, in the precision of the state."""
+    return (episode.time * env.dt).astype(episode.state.dtype)
 
 
-def move(
+def observe(env: Environment, episode: EpisodeState) -> Float[Array, " features"]:
+    """What a network is given."""
+    x, noise = episode.state, episode.signals.noise
+    y = env.dynamics.observe(time_of(env, episode), x)
+    return env.encode(y if noise is None else (y + noise[episode.time]).astype(x.dtype))
+
+
+def step(
     env: Environment,
-    k: Any,
-    x: Array,
-    action: Array,
-    signals: Signals,
+    episode: EpisodeState,
+    action: Control | Array,
     truncate: bool = True,
-) -> Moved:
+) -> tuple[EpisodeState, Outcome]:
     """One step; the final cost is charged with the last, which is at the horizon if
     episodes are to be truncated there."""
-    w = None if signals.disturbance is None else signals.disturbance[k]
-    step = env.step(time_of(env, k, x.dtype), x, action, w)
-    x_next, after = step.state.astype(x.dtype), k + 1
-    truncated = (after >= env.horizon) & truncate
-    ended = step.terminated | truncated
-    final = jnp.where(ended, env.cost.final(time_of(env, after, x.dtype), x_next), 0)
+    x, w = episode.state, episode.signals.disturbances
+    w = None if w is None else w[episode.time]
+    made = env.step(time_of(env, episode), x, action, w)
+    x_next = made.state.astype(x.dtype)
+    after = EpisodeState(x_next, episode.time + 1, episode.signals)
+    truncated = (after.time >= env.horizon) & truncate
+    ended = made.terminated | truncated
+    final = jnp.where(ended, env.cost.final(time_of(env, after), x_next), 0)
     finite = jnp.all(jnp.isfinite(action)) & jnp.all(jnp.isfinite(x_next))
-    failed = (step.result != RESULTS.successful) | ~finite
-    return Moved(x_next, -(step.cost + final), step.terminated, truncated, failed)
+    failed = (made.result != RESULTS.successful) | ~finite
+    return after, Outcome(-(made.cost + final), made.terminated, truncated, failed)

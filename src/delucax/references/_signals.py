@@ -1,7 +1,5 @@
 """Signals to follow, as functions of time."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +7,7 @@ from jaxtyping import Array
 
 from .._check import as_matrix, check_step
 from .._module import check_parameters, parameter, positive
+from .._typing import RealScalar, Vector
 from ..math import sin
 from ..math._steps import step_at
 
@@ -39,7 +38,7 @@ class Constant(eqx.Module):
             )
         check_parameters(self)
 
-    def __call__(self, t: Any) -> Array:
+    def __call__(self, t: RealScalar) -> Vector:
         """The signal at time `t`."""
         del t
         return self.value
@@ -76,7 +75,7 @@ class Sequence(eqx.Module):
         as_matrix(self.values, "values", "Sequence")
         check_parameters(self)
 
-    def __call__(self, t: Any) -> Array:
+    def __call__(self, t: RealScalar) -> Vector:
         """The signal at time `t`."""
         count = self.values.shape[0]
         k = step_at(t, self.dt, count, "Sequence")
@@ -112,7 +111,7 @@ class FigureEight(eqx.Module):
     def __check_init__(self):
         check_parameters(self)
 
-    def __call__(self, t: Any) -> Array:
+    def __call__(self, t: RealScalar) -> Vector:
         """The signal at time `t`."""
         s = 2 * np.pi * t / self.period
         return self.centre + jnp.stack([self.width * sin(s), self.height * sin(2 * s)])

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.random as jr
 
 from .._check import (
     as_number,
@@ -26,7 +25,6 @@ from .._module import as_float_array
 from .._results import choose, first_failure, first_of, or_none, RESULTS
 from .._typing import Checkpoint, PRNGKey
 from ..disturbances import Zero
-from ..disturbances._base import times_to_draw
 from ..dynamics._runge_kutta import join_state, split_state, stack_steps
 from ..environments import Environment
 from ._answer import answer, check_state, outcome_of
@@ -173,19 +171,15 @@ def rollout(
 @eqx.filter_jit
 def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkpoint):
     dynamics = env.dynamics
-    start_key, w_key, noise_key, controller_key = jr.split(key, 4)
+    start_key, w_key, noise_key, controller_key = env.split_key(key)
     if x0 is None:
         x0 = env.reset(start_key)
     size, dtype, dt = x0.shape[0], x0.dtype, env.dt
-    times = (jnp.arange(horizon + 1) * dt).astype(dtype)
     if w is None and not isinstance(env.disturbance, Zero):
-        shown = times_to_draw(env.disturbance, times, horizon)
-        w = _drawn(env.disturbance, w_key, shown, env.disturbance_size)[:horizon]
+        w = env.disturbance.draw(w_key, dt, horizon, dtype)
     noise = None
     if env.sensor_noise is not None:
-        shown = times_to_draw(env.sensor_noise, times, horizon)
-        noise = _drawn(env.sensor_noise, noise_key, shown, env.observation_size)
-        noise = noise[:horizon]
+        noise = env.sensor_noise.draw(noise_key, dt, horizon, dtype)
     ends = env.terminated is not None
     plain_sight = True  # whether the observation is the state itself, found by tracing
 
@@ -349,19 +343,6 @@ def _scan(body, carry, inputs, horizon, checkpoint):
         carry, last = lax.scan(inner, carry, tail)
         kept = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), kept, last)
     return carry, kept
-
-
-def _drawn(disturbance, key, times, size):
-    """The sequence that a disturbance draws, with its shape checked."""
-    w = disturbance.sequence(key, times)
-    shape = (times.shape[0], size)
-    if getattr(w, "shape", None) != shape:
-        got = getattr(w, "shape", f"a {type(w).__name__}")
-        raise ValueError(
-            f"{type(disturbance).__name__}: sequence must return an array of shape "
-            f"{shape}, got {got}."
-        )
-    return w
 
 
 def _check_control(controller, u, env) -> None:

@@ -16,7 +16,7 @@ from .. import plotting
 from .._extras import extra
 from .._module import replace, save
 from ..controllers import Linear, LQR, Zero
-from ..disturbances import Shock
+from ..disturbances import shock
 from ..dynamics import linearize
 from ..environments import Environment, pendulum
 from ..simulation import rollout, Trajectory
@@ -28,7 +28,7 @@ from .paper._wall_clock import gymnasium_run
 
 EVALUATION_STEPS = 400
 STARTS = 100
-_SHOCK = Shock(np.array([0.0, 0.3]), start=10.0, duration=0.5)
+_SHOCK = shock(np.array([0.0, 0.3]), start=10.0, duration=0.5)
 
 
 def demo(

@@ -8,13 +8,13 @@ from ..._extras import extra
 
 extra("gymnasium", "gymnasium")
 
-from ._env import GymnasiumEnv as GymnasiumEnv  # noqa: E402
-from ._ids import (  # noqa: E402
+from ._registration import (  # noqa: E402
     make as make,
     make_vector as make_vector,
     register_ids as register_ids,
 )
-from ._vector import GymnasiumVectorEnv as GymnasiumVectorEnv  # noqa: E402
+from ._single_env import GymnasiumEnv as GymnasiumEnv  # noqa: E402
+from ._vector_env import GymnasiumVectorEnv as GymnasiumVectorEnv  # noqa: E402
 
 
 register_ids()

@@ -6,58 +6,40 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
-from ..._check import check_bool
 from ...environments import Environment
-from ...environments._environment import LARGEST
-
-
-# Samples are drawn of an action space, which has to end somewhere.
-_LARGEST_ACTION = 1e3
-
-
-def is_discrete(env: Environment, discrete: bool | None, where: str) -> bool:
-    """Whether actions are indices into the table of `actions`."""
-    if discrete is not None:
-        check_bool(discrete, "discrete", where)
-    if discrete and env.actions is None:
-        raise ValueError(
-            f"{where}: discrete needs a table of actions in the environment, which has "
-            "none."
-        )
-    return env.actions is not None if discrete is None else discrete
+from .._spaces import finite_ends, LARGEST, LARGEST_ACTION
 
 
 def read_options(options: Any, names: tuple[str, ...], where: str) -> list[Any]:
-    """What the options of a reset say, none where they do not."""
+    """The options of a reset, none for those that are left out."""
     if options is not None and not isinstance(options, Mapping):
         raise ValueError(f"{where}: options must be a dictionary, got {options!r}.")
     options = dict(options or {})
-    found = [options.pop(name, None) for name in names]
+    values = [options.pop(name, None) for name in names]
     if options:
         raise ValueError(
             f"{where}: options takes {' and '.join(map(repr, names))} alone, got "
             f"{', '.join(map(repr, options))}."
         )
-    return found
+    return values
 
 
 def action_space(env: Environment, discrete: bool) -> Box | Discrete:
+    """Indices into the table of actions, or controls."""
     if discrete:
         assert env.actions is not None
         return Discrete(len(env.actions))
-    low, high = (-np.inf, np.inf) if env.control_bounds is None else env.control_bounds
-    ends = [
-        np.where(np.isfinite(end), end, np.sign(end) * _LARGEST_ACTION)
-        for end in (low, high)
-    ]
-    return _box(ends, env.control_size)
+    return _box(finite_ends(env.control_bounds, env.control_size, LARGEST_ACTION))
 
 
 def observation_space(env: Environment) -> Box:
+    """What `encode` returns."""
     bounds = env.observation_bounds
-    return _box((-LARGEST, LARGEST) if bounds is None else bounds, env.feature_size)
+    # Gymnasium's own spaces are infinite where bounds are.
+    ends = (-LARGEST, LARGEST) if bounds is None else bounds
+    return _box(finite_ends(ends, env.feature_size, np.inf))
 
 
-def _box(ends: Any, size: int) -> Box:
-    low, high = (np.broadcast_to(np.asarray(end, np.float32), size) for end in ends)
+def _box(ends: Any) -> Box:
+    low, high = (np.asarray(end, np.float32) for end in ends)
     return Box(low, high, dtype=np.float32)

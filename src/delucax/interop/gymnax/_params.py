@@ -1,10 +1,10 @@
-"""The numbers and the state of an environment, as gymnax's protocol passes them."""
+"""The numbers of an environment, as gymnax's protocol passes them."""
 
 from typing import Any
 
 import equinox as eqx
-from jaxtyping import Array
 
+from ..._check import check_instance
 from ...environments import Environment
 
 
@@ -29,11 +29,7 @@ class GymnaxParams(eqx.Module):
     static: Any = eqx.field(static=True)
 
     def __init__(self, environment: Environment):
-        if not isinstance(environment, Environment):
-            raise ValueError(
-                "GymnaxParams: environment must be a delucax.Environment, got "
-                f"{type(environment).__name__}."
-            )
+        check_instance(environment, Environment, "environment", "GymnaxParams")
         self.arrays, self.static = eqx.partition(environment, eqx.is_array)
 
     @property
@@ -45,28 +41,3 @@ class GymnaxParams(eqx.Module):
     def max_steps_in_episode(self) -> int:
         """The horizon."""
         return self.environment.horizon
-
-
-class GymnaxState(eqx.Module):
-    """The state of an episode.
-
-    **Arguments:**
-
-    - `state`: of the environment, shape `(state_size,)`.
-    - `time`: steps since it began.
-    - `keys`: what the disturbances and the noise of the episode are drawn with; none if
-        nothing is drawn.
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax.interop.gymnax import GymnaxState
-
-        GymnaxState(jnp.array([0.5, 0.0]), jnp.asarray(0))
-        ```
-    """
-
-    state: Array
-    time: Array
-    keys: Any = None

@@ -9,11 +9,8 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._check import is_concrete
-from ...environments._environment import LARGEST as LARGEST
-
-
-# A space has to end somewhere, and of an action space samples are drawn.
-LARGEST_ACTION = 1e3
+from ..._typing import PRNGKey
+from .._spaces import finite_ends
 
 
 class Box:
@@ -23,7 +20,7 @@ class Box:
         self.low, self.high = low, high
         self.shape, self.dtype = shape, dtype
 
-    def sample(self, key: Any) -> Array:
+    def sample(self, key: PRNGKey) -> Array:
         """A uniform draw."""
         return jr.uniform(key, self.shape, self.dtype, self.low, self.high)
 
@@ -41,7 +38,7 @@ class Discrete:
     def __init__(self, n: int):
         self.n, self.shape, self.dtype = n, (), jnp.zeros((), int).dtype
 
-    def sample(self, key: Any) -> Array:
+    def sample(self, key: PRNGKey) -> Array:
         """A uniform draw."""
         return jr.randint(key, (), 0, self.n, self.dtype)
 
@@ -53,20 +50,9 @@ class Discrete:
         return f"Discrete({self.n})"
 
 
-def check_index(action: Array, n: int) -> None:
-    """Raise unless an action that can be looked at is one of `n`."""
-    if not is_concrete(action):
-        return
-    index = np.asarray(action).reshape(())
-    if not (index == np.round(index) and 0 <= index < n):
-        raise ValueError(
-            f"GymnaxEnv: action must be a whole number from 0 to {n - 1}, got {index}."
-        )
-
-
 def separates_ends() -> bool:
-    """Whether those who will step want two ends: gymnax since 1.0 does. rejax, which
-    imports any gymnax, wants one.
+    """Whether `step` should return `terminated` and `truncated`: gymnax expects both
+    since 1.0, and rejax, which imports any gymnax, expects `done`.
     """
     theirs = sys.modules.get("gymnax.environments.environment")
     two = hasattr(getattr(theirs, "Environment", None), "is_truncated")
@@ -84,19 +70,13 @@ def discrete_space(n: int) -> Any:
 def box_space(bounds: Any, size: int, largest: float) -> Any:
     """A `Box`, or gymnax's own; a side without a bound ends at the largest number."""
     theirs = sys.modules.get("gymnax.environments.spaces")
-    dtype = jnp.zeros(()).dtype
-    low, high = (-np.inf, np.inf) if bounds is None else bounds
-    low, high = _end(low, size, largest), _end(high, size, largest)
-    return (Box if theirs is None else theirs.Box)(low, high, (size,), dtype)
+    low, high = map(_number_if_one, finite_ends(bounds, size, largest))
+    box = Box if theirs is None else theirs.Box
+    return box(low, high, (size,), jnp.zeros(()).dtype)
 
 
-def _end(end: Any, size: int, largest: float) -> Any:
+def _number_if_one(end: Any) -> Any:
     """A float if all entries are one, for networks want what has a hash."""
-    if not is_concrete(end):
-        end = jnp.nan_to_num(end, posinf=largest, neginf=-largest)
-        return jnp.broadcast_to(end, (size,))
-    values = np.asarray(end)
-    values = np.where(np.isfinite(values), values, np.sign(values) * largest)
-    if np.all(values == values.flat[0]):
-        return float(values.flat[0])
-    return jnp.broadcast_to(values, (size,))
+    if is_concrete(end) and np.all(end == end[0]):
+        return float(end[0])
+    return jnp.asarray(end)

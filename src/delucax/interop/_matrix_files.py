@@ -9,6 +9,7 @@ import numpy as np
 from .._check import as_path
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
+from ._linear_model import check_no_feed_through, linear_model
 
 
 def read_linear(
@@ -43,33 +44,22 @@ def read_linear(
     """
     where = "read_linear"
     held = _matrices(as_path(path, "path", where), where)
-    for name in ("A", "B"):
-        if name not in held:
-            raise ValueError(
-                f"{where}: '{path}' must hold A and B, got {', '.join(held) or 'none'}."
-            )
-    if "D" in held and np.any(held["D"]):
+    if not {"A", "B"} <= held.keys():
         raise ValueError(
-            f"{where}: D must be zero, as the models here have no feed-through, got "
-            f"{held['D'].tolist()}."
+            f"{where}: '{path}' must hold A and B, got {', '.join(held) or 'none'}."
         )
-    if "dt" in held:
-        step = float(held["dt"].reshape(()))
-        if dt is not None and float(dt) != step:
-            raise ValueError(
-                f"{where}: dt must be that of '{path}', {step}, or left out, got {dt}."
-            )
-    elif dt is None:
+    check_no_feed_through(held.get("D", np.zeros(())), where)
+    if dt is None and "dt" not in held:
         raise ValueError(
             f"{where}: '{path}' holds no dt; give it: 0 for continuous time, or the "
             "step."
         )
-    else:
-        step = float(dt)
-    matrices = [held["A"], held["B"], held.get("C"), held.get("E")]
-    if step == 0:
-        return LinearSystem(*matrices)
-    return LinearDynamics(*matrices, dt=step)
+    step = float(np.reshape(held.get("dt", dt), ()))
+    if dt is not None and float(dt) != step:
+        raise ValueError(
+            f"{where}: dt must be that of '{path}', {step}, or left out, got {dt}."
+        )
+    return linear_model(held["A"], held["B"], held.get("C"), held.get("E"), step)
 
 
 def _matrices(path: Path, where: str) -> dict[str, Any]:
@@ -78,8 +68,8 @@ def _matrices(path: Path, where: str) -> dict[str, Any]:
     if path.suffix in (".npz", ".mat") and not path.is_file():
         raise FileNotFoundError(f"{where}: path must be a file, got '{path}'.")
     if path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as file:
-            held = {name: file[name] for name in names if name in file}
+        with np.load(path, allow_pickle=False) as archive:
+            file = {name: archive[name] for name in names if name in archive}
     elif path.suffix == ".mat":
         from scipy.io import loadmat
 
@@ -90,7 +80,6 @@ def _matrices(path: Path, where: str) -> dict[str, Any]:
                 f"{where}: '{path}' is a .mat file of version 7.3; save it with "
                 "'-v7' in MATLAB."
             ) from error
-        held = {name: file[name] for name in names if name in file}
     else:
         raise ValueError(f"{where}: path must end in .npz or .mat, got '{path}'.")
-    return {name: np.asarray(value, float) for name, value in held.items()}
+    return {name: np.asarray(file[name], float) for name in names if name in file}

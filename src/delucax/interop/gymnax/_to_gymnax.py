@@ -8,29 +8,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..._check import check_bool, check_key, is_concrete
+from ..._check import check_bool, check_instance, check_key, is_concrete
 from ..._message import shortened
 from ..._module import as_float_array
+from ..._typing import PRNGKey
 from ...environments import Environment
 from .._by_value import ByValue
-from .._episode import (
-    draw_signals,
-    has_signals,
-    move,
-    NO_SIGNALS,
-    see,
-    Signals,
-    split_key,
-)
-from ._params import GymnaxParams, GymnaxState
-from ._spaces import (
-    box_space,
-    check_index,
-    discrete_space,
-    LARGEST,
-    LARGEST_ACTION,
-    separates_ends,
-)
+from .._episode import begin, EpisodeState, observe, step as episode_step, time_of
+from .._spaces import has_discrete_actions, LARGEST, LARGEST_ACTION
+from ._params import GymnaxParams
+from ._spaces import box_space, discrete_space, separates_ends
 
 
 class GymnaxEnv:
@@ -72,10 +59,7 @@ class GymnaxEnv:
         separate_ends: bool | None = None,
     ):
         where = "to_gymnax"
-        if not isinstance(env, Environment):
-            raise ValueError(
-                f"{where}: env must be a delucax.Environment, got {type(env).__name__}."
-            )
+        check_instance(env, Environment, "env", where)
         leaves = jax.tree.leaves(eqx.filter(env, eqx.is_array))
         if not all(map(is_concrete, leaves)):
             raise ValueError(
@@ -83,17 +67,10 @@ class GymnaxEnv:
                 "jax.jit, jax.vmap or jax.grad); give traced numbers as params, "
                 "GymnaxParams(env)."
             )
-        for name, given in (("discrete", discrete), ("separate_ends", separate_ends)):
-            if given is not None:
-                check_bool(given, name, where)
-        if discrete and env.actions is None:
-            raise ValueError(
-                f"{where}: discrete needs a table of actions in the environment, which "
-                "has none."
-            )
-        self.discrete = env.actions is not None if discrete is None else discrete
-        separate = separates_ends() if separate_ends is None else separate_ends
-        self.separate_ends = bool(separate)
+        self.discrete = has_discrete_actions(env, discrete, where)
+        if separate_ends is None:
+            separate_ends = separates_ends()
+        self.separate_ends = check_bool(separate_ends, "separate_ends", where)
         self._made = ByValue(env)
         self._identity = (self._made, self.discrete, self.separate_ends)
 
@@ -125,8 +102,8 @@ class GymnaxEnv:
 
     @functools.partial(jax.jit, static_argnames=("self",))
     def reset(
-        self, key: Any, params: GymnaxParams | None = None
-    ) -> tuple[Array, GymnaxState]:
+        self, key: PRNGKey, params: GymnaxParams | None = None
+    ) -> tuple[Array, EpisodeState]:
         """Begin an episode, the one of `delucax.rollout` with the same key.
 
         **Arguments:**
@@ -134,14 +111,14 @@ class GymnaxEnv:
         - `key`: a random key.
         - `params`: `default_params` by default.
 
-        **Returns:** the observation, and a [`delucax.interop.gymnax.GymnaxState`][].
+        **Returns:** the observation, and a [`delucax.interop.gymnax.EpisodeState`][].
         """
         return self.reset_env(key, params)
 
     def step(
         self,
-        key: Any,
-        state: GymnaxState,
+        key: PRNGKey,
+        state: EpisodeState,
         action: Any,
         params: GymnaxParams | None = None,
     ) -> tuple[Any, ...]:
@@ -164,20 +141,25 @@ class GymnaxEnv:
         return self._step(key, state, action, params)
 
     @functools.partial(jax.jit, static_argnames=("self",))
-    def _step(self, key: Any, state: GymnaxState, action: Any, params: Any):
-        seen, moved, reward, _, info = self.step_env(key, state, action, params)
+    def _step(self, key: Any, state: EpisodeState, action: Any, params: Any):
+        last, after, reward, _, info = self.step_env(key, state, action, params)
         terminated, truncated = info["terminated"], info["truncated"]
+
+        # One of the two where nothing is batched: a reset may draw a whole episode.
+        def reset():
+            fresh = self.reset_env(key, params)
+            as_now = lambda new, now: jnp.asarray(new, now.dtype)
+            return jax.tree.map(as_now, fresh, (last, after))
+
         done = terminated | truncated
-        fresh = self.reset_env(key, params)
-        pick = lambda new, old: jnp.where(done, new, old)
-        observation, after = jax.tree.map(pick, fresh, (seen, moved))
-        info["final_observation"] = seen
+        observation, after = jax.lax.cond(done, reset, lambda: (last, after))
+        info["final_observation"] = last
         ends = (terminated, truncated) if self.separate_ends else (done,)
         return observation, after, reward, *ends, info
 
     def reset_env(
-        self, key: Any, params: GymnaxParams | None = None
-    ) -> tuple[Array, GymnaxState]:
+        self, key: PRNGKey, params: GymnaxParams | None = None
+    ) -> tuple[Array, EpisodeState]:
         """`reset`, not compiled.
 
         **Arguments:** `key`, `params`: of `reset`.
@@ -185,17 +167,13 @@ class GymnaxEnv:
         **Returns:** as `reset` does.
         """
         check_key(key, "GymnaxEnv.reset")
-        env = self._params(params).environment
-        start_key, keys = split_key(key)
-        x = env.reset(start_key)
-        drawn = keys if has_signals(env) else None
-        state = GymnaxState(x, jnp.zeros((), int), drawn)
+        state = begin(self._params(params).environment, key)
         return self.get_obs(state, params), state
 
     def step_env(
         self,
-        key: Any,
-        state: GymnaxState,
+        key: PRNGKey,
+        state: EpisodeState,
         action: Any,
         params: GymnaxParams | None = None,
     ) -> tuple[Any, ...]:
@@ -208,23 +186,20 @@ class GymnaxEnv:
         """
         del key
         env = self._params(params).environment
-        signals = self._signals(env, state)
-        asked = self._check_action(action)
-        moved = move(env, state.time, state.state, self._action(env, asked), signals)
-        after = GymnaxState(moved.state, state.time + 1, state.keys)
-        seen = see(env, after.time, moved.state, signals)
+        given = self._check_action(action)
+        after, outcome = episode_step(env, state, self._action(env, given))
         info = {
-            "terminated": moved.terminated,
-            "truncated": moved.truncated,
-            "discount": 1 - moved.terminated.astype(moved.reward.dtype),
-            "failed": moved.failed | ~jnp.all(jnp.isfinite(asked)),
+            "terminated": outcome.terminated,
+            "truncated": outcome.truncated,
+            "discount": 1 - outcome.terminated.astype(outcome.reward.dtype),
+            "failed": outcome.failed | ~jnp.all(jnp.isfinite(given)),
         }
-        ended = moved.terminated | moved.truncated
-        done = moved.terminated if self.separate_ends else ended
-        return seen, after, moved.reward, done, info
+        ended = outcome.terminated | outcome.truncated
+        done = outcome.terminated if self.separate_ends else ended
+        return observe(env, after), after, outcome.reward, done, info
 
     def get_obs(
-        self, state: GymnaxState, params: GymnaxParams | None = None, key: Any = None
+        self, state: EpisodeState, params: GymnaxParams | None = None, key: Any = None
     ) -> Array:
         """What is observed of a state.
 
@@ -233,11 +208,10 @@ class GymnaxEnv:
         **Returns:** the observation.
         """
         del key
-        env = self._params(params).environment
-        return see(env, state.time, state.state, self._signals(env, state))
+        return observe(self._params(params).environment, state)
 
     def is_terminal(
-        self, state: GymnaxState, params: GymnaxParams | None = None
+        self, state: EpisodeState, params: GymnaxParams | None = None
     ) -> Array:
         """Whether the episode ends at a state, by itself or at the horizon.
 
@@ -249,8 +223,7 @@ class GymnaxEnv:
         truncated = state.time >= env.horizon
         if env.terminated is None:
             return truncated
-        t = (state.time * env.dt).astype(state.state.dtype)
-        return env.terminated(t, state.state) | truncated
+        return env.terminated(time_of(env, state), state.state) | truncated
 
     def action_space(self, params: GymnaxParams | None = None) -> Any:
         """The actions.
@@ -279,32 +252,29 @@ class GymnaxEnv:
     def _params(self, params: GymnaxParams | None) -> GymnaxParams:
         if params is None:
             return self.default_params
-        if not isinstance(params, GymnaxParams):
-            raise ValueError(
-                "GymnaxEnv: params must be GymnaxParams, such as default_params, got "
-                f"{type(params).__name__}."
-            )
+        hint = ", such as default_params"
+        check_instance(params, GymnaxParams, "params", "GymnaxEnv", hint)
         return params
 
     def _check_action(self, action: Any) -> Array:
-        asked, size = as_float_array(action), self._made.env.control_size
-        size = 1 if self.discrete else size
-        if not eqx.is_inexact_array(asked) or asked.size != size:
-            got = f"shape {asked.shape}" if eqx.is_array(asked) else shortened(action)
+        given = as_float_array(action)
+        size = 1 if self.discrete else self._made.env.control_size
+        if not eqx.is_inexact_array(given) or given.size != size:
+            got = f"shape {given.shape}" if eqx.is_array(given) else shortened(action)
             raise ValueError(f"GymnaxEnv: action must have {size} entries, got {got}.")
-        if self.discrete:
-            check_index(asked, self.num_actions)
-        return asked
+        if self.discrete and is_concrete(given):
+            index, last = given.item(), self.num_actions - 1
+            if not (index.is_integer() and 0 <= index <= last):
+                raise ValueError(
+                    f"GymnaxEnv: action must be a whole number from 0 to {last}, got "
+                    f"{shortened(action)}."
+                )
+        return given
 
-    def _action(self, env: Environment, asked: Array) -> Array:
+    def _action(self, env: Environment, given: Array) -> Array:
         if not self.discrete:
-            return asked.reshape(env.control_size)
-        return jnp.clip(asked.reshape(()).astype(int), 0, self.num_actions - 1)
-
-    def _signals(self, env: Environment, state: GymnaxState) -> Signals:
-        if state.keys is None:
-            return NO_SIGNALS
-        return draw_signals(env, state.keys, state.state.dtype)
+            return given.reshape(env.control_size)
+        return jnp.clip(given.reshape(()).astype(int), 0, self.num_actions - 1)
 
 
 def to_gymnax(
@@ -323,9 +293,10 @@ def to_gymnax(
     All numbers are in `params`, [`delucax.interop.gymnax.GymnaxParams`][], so that
     `jax.vmap` over params runs many plants at once.
 
-    The disturbances and the sensor noise of an episode are drawn from the key that it
-    was reset with. They are drawn for the whole horizon at every step, as a coloured
-    disturbance must be; without any, nothing is drawn.
+    The disturbances and the sensor noise of an episode are drawn for the whole horizon
+    when it is reset, from the key of the reset, and are carried in its state. Under
+    `jax.vmap` a `step` computes a reset for each environment, whether its episode ends
+    or not, and so draws them; `step_env` draws nothing.
 
     **Arguments:**
 

@@ -12,8 +12,9 @@ from ...costs import AbstractCost
 from ...environments import Environment, make as make_task
 from ...environments._registry import horizon_of
 from .._episode import has_signals
-from ._env import GymnasiumEnv
-from ._vector import GymnasiumVectorEnv
+from .._reads_argument import reads_first_argument
+from ._single_env import GymnasiumEnv
+from ._vector_env import GymnasiumVectorEnv
 
 
 # The name of a task, and whether its actions are whole numbers.
@@ -120,11 +121,9 @@ def make_registered(task: str, **kwargs: Any) -> GymnasiumEnv:
 
 def _has_final(cost: AbstractCost | None, env: Environment) -> bool:
     """Whether a cost that is given charges the last state."""
-    if cost is None:
-        return False
-    final = jax.make_jaxpr(cost.final)(0.0, jnp.zeros(env.state_size))
-    x = final.jaxpr.invars[1]
-    return any(x is v for e in final.jaxpr.eqns for v in e.invars)
+    return cost is not None and reads_first_argument(
+        lambda x: cost.final(0.0, x), jnp.zeros(env.state_size)
+    )
 
 
 def make_vector(

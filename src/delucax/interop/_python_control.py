@@ -10,6 +10,7 @@ from .._extras import extra
 from .._module import indexed_names
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
+from ._linear_model import check_no_feed_through, linear_model
 
 
 def to_control(
@@ -128,11 +129,7 @@ def from_control(
             f"{where}: system must be a control.StateSpace (`control.ss` makes one of "
             f"a transfer function), got {type(system).__name__}."
         )
-    if np.any(system.D):
-        raise ValueError(
-            f"{where}: D must be zero, as the models here have no feed-through, got "
-            f"{system.D.tolist()}."
-        )
+    check_no_feed_through(system.D, where)
     if system.dt is None:
         raise ValueError(
             f"{where}: system must say its time base: dt=0 for continuous time, or its "
@@ -149,19 +146,15 @@ def from_control(
     rest = [i for i in range(len(labels)) if i not in chosen]
     n = system.nstates
     identity = system.C.shape == (n, n) and np.array_equal(system.C, np.eye(n))
-    matrices = (
+    return linear_model(
         system.A,
         system.B[:, rest],
         None if identity else system.C,
         system.B[:, chosen] if chosen else None,
+        float(system.dt),
+        state_names=tuple(system.state_labels),
+        control_names=tuple(labels[i] for i in rest),
     )
-    names: Any = {
-        "state_names": tuple(system.state_labels),
-        "control_names": tuple(labels[i] for i in rest),
-    }
-    if system.dt == 0:
-        return LinearSystem(*matrices, **names)
-    return LinearDynamics(*matrices, dt=float(system.dt), **names)
 
 
 def _index(disturbance: Any, labels: list[str], where: str) -> int:

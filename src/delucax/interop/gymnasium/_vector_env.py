@@ -1,5 +1,6 @@
 """A batch of environments with Gymnasium's vector interface."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,12 +14,14 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ..._check import check_count, check_finite, check_real
+from ..._check import check_count, check_finite, check_instance, check_real
 from ..._message import shortened
 from ..._module import as_float_array
+from ..._typing import PRNGKey
 from ...environments import Environment
-from ._program import FAILED, program, REWARD, TERMINATED, TRUNCATED
-from ._spaces import action_space, is_discrete, observation_space, read_options
+from .._spaces import has_discrete_actions
+from ._compiled import draw_key, FAILED, program, REWARD, TERMINATED, TRUNCATED
+from ._spaces import action_space, observation_space, read_options
 
 
 class GymnasiumVectorEnv(VectorEnv):
@@ -70,10 +73,7 @@ class GymnasiumVectorEnv(VectorEnv):
         discrete: bool | None = None,
     ):
         where = "GymnasiumVectorEnv"
-        if not isinstance(env, Environment):
-            raise ValueError(
-                f"{where}: env must be a delucax.Environment, got {type(env).__name__}."
-            )
+        check_instance(env, Environment, "env", where)
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -83,7 +83,7 @@ class GymnasiumVectorEnv(VectorEnv):
             ) from None
         self.environment = env
         self.num_envs = check_count(num_envs, "num_envs", where)
-        self.discrete = is_discrete(env, discrete, where)
+        self.discrete = has_discrete_actions(env, discrete, where)
         self.metadata = {"autoreset_mode": self._mode, "render_modes": []}
         self.single_action_space = action_space(env, self.discrete)
         self.single_observation_space = observation_space(env)
@@ -122,7 +122,7 @@ class GymnasiumVectorEnv(VectorEnv):
         where = "GymnasiumVectorEnv"
         state, mask = read_options(options, ("state", "reset_mask"), where)
         state = self._as_states(state)
-        keys = self._seeded(seed)
+        keys = self._start_keys(seed)
         packed, signals = self._program.start_batch(keys, state)
         if mask is not None:
             mask = np.asarray(mask)
@@ -133,13 +133,9 @@ class GymnasiumVectorEnv(VectorEnv):
                 )
             if self._packed is None:
                 raise ResetNeeded(f"{where}: reset all before some with reset_mask.")
-            packed, signals = jax.tree.map(
-                lambda new, old: jnp.where(
-                    mask.reshape(-1, *[1] * (old.ndim - 1)), new, old
-                ),
-                (packed, signals),
-                (self._packed, self._signals),
-            )
+            select = functools.partial(jax.vmap(jnp.where), mask)
+            current = self._packed, self._signals
+            packed, signals = jax.tree.map(select, (packed, signals), current)
         self._packed, self._signals = packed, signals
         return self._observations(np.asarray(packed)), {}
 
@@ -160,32 +156,25 @@ class GymnasiumVectorEnv(VectorEnv):
         check_finite(state, "state", where)
         return jnp.broadcast_to(state.astype(float), each)
 
-    def _seeded(self, seed: Any) -> jax.Array:
-        """A key for the start of each; and one for what starts later."""
-        own: Any = None
-        if not isinstance(seed, Sequence | np.ndarray):
-            super().reset(seed=seed)
-        else:
-            own = seed
-            whole = [
-                one is None or isinstance(one, int | np.integer) and one >= 0
-                for one in own
-            ]
-            if len(whole) != self.num_envs or not all(whole):
+    def _start_keys(self, seed: Any) -> PRNGKey:
+        """A key for the start of each, and `_key` for what starts later."""
+        own: dict[int, int] = {}
+        if isinstance(seed, Sequence | np.ndarray):
+            integer = lambda one: isinstance(one, int | np.integer) and one >= 0
+            legal = [one is None or integer(one) for one in seed]
+            if len(legal) != self.num_envs or not all(legal):
                 raise ValueError(
                     f"GymnasiumVectorEnv: seed must be {self.num_envs} whole numbers "
                     f"from 0, one for each, or one for all, got {shortened(seed)}."
                 )
-            given = [int(one) for one in own if one is not None]
-            mixed = np.random.SeedSequence(given).generate_state(1)[0]
-            super().reset(seed=int(mixed) if given else None)
-        key = jax.random.key(int(self.np_random.integers(2**32)))
-        self._key, use = jax.random.split(key)
+            own = {i: int(one) for i, one in enumerate(seed) if one is not None}
+            mixed = np.random.SeedSequence(list(own.values())).generate_state(1)[0]
+            seed = int(mixed) if own else None
+        super().reset(seed=seed)
+        self._key, use = jax.random.split(draw_key(self.np_random))
         keys = jax.random.split(use, self.num_envs)
-        for i, one in enumerate(() if own is None else own):
-            if one is not None:
-                draw = np_random(int(one))[0].integers(2**32)
-                keys = keys.at[i].set(jax.random.key(int(draw)))
+        for i, one in own.items():
+            keys = keys.at[i].set(draw_key(np_random(one)[0]))
         return keys
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -197,17 +186,11 @@ class GymnasiumVectorEnv(VectorEnv):
         """
         if self._packed is None:
             raise ResetNeeded("GymnasiumVectorEnv: call reset() before step().")
-        actions = self._checked(actions)
-        made = self._program
-        seen, moved, self._signals, self._key = made.step_batch(
-            self._mode.value,
-            self._packed,
-            actions,
-            self._signals,
-            self._key,
+        actions = self._as_actions(actions)
+        self._packed, last, self._signals, self._key = self._program.step_batch(
+            self._mode.value, self._packed, actions, self._signals, self._key
         )
-        self._packed = seen
-        packed, last = np.asarray(seen), np.asarray(moved)
+        packed, last = np.asarray(self._packed), np.asarray(last)
         if last[:, FAILED].any() and packed[:, FAILED].any():
             which = np.flatnonzero(packed[:, FAILED])[:5].tolist()
             self._packed = None
@@ -232,7 +215,8 @@ class GymnasiumVectorEnv(VectorEnv):
     def _observations(self, packed: np.ndarray) -> np.ndarray:
         return packed[:, self._program.layout.observation].astype(np.float32)
 
-    def _checked(self, actions: Any) -> np.ndarray:
+    def _as_actions(self, actions: Any) -> np.ndarray:
+        """Actions as the program takes them, or an error."""
         where, space = "GymnasiumVectorEnv", self.single_action_space
         try:
             actions = np.asarray(actions)
@@ -241,20 +225,20 @@ class GymnasiumVectorEnv(VectorEnv):
                 f"{where}: actions must have the shape {self.action_space.shape}, got "
                 f"{shortened(actions)}."
             ) from None
-        kinds = "iu" if isinstance(space, Discrete) else "iuf"
+        discrete = isinstance(space, Discrete)
+        what, kinds = ("whole numbers", "iu") if discrete else ("numbers", "iuf")
         shape = (self.num_envs, *(space.shape or ()))
         if actions.shape != shape or actions.dtype.kind not in kinds:
-            what = "whole numbers" if isinstance(space, Discrete) else "numbers"
             raise InvalidAction(
                 f"{where}: actions must be {what} of shape {shape}, got "
                 f"{actions.dtype} of shape {actions.shape}."
             )
-        if isinstance(space, Discrete):
-            if not ((actions >= 0) & (actions < space.n)).all():
-                raise InvalidAction(
-                    f"{where}: actions must be from 0 to {space.n - 1}, got {actions}."
-                )
-            return actions[:, None].astype(np.float32)
-        if not np.isfinite(actions).all():
+        if not discrete and not np.isfinite(actions).all():
             raise InvalidAction(f"{where}: actions must be finite.")
-        return actions
+        if not discrete:
+            return actions
+        if not ((actions >= 0) & (actions < space.n)).all():
+            raise InvalidAction(
+                f"{where}: actions must be from 0 to {space.n - 1}, got {actions}."
+            )
+        return actions[:, None].astype(np.float32)

@@ -2,11 +2,13 @@
 
 import dataclasses
 import inspect
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -15,83 +17,64 @@ from jaxtyping import Array
 
 from ..._check import check_step
 from ..._module import as_float_array, parameter
-from ..._results import RESULTS
-from ..._typing import RealScalar
+from ..._results import Result, RESULTS
+from ..._typing import (
+    BoolScalar,
+    Control,
+    Disturbance,
+    PRNGKey,
+    RealScalar,
+    Scalar,
+    State,
+    Vector,
+)
 from ...costs import AbstractCost
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
+from .._reads_argument import reads_first_argument
 
 
 @dataclasses.dataclass(frozen=True)
 class _Layout:
-    """How the state of a gymnax environment lies in a vector.
+    """How arrays lie one after the other in a vector of floats.
 
-    The leaves of the state in their order, then the key of the episode if steps draw
-    from it, then whether the episode is over.
+    Whole numbers and booleans are floats there (exact up to 2^24 in float32). The 32
+    bits of an unsigned number, such as a word of a random key, are two of 16.
     """
 
-    structure: Any
     shapes: tuple[tuple[int, ...], ...]
     dtypes: tuple[Any, ...]
     dtype: Any
-    draws: bool
 
-    def ravel(self, state: Any, words: Any, done: Any) -> Array:
-        """The vector of a state."""
-        leaves, structure = jax.tree.flatten(state)
-        shapes = tuple(jnp.shape(leaf) for leaf in leaves)
-        if (structure, shapes) != (self.structure, self.shapes):
-            raise ValueError(
-                f"from_gymnax: a state must be {self.structure} with leaves of shapes "
-                f"{self.shapes}, as reset_env returns it, got {structure} with leaves "
-                f"of shapes {shapes}."
-            )
+    def stored_shape(self, i: int) -> tuple[int, ...]:
+        """The shape of array `i` in the vector."""
+        return self.shapes[i] + (2,) * (self.dtypes[i] == jnp.uint32)
+
+    def ravel(self, arrays: Sequence[Any]) -> Vector:
+        """The vector of some arrays."""
         parts = [
-            _halves(leaf) if dtype == jnp.uint32 else jnp.ravel(leaf)
-            for leaf, dtype in zip(leaves, self.dtypes, strict=True)
+            lax.bitcast_convert_type(jnp.asarray(array, dtype), jnp.uint16)
+            if dtype == jnp.uint32
+            else array
+            for array, dtype in zip(arrays, self.dtypes, strict=True)
         ]
-        if self.draws:
-            parts.append(_halves(words))
-        parts.append(jnp.reshape(done, 1))
-        return jnp.concatenate([part.astype(self.dtype) for part in parts])
+        return jnp.concatenate([jnp.ravel(part).astype(self.dtype) for part in parts])
 
-    def unravel(self, x: Array) -> tuple[Any, Any]:
-        """The state in a vector, and the words of the key."""
-        leaves, at = [], 0
-        for shape, dtype in zip(self.shapes, self.dtypes, strict=True):
-            size = int(np.prod(shape)) * (2 if dtype == jnp.uint32 else 1)
-            part, at = x[at : at + size], at + size
+    def unravel(self, x: Vector) -> list[Array]:
+        """The arrays in a vector."""
+        shapes = [self.stored_shape(i) for i in range(len(self.shapes))]
+        ends = np.cumsum([math.prod(shape) for shape in shapes])
+        arrays = []
+        parts = zip(jnp.split(x, ends[:-1]), shapes, self.dtypes, strict=True)
+        for part, shape, dtype in parts:
+            part = part.reshape(shape)
             if dtype == jnp.uint32:
-                part = _whole(part)
+                halves = jnp.round(part).astype(jnp.uint16)
+                part = lax.bitcast_convert_type(halves, jnp.uint32)
             elif not jnp.issubdtype(dtype, jnp.inexact):
                 part = jnp.round(part)
-            leaves.append(part.reshape(shape).astype(dtype))
-        words = _whole(x[at : at + 4]) if self.draws else None
-        return jax.tree.unflatten(self.structure, leaves), words
-
-
-def _halves(words: Any) -> Array:
-    """32 bits as two numbers, which a float holds exactly."""
-    words = jnp.ravel(jnp.asarray(words, jnp.uint32))
-    return jnp.stack([words >> 16, words & 0xFFFF], axis=1).ravel()
-
-
-def _whole(halves: Array) -> Array:
-    """The inverse of `_halves`."""
-    high, low = jnp.round(halves).astype(jnp.uint32).reshape(-1, 2).T
-    return (high << 16) | low
-
-
-def _names(leaves: Any, draws: bool) -> tuple[str, ...]:
-    names = []
-    for path, leaf in leaves:
-        name = jax.tree_util.keystr(path).lstrip(".") or "state"
-        if leaf.dtype == jnp.uint32:
-            entries = [(*i, part) for i in np.ndindex(leaf.shape) for part in (0, 1)]
-        else:
-            entries = list(np.ndindex(leaf.shape))
-        names += [name + "".join(f"[{i}]" for i in entry) for entry in entries]
-    return (*names, *(f"key[{i}]" for i in range(4 * draws)), "done")
+            arrays.append(part.astype(dtype))
+        return arrays
 
 
 def _check_protocol(env: Any, where: str) -> None:
@@ -145,7 +128,9 @@ class GymnaxDynamics(AbstractDynamics):
     env: Any = eqx.field(static=True)
     params: Any
     dt: Array = parameter()
+    structure: Any = eqx.field(static=True)
     layout: _Layout = eqx.field(static=True)
+    draws: bool = eqx.field(static=True)
     action_shape: tuple[int, ...] = eqx.field(static=True)
     discrete: bool = eqx.field(static=True)
     state_names: tuple[str, ...] = eqx.field(static=True)
@@ -179,22 +164,24 @@ class GymnaxDynamics(AbstractDynamics):
                     f"{jax.tree_util.keystr(path)}, where a raw one "
                     "(`jax.random.PRNGKey`) is expected."
                 )
-        floats = [leaf.dtype for _, leaf in leaves if eqx.is_inexact_array(leaf)]
+        self.structure = structure
         action = jnp.zeros(self.action_shape, int if self.discrete else float)
-        step = jax.make_jaxpr(lambda key, *args: env.step_env(key, *args, params))(
-            key, reset, action
+        step = lambda key, *args: env.step_env(key, *args, params)
+        self.draws = reads_first_argument(step, key, reset, action)
+        name = lambda path: jax.tree_util.keystr(path).lstrip(".") or "state"
+        parts = [(name(path), leaf.shape, leaf.dtype) for path, leaf in leaves]
+        parts += [("key", (2,), jnp.dtype(jnp.uint32))] * self.draws
+        names, shapes, dtypes = zip(*parts, ("done", (), jnp.dtype(bool)), strict=True)
+        floats = [dtype for dtype in dtypes if jnp.issubdtype(dtype, jnp.inexact)]
+        dtype = jnp.result_type(*floats) if floats else jnp.zeros(()).dtype
+        self.layout = _Layout(shapes, dtypes, dtype)
+        self.state_names = tuple(
+            name + "".join(f"[{k}]" for k in index)
+            for i, name in enumerate(names)
+            for index in np.ndindex(self.layout.stored_shape(i))
         )
-        draws = any(step.jaxpr.invars[0] is v for e in step.eqns for v in e.invars)
-        self.layout = _Layout(
-            structure,
-            tuple(leaf.shape for _, leaf in leaves),
-            tuple(leaf.dtype for _, leaf in leaves),
-            jnp.result_type(*floats) if floats else jnp.zeros(()).dtype,
-            draws,
-        )
-        self.state_names = _names(leaves, draws)
 
-    def ravel(self, state: Any, key: Any = None) -> Array:
+    def ravel(self, state: Any, key: PRNGKey | None = None) -> Vector:
         """The vector of a state, such as `x0` of `delucax.rollout`.
 
         **Arguments:**
@@ -206,63 +193,79 @@ class GymnaxDynamics(AbstractDynamics):
         **Returns:** shape `(state_size,)`.
         """
         words = jr.bits(jr.key(0) if key is None else key, (2,), jnp.uint32)
-        return self.layout.ravel(state, words, False)
+        return self._ravel(state, words, False)
 
-    def unravel(self, x: Array) -> Any:
+    def _ravel(self, state: Any, words: Any, done: Any) -> Vector:
+        leaves, structure = jax.tree.flatten(state)
+        shapes = tuple(jnp.shape(leaf) for leaf in leaves)
+        expected = self.layout.shapes[: self.structure.num_leaves]
+        if (structure, shapes) != (self.structure, expected):
+            raise ValueError(
+                f"from_gymnax: a state must be {self.structure} with leaves of shapes "
+                f"{expected}, as reset_env returns it, got {structure} with leaves of "
+                f"shapes {shapes}."
+            )
+        return self.layout.ravel([*leaves, *[words] * self.draws, done])
+
+    def unravel(self, x: State) -> Any:
         """The state that a vector holds.
 
         **Arguments:** `x`: shape `(state_size,)`.
 
         **Returns:** a state of the environment.
         """
-        return self.layout.unravel(x)[0]
+        leaves = self.layout.unravel(x)[: self.structure.num_leaves]
+        return jax.tree.unflatten(self.structure, leaves)
 
-    def move(self, x: Array, u: Array) -> tuple[Array, Array]:
+    def transition(self, x: State, u: Control) -> tuple[State, Scalar]:
         """One step.
 
         **Arguments:** `x`: state. `u`: control.
 
         **Returns:** the next state, and the reward.
         """
-        state, words = self.layout.unravel(x)
-        use = jr.key(0)
-        if words is not None:
-            use, after = jr.split(jr.wrap_key_data(words, impl="threefry2x32"))
+        *leaves, _ = self.layout.unravel(x)
+        key, words = jr.key(0), None
+        if self.draws:
+            key, after = jr.split(jr.wrap_key_data(leaves.pop(), impl="threefry2x32"))
             words = jr.key_data(after)
+        state = jax.tree.unflatten(self.structure, leaves)
         action = u.reshape(self.action_shape)
         if self.discrete:
             action = jnp.round(action).astype(int)
-        _, state, reward, done, _ = self.env.step_env(use, state, action, self.params)
-        x_next = self.layout.ravel(state, words, done).astype(x.dtype)
+        _, state, reward, done, _ = self.env.step_env(key, state, action, self.params)
+        x_next = self._ravel(state, words, done).astype(x.dtype)
         return x_next, jnp.reshape(reward, ()).astype(x.dtype)
 
-    def advance(self, t, x, u, w):
-        x_next, _ = self.move(x, u)
+    def advance(
+        self, t: RealScalar, x: State, u: Control, w: Disturbance | None
+    ) -> tuple[State, Result]:
+        x_next, _ = self.transition(x, u)
         return x_next if w is None else x_next + w, RESULTS.successful
 
 
 class _MinusReward(AbstractCost):
     dynamics: GymnaxDynamics
 
-    def __call__(self, t, x, u):
-        return -self.dynamics.move(x, u)[1]
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
+        return -self.dynamics.transition(x, u)[1]
 
 
 class _Start(eqx.Module):
     dynamics: GymnaxDynamics
 
-    def __call__(self, key):
+    def __call__(self, key: PRNGKey) -> State:
         start_key, step_key = jr.split(key)
         _, state = self.dynamics.env.reset_env(start_key, self.dynamics.params)
         return self.dynamics.ravel(state, step_key)
 
 
 class _Observation(eqx.Module):
-    """What gymnax's users see, as a vector."""
+    """What gymnax's users observe, as a vector."""
 
     dynamics: GymnaxDynamics
 
-    def __call__(self, x):
+    def __call__(self, x: State) -> Vector:
         env, state = self.dynamics.env, self.dynamics.unravel(x)
         known = dict(
             key=jr.key(0), state=state, action=None, params=self.dynamics.params
@@ -270,8 +273,8 @@ class _Observation(eqx.Module):
         function = _observer(env)
         assert function is not None
         takes = inspect.signature(function).parameters
-        seen = function(**{name: known[name] for name in known if name in takes})
-        leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(seen)]
+        parts = function(**{name: known[name] for name in known if name in takes})
+        leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(parts)]
         return jnp.concatenate(leaves)
 
 
@@ -279,7 +282,7 @@ def _observer(env: Any) -> Callable | None:
     return getattr(env, "observe", None) or getattr(env, "get_obs", None)
 
 
-def _is_done(t: RealScalar, x: Array) -> Array:
+def _is_done(t: RealScalar, x: State) -> BoolScalar:
     return x[-1] > 0.5
 
 
@@ -359,15 +362,11 @@ def from_gymnax(
         bounds = (0.0, float(space.n - 1))
         actions = jnp.arange(float(space.n))[:, None]
     else:
-        size = (dynamics.control_size,)
-        bounds = tuple(
-            jnp.broadcast_to(jnp.asarray(end, float), dynamics.action_shape).reshape(
-                size
-            )
-            for end in (space.low, space.high)
-        )
+        ends = (jnp.asarray(end, float) for end in (space.low, space.high))
+        shape = dynamics.action_shape
+        bounds = tuple(jnp.broadcast_to(end, shape).ravel() for end in ends)
         actions = None
-    arguments: dict[str, Any] = dict(
+    defaults: dict[str, Any] = dict(
         dynamics=dynamics,
         cost=_MinusReward(dynamics),
         initial_state=_Start(dynamics),
@@ -375,7 +374,6 @@ def from_gymnax(
         terminated=_is_done,
         actions=actions,
         encode=_Observation(dynamics),
+        horizon=horizon,
     )
-    if horizon is not None:
-        arguments["horizon"] = horizon
-    return Environment(**{**arguments, **environment})
+    return Environment(**{**defaults, **environment})

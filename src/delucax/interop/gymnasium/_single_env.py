@@ -9,12 +9,13 @@ import jax
 import numpy as np
 from gymnasium.error import InvalidAction, ResetNeeded
 
-from ..._check import as_vector, check_bool, check_finite
+from ..._check import as_vector, check_bool, check_finite, check_instance
 from ..._message import shortened
 from ...environments import Environment
 from .._episode import has_signals
-from ._program import program, REWARD, shared, STEP
-from ._spaces import action_space, is_discrete, observation_space, read_options
+from .._spaces import has_discrete_actions
+from ._compiled import draw_key, program, REWARD, shared, STEP
+from ._spaces import action_space, observation_space, read_options
 
 
 RENDER_MODES = ("rgb_array", "human")
@@ -69,10 +70,7 @@ class GymnasiumEnv(gymnasium.Env):
         truncate: bool = True,
     ):
         where = "GymnasiumEnv"
-        if not isinstance(env, Environment):
-            raise ValueError(
-                f"{where}: env must be a delucax.Environment, got {type(env).__name__}."
-            )
+        check_instance(env, Environment, "env", where)
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ValueError(
                 f"{where}: render_mode must be one of {RENDER_MODES} or None, got "
@@ -84,7 +82,7 @@ class GymnasiumEnv(gymnasium.Env):
                 "sensor noise, which are drawn up to the horizon, got False."
             )
         self.environment = env
-        self.discrete = is_discrete(env, discrete, where)
+        self.discrete = has_discrete_actions(env, discrete, where)
         self.truncate = bool(truncate)
         self.render_mode = render_mode
         fps = int(np.clip(np.round(1 / float(env.dt)), 1, 60))
@@ -92,19 +90,19 @@ class GymnasiumEnv(gymnasium.Env):
         self.action_space = action_space(env, self.discrete)
         self.observation_space = observation_space(env)
         self._program = program(env, self.discrete, self.truncate)
-        self._table = np.asarray(env.actions) if self.discrete else None
-        self._count = 0 if env.actions is None else len(env.actions)
+        self._table = np.asarray(env.actions) if self.discrete else np.zeros((0, 1))
+        self._count = len(self._table)
         self._shape = (env.control_size,)
-        self._given: Any = None
+        self._buffer: Any = None
         self._ended = True
         self._picture: Any = None
 
     @property
     def state(self) -> np.ndarray:
         """The state, shape `(state_size,)`."""
-        if self._given is None:
+        if self._buffer is None:
             raise ResetNeeded("GymnasiumEnv: there is no state before reset().")
-        return self._given[: self._program.layout.states].copy()
+        return self._buffer[: self._program.layout.states].copy()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -125,15 +123,14 @@ class GymnasiumEnv(gymnasium.Env):
             state = as_vector(state, self.environment.state_size, "state", where)
             check_finite(state, "state", where)
             state = state.astype(float)
-        key = jax.random.key(int(self.np_random.integers(2**32)))
-        packed, signals = self._program.start(key, state)
+        packed, signals = self._program.start(draw_key(self.np_random), state)
         packed = np.asarray(packed)
-        if self._given is None or self._given.dtype != packed.dtype:
+        if self._buffer is None or self._buffer.dtype != packed.dtype:
             self._allocate(packed.dtype)
         self._signals = jax.device_put(signals, self._shared.device)
-        self._bind(packed)
+        self._continue_from(packed)
         self._action[...] = 0
-        self._ended, self._moved = False, False
+        self._ended, self._stepped = False, False
         if self.render_mode == "human":
             self.render()
         return packed[self._program.layout.observation].astype(np.float32), {}
@@ -142,14 +139,14 @@ class GymnasiumEnv(gymnasium.Env):
         """Make the arrays that steps are taken in."""
         layout, actions = self._program.layout, self.action_space.shape or (1,)
         # The packed array with the action after it, and views of its parts.
-        self._given, self._shared = shared(layout.size + actions[0], dtype)
-        self._packed, self._action = np.split(self._given, [layout.size])
-        self._told = self._packed[REWARD:]
-        seen = self._packed[layout.observation]
-        same = seen.dtype == np.float32
-        self._see = seen.copy if same else functools.partial(seen.astype, np.float32)
+        self._buffer, self._shared = shared(layout.size + actions[0], dtype)
+        self._packed, self._action = np.split(self._buffer, [layout.size])
+        self._outcome = self._packed[REWARD:]
+        view, single = self._packed[layout.observation], np.float32
+        copy = functools.partial(view.astype, single)
+        self._observation = view.copy if view.dtype == single else copy
 
-    def _bind(self, packed: np.ndarray) -> None:
+    def _continue_from(self, packed: np.ndarray) -> None:
         """Go on from here."""
         # Whole, for the case that a step fails.
         self._packed[...] = self._last = packed
@@ -158,18 +155,18 @@ class GymnasiumEnv(gymnasium.Env):
 
     def __getstate__(self):
         """What a copy is made of: all but compiled functions, and views."""
-        made = "_program _shared _packed _action _told _see _advance".split()
+        made = "_program _shared _packed _action _outcome _observation _advance".split()
         state = {k: v for k, v in self.__dict__.items() if k not in made}
         return state | {"_picture": None}
 
     def __setstate__(self, state):
         self.__dict__.update(state)
         self._program = program(self.environment, self.discrete, self.truncate)
-        given = self._given
+        given = self._buffer
         if given is not None:
             self._allocate(given.dtype)
-            self._bind(np.asarray(self._last))
-            self._given[...] = given
+            self._continue_from(np.asarray(self._last))
+            self._buffer[...] = given
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One step.
@@ -183,43 +180,42 @@ class GymnasiumEnv(gymnasium.Env):
         if self._ended:
             raise ResetNeeded(
                 "GymnasiumEnv: call reset() before step(): the episode has "
-                + ("not begun." if self._given is None else "ended.")
+                + ("not begun." if self._buffer is None else "ended.")
             )
         if self.discrete:
             try:
                 index = operator.index(action)
             except TypeError:
-                self._refuse(action)
+                self._invalid_action(action)
             if not 0 <= index < self._count:
-                self._refuse(action)
+                self._invalid_action(action)
             self._action[0] = index
         else:
             try:
-                asked = np.asarray(action)
+                control = np.asarray(action)
             except ValueError:  # ragged
-                self._refuse(action)
-            if asked.shape != self._shape or asked.dtype.kind not in "iuf":
-                self._refuse(action)
-            self._action[...] = asked
+                self._invalid_action(action)
+            if control.shape != self._shape or control.dtype.kind not in "iuf":
+                self._invalid_action(action)
+            self._action[...] = control
         self._packed[...] = after = self._advance()
-        reward, terminated, truncated, failed, _ = self._told.tolist()
+        reward, terminated, truncated, failed, _ = self._outcome.tolist()
         if failed:
             self._fail(action)
         self._last = after
         if terminated or truncated:
             self._ended = True
-        self._moved = True
+        self._stepped = True
         if self.render_mode == "human":
             self.render()
-        return self._see(), reward, terminated > 0, truncated > 0, {}
+        return self._observation(), reward, terminated > 0, truncated > 0, {}
 
-    def _refuse(self, action: Any) -> NoReturn:
+    def _invalid_action(self, action: Any) -> NoReturn:
         """Say what an action must be."""
-        if self._table is not None:
+        if self.discrete:
             raise InvalidAction(
-                "GymnasiumEnv: action must be a whole number from 0 to "
-                f"{len(self._table) - 1}, "
-                f"got {shortened(action)}; discrete=False takes the "
+                f"GymnasiumEnv: action must be a whole number from 0 to "
+                f"{self._count - 1}, got {shortened(action)}; discrete=False takes the "
                 "control itself."
             )
         raise InvalidAction(
@@ -250,16 +246,15 @@ class GymnasiumEnv(gymnasium.Env):
                 "given when the environment is made."
             )
             return None
-        if self._given is None:
+        if self._buffer is None:
             raise ResetNeeded("GymnasiumEnv: call reset() before render().")
         if self._picture is None:
             from ...plotting._renderer import Renderer
 
             self._picture = Renderer(self.environment, self.render_mode == "human")
         control = self._action
-        if self._table is not None:
-            shown = self._table[int(control[0])]
-            control = shown if self._moved else np.zeros_like(shown)
+        if self.discrete:
+            control = self._table[int(control[0])] * self._stepped
         frame = self._picture.frame(self.state, control)
         return frame if self.render_mode == "rgb_array" else None
 

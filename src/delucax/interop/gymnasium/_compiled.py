@@ -14,10 +14,21 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from jaxtyping import Array
 
+from ..._typing import PRNGKey, State
 from ...environments import Environment
 from .._by_value import ByValue
-from .._episode import draw_signals, has_signals, move, NO_SIGNALS, see, split_key
+from .._episode import (
+    begin,
+    EpisodeState,
+    has_signals,
+    NO_SIGNALS,
+    observe,
+    Outcome,
+    Signals,
+    step as episode_step,
+)
 
 
 class Layout(NamedTuple):
@@ -69,82 +80,91 @@ def shared(size: int, dtype: Any) -> tuple[np.ndarray, jax.Array]:
     return written, jax.dlpack.from_dlpack(written, copy=False)
 
 
+def draw_key(generator: np.random.Generator) -> PRNGKey:
+    """A random key from a generator of NumPy's, which Gymnasium seeds."""
+    return jr.key(int(generator.integers(2**32)))
+
+
 @functools.lru_cache(maxsize=64)
 def _compiled(same: ByValue, discrete: bool, truncate: bool) -> Program:
     env = same.env
     layout = Layout(env.state_size, env.feature_size)
 
-    def act(packed, action, signals):
+    def step(packed, action, signals):
         action = action[0].astype(int) if discrete else action
-        return _step(env, packed, action, signals, truncate)
+        x, k = packed[: layout.states], packed[STEP].astype(int)
+        now = EpisodeState(x, k, signals)
+        return _packed(env, *episode_step(env, now, action, truncate))
 
-    def step(given, signals=NO_SIGNALS):
-        return act(given[: layout.size], given[layout.size :], signals)
+    def step_in_place(given, signals=NO_SIGNALS):
+        return step(given[: layout.size], given[layout.size :], signals)
 
     start = functools.partial(_start, env)
     start_batch = jax.vmap(start)
-    step_batch = functools.partial(_step_batch, act, start_batch)
+    step_batch = functools.partial(_step_batch, step, start_batch)
     return Program(
         jax.jit(start),
-        jax.jit(step),
+        jax.jit(step_in_place),
         jax.jit(start_batch),
         jax.jit(step_batch, static_argnums=0),
         layout,
     )
 
 
-def _packed(env, k, x, signals, reward, terminated, truncated, failed):
-    observation = see(env, k, x, signals)
+def _packed(env: Environment, episode: EpisodeState, outcome: Outcome) -> Array:
+    x, (reward, terminated, truncated, failed) = episode.state, outcome
     failed = failed | ~jnp.all(jnp.isfinite(x)) | ~jnp.isfinite(reward)
-    rest = (reward, terminated, truncated, failed, k)
+    rest = (reward, terminated, truncated, failed, episode.time)
     rest = jnp.stack([jnp.asarray(part, x.dtype) for part in rest])
-    return jnp.concatenate([x, observation.astype(x.dtype), rest])
+    return jnp.concatenate([x, observe(env, episode).astype(x.dtype), rest])
 
 
-def _start(env, key, state):
-    # A key that is not split saves a batch a third of the time of a reset.
-    key, keys = split_key(key) if has_signals(env) else (key, None)
-    x = env.reset(key) if state is None else state
-    signals = draw_signals(env, keys, x.dtype)
-    return _packed(env, jnp.asarray(0), x, signals, 0, False, False, False), signals
+def _start(
+    env: Environment, key: PRNGKey, state: State | None
+) -> tuple[Array, Signals]:
+    if has_signals(env):
+        episode = begin(env, key, state)
+    else:
+        # A key that is not split saves a batch a third of the time of a reset.
+        x = env.reset(key) if state is None else state
+        episode = EpisodeState(x, jnp.zeros((), int))
+    no = jnp.zeros((), bool)
+    outcome = Outcome(jnp.zeros((), episode.state.dtype), no, no, no)
+    return _packed(env, episode, outcome), episode.signals
 
 
-def _step(env, packed, action, signals, truncate):
-    x, k = packed[: env.state_size], packed[STEP].astype(int)
-    x_next, *told = move(env, k, x, action, signals, truncate)
-    return _packed(env, k + 1, x_next, signals, *told)
-
-
-def _step_batch(move, start_batch, mode, packed, actions, signals, key):
+def _step_batch(step, start_batch, mode, packed, actions, signals, key):
     """A step of each; those that have ended begin anew as `mode` says.
 
-    **Returns:** what is seen, the last of what has ended, the signals and a key.
+    **Returns:** the packed arrays, those of the last step of what has ended, the
+    signals and a key.
     """
     ended = (packed[:, TERMINATED] + packed[:, TRUNCATED]) > 0
-    moved = jax.vmap(move)(packed, actions.astype(packed.dtype), signals)
+    last = jax.vmap(step)(packed, actions.astype(packed.dtype), signals)
     if mode == "Disabled":
         # What has ended rests until it is reset.
-        seen = jnp.where(ended[:, None], packed.at[:, REWARD].set(0), moved)
-        return seen, seen, signals, key
+        packed = jnp.where(ended[:, None], packed.at[:, REWARD].set(0), last)
+        return packed, packed, signals, key
     if mode == "SameStep":
-        ended = (moved[:, TERMINATED] + moved[:, TRUNCATED]) > 0
+        ended = (last[:, TERMINATED] + last[:, TRUNCATED]) > 0
 
     # A few at a time, for most steps end few episodes.
     count = len(packed)
     few = min(count, max(16, count // 16))
 
-    def anew(carry):
-        ended, seen, signals, key = carry
+    def reset_few(carry):
+        ended, packed, signals, key = carry
         which = jnp.flatnonzero(ended, size=few, fill_value=count)
         use, key = jr.split(key)
-        fresh, drawn = start_batch(jr.split(use, few), None)
+        first, drawn = start_batch(jr.split(use, few), None)
         if mode == "SameStep":  # the reward and the end are those of the old episode
-            told = slice(REWARD, STEP)
-            fresh = fresh.at[:, told].set(moved[which, told])
+            outcome = slice(REWARD, STEP)
+            first = first.at[:, outcome].set(last[which, outcome])
         put = lambda new, old: old.at[which].set(new, mode="drop")
-        after = put(False, ended), put(fresh, seen), jax.tree.map(put, drawn, signals)
+        after = put(False, ended), put(first, packed), jax.tree.map(put, drawn, signals)
         return *after, key
 
-    carry = ended, moved, signals, key
-    _, seen, signals, key = jax.lax.while_loop(lambda c: jnp.any(c[0]), anew, carry)
-    return seen, moved, signals, key
+    carry = ended, last, signals, key
+    any_ended = lambda carry: jnp.any(carry[0])
+    _, packed, signals, key = jax.lax.while_loop(any_ended, reset_few, carry)
+    return packed, last, signals, key
