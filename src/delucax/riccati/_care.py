@@ -84,8 +84,7 @@ def care(
     symmetric or (`R`) not definite; an error at run time as `throw` says.
 
     Source: Roberts, 1971 (sign); Byers, 1987 (scaling); Chu, Fan and Lin, 2005
-    (doubling); Kleinman, 1968 (Newton); Benner, 2001
-    (balancing).
+    (doubling); Kleinman, 1968 (Newton); Benner, 2001 (balancing).
 
     !!! example
 
