@@ -272,10 +272,11 @@ def check_range(
 def check_choice(value: Any, choices: tuple[Any, ...], name: str, where: str) -> None:
     """Raise unless `value` is one of `choices`."""
     if value not in choices:
-        *most, last = map(repr, choices)
-        raise ValueError(
-            f"{where}: {name} must be {', '.join(most)} or {last}, got {value!r}."
+        words = [repr(choice) for choice in choices]
+        expected = (
+            " or ".join(words) if len(words) == 2 else f"one of {', '.join(words)}"
         )
+        raise ValueError(f"{where}: {name} must be {expected}, got {value!r}.")
 
 
 def check_bool(value: Any, name: str, where: str) -> bool:
@@ -285,15 +286,6 @@ def check_bool(value: Any, name: str, where: str) -> bool:
             f"{where}: {name} must be True or False, got {shortened(value)}."
         )
     return bool(value)
-
-
-def check_choice(value: Any, choices: tuple[str, ...], name: str, where: str) -> None:
-    """Raise unless `value` is one of a few strings."""
-    if value not in choices:
-        raise ValueError(
-            f"{where}: {name} must be one of {', '.join(map(repr, choices))}, got "
-            f"{value!r}."
-        )
 
 
 def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
