@@ -2,7 +2,7 @@
 
 from typing import Literal, TypeAlias
 
-from jaxtyping import Array, Bool, Float, Key, Num, Shaped, UInt32
+from jaxtyping import Array, Bool, Float, Key, Num, UInt32
 
 
 RealScalar: TypeAlias = Num[Array, ""] | int | float
@@ -21,4 +21,3 @@ PRNGKey: TypeAlias = Key[Array, "..."] | UInt32[Array, "... 2"]
 """A key from `jax.random.key` (or the older `jax.random.PRNGKey`)."""
 Checkpoint: TypeAlias = Literal["step", "sqrt"] | None
 """What the gradient of a rollout stores."""
-AnyArray: TypeAlias = Shaped[Array, "..."]

@@ -1,6 +1,5 @@
 """Leaves by their path: `replace(env, {"dynamics.system.length": 1.2})`."""
 
-import difflib
 import warnings
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -11,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import PyTree
 
-from .._message import shortened
+from .._message import did_you_mean, shortened
 from ._fields import (
     as_float_array,
     check_module,
@@ -46,11 +45,9 @@ def _nodes_along(tree: Any, path: str) -> list[Any]:
     for part in path.split(".") if path else ():
         children = children_of(nodes[-1])
         if part not in children:
-            close = difflib.get_close_matches(part, children, n=3) or children
-            raise ValueError(
-                f"path: {type(nodes[-1]).__name__} has no {part!r} (in {path!r}); "
-                f"did you mean one of {', '.join(close) or 'nothing: it is a leaf'}?"
-            )
+            hint = did_you_mean(part, children) if children else "it is a leaf."
+            kind = type(nodes[-1]).__name__
+            raise ValueError(f"path: {kind} has no {part!r} (in {path!r}); {hint}")
         nodes.append(children[part])
     return nodes
 

@@ -22,8 +22,7 @@ import jax.random as jr
 import numpy as np
 from jax.core import Tracer
 
-from .._check import as_path
-from .._files import replaced
+from .._files import as_path, replaced
 from .._results import Result
 from ._qualified import name_of, thing_of
 

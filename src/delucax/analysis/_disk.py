@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._message import shortened
-from .._results import Result
+from .._results import raise_on_failure, Result
 from .._typing import Scalar
 from ._norms import peak_gain
-from ._state_space import LinearModel, raise_unless_successful, state_space, StateSpace
+from ._state_space import LinearModel, state_space, StateSpace
 
 
 class DiskMargin(eqx.Module):
@@ -104,7 +104,7 @@ def disk_margin(
                 f"for all, got {shortened(channel)}."
             )
     disk = disk_of(system, jnp.asarray(skew, system.A.dtype), channel)
-    return raise_unless_successful(disk, where) if throw else disk
+    return raise_on_failure(disk, where, throw)
 
 
 @eqx.filter_jit

@@ -9,11 +9,12 @@ import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
 from .._check import check_count, check_positive
+from .._results import raise_if
 from .._typing import BoolScalar, Scalar
 from ..math._linear_solve import full_precision, symmetric
 from ..riccati._lyapunov import lyapunov
 from ..riccati._stein import stein
-from ._state_space import LinearModel, raise_if, state_space, StateSpace
+from ._state_space import LinearModel, state_space, StateSpace
 
 
 _DOUBLINGS = 60

@@ -8,17 +8,11 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
-from .._results import first_of, Result
+from .._results import first_of, raise_on_failure, Result
 from .._typing import BoolScalar, Scalar
+from ..math._linear_solve import lu_solve
 from ._disk import disk_of, DiskMargin
-from ._state_space import (
-    LinearModel,
-    raise_unless_successful,
-    size,
-    solve,
-    state_space,
-    StateSpace,
-)
+from ._state_space import frobenius_norm, LinearModel, state_space, StateSpace
 
 
 _HALVINGS = 60
@@ -121,8 +115,7 @@ def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
             f"{where}: loop must have one control and one output, got {m} and {p}; "
             "`disk_margin` takes more."
         )
-    solution = _margins(system)
-    return raise_unless_successful(solution, where) if throw else solution
+    return raise_on_failure(_margins(system), where, throw)
 
 
 @eqx.filter_jit
@@ -158,7 +151,7 @@ def _margins(loop: StateSpace) -> Margins:
     # Where there is none, a point at which all is finite.
     followed = jnp.where(exists, followed, 1)
     L = jax.vmap(lambda w, ok: jnp.where(ok, _scalar(loop, w), 1))(followed, exists)
-    factor = 1 / jax.vmap(size)(L)
+    factor = 1 / jax.vmap(frobenius_norm)(L)
     angle = jnp.arctan2(-jnp.imag(L), -jnp.real(L))
     lag = jnp.where(angle < 0, angle + 2 * jnp.pi, angle) / followed
     margins = jnp.stack([factor[0], factor[1], jnp.abs(angle[2]), lag[3]])
@@ -184,7 +177,7 @@ def _scalar(loop: StateSpace, omega: Scalar) -> Complex[Array, ""]:
 
 def _crossing(kind: Any, L: Complex[Array, ""]) -> Scalar:
     """Zero where `L` is real, or for the second kind where it is 1 in size."""
-    length = size(L)
+    length = frobenius_norm(L)
     return jnp.where(kind == 0, jnp.imag(L) / length, jnp.log(length))
 
 
@@ -282,7 +275,7 @@ def _real_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
     # Neither is likely to be a pole, or a zero itself.
     for point in (0.7368, 1.3719):
         right = jnp.concatenate([eye, both_B], axis=1)
-        solved = solve(point * eye - both_A, right)
+        solved = lu_solve(point * eye - both_A, right)
         F, FB = solved[:, : len(eye)], solved[:, len(eye) :]
         inverse = FB @ (both_C @ F) / (both_C @ FB) - F
         frequencies.append(jnp.imag(1 / jnp.linalg.eigvals(inverse)))

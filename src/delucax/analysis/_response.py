@@ -9,8 +9,10 @@ from jaxtyping import Array, Complex, Float
 
 from .._check import is_concrete
 from .._module import as_float_array
+from .._results import raise_if
 from .._typing import BoolScalar
-from ._state_space import LinearModel, raise_if, solve, state_space, StateSpace
+from ..math._linear_solve import lu_solve
+from ._state_space import LinearModel, state_space, StateSpace
 
 
 def frequency_response(
@@ -110,5 +112,5 @@ def _dcgain(system: StateSpace) -> tuple[Float[Array, "p m"], BoolScalar]:
     eps = jnp.finfo(values.dtype).eps
     singular = ~(values[-1] > len(values) * eps * values[0])
     invertible = jnp.where(singular, system.eye, matrix)
-    gain = system.C @ solve(invertible, system.B) + system.D
+    gain = system.C @ lu_solve(invertible, system.B) + system.D
     return jnp.where(singular, jnp.inf, gain), singular

@@ -10,6 +10,7 @@ import lineax as lx
 from jaxtyping import Array
 
 from .._check import as_vector, check_instance, check_step
+from .._jax import jacobian
 from .._message import shortened
 from .._typing import RealScalar
 from ..systems import AbstractSystem, LinearSystem
@@ -73,15 +74,15 @@ def linearize(
         )
     x, u = point_of(model, x, u, "linearize")
     t = jnp.asarray(t, x.dtype)
-    C = _jacobian(lambda x: model.observe(t, x))(x)
+    C = jacobian(lambda x: model.observe(t, x))(x)
     if is_system:
         w = jnp.zeros(model.disturbance_size, x.dtype)
         held = w if model.disturbance_names else None
         f = functools.partial(evaluate_field, model)
-        A, B = _jacobian(f, (1, 2))(t, x, u, held)
+        A, B = jacobian(f, (1, 2))(t, x, u, held)
         E = None
         if model.disturbance_names:
-            E = _jacobian(f, 3)(t, x, u, w)
+            E = jacobian(f, 3)(t, x, u, w)
         return LinearSystem(
             A,
             B,
@@ -100,7 +101,7 @@ def linearize(
         return dynamics(t, x, u, w)
 
     w = zeros_if_none(None, model.disturbance_size, x)
-    A, B, E = _jacobian(step, (0, 1, 2))(x, u, w)
+    A, B, E = jacobian(step, (0, 1, 2))(x, u, w)
     return LinearDynamics(
         A,
         B,
@@ -204,17 +205,3 @@ def _solve(matrix: Array, right: Array) -> Array:
     operator = lx.MatrixLinearOperator(matrix)
     solve = lambda b: lx.linear_solve(operator, b, lx.LU()).value  # noqa: E731
     return jax.vmap(solve, in_axes=1, out_axes=1)(right)
-
-
-def _jacobian(f: Any, argnums: Any = 0) -> Any:
-    """Forward mode; reverse where a solver inside has only that."""
-
-    def jacobian(*args):
-        try:
-            return jax.jacfwd(f, argnums)(*args)
-        except TypeError as error:
-            if "forward-mode" not in str(error):
-                raise
-            return jax.jacrev(f, argnums)(*args)
-
-    return jacobian

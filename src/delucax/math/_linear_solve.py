@@ -8,7 +8,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Inexact
 
 
 SMALL = 5
@@ -41,8 +41,19 @@ def solve(
     A small matrix is eliminated entry by entry: one member of a batch is
     then a lane of vector instructions, where LAPACK would be called for each.
     """
-    operator = lx.MatrixLinearOperator(matrix)
     solver = _Elimination() if matrix.shape[0] <= SMALL else lx.LU()
+    return _solve_by(solver, matrix, right)
+
+
+def lu_solve(
+    matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"]
+) -> Inexact[Array, "n k"]:
+    """`solve` by LAPACK, of matrices of any size, also complex."""
+    return _solve_by(lx.LU(), matrix, right)
+
+
+def _solve_by(solver: lx.AbstractLinearSolver, matrix: Array, right: Array) -> Array:
+    operator = lx.MatrixLinearOperator(matrix)
     state = solver.init(operator, {})
 
     def column(b):
@@ -149,9 +160,9 @@ def is_definite(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
     return definite
 
 
-def symmetric(X: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def symmetric(X: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
     """The symmetric part."""
-    return (X + X.T) / 2
+    return (X + X.mT) / 2
 
 
 def no_tangent(tree: Any) -> Any:

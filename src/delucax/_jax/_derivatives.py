@@ -1,0 +1,33 @@
+"""Derivatives of programs that may have none in one of the two modes."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+
+
+def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
+    """The first of some ways to take a derivative that the solvers inside have.
+
+    Some have none in reverse, others none forward. If no way is possible the error is
+    that of the first, and so is one that has nothing to do with derivatives.
+    """
+
+    def evaluate(*args):
+        errors = []
+        for derivative in derivatives:
+            try:
+                return derivative(*args)
+            except (RuntimeError, TypeError, ValueError) as error:
+                errors.append(error)
+        raise errors[0]
+
+    return evaluate
+
+
+def jacobian(
+    function: Callable[..., Any], argnums: int | Sequence[int] = 0
+) -> Callable[..., Any]:
+    """Forward mode; reverse where a solver inside has only that."""
+    modes = jax.jacfwd, jax.jacrev
+    return first_possible(*(mode(function, argnums) for mode in modes))
