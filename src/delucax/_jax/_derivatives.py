@@ -1,9 +1,7 @@
 """Derivatives of programs that may have none in one of the two modes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
-
-import jax
 
 
 def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
@@ -23,11 +21,3 @@ def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
         raise errors[0]
 
     return evaluate
-
-
-def jacobian(
-    function: Callable[..., Any], argnums: int | Sequence[int] = 0
-) -> Callable[..., Any]:
-    """Forward mode; reverse where a solver inside has only that."""
-    modes = jax.jacfwd, jax.jacrev
-    return first_possible(*(mode(function, argnums) for mode in modes))

@@ -10,7 +10,6 @@ import lineax as lx
 from jaxtyping import Array
 
 from .._check import as_vector, check_instance, check_step
-from .._jax import jacobian
 from .._message import shortened
 from .._typing import RealScalar
 from ..systems import AbstractSystem, LinearSystem
@@ -74,15 +73,15 @@ def linearize(
         )
     x, u = point_of(model, x, u, "linearize")
     t = jnp.asarray(t, x.dtype)
-    C = jacobian(lambda x: model.observe(t, x))(x)
+    C = _jacobian(lambda x: model.observe(t, x))(x)
     if is_system:
         w = jnp.zeros(model.disturbance_size, x.dtype)
         held = w if model.disturbance_names else None
         f = functools.partial(evaluate_field, model)
-        A, B = jacobian(f, (1, 2))(t, x, u, held)
+        A, B = _jacobian(f, (1, 2))(t, x, u, held)
         E = None
         if model.disturbance_names:
-            E = jacobian(f, 3)(t, x, u, w)
+            E = _jacobian(f, 3)(t, x, u, w)
         return LinearSystem(
             A,
             B,
@@ -101,7 +100,7 @@ def linearize(
         return dynamics(t, x, u, w)
 
     w = zeros_if_none(None, model.disturbance_size, x)
-    A, B, E = jacobian(step, (0, 1, 2))(x, u, w)
+    A, B, E = _jacobian(step, (0, 1, 2))(x, u, w)
     return LinearDynamics(
         A,
         B,
@@ -205,3 +204,17 @@ def _solve(matrix: Array, right: Array) -> Array:
     operator = lx.MatrixLinearOperator(matrix)
     solve = lambda b: lx.linear_solve(operator, b, lx.LU()).value  # noqa: E731
     return jax.vmap(solve, in_axes=1, out_axes=1)(right)
+
+
+def _jacobian(f: Any, argnums: Any = 0) -> Any:
+    """Forward mode; reverse where a solver inside has only that."""
+
+    def jacobian(*args):
+        try:
+            return jax.jacfwd(f, argnums)(*args)
+        except TypeError as error:
+            if "forward-mode" not in str(error):
+                raise
+            return jax.jacrev(f, argnums)(*args)
+
+    return jacobian

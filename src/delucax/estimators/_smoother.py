@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_finite
+from .._check import check_finite, is_concrete
 from .._message import shortened
 from .._module import as_float_array
-from .._results import choose, raise_on_failure, Result, RESULTS
+from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision
 from ._base import Belief
 from ._gaussian import AbstractGaussianFilter
@@ -146,7 +146,7 @@ def run_filter(
     filtered = _filter(
         estimator, *_record(estimator, observations, controls, t0, where)
     )
-    return _checked(filtered, filtered, where, throw)
+    return _checked(filtered, where) if throw else filtered
 
 
 def smooth(
@@ -208,7 +208,7 @@ def smooth(
     smoothed = _smooth(
         estimator, *_record(estimator, observations, controls, t0, where)
     )
-    return _checked(smoothed, smoothed.filtered, where, throw)
+    return _checked(smoothed, where) if throw else smoothed
 
 
 def _record(estimator, observations, controls, t0, where):
@@ -309,11 +309,17 @@ def _masked(well: Array, values: Array) -> Array:
     return jnp.where(well.reshape(-1, *(1,) * (values.ndim - 1)), values, jnp.nan)
 
 
-def _checked(estimates: Any, filtered: Filtered, where: str, throw: bool) -> Any:
-    """Raise if asked to and the run failed."""
-
-    def facts():
+def _checked(found, where):
+    """Raise if the run failed: now if it can be seen, else at run time."""
+    failed = found.result != RESULTS.successful
+    if not is_concrete(failed):
+        return found.result.error_if(found, failed)
+    if failed:
+        filtered = found if isinstance(found, Filtered) else found.filtered
         finite = np.isfinite(filtered.log_likelihoods)
-        return "" if finite.all() else f"At observation {finite.argmin()}."
-
-    return raise_on_failure(estimates, where, throw, "the beliefs", facts)
+        where_to = "" if finite.all() else f" At observation {finite.argmin()}."
+        raise RuntimeError(
+            f"{where}: {RESULTS[found.result]}{where_to} Pass throw=False to look at "
+            "the beliefs."
+        )
+    return found

@@ -41,19 +41,8 @@ def solve(
     A small matrix is eliminated entry by entry: one member of a batch is
     then a lane of vector instructions, where LAPACK would be called for each.
     """
-    solver = _Elimination() if matrix.shape[0] <= SMALL else lx.LU()
-    return _solve_by(solver, matrix, right)
-
-
-def lu_solve(
-    matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"]
-) -> Inexact[Array, "n k"]:
-    """`solve` by LAPACK, of matrices of any size, also complex."""
-    return _solve_by(lx.LU(), matrix, right)
-
-
-def _solve_by(solver: lx.AbstractLinearSolver, matrix: Array, right: Array) -> Array:
     operator = lx.MatrixLinearOperator(matrix)
+    solver = _Elimination() if matrix.shape[0] <= SMALL else lx.LU()
     state = solver.init(operator, {})
 
     def column(b):
@@ -174,3 +163,16 @@ def no_tangent(tree: Any) -> Any:
         return jnp.zeros(x.shape, jax.dtypes.float0)
 
     return jax.tree.map(zero, tree)
+
+
+def lu_solve(
+    matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"]
+) -> Inexact[Array, "n k"]:
+    """`solve` by LAPACK at every size, of complex matrices too."""
+    operator, solver = lx.MatrixLinearOperator(matrix), lx.LU()
+    state = solver.init(operator, {})
+
+    def column(b):
+        return lx.linear_solve(operator, b, solver, state=state, throw=False).value
+
+    return jax.vmap(column, in_axes=1, out_axes=1)(right)
