@@ -53,16 +53,16 @@ def by_components(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _replay(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:
-    known: dict[Any, Any] = {}
+    env: dict[Any, Any] = {}
 
     def read(atom):
-        return atom.val if isinstance(atom, Literal) else known[atom]
+        return atom.val if isinstance(atom, Literal) else env[atom]
 
-    known.update(zip(jaxpr.constvars, consts, strict=True))
-    known.update(zip(jaxpr.invars, args, strict=True))
+    env.update(zip(jaxpr.constvars, consts, strict=True))
+    env.update(zip(jaxpr.invars, args, strict=True))
     for equation in jaxpr.eqns:
         values = [read(atom) for atom in equation.invars]
-        known.update(zip(equation.outvars, _apply(equation, values), strict=True))
+        env.update(zip(equation.outvars, _apply(equation, values), strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
@@ -93,10 +93,10 @@ def _on_components(
 ) -> Sequence[Any] | None:
     """The outputs of a primitive that makes components, or acts on them; `None` if it
     needs the whole arrays. `shape` is that of its first output."""
-    name, (first, *rest) = primitive.name, values or [None]
+    name, (first, *others) = primitive.name, values or [None]
     split = [isinstance(value, _Components) for value in values]
     is_vector = shape is not None and len(shape) == 1
-    if name in ("broadcast_in_dim", "reshape") and not rest and shape == (1,):
+    if name in ("broadcast_in_dim", "reshape") and not others and shape == (1,):
         if not split[0] and jnp.shape(first) == ():
             return [_Components([first])]
     if name == "concatenate" and is_vector and shape[0] <= LARGEST and all(split):
@@ -119,9 +119,9 @@ def _on_components(
         ends = params["start_indices"] + params["limit_indices"]
         taken = first.entries[slice(*ends, *(params["strides"] or ()))]
         return [_Components(taken)] if taken else None
-    if name == "dynamic_slice" and not isinstance(rest[0], Tracer):
+    if name == "dynamic_slice" and not isinstance(others[0], Tracer):
         (size,) = params["slice_sizes"]
-        start = min(max(int(rest[0]), 0), len(first.entries) - size)
+        start = min(max(int(others[0]), 0), len(first.entries) - size)
         return [_Components(first.entries[start : start + size])]
     return None
 

@@ -53,13 +53,13 @@ class _Positive(AbstractConstraint):
         ```
     """
 
-    def constrain(self, z):
+    def constrain(self, z: Array) -> Array:
         return _inside(jnp.exp(z), 0.0, np.inf)
 
-    def unconstrain(self, value):
+    def unconstrain(self, value: Array) -> Array:
         return jnp.log(value)
 
-    def holds(self, value):
+    def holds(self, value: Array) -> Array:
         return value > 0
 
     def __repr__(self):
@@ -69,15 +69,11 @@ class _Positive(AbstractConstraint):
 def _inside(value: Array, low: float, high: float) -> Array:
     """`value` off the ends of an open interval, which rounding may put it on."""
     dtype = jnp.result_type(value)
-    tiny = float(jnp.finfo(dtype).tiny)
-    least, most = (
-        float(np.nextafter(np.asarray(end, dtype), np.asarray(other, dtype)))
-        for end, other in ((low, high), (high, low))
-    )
+    tiny, ends = jnp.finfo(dtype).tiny, np.asarray([low, high], dtype)
+    inner = np.nextafter(ends, ends[::-1])
     # Numbers below `tiny` are flushed to zero.
-    least = tiny if low == 0 else least
-    most = -tiny if high == 0 else most
-    return jnp.clip(value, least, most)
+    inner = np.where(np.abs(inner) < tiny, np.copysign(tiny, inner), inner)
+    return jnp.clip(value, *map(float, inner))
 
 
 positive = _Positive()
@@ -112,14 +108,14 @@ class bounded(AbstractConstraint):
         self.low = float(low)
         self.high = float(high)
 
-    def constrain(self, z):
+    def constrain(self, z: Array) -> Array:
         value = self.low + (self.high - self.low) * jax.nn.sigmoid(z)
         return _inside(value, self.low, self.high)
 
-    def unconstrain(self, value):
+    def unconstrain(self, value: Array) -> Array:
         return jnp.log(value - self.low) - jnp.log(self.high - value)
 
-    def holds(self, value):
+    def holds(self, value: Array) -> Array:
         return (value > self.low) & (value < self.high)
 
     def __repr__(self):
@@ -333,9 +329,9 @@ def _check_numbers(value: Any, name: str, field: dataclasses.Field) -> None:
     is_missing = value is None and field.default not in (dataclasses.MISSING, None)
     for leaf in [None] if is_missing else jax.tree.leaves(value):
         is_number = eqx.is_inexact_array(leaf)
-        # Inside a network there may be anything.
-        bare = leaf is value or field.metadata[_ROLE] == "parameter"
-        if bare and not (callable(leaf) or is_number):
+        # The leaves of a network may be anything.
+        is_alone = leaf is value or field.metadata[_ROLE] == "parameter"
+        if is_alone and not (callable(leaf) or is_number):
             raise ValueError(
                 f"{name} must be a number or an array, got {shortened(leaf)}."
             )

@@ -233,8 +233,8 @@ def _members(module: eqx.Module) -> dict[int, eqx.Module]:
     (count,) = lengths.pop()
     places = range(count) if count <= _MOST_MEMBERS else _sampled(leaves, count)
     rows = zip(*(list(leaf[np.asarray(places)]) for leaf in leaves), strict=True)
-    whole = lambda row: eqx.combine(jax.tree.unflatten(structure, row), rest)
-    return {int(k): whole(row) for k, row in zip(places, rows, strict=True)}
+    member = lambda row: eqx.combine(jax.tree.unflatten(structure, row), rest)
+    return {int(k): member(row) for k, row in zip(places, rows, strict=True)}
 
 
 def _sampled(leaves: list[Any], count: int) -> np.ndarray:

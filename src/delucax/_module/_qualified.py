@@ -57,8 +57,8 @@ def thing_of(name: str, trust: tuple[str, ...]) -> Any:
     """
     module, _, path = name.partition(":")
     package = module.partition(".")[0]
-    named = _is_in(module, trust)
-    if not named and package not in (*_TRUSTED, "jax", "numpy", "__main__"):
+    is_asked_for = _is_in(module, trust)
+    if not is_asked_for and package not in (*_TRUSTED, "jax", "numpy", "__main__"):
         raise ValueError(
             f"it needs {name!r}, and {package!r} is not a package that is trusted; if "
             f"you trust it, give trust=({package!r},)."
@@ -84,7 +84,7 @@ def thing_of(name: str, trust: tuple[str, ...]) -> Any:
     else:
         others = _TRUSTED if package in _TRUSTED else ()
         fits = _is_in(origin, (*others, *trust, package))
-    if not fits and not named:
+    if not fits and not is_asked_for:
         raise ValueError(
             f"it needs {name!r}, which is not among what is trusted; if you trust it, "
             f"give trust=({module!r},)."

@@ -217,12 +217,11 @@ class _Writer:
             }
         if kind in _SEQUENCES.values():
             items = sorted(node, key=repr) if kind is frozenset else node
-            items = {str(i): item for i, item in enumerate(items)}
-            return {kind.__name__: [*self.fields(items, path).values()]}
+            items = [self.describe(c, f"{path}.{i}") for i, c in enumerate(items)]
+            return {kind.__name__: items}
         if kind is dict:
-            values = self.fields(node, path).values()
-            keys = [self.describe(key, f"{path}.{key}") for key in node]
-            return {"dict": [list(pair) for pair in zip(keys, values, strict=True)]}
+            at = lambda part, key: self.describe(part, f"{path}.{key}")
+            return {"dict": [[at(k, k), at(v, k)] for k, v in node.items()]}
         return {"name": self.name(node, path)}
 
     def fields(self, nodes: Mapping[Any, Any], path: str) -> dict[Any, Any]:

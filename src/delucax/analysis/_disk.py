@@ -1,13 +1,11 @@
 """How large a disk of perturbations a feedback loop stands."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 
 from .._message import shortened
 from .._results import raise_on_failure, Result
-from .._typing import Scalar
+from .._typing import RealScalar, Scalar
 from ._norms import peak_gain
 from ._state_space import LinearModel, state_space, StateSpace
 
@@ -47,7 +45,7 @@ class DiskMargin(eqx.Module):
 
 def disk_margin(
     loop: LinearModel,
-    skew: Any = 0.0,
+    skew: RealScalar = 0.0,
     *,
     channel: int | None = None,
     throw: bool = True,

@@ -1,12 +1,10 @@
 """How far a feedback loop is from instability."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from .._results import first_of, raise_on_failure, Result
 from .._typing import BoolScalar, Scalar
@@ -175,13 +173,15 @@ def _scalar(loop: StateSpace, omega: Scalar) -> Complex[Array, ""]:
     return loop.response(omega)[0, 0]
 
 
-def _crossing(kind: Any, L: Complex[Array, ""]) -> Scalar:
+def _crossing(kind: Int[Array, ""] | int, L: Complex[Array, ""]) -> Scalar:
     """Zero where `L` is real, or for the second kind where it is 1 in size."""
     length = frobenius_norm(L)
     return jnp.where(kind == 0, jnp.imag(L) / length, jnp.log(length))
 
 
-def _follow(loop: StateSpace, kind: Any, omega: Scalar, exists: BoolScalar) -> Scalar:
+def _follow(
+    loop: StateSpace, kind: Int[Array, ""] | int, omega: Scalar, exists: BoolScalar
+) -> Scalar:
     """`omega` itself, which moves with the loop as the crossing does.
 
     Two Newton steps from where it is already: their values change nothing but rounding,
@@ -194,14 +194,14 @@ def _follow(loop: StateSpace, kind: Any, omega: Scalar, exists: BoolScalar) -> S
         at_nyquist = omega * lax.stop_gradient(dt) > nearly
     moves = exists & (omega > 0) & ~at_nyquist
 
-    def newton(_, there):
+    def newton(_, crossed):
         crossing = lambda w: _crossing(kind, _scalar(loop, w))
-        g, slope = jax.jvp(crossing, (there,), (jnp.ones_like(there),))
-        return there - jnp.where(moves, g / jnp.where(moves, slope, 1), 0)
+        g, slope = jax.jvp(crossing, (crossed,), (jnp.ones_like(crossed),))
+        return crossed - jnp.where(moves, g / jnp.where(moves, slope, 1), 0)
 
-    there = lax.fori_loop(0, 2, newton, jnp.where(moves, omega, 1))
-    rest = omega if dt is None else jnp.where(at_nyquist, jnp.pi / dt, omega)
-    return jnp.where(moves, there, rest)
+    crossed = lax.fori_loop(0, 2, newton, jnp.where(moves, omega, 1))
+    fixed = omega if dt is None else jnp.where(at_nyquist, jnp.pi / dt, omega)
+    return jnp.where(moves, crossed, fixed)
 
 
 def _crossings(
@@ -240,13 +240,13 @@ def _crossings(
     between = (nodes[1:] + nodes[:-1]) / 2
     between = jnp.stack([between, between])
     signs = values(between)
-    # What is on the crossing but for rounding tells nothing.
-    tells = jnp.isfinite(signs) & (jnp.abs(signs) > eps**0.5)
+    # The sign of what is zero up to rounding is not reliable.
+    is_reliable = jnp.isfinite(signs) & (jnp.abs(signs) > eps**0.5)
     indices = jnp.arange(signs.shape[1])
-    last = lax.cummax(jnp.where(tells, indices, -1), axis=1)[:, :-1]
+    last = lax.cummax(jnp.where(is_reliable, indices, -1), axis=1)[:, :-1]
     low, high = jnp.take_along_axis(between, last, axis=1), between[:, 1:]
     low_sign = jnp.sign(jnp.take_along_axis(signs, last, axis=1))
-    crosses = tells[:, 1:] & (last >= 0) & (low_sign != jnp.sign(signs[:, 1:]))
+    crosses = is_reliable[:, 1:] & (last >= 0) & (low_sign != jnp.sign(signs[:, 1:]))
 
     def halve(_, bracket):
         low, high = bracket
@@ -285,8 +285,8 @@ def _real_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
 def _unit_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
     """Zeros of `1 - L(-s) L(s)`: eigenvalues of a Hamiltonian."""
     A, B, C, D = loop.A, loop.B, loop.C, loop.D
-    rest = 1 - D[0, 0] ** 2
-    rest = jnp.where(rest == 0, jnp.finfo(A.dtype).eps, rest)
-    F = A + B @ C * D[0, 0] / rest
-    H = jnp.block([[F, B @ B.T / rest], [-C.T @ C / rest, -F.T]])
+    remainder = 1 - D[0, 0] ** 2
+    remainder = jnp.where(remainder == 0, jnp.finfo(A.dtype).eps, remainder)
+    F = A + B @ C * D[0, 0] / remainder
+    H = jnp.block([[F, B @ B.T / remainder], [-C.T @ C / remainder, -F.T]])
     return jnp.imag(jnp.linalg.eigvals(H))

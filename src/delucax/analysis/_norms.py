@@ -99,13 +99,13 @@ def hinf_norm(
     `max over omega of sigma_max(C (s I - A)^-1 B)`, at `s = j omega`, or in discrete
     time at `exp(j omega dt)`.
 
-    A level just above the largest gain found so far is crossed at frequencies that are
+    A level just above the largest gain so far is crossed at frequencies that are
     eigenvalues of a Hamiltonian matrix; between two of them the gain is looked at
     again, until nothing is above the level, and Newton steps find the top. Infinite if
     a pole is on or outside the boundary of stability.
 
     It has first and second derivatives, in either mode, where one frequency and one
-    direction alone attain the maximum; elsewhere it has those of the one found.
+    direction alone attain the maximum; elsewhere it has those of one that does.
 
     **Arguments:**
 

@@ -1,11 +1,9 @@
 """What a linear model makes of sinusoids and of constants."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex, Float
 
 from .._check import is_concrete
 from .._module import as_float_array
@@ -16,7 +14,7 @@ from ._state_space import LinearModel, state_space, StateSpace
 
 
 def frequency_response(
-    model: LinearModel, omega: Any, *, inputs: str = "controls"
+    model: LinearModel, omega: ArrayLike, *, inputs: str = "controls"
 ) -> Complex[Array, "*frequencies p m"]:
     """The complex gain `C (s I - A)^-1 B` from inputs to outputs,
 

@@ -7,6 +7,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Inexact
 
+from .._check import check_choice
 from .._typing import BoolScalar, Scalar
 from ..dynamics import LinearDynamics
 from ..math import safe_norm
@@ -83,32 +84,26 @@ def state_space(model: Any, inputs: str, where: str) -> StateSpace:
             "(`delucax.linearize` makes one of any system or dynamics), got "
             f"{type(model).__name__}."
         )
-    discrete = isinstance(model, LinearDynamics)
-    if discrete and model.is_time_varying:
+    check_choice(inputs, ("controls", "disturbances"), "inputs", where)
+    dt = model.dt if isinstance(model, LinearDynamics) else None
+    if isinstance(model, LinearDynamics) and model.is_time_varying:
         raise ValueError(
             f"{where}: model must be time-invariant, got matrices at "
             f"{model.A.shape[0]} times; `dynamics.at(t)` are those at one time."
         )
-    eye = jnp.eye(model.A.shape[0], dtype=model.A.dtype)
-    if inputs == "controls":
-        B = model.B
-    elif inputs == "disturbances":
-        if model.E is None and not discrete:
-            raise ValueError(
-                f"{where}: inputs='disturbances' needs a model with E, which says how "
-                "they enter the vector field, got a LinearSystem whose E is None."
-            )
-        B = eye if model.E is None else model.E
-    else:
+    if inputs == "disturbances" and model.E is None and dt is None:
         raise ValueError(
-            f"{where}: inputs must be 'controls' or 'disturbances', got {inputs!r}."
+            f"{where}: inputs='disturbances' needs a model with E, which says how "
+            "they enter the vector field, got a LinearSystem whose E is None."
         )
+    eye = jnp.eye(model.A.shape[0], dtype=model.A.dtype)
+    B = model.B if inputs == "controls" else model.E
+    B = eye if B is None else B
     C = eye if model.C is None else model.C
     dtype = jnp.result_type(model.A, B, C)
     A, B, C = (M.astype(dtype) for M in (model.A, B, C))
     D = jnp.zeros((C.shape[0], B.shape[1]), dtype)
-    dt = jnp.asarray(model.dt, dtype) if isinstance(model, LinearDynamics) else None
-    return StateSpace(A, B, C, D, dt)
+    return StateSpace(A, B, C, D, None if dt is None else jnp.asarray(dt, dtype))
 
 
 def frobenius_norm(M: Inexact[Array, "..."]) -> Scalar:
@@ -127,12 +122,12 @@ def largest_gain(G: Inexact[Array, "p m"]) -> Scalar:
     """
     if 1 in G.shape:
         return frobenius_norm(G)
-    still = lax.stop_gradient(G)
-    squares, vectors = jnp.linalg.eigh(still.conj().T @ still)
+    frozen = lax.stop_gradient(G)
+    squares, vectors = jnp.linalg.eigh(frozen.conj().T @ frozen)
     gaps = squares[-1] - squares
     open_gaps = gaps > jnp.finfo(gaps.dtype).eps ** 0.5 * squares[-1]
     weights = jnp.where(open_gaps, 1 / jnp.where(open_gaps, gaps, 1), 0)
     top = vectors[:, -1]
-    moved = vectors.conj().T @ (G.conj().T @ (G @ top))
-    follows = top + vectors @ (weights * moved)
-    return frobenius_norm(G @ follows) / frobenius_norm(follows)
+    change = vectors.conj().T @ (G.conj().T @ (G @ top))
+    vector = top + vectors @ (weights * change)
+    return frobenius_norm(G @ vector) / frobenius_norm(vector)
