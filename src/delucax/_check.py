@@ -14,6 +14,7 @@ from jaxtyping import Array
 from ._files import as_path as as_path
 from ._message import shortened
 from ._module import as_float_array
+from ._typing import Bounds
 
 
 Shape = tuple[int, ...]
@@ -139,7 +140,7 @@ def symmetric_matrix(value: Any, name: str, where: str) -> Array:
 
 def as_bounds(
     value: Any, where: str, name: str = "bounds", size: int | None = None
-) -> tuple[Array, Array] | None:
+) -> Bounds | None:
     """`value` as `(low, high)`, each a number or a vector (of `size`, if it is given),
     or an error."""
     if value is None:
@@ -167,9 +168,7 @@ def as_bounds(
     return low, high
 
 
-def check_control_bounds(
-    value: Any, size: int, where: str
-) -> tuple[Array, Array] | None:
+def check_control_bounds(value: Any, size: int, where: str) -> Bounds | None:
     """`value` as bounds of `size` controls, or an error."""
     bounds = as_bounds(value, where)
     for end in bounds or ():

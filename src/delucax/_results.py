@@ -147,7 +147,7 @@ def raise_on_failure(
     where: str,
     throw: bool = True,
     it: str = "the solution",
-    facts: Callable[[], str] = str,
+    facts: Callable[[], str] = lambda: "",
 ) -> Any:
     """`solution`, or an error if its `result` is a failure and `throw` holds: now if
     that can be seen, else at run time.

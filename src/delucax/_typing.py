@@ -16,6 +16,8 @@ Control: TypeAlias = Float[Array, "controls"]  # noqa: F821
 Disturbance: TypeAlias = Float[Array, "disturbances"]  # noqa: F821
 Observation: TypeAlias = Float[Array, "observations"]  # noqa: F821
 Scalar: TypeAlias = Float[Array, ""]
+Bounds: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."]]
+"""`(low, high)`, each a number or one for each entry."""
 BoolScalar: TypeAlias = Bool[Array, ""]
 PRNGKey: TypeAlias = Key[Array, "..."] | UInt32[Array, "... 2"]
 """A key from `jax.random.key` (or the older `jax.random.PRNGKey`)."""

@@ -95,16 +95,16 @@ def _on_components(
     needs the whole arrays. `shape` is that of its first output."""
     name, (first, *others) = primitive.name, values or [None]
     split = [isinstance(value, _Components) for value in values]
-    is_vector = shape is not None and len(shape) == 1
+    size = shape[0] if shape and len(shape) == 1 else None
     if name in ("broadcast_in_dim", "reshape") and not others and shape == (1,):
         if not split[0] and jnp.shape(first) == ():
             return [_Components([first])]
-    if name == "concatenate" and is_vector and shape[0] <= LARGEST and all(split):
+    if name == "concatenate" and size is not None and size <= LARGEST and all(split):
         return [_Components([entry for v in values for entry in v.entries])]
     if name == "stack" and shape == (len(values),) and len(values) <= LARGEST:
         return [_Components(values)]
-    if name in _ELEMENTWISE and is_vector and any(split):
-        columns = [_entries(value, *shape) for value in values]
+    if name in _ELEMENTWISE and size is not None and any(split):
+        columns = [_entries(value, size) for value in values]
         if any(column is None for column in columns):
             return None
         rows = zip(*columns, strict=True)
@@ -120,9 +120,9 @@ def _on_components(
         taken = first.entries[slice(*ends, *(params["strides"] or ()))]
         return [_Components(taken)] if taken else None
     if name == "dynamic_slice" and not isinstance(others[0], Tracer):
-        (size,) = params["slice_sizes"]
-        start = min(max(int(others[0]), 0), len(first.entries) - size)
-        return [_Components(first.entries[start : start + size])]
+        (count,) = params["slice_sizes"]
+        start = min(max(int(others[0]), 0), len(first.entries) - count)
+        return [_Components(first.entries[start : start + count])]
     return None
 
 

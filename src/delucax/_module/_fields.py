@@ -59,7 +59,7 @@ class _Positive(AbstractConstraint):
     def unconstrain(self, value: Array) -> Array:
         return jnp.log(value)
 
-    def holds(self, value: Array) -> Array:
+    def holds(self, value):
         return value > 0
 
     def __repr__(self):
@@ -115,7 +115,7 @@ class bounded(AbstractConstraint):
     def unconstrain(self, value: Array) -> Array:
         return jnp.log(value - self.low) - jnp.log(self.high - value)
 
-    def holds(self, value: Array) -> Array:
+    def holds(self, value):
         return (value > self.low) & (value < self.high)
 
     def __repr__(self):
@@ -166,7 +166,7 @@ def parameter(
         ```python
         import delucax as dlx
         import jax.numpy as jnp
-        from jaxtyping import AbstractArray, Array, jaxtyped
+        from jaxtyping import Array
 
         class Oscillator(dlx.AbstractSystem):
             state_names = ("x", "v")
@@ -198,7 +198,7 @@ def weight(
 
         ```python
         import delucax as dlx
-        from jaxtyping import AbstractArray, Array, jaxtyped
+        from jaxtyping import Array
 
         class Proportional(dlx.AbstractController):
             gain: Array = dlx.weight(1.0)

@@ -31,7 +31,10 @@ _MAGIC = "delucax-file"
 _VERSION = 1
 _NUMBERS = {"float": float, "complex": complex}
 _SEQUENCES = {"tuple": tuple, "list": list, "frozenset": frozenset}
-_PARTIALS = {"partial": functools.partial, "Partial": jax.tree_util.Partial}
+_PARTIALS: dict[str, Any] = {
+    "partial": functools.partial,
+    "Partial": jax.tree_util.Partial,
+}
 
 
 def save(path: str | os.PathLike, obj: Any) -> None:
@@ -219,7 +222,7 @@ class _Writer:
             items = sorted(node, key=repr) if kind is frozenset else node
             items = [self.describe(c, f"{path}.{i}") for i, c in enumerate(items)]
             return {kind.__name__: items}
-        if kind is dict:
+        if type(node) is dict:
             at = lambda part, key: self.describe(part, f"{path}.{key}")
             return {"dict": [[at(k, k), at(v, k)] for k, v in node.items()]}
         return {"name": self.name(node, path)}

@@ -268,18 +268,17 @@ def poles(model: LinearModel) -> Complex[Array, " n"]:
 def _modal_test(
     system: StateSpace, tolerance: RealScalar | None, where: str
 ) -> ModalTest:
-    if tolerance is not None:
-        check_positive(tolerance, "tolerance", where)
-    return _tested(system, tolerance)
+    eps = jnp.finfo(system.A.dtype).eps
+    if tolerance is None:
+        tolerance = float(10 * len(system.A) * eps)
+    check_positive(tolerance, "tolerance", where)
+    return _tested(system, jnp.asarray(tolerance, system.A.dtype))
 
 
 @eqx.filter_jit
-def _tested(system: StateSpace, tolerance: RealScalar | None) -> ModalTest:
+def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
     system = lax.stop_gradient(system)
-    n = system.A.shape[0]
     eps = jnp.finfo(system.A.dtype).eps
-    if tolerance is None:
-        tolerance = 10 * n * eps
     scale_A, scale_B = (
         jnp.where(norm > 0, norm, 1)
         for norm in (jnp.linalg.norm(system.A), jnp.linalg.norm(system.B))
@@ -311,4 +310,4 @@ def _tested(system: StateSpace, tolerance: RealScalar | None) -> ModalTest:
     modes, distances = jax.vmap(nearby)(eigenvalues)
     modes = modes * scale_A
     unstable = system.growth(modes) >= 0
-    return ModalTest(modes, distances, unstable, jnp.asarray(tolerance, A.dtype))
+    return ModalTest(modes, distances, unstable, tolerance)

@@ -48,11 +48,11 @@ def frequency_response(
     """
     where = "frequency_response"
     system = state_space(model, inputs, where)
-    omega = as_float_array(omega)
-    real = eqx.is_inexact_array(omega) and not jnp.iscomplexobj(omega)
-    if not real or is_concrete(omega) and not bool(jnp.all(jnp.isfinite(omega))):
-        raise ValueError(f"{where}: omega must be real and finite, got {omega}.")
-    return _responses(system, omega)
+    array = as_float_array(omega)
+    real = eqx.is_inexact_array(array) and not jnp.iscomplexobj(array)
+    if not real or is_concrete(array) and not bool(jnp.all(jnp.isfinite(array))):
+        raise ValueError(f"{where}: omega must be real and finite, got {array}.")
+    return _responses(system, array)
 
 
 @eqx.filter_jit

@@ -1,10 +1,12 @@
 """Limits that XLA vectorises on CPU."""
 
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 
-def clip(x: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
+def clip(x: ArrayLike, low: Any, high: Any) -> Array:
     """`x` kept between `low` and `high`, either of which may be infinite.
 
     `jnp.clip` by comparisons: its own minimum and maximum must pass on a NaN of the
