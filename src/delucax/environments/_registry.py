@@ -1,11 +1,11 @@
 """Tasks by name."""
 
+import difflib
 import importlib
 import inspect
 from collections.abc import Callable
 from typing import Any
 
-from .._message import did_you_mean
 from ._environment import Environment
 
 
@@ -53,9 +53,10 @@ def make(name: str, **kwargs: Any) -> Environment:
     """
     if not isinstance(name, str) or name not in _REGISTRY:
         names = sorted(_REGISTRY)
-        hint = did_you_mean(str(name), names, cutoff=0.4)
+        close = difflib.get_close_matches(str(name), names, n=3, cutoff=0.4) or names
         raise ValueError(
-            f"make: no task is called {name!r}; {hint} All names: {', '.join(names)}."
+            f"make: no task is called {name!r}; did you mean "
+            f"{' or '.join(repr(n) for n in close)}? All names: {', '.join(names)}."
         )
     try:
         task = _imported(_REGISTRY[name])
