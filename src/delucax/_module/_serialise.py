@@ -29,7 +29,7 @@ from ._qualified import name_of, thing_of
 
 _MAGIC = "delucax-file"
 _VERSION = 1
-_NUMBERS = {"float": float, "complex": complex}
+_FROM_TEXT = {"float": float, "complex": complex, "dtype": jnp.dtype}
 _SEQUENCES = {"tuple": tuple, "list": list, "frozenset": frozenset}
 _PARTIALS: dict[str, Any] = {
     "partial": functools.partial,
@@ -194,7 +194,7 @@ class _Writer:
             return node
         if kind is float and math.isfinite(node):
             return node
-        if kind in _NUMBERS.values():
+        if kind in _FROM_TEXT.values():
             return {kind.__name__: repr(node)}
         if isinstance(node, Tracer):
             raise ValueError(
@@ -308,8 +308,8 @@ class _Reader:
         if not isinstance(node, dict):
             return node
         kind, content = next(iter(node.items()))
-        if kind in _NUMBERS:
-            return _NUMBERS[kind](content)
+        if kind in _FROM_TEXT:
+            return _FROM_TEXT[kind](content)
         if kind in _SEQUENCES:
             return _SEQUENCES[kind](map(self.build, content))
         return getattr(self, f"build_{kind}")(content, node)
@@ -334,9 +334,6 @@ class _Reader:
     def build_scalar(self, content, node):
         return self.arrays[content][()]
 
-    def build_dtype(self, content, node):
-        return jnp.dtype(content)
-
     def build_name(self, content, node):
         return thing_of(content, self.trust)
 
@@ -350,7 +347,7 @@ class _Reader:
             fitted = np.where(numbers == int(number), _number(item), fitted)
         fitted = fitted.astype(numbers.dtype)
         fitted = jnp.asarray(fitted) if isinstance(value, jax.Array) else fitted
-        return Result(fitted, enumeration)
+        return Result(fitted, enumeration)  # pyright: ignore[reportCallIssue]
 
     def build_module(self, content, node):
         cls = self.class_of(content, eqx.Module, "module class")
