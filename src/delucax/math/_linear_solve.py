@@ -149,7 +149,7 @@ def is_definite(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
     return definite
 
 
-def symmetric(X: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+def symmetric(X: Float[Array, "*T n n"]) -> Float[Array, "*T n n"]:
     """The symmetric part."""
     return (X + X.mT) / 2
 
