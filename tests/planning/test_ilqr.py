@@ -377,7 +377,7 @@ def test_a_bad_member_of_a_batch_harms_no_other(line_search):
         (dict(t0=jnp.zeros(2)), "t0 must be a number"),
         (dict(cost=lambda t, x, u: 0.0), "cost must be an AbstractCost"),
         (dict(dynamics=dlx.make("pendulum")), "dynamics must be an AbstractDynamics"),
-        (dict(line_search="exact"), "line_search must be one of"),
+        (dict(line_search="exact"), "line_search must be .parallel. or .backtracking."),
         (dict(regularise="both"), "regularise must be"),
         (dict(parallel=True, bounds=(-1.0, 1.0)), "parallel"),
         (dict(parallel=True, regularise="state"), "parallel"),
