@@ -8,7 +8,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Inexact
 
 
 SMALL = 5
@@ -149,9 +149,9 @@ def is_definite(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
     return definite
 
 
-def symmetric(X: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def symmetric(X: Float[Array, "*T n n"]) -> Float[Array, "*T n n"]:
     """The symmetric part."""
-    return (X + X.T) / 2
+    return (X + X.mT) / 2
 
 
 def no_tangent(tree: Any) -> Any:
@@ -163,3 +163,16 @@ def no_tangent(tree: Any) -> Any:
         return jnp.zeros(x.shape, jax.dtypes.float0)
 
     return jax.tree.map(zero, tree)
+
+
+def lu_solve(
+    matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"]
+) -> Inexact[Array, "n k"]:
+    """`solve` by LAPACK at every size, of complex matrices too."""
+    operator, solver = lx.MatrixLinearOperator(matrix), lx.LU()
+    state = solver.init(operator, {})
+
+    def column(b):
+        return lx.linear_solve(operator, b, solver, state=state, throw=False).value
+
+    return jax.vmap(column, in_axes=1, out_axes=1)(right)
