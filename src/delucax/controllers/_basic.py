@@ -163,7 +163,7 @@ class Linear(AbstractController):
         return -matvec(self.K, y).astype(y.dtype), state
 
 
-class Sequence(AbstractController):
+class OpenLoop(AbstractController):
     """Given controls, one after the other: open loop.
 
     `u_k = values[k]`; the last is held after the end.
@@ -180,7 +180,7 @@ class Sequence(AbstractController):
         import jax
         import jax.numpy as jnp
 
-        replay = dlx.controllers.Sequence(0.5 * jnp.ones((20, 1)))
+        replay = dlx.controllers.OpenLoop(0.5 * jnp.ones((20, 1)))
         dlx.rollout(dlx.make("pendulum"), replay, key=jax.random.key(0)).total_cost
         ```
     """
@@ -191,10 +191,10 @@ class Sequence(AbstractController):
         self.values = values
 
     def __check_init__(self):
-        as_matrix(self.values, "values", "Sequence")
-        check_real(self.values, "values", "Sequence")
+        as_matrix(self.values, "values", "OpenLoop")
+        check_real(self.values, "values", "OpenLoop")
         if self.values.shape[0] == 0:
-            raise ValueError("Sequence: values must have at least one row, got none.")
+            raise ValueError("OpenLoop: values must have at least one row, got none.")
 
     def init(self, *, key=None):
         return jnp.zeros((), jnp.int32)

@@ -137,7 +137,7 @@ def check_squash(bounds: Any, size: int, where: str) -> None:
             )
 
 
-def Deep(
+def mlp_policy(
     environment: Environment,
     width: int = 64,
     depth: int = 2,
@@ -175,11 +175,11 @@ def Deep(
         import jax
 
         env = dlx.make("pendulum")
-        policy = dlx.controllers.Deep(env, width=32, key=jax.random.key(0))
+        policy = dlx.controllers.mlp_policy(env, width=32, key=jax.random.key(0))
         dlx.rollout(env, policy, key=jax.random.key(1)).total_cost
         ```
     """
-    where = "Deep"
+    where = "mlp_policy"
     check_instance(environment, Environment, "environment", where)
     if head not in ("deterministic", "gaussian"):
         raise ValueError(

@@ -52,12 +52,12 @@ class Adaptive(AbstractController):
 
     What is played is the mixture `u = sum_i p_i u_i`; or the control of one expert,
     chosen anew only with the probability by which its weight has fallen, so that it is
-    seldom exchanged. With [`delucax.controllers.GPC`][] as base it is AdaGPC.
+    seldom exchanged. With [`delucax.controllers.gpc`][] as base it is AdaGPC.
 
     **Arguments:**
 
     - `base`: an [`delucax.AbstractLearner`][], such as one of
-        [`delucax.controllers.GPC`][].
+        [`delucax.controllers.gpc`][].
     - `slots`: the number of experts alive at once, 8 by default.
     - `every`: steps between births, 64 by default.
     - `rate`: of the weights, 0.5 by default.
@@ -77,7 +77,7 @@ class Adaptive(AbstractController):
         import jax
 
         env = dlx.make("lds", key=jax.random.key(0))
-        learner = dlx.controllers.GPC(env.dynamics, env.cost)
+        learner = dlx.controllers.gpc(env.dynamics, env.cost)
         adaptive = dlx.controllers.Adaptive(learner)
         dlx.rollout(env, adaptive, key=jax.random.key(0)).total_cost
         ```
@@ -110,7 +110,7 @@ class Adaptive(AbstractController):
 
     def __check_init__(self):
         where = "Adaptive"
-        check_instance(self.base, AbstractLearner, "base", where, " such as GPC makes")
+        check_instance(self.base, AbstractLearner, "base", where, " such as gpc makes")
         check_step(self.rate, where, "rate")
         check_step(self.share, where, "share")
         check_range(self.share, "share", where, 0, 1)

@@ -14,7 +14,7 @@ from ._features import Features
 from ._learner import OnlineLearner
 
 
-def DRC(
+def drc(
     dynamics: AbstractDynamics,
     cost: Callable[..., Array],
     *,
@@ -82,11 +82,11 @@ def DRC(
         cost = dlx.costs.Quadratic(C.T @ C, jnp.eye(1))
         env = dlx.make("lds", A=A, B=B, C=C, cost=cost, disturbance=push)
         cost = dlx.costs.Quadratic(jnp.eye(1), jnp.eye(1))  # of what is seen
-        learner = dlx.controllers.DRC(env.dynamics, cost)
+        learner = dlx.controllers.drc(env.dynamics, cost)
         dlx.rollout(env, learner, key=jax.random.key(0), horizon=1000).total_cost
         ```
     """
-    where = "DRC"
+    where = "drc"
     loop = loop_of(dynamics, cost, base, horizon, where, echoes=True)
     memory = check_count(memory, "memory", where)
     features = Features(None, memory, dynamics.observation_size, nature=True)

@@ -51,7 +51,7 @@ class Explore(AbstractController):
     `B = N_0`, and `A - BK` is the least-squares solution of
     `(A - BK) [N_0 ... N_{order-1}] = [N_1 ... N_order]`. From then on the controller
     that `build` makes for `x_next = A x + B u` is in charge. With
-    [`delucax.controllers.GPC`][] and `steps` near `T^(2/3)`, its regret over T steps
+    [`delucax.controllers.gpc`][] and `steps` near `T^(2/3)`, its regret over T steps
     grows as `T^(2/3)`.
 
     **Arguments:**
@@ -82,7 +82,7 @@ class Explore(AbstractController):
         env = dlx.make("lds", A=jnp.array([[0.9, 0.3], [0.0, 0.8]]), B=jnp.eye(2))
 
         def build(model):
-            return dlx.controllers.GPC(model, env.cost, horizon=20)
+            return dlx.controllers.gpc(model, env.cost, horizon=20)
 
         learner = dlx.controllers.Explore(build, jnp.zeros((2, 2)), steps=200)
         dlx.rollout(env, learner, key=jax.random.key(0), horizon=1000).total_cost

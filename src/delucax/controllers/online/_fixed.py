@@ -36,7 +36,7 @@ class FixedPolicy(AbstractController):
         import jax
 
         env = dlx.make("lds", key=jax.random.key(0))
-        policy = dlx.controllers.GPC(env.dynamics, env.cost).fixed()
+        policy = dlx.controllers.gpc(env.dynamics, env.cost).fixed()
         dlx.rollout(env, policy, key=jax.random.key(0)).total_cost
         ```
     """

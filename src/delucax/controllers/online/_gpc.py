@@ -13,7 +13,7 @@ from ._features import Features
 from ._learner import OnlineLearner
 
 
-def GPC(
+def gpc(
     dynamics: AbstractDynamics,
     cost: Callable[..., Array],
     *,
@@ -87,16 +87,16 @@ def GPC(
         env = dlx.Environment(dynamics, cost, disturbance=push)
 
         run = lambda c: dlx.rollout(env, c, key=jax.random.key(0), horizon=1000)
-        learner = dlx.controllers.GPC(dynamics, cost)
+        learner = dlx.controllers.gpc(dynamics, cost)
         regulator = dlx.controllers.LQR(dynamics, jnp.eye(2), jnp.eye(1))
         run(learner).total_cost / run(regulator).total_cost
         ```
     """
-    where = "GPC"
+    where = "gpc"
     loop = loop_of(dynamics, cost, base, horizon, where, echoes=False)
     if not loop.observed:
         raise ValueError(
-            f"{where}: dynamics must observe their state (DRC learns from outputs), "
+            f"{where}: dynamics must observe their state (drc learns from outputs), "
             f"got {loop.dynamics.observation_size} outputs of {dynamics.state_size} "
             "states."
         )

@@ -72,10 +72,10 @@ def best_in_hindsight(
     minimum where the cost is convex in theta: of a disturbance-action policy on a
     linear plant with a convex cost it is, of a linear gain in general not.
 
-    - `GPC(...).fixed()`: the best disturbance-action policy.
-    - `DRC(...).fixed()`: the best disturbance-response policy.
+    - `gpc(...).fixed()`: the best disturbance-action policy.
+    - `drc(...).fixed()`: the best disturbance-response policy.
     - `Linear(K)` or `LQR(...)`: the best gain, from that one on.
-    - `Sequence(controls)`: the best open loop, for short horizons.
+    - `OpenLoop(controls)`: the best open loop, for short horizons.
 
     **Arguments:**
 
@@ -101,7 +101,7 @@ def best_in_hindsight(
 
         push = dlx.disturbances.Constant(0.1 * jnp.ones(2))
         env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
-        learner = dlx.controllers.GPC(env.dynamics, env.cost)
+        learner = dlx.controllers.gpc(env.dynamics, env.cost)
         run = dlx.rollout(env, learner, key=jax.random.key(0))
         best = dlx.controllers.best_in_hindsight(env, learner.fixed(), run)
         run.total_cost / best.trajectory.total_cost
@@ -164,7 +164,7 @@ def regret(trajectory: Trajectory, comparator: Trajectory) -> Array:
 
         noise = dlx.disturbances.Gaussian(0.1, size=2)
         env = dlx.make("lds", key=jax.random.key(0), disturbance=noise)
-        learner = dlx.controllers.GPC(env.dynamics, env.cost)
+        learner = dlx.controllers.gpc(env.dynamics, env.cost)
         run = dlx.rollout(env, learner, key=jax.random.key(0))
         best = dlx.controllers.best_in_hindsight(env, learner.fixed(), run)
         dlx.controllers.regret(run, best.trajectory)[-1]

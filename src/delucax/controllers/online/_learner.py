@@ -68,9 +68,9 @@ class OnlineLearner(AbstractLearner):
     likewise for the control. The responses are those of linear dynamics, or of any
     dynamics linearised along the way.
 
-    [`delucax.controllers.GPC`][], [`delucax.controllers.DRC`][],
-    [`delucax.controllers.SFC`][], [`delucax.controllers.DSC`][] and
-    [`delucax.controllers.NeuralGPC`][] make it.
+    [`delucax.controllers.gpc`][], [`delucax.controllers.drc`][],
+    [`delucax.controllers.sfc`][], [`delucax.controllers.dsc`][] and
+    [`delucax.controllers.neural_gpc`][] make it.
 
     **Attributes:**
 
@@ -94,7 +94,7 @@ class OnlineLearner(AbstractLearner):
         import jax
 
         env = dlx.make("lds", key=jax.random.key(0))
-        learner = dlx.controllers.GPC(env.dynamics, env.cost)
+        learner = dlx.controllers.gpc(env.dynamics, env.cost)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```
     """

@@ -21,7 +21,7 @@ from ._policy import NetworkPolicy
 from ._step_size import adagrad_norm
 
 
-def NeuralGPC(
+def neural_gpc(
     dynamics: AbstractDynamics,
     cost: Callable[..., Array],
     *,
@@ -34,7 +34,7 @@ def NeuralGPC(
     optimiser: optax.GradientTransformation | None = None,
     key: PRNGKey,
 ) -> OnlineLearner:
-    """A network in place of the matrices of [`delucax.controllers.GPC`][],
+    """A network in place of the matrices of [`delucax.controllers.gpc`][],
 
     `u_t = base(y_t) + network(s_t, ..., s_{t-memory+1})`,
 
@@ -45,7 +45,7 @@ def NeuralGPC(
     **Arguments:**
 
     - `dynamics`, `cost`, `base`, `memory`, `horizon`: as for
-        [`delucax.controllers.GPC`][] and [`delucax.controllers.DRC`][].
+        [`delucax.controllers.gpc`][] and [`delucax.controllers.drc`][].
     - `width`, `depth`: of the hidden layers, 32 units in 1 layer by default.
     - `learning_rate`: scales the optimiser's step, 1e-3 by default.
     - `optimiser`: an Optax transformation; by default Adam, with the norm of the
@@ -55,7 +55,7 @@ def NeuralGPC(
     **Returns:** a [`delucax.controllers.OnlineLearner`][], whose `theta` are the
     network's weights.
 
-    **Raises:** `ValueError` as [`delucax.controllers.GPC`][].
+    **Raises:** `ValueError` as [`delucax.controllers.gpc`][].
 
     Source: Chen, Minasyan, Lee and Hazan, 2022.
 
@@ -67,11 +67,11 @@ def NeuralGPC(
 
         env = dlx.make("lds", key=jax.random.key(0))
         key, run_key = jax.random.split(jax.random.key(0))
-        learner = dlx.controllers.NeuralGPC(env.dynamics, env.cost, key=key)
+        learner = dlx.controllers.neural_gpc(env.dynamics, env.cost, key=key)
         dlx.rollout(env, learner, key=run_key).total_cost
         ```
     """
-    where = "NeuralGPC"
+    where = "neural_gpc"
     loop = loop_of(dynamics, cost, base, horizon, where)
     check_key(key, where)
     check_positive(learning_rate, "learning_rate", where)

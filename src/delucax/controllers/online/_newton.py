@@ -110,7 +110,7 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
 
         env = dlx.make("lds", key=jax.random.key(0))
         optimiser = dlx.controllers.online_newton(prior=20.0)
-        learner = dlx.controllers.GPC(env.dynamics, env.cost, optimiser=optimiser)
+        learner = dlx.controllers.gpc(env.dynamics, env.cost, optimiser=optimiser)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```
     """

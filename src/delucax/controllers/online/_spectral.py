@@ -19,7 +19,7 @@ from ._features import Features
 from ._learner import OnlineLearner
 
 
-def SFC(
+def sfc(
     dynamics: AbstractDynamics,
     cost: Callable[..., Array],
     *,
@@ -41,15 +41,15 @@ def SFC(
     `(sigma_i, phi_i)` the largest eigenvalues and eigenvectors of the matrix
     `H_jk = (1 - margin)^(j + k - 1) / (j + k - 1)`.
 
-    A few such filters do for a long memory what [`delucax.controllers.GPC`][] and
-    [`delucax.controllers.DRC`][] need a matrix a step for: there is less to learn where
+    A few such filters do for a long memory what [`delucax.controllers.gpc`][] and
+    [`delucax.controllers.drc`][] need a matrix a step for: there is less to learn where
     the closed loop is slow. They depend on the memory and the margin alone, not on the
     plant.
 
     **Arguments:**
 
     - `dynamics`, `cost`, `base`, `horizon`, `learning_rate`, `optimiser`, `radius`: as
-        for [`delucax.controllers.DRC`][].
+        for [`delucax.controllers.drc`][].
     - `filters`: how many, 5 by default.
     - `memory`: the number of past values that are filtered, 30 by default.
     - `margin`: the stability margin, between 0 and 1: memories that fade as
@@ -58,7 +58,7 @@ def SFC(
     **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state, `signal` has
     the last `memory + 1` values and `theta` the matrices M side by side.
 
-    **Raises:** `ValueError` as [`delucax.controllers.DRC`][]; and if there are more
+    **Raises:** `ValueError` as [`delucax.controllers.drc`][]; and if there are more
     filters than the memory has room for, or the margin is not between 0 and 1.
 
     Source: Brahmbhatt, Buzaglo, Druchyna and Hazan, 2025 (spectral control).
@@ -70,18 +70,18 @@ def SFC(
         import jax
 
         env = dlx.make("lds", key=jax.random.key(0))
-        learner = dlx.controllers.SFC(env.dynamics, env.cost)
+        learner = dlx.controllers.sfc(env.dynamics, env.cost)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```
     """
-    where = "SFC"
+    where = "sfc"
     bank = _bank(filters, memory, margin, where)
     past = np.pad(bank, ((0, 0), (1, 0)))
     parts = dynamics, cost, base, horizon, learning_rate, optimiser, radius
     return _learner(np.concatenate([np.eye(1, memory + 1), past]), *parts, where)
 
 
-def DSC(
+def dsc(
     dynamics: AbstractDynamics,
     cost: Callable[..., Array],
     *,
@@ -99,17 +99,17 @@ def DSC(
     `u_t = base(y_t) + M_0 s_t + sum_i M_i f_i(s_{t-1}, ...)`
     `    + sum_i M'_i f_i(s_t, ...) + sum_{i <= j} M''_ij (f_i * f_j)(s_t, ...)`,
 
-    with the signal s and the filters f of [`delucax.controllers.SFC`][]; `f_i * f_j` is
+    with the signal s and the filters f of [`delucax.controllers.sfc`][]; `f_i * f_j` is
     one filter after the other, which represents what an observer, itself a filter,
     makes of the past.
 
     **Arguments:** `dynamics`, `cost`, `base`, `filters`, `memory`, `margin`, `horizon`,
-    `learning_rate`, `optimiser`, `radius`: as for [`delucax.controllers.SFC`][].
+    `learning_rate`, `optimiser`, `radius`: as for [`delucax.controllers.sfc`][].
 
     **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state, `signal` has
     the last `2 memory` values and `theta` the matrices M side by side.
 
-    **Raises:** `ValueError` as [`delucax.controllers.SFC`][].
+    **Raises:** `ValueError` as [`delucax.controllers.sfc`][].
 
     Source: Brahmbhatt, Buzaglo, Druchyna and Hazan, 2025 (double spectral control).
 
@@ -120,11 +120,11 @@ def DSC(
         import jax
 
         env = dlx.make("lds", key=jax.random.key(0))
-        learner = dlx.controllers.DSC(env.dynamics, env.cost)
+        learner = dlx.controllers.dsc(env.dynamics, env.cost)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```
     """
-    where = "DSC"
+    where = "dsc"
     bank = _bank(filters, memory, margin, where)
     length = 2 * memory
     wide = lambda rows, first: np.pad(  # noqa: E731
