@@ -218,10 +218,8 @@ def check_positive(value: Any, name: str, where: str) -> None:
 def check_step(dt: Any, where: str, name: str = "dt") -> None:
     """Raise unless `dt`, or what has another name, is one positive number."""
     check_positive(dt, name, where)
-    if jnp.shape(dt) != ():
-        raise ValueError(
-            f"{where}: {name} must be a number, got shape {jnp.shape(dt)}."
-        )
+    if np.shape(dt) != ():
+        raise ValueError(f"{where}: {name} must be a number, got shape {np.shape(dt)}.")
 
 
 def check_number(value: Any, name: str, where: str) -> None:

@@ -80,19 +80,19 @@ def test_recovered_disturbances(dynamics, make):
     env = dlx.Environment(dynamics, COST, control_bounds=(-0.4, 0.4))
     learner, x0 = make(dynamics, COST), jnp.array([0.3, -0.5])
     quiet, *_ = follow(env, learner, x0, jnp.zeros((12, dynamics.disturbance_size)))
-    assert np.all(np.asarray(quiet.signal) == 0)
+    assert np.all(np.asarray(quiet.loop.signal) == 0)
     w = 0.2 * np.random.default_rng(0).normal(size=(12, dynamics.disturbance_size))
     states, applied, asked, _ = follow(env, learner, x0, w)
     assert np.any(np.asarray(applied) != np.asarray(asked))
     if dynamics is PLANT:
-        assert_close(states.signal[1:, 0], w[:-1], rtol=0, atol=1e-14)
+        assert_close(states.loop.signal[1:, 0], w[:-1], rtol=0, atol=1e-14)
         return
     found = dlx.rollout(env, learner, key=jax.random.key(1), x0=x0, w=w, horizon=12)
     x = found.states
     undisturbed = jax.vmap(lambda x, u: dynamics(0.0, x, u))(x[:-1], applied)
-    assert np.any(np.abs(states.signal[1:, 0]) > 1e-3)
+    assert np.any(np.abs(states.loop.signal[1:, 0]) > 1e-3)
     if not isinstance(learner, c.BPC):  # which draws another key in a rollout
-        assert_close(states.signal[1:, 0], (x[1:] - undisturbed)[:-1], atol=1e-13)
+        assert_close(states.loop.signal[1:, 0], (x[1:] - undisturbed)[:-1], atol=1e-13)
 
 
 def partial(base=None):
@@ -118,7 +118,7 @@ def test_natures_output():
         w=w,
     )
     assert np.any(np.asarray(applied) != np.asarray(asked))
-    assert_close(states.signal[:, 0], base.observations, rtol=0, atol=1e-12)
+    assert_close(states.loop.signal[:, 0], base.observations, rtol=0, atol=1e-12)
 
 
 class Filtering(dlx.AbstractController):
@@ -382,7 +382,7 @@ def test_online_newton_is_recursive_least_squares():
 @needs_x64
 def test_the_curvature_of_a_cost():
     """A convex one in full, of another what is positive, of a flat one nothing."""
-    from delucax.controllers.online._newton import positive_root
+    from delucax.controllers.online._optimisers import positive_root
 
     A = np.random.default_rng(1).normal(size=(3, 3))
     for H in (A @ A.T, np.diag([1.0, 0.0, 2.0]), np.zeros((3, 3))):
@@ -449,10 +449,10 @@ def test_the_default_memory_follows_the_closed_loop(decay, memory):
     plant = dlx.LinearDynamics(np.array([[decay]]), np.eye(1))
     cost = dlx.costs.Quadratic(np.eye(1), np.eye(1))
     base = c.Linear(np.zeros((1, 1)))
-    assert c.gpc(plant, cost, base=base).features.memory == memory
-    assert c.gpc(plant, cost, base=base, memory=3).features.memory == 3
+    assert c.gpc(plant, cost, base=base).loop.memory == memory
+    assert c.gpc(plant, cost, base=base, memory=3).loop.memory == 3
     neural = c.neural_gpc(plant, cost, base=base, key=jax.random.key(0))
-    assert neural.features.memory == memory
+    assert neural.loop.memory == memory
 
 
 def test_the_default_memory_of_a_loop_that_cannot_be_seen():
@@ -462,7 +462,7 @@ def test_the_default_memory_of_a_loop_that_cannot_be_seen():
         plant = dlx.LinearDynamics(a * jnp.eye(1), np.eye(1))
         cost = dlx.costs.Quadratic(np.eye(1), np.eye(1))
         base = c.Linear(np.zeros((1, 1)))
-        seen.append(c.gpc(plant, cost, base=base, horizon=20).features.memory)
+        seen.append(c.gpc(plant, cost, base=base, horizon=20).loop.memory)
         return a
 
     jax.eval_shape(make, jnp.asarray(0.9))
@@ -475,7 +475,7 @@ def test_a_slow_plant_needs_a_long_memory():
     plant = dlx.LinearDynamics(A, np.array([[0.0], [0.1], [1.0]]))
     cost = dlx.costs.Quadratic(np.eye(3), np.eye(1))
     learner = c.gpc(plant, cost)
-    assert learner.features.memory == 21
+    assert learner.loop.memory == 21
     w = np.sin(2 * np.pi * TIMES / 57)[:, None] * np.ones(3)
     total = run(learner, w, plant, cost).total_cost
     assert total < 0.28 * run(learner.loop.base, w, plant, cost).total_cost

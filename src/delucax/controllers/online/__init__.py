@@ -13,6 +13,5 @@ from ._hindsight import (
 )
 from ._learner import OnlineLearner as OnlineLearner
 from ._neural import neural_gpc as neural_gpc
-from ._newton import online_newton as online_newton
+from ._optimisers import adagrad_norm as adagrad_norm, online_newton as online_newton
 from ._spectral import dsc as dsc, sfc as sfc
-from ._step_size import adagrad_norm as adagrad_norm

@@ -9,9 +9,7 @@ from jaxtyping import Array
 from ..._check import check_count
 from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics
-from ._base import linear_learner, loop_of
-from ._features import Features
-from ._learner import OnlineLearner
+from ._learner import learner_loop, linear_learner, OnlineLearner
 
 
 def drc(
@@ -60,8 +58,9 @@ def drc(
     - `radius`: M is kept inside this ball in the Frobenius norm; by default 50 over the
         same size.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state, `signal` has
-    nature's outputs and `theta`, shape `(m, memory p)`, the matrices M side by side.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
+    has nature's outputs and `theta`, shape `(m, memory p)`, the matrices M side by
+    side.
 
     **Raises:** `ValueError` if the base does not stabilise the dynamics, does not fit
     them or cannot be designed, the cost is not a scalar, or a number is out of its
@@ -86,8 +85,8 @@ def drc(
         dlx.rollout(env, learner, key=jax.random.key(0), horizon=1000).total_cost
         ```
     """
-    where = "drc"
-    loop = loop_of(dynamics, cost, base, horizon, where, echoes=True)
-    memory = check_count(memory, "memory", where)
-    features = Features(None, memory, dynamics.observation_size, nature=True)
-    return linear_learner(loop, cost, features, learning_rate, optimiser, radius, where)
+    memory = check_count(memory, "memory", "drc")
+    loop = learner_loop(
+        dynamics, cost, base, horizon, "drc", memory=memory, nature=True
+    )
+    return linear_learner(loop, cost, learning_rate, optimiser, radius, "drc")

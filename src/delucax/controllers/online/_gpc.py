@@ -8,9 +8,7 @@ from jaxtyping import Array
 
 from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics
-from ._base import linear_learner, loop_of, memory_of
-from ._features import Features
-from ._learner import OnlineLearner
+from ._learner import learner_loop, linear_learner, OnlineLearner
 
 
 def gpc(
@@ -64,8 +62,9 @@ def gpc(
     - `radius`: E is kept inside this ball in the Frobenius norm, `50 / |B|_F` by
         default.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state, `signal` has
-    the disturbances and `theta`, shape `(m, memory n)`, the matrices E side by side.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
+    has the disturbances and `theta`, shape `(m, memory n)`, the matrices E side by
+    side.
 
     **Raises:** `ValueError` if the base does not stabilise the dynamics, does not fit
     them or cannot be designed, the cost is not a scalar, the state is not observed, or
@@ -92,14 +91,12 @@ def gpc(
         run(learner).total_cost / run(regulator).total_cost
         ```
     """
-    where = "gpc"
-    loop = loop_of(dynamics, cost, base, horizon, where, echoes=False)
+    loop = learner_loop(
+        dynamics, cost, base, horizon, "gpc", memory=memory, nature=False
+    )
     if not loop.observed:
         raise ValueError(
-            f"{where}: dynamics must observe their state (drc learns from outputs), "
-            f"got {loop.dynamics.observation_size} outputs of {dynamics.state_size} "
-            "states."
+            "gpc: dynamics must observe their state (drc learns from outputs), got "
+            f"{dynamics.observation_size} outputs of {dynamics.state_size} states."
         )
-    memory = memory_of(loop, memory, where)
-    features = Features(None, memory, dynamics.state_size, nature=False)
-    return linear_learner(loop, cost, features, learning_rate, optimiser, radius, where)
+    return linear_learner(loop, cost, learning_rate, optimiser, radius, "gpc")

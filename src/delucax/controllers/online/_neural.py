@@ -14,11 +14,9 @@ from ..._controller import AbstractController
 from ..._module import as_module
 from ..._typing import PRNGKey
 from ...dynamics import AbstractDynamics
-from ._base import loop_of, memory_of
-from ._features import Features
-from ._learner import OnlineLearner
+from ._learner import learner_loop, OnlineLearner
+from ._optimisers import adagrad_norm
 from ._policy import NetworkPolicy
-from ._step_size import adagrad_norm
 
 
 def neural_gpc(
@@ -48,8 +46,8 @@ def neural_gpc(
         [`delucax.controllers.gpc`][] and [`delucax.controllers.drc`][].
     - `width`, `depth`: of the hidden layers, 32 units in 1 layer by default.
     - `learning_rate`: scales the optimiser's step, 1e-3 by default.
-    - `optimiser`: an Optax transformation; by default Adam, with the norm of the
-        gradient clipped at 1.
+    - `optimiser`: an Optax transformation; [`delucax.controllers.adagrad_norm`][] by
+        default.
     - `key`: a random key, for the first weights.
 
     **Returns:** a [`delucax.controllers.OnlineLearner`][], whose `theta` are the
@@ -72,13 +70,11 @@ def neural_gpc(
         ```
     """
     where = "neural_gpc"
-    loop = loop_of(dynamics, cost, base, horizon, where)
+    loop = learner_loop(dynamics, cost, base, horizon, where, memory=memory)
     check_key(key, where)
     check_positive(learning_rate, "learning_rate", where)
-    memory = memory_of(loop, memory, where)
-    features = Features(None, memory, dynamics.observation_size, nature=loop.echoes)
     network = eqx.nn.MLP(
-        features.size,
+        loop.feature_size,
         dynamics.control_size,
         check_count(width, "width", where),
         check_count(depth, "depth", where),
@@ -87,13 +83,7 @@ def neural_gpc(
         dtype=loop.dtype,
         key=key,
     )
-    last = lambda net: [net.layers[-1].weight, net.layers[-1].bias]  # noqa: E731
+    last = lambda net: [net.layers[-1].weight, net.layers[-1].bias]
     network = eqx.tree_at(last, network, [0 * leaf for leaf in last(network)])
-    return OnlineLearner(
-        loop,
-        cost,
-        features,
-        NetworkPolicy(network),
-        learning_rate,
-        adagrad_norm() if optimiser is None else optimiser,
-    )
+    optimiser = adagrad_norm() if optimiser is None else optimiser
+    return OnlineLearner(loop, cost, NetworkPolicy(network), learning_rate, optimiser)

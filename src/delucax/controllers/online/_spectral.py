@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array
@@ -14,9 +13,7 @@ from ..._check import check_count
 from ..._controller import AbstractController
 from ..._message import shortened
 from ...dynamics import AbstractDynamics
-from ._base import linear_learner, loop_of
-from ._features import Features
-from ._learner import OnlineLearner
+from ._learner import learner_loop, linear_learner, OnlineLearner
 
 
 def sfc(
@@ -55,8 +52,8 @@ def sfc(
     - `margin`: the stability margin, between 0 and 1: memories that fade as
         `(1 - margin)^k` or faster are well represented. 0.2 by default.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state, `signal` has
-    the last `memory + 1` values and `theta` the matrices M side by side.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
+    has the last `memory + 1` values and `theta` the matrices M side by side.
 
     **Raises:** `ValueError` as [`delucax.controllers.drc`][]; and if there are more
     filters than the memory has room for, or the margin is not between 0 and 1.
@@ -74,11 +71,10 @@ def sfc(
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```
     """
-    where = "sfc"
-    bank = _bank(filters, memory, margin, where)
-    past = np.pad(bank, ((0, 0), (1, 0)))
-    parts = dynamics, cost, base, horizon, learning_rate, optimiser, radius
-    return _learner(np.concatenate([np.eye(1, memory + 1), past]), *parts, where)
+    bank = _bank(filters, memory, margin, "sfc")
+    rows = np.concatenate([np.eye(1, memory + 1), np.pad(bank, ((0, 0), (1, 0)))])
+    loop = learner_loop(dynamics, cost, base, horizon, "sfc", filters=rows)
+    return linear_learner(loop, cost, learning_rate, optimiser, radius, "sfc")
 
 
 def dsc(
@@ -106,8 +102,8 @@ def dsc(
     **Arguments:** `dynamics`, `cost`, `base`, `filters`, `memory`, `margin`, `horizon`,
     `learning_rate`, `optimiser`, `radius`: as for [`delucax.controllers.sfc`][].
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state, `signal` has
-    the last `2 memory` values and `theta` the matrices M side by side.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
+    has the last `2 memory` values and `theta` the matrices M side by side.
 
     **Raises:** `ValueError` as [`delucax.controllers.sfc`][].
 
@@ -124,29 +120,19 @@ def dsc(
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```
     """
-    where = "dsc"
-    bank = _bank(filters, memory, margin, where)
+    bank = _bank(filters, memory, margin, "dsc")
     length = 2 * memory
-    wide = lambda rows, first: np.pad(  # noqa: E731
-        rows, ((0, 0), (first, length - first - rows.shape[1]))
-    )
+
+    def padded(rows, first):
+        return np.pad(rows, ((0, 0), (first, length - first - rows.shape[1])))
+
     # f_i * f_j is f_j * f_i: a matrix for each pair.
     pairs = [(i, j) for i in range(filters) for j in range(i, filters)]
     twice = np.stack([np.convolve(bank[i], bank[j]) for i, j in pairs])
-    rows = [np.eye(1, length), wide(bank, 1), wide(bank, 0), wide(twice, 0)]
-    parts = dynamics, cost, base, horizon, learning_rate, optimiser, radius
-    return _learner(np.concatenate(rows), *parts, where)
-
-
-def _learner(
-    rows, dynamics, cost, base, horizon, learning_rate, optimiser, radius, where
-):
-    loop = loop_of(dynamics, cost, base, horizon, where)
-    size = dynamics.observation_size
-    features = Features(
-        jnp.asarray(rows, loop.dtype), rows.shape[1], size, nature=loop.echoes
-    )
-    return linear_learner(loop, cost, features, learning_rate, optimiser, radius, where)
+    rows = [np.eye(1, length), padded(bank, 1), padded(bank, 0), padded(twice, 0)]
+    rows = np.concatenate(rows)
+    loop = learner_loop(dynamics, cost, base, horizon, "dsc", filters=rows)
+    return linear_learner(loop, cost, learning_rate, optimiser, radius, "dsc")
 
 
 def _bank(filters: int, memory: int, margin: float, where: str) -> np.ndarray:
