@@ -188,9 +188,11 @@ def check_control_bounds(
     return bounds
 
 
-def bounds_field(where: str, name: str = "bounds") -> Any:
-    """A field that holds `(low, high)`, converted and checked by `as_bounds`."""
-    return eqx.field(converter=functools.partial(as_bounds, where=where, name=name))
+def bounds_field(where: str, name: str = "bounds", **options: Any) -> Any:
+    """A field that holds `(low, high)`, converted and checked by `as_bounds`; `options`
+    are those of a field."""
+    converter = functools.partial(as_bounds, where=where, name=name)
+    return eqx.field(converter=converter, **options)
 
 
 def check_finite(array: Any, name: str, where: str) -> None:

@@ -8,9 +8,7 @@ from ._basic import (
     Random as Random,
     Zero as Zero,
 )
-from ._categorical import Categorical as Categorical, Likeliest as Likeliest
 from ._finite_horizon import FiniteHorizonLQR as FiniteHorizonLQR
-from ._gaussian import Gaussian as Gaussian
 from ._hinfinity import HInfinity as HInfinity
 from ._lqg import LQG as LQG
 from ._lqi import LQI as LQI
@@ -22,6 +20,11 @@ from ._pid import LeakyPID as LeakyPID, PID as PID
 from ._recurrent import GRU as GRU, History as History, Standardise as Standardise
 from ._sampled import lqrd as lqrd, sampled_weights as sampled_weights
 from ._scheduled import Scheduled as Scheduled
+from ._stochastic import (
+    Categorical as Categorical,
+    Gaussian as Gaussian,
+    Likeliest as Likeliest,
+)
 from .online import (
     adagrad_norm as adagrad_norm,
     Adaptive as Adaptive,

@@ -1,7 +1,5 @@
 """The simplest controllers."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
@@ -35,8 +33,8 @@ class Zero(AbstractController):
 
     control_size: int = eqx.field(static=True)
 
-    def __init__(self, control_size: int):
-        self.control_size = check_count(control_size, "control_size", "Zero", least=0)
+    def __check_init__(self):
+        check_count(self.control_size, "control_size", "Zero", least=0)
 
     def __call__(self, t, y, state):
         return jnp.zeros(self.control_size, y.dtype), state
@@ -62,9 +60,6 @@ class Constant(AbstractController):
     """
 
     value: Array = weight()
-
-    def __init__(self, value: Any):
-        self.value = value
 
     def __check_init__(self):
         if not eqx.is_array(self.value) or self.value.ndim != 1:
@@ -100,10 +95,7 @@ class Random(AbstractController):
     """
 
     std: Array = parameter()
-    mean: Array = parameter()
-
-    def __init__(self, std: Any, mean: Any = 0.0):
-        self.std, self.mean = std, mean
+    mean: Array = parameter(0.0)
 
     def __check_init__(self):
         if not eqx.is_array(self.std) or self.std.ndim != 1:
@@ -120,8 +112,7 @@ class Random(AbstractController):
             raise ValueError(f"Random: std must not be negative, got {self.std}.")
 
     def init(self, *, key=None):
-        check_key(key, "Random.init")
-        return key
+        return check_key(key, "Random.init")
 
     def __call__(self, t, y, state):
         state, now = jr.split(state)
@@ -150,9 +141,6 @@ class Linear(AbstractController):
     """
 
     K: Array = weight()
-
-    def __init__(self, K: Any):
-        self.K = K
 
     def __check_init__(self):
         as_matrix(self.K, "K", "Linear")
@@ -186,9 +174,6 @@ class OpenLoop(AbstractController):
     """
 
     values: Array = weight()
-
-    def __init__(self, values: Any):
-        self.values = values
 
     def __check_init__(self):
         as_matrix(self.values, "values", "OpenLoop")

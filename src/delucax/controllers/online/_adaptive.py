@@ -1,5 +1,6 @@
 """Learners that start anew, each followed for as long as it does well."""
 
+from dataclasses import KW_ONLY
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -92,35 +93,22 @@ class Adaptive(AbstractController):
     """
 
     base: AbstractLearner
-    rate: Array = parameter()
-    share: Array = parameter()
-    slots: int = eqx.field(static=True)
-    every: int = eqx.field(static=True)
-    play: Literal["mix", "switch"] = eqx.field(static=True)
-
-    def __init__(
-        self,
-        base: AbstractLearner,
-        *,
-        slots: int = 8,
-        every: int = 64,
-        rate: ArrayLike = 0.5,
-        share: ArrayLike = 0.02,
-        play: Literal["mix", "switch"] = "mix",
-    ):
-        where = "Adaptive"
-        check_choice(play, ("mix", "switch"), "play", where)
-        self.base, self.play = base, play
-        self.slots = check_count(slots, "slots", where, least=2)
-        self.every = check_count(every, "every", where)
-        self.rate, self.share = rate, share
+    _: KW_ONLY
+    slots: int = eqx.field(default=8, static=True)
+    every: int = eqx.field(default=64, static=True)
+    rate: Array = parameter(0.5)
+    share: Array = parameter(0.02)
+    play: Literal["mix", "switch"] = eqx.field(default="mix", static=True)
 
     def __check_init__(self):
         where = "Adaptive"
         check_instance(self.base, AbstractLearner, "base", where, " such as gpc makes")
+        check_count(self.slots, "slots", where, least=2)
+        check_count(self.every, "every", where)
         check_step(self.rate, where, "rate")
         check_step(self.share, where, "share")
         check_range(self.share, "share", where, 0, 1)
+        check_choice(self.play, ("mix", "switch"), "play", where)
 
     def init(self, *, key=None):
         chosen, own, base_key = None, None, key
