@@ -154,7 +154,7 @@ CASES = {
     "Zero": Case(lambda size: c.Zero(1), reads_all=False),
     "Constant": Case(lambda size: c.Constant([size]), reads_all=False),
     "Random": Case(lambda size: c.Random([size], 0.1), reads_all=False),
-    "Sequence": Case(lambda size: c.OpenLoop(size * jnp.ones((4, 1))), False),
+    "OpenLoop": Case(lambda size: c.OpenLoop(size * jnp.ones((4, 1))), False),
     "Linear": Case(lambda size: c.Linear(size * FEEDBACK)),
     "LQR": Case(lqr),
     "LQR that looks ahead": Case(ahead),
@@ -236,8 +236,8 @@ KIN = (
 
 
 # What a controller without a state, or with little in it, shows no better than others.
-PLAIN = ("Zero", "Random", "Sequence", "Scheduled")
-STATELESS = ("Zero", "Sequence", "Linear", "LQR", "HInfinity", "MLP", "Scheduled")
+PLAIN = ("Zero", "Random", "OpenLoop", "Scheduled")
+STATELESS = ("Zero", "OpenLoop", "Linear", "LQR", "HInfinity", "MLP", "Scheduled")
 FEW = ("Gaussian", "GPC", "Linear", "LQR", "MLP")
 
 

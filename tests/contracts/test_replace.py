@@ -59,7 +59,7 @@ CASES = {
     "UniformState": Case(lambda: dlx.environments.UniformState([0.0, 1.0], [2.0, 3.0])),
     "Linear": Case(lambda: dlx.controllers.Linear(A)),
     "Random": Case(lambda: dlx.controllers.Random([0.1, 0.2])),
-    "Sequence": Case(lambda: dlx.controllers.OpenLoop(A)),
+    "OpenLoop": Case(lambda: dlx.controllers.OpenLoop(A)),
     "PID": Case(
         lambda: dlx.controllers.PID([1.0, 2.0], 0.1, dt=0.1, anti_windup_time=0.5)
     ),

@@ -126,7 +126,7 @@ class HInfinity(AbstractController):
         if self.dt is not None:
             step = step_at(t, self.dt, len(K), "HInfinity")
             K = row_at(K, step)
-            x_ref = row_at(x_ref, step) if x_ref.ndim == 2 else x_ref
-            u_ref = row_at(u_ref, step) if u_ref.ndim == 2 else u_ref
+            if x_ref.ndim == 2:
+                x_ref, u_ref = row_at((x_ref, u_ref), step)
         u = u_ref - matvec(K, deviation(y, x_ref, self.difference))
         return u.astype(y.dtype), state

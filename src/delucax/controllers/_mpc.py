@@ -25,7 +25,7 @@ from .._typing import Control, Observation, PRNGKey
 from ..costs import AbstractCost
 from ..costs._base import check_cost
 from ..dynamics import AbstractDynamics
-from ..math import clip, matvec
+from ..math import matvec
 from ..planning import AbstractPlanner, Constraints, default_start, ILQR, Start
 from ._operating_point import check_state, deviation, Difference
 
@@ -280,7 +280,10 @@ class MPC(AbstractController):
         x, u = last.states[0], last.controls[0]
         tried = u - matvec(last.gains[0], deviation(y, x, self.difference))
         u = jnp.where(jnp.isfinite(tried), tried, u)
-        return u if self.bounds is None else clip(u, *self.bounds)
+        if self.bounds is None:
+            return u
+        low, high = self.bounds
+        return jnp.minimum(jnp.maximum(u, low), high)
 
 
 def _stacked(start: Start, n: int) -> Start:

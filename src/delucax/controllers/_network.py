@@ -132,12 +132,7 @@ def squash(u: Array, bounds: tuple[Array, Array] | None) -> Array:
 def check_squash(bounds: Any, size: int, where: str) -> None:
     """Raise unless the bounds, if any, are ones that `size` controls can be squashed
     into."""
-    for end in as_bounds(bounds, where) or ():
-        if end.shape not in ((), (size,)):
-            raise ValueError(
-                f"{where}: bounds must be numbers or have shape ({size},), got shape "
-                f"{end.shape}."
-            )
+    for end in as_bounds(bounds, where, size=size) or ():
         if is_concrete(end) and not np.all(np.isfinite(end)):
             raise ValueError(
                 f"{where}: bounds must be finite to squash into, got {end}."

@@ -9,7 +9,9 @@ from jaxtyping import Array
 from ..._check import check_count
 from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics
-from ._learner import learner_loop, linear_learner, OnlineLearner
+from ._base import base_for
+from ._closed_loop import ClosedLoop
+from ._learner import linear_learner, OnlineLearner
 
 
 def drc(
@@ -86,7 +88,6 @@ def drc(
         ```
     """
     memory = check_count(memory, "memory", "drc")
-    loop = learner_loop(
-        dynamics, cost, base, horizon, "drc", memory=memory, nature=True
-    )
+    base = base_for(dynamics, cost, base, "drc")
+    loop = ClosedLoop(dynamics, base, horizon, "drc", memory=memory, nature=True)
     return linear_learner(loop, cost, learning_rate, optimiser, radius, "drc")

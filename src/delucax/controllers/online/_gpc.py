@@ -8,7 +8,9 @@ from jaxtyping import Array
 
 from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics
-from ._learner import learner_loop, linear_learner, OnlineLearner
+from ._base import base_for
+from ._closed_loop import ClosedLoop
+from ._learner import linear_learner, OnlineLearner
 
 
 def gpc(
@@ -91,9 +93,8 @@ def gpc(
         run(learner).total_cost / run(regulator).total_cost
         ```
     """
-    loop = learner_loop(
-        dynamics, cost, base, horizon, "gpc", memory=memory, nature=False
-    )
+    base = base_for(dynamics, cost, base, "gpc")
+    loop = ClosedLoop(dynamics, base, horizon, "gpc", memory=memory, nature=False)
     if not loop.observed:
         raise ValueError(
             "gpc: dynamics must observe their state (drc learns from outputs), got "

@@ -6,17 +6,15 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jax.interpreters import partial_eval
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ..._check import check_instance, check_step, output_of
-from ..._controller import AbstractController, AbstractLearner, Tally
+from ..._check import check_step
+from ..._controller import AbstractLearner, Tally
 from ..._module import function_field, parameter
-from ...dynamics import AbstractDynamics
+from ._base import check_scalar_cost
 from ._closed_loop import ClosedLoop, ClosedLoopState, in_first_responses, shift
-from ._default_base import default_base
 from ._fixed import FixedPolicy
 from ._optimisers import adagrad_norm, online_newton, positive_root, projected_step
 from ._policy import AbstractPolicy, LinearPolicy
@@ -169,7 +167,7 @@ class OnlineLearner(AbstractLearner):
         theta = self.policy.init()
         return state._replace(theta=theta, optimiser=self.optimiser.init(theta))
 
-    def fixed(self, theta: Any = None) -> "FixedPolicy":
+    def fixed(self, theta: Any = None) -> FixedPolicy:
         """The same controller, no longer learning.
 
         **Arguments:** `theta`: what it has learned, from its state; by default what it
@@ -218,51 +216,6 @@ class OnlineLearner(AbstractLearner):
         traced = jax.make_jaxpr(self._root)(*here)
         _, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
         return None if any(used) else self._root(*here)
-
-
-def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None:
-    """Raise unless a cost of what `dynamics` show is a scalar."""
-    y, u = (dynamics.observation_size,), (dynamics.control_size,)
-    try:
-        value = output_of(cost, (), y, u)
-    except ValueError as error:
-        raise ValueError(
-            f"{where}: cost must take the observation, of shape {y}, where a state is "
-            f"asked for, and a control of shape {u}: {error}"
-        ) from error
-    got = getattr(value, "shape", None)
-    if got != ():
-        got = type(value).__name__ if got is None else f"an array of shape {got}"
-        raise ValueError(f"{where}: cost must give a scalar, got {got}.")
-
-
-def learner_loop(
-    dynamics: AbstractDynamics,
-    cost: Callable[..., Array],
-    base: AbstractController | None,
-    horizon: int | None,
-    where: str,
-    *,
-    memory: int | None = None,
-    filters: np.ndarray | None = None,
-    nature: bool | None = None,
-) -> ClosedLoop:
-    """The loop of a learner, with the default base if none is given; its signal is
-    nature's output by default if the state is not observed."""
-    hint = (
-        ", the model that it learns with (`delucax.controllers.Explore` identifies one)"
-    )
-    check_instance(dynamics, AbstractDynamics, "dynamics", where, hint)
-    if not callable(cost):
-        raise ValueError(
-            f"{where}: cost must be a function of (t, y, u), such as one of "
-            f"delucax.costs, got {type(cost).__name__}."
-        )
-    check_scalar_cost(cost, dynamics, where)
-    if base is None:
-        base = default_base(dynamics, cost, where)
-    features: Any = dict(memory=memory, filters=filters, nature=nature)
-    return ClosedLoop(dynamics, base, horizon, where, **features)
 
 
 def linear_learner(

@@ -14,7 +14,9 @@ from ..._controller import AbstractController
 from ..._module import as_module
 from ..._typing import PRNGKey
 from ...dynamics import AbstractDynamics
-from ._learner import learner_loop, OnlineLearner
+from ._base import base_for
+from ._closed_loop import ClosedLoop
+from ._learner import OnlineLearner
 from ._optimisers import adagrad_norm
 from ._policy import NetworkPolicy
 
@@ -70,7 +72,8 @@ def neural_gpc(
         ```
     """
     where = "neural_gpc"
-    loop = learner_loop(dynamics, cost, base, horizon, where, memory=memory)
+    base = base_for(dynamics, cost, base, where)
+    loop = ClosedLoop(dynamics, base, horizon, where, memory=memory)
     check_key(key, where)
     check_positive(learning_rate, "learning_rate", where)
     network = eqx.nn.MLP(

@@ -13,7 +13,9 @@ from ..._check import check_count
 from ..._controller import AbstractController
 from ..._message import shortened
 from ...dynamics import AbstractDynamics
-from ._learner import learner_loop, linear_learner, OnlineLearner
+from ._base import base_for
+from ._closed_loop import ClosedLoop
+from ._learner import linear_learner, OnlineLearner
 
 
 def sfc(
@@ -73,7 +75,8 @@ def sfc(
     """
     bank = _bank(filters, memory, margin, "sfc")
     rows = np.concatenate([np.eye(1, memory + 1), np.pad(bank, ((0, 0), (1, 0)))])
-    loop = learner_loop(dynamics, cost, base, horizon, "sfc", filters=rows)
+    base = base_for(dynamics, cost, base, "sfc")
+    loop = ClosedLoop(dynamics, base, horizon, "sfc", filters=rows)
     return linear_learner(loop, cost, learning_rate, optimiser, radius, "sfc")
 
 
@@ -131,7 +134,8 @@ def dsc(
     twice = np.stack([np.convolve(bank[i], bank[j]) for i, j in pairs])
     rows = [np.eye(1, length), padded(bank, 1), padded(bank, 0), padded(twice, 0)]
     rows = np.concatenate(rows)
-    loop = learner_loop(dynamics, cost, base, horizon, "dsc", filters=rows)
+    base = base_for(dynamics, cost, base, "dsc")
+    loop = ClosedLoop(dynamics, base, horizon, "dsc", filters=rows)
     return linear_learner(loop, cost, learning_rate, optimiser, radius, "dsc")
 
 

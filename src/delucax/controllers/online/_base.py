@@ -1,6 +1,7 @@
-"""The base controller of a learner that is given none."""
+"""What a learner is given, and the base controller of one that is given none."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..._check import is_concrete
+from ..._check import check_instance, is_concrete, output_of
 from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics, LinearDynamics, linearize
 from .._lqg import LQG
@@ -16,7 +17,44 @@ from .._lqr import LQR
 from .._scheduled import Scheduled
 
 
-def default_base(
+def base_for(
+    dynamics: AbstractDynamics,
+    cost: Callable[..., Array],
+    base: AbstractController | None,
+    where: str,
+) -> AbstractController:
+    """The base of a learner with this model and cost, which are checked: as given, or
+    the default one."""
+    hint = (
+        ", the model that it learns with (`delucax.controllers.Explore` identifies one)"
+    )
+    check_instance(dynamics, AbstractDynamics, "dynamics", where, hint)
+    if not callable(cost):
+        raise ValueError(
+            f"{where}: cost must be a function of (t, y, u), such as one of "
+            f"delucax.costs, got {type(cost).__name__}."
+        )
+    check_scalar_cost(cost, dynamics, where)
+    return _default_base(dynamics, cost, where) if base is None else base
+
+
+def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None:
+    """Raise unless a cost of what `dynamics` show is a scalar."""
+    y, u = (dynamics.observation_size,), (dynamics.control_size,)
+    try:
+        value = output_of(cost, (), y, u)
+    except ValueError as error:
+        raise ValueError(
+            f"{where}: cost must take the observation, of shape {y}, where a state is "
+            f"asked for, and a control of shape {u}: {error}"
+        ) from error
+    got = getattr(value, "shape", None)
+    if got != ():
+        got = type(value).__name__ if got is None else f"an array of shape {got}"
+        raise ValueError(f"{where}: cost must give a scalar, got {got}.")
+
+
+def _default_base(
     dynamics: AbstractDynamics, cost: Callable[..., Array], where: str
 ) -> AbstractController:
     """The regulator for the curvature of the cost at the operating point.
