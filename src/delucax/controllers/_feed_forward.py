@@ -84,7 +84,7 @@ def as_signals(
     )
 
 
-def as_signal(value: Any, size: int, name: str, where: str) -> Signal | None:
+def as_signal(value: Any, size: int, name: str, where: str) -> Any:
     """A vector as a constant signal; a function `t -> vector` with its size checked."""
     if value is None:
         return None

@@ -119,7 +119,9 @@ class BPC(AbstractController):
         memory = check_count(memory, "memory", where)
         # A roll-out as long as it takes a control to be seen.
         loop = ClosedLoop(dynamics, base, dynamics.state_size, where, memory=memory)
-        scale = lambda *given: in_first_responses(loop, *given, where)
+        scale = lambda given, name, units: in_first_responses(
+            loop, given, name, units, where
+        )
         start = jnp.zeros((dynamics.control_size, loop.feature_size), loop.dtype)
         self.loop = loop
         self.policy = LinearPolicy(start, scale(radius, "radius", RADIUS))

@@ -225,6 +225,7 @@ class ClosedLoop(eqx.Module):
 
     def _disturbance(self, state: ClosedLoopState) -> Float[Array, " n"]:
         """The last disturbance: the state less where the model went."""
+        assert state.predicted is not None
         off = self.dynamics.difference(state.y, state.predicted)
         size = jnp.max(jnp.abs(state.y) + jnp.abs(state.predicted))
         # Compiled twice, a step may round differently: of that nothing is learned.
@@ -234,6 +235,7 @@ class ClosedLoop(eqx.Module):
     def _nature(self, state: ClosedLoopState) -> Float[Array, " p"]:
         """The observation, had nothing been added to the base's control."""
         p = state.y.shape[0]
+        assert state.forced is not None
         if self.tangents is None:
             return state.y - state.forced[:p]
         return state.y - matvec(self.tangents.output[:p], state.forced)
@@ -278,7 +280,7 @@ class ClosedLoop(eqx.Module):
         of the roll-out, newest first."""
         if self.response is not None:
             return self.response
-        assert state.now is not None
+        assert state.now is not None and state.impulses is not None
         return state.now.output @ state.impulses
 
 

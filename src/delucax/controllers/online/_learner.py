@@ -228,7 +228,7 @@ def linear_learner(
 ) -> OnlineLearner:
     """A learner of a linear map from features to control."""
     start = jnp.zeros((loop.dynamics.control_size, loop.feature_size), loop.dtype)
-    radius = in_first_responses(loop, radius, "radius", RADIUS, where)
+    ball = in_first_responses(loop, radius, "radius", RADIUS, where)
     rate = in_first_responses(loop, learning_rate, "learning_rate", STEP, where)
     if optimiser is None:
         # Newton's step where gradients alone are slow: nature's outputs are much alike
@@ -237,4 +237,4 @@ def linear_learner(
             optimiser = online_newton(_PRIOR_OF_OUTPUTS)
         else:
             optimiser = online_newton() if loop.response is None else adagrad_norm()
-    return OnlineLearner(loop, cost, LinearPolicy(start, radius), rate, optimiser)
+    return OnlineLearner(loop, cost, LinearPolicy(start, ball), rate, optimiser)

@@ -44,10 +44,10 @@ def _adagrad_norm_init(params: PyTree) -> Array:
 
 
 def _adagrad_norm_update(
-    updates: PyTree, total: Array, params: Any = None
+    updates: Any, state: Any, params: Any = None
 ) -> tuple[PyTree, Array]:
     del params
-    total = total + optax.tree.norm(updates, squared=True)
+    total = state + optax.tree.norm(updates, squared=True)
     some = total > 0
     scale = jnp.where(some, 1 / jnp.sqrt(jnp.where(some, total, 1)), 0)
     return jax.tree.map(lambda g: -scale.astype(g.dtype) * g, updates), total
@@ -108,8 +108,8 @@ class _OnlineNewtonUpdate(eqx.Module):
 
     def __call__(
         self,
-        updates: PyTree,
-        state: OnlineNewtonState,
+        updates: Any,
+        state: Any,
         params: Any = None,
         *,
         curvature: Callable[[], Array] | None = None,
