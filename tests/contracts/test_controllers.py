@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 import delucax as dlx
 
 
-c, estimators = dlx.controllers, dlx.estimators
+c = dlx.controllers
 DT = 0.1
 A = jnp.array([[1.0, DT], [0.3 * DT, 0.98]])
 B = jnp.array([[0.0], [DT]])
@@ -163,10 +163,10 @@ CASES = {
     "LQG": Case(lqg),
     "LQG from the start": Case(lambda size: lqg(size, steady_state=False)),
     "OutputFeedback": Case(
-        lambda size: estimated(estimators.ExtendedKalmanFilter, size)
+        lambda size: estimated(dlx.estimators.ExtendedKalmanFilter, size)
     ),
     "OutputFeedback of an unscented filter": Case(
-        lambda size: estimated(estimators.UnscentedKalmanFilter, size)
+        lambda size: estimated(dlx.estimators.UnscentedKalmanFilter, size)
     ),
     "HInfinity": Case(hinfinity),
     "HInfinity over a horizon": Case(lambda size: hinfinity(size, horizon=8)),

@@ -19,7 +19,7 @@ import delucax as dlx
 pytestmark = needs_x64
 
 
-c, estimators = dlx.controllers, dlx.estimators
+c = dlx.controllers
 A = jnp.array([[1.0, 0.2], [0.1, 0.9]])
 B = jnp.array([[0.0], [0.2]])
 C = jnp.array([[1.0, 0.0]])
@@ -169,11 +169,11 @@ def test_output_feedback_of_anything(key):
     a, b = (dlx.rollout(env, law, key=key) for law in (lqg, same))
     np.testing.assert_array_equal(a.controls, b.controls)
 
-    class Luenberger(estimators.AbstractEstimator):
+    class Luenberger(dlx.estimators.AbstractEstimator):
         L: jax.Array = dlx.weight()
 
         def init(self, *, key=None):
-            return estimators.Belief(jnp.zeros(2), jnp.eye(2))
+            return dlx.estimators.Belief(jnp.zeros(2), jnp.eye(2))
 
         def update(self, t, y, belief):
             error = y - DYNAMICS.observe(t, belief.mean)

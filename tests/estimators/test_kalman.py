@@ -19,7 +19,7 @@ import delucax as dlx
 pytestmark = needs_x64
 
 
-estimators = dlx.estimators
+c = dlx.estimators
 CLOSE = dict(rtol=tolerance(2e-4, 1e-10), atol=tolerance(2e-4, 1e-11))
 
 
@@ -37,7 +37,7 @@ def problem(n, p, m=1, k=2, steps=None, T=8, seed=0):
     points = [rng.standard_normal((*lead, size)) for size in (n, m, n)]
     C = rng.standard_normal((p, n))
     dynamics = dlx.LinearDynamics(A, B, C, E, 0.1, *points)
-    kalman = estimators.KalmanFilter(
+    kalman = c.KalmanFilter(
         dynamics,
         covariance(rng, k),
         covariance(rng, p),
@@ -79,7 +79,7 @@ def textbook(kalman, ys, us):
 )
 def test_as_in_the_textbook(n, p, steps):
     kalman, ys, us = problem(n, p, steps=steps)
-    filtered = estimators.run_filter(kalman, ys, us)
+    filtered = c.run_filter(kalman, ys, us)
     expected = textbook(kalman, ys, us)
     assert_close(filtered.log_likelihoods, expected["densities"], **CLOSE)
     assert_close(filtered.log_likelihood, np.sum(expected["densities"]), **CLOSE)
@@ -96,7 +96,7 @@ def test_as_in_the_textbook(n, p, steps):
 def test_step_by_step():
     """By hand, the steps and the log-likelihood are those of a record."""
     kalman, ys, us = problem(3, 2)
-    filtered = estimators.run_filter(kalman, ys, us, t0=0.3)
+    filtered = c.run_filter(kalman, ys, us, t0=0.3)
     belief, total = kalman.init(), 0.0
     update, predict = eqx.filter_jit(kalman.update), eqx.filter_jit(kalman.predict)
     likelihood = eqx.filter_jit(kalman.log_likelihood)
@@ -145,7 +145,7 @@ def test_smoother_solves_the_whole_record_at_once(known_start):
     if known_start:  # with one noise, the first predictions are singular
         zero = jnp.zeros_like(kalman.covariance)
         kalman = eqx.tree_at(lambda k: k.covariance, kalman, zero)
-    smoothed = estimators.smooth(kalman, ys, us)
+    smoothed = c.smooth(kalman, ys, us)
     mean, covariance, density = batch_solution(kalman, ys, us)
     assert_close(smoothed.mean, mean, **CLOSE)
     assert_close(smoothed.covariance, covariance, **CLOSE)
@@ -158,9 +158,7 @@ def test_smoother_solves_the_whole_record_at_once(known_start):
 def test_steady_state():
     transient, ys, us = problem(3, 2, k=3, T=60)
     dynamics, W, V = transient.dynamics, transient.W, transient.V
-    steady = estimators.KalmanFilter(
-        dynamics, W, V, mean=transient.mean, steady_state=True
-    )
+    steady = c.KalmanFilter(dynamics, W, V, mean=transient.mean, steady_state=True)
     A, C, E = (np.asarray(M, np.float64) for M in (dynamics.A, dynamics.C, dynamics.E))
     noise = E @ np.asarray(W, np.float64) @ E.T
     Sigma = scipy.linalg.solve_discrete_are(A.T, C.T, noise, np.float64(V))
@@ -168,7 +166,7 @@ def test_steady_state():
     L = Sigma @ C.T @ np.linalg.inv(C @ Sigma @ C.T + np.float64(V))
     assert_close(steady.L, L, **CLOSE)
     assert_close(steady.updated_covariance, Sigma - L @ C @ Sigma, **CLOSE)
-    constant, settled = (estimators.run_filter(k, ys, us) for k in (steady, transient))
+    constant, settled = (c.run_filter(k, ys, us) for k in (steady, transient))
     assert_close(constant.predicted.covariance[-1], steady.covariance)
     assert_close(constant.updated.covariance[0], steady.updated_covariance)
     for name in ("predicted", "updated"):
@@ -184,9 +182,9 @@ def test_steady_state():
 def test_steady_smoother_is_that_of_the_stationary_start():
     transient, ys, us = problem(2, 1, T=6)
     dynamics, W, V = transient.dynamics, transient.W, transient.V
-    steady = estimators.KalmanFilter(dynamics, W, V, steady_state=True)
-    same = estimators.KalmanFilter(dynamics, W, V, covariance=steady.covariance)
-    a, b = estimators.smooth(steady, ys, us), estimators.smooth(same, ys, us)
+    steady = c.KalmanFilter(dynamics, W, V, steady_state=True)
+    same = c.KalmanFilter(dynamics, W, V, covariance=steady.covariance)
+    a, b = c.smooth(steady, ys, us), c.smooth(same, ys, us)
     assert_close(a.mean, b.mean, **CLOSE)
     assert_close(a.covariance, b.covariance, **CLOSE)
 
@@ -201,13 +199,13 @@ YS = jnp.sin(jnp.arange(8.0))[:, None]
 def test_operating_point():
     """About another point, and with another reading there, only the origin moves."""
     x_ref, u_ref, y_ref = jnp.array([2.0, -1.0]), jnp.array([0.7]), jnp.array([5.0])
-    plain = estimators.KalmanFilter(dlx.LinearDynamics(A, B, C), W, V)
+    plain = c.KalmanFilter(dlx.LinearDynamics(A, B, C), W, V)
     moved = dlx.LinearDynamics(A, B, C, x_ref=x_ref, u_ref=u_ref)
     us = jnp.cos(jnp.arange(8.0))[:, None]
-    a = estimators.smooth(plain, YS, us)
+    a = c.smooth(plain, YS, us)
     for options, offset in (({"y_ref": y_ref}, y_ref), ({}, C @ x_ref)):
-        about = estimators.KalmanFilter(moved, W, V, **options)
-        b = estimators.smooth(about, YS + offset, us + u_ref)
+        about = c.KalmanFilter(moved, W, V, **options)
+        b = c.smooth(about, YS + offset, us + u_ref)
         assert_close(b.mean, a.mean + x_ref, **CLOSE)
         assert_close(b.covariance, a.covariance, **CLOSE)
 
@@ -222,7 +220,7 @@ def test_linearised_sensor():
     )
     dynamics = dlx.linearize(dlx.Discretized(system, 0.1), 0.0, jnp.ones(2), [0.0])
     dynamics = eqx.tree_at(lambda d: d.C, dynamics, -jnp.sin(1.0) * C)
-    kalman = estimators.KalmanFilter(dynamics, W, V, y_ref=[np.cos(1.0)])
+    kalman = c.KalmanFilter(dynamics, W, V, y_ref=[np.cos(1.0)])
     belief = kalman.update(0.0, jnp.array([np.cos(1.0)]), kalman.init())
     assert_close(belief.mean, np.ones(2), atol=tolerance(1e-6, 1e-14))
 
@@ -231,7 +229,7 @@ def test_angles_wrap():
     turn = jnp.array([2 * np.pi, 0.0])
     difference = dlx.systems.Pendulum().difference
     dynamics = dlx.LinearDynamics(A, B)
-    wrapped = estimators.KalmanFilter(
+    wrapped = c.KalmanFilter(
         dynamics, W, 0.1 * jnp.eye(2), observation_difference=difference
     )
     y = jnp.array([0.3, 0.1])
@@ -252,7 +250,7 @@ def noisy(log_levels, stiffness):
     dynamics = dlx.linearize(dynamics, 0.0, jnp.zeros(2), jnp.zeros(1))
     dynamics = eqx.tree_at(lambda d: d.C, dynamics, C)
     q, r = jnp.exp(log_levels)
-    return estimators.KalmanFilter(dynamics, q * jnp.eye(2), r * jnp.eye(1))
+    return c.KalmanFilter(dynamics, q * jnp.eye(2), r * jnp.eye(1))
 
 
 @thorough
@@ -260,7 +258,7 @@ def noisy(log_levels, stiffness):
 def test_gradient_of_the_likelihood():
     @jax.jit
     def likelihood(z):
-        return estimators.run_filter(noisy(z[:2], z[2]), YS).log_likelihood
+        return c.run_filter(noisy(z[:2], z[2]), YS).log_likelihood
 
     z = jnp.array([-2.0, -1.0, 1.5])
     numeric = central_difference(likelihood, z)
@@ -280,7 +278,7 @@ def test_gradient_of_the_smoother():
 
     @jax.jit
     def size(W):
-        smoothed = estimators.smooth(eqx.tree_at(lambda k: k.W, kalman, W), ys, us)
+        smoothed = c.smooth(eqx.tree_at(lambda k: k.W, kalman, W), ys, us)
         return jnp.sum(smoothed.mean**2) + jnp.sum(smoothed.covariance**2)
 
     numeric = central_difference(size, kalman.W)
@@ -294,8 +292,8 @@ def test_batch_and_its_bad_member():
     dynamics = dlx.LinearDynamics(A, B, C)
 
     def run(noise, y):
-        kalman = estimators.KalmanFilter(dynamics, W, noise * jnp.eye(1))
-        return estimators.smooth(kalman, y, throw=False)
+        kalman = c.KalmanFilter(dynamics, W, noise * jnp.eye(1))
+        return c.smooth(kalman, y, throw=False)
 
     def total(noises, scale):
         found = jax.vmap(run)(noises, scale * ys)
@@ -324,10 +322,10 @@ def test_covariance_stays_semidefinite():
     """A precise sensor of a large uncertainty cancels nearly all of it."""
     dynamics = dlx.LinearDynamics(A, B, C)
     tiny = tolerance(1e-6, 1e-14)
-    kalman = estimators.KalmanFilter(
+    kalman = c.KalmanFilter(
         dynamics, 0 * W, tiny * jnp.eye(1), covariance=1e3 * jnp.eye(2)
     )
-    run = estimators.smooth(kalman, jnp.zeros((100, 1)))
+    run = c.smooth(kalman, jnp.zeros((100, 1)))
     for covariances in (run.covariance, run.filtered.updated.covariance):
         eigenvalues = np.linalg.eigvalsh(np.asarray(covariances, np.float64))
         scale = np.max(eigenvalues, axis=1)
@@ -341,42 +339,45 @@ def test_precision_and_file(dtype, tmp_path):
     dynamics = dlx.LinearDynamics(A.astype(dtype), B.astype(dtype), C.astype(dtype))
     noise = W.astype(dtype), V.astype(dtype)
     for steady_state in (False, True):
-        kalman = estimators.KalmanFilter(dynamics, *noise, steady_state=steady_state)
-        found = estimators.smooth(kalman, YS.astype(dtype))
+        kalman = c.KalmanFilter(dynamics, *noise, steady_state=steady_state)
+        found = c.smooth(kalman, YS.astype(dtype))
         assert found.mean.dtype == found.filtered.log_likelihoods.dtype == dtype
         dlx.save(tmp_path / "kalman.dlx", kalman)
         loaded = dlx.load(tmp_path / "kalman.dlx")
         assert jax.tree.structure(loaded) == jax.tree.structure(kalman)
-        again = estimators.smooth(loaded, YS.astype(dtype))
+        again = c.smooth(loaded, YS.astype(dtype))
         np.testing.assert_array_equal(again.mean, found.mean)
 
 
 @thorough
 def test_failures():
     dynamics = dlx.LinearDynamics(A, B, C)
-    blind = estimators.KalmanFilter(dynamics, W, 0 * V, covariance=jnp.zeros((2, 2)))
+    blind = c.KalmanFilter(dynamics, W, 0 * V, covariance=jnp.zeros((2, 2)))
     with pytest.raises(RuntimeError, match="run_filter: The data.*At observation 0"):
-        estimators.run_filter(blind, YS)
-    found = estimators.run_filter(blind, YS, throw=False)
+        c.run_filter(blind, YS)
+    found = c.run_filter(blind, YS, throw=False)
     assert found.result == dlx.RESULTS.ill_posed
     # Where nothing varies there is nothing to correct, and no NaN.
     assert_close(found.updated.mean[0], np.zeros(2))
     short = dlx.LinearDynamics(jnp.stack([A] * 4), B, C)
-    short = estimators.KalmanFilter(short, W, V)
+    short = c.KalmanFilter(short, W, V)
     with pytest.raises(RuntimeError, match="smooth: The states.*At observation 4"):
-        estimators.smooth(short, YS)
-    found = estimators.run_filter(short, YS, throw=False)
+        c.smooth(short, YS)
+    found = c.run_filter(short, YS, throw=False)
     assert found.result == dlx.RESULTS.diverged
     np.testing.assert_array_equal(np.isnan(found.updated.mean[:, 0]), [0] * 4 + [1] * 4)
     with pytest.raises(eqx.EquinoxRuntimeError, match="not finite"):
-        eqx.filter_jit(estimators.run_filter)(blind, YS)
+        eqx.filter_jit(c.run_filter)(blind, YS)
     unseen = dlx.LinearDynamics(2 * jnp.eye(2), B, C)
     with pytest.raises(RuntimeError, match="KalmanFilter: there is no steady state"):
-        estimators.KalmanFilter(unseen, W, V, steady_state=True)
+        c.KalmanFilter(unseen, W, V, steady_state=True)
 
 
 BAD = [
-    ({"dynamics": dlx.systems.Pendulum()}, "dynamics must be LinearDynamics.*Pendulum"),
+    (
+        {"dynamics": dlx.systems.Pendulum()},
+        "dynamics must be a Linear.*Pendulum",
+    ),
     ({"W": jnp.eye(3)}, r"W must have shape \(2, 2\), .*disturbance, got \(3, 3\)"),
     ({"W": jnp.ones(2)}, r"W must be a matrix, got shape \(2,\)"),
     ({"W": jnp.diag(jnp.array([1.0, -1.0]))}, "W must be positive semidefinite"),
@@ -407,20 +408,20 @@ BAD = [
 def test_wrong_arguments(arguments, message):
     given = {"dynamics": dlx.LinearDynamics(A, B, C), "W": W, "V": V} | arguments
     with user_error(match="KalmanFilter: " + message):
-        estimators.KalmanFilter(**given)
+        c.KalmanFilter(**given)
 
 
 def test_wrong_records():
-    kalman = estimators.KalmanFilter(dlx.LinearDynamics(A, B, C), W, V)
-    for run in (estimators.run_filter, estimators.smooth):
+    kalman = c.KalmanFilter(dlx.LinearDynamics(A, B, C), W, V)
+    for run in (c.run_filter, c.smooth):
         name = run.__name__
         with user_error(match=f"{name}: estimator must be a KalmanFilter.*got LinearD"):
             run(kalman.dynamics, YS)
         with user_error(
-            match=rf"{name}: observations must have shape \(T, 1\).*\(8,\)"
+            match=rf"{name}: observations must have shape \(steps, 1\).*\(8,\)"
         ):
             run(kalman, YS[:, 0])
-        with user_error(match=r"observations must have shape.*got shape \(0, 1\)"):
+        with user_error(match=r"observations must have at least one step"):
             run(kalman, YS[:0])
         with user_error(match="observations must be finite"):
             run(kalman, YS.at[3].set(jnp.nan))

@@ -20,8 +20,8 @@ import delucax as dlx
 pytestmark = needs_x64
 
 
-c, estimators = dlx.controllers, dlx.estimators
-EKF, UKF = estimators.ExtendedKalmanFilter, estimators.UnscentedKalmanFilter
+c = dlx.estimators
+EKF, UKF = c.ExtendedKalmanFilter, c.UnscentedKalmanFilter
 CLOSE = dict(rtol=1e-10, atol=1e-11)
 both = pytest.mark.parametrize("kind", [EKF, UKF])
 # The extended one is a Kalman filter, whose own tests say the same.
@@ -45,10 +45,8 @@ def test_is_the_kalman_filter_of_linear_dynamics(kind, options):
     noise = jnp.diag(jnp.array([0.3, 0.1])), jnp.diag(jnp.array([0.2, 0.5]))
     start = dict(mean=jnp.ones(3), covariance=jnp.diag(jnp.array([1.0, 0.5, 2.0])))
     ys, us = rng.standard_normal((6, 2)), rng.standard_normal((6, 1))
-    found = estimators.smooth(kind(dynamics, *noise, **start, **options), ys, us)
-    expected = estimators.smooth(
-        estimators.KalmanFilter(dynamics, *noise, **start), ys, us
-    )
+    found = c.smooth(kind(dynamics, *noise, **start, **options), ys, us)
+    expected = c.smooth(c.KalmanFilter(dynamics, *noise, **start), ys, us)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert_close(a, b, **CLOSE)
 
@@ -134,14 +132,14 @@ def test_better_than_dead_reckoning(key):
     def errors(key):
         start, run = jax.random.split(key)
         x0 = START["mean"] + 0.3 * jax.random.normal(start, (2,))
-        run = dlx.rollout(env, c.Zero(1), key=run, x0=x0)
+        run = dlx.rollout(env, dlx.controllers.Zero(1), key=run, x0=x0)
         states = run.states[:-1]
         dead = dlx.open_loop(dynamics, START["mean"], run.controls)[:-1]
         seen = jnp.arctan2(run.observations[:, 0], run.observations[:, 1])
         off = jax.vmap(dynamics.difference)
 
         def of(estimator):
-            smoothed = estimators.smooth(estimator, run.observations, run.controls)
+            smoothed = c.smooth(estimator, run.observations, run.controls)
             deviation = off(smoothed.mean, states)
             surprise = jax.vmap(jnp.linalg.solve)(smoothed.covariance, deviation)
             return {
@@ -195,7 +193,7 @@ def test_angles_wrap(kind):
     def smooth(wraps, ys):
         dynamics = dlx.Discretized(Wrapped(wraps, pendulum), dt=0.05)
         noise = 0.01 * jnp.eye(2), 0.01 * jnp.eye(2)
-        found = estimators.smooth(kind(dynamics, *noise, **options), ys, throw=False)
+        found = c.smooth(kind(dynamics, *noise, **options), ys, throw=False)
         return found, jax.vmap(pendulum.difference, (0, None))(found.mean, ys[0])
 
     found, off = smooth(np.array([False, True]), np.stack([ys, turned]))
@@ -215,7 +213,7 @@ def test_gradient_of_the_likelihood(kind):
     def likelihood(z):
         noise = jnp.exp(z[1]) * NOISE[0], jnp.exp(z[2]) * NOISE[1]
         estimator = kind(swinging(z[0]), *noise, **START)
-        found = estimators.run_filter(estimator, ys, throw=False).log_likelihood
+        found = c.run_filter(estimator, ys, throw=False).log_likelihood
         return found, found
 
     z = jnp.array([1.1, 0.2, -0.3])
@@ -232,15 +230,14 @@ def test_points_of_a_singular_covariance():
     half = jnp.diag(jnp.array([0.0, 1.0]))
     ys = jnp.ones((3, 2))
     kalman, ukf = (
-        kind(dynamics, *noise, covariance=half)
-        for kind in (estimators.KalmanFilter, UKF)
+        kind(dynamics, *noise, covariance=half) for kind in (c.KalmanFilter, UKF)
     )
-    found, expected = estimators.run_filter(ukf, ys), estimators.run_filter(kalman, ys)
+    found, expected = c.run_filter(ukf, ys), c.run_filter(kalman, ys)
     assert_close(found.updated.mean, expected.updated.mean, **CLOSE)
     assert_close(found.updated.mean[:, 0], np.zeros(3))
     spoilt = eqx.tree_at(lambda k: k.covariance, ukf, -jnp.eye(2))
     with pytest.raises(RuntimeError, match="states.*At observation 0"):
-        estimators.run_filter(spoilt, ys)
+        c.run_filter(spoilt, ys)
 
 
 @thorough
@@ -255,7 +252,7 @@ def test_solver_that_fails(kind):
         max_steps=2,
     )
     estimator = kind(dynamics, jnp.eye(2), jnp.eye(2))
-    found = estimators.run_filter(estimator, jnp.ones((2, 2)), throw=False)
+    found = c.run_filter(estimator, jnp.ones((2, 2)), throw=False)
     assert found.result == dlx.RESULTS.diverged
     assert np.all(np.isnan(found.predicted.mean[1:]))
 
@@ -269,7 +266,7 @@ def test_precision_batch_and_file(kind, tmp_path):
     options = dict(observation_difference=pendulum.difference)
     estimator = kind(dynamics, eye, eye, **options)
     assert estimator.init().mean.dtype == jnp.float32
-    run = jax.jit(jax.vmap(estimators.run_filter, in_axes=(None, 0)))
+    run = jax.jit(jax.vmap(c.run_filter, in_axes=(None, 0)))
     found = run(estimator, ys)
     assert found.updated.covariance.dtype == jnp.float32
     assert found.log_likelihood.shape == (2,) and found.log_likelihoods.shape == (2, 4)
