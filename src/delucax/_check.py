@@ -180,9 +180,11 @@ def check_control_bounds(value: Any, size: int, where: str) -> Bounds | None:
     return bounds
 
 
-def bounds_field(where: str, name: str = "bounds") -> Any:
-    """A field that holds `(low, high)`, converted and checked by `as_bounds`."""
-    return eqx.field(converter=functools.partial(as_bounds, where=where, name=name))
+def bounds_field(where: str, name: str = "bounds", **options: Any) -> Any:
+    """A field that holds `(low, high)`, converted and checked by `as_bounds`; `options`
+    are those of a field."""
+    converter = functools.partial(as_bounds, where=where, name=name)
+    return eqx.field(converter=converter, **options)
 
 
 def check_finite(array: Any, name: str, where: str) -> None:
@@ -214,10 +216,8 @@ def check_positive(value: Any, name: str, where: str) -> None:
 def check_step(dt: Any, where: str, name: str = "dt") -> None:
     """Raise unless `dt`, or what has another name, is one positive number."""
     check_positive(dt, name, where)
-    if jnp.shape(dt) != ():
-        raise ValueError(
-            f"{where}: {name} must be a number, got shape {jnp.shape(dt)}."
-        )
+    if np.shape(dt) != ():
+        raise ValueError(f"{where}: {name} must be a number, got shape {np.shape(dt)}.")
 
 
 def check_number(value: Any, name: str, where: str) -> None:

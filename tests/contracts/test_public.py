@@ -114,9 +114,9 @@ LONG = {
     AbstractDisturbance analysis.disk_margin analysis.DiskMargin analysis.hinf_norm
     analysis.Margins analysis.margins c2d controllers.Adaptive
     controllers.best_in_hindsight controllers.BPC controllers.Categorical
-    controllers.DRC controllers.Explore estimators.ExtendedKalmanFilter
+    controllers.drc controllers.Explore estimators.ExtendedKalmanFilter
     estimators.Filtered controllers.FiniteHorizonLQR controllers.FixedPolicy
-    controllers.Gaussian controllers.GPC controllers.Hindsight controllers.HInfinity
+    controllers.Gaussian controllers.gpc controllers.Hindsight controllers.HInfinity
     estimators.KalmanFilter controllers.Linear
     controllers.LQG controllers.LQI controllers.LQR controllers.lqrd controllers.MLP
     controllers.MPC controllers.MPCState controllers.online_newton

@@ -134,7 +134,7 @@ def test_a_plan_is_a_controller():
     assert_close(run.total_cost, plan.cost, rtol=tolerance(1e-5, 1e-12))
     # Feedback does better than the plan alone.
     x0 = plan.states[0] + 0.05
-    alone = dlx.controllers.Sequence(plan.controls)
+    alone = dlx.controllers.OpenLoop(plan.controls)
     closed, open_ = (
         dlx.rollout(env, c, key=key, x0=x0).total_cost for c in (plan, alone)
     )

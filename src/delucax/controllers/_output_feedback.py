@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._controller import AbstractController
+from .._check import check_instance
+from .._controller import AbstractController, check_controller
 from ..estimators import AbstractEstimator, Belief
 
 
@@ -54,19 +55,9 @@ class OutputFeedback(AbstractController):
     controller: AbstractController
     estimator: AbstractEstimator
 
-    def __init__(self, controller: AbstractController, estimator: AbstractEstimator):
-        self.controller, self.estimator = controller, estimator
-
     def __check_init__(self):
-        for name, value, kind in (
-            ("controller", self.controller, AbstractController),
-            ("estimator", self.estimator, AbstractEstimator),
-        ):
-            if not isinstance(value, kind):
-                raise ValueError(
-                    f"OutputFeedback: {name} must be an {kind.__name__}, got "
-                    f"{type(value).__name__}."
-                )
+        check_controller(self.controller, "controller", "OutputFeedback")
+        check_instance(self.estimator, AbstractEstimator, "estimator", "OutputFeedback")
 
     def init(self, *, key=None):
         keys = (None, None) if key is None else jax.random.split(key)

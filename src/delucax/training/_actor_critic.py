@@ -12,7 +12,7 @@ from .._check import check_instance, check_key
 from .._controller import AbstractController, check_controller
 from .._module import parameter
 from .._typing import PRNGKey, RealScalar
-from ..controllers import Categorical, Deep, MLP, Standardise
+from ..controllers import Categorical, MLP, mlp_policy, Standardise
 from ..environments import Environment
 
 
@@ -40,7 +40,7 @@ class ActorCritic(eqx.Module):
 
         env = dlx.make("pendulum")
         policy_key, critic_key = jax.random.split(jax.random.key(0))
-        policy = dlx.controllers.Deep(env, head="gaussian", key=policy_key)
+        policy = dlx.controllers.mlp_policy(env, head="gaussian", key=policy_key)
         critic = dlx.controllers.MLP(3, 1, features=env.encode, key=critic_key)
         model = dlx.training.ActorCritic(policy, critic)
         model.value(0.0, env.reset(critic_key))
@@ -151,7 +151,7 @@ def actor_critic(
         base = MLP(size, len(table), **sizes, features=features, key=policy_key)
         policy: Any = Categorical(base, table)
     else:
-        policy = Deep(environment, **sizes, head=head, key=policy_key)
+        policy = mlp_policy(environment, **sizes, head=head, key=policy_key)
         policy = eqx.tree_at(lambda p: network_of(p).features, policy, features)
     critic = MLP(size, 1, **sizes, features=features, key=critic_key)
 

@@ -98,7 +98,7 @@ def worst_case(
 
         A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
         env = dlx.make("lds", A=A, B=B, horizon=100)
-        learner = dlx.controllers.GPC(env.dynamics, env.cost)
+        learner = dlx.controllers.gpc(env.dynamics, env.cost)
         found = dlx.training.worst_case(env, learner, key=jax.random.key(0), bound=1.0)
         again = dlx.rollout(env, learner, key=jax.random.key(1), w=found.w)
         found.total_cost

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from ... import lung
 from ..._typing import PRNGKey
-from ...controllers import GPC, LeakyPID, online_newton, OutputFeedback, PID
+from ...controllers import gpc, LeakyPID, online_newton, OutputFeedback, PID
 from ...costs import Tracking
 from ...dynamics import LinearDynamics
 from ...environments import Environment
@@ -225,7 +225,7 @@ def online_learners(
         error = jnp.zeros(n).at[0].set(1.0)
         target = _Target(trainer.waveform, n)
         cost = Tracking(error, jnp.zeros(1), target)
-        learner = GPC(model, cost, base=base, horizon=10, optimiser=newton)
+        learner = gpc(model, cost, base=base, horizon=10, optimiser=newton)
         # All that the fit leaves over moves the lung; the sensor is taken at its word.
         process = jnp.diag(_NOISE**2 * error)
         mean = error.at[1].set(1.0) * trainer.waveform.peep
