@@ -15,7 +15,7 @@ from delucax import lung
 pytestmark = once
 
 KEY = jax.random.key(0)
-ENV = lung.single_compartment(50.0, 10.0)
+ENV = lung.single_compartment(resistance=50.0, compliance=10.0)
 WAVEFORM = ENV.cost.waveform
 
 

@@ -194,7 +194,7 @@ def train_controllers(
         import jax
         from delucax import lung
 
-        envs = lung.stack([lung.single_compartment(R) for R in (5.0, 20.0)])
+        envs = lung.stack([lung.single_compartment(resistance=R) for R in (5.0, 20.0)])
         forward = lung.FeedForward(lung.BreathWaveform(), gain=0.5)
         one = lung.stack([lung.stack([forward, forward])])
         few = dict(steps=3, horizon=2, pips=[20.0])

@@ -103,7 +103,7 @@ def pid_grid(
         import jax
         from delucax import lung
 
-        envs = lung.stack([lung.single_compartment(R) for R in (5.0, 20.0)])
+        envs = lung.stack([lung.single_compartment(resistance=R) for R in (5.0, 20.0)])
         few = dict(kp=[0.5, 1.0], ki=[1.0], pips=[20.0])
         lung.pid_grid(envs, key=jax.random.key(0), **few).best()
         ```
