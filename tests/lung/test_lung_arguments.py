@@ -103,7 +103,6 @@ def test_a_stack_is_not_one_task():
 @pytest.mark.parametrize(
     "kind, make",
     {
-        "ExpiratoryValve": lung.ExpiratoryValve,
         "BangBang": lung.BangBang,
         "FeedForward": lung.FeedForward,
         "BreathCost": lambda w: lung.BreathCost(w, index=0),

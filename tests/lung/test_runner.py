@@ -102,7 +102,7 @@ def test_cleans_up_after_an_error():
 
 
 def test_wrong_arguments():
-    with user_error(match="runner must have physical"):
+    with user_error(match="runner must have dt, observe"):
         lung.run_breaths(object(), breathing(0.5))
     with user_error(match="controller must be an AbstractController"):
         lung.run_breaths(lung.SimulatedRunner(ENV, key=KEY), print)

@@ -33,7 +33,7 @@ class Runner(Protocol):
 
     Write one for a machine: none of it needs JAX, and any of it may block or raise.
 
-    **Attributes:** `physical`, whether there is a machine; `dt`, the time of a step.
+    **Attributes:** `dt`, the time of a step.
 
     !!! example
 
@@ -48,7 +48,6 @@ class Runner(Protocol):
         ```
     """
 
-    physical: bool
     dt: float
 
     @abc.abstractmethod
@@ -109,8 +108,6 @@ class SimulatedRunner:
         runner.observe()
         ```
     """
-
-    physical = False
 
     def __init__(
         self,
@@ -258,7 +255,7 @@ def run_breaths(
     where = "run_breaths"
     if not isinstance(runner, Runner):
         raise ValueError(
-            f"{where}: runner must have physical, dt, observe, actuate, wait, "
+            f"{where}: runner must have dt, observe, actuate, wait, "
             f"should_abort and cleanup, got {type(runner).__name__}."
         )
     check_controller(controller, "controller", where)

@@ -263,8 +263,7 @@ def lung_environment(
 
 def waveform_of(env: Any, where: str, *, stacked: bool = False) -> BreathWaveform:
     """The waveform of a task of a lung, or of several that are stacked."""
-    waveform = getattr(getattr(env, "cost", None), "waveform", None)
-    if not isinstance(env, Environment) or not isinstance(waveform, BreathWaveform):
+    if not isinstance(env, Environment) or not isinstance(env.cost, BreathCost):
         raise ValueError(
             f"{where}: env must be a task with a breath waveform, such as "
             f"delucax.make('lung/double_compartment'), got {type(env).__name__}."
@@ -274,4 +273,4 @@ def waveform_of(env: Any, where: str, *, stacked: bool = False) -> BreathWavefor
             f"{where}: env must be one task, got {jnp.shape(env.dt)[0]} that are "
             "stacked: map over them with equinox.filter_vmap."
         )
-    return waveform
+    return env.cost.waveform

@@ -109,11 +109,7 @@ class BreathWaveform(eqx.Module):
                 raise ValueError(
                     f"{where}: keypoints must increase from 0 to 1, got {points}."
                 )
-        if is_concrete(self.pip) and is_concrete(self.peep):
-            if not np.all(np.asarray(self.pip) >= np.asarray(self.peep)):
-                raise ValueError(
-                    f"{where}: pip must be at least peep = {self.peep}, got {self.pip}."
-                )
+        _check_pip(self.pip, self.peep, "pip", where)
         share = self.inspiration
         if is_concrete(share) and not 0 < float(share) < 1:
             raise ValueError(
