@@ -190,8 +190,6 @@ def explore(
         jnp.asarray(np.concatenate(column)[:breaths])
         for column in zip(*kept, strict=True)
     )
-    known = {
-        name: None if value is None else jnp.full(breaths, float(value))
-        for name, value in (("resistance", resistance), ("compliance", compliance))
-    }
-    return Breaths(u_in, u_out, pressure, env.dt, truth=truth, **known)
+    each = lambda value: None if value is None else jnp.full(breaths, float(value))
+    lungs = each(resistance), each(compliance)
+    return Breaths(u_in, u_out, pressure, env.dt, *lungs, truth)

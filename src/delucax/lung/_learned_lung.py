@@ -105,13 +105,9 @@ class LearnedLung(AbstractDynamics):
         where = "LearnedLung"
         check_instance(breaths, Breaths, "breaths", where)
         check_key(key, where)
-        for name, value in (
-            ("width", width),
-            ("depth", depth),
-            ("boundary", boundary),
-            ("u_window", u_window),
-            ("p_window", p_window),
-        ):
+        sizes = dict(width=width, depth=depth, boundary=boundary)
+        sizes |= dict(u_window=u_window, p_window=p_window)
+        for name, value in sizes.items():
             check_count(value, name, where)
         hidden_key, output_key, valve_key, key = jr.split(key, 4)
         size = 2 * max(u_window, p_window, boundary)
@@ -211,14 +207,7 @@ class LearnedLung(AbstractDynamics):
         history = jnp.concatenate([controls, pressures])
         early = self._early(history, late, self.hidden[i], self.output[i])
         predicted = self._bound(jnp.where(step < first - 0.5, early, late))
-        after = jnp.concatenate(
-            [
-                controls,
-                jnp.reshape(predicted, (1,)),
-                pressures[: n - 1],
-                jnp.reshape(step + 1, (1,)),
-            ]
-        )
+        after = jnp.hstack([controls, predicted, pressures[: n - 1], step + 1])
         after = jnp.where(u[1] > 0.5, self.resting(), after)
         return after.astype(x.dtype), RESULTS.successful
 

@@ -157,8 +157,8 @@ class NeuralLung(AbstractLung):
         return self.p_mean + self.p_std * x[0]
 
     def resting(self, pressure: RealScalar) -> State:
-        first = jnp.reshape((pressure - self.p_mean) / self.p_std, (1,))
-        return jnp.concatenate([first, jnp.zeros(self.hidden)])
+        first = (pressure - self.p_mean) / self.p_std
+        return jnp.hstack([first, jnp.zeros(self.hidden)])
 
     def vector_field(self, t, x, u, w):
         flow = self.valves.flow(u[0]) / self.valves.max_flow
@@ -240,10 +240,9 @@ class GreyBoxLung(AbstractLung):
         return self.single.pressure(x[:3]) + self.p_std * rest
 
     def resting(self, pressure: RealScalar) -> State:
-        physical = self.single.resting(pressure)
-        return jnp.concatenate([physical, jnp.zeros(1)])
+        return jnp.append(self.single.resting(pressure), 0.0)
 
     def vector_field(self, t, x, u, w):
         physical = self.single.vector_field(t, x[:3], u, w)
         memory = self.rate * self.memory(self._inputs(x))
-        return jnp.concatenate([physical, jnp.reshape(memory, (1,))])
+        return jnp.append(physical, memory)

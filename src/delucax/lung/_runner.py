@@ -53,7 +53,6 @@ class Runner(Protocol):
     @abc.abstractmethod
     def observe(self) -> float:
         """The pressure that the sensor reads now [cmH2O]."""
-        ...
 
     @abc.abstractmethod
     def actuate(self, u_in: float, u_out: float) -> None:
@@ -61,12 +60,10 @@ class Runner(Protocol):
 
         **Arguments:** `u_in`: from 0 to 100 %. `u_out`: from 0 to 1.
         """
-        ...
 
     @abc.abstractmethod
     def wait(self) -> None:
         """Return when the next step is due."""
-        ...
 
     @abc.abstractmethod
     def should_abort(self, pressure: float) -> bool:
@@ -74,12 +71,10 @@ class Runner(Protocol):
 
         **Arguments:** `pressure`: what was read last [cmH2O].
         """
-        ...
 
     @abc.abstractmethod
     def cleanup(self) -> None:
         """Leave the machine safe; called once at the end, whatever happened."""
-        ...
 
 
 class SimulatedRunner:

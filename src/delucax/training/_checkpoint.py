@@ -108,8 +108,8 @@ def checkpoint_path(path: Any) -> Path:
 
 def describe_run(
     model: PyTree,
-    values: dict[str, Any],
     constraints: dict[str, Any],
+    values: dict[str, Any],
     state: PyTree,
     memory: PyTree,
     **options: Any,

@@ -140,7 +140,7 @@ class PPO(AbstractActorCriticLoss):
                 f"{self.minibatches}."
             )
         none = Statistics.empty(model, rows.costs.dtype)
-        statistics = _updated(none, model, rows)
+        statistics = none.updated(model, rows)
         zero = jnp.zeros((), int)
         return _Memory(rows, jnp.arange(count), zero, statistics, total_cost)
 
@@ -160,7 +160,7 @@ class PPO(AbstractActorCriticLoss):
         again = (part == 0) & (step > 0)
         old = memory.statistics
         statistics = lax.cond(
-            again, lambda: _updated(old, model, memory.rows), lambda: old
+            again, lambda: old.updated(model, memory.rows), lambda: old
         )
         memory = memory._replace(statistics=statistics)
         memory = lax.cond(part == 0, fresh, lambda: memory)
@@ -181,7 +181,6 @@ class PPO(AbstractActorCriticLoss):
         chosen = lax.dynamic_slice(memory.order, (start,), (size,))
         rows = jax.tree.map(lambda leaf: leaf[chosen], memory.rows)
         log_prob, entropy = _scores(model, rows)
-        raw = jax.vmap(jax.vmap(model.raw))(rows.times, rows.observations)
         weights = rows.valid / jnp.maximum(jnp.sum(rows.valid), 1)
 
         def mean(values):
@@ -193,8 +192,7 @@ class PPO(AbstractActorCriticLoss):
         surrogate = mean(
             jnp.maximum(ratio * rows.advantages, clipped * rows.advantages)
         )
-        target = (rows.targets - model.shift) / model.scale
-        value_loss = mean((raw - target) ** 2)
+        value_loss = mean(self._value_errors(model, rows) ** 2)
         bonus = mean(entropy)
         loss = surrogate + self.value_weight * value_loss - self.entropy_weight * bonus
         metrics = {
@@ -219,7 +217,6 @@ class PPO(AbstractActorCriticLoss):
             log_prob=log_prob,
             continues=None,
             following=None,
-            values=None,
             total_cost=None,
         )
         if not _policy_of(model).has_memory:
@@ -230,10 +227,6 @@ class PPO(AbstractActorCriticLoss):
 def _policy_of(model: ActorCritic) -> AbstractStochasticPolicy:
     """The policy of a model, which must know the probability of what it draws."""
     return check_stochastic(model.policy, "policy", "PPO")
-
-
-def _updated(old: Statistics, model: ActorCritic, rows: Episodes) -> Statistics:
-    return old.updated(model, rows.observations, rows.targets, rows.valid)
 
 
 def _scores(model: ActorCritic, rows: Episodes) -> tuple[Array, Array]:

@@ -6,10 +6,11 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
 from ..controllers import Standardise
 from ._actor_critic import ActorCritic
+from ._actor_critic_loss import Episodes
 
 
 class Moments(NamedTuple):
@@ -59,21 +60,15 @@ class Statistics(NamedTuple):
         features = [Moments.empty(one.mean) for one in _standardisers(model)]
         return Statistics(features, Moments.empty(jnp.zeros((), dtype)))
 
-    def updated(
-        self,
-        model: ActorCritic,
-        observations: Float[Array, "batch steps p"],
-        targets: Float[Array, "batch steps"],
-        valid: Bool[Array, "batch steps"],
-    ) -> "Statistics":
+    def updated(self, model: ActorCritic, runs: Episodes) -> "Statistics":
         """With the valid ones of more observations and targets."""
-        rows = observations.reshape(-1, observations.shape[-1])
-        valid = valid.reshape(-1)
+        rows = runs.observations.reshape(-1, runs.observations.shape[-1])
+        valid, targets = runs.valid.reshape(-1), runs.targets.reshape(-1)
         features = [
             old.joined(jax.vmap(one.of)(rows), valid)
             for one, old in zip(_standardisers(model), self.features, strict=True)
         ]
-        return Statistics(features, self.targets.joined(targets.reshape(-1), valid))
+        return Statistics(features, self.targets.joined(targets, valid))
 
     def applied_to(self, model: ActorCritic) -> ActorCritic:
         """The model, standardised by these moments."""

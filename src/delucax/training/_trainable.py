@@ -183,12 +183,9 @@ def _chosen_by_filter(model, entries, trainable, where) -> list[bool]:
         chosen = [trainable(leaf) for _, leaf, _, _ in entries]
     else:
         try:
-            spread = jax.tree.map(
-                lambda mask, part: jax.tree.map(lambda _: mask, part), trainable, model
-            )
+            chosen = jax.tree.leaves(jax.tree.broadcast(trainable, model))
         except (ValueError, TypeError):
-            spread = None
-        chosen = jax.tree.leaves(spread)
+            chosen = []
         if len(chosen) != len(entries):
             raise ValueError(
                 f"{where}: trainable must be a path, paths, a function of a leaf, or "

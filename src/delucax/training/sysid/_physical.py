@@ -20,7 +20,7 @@ from ..._module import as_float_array
 from ..._results import RESULTS
 from ...dynamics import AbstractDynamics, open_loop
 from .._trainable import Assembly, take_apart
-from ._identified import checked, CORRELATED, Identified, quantile
+from ._identified import checked, CORRELATED, Identified, reach
 from ._linear import runs_of
 from ._multiple_shooting import (
     cut_into_windows,
@@ -45,7 +45,6 @@ def physical(
     x0: Any = None,
     window: int = 20,
     noise: Any = None,
-    level: Any = 0.95,
     max_steps: int = 100,
     throw: bool = True,
 ) -> Identified:
@@ -84,7 +83,6 @@ def physical(
         not fill the last is left out.
     - `noise`: the standard deviation of each observation, a number or shape `(p,)`; by
         default as in what remains of a first fit.
-    - `level`: of the confidence intervals, 0.95 by default.
     - `max_steps`: 100 by default.
     - `throw`: raise if it does not converge or the data do not tell all parameters
         (default); if false, look at `result`.
@@ -128,7 +126,6 @@ def physical(
     runs, steps = controls.shape[:2]
     window = min(check_count(window, "window", where), steps)
     max_steps = check_count(max_steps, "max_steps", where)
-    reach = quantile(level, where)
     check_bool(throw, "throw", where)
     if noise is not None:
         check_positive(noise, "noise", where)
@@ -152,7 +149,8 @@ def physical(
     ]
 
     def fit(values, window):
-        starts, data, spread = cut_into_windows(guesses, observations, controls, window)
+        starts, data = cut_into_windows(guesses, observations, controls, window)
+        spread = data.noise
         data = data._replace(noise=spread if noise is None else noise)
         solution = solve(assembly, values, starts, data, max_steps)
         if noise is not None:
@@ -176,7 +174,7 @@ def physical(
                 solution = again
     values, legal, certainty = solution.values, solution.legal, solution.certainty
     std = certainty.std
-    ends = [_ends(assembly, values, sign * reach * std) for sign in (-1, 1)]
+    ends = [_ends(assembly, values, sign * reach() * std) for sign in (-1, 1)]
     starts = solution.starts.reshape(runs, count, n)[:, 0]
     fitted = Identified(
         model=assembly(values),
