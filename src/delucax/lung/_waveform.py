@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._check import (
     check_finite,
@@ -70,25 +70,12 @@ class BreathWaveform(eqx.Module):
         ```
     """
 
-    pip: Array = parameter()
-    peep: Array = parameter()
-    rate: Array = parameter(constraint=positive)
-    keypoints: Array = parameter()
-    levels: Array = parameter()
-    inspiration: Array = parameter()
-
-    def __init__(
-        self,
-        pip: Any = 35.0,
-        peep: Any = 5.0,
-        rate: Any = 20.0,
-        keypoints: Any = (0.0, 1 / 3, 1 / 2, 1.0),
-        levels: Any = (1.0, 1.0, 0.0, 0.0),
-        inspiration: Any = 1 / 3,
-    ):
-        self.pip, self.peep, self.rate = pip, peep, rate
-        self.keypoints, self.levels = keypoints, levels
-        self.inspiration = inspiration
+    pip: Array = parameter(35.0)
+    peep: Array = parameter(5.0)
+    rate: Array = parameter(20.0, constraint=positive)
+    keypoints: Float[Array, " points"] = parameter((0.0, 1 / 3, 1 / 2, 1.0))
+    levels: Float[Array, " points"] = parameter((1.0, 1.0, 0.0, 0.0))
+    inspiration: Array = parameter(1 / 3)
 
     def __check_init__(self):
         where = "BreathWaveform"

@@ -64,16 +64,15 @@ class LikelihoodRatio(eqx.Module):
     """
 
     samples: int = eqx.field(static=True)
-    baseline: bool = eqx.field(static=True)
+    baseline: bool = eqx.field(static=True, default=True)
 
-    def __init__(self, samples: int, baseline: bool = True):
+    def __check_init__(self):
         where = "LikelihoodRatio"
-        self.samples = check_count(samples, "samples", where)
-        self.baseline = bool(baseline)
-        if self.baseline and samples < 2:
+        check_count(self.samples, "samples", where)
+        if self.baseline and self.samples < 2:
             raise ValueError(
                 f"{where}: samples must be at least 2 with a baseline, the mean of the "
-                f"others, got {samples}."
+                f"others, got {self.samples}."
             )
 
     def __call__(self, loss, model, key: PRNGKey) -> tuple[Any, PyTree]:
