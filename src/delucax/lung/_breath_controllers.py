@@ -105,7 +105,7 @@ class BangBang(AbstractController):
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `high`: the control below it [%], 100 by default.
 
-    **Raises:** `ValueError` if `waveform` is none.
+    **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`.
 
     !!! example
 
@@ -163,7 +163,7 @@ class BreathPolicy(AbstractController):
     a little open.
 
     **Raises:** `ValueError` if a size is below its least, the kind is unknown,
-    `waveform` is none or there is no key.
+    `waveform` is not a `BreathWaveform` or there is no key.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -310,7 +310,7 @@ class FeedForward(AbstractController):
     - `gain`: [%/cmH2O], 1 by default. Trainable.
     - `offset`: [%], 0 by default. Trainable.
 
-    **Raises:** `ValueError` if `waveform` is none.
+    **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`.
 
     !!! example
 

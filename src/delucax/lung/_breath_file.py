@@ -171,7 +171,7 @@ def _breaths(path: Path, table: dict[str, np.ndarray]) -> tuple[np.ndarray, np.n
 
 def _table(path: Path) -> dict[str, np.ndarray]:
     """The columns by name, as numbers, and of each row its `line` in the file."""
-    # What is no text is a value like any other that is no number.
+    # Bytes that are not text are rejected later, as values that are not numbers.
     with open(path, newline="", encoding="utf-8-sig", errors="replace") as file:
         reader = csv.reader(file)
         header = [name.strip() for name in next(reader, [])]

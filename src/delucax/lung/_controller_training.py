@@ -151,8 +151,9 @@ def train_controllers(
     """Train controllers in lungs, by the gradient of their error.
 
     The loss is [`delucax.lung.breath_error`][] over all peak pressures, with fresh
-    noise in each step; Adam with a learning rate that falls to 0 along a cosine. As
-    Adam moves each weight by itself, those of one controller do not feel the others.
+    noise in each step; Adam with a learning rate that falls to 0 along a cosine.
+    Because Adam scales each weight by itself, the gradients of one controller do not
+    affect the others.
 
     **Arguments:**
 
@@ -171,7 +172,7 @@ def train_controllers(
         no bar and no file by default.
     - `throw`: raise if an error or its gradient is NaN or infinite (default); if false,
         that gradient counts as 0, the other controllers are trained as if nothing were,
-        and `history["diverged"]` says of how many it was in each step.
+        and `history["diverged"]` counts those controllers at each step.
 
     **Returns:** a [`delucax.training.Fitted`][].
 

@@ -43,8 +43,8 @@ class Explorer(AbstractController):
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `scale`: of the gains that are drawn, 1 by default.
 
-    **Raises:** `ValueError` if a number is none or not finite, `dt` is not positive, or
-    `waveform` is none.
+    **Raises:** `ValueError` if a number is not one or not finite, `dt` is not positive,
+    or `waveform` is not a `BreathWaveform`.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.

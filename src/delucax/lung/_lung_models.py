@@ -19,13 +19,13 @@ from ._valves import Valves
 
 
 class LungModel(eqx.Module):
-    """A lung as a differential equation, seen by a sensor: what is fitted to breaths.
+    """A lung as a differential equation and a sensor, to be fitted to breaths.
 
     **Arguments:**
 
     - `system`: a [`delucax.lung.AbstractLung`][].
     - `dt`: the time between samples [s], 0.03 by default.
-    - `sensor_delay`: steps until a pressure is seen, 2 by default.
+    - `sensor_delay`: steps until a pressure is observed, 2 by default.
     - `peep`: the pressure at which it rests before an inspiration [cmH2O], 5 by
         default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
@@ -90,7 +90,7 @@ class LungModel(eqx.Module):
 
 
 class NeuralLung(AbstractLung):
-    r"""A neural ODE: what a pressure does, and some states that are not seen,
+    r"""A neural ODE: a pressure and some hidden states,
 
     `dz/dt = rate network(z, flow(u_in) / max_flow, u_out)`, `p = p_mean + p_std z[0]`.
 
@@ -98,7 +98,7 @@ class NeuralLung(AbstractLung):
 
     **Arguments:**
 
-    - `hidden`: states that are not seen, 2 by default.
+    - `hidden`: hidden states, 2 by default.
     - `width`, `depth`: of the network, 24 and 1 by default.
     - `valves`: whose curve of the flow is used; the default ones by default.
     - `key`: a random key, for the first weights.

@@ -165,7 +165,7 @@ def single_compartment(
 def double_compartment(
     system: DoubleCompartment | None = None, **options: Any
 ) -> Environment:
-    """Make a lung of a fast and a slow compartment breathe, seen late and with noise.
+    """Make a lung of a fast and a slow compartment breathe, with delay and noise.
 
     The plant of the ventilator study: as `lung/single_compartment`, with another lung
     and a real sensor.

@@ -166,7 +166,7 @@ class SimulatedRunner:
         return _step(self.environment, t, self.state, u).state
 
     def should_abort(self, pressure: float) -> bool:
-        """Whether the pressure is above the limit, or no number.
+        """Whether the pressure is above the limit, or is not a number.
 
         **Arguments:** `pressure`: what was read last [cmH2O].
         """
@@ -217,7 +217,7 @@ def run_breaths(
 ) -> Recording:
     """Run a controller at a ventilator.
 
-    Each step: read the pressure; give up if `runner.should_abort` says so; ask the
+    Each step: read the pressure; stop if `runner.should_abort` is true; ask the
     controller; set the valves; wait. At the end, and also after an error in any of it
     or an interruption, `runner.cleanup()` is called, and the error goes on.
 

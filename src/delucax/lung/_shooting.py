@@ -1,4 +1,4 @@
-"""Controls of a breath that are found by gradient descent through a lung."""
+"""Controls of a breath by gradient descent through a lung."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -28,7 +28,8 @@ class PressureSensor(AbstractWrapper):
 
     **Arguments:** `dynamics`: of a lung; it observes one number.
 
-    **Raises:** `ValueError` if `dynamics` are none or observe more than one number.
+    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or observes more
+    than one number.
 
     !!! example
 
@@ -100,7 +101,7 @@ class BreathCost(AbstractCost):
     - `index`: the place of the pressure in the state.
     - `limit`: a pressure [cmH2O]; none by default.
 
-    **Raises:** `ValueError` if `waveform` is none, or the limit is not positive.
+    **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`, or the limit is not positive.
 
     !!! example
 
@@ -191,7 +192,7 @@ def ventilation(
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20
         times a minute, by default.
     - `rest`: the first state of the dynamics; zero by default.
-    - `sensor_delay`: steps until a pressure is seen, 0 by default.
+    - `sensor_delay`: steps until a pressure is observed, 0 by default.
     - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
     - `limit`: of the cost; none by default.
     - `horizon`: steps an episode, 100 by default.
@@ -200,7 +201,7 @@ def ventilation(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or if `waveform` is none.
+    **Raises:** `ValueError` on illegal numbers, or if `waveform` is not a `BreathWaveform`.
 
     !!! example
 
@@ -237,7 +238,7 @@ def lung_environment(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if it is no such model, or `waveform` is none.
+    **Raises:** `ValueError` if it is no such model, or `waveform` is not a `BreathWaveform`.
 
     !!! example
 

@@ -156,8 +156,8 @@ def check_waveform(waveform: Any, where: str) -> None:
 
 
 def check_peep(waveform: BreathWaveform, valves: Any, where: str) -> None:
-    """Raise if the PEEP of a waveform is below what the valves let a lung out to, as
-    far as can be seen."""
+    """Raise if the PEEP of a waveform is below what the valves let a lung out to, if
+    their values are known."""
     asked, least = waveform.peep, valves.peep
     if is_concrete(asked) and is_concrete(least):
         # Numbers of another precision may differ by their rounding.
@@ -192,7 +192,7 @@ def _waveforms(tree: Any) -> list[BreathWaveform]:
 
 
 def _check_pip(pip: Array, peep: Any, name: str, where: str) -> None:
-    """Raise unless a peak pressure is at least PEEP, as far as can be seen."""
+    """Raise unless a peak pressure is at least PEEP, if both are known."""
     check_finite(pip, name, where)
     if is_concrete(pip) and is_concrete(peep):
         if not np.all(np.asarray(pip) >= np.asarray(peep)):

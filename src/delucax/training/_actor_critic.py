@@ -98,8 +98,8 @@ def actor_critic(
 
     Both are given `environment.encode(y)`, standardised by what training sees. The last
     layers begin a hundred times smaller than usual: that of the policy near the middle
-    of the bounds, and that of the critic flat, for the slope of an estimate that has
-    seen nothing would lead a policy that follows it astray.
+    of the bounds, and that of the critic flat, because the slope of an
+    estimate that has learned nothing would lead a policy that follows it astray.
 
     **Arguments:**
 

@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import PyTree
 
-from .._check import check_count, check_key, is_concrete
+from .._check import check_at_most, check_count, check_key, is_concrete
 from .._results import choose, Result, RESULTS
 from .._typing import PRNGKey
 from ._analytic import analytic
@@ -22,7 +22,7 @@ from ._checkpoint import Checkpoint, checkpoint_path, describe_run
 from ._history import History, history_of
 from ._steps import CAPACITY, FAULTS, State, Steps
 from ._surrogate import AbstractSurrogate
-from ._trainable import take_apart
+from ._trainable import partition_trainable
 
 
 with warnings.catch_warnings():
@@ -187,8 +187,7 @@ def fit(
         )
     steps = check_count(steps, "steps", _WHERE)
     block = check_count(block, "block", _WHERE)
-    if block > CAPACITY:
-        raise ValueError(f"{_WHERE}: block must be at most {CAPACITY}, got {block}.")
+    check_at_most(block, CAPACITY, "block", _WHERE)
     seeds = _checked_seeds(key)
     data, data_size, batch_size = _checked_data(data, batch_size)
     if isinstance(loss, AbstractSurrogate) and data is not None:
@@ -214,7 +213,7 @@ def fit(
             "keys."
         )
     _check_batched(model, seeds)
-    assembly, values = take_apart(model, trainable, _WHERE)
+    assembly, values = partition_trainable(model, trainable, _WHERE)
     run = Steps(loss, gradient, optimiser, assembly, key, data, batch_size, seeds)
     state = run.start(model, values)
 
@@ -261,10 +260,7 @@ def fit(
     if np.any(faults) and throw:
         raise RuntimeError(_failure(faults, blocks[-1], done))
     outcome = lambda fault: choose(fault > 0, RESULTS.diverged, RESULTS.successful)
-    if seeds is None:
-        result = RESULTS.diverged if faults else RESULTS.successful
-    else:
-        result = jax.vmap(outcome)(faults)
+    result = outcome(faults) if seeds is None else jax.vmap(outcome)(faults)
     return Fitted(run.finished(state), history_of(_joined(blocks)), result)
 
 
@@ -297,10 +293,8 @@ def _checked_seeds(key: Any) -> int | None:
 
 def _check_batched(model: PyTree, seeds: int | None) -> None:
     """Raise unless each array of a model has the axis of a batch of keys in front."""
-    if seeds is None:
-        return
     for leaf in jax.tree.leaves(eqx.filter(model, eqx.is_array)):
-        if leaf.shape[:1] != (seeds,):
+        if seeds is not None and leaf.shape[:1] != (seeds,):
             raise ValueError(
                 f"{_WHERE}: each array of model must have the axis of the {seeds} keys "
                 "in front, as equinox.filter_vmap(make)(keys) gives it, got one of "
@@ -328,11 +322,7 @@ def _checked_data(
     size = shapes[0][0]
     if batch_size is not None:
         batch_size = check_count(batch_size, "batch_size", _WHERE)
-        if batch_size > size:
-            raise ValueError(
-                f"{_WHERE}: batch_size must be at most the {size} rows of data, got "
-                f"{batch_size}."
-            )
+        check_at_most(batch_size, size, "batch_size", _WHERE, "rows of data")
     return data, size, batch_size
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_count, check_positive, check_range
+from .._check import check_at_most, check_count, check_positive, check_range
 from .._controller import (
     AbstractStochasticPolicy,
     check_stochastic,
@@ -54,7 +54,7 @@ class PPO(AbstractActorCriticLoss):
     An episode that its horizon cuts off is no end: the estimated cost to go stands for
     what would follow. On termination nothing follows but the final cost. Each
     [`delucax.controllers.Standardise`][] of the model, and the scale of the critic, are
-    set by what was seen before the batch, so that the ratio begins at 1; one batch is
+    set by what was observed before the batch, so that the ratio begins at 1; one batch is
     run before the first step for them. A policy with a memory is trained on whole
     episodes, through its memory; one without on single steps in random order.
 
@@ -134,11 +134,7 @@ class PPO(AbstractActorCriticLoss):
             )
         rows, total_cost = self._rows(model, key)
         count = rows.times.shape[0]
-        if count < self.minibatches:
-            raise ValueError(
-                f"PPO: minibatches must be at most the {count} rows of a batch, got "
-                f"{self.minibatches}."
-            )
+        check_at_most(self.minibatches, count, "minibatches", "PPO", "rows of a batch")
         none = Statistics.empty(model, rows.costs.dtype)
         statistics = none.updated(model, rows)
         zero = jnp.zeros((), int)

@@ -206,7 +206,7 @@ def _over_seeds(
 ) -> Callable[..., Any]:
     """`function` over a leading axis of every argument, or as it is for one seed.
 
-    `last` says of the last argument alone whether it has that axis.
+    `last` is `None` if the last argument does not have that axis.
     """
     if seeds is None:
         return function

@@ -28,7 +28,7 @@ class Identified(eqx.Module):
     fit). Along each there is a spread, the standard deviation of the estimate; where it
     is as large as the parameter itself, or the data do not depend on it at all, the
     direction is not identifiable: the parameters can be moved along it together, and
-    nothing is seen of it.
+    the data do not change.
 
     **Attributes:**
 
@@ -70,8 +70,8 @@ class Identified(eqx.Module):
         controls = jax.random.normal(jax.random.key(0), (50, 1))
         true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
         states = dlx.open_loop(true, [0.0, 0.0], controls)
-        found = dlx.training.sysid.linear(states, controls)
-        print(found.report())
+        fit = dlx.training.sysid.linear(states, controls)
+        print(fit.report())
         ```
     """
 
@@ -152,7 +152,7 @@ def checked(fit: Identified, throw: bool) -> Identified:
 
 
 class Certainty(eqx.Module):
-    """What the sensitivity of the data says of an estimate."""
+    """How certain an estimate is, from the sensitivity of the data to it."""
 
     directions: Array
     spread: Array

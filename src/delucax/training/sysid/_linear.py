@@ -57,8 +57,8 @@ def linear(
         controls = jax.random.normal(jax.random.key(0), (50, 1))
         true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
         states = dlx.open_loop(true, [0.0, 0.0], controls)
-        found = dlx.training.sysid.linear(states, controls)
-        found.model.A, found.model.B, found.std
+        fit = dlx.training.sysid.linear(states, controls)
+        fit.model.A, fit.model.B, fit.std
         ```
     """
     where = "sysid.linear"
@@ -127,8 +127,8 @@ def arx(
         true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
         angles = dlx.open_loop(true, [0.0, 0.0], controls)[:, :1]
         back = dict(outputs_back=2, controls_back=2)
-        found = dlx.training.sysid.arx(angles, controls, **back, throw=False)
-        found.estimate
+        fit = dlx.training.sysid.arx(angles, controls, **back, throw=False)
+        fit.estimate
         ```
     """
     where = "sysid.arx"

@@ -140,7 +140,7 @@ def solve(
     correlation = jnp.sqrt(jnp.sum(data.counts)) * jnp.max(
         paired / jnp.where(each > 0, each, 1)
     )
-    # The correlation of rounding says nothing.
+    # The correlation of rounding errors has no meaning.
     correlation = jnp.where(sigma < 0.5, 0, correlation)
     noise = data.noise * jnp.sqrt(each * size / free)
     values = unravel(theta)

@@ -10,7 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._check import check_count, check_instance, check_key, check_positive, check_step
+from ..._check import (
+    check_at_most,
+    check_count,
+    check_instance,
+    check_key,
+    check_positive,
+    check_step,
+)
 from ..._module import as_module, names_of, parameter, positive, weight
 from ..._results import Result, RESULTS
 from ..._typing import PRNGKey, RealScalar
@@ -156,10 +163,7 @@ def windows(
     steps = check_count(steps, "steps", where)
     check_step(dt, where)
     runs, total = controls.shape[:2]
-    if steps > total:
-        raise ValueError(
-            f"{where}: steps must be at most the {total} of a run, got {steps}."
-        )
+    check_at_most(steps, total, "steps", where, "of a run")
     begins = np.arange(total - steps + 1)
     inside = begins[:, None] + np.arange(steps + 1)
     count = runs * len(begins)

@@ -19,7 +19,7 @@ from ..._check import (
 from ..._module import as_float_array
 from ..._results import RESULTS
 from ...dynamics import AbstractDynamics, open_loop
-from .._trainable import Assembly, take_apart
+from .._trainable import Assembly, partition_trainable
 from ._identified import checked, CORRELATED, Identified, reach
 from ._linear import runs_of
 from ._multiple_shooting import (
@@ -108,8 +108,8 @@ def physical(
         states = dlx.open_loop(true, [3.0, 0.0], controls)
         guess = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         fit = dlx.training.sysid.physical
-        found = fit(guess, states, controls, "system.length", window=20)
-        found.estimate, found.low, found.high
+        fitted = fit(guess, states, controls, "system.length", window=20)
+        fitted.estimate, fitted.low, fitted.high
         ```
     """
     where = "sysid.physical"
@@ -141,7 +141,7 @@ def physical(
             f"{where}: x0 must be given where the state (of size {n}) is not what is "
             f"observed (of size {size})."
         )
-    assembly, values = take_apart(dynamics, parameters, where)
+    assembly, values = partition_trainable(dynamics, parameters, where)
     names = [
         path + (f"[{','.join(map(str, index))}]" if index else "")
         for path, value in sorted(values.items())
