@@ -28,8 +28,8 @@ class PressureSensor(AbstractWrapper):
 
     **Arguments:** `dynamics`: of a lung; it observes one number.
 
-    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or observes more
-    than one number.
+    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or observes
+    more than one number.
 
     !!! example
 
@@ -101,7 +101,8 @@ class BreathCost(AbstractCost):
     - `index`: the place of the pressure in the state.
     - `limit`: a pressure [cmH2O]; none by default.
 
-    **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`, or the limit is not positive.
+    **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`, or the limit is
+    not positive.
 
     !!! example
 
@@ -201,7 +202,8 @@ def ventilation(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or if `waveform` is not a `BreathWaveform`.
+    **Raises:** `ValueError` on illegal numbers, or if `waveform` is not a
+    `BreathWaveform`.
 
     !!! example
 
@@ -238,7 +240,8 @@ def lung_environment(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if it is no such model, or `waveform` is not a `BreathWaveform`.
+    **Raises:** `ValueError` if it is no such model, or `waveform` is not a
+    `BreathWaveform`.
 
     !!! example
 

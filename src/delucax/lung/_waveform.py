@@ -3,7 +3,6 @@
 from typing import Any, TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -17,7 +16,13 @@ from .._check import (
     is_concrete,
 )
 from .._message import shortened
-from .._module import as_float_array, check_parameters, parameter, positive
+from .._module import (
+    as_float_array,
+    check_parameters,
+    parameter,
+    parts_of,
+    positive,
+)
 
 
 _T = TypeVar("_T")
@@ -187,8 +192,7 @@ def as_pips(pips: Any, tree: Any, where: str) -> Array:
 
 def _waveforms(tree: Any) -> list[BreathWaveform]:
     """The breath waveforms in a pytree."""
-    is_waveform = lambda node: isinstance(node, BreathWaveform)
-    return list(filter(is_waveform, jax.tree.leaves(tree, is_leaf=is_waveform)))
+    return parts_of((tree,), BreathWaveform)
 
 
 def _check_pip(pip: Array, peep: Any, name: str, where: str) -> None:

@@ -54,7 +54,7 @@ class PPO(AbstractActorCriticLoss):
     An episode that its horizon cuts off is no end: the estimated cost to go stands for
     what would follow. On termination nothing follows but the final cost. Each
     [`delucax.controllers.Standardise`][] of the model, and the scale of the critic, are
-    set by what was observed before the batch, so that the ratio begins at 1; one batch is
+    set by the batches before, so that the ratio begins at 1; one batch is
     run before the first step for them. A policy with a memory is trained on whole
     episodes, through its memory; one without on single steps in random order.
 

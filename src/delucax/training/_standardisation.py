@@ -8,6 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._module import parts_of
 from ..controllers import Standardise
 from ._actor_critic import ActorCritic
 from ._actor_critic_loss import Episodes
@@ -57,7 +58,7 @@ class Statistics(NamedTuple):
     @staticmethod
     def empty(model: ActorCritic, dtype: Any) -> "Statistics":
         """Of no observations yet."""
-        features = [Moments.empty(one.mean) for one in _standardisers(model)]
+        features = [Moments.empty(one.mean) for one in parts_of(model, Standardise)]
         return Statistics(features, Moments.empty(jnp.zeros((), dtype)))
 
     def updated(self, model: ActorCritic, runs: Episodes) -> "Statistics":
@@ -66,7 +67,9 @@ class Statistics(NamedTuple):
         valid, targets = runs.valid.reshape(-1), runs.targets.reshape(-1)
         features = [
             old.joined(jax.vmap(one.of)(rows), valid)
-            for one, old in zip(_standardisers(model), self.features, strict=True)
+            for one, old in zip(
+                parts_of(model, Standardise), self.features, strict=True
+            )
         ]
         return Statistics(features, self.targets.joined(targets, valid))
 
@@ -74,15 +77,11 @@ class Statistics(NamedTuple):
         """The model, standardised by these moments."""
 
         def places(model):
-            each = [leaf for s in _standardisers(model) for leaf in (s.mean, s.std)]
+            each = [
+                leaf for s in parts_of(model, Standardise) for leaf in (s.mean, s.std)
+            ]
             return (*each, model.shift, model.scale)
 
         new = [v for m in (*self.features, self.targets) for v in (m.mean, m.std)]
         new = [n.astype(o.dtype) for n, o in zip(new, places(model), strict=True)]
         return eqx.tree_at(places, model, tuple(lax.stop_gradient(new)))
-
-
-def _standardisers(model: ActorCritic) -> list[Standardise]:
-    """Each `Standardise` in a model, in the order of its leaves."""
-    is_one = lambda node: isinstance(node, Standardise)
-    return [node for node in jax.tree.leaves(model, is_leaf=is_one) if is_one(node)]

@@ -37,7 +37,8 @@ class Attack(NamedTuple):
         env = dlx.make("pendulum")
         feedback = dlx.controllers.Linear([[20.0, 5.0]])
         options = dict(bound=0.01, x0=[0.1, 0.0], horizon=30, iterations=5)
-        attack = dlx.training.worst_case(env, feedback, key=jax.random.key(0), **options)
+        search = dlx.training.worst_case
+        attack = search(env, feedback, key=jax.random.key(0), **options)
         attack.w.shape, attack.costs
         ```
     """
