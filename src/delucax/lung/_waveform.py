@@ -16,13 +16,7 @@ from .._check import (
     is_concrete,
 )
 from .._message import shortened
-from .._module import (
-    as_float_array,
-    check_parameters,
-    parameter,
-    parts_of,
-    positive,
-)
+from .._module import as_float_array, check_parameters, parameter, parts_of, positive
 
 
 _T = TypeVar("_T")

@@ -7,7 +7,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
 from .._check import check_bool, check_count, check_instance, check_range
 from .._typing import PRNGKey, RealScalar
@@ -65,10 +65,6 @@ class AbstractActorCriticLoss(AbstractSurrogate):
 
     def finished(self, model: ActorCritic, memory: Any) -> ActorCritic:
         return memory.statistics.applied_to(model)
-
-    def _check_model(self, model: PyTree) -> None:
-        """Raise unless `model` is an actor and a critic."""
-        check_instance(model, ActorCritic, "model", type(self).__name__)
 
     def _episodes(
         self, model: ActorCritic, key: PRNGKey, truncate: int | None = None

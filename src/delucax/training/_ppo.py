@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_at_most, check_count, check_positive, check_range
+from .._check import (
+    check_at_most,
+    check_count,
+    check_instance,
+    check_positive,
+    check_range,
+)
 from .._controller import (
     AbstractStochasticPolicy,
     check_stochastic,
@@ -123,7 +129,7 @@ class PPO(AbstractActorCriticLoss):
         check_range(self.entropy_weight, "entropy_weight", "PPO")
 
     def init(self, model: ActorCritic, key: PRNGKey) -> _Memory:
-        self._check_model(model)
+        check_instance(model, ActorCritic, "model", "PPO")
         policy = _policy_of(model)
         unbounded = isinstance(policy, Gaussian) and policy.bounds is None
         if unbounded and self.environment.control_bounds is not None:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, PyTree
 
-from .._check import check_count, check_range
+from .._check import check_count, check_instance, check_range
 from .._module import parameter
 from .._typing import PRNGKey, RealScalar
 from ..environments import Environment
@@ -107,7 +107,7 @@ class SHAC(AbstractActorCriticLoss):
         check_count(self.refresh, "refresh", "SHAC")
 
     def init(self, model: ActorCritic, key: PRNGKey) -> _Memory:
-        self._check_model(model)
+        check_instance(model, ActorCritic, "model", "SHAC")
         none = Statistics.empty(model, self.environment.dt.dtype)
         statistics = none
         # Twice: what the targets are depends on the scale of the critic.

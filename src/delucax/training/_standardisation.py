@@ -65,21 +65,16 @@ class Statistics(NamedTuple):
         """With the valid ones of more observations and targets."""
         rows = runs.observations.reshape(-1, runs.observations.shape[-1])
         valid, targets = runs.valid.reshape(-1), runs.targets.reshape(-1)
-        features = [
-            old.joined(jax.vmap(one.of)(rows), valid)
-            for one, old in zip(
-                parts_of(model, Standardise), self.features, strict=True
-            )
-        ]
+        parts = zip(parts_of(model, Standardise), self.features, strict=True)
+        features = [old.joined(jax.vmap(one.of)(rows), valid) for one, old in parts]
         return Statistics(features, self.targets.joined(targets, valid))
 
     def applied_to(self, model: ActorCritic) -> ActorCritic:
         """The model, standardised by these moments."""
 
         def places(model):
-            each = [
-                leaf for s in parts_of(model, Standardise) for leaf in (s.mean, s.std)
-            ]
+            parts = parts_of(model, Standardise)
+            each = [leaf for part in parts for leaf in (part.mean, part.std)]
             return (*each, model.shift, model.scale)
 
         new = [v for m in (*self.features, self.targets) for v in (m.mean, m.std)]
