@@ -260,8 +260,8 @@ def fit(
     if np.any(faults) and throw:
         raise RuntimeError(_failure(faults, blocks[-1], done))
     outcome = lambda fault: choose(fault > 0, RESULTS.diverged, RESULTS.successful)
-    result = outcome(faults) if seeds is None else jax.vmap(outcome)(faults)
-    return Fitted(run.finished(state), history_of(_joined(blocks)), result)
+    each = outcome if seeds is None else jax.vmap(outcome)
+    return Fitted(run.finished(state), history_of(_joined(blocks)), each(state.fault))
 
 
 def _failure(faults: np.ndarray, rows: dict[str, np.ndarray], done: int) -> str:
