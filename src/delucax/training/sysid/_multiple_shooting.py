@@ -46,7 +46,6 @@ class Solution(NamedTuple):
 
     values: dict[str, Array]
     starts: Float[Array, "windows n"]
-    cost: Float[Array, ""]
     legal: Float[Array, " p"]
     certainty: Certainty
     noise: Float[Array, " y"]
@@ -155,7 +154,7 @@ def solve(
     result = choose(jnp.isfinite(cost), result, RESULTS.diverged)
     legal = flat_legal(assembly, values)
     noise = jnp.where(jnp.isfinite(cost), noise, jnp.nan).astype(dtype)
-    return Solution(values, starts, cost, legal, certainty, noise, correlation, result)
+    return Solution(values, starts, legal, certainty, noise, correlation, result)
 
 
 def _levenberg_marquardt(

@@ -199,7 +199,7 @@ def physical(
 def _is_doubtful(solution: Solution) -> bool:
     """Whether it is known now that the iteration did not converge, or that it ended
     where what remains is correlated from step to step, as the noise is not."""
-    if not is_concrete(solution.cost):
+    if not is_concrete(solution.correlation):
         return False
     failed = solution.result != RESULTS.successful
     return bool(failed | (solution.correlation > CORRELATED))
