@@ -227,7 +227,8 @@ def fit(
             arrays, history, seconds = resumed
             _, rows = run.block(state, 0, min(2, len(history["step"])))
             saved.check_replay(history, rows)
-            state, blocks = State(*arrays, *state[3:]), [history]
+            state = State(*arrays, order=state.order, fault=state.fault)
+            blocks = [history]
     elif checkpoint_every is not None:
         raise ValueError(f"{_WHERE}: checkpoint_every needs checkpoint, a path.")
     every = 10 * block if checkpoint_every is None else checkpoint_every

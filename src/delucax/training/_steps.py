@@ -124,11 +124,11 @@ class Steps(NamedTuple):
         values, memory, order = before.values, before.memory, before.order
         own_key = jr.fold_in(key, k)
         arguments = () if self.data is None else (self.data,)
-        if self.batch_size is not None:
+        if self.batch_size is not None and order is not None:
             order_key = jr.fold_in(key, _ORDER)
             rows, order = _drawn_rows(order_key, order, k, self.batch_size)
             arguments = (jax.tree.map(lambda leaf: leaf[rows], self.data),)
-        if memory is not None:
+        if isinstance(self.loss, AbstractSurrogate):
             own_key, memory_key = jr.split(own_key)
             memory = self.loss.update(assembly(values), memory, k, memory_key)
             _check_memory(self.loss, before.memory, memory)
@@ -167,7 +167,7 @@ class Steps(NamedTuple):
         # A seed that failed stays as it was while the others go on.
         if self.seeds is not None:
             fault = jnp.where(before.fault == 0, fault, before.fault)
-        stepped = jax.tree.map(
+        stepped: Any = jax.tree.map(
             lambda new, old: jnp.where(fault == 0, new, old),
             (moved, after, memory),
             before[:3],
