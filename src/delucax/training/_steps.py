@@ -173,7 +173,7 @@ class Steps(NamedTuple):
             before[:3],
         )
         row = {"loss": strong(cost), "gradient_norm": norm, **metrics}
-        return State(*stepped, order, fault), row
+        return State(*stepped, order=order, fault=fault), row
 
 
 @eqx.filter_jit
