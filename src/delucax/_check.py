@@ -289,3 +289,12 @@ def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
             f"{shortened(value)}."
         )
     return int(value)
+
+
+def check_at_most(
+    value: int, most: int, name: str, where: str, of: str | None = None
+) -> None:
+    """Raise unless a count is at most `most`, the number `of` something."""
+    if value > most:
+        limit = most if of is None else f"the {most} {of}"
+        raise ValueError(f"{where}: {name} must be at most {limit}, got {value}.")

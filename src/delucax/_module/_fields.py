@@ -270,8 +270,9 @@ def children_of(node: Any) -> dict[str, Any]:
 _Part = TypeVar("_Part", bound=eqx.Module)
 
 
-def parts_of(module: eqx.Module, kind: type[_Part]) -> list[_Part]:
-    """The modules of a class inside of another one; not those inside of them."""
+def parts_of(module: Any, kind: type[_Part]) -> list[_Part]:
+    """The modules of a class inside of another one, or of any pytree; not those inside
+    of them."""
     is_part = lambda node: isinstance(node, kind) and node is not module
     nodes = jax.tree.leaves(module, is_leaf=is_part)
     return [node for node in nodes if is_part(node)]

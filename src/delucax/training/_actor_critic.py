@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_instance, check_key
+from .._check import check_choice, check_instance, check_key
 from .._controller import AbstractController, check_controller
 from .._module import parameter
 from .._typing import PRNGKey, RealScalar
@@ -98,8 +98,8 @@ def actor_critic(
 
     Both are given `environment.encode(y)`, standardised by what training sees. The last
     layers begin a hundred times smaller than usual: that of the policy near the middle
-    of the bounds, and that of the critic flat, for the slope of an estimate that has
-    seen nothing would lead a policy that follows it astray.
+    of the bounds, and that of the critic flat, because the slope of an
+    estimate that has learned nothing would lead a policy that follows it astray.
 
     **Arguments:**
 
@@ -132,11 +132,7 @@ def actor_critic(
     """
     where = "actor_critic"
     check_instance(environment, Environment, "environment", where)
-    if head not in ("deterministic", "gaussian", "categorical"):
-        raise ValueError(
-            f"{where}: head must be 'deterministic', 'gaussian' or 'categorical', got "
-            f"{head!r}."
-        )
+    check_choice(head, ("deterministic", "gaussian", "categorical"), "head", where)
     policy_key, critic_key = jr.split(check_key(key, where))
     size = environment.feature_size
     features = Standardise(jnp.zeros(size), features=environment.encode)

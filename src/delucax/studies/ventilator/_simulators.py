@@ -79,7 +79,9 @@ def explored(size: Size) -> lung.Breaths:
     return stack_breaths(
         [
             lung.explore(
-                lung.double_compartment(R, C, sensor_delay=size.sensor_delay),
+                lung.double_compartment(
+                    resistance=R, compliance=C, sensor_delay=size.sensor_delay
+                ),
                 size.breaths,
                 key=jr.key(i),
                 resistance=R,

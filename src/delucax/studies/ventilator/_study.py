@@ -132,10 +132,12 @@ def lung_study(
 
     between = None
     if recorded is None:
-        late: Any = dict(sensor_delay=sensor_delay)
-        envs = lung.stack([lung.double_compartment(*each, **late) for each in lungs])
+        env_of = lambda each: lung.double_compartment(
+            lung.DoubleCompartment(*each), sensor_delay=sensor_delay
+        )
+        envs = lung.stack([env_of(each) for each in lungs])
         around = [size.between[i % len(size.between)] for i in range(len(lungs))]
-        others = lung.stack([lung.double_compartment(*each, **late) for each in around])
+        others = lung.stack([env_of(each) for each in around])
         between = others, [_lung_name(*each) for each in size.between]
         judge = "the lungs themselves"
     else:
