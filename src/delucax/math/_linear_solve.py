@@ -36,10 +36,17 @@ def full_precision(function: Callable) -> Callable:
 def solve(
     matrix: Float[Array, "n n"], right: Float[Array, "n k"]
 ) -> Float[Array, "n k"]:
-    """`matrix^-1 right`, with one factorisation; not finite where `matrix` is singular.
+    """`matrix^-1 right`, with one factorisation; not finite where `matrix` is singular."""
+    return factorised(matrix)(right)
 
-    A small matrix is eliminated entry by entry: one member of a batch is
-    then a lane of vector instructions, where LAPACK would be called for each.
+
+def factorised(
+    matrix: Float[Array, "n n"],
+) -> Callable[[Float[Array, "n k"]], Float[Array, "n k"]]:
+    """`right -> matrix^-1 right`, for more than one right side in turn.
+
+    A small matrix is eliminated entry by entry: one member of a batch is then a lane of
+    vector instructions, where LAPACK would be called for each.
     """
     operator = lx.MatrixLinearOperator(matrix)
     solver = _Elimination() if matrix.shape[0] <= SMALL else lx.LU()
@@ -48,7 +55,7 @@ def solve(
     def column(b):
         return lx.linear_solve(operator, b, solver, state=state, throw=False).value
 
-    return jax.vmap(column, in_axes=1, out_axes=1)(right)
+    return jax.vmap(column, in_axes=1, out_axes=1)
 
 
 class _Elimination(lx.AbstractLinearSolver):

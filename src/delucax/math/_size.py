@@ -5,23 +5,34 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 
-def size(*matrices: Array) -> Array:
-    """The sum of the Frobenius norms."""
-    scale = _largest(*matrices)
-    return scale * sum(jnp.linalg.norm(M / scale) for M in matrices)
+def size(matrix: Array) -> Array:
+    """The Frobenius norm."""
+    scale = one_if_zero(jnp.max(jnp.abs(matrix)))
+    return scale * _norm(matrix / scale)
 
 
 def relative_size(error: Array, *terms: Array) -> Array:
     """The norm of what is left of an equation, over the sum of those of its terms."""
-    scale = _largest(*terms)
-    total = sum(jnp.linalg.norm(M / scale) for M in terms)
-    return jnp.linalg.norm(error / scale) / jnp.where(total == 0, 1, total)
+    return relative_and_total_size(error, *terms)[0]
 
 
-def _largest(*matrices):
-    """The largest magnitude, or 1 if there is none. A NaN stays one."""
-    largest = jnp.max(jnp.stack([jnp.max(jnp.abs(M), initial=0) for M in matrices]))
-    return jnp.where(largest == 0, 1, largest)
+def relative_and_total_size(error: Array, *terms: Array) -> tuple[Array, Array]:
+    """The norm of what is left of an equation over the sum of those of its terms, and
+    this sum. All have one shape."""
+    stack = jnp.stack(terms)
+    # A NaN stays one.
+    scale = one_if_zero(jnp.max(jnp.abs(stack)))
+    total = jnp.sum(_norm(stack / scale))
+    return _norm(error / scale) / one_if_zero(total), scale * total
+
+
+def one_if_zero(x: Array) -> Array:
+    """Numbers to divide by."""
+    return x + (x == 0)
+
+
+def _norm(matrix):
+    return jnp.sqrt(jnp.sum(matrix * matrix, axis=(-2, -1)))
 
 
 def power_of_two(x: Array) -> Array:

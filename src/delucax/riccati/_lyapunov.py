@@ -4,7 +4,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..math._linear_solve import solve
+from ..math._linear_solve import factorised
 from ..math._size import relative_size
 from ._stein import smith
 
@@ -43,37 +43,39 @@ def stable_sylvester(
     logs = jnp.linalg.slogdet(A)[1]
     logs = 2 * logs if B is None else logs + jnp.linalg.slogdet(B)[1]
     c = jnp.exp(logs / (2 * n if B is None else n + m))
-    eye_A, eye_B = jnp.eye(n, dtype=A.dtype), jnp.eye(m, dtype=A.dtype)
-    moved_A, moved_B = A - c * eye_A, other.T - c * eye_B
-    power_A = solve(moved_A, A + c * eye_A)
-    power_B = None if B is None else solve(moved_B, B.T + c * eye_B).T
-
-    def once(C):
-        left = solve(moved_A, C)
-        both = solve(moved_B, left.T).T
-        return smith(power_A, power_B, -2 * c * both)
-
-    def measured(X):
-        left, right = A @ X, X @ other
-        rest = C - left - right
-        return rest, relative_size(rest, left, right, C)
+    shifted_A, power_A = _cayley(A, c)
+    shifted_B, power_B = (shifted_A, None) if B is None else _cayley(B.T, c)
 
     def more(carry):
         *_, going, k = carry
-        return going & (k < _REFINEMENTS)
+        return going & (k <= _REFINEMENTS)
 
     def body(carry):
         X, rest, residual, iterations, _, k = carry
-        change, doublings = once(rest)
-        rest, found = measured(X + change)
-        better = found < residual
-        X = jnp.where(better, X + change, X)
-        residual = jnp.where(better, found, residual)
+        scaled = shifted_B(shifted_A(rest).T).T
+        change, doublings = smith(
+            power_A, None if power_B is None else power_B.T, -2 * c * scaled
+        )
+        candidate = X + change
+        left, right = A @ candidate, candidate @ other
+        left_over = C - left - right
+        relative = relative_size(left_over, left, right, C)
+        # The first round solves, those after it refine.
+        better = (relative < residual) | (k == 0)
+        X = jnp.where(better, candidate, X)
+        residual = jnp.where(better, relative, residual)
         going = better & (residual > 10 * eps)
-        return X, rest, residual, iterations + doublings, going, k + 1
+        return X, left_over, residual, iterations + doublings, going, k + 1
 
-    X, iterations = once(C)
-    rest, residual = measured(X)
-    start = (X, rest, residual, iterations, residual > 10 * eps, jnp.asarray(0))
+    unknown = jnp.asarray(jnp.inf, C.dtype)
+    zero = jnp.asarray(0)
+    start = jnp.zeros_like(C), C, unknown, zero, jnp.asarray(True), zero
     X, _, _, iterations, *_ = lax.while_loop(more, body, start)
     return X, iterations
+
+
+def _cayley(A, c):
+    """The solution with `A - c`, and `(A - c)^-1 (A + c)`."""
+    shift = c * jnp.eye(len(A), dtype=A.dtype)
+    solved = factorised(A - shift)
+    return solved, solved(A + shift)

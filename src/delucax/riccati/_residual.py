@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..math._accurate import in_parts, product
 from ..math._linear_solve import solve, symmetric
-from ..math._size import relative_size, size
+from ..math._size import relative_and_total_size, relative_size
 
 
 _MARGIN = 1.01
@@ -101,8 +101,9 @@ def riccati_residual(
     bound = jnp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
 
     def in_units(d):
-        rest, *parts = (M * (d[:, None] * d) for M in (bound, *terms))
-        return _MARGIN * relative_size(rest, *parts), size(*parts)
+        rest, *parts = jnp.stack([bound, *terms]) * (d[:, None] * d)
+        relative, total = relative_and_total_size(rest, *parts)
+        return _MARGIN * relative, total
 
     # Powers of two: their products have no rounding.
     units = jnp.stack([jnp.ones(n, dtype), *others])

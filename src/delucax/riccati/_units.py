@@ -38,9 +38,9 @@ def units(
         usable = (M > 0) & jnp.isfinite(M)
         return jnp.where(usable, jnp.log2(jnp.where(usable, M, 1)), lowest)
 
-    effort = jnp.sqrt(jnp.abs(jnp.diagonal(R)))
+    effort = jnp.sqrt(_diagonal_sizes(R))
     force = jnp.max(jnp.abs(plain_B) / jnp.where(effort > 0, effort, 1), axis=1)
-    weight = logarithm(jnp.sqrt(jnp.abs(jnp.diagonal(Q))))
+    weight = logarithm(jnp.sqrt(_diagonal_sizes(Q)))
     other = ~jnp.eye(n, dtype=bool)
     inside, force = logarithm(jnp.abs(plain_A) * other), logarithm(force)
 
@@ -70,6 +70,11 @@ def units(
     apart = jnp.any(jnp.max(both, axis=1) - jnp.min(both, axis=1) > _APART)
     both = jnp.where(apart, both, 0)
     return lax.stop_gradient(power_of_two(jnp.exp2(both)))
+
+
+def _diagonal_sizes(M):
+    # `jnp.diagonal` gathers, which is slower to compile.
+    return jnp.max(jnp.where(jnp.eye(len(M), dtype=bool), jnp.abs(M), 0), axis=1)
 
 
 def in_units(by: Float[Array, "2 n"], A, B, Q, R, S, E) -> tuple:
