@@ -38,7 +38,9 @@ def _term_by_term(left, right, *added):
     Source: Ogita, Rump and Oishi, 2005.
     """
     eps, k = jnp.finfo(left.dtype).eps, left.shape[1]
-    total = off = size = jnp.zeros((len(left), right.shape[1]), left.dtype)
+    nothing = jnp.zeros((len(left), right.shape[1]), left.dtype)
+    total, *added = added or (nothing,)
+    off, size = nothing, jnp.abs(total)
     for part in added:
         total, error = _sum(total, part)
         off, size = off + error, size + jnp.abs(part)
@@ -56,7 +58,7 @@ def _term_by_term(left, right, *added):
 
     (total, off, size), _ = lax.scan(add, (total, off, size), (left.T, right))
     total += off
-    return total, eps * jnp.abs(total) + (4 * (k + len(added)) * eps) ** 2 * size
+    return total, eps * jnp.abs(total) + (4 * (k + len(added) + 1) * eps) ** 2 * size
 
 
 def _by_slices(left, right, *added):

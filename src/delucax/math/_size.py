@@ -7,28 +7,31 @@ from jaxtyping import Array
 
 def size(matrix: Array) -> Array:
     """The Frobenius norm."""
-    scale = one_if_zero(jnp.max(jnp.abs(matrix)))
+    scale = _divisor(jnp.max(jnp.abs(matrix)))
     return scale * _norm(matrix / scale)
 
 
 def relative_size(error: Array, *terms: Array) -> Array:
     """The norm of what is left of an equation, over the sum of those of its terms."""
-    return relative_and_total_size(error, *terms)[0]
+    return relative_and_total_size(error, jnp.stack(terms))[0]
 
 
-def relative_and_total_size(error: Array, *terms: Array) -> tuple[Array, Array]:
-    """The norm of what is left of an equation over the sum of those of its terms, and
-    this sum. All have one shape."""
-    stack = jnp.stack(terms)
-    # A NaN stays one.
-    scale = one_if_zero(jnp.max(jnp.abs(stack)))
-    total = jnp.sum(_norm(stack / scale))
-    return _norm(error / scale) / one_if_zero(total), scale * total
+def relative_and_total_size(error: Array, terms: Array) -> tuple[Array, Array]:
+    """The norm of what is left of an equation, or of a stack of such, over the sum of
+    those of its terms, which are stacked; and this sum."""
+    scale = _divisor(jnp.max(jnp.abs(terms)))
+    total = jnp.sum(_norm(terms / scale))
+    return _norm(error / scale) / _divisor(total), scale * total
 
 
 def one_if_zero(x: Array) -> Array:
-    """Numbers to divide by."""
+    """Numbers, with 1 for each that is zero."""
     return x + (x == 0)
+
+
+def _divisor(x):
+    # A NaN stays one.
+    return lax.max(x, jnp.finfo(x.dtype).tiny)
 
 
 def _norm(matrix):

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..math._linear_solve import full_precision, solve
+from ._arguments import RiccatiData
 from ._flow import hamiltonian, lyapunov, scale_of, short_element
 from ._game import (
-    double,
     is_semidefinite,
     players,
     polish,
@@ -19,6 +19,7 @@ from ._level import Game, search
 from ._recursion import is_clearly_definite, symmetric
 from ._residual import riccati_residual
 from ._spectrum import spectral_abscissa
+from ._start import double
 
 
 def joint_gain(A, both, weight, X):
@@ -76,12 +77,10 @@ def continuous_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     time = 0.5 / jnp.where(size > 0, size, 1)
     J, iterations = double(short_element(H, time), X0 / unit)
 
-    S = jnp.zeros_like(both)
+    data = RiccatiData(A, both, Q, weight, jnp.zeros_like(both), None)
 
     def equation(X):
-        left = riccati_residual(
-            False, A, both, Q, weight, S, None, X, False, players=D.shape[1]
-        )
+        left = riccati_residual(False, data, X, False, players=D.shape[1])
         return left.error, left.closed_loop, left.K, left
 
     X, _, loop, K, left = polish(X0 + unit * J, equation, even_lyapunov, size)

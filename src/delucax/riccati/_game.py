@@ -8,11 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..math._linear_solve import full_precision, solve
+from ._arguments import RiccatiData
 from ._level import Game
-from ._recursion import gain, is_saddle, joined, one_step, symmetric
+from ._recursion import gain, is_saddle, one_step, symmetric
 from ._residual import riccati_residual
 from ._spectrum import spectral_radius
-from ._stein import MAX_DOUBLINGS, stein
+from ._start import double
+from ._stein import stein
 
 
 NEWTON_STEPS = 4
@@ -63,10 +65,10 @@ def discrete_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     J = symmetric(A.T @ X0 @ A - X0 - A.T @ crossed.T @ K + Q)
     J, iterations = double((A - both @ K, G, J), X0)
 
+    data = RiccatiData(A, both, Q, weight, S, None)
+
     def equation(X):
-        left = riccati_residual(
-            True, A, both, Q, weight, S, None, X, False, players=D.shape[1]
-        )
+        left = riccati_residual(True, data, X, False, players=D.shape[1])
         return left.error, left.closed_loop, left.K, left
 
     X, _, loop, K, left = polish(X0 + J, equation, lambda _, *linear: stein(*linear))
@@ -77,36 +79,6 @@ def discrete_game(problem: tuple, gamma: Array, X0: Array) -> Game:
     holds &= jnp.all(jax.vmap(spectral_radius)(loops) < bound)
     solved = left.relative < rounding(n, A.dtype)
     return Game(X, left.bounds[0], holds, solved, iterations)
-
-
-def double(element, X0):
-    """The limit of joining an interval's element to itself, as `J`; and the doublings.
-
-    `X0` is what `J` is a correction to, for its size alone.
-    """
-    eps = jnp.finfo(X0.dtype).eps
-
-    def more(carry):
-        _, relative, k = carry
-        return (k < MAX_DOUBLINGS) & (relative > eps)
-
-    def body(carry):
-        element, _, k = carry
-        after = joined(element, element)
-        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in after]))
-        # What overflows is left at the last finite step: it has no stable loop, and
-        # the caller finds that out.
-        change = jnp.linalg.norm(after[2] - element[2])
-        after = tuple(
-            jnp.where(finite, new, old) for new, old in zip(after, element, strict=True)
-        )
-        size = jnp.linalg.norm(X0 + after[2])
-        relative = change / jnp.where(size == 0, 1, size)
-        return after, jnp.where(finite, relative, 0), k + 1
-
-    start = (element, jnp.asarray(jnp.inf, X0.dtype), jnp.asarray(0))
-    (_, _, J), _, iterations = lax.while_loop(more, body, start)
-    return J, iterations
 
 
 def polish(X: Array, equation: Callable, correction: Callable, unit: Array | float = 1):

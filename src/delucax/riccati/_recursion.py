@@ -10,6 +10,11 @@ from jaxtyping import Array, Bool, Float
 from ..math._linear_solve import full_precision, solve
 
 
+Element = tuple[Array, Array, Array]
+"""`A, C, J` of an interval: from `X` at its end follows `J + A' X (I + C X)^-1 A` at
+its start."""
+
+
 def symmetric(X: Float[Array, "*T n n"]) -> Float[Array, "*T n n"]:
     """The symmetric part."""
     return (X + jnp.swapaxes(X, -1, -2)) / 2
@@ -92,8 +97,6 @@ def _in_sequence(A, B, Q, R, S, final):
 
 
 def _in_parallel(A, B, Q, R, S, final):
-    # An element is the cost between two times as a function of the states there, in
-    # dual form: from `X` at its end follows `J + A' X (I + C X)^-1 A` at its start.
     # Adding x_next' P x_next - x' P x to each step changes no decision, and makes the
     # control weight definite even where R is not.
     n = A.shape[-1]
@@ -122,7 +125,7 @@ def _in_parallel(A, B, Q, R, S, final):
     return X.at[:-1].set(jax.vmap(one_step)(A, B, Q, R, S, K, X[1:]))
 
 
-def joined(first, second):
+def joined(first: Element, second: Element) -> Element:
     """The element of two intervals, one after the other.
 
     Source: Sarkka and Garcia-Fernandez, 2023.
