@@ -42,6 +42,11 @@ def is_saddle(M: Float[Array, "k k"], players: int) -> Bool[Array, ""]:
     return concave & is_clearly_definite(symmetric(U + C @ solve(safe, C.T)))
 
 
+def failed_step(X: Float[Array, "T n n"]) -> int:
+    """The last step without a solution: it is NaN there and at all before it."""
+    return int(jnp.sum(jnp.isnan(X[:, 0, 0]))) - 1
+
+
 def gain(A, B, R, S, X):
     """The stationary `K = (R + B'XB)^-1 (B'XA + S')`, and the loop `A - B K`."""
     K = solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
@@ -105,10 +110,8 @@ def _in_parallel(A, B, Q, R, S, final):
     P = jnp.where(size > 0, size, 1) * jnp.eye(n, dtype=A.dtype)
 
     def element(A, B, Q, R, S):
-        cross = B.T @ P @ A + S.T
-        solved = solve(R + B.T @ P @ B, jnp.concatenate([cross, B.T], axis=1))
-        K, C = solved[:, :n], symmetric(B @ solved[:, n:])
-        return A - B @ K, C, symmetric(A.T @ P @ A - P + Q - cross.T @ K)
+        cross = A.T @ P @ B + S
+        return step_element(A, B, R + B.T @ P @ B, cross, A.T @ P @ A - P, Q)
 
     def combine(later, earlier):
         # The scan runs backwards, so that the later of two comes first.
@@ -125,6 +128,18 @@ def _in_parallel(A, B, Q, R, S, final):
     return X.at[:-1].set(jax.vmap(one_step)(A, B, Q, R, S, K, X[1:]))
 
 
+def step_element(A, B, weight, cross, linear, Q) -> Element:
+    """The element of a step, about some `X0`.
+
+    There `weight` is `R + B'X0 B`, `cross` is `A'X0 B + S`, and `linear` is
+    `A'X0 A - X0`.
+    """
+    n = A.shape[0]
+    solved = solve(weight, jnp.concatenate([cross.T, B.T], axis=1))
+    K, G = solved[:, :n], symmetric(B @ solved[:, n:])
+    return A - B @ K, G, symmetric(linear - cross @ K + Q)
+
+
 def joined(first: Element, second: Element) -> Element:
     """The element of two intervals, one after the other.
 
@@ -137,7 +152,7 @@ def joined(first: Element, second: Element) -> Element:
     solved = solve(eye + C1 @ J2, jnp.concatenate([A1, C1], axis=1))
     moved, weighted = solved[:, :n], solved[:, n:]
     C = symmetric(C2 + A2 @ weighted @ A2.T)
-    return A2 @ moved, C, symmetric(J1 + A1.T @ J2 @ moved)
+    return A2 @ moved, C, J1 + symmetric(A1.T @ (J2 @ moved))
 
 
 def linear_recursion(loop, added, final, parallel: bool, product):

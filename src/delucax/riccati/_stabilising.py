@@ -88,7 +88,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
         solved = factorised(E)
         explicit = RiccatiData(solved(A), solved(B), Q, R, S, None)
     posed = (
-        is_semidefinite(R) if discrete else is_definite(R - _shift(eps * size(R), R))
+        is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
     )
     for M in explicit[:5]:
         posed = posed & jnp.all(jnp.isfinite(M))
@@ -112,9 +112,9 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             X, size_G, iterations = continuous_start(start, second)
         X, left = polish(
             lambda *at: riccati_residual(discrete, here, *at, by[0] * state, state),
-            lambda *at: _correction(discrete, here.E, *at),
+            lambda _, *at: _correction(discrete, here.E, *at),
             _outside(here.E, X),
-            3,
+            units=3,
         )
         loop = left.closed_loop
         if discrete:
@@ -161,16 +161,16 @@ def _certified_jvp(discrete, primals, tangents):
     # Guarded at both ends: what is not finite in a failed member stays in it.
     tangent = _where(ok, tangents[0], 0)
     safe, X = _harmless(ok, data, solution.X)
-    equation = functools.partial(_left_side, discrete, X)
+    equation = functools.partial(left_side, discrete, X)
     _, error, loop = jax.jvp(equation, (safe,), (tangent,), has_aux=True)
-    loop = jnp.where(ok, loop, _shift(-0.5, loop))
+    loop = jnp.where(ok, loop, shifted(-0.5, loop))
     change = _correction(discrete, data.E, loop, jnp.where(ok, error, 0))
     still = no_tangent(solution)
     best = still.best._replace(X=jnp.where(ok, change, 0))
     return solution, still._replace(best=best)
 
 
-def _left_side(discrete: bool, X: Array, data: RiccatiData) -> tuple[Array, Array]:
+def left_side(discrete: bool, X: Array, data: RiccatiData) -> tuple[Array, Array]:
     """The left side of the equation at `X`, and the closed loop; for derivatives."""
     A, _, Q, *_, E = data
     moved, cross, K, closed_loop = _terms(discrete, data, X)
@@ -219,7 +219,7 @@ def _harmless(ok: Bool[Array, ""], data: RiccatiData, X: Array):
     """
     A, B, Q, R, S, E = data
     A, B, Q, S, X = (jnp.where(ok, M, 0) for M in (A, B, Q, S, X))
-    R, E = (None if M is None else jnp.where(ok, M, _shift(1, M)) for M in (R, E))
+    R, E = (None if M is None else jnp.where(ok, M, shifted(1, M)) for M in (R, E))
     return RiccatiData(A, B, Q, R, S, E), X
 
 
@@ -233,13 +233,13 @@ def _outside(E: Array | None, Y: Array) -> Array:
     return Y if E is None else symmetric(solve(E.T, solve(E.T, Y).T))
 
 
-def is_semidefinite(weight: Array) -> Bool[Array, ""]:
+def is_semidefinite(weight: Array, units: float = 100) -> Bool[Array, ""]:
     """Whether a symmetric matrix has no negative eigenvalue, up to rounding."""
     rounding = weight.shape[0] * jnp.finfo(weight.dtype).eps
-    slack = 100 * rounding * one_if_zero(size(weight))
-    return is_definite(symmetric(weight) + _shift(slack, weight))
+    slack = units * rounding * one_if_zero(size(weight))
+    return is_definite(symmetric(weight) + shifted(slack, weight))
 
 
-def _shift(c, like: Array) -> Array:
+def shifted(c, like: Array) -> Array:
     """`c I`."""
     return c * jnp.eye(like.shape[0], dtype=like.dtype)

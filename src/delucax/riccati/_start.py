@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from ..math._linear_solve import solve, symmetric
 from ..math._size import one_if_zero, relative_and_total_size, size
 from ._arguments import RiccatiData
-from ._recursion import Element, joined
+from ._recursion import Element, joined, step_element
 from ._stein import MAX_DOUBLINGS
 
 
@@ -21,14 +21,11 @@ def discrete_start(data: RiccatiData, height: Float[Array, ""]) -> tuple[Array, 
     # There the control weight is invertible even where R is not, and the recursion
     # cannot rest at a solution that leaves an unstable mode unseen by Q.
     A, B, Q, R, S, _ = data
-    n = A.shape[0]
-    X0 = height * jnp.eye(n, dtype=A.dtype)
+    X0 = height * jnp.eye(A.shape[0], dtype=A.dtype)
     cross = height * (A.T @ B) + S
-    control = R + height * (B.T @ B)
-    solved = solve(symmetric(control), jnp.concatenate([cross.T, B.T], axis=1))
-    K, G = solved[:, :n], symmetric(B @ solved[:, n:])
-    reduced_Q = symmetric(height * (A.T @ A) - X0 - cross @ K + Q)
-    H, doublings = double((A - B @ K, G, reduced_Q), X0)
+    weight = symmetric(R + height * (B.T @ B))
+    element = step_element(A, B, weight, cross, height * (A.T @ A) - X0, Q)
+    H, doublings = double(element, X0)
     return X0 + H, doublings
 
 
