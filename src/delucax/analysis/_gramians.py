@@ -11,8 +11,7 @@ from jaxtyping import Array, Float
 from .._check import check_count, check_positive
 from .._typing import BoolScalar, Scalar
 from ..math._linear_solve import full_precision, symmetric
-from ..riccati._lyapunov import lyapunov
-from ..riccati._stein import stein
+from ..riccati._lyapunov import lyapunov, stein
 from ._state_space import LinearModel, raise_if, state_space, StateSpace
 
 

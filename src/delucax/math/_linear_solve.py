@@ -157,9 +157,9 @@ def is_definite(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
     return definite
 
 
-def symmetric(X: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def symmetric(X: Float[Array, "*T n n"]) -> Float[Array, "*T n n"]:
     """The symmetric part."""
-    return (X + X.T) / 2
+    return (X + X.mT) / 2
 
 
 def no_tangent(tree: Any) -> Any:

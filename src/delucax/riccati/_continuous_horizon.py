@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from .._check import as_matrix, symmetric_matrix
 from .._results import choose, Result, RESULTS
-from ..math._linear_solve import full_precision, solve
+from ..math._linear_solve import full_precision, solve, symmetric
 from ._flow import flow_values
 from ._horizon_arguments import (
     check_shapes,
@@ -17,7 +17,7 @@ from ._horizon_arguments import (
     common_dtype,
     final_weight,
 )
-from ._recursion import failed_step, is_clearly_definite, symmetric
+from ._recursion import failed_step, is_clearly_definite
 from ._solution import checked
 
 

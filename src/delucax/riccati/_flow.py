@@ -7,8 +7,8 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..math._linear_solve import full_precision, solve
-from ._recursion import joined, symmetric
+from ..math._linear_solve import full_precision, solve, symmetric
+from ._recursion import joined
 
 
 _MAX_HALVINGS = 40

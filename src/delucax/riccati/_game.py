@@ -13,14 +13,13 @@ from ..math._size import one_if_zero, size
 from ._arguments import RiccatiData
 from ._flow import hamiltonian, scale_of, short_element
 from ._level import bisect_level, Game
-from ._lyapunov import lyapunov
+from ._lyapunov import lyapunov, stein
 from ._newton import polish
 from ._recursion import is_clearly_definite, is_saddle, step_element
 from ._residual import riccati_residual, stationary
 from ._spectrum import spectral_abscissa, spectral_radius
 from ._stabilising import is_semidefinite, left_side, shifted
 from ._start import double
-from ._stein import stein
 
 
 def players(B, D, R, gamma) -> tuple[Array, Array]:

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._results import choose, Result, RESULTS
-from ..math._linear_solve import full_precision, solve
+from ..math._linear_solve import full_precision, solve, symmetric
 from ._flow import flow_values
 from ._game import inverse_margins, joint, joint_gain, players
 from ._hinfinity import checked_game, checked_level, level_of, LOOSE
 from ._horizon_arguments import checked_times, final_weight, in_time, symmetric_stack
 from ._level import bisect_level, followed, Game
-from ._recursion import gain, is_clearly_definite, sanitised, symmetric, values
+from ._recursion import gain, is_clearly_definite, sanitised, values
 from ._solution import checked
 from ._stabilising import shifted
 

@@ -63,7 +63,7 @@ def bisect_level(
     """The game at `gamma`, or at the least level; and the level. No derivatives.
 
     The first trial is without a disturbance, from `start`. It tells whether there is
-    any level, and about where; and the others start at what it found. The level is the
+    any level, and about where; and the others start at its solution. The level is the
     upper, feasible end of a bracket that is narrower than `tolerance`, relatively. It
     is 0 where no disturbance has any effect.
     """

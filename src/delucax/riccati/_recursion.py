@@ -7,17 +7,12 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..math._linear_solve import full_precision, solve
+from ..math._linear_solve import full_precision, solve, symmetric
 
 
 Element = tuple[Array, Array, Array]
 """`A, C, J` of an interval: from `X` at its end follows `J + A' X (I + C X)^-1 A` at
 its start."""
-
-
-def symmetric(X: Float[Array, "*T n n"]) -> Float[Array, "*T n n"]:
-    """The symmetric part."""
-    return (X + jnp.swapaxes(X, -1, -2)) / 2
 
 
 def is_clearly_definite(M: Float[Array, "n n"]) -> Bool[Array, ""]:

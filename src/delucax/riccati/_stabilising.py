@@ -18,14 +18,13 @@ from ..math._linear_solve import (
 )
 from ..math._size import one_if_zero, size
 from ._arguments import complex_form, is_complex, real_form, RiccatiData
-from ._lyapunov import lyapunov
+from ._lyapunov import lyapunov, stein
 from ._newton import polish
 from ._residual import riccati_residual, stationary
 from ._search import Attempt, Candidate, search, SearchResult, SECOND, weights
 from ._solution import RiccatiSolution
 from ._spectrum import abscissa_and_size, spectral_radius
 from ._start import continuous_start, discrete_start
-from ._stein import stein
 from ._units import in_units, units
 
 

@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float
 from ..math._linear_solve import solve, symmetric
 from ..math._size import one_if_zero, relative_and_total_size, size
 from ._arguments import RiccatiData
+from ._lyapunov import MAX_DOUBLINGS
 from ._recursion import Element, joined, step_element
-from ._stein import MAX_DOUBLINGS
 
 
 _SIGN_STEPS = 60
