@@ -1,7 +1,7 @@
 """What the solvers of matrix equations return."""
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, runtime_checkable, TypeVar
 
 import equinox as eqx
 from jaxtyping import Array
@@ -10,6 +10,7 @@ from .._check import is_concrete
 from .._results import Result, RESULTS
 
 
+@runtime_checkable
 class _HasResult(Protocol):
     result: Result
 

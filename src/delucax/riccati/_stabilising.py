@@ -232,7 +232,7 @@ def _outside(E: Array | None, Y: Array) -> Array:
     return Y if E is None else symmetric(solve(E.T, solve(E.T, Y).T))
 
 
-def is_semidefinite(weight: Array, units: float = 100) -> Bool[Array, ""]:
+def is_semidefinite(weight: Array, units: int = 100) -> Bool[Array, ""]:
     """Whether a symmetric matrix has no negative eigenvalue, up to rounding."""
     rounding = weight.shape[0] * jnp.finfo(weight.dtype).eps
     slack = units * rounding * one_if_zero(size(weight))
