@@ -122,10 +122,11 @@ def checked(
     return solution
 
 
-def _facts(solution: RiccatiSolution | MatrixSolution) -> str:
+def _facts(solution: Any) -> str:
     known = f"Relative residual {float(solution.residual):.1e}"
     if isinstance(solution, RiccatiSolution):
         radius, abscissa = solution.spectral_radius, solution.spectral_abscissa
         name, bound = ("abscissa", abscissa) if radius is None else ("radius", radius)
+        assert bound is not None
         known += f", spectral {name} of the closed loop {float(bound):.6g}"
     return f"{known}."

@@ -106,7 +106,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
         if discrete:
             height = size_Q * jnp.where(second, _SECOND_START, 1)
             X, iterations = discrete_start(start, height)
-            size_G = None
+            size_G = jnp.zeros_like(size_Q)  # not needed
         else:
             X, size_G, iterations = continuous_start(start, second)
         X, left = polish(
@@ -218,7 +218,8 @@ def _harmless(ok: Bool[Array, ""], data: RiccatiData, X: Array):
     """
     A, B, Q, R, S, E = data
     A, B, Q, S, X = (jnp.where(ok, M, 0) for M in (A, B, Q, S, X))
-    R, E = (None if M is None else jnp.where(ok, M, shifted(1, M)) for M in (R, E))
+    R = jnp.where(ok, R, shifted(1, R))
+    E = None if E is None else jnp.where(ok, E, shifted(1, E))
     return RiccatiData(A, B, Q, R, S, E), X
 
 
