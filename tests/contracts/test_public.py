@@ -128,7 +128,7 @@ LONG = {
     studies.train_swing_up lung.explore lung.fit_lungs lung.LearnedLung
     lung.least_error lung.pid_grid lung.ShootingMPC lung.train_controllers
     lung.write_example planning.cem planning.Constraints planning.ilqr planning.Plan
-    plotting.phase_portrait randomise riccati.ContinuousGameSolution
+    plotting.phase_portrait randomise
     riccati.ContinuousHorizonSolution riccati.dre riccati.hinf_care riccati.hinf_cre
     riccati.hinf_dre simulate training.analytic training.EvolutionStrategies
     training.expected_cost training.fit training.PPO training.scored_cost

@@ -10,8 +10,7 @@ from .._check import check_count, check_positive
 from .._results import raise_if
 from .._typing import BoolScalar, RealScalar, Scalar
 from ..math._linear_solve import full_precision, symmetric
-from ..riccati._lyapunov import lyapunov
-from ..riccati._stein import stein
+from ..riccati._lyapunov import lyapunov, stein
 from ._state_space import LinearModel, state_space, StateSpace
 
 
