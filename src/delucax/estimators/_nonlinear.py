@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._check import check_instance, check_number, check_positive, is_concrete
+from .._jax import jacobian
 from .._module import function_field, parameter, positive
 from .._results import RESULTS
 from ..dynamics import AbstractDynamics
-from ..dynamics._linearize import _jacobian
 from ._gaussian import AbstractGaussianFilter, first_belief, noise_covariances
 from ._moments import congruence, LinearJoint, SampledJoint, square_root
 
@@ -95,11 +95,11 @@ class ExtendedKalmanFilter(AbstractGaussianFilter):
 
     def _observation(self, t, belief):
         observe = lambda x: self.dynamics.observe(t, x)
-        C = _jacobian(observe)(belief.mean)
+        C = jacobian(observe)(belief.mean)
         return LinearJoint(observe(belief.mean), belief.covariance, C, self.V)
 
     def _transition(self, t, u, belief):
-        A = _jacobian(lambda x: _advanced(self.dynamics, t, x, u))(belief.mean)
+        A = jacobian(lambda x: _advanced(self.dynamics, t, x, u))(belief.mean)
         mean = _advanced(self.dynamics, t, belief.mean, u)
         noise = _added_covariance(self, t, u, belief.mean)
         return LinearJoint(mean, belief.covariance, A, noise)
@@ -264,5 +264,5 @@ def _added_covariance(estimator: Any, t: Any, u: Array, x: Array) -> Array:
     """`E W E'`, what the disturbance adds to the covariance of the next state."""
     dynamics, W = estimator.dynamics, estimator.W
     w = jnp.zeros(W.shape[0], x.dtype)
-    E = _jacobian(lambda w: _advanced(dynamics, t, x, u, w))(w)
+    E = jacobian(lambda w: _advanced(dynamics, t, x, u, w))(w)
     return congruence(E, W)
