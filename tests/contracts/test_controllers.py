@@ -162,9 +162,11 @@ CASES = {
     "LQI": Case(lqi),
     "LQG": Case(lqg),
     "LQG from the start": Case(lambda size: lqg(size, steady_state=False)),
-    "OutputFeedback": Case(lambda size: estimated(c.ExtendedKalmanFilter, size)),
+    "OutputFeedback": Case(
+        lambda size: estimated(dlx.estimators.ExtendedKalmanFilter, size)
+    ),
     "OutputFeedback of an unscented filter": Case(
-        lambda size: estimated(c.UnscentedKalmanFilter, size)
+        lambda size: estimated(dlx.estimators.UnscentedKalmanFilter, size)
     ),
     "HInfinity": Case(hinfinity),
     "HInfinity over a horizon": Case(lambda size: hinfinity(size, horizon=8)),

@@ -14,7 +14,7 @@ from .._jax import jacobian
 from .._module import function_field, parameter, positive
 from .._results import RESULTS
 from ..dynamics import AbstractDynamics
-from ._gaussian import AbstractGaussianFilter, first_belief, noise_covariances
+from ._gaussian import AbstractGaussianFilter, gaussian_model
 from ._moments import congruence, LinearJoint, SampledJoint, square_root
 
 
@@ -83,10 +83,8 @@ class ExtendedKalmanFilter(AbstractGaussianFilter):
         where = "ExtendedKalmanFilter"
         _check_dynamics(dynamics, where)
         self.dynamics = dynamics
-        self.W, self.V = noise_covariances(dynamics, W, V, where)
-        zero = jnp.zeros(dynamics.state_size, self.W.dtype)
-        self.mean, self.covariance = first_belief(
-            mean, covariance, zero, (self.W, self.V), where
+        self.W, self.V, self.mean, self.covariance = gaussian_model(
+            dynamics, W, V, mean, covariance, None, where
         )
         self.observation_difference = observation_difference
 
@@ -106,8 +104,8 @@ class ExtendedKalmanFilter(AbstractGaussianFilter):
 
 
 class UnscentedKalmanFilter(AbstractGaussianFilter):
-    r"""The Kalman filter whose moments are those of `2 n + 1` points, moved by the
-    dynamics and seen by the sensor as they are:
+    r"""The Kalman filter whose moments are those of `2 n + 1` points, each passed
+    through the dynamics and the sensor:
 
     `x_next = F(t, x, u, w)`, `w ~ N(0, W)`, `y = h(t, x) + v`, `v ~ N(0, V)`.
 
@@ -190,10 +188,8 @@ class UnscentedKalmanFilter(AbstractGaussianFilter):
         where = "UnscentedKalmanFilter"
         _check_dynamics(dynamics, where)
         self.dynamics = dynamics
-        self.W, self.V = noise_covariances(dynamics, W, V, where)
-        zero = jnp.zeros(dynamics.state_size, self.W.dtype)
-        self.mean, self.covariance = first_belief(
-            mean, covariance, zero, (self.W, self.V), where
+        self.W, self.V, self.mean, self.covariance = gaussian_model(
+            dynamics, W, V, mean, covariance, None, where
         )
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
         self.observation_difference = observation_difference
