@@ -216,7 +216,9 @@ class _FixedStep(AbstractTransparentSolver):
         is_double = y0.dtype == jnp.float64
         rtol, atol = (1e-10, 1e-12) if is_double else (1e-5, 1e-6)
         scale = lax.stop_gradient(atol + rtol * jnp.abs(y0))
-        if isinstance(self.solver, diffrax.AbstractDIRK) and self.solver.tableau.fsal:
+        solver: Any = self.solver
+        is_runge_kutta = isinstance(self.solver, diffrax.AbstractDIRK)
+        if is_runge_kutta and solver.tableau.fsal:
             # Then Diffrax solves for the slope.
             scale = scale / lax.stop_gradient(t1 - t0)
         solver = self._with_tolerances(rtol, scale)

@@ -20,7 +20,7 @@ def call_controller(
     returned: Any = controller(t, y, state)
     if not isinstance(returned, tuple | list) or len(returned) != 2:
         got = type(returned).__name__
-        if eqx.is_array(returned):
+        if isinstance(returned, jax.Array):
             got = f"an array of shape {returned.shape}"
         raise ValueError(
             f"{type(controller).__name__}: must return (u, state), the state as it was "
