@@ -3,9 +3,11 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
+import lineax as lx
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
@@ -64,7 +66,9 @@ def c2d(system: LinearSystem, dt: ArrayLike, method: str = "zoh") -> LinearDynam
         half = system.A * (dt / 2)
         eye = jnp.eye(n, dtype=half.dtype)
         right = jnp.concatenate([eye + half, inputs * dt], axis=1)
-        sampled = solve(eye - half, right)
+        operator = lx.MatrixLinearOperator(eye - half)
+        column = lambda b: lx.linear_solve(operator, b, lx.LU()).value
+        sampled = jax.vmap(column, in_axes=1, out_axes=1)(right)
     B, drift, E = _parts(sampled[:, n:], system)
     x_next = system.x_ref + drift
     about = _operating_point(system)
