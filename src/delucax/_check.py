@@ -298,3 +298,23 @@ def check_at_most(
     if value > most:
         limit = most if of is None else f"the {most} {of}"
         raise ValueError(f"{where}: {name} must be at most {limit}, got {value}.")
+
+
+def as_rows(
+    value: Any, size: int, name: str, where: str, steps: int | None = None
+) -> Array:
+    """`value` as a real array of a row of `size` entries for each step (of `steps`, if
+    it is given), or an error."""
+    array = as_float_array(value)
+    fits = eqx.is_inexact_array(array) and array.ndim == 2 and array.shape[1] == size
+    if not fits or steps not in (None, array.shape[0]):
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
+        rows = "steps" if steps is None else steps
+        raise ValueError(
+            f"{where}: {name} must have shape ({rows}, {size}), a row for each step, "
+            f"got {got}."
+        )
+    if array.shape[0] == 0:
+        raise ValueError(f"{where}: {name} must have at least one step.")
+    check_real(array, name, where)
+    return array

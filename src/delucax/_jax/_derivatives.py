@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax
+
 
 def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
     """The first of some ways to take a derivative that the solvers inside have.
@@ -21,3 +23,11 @@ def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
         raise errors[0]
 
     return evaluate
+
+
+def jacobian(
+    f: Callable[..., Any], argnums: int | tuple[int, ...] = 0
+) -> Callable[..., Any]:
+    """The Jacobian of `f` in forward mode, or in reverse where a solver inside has only
+    that."""
+    return first_possible(jax.jacfwd(f, argnums), jax.jacrev(f, argnums))

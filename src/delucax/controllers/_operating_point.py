@@ -13,7 +13,7 @@ from .._check import is_concrete
 from .._controller import AbstractController, wrong_observation
 from .._message import shortened
 from ..dynamics import LinearDynamics, linearize, OperatingPoint
-from ..dynamics._trim import relative_drift
+from ..math._drift import relative_drift
 from ..systems import LinearSystem
 
 

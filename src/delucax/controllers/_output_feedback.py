@@ -1,6 +1,6 @@
 """A state feedback that acts on an estimate."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,20 +8,20 @@ from jaxtyping import Array, PyTree
 
 from .._check import check_instance
 from .._controller import AbstractController, check_controller
-from ..estimators import AbstractEstimator, Belief
+from ..estimators import AbstractEstimator
 
 
 class _State(NamedTuple):
     controller: PyTree
-    belief: Belief
+    estimator: PyTree
     time: Array
 
 
 class OutputFeedback(AbstractController):
     """Any controller of the state, run on an estimate of it.
 
-    At each step the estimator's belief is updated with the observation, the controller
-    acts on its mean, and the belief is moved on with the control that was really
+    At each step the estimator takes in the observation, the controller acts on the mean
+    of its estimate, and the estimator moves on with the control that was really
     applied, after saturation.
 
     **Arguments:**
@@ -61,17 +61,18 @@ class OutputFeedback(AbstractController):
 
     def init(self, *, key=None):
         keys = (None, None) if key is None else jax.random.split(key)
-        belief = self.estimator.init(key=keys[1])
-        time = jnp.zeros((), belief.mean.dtype)
-        return _State(self.controller.init(key=keys[0]), belief, time)
+        state = self.estimator.init(key=keys[1])
+        time = jnp.zeros((), self.estimator.estimate(state).mean.dtype)
+        return _State(self.controller.init(key=keys[0]), state, time)
 
     def __call__(self, t, y, state):
-        belief = self.estimator.update(t, y, state.belief)
-        u, memory = self.controller(t, belief.mean.astype(y.dtype), state.controller)
+        after = self.estimator.update(t, y, state.estimator)
+        mean = self.estimator.estimate(after).mean.astype(y.dtype)
+        u, memory = self.controller(t, mean, state.controller)
         time = jnp.asarray(t, state.time.dtype)
-        return u, _State(memory, belief, time)
+        return u, _State(memory, after, time)
 
     def applied(self, u, cost, state):
         memory = self.controller.applied(u, cost, state.controller)
-        belief: Any = self.estimator.predict(state.time, u, state.belief)
-        return _State(memory, belief, state.time)
+        after = self.estimator.predict(state.time, u, state.estimator)
+        return _State(memory, after, state.time)

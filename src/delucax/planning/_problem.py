@@ -9,11 +9,10 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._jax import by_components, first_possible
+from .._jax import by_components, first_possible, join_state, split_state, stack_steps
 from .._results import first_of, or_none, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ..dynamics._runge_kutta import join_state, split_state, stack_steps
 from ..math import matvec
 from ._constraints import (
     at_end,

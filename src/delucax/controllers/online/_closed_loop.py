@@ -14,9 +14,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..._check import check_count, check_instance, check_step, is_concrete
 from ..._controller import AbstractController, wrong_observation
+from ..._jax import jacobian
 from ..._module import parameter
 from ...dynamics import AbstractDynamics, LinearDynamics
-from ...dynamics._linearize import _jacobian
 from ...math import matvec
 from .._basic import Constant, Linear, Zero
 from .._hinfinity import HInfinity
@@ -348,7 +348,7 @@ def _tangents(dynamics, base, t, x, state, v) -> Tangents:
         return z_next, jnp.concatenate([y, u.astype(y.dtype)])
 
     z = jnp.concatenate([x, vector.astype(x.dtype)])
-    (transition, input), (output, _) = _jacobian(step, (0, 1))(z, v)
+    (transition, input), (output, _) = jacobian(step, (0, 1))(z, v)
     return Tangents(transition, input, output)
 
 
