@@ -1,7 +1,10 @@
 """Checks of arguments, with errors that name the argument and what was expected."""
 
+import difflib
 import functools
+import inspect
 import os
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -297,3 +300,50 @@ def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
             f"{shortened(value)}."
         )
     return int(value)
+
+
+def keywords_of(function: Callable[..., Any]) -> tuple[str, ...]:
+    """The names of the arguments that `function` takes as keywords."""
+    parameters = inspect.signature(function).parameters.values()
+    keyword = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
+    return tuple(p.name for p in parameters if p.kind in keyword)
+
+
+def check_keywords(
+    given: Iterable[str], where: str, *functions: Callable[..., Any]
+) -> None:
+    """Raise unless each name of `given` is a keyword of one of `functions`."""
+    names = list(dict.fromkeys(n for f in functions for n in keywords_of(f)))
+    for name in given:
+        if name not in names:
+            close = difflib.get_close_matches(name, names, n=3) or names
+            raise ValueError(
+                f"{where}: no argument is called {name!r}; did you mean "
+                f"{' or '.join(repr(n) for n in close)}?"
+            )
+
+
+LARGEST = float(np.finfo(np.float32).max)
+"""Ends a space where there is no bound, because Gymnasium advises against infinity."""
+
+
+def check_cost_sizes(cost: Any, sizes: tuple[int, int], name: str, where: str) -> None:
+    """Raise unless `cost` takes states and controls of these `sizes`."""
+    n, m = sizes
+    try:
+        output_of(cost, (), (n,), (m,))
+        output_of(cost.final, (), (n,))
+    except _UNTRACEABLE:  # it may still be called, one step after the other
+        return
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{where}: {name} does not fit a state of size {n} and a control of size "
+            f"{m}: {error}"
+        ) from error
+
+
+_UNTRACEABLE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)

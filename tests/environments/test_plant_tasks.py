@@ -306,7 +306,7 @@ FLOW = dlx.systems.LinearSystem(jnp.eye(1), jnp.eye(1))
         (
             "neural",
             dict(system=dlx.systems.VanDerPol(), key=jax.random.key(0)),
-            "got both",
+            "neural: give a system or its key, not both",
         ),
         (
             "neural",

@@ -38,7 +38,12 @@ from ._quadrotor import (
 )
 from ._randomise import randomise as randomise
 from ._reacher import reacher as reacher, ReacherCost as ReacherCost
-from ._registry import make as make, register as register, registered as registered
+from ._registry import (
+    default_horizon as default_horizon,
+    make as make,
+    register as register,
+    registered as registered,
+)
 from ._two_tank import two_tank as two_tank
 from ._uniform_state import UniformState as UniformState
 from ._van_der_pol import van_der_pol as van_der_pol

@@ -2,22 +2,21 @@
 
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_bool, check_positive, check_range, check_step
+from .._check import check_bool, check_keywords, check_positive, check_range, check_step
 from .._jax import fence
 from .._module import as_float_array, parameter, positive
 from .._results import RESULTS
 from .._typing import BoolScalar, RealScalar, State
 from ..costs import Arrival, Quadratic
-from ..dynamics import AbstractDiscretization, LinearDynamics
+from ..dynamics import AbstractDiscretization, Discretized, LinearDynamics
 from ..systems import CartPole
 from ._environment import Environment
-from ._task import check_names, gym_dynamics, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
@@ -79,18 +78,14 @@ class _Fallen(eqx.Module):
         return (abs(x[0]) > self.max_position) | (abs(x[2]) > self.max_angle)
 
 
+@task(CartPole, gym=GymCartPole, dt=0.02, horizon=500)
 def cartpole(
-    system: CartPole | None = None,
+    dynamics: GymCartPole | Discretized,
     *,
-    dt: Any = 0.02,
-    horizon: int = 500,
     max_force: Any = 10.0,
     max_position: Any = 2.4,
     max_angle: Any = 12 * 2 * np.pi / 360,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+) -> dict[str, Any]:
     """Keep a pole upright on a cart that a force pushes to and fro.
 
     State (position, velocity, angle, spin), upright at 0; control (force), continuous
@@ -137,20 +132,14 @@ def cartpole(
         ```
     """
     check_range(max_force, "max_force", "cartpole")
-    dynamics, others = gym_dynamics(
-        cartpole, CartPole, GymCartPole, system, others, dt, solver, substeps
-    )
     check_positive(max_position, "max_position", "cartpole")
     check_positive(max_angle, "max_angle", "cartpole")
     # Gym's own: twice where the episode ends, which no state of an episode reaches.
     feature_bound = jnp.array([2 * max_position, np.inf, 2 * max_angle, np.inf])
-    return task_environment(
-        others,
-        dynamics=dynamics,
+    return dict(
         cost=Arrival(step_cost=-1.0),
         initial_state=UniformState(jnp.full(4, -0.05), jnp.full(4, 0.05)),
         control_bounds=(-max_force, max_force),
-        horizon=horizon,
         terminated=_Fallen(max_position, max_angle),
         actions=max_force * jnp.array([[-1.0], [1.0]]),
         observation_bounds=(-feature_bound, feature_bound),
@@ -210,7 +199,7 @@ def cartpole_linear(
         ```
     """
     where = "cartpole_linear"
-    check_names(cartpole_linear, others)
+    check_keywords(others, where, cartpole_linear, Environment)
     check_positive(cart_mass, "cart_mass", where)
     check_positive(pole_mass, "pole_mass", where)
     check_positive(length, "length", where)
@@ -232,10 +221,10 @@ def cartpole_linear(
         state_names=("position", "angle", "velocity", "spin"),
         control_names=("force",),
     )
-    return task_environment(
-        others,
+    task = dict(
         dynamics=dynamics,
         cost=Quadratic(jnp.ones(4), jnp.ones(1)),
         initial_state=UniformState(jnp.full(4, -0.05), jnp.full(4, 0.05)),
         horizon=horizon,
     )
+    return Environment(**(task | others))

@@ -2,30 +2,23 @@
 
 from typing import Any
 
-import diffrax
 import jax.numpy as jnp
 
 from .._check import check_positive, check_range
 from ..costs import Quadratic
-from ..dynamics import Discretized
 from ..systems import CSTR
-from ._environment import Environment
-from ._task import system_of, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
+@task(CSTR, dt=0.05, horizon=100, substeps=4)
 def cstr(
-    system: CSTR | None = None,
+    system: CSTR,
     *,
     concentration: Any = 0.5,
-    dt: Any = 0.05,
-    horizon: int = 100,
     min_coolant: Any = 280.0,
     max_coolant: Any = 320.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 4,
-    **others: Any,
-) -> Environment:
+) -> dict[str, Any]:
     """Hold a stirred-tank reactor at its unstable equilibrium.
 
     State (concentration [mol/l], temperature [K]); control (coolant [K]). Starts within
@@ -63,14 +56,10 @@ def cstr(
     check_positive(concentration, "concentration", "cstr")
     check_range(min_coolant, "min_coolant", "cstr")
     check_range(max_coolant, "max_coolant", "cstr")
-    system, others = system_of(cstr, CSTR, system, others)
     x, u = system.equilibrium(concentration)
     about = jnp.array([0.05, 3.0])
-    return task_environment(
-        others,
-        dynamics=Discretized(system, dt, solver, substeps),
+    return dict(
         cost=Quadratic([10.0, 0.01], [0.01], state_target=x, control_target=u),
         initial_state=UniformState(x - about, x + about),
         control_bounds=(min_coolant, max_coolant),
-        horizon=horizon,
     )

@@ -2,28 +2,17 @@
 
 from typing import Any
 
-import diffrax
-import jax.numpy as jnp
-
 from .._check import check_range
 from ..costs import Quadratic
-from ..dynamics import Discretized
 from ..systems import DoubleIntegrator
-from ._environment import Environment
-from ._task import system_of, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
+@task(DoubleIntegrator, dt=0.1, horizon=100)
 def double_integrator(
-    system: DoubleIntegrator | None = None,
-    *,
-    dt: Any = 0.1,
-    horizon: int = 100,
-    max_force: Any = 1.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+    system: DoubleIntegrator, *, max_force: Any = 1.0
+) -> dict[str, Any]:
     """Bring a mass on a line to rest at the origin.
 
     State (position, velocity); control (force). Starts with the position uniform in
@@ -55,13 +44,8 @@ def double_integrator(
         ```
     """
     check_range(max_force, "max_force", "double_integrator")
-    system, others = system_of(double_integrator, DoubleIntegrator, system, others)
-    corner = jnp.array([2.0, 1.0])
-    return task_environment(
-        others,
-        dynamics=Discretized(system, dt, solver, substeps),
-        cost=Quadratic(jnp.ones(2), 0.1 * jnp.ones(1)),
-        initial_state=UniformState(-corner, corner),
+    return dict(
+        cost=Quadratic([1.0, 1.0], [0.1]),
+        initial_state=UniformState([-2.0, -1.0], [2.0, 1.0]),
         control_bounds=(-max_force, max_force),
-        horizon=horizon,
     )

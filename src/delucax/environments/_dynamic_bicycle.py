@@ -2,27 +2,19 @@
 
 from typing import Any
 
-import diffrax
-
-from ..dynamics import Discretized
 from ..systems import DynamicBicycle
-from ._environment import Environment
-from ._lane import lane_task
-from ._task import system_of
+from ._lane import lane_keeping
+from ._task import task
 
 
+@task(DynamicBicycle, dt=0.05, horizon=100, substeps=5)
 def dynamic_bicycle(
-    system: DynamicBicycle | None = None,
+    system: DynamicBicycle,
     *,
     speed: Any = 20.0,
-    dt: Any = 0.05,
-    horizon: int = 100,
     max_acceleration: Any = 5.0,
     max_steering: Any = 0.2,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 5,
-    **others: Any,
-) -> Environment:
+) -> dict[str, Any]:
     """Bring a fast car on tyres to the lane y = 0, and to a speed.
 
     State (x, y, heading, vx, vy, rate); control (acceleration, steering). Starts at
@@ -59,14 +51,5 @@ def dynamic_bicycle(
         icy = dlx.make("dynamic_bicycle", front_stiffness=3e4, rear_stiffness=3e4)
         ```
     """
-    system, others = system_of(dynamic_bicycle, DynamicBicycle, system, others)
-    return lane_task(
-        dynamic_bicycle,
-        Discretized(system, dt, solver, substeps),
-        others,
-        spread=[0.0, 2.0, 0.1, 5.0, 0.5, 0.2],
-        speed=speed,
-        max_acceleration=max_acceleration,
-        max_steering=max_steering,
-        horizon=horizon,
-    )
+    where, spread = "dynamic_bicycle", [0.0, 2.0, 0.1, 5.0, 0.5, 0.2]
+    return lane_keeping(where, spread, speed, max_acceleration, max_steering)

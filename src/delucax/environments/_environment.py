@@ -13,6 +13,7 @@ from .._check import (
     as_bounds,
     as_vector,
     bounds_field,
+    check_cost_sizes,
     check_count,
     check_finite,
     check_instance,
@@ -32,16 +33,11 @@ from .._module import (
 from .._results import Result
 from .._typing import PRNGKey, RealScalar
 from ..costs import AbstractCost
-from ..costs._base import check_cost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics, OperatingPoint, trim
 from ..dynamics._noise import check_noise
 from ..dynamics._operating_point import operating_point
 from ..math import clip
-
-
-# A number to end a space where there is no bound; Gymnasium advises against infinity.
-LARGEST = float(np.finfo(np.float32).max)
 
 
 class Step(NamedTuple):
@@ -159,7 +155,8 @@ class Environment(eqx.Module):
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         check_noise(dynamics, where)
         sizes = dynamics.state_size, dynamics.control_size
-        check_cost(self.cost, "cost", where, sizes)
+        check_instance(self.cost, AbstractCost, "cost", where)
+        check_cost_sizes(self.cost, sizes, "cost", where)
         sized = [("disturbance", self.disturbance, dynamics.disturbance_size)]
         if self.sensor_noise is not None:
             sized.append(("sensor_noise", self.sensor_noise, dynamics.observation_size))

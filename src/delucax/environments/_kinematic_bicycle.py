@@ -2,27 +2,19 @@
 
 from typing import Any
 
-import diffrax
-
-from ..dynamics import Discretized
 from ..systems import KinematicBicycle
-from ._environment import Environment
-from ._lane import lane_task
-from ._task import system_of
+from ._lane import lane_keeping
+from ._task import task
 
 
+@task(KinematicBicycle, dt=0.05, horizon=100)
 def kinematic_bicycle(
-    system: KinematicBicycle | None = None,
+    system: KinematicBicycle,
     *,
     speed: Any = 10.0,
-    dt: Any = 0.05,
-    horizon: int = 100,
     max_acceleration: Any = 3.0,
     max_steering: Any = 0.5,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+) -> dict[str, Any]:
     """Bring a car that rolls without slip to the lane y = 0, and to a speed.
 
     State (x, y, heading, speed); control (acceleration, steering). Starts at x = 0 with
@@ -58,14 +50,5 @@ def kinematic_bicycle(
         env = dlx.make("kinematic_bicycle", speed=5.0)
         ```
     """
-    system, others = system_of(kinematic_bicycle, KinematicBicycle, system, others)
-    return lane_task(
-        kinematic_bicycle,
-        Discretized(system, dt, solver, substeps),
-        others,
-        spread=[0.0, 2.0, 0.3, 3.0],
-        speed=speed,
-        max_acceleration=max_acceleration,
-        max_steering=max_steering,
-        horizon=horizon,
-    )
+    where, spread = "kinematic_bicycle", [0.0, 2.0, 0.3, 3.0]
+    return lane_keeping(where, spread, speed, max_acceleration, max_steering)

@@ -2,28 +2,15 @@
 
 from typing import Any
 
-import diffrax
-import jax.numpy as jnp
-
 from .._check import check_range
 from ..costs import Quadratic
-from ..dynamics import Discretized
 from ..systems import Lorenz
-from ._environment import Environment
-from ._task import system_of, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
-def lorenz(
-    system: Lorenz | None = None,
-    *,
-    dt: Any = 0.01,
-    horizon: int = 500,
-    max_control: Any = 50.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+@task(Lorenz, dt=0.01, horizon=500)
+def lorenz(system: Lorenz, *, max_control: Any = 50.0) -> dict[str, Any]:
     """Hold Lorenz's chaotic system at the centre of its right wing.
 
     State (x, y, z); control (u). Starts with x and y uniform in +-20 and z in [10, 40].
@@ -55,14 +42,9 @@ def lorenz(
         ```
     """
     check_range(max_control, "max_control", "lorenz")
-    system, others = system_of(lorenz, Lorenz, system, others)
     centre, _ = system.equilibrium()
-    low, high = jnp.array([-20.0, -20.0, 10.0]), jnp.array([20.0, 20.0, 40.0])
-    return task_environment(
-        others,
-        dynamics=Discretized(system, dt, solver, substeps),
-        cost=Quadratic(jnp.ones(3), 0.001 * jnp.ones(1), state_target=centre),
-        initial_state=UniformState(low, high),
+    return dict(
+        cost=Quadratic([1.0, 1.0, 1.0], [0.001], state_target=centre),
+        initial_state=UniformState([-20.0, -20.0, 10.0], [20.0, 20.0, 40.0]),
         control_bounds=(-max_control, max_control),
-        horizon=horizon,
     )

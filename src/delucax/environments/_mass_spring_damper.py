@@ -2,28 +2,19 @@
 
 from typing import Any
 
-import diffrax
 import jax.numpy as jnp
 
 from .._check import check_range
 from ..costs import Quadratic
-from ..dynamics import Discretized
 from ..systems import MassSpringDamper
-from ._environment import Environment
-from ._task import system_of, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
+@task(MassSpringDamper, dt=0.1, horizon=200)
 def mass_spring_damper(
-    system: MassSpringDamper | None = None,
-    *,
-    dt: Any = 0.1,
-    horizon: int = 200,
-    max_force: Any = 1.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+    system: MassSpringDamper, *, max_force: Any = 1.0
+) -> dict[str, Any]:
     """Bring a mass on a spring, or a chain of them, to rest by a force on the last.
 
     State (positions, velocities); control (force). Starts with each state uniform in
@@ -55,13 +46,9 @@ def mass_spring_damper(
         ```
     """
     check_range(max_force, "max_force", "mass_spring_damper")
-    system, others = system_of(mass_spring_damper, MassSpringDamper, system, others)
     corner = jnp.ones(system.state_size)
-    return task_environment(
-        others,
-        dynamics=Discretized(system, dt, solver, substeps),
-        cost=Quadratic(corner, 0.1 * jnp.ones(1)),
+    return dict(
+        cost=Quadratic(corner, [0.1]),
         initial_state=UniformState(-corner, corner),
         control_bounds=(-max_force, max_force),
-        horizon=horizon,
     )

@@ -2,29 +2,17 @@
 
 from typing import Any
 
-import diffrax
-import jax.numpy as jnp
-
 from .._check import check_number, check_range
 from ..costs import Quadratic
-from ..dynamics import Discretized
 from ..systems import PermanentMagnetMotor
-from ._environment import Environment
-from ._task import system_of, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
+@task(PermanentMagnetMotor, dt=0.0005, horizon=200)
 def permanent_magnet_motor(
-    system: PermanentMagnetMotor | None = None,
-    *,
-    speed: Any = 100.0,
-    dt: Any = 0.0005,
-    horizon: int = 200,
-    max_voltage: Any = 150.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+    system: PermanentMagnetMotor, *, speed: Any = 100.0, max_voltage: Any = 150.0
+) -> dict[str, Any]:
     """Bring a synchronous motor to a speed and hold it.
 
     State (i_d, i_q, speed); control (v_d, v_q), each within +-max_voltage; disturbance
@@ -63,17 +51,10 @@ def permanent_magnet_motor(
     """
     check_number(speed, "speed", "permanent_magnet_motor")
     check_range(max_voltage, "max_voltage", "permanent_magnet_motor")
-    system, others = system_of(
-        permanent_magnet_motor, PermanentMagnetMotor, system, others
-    )
     x, u = system.equilibrium(speed)
-    Q, R = jnp.array([0.01, 0.01, 0.001]), 1e-5 * jnp.ones(2)
-    corner = jnp.array([1.0, 1.0, 50.0])
-    return task_environment(
-        others,
-        dynamics=Discretized(system, dt, solver, substeps),
+    Q, R = [0.01, 0.01, 0.001], [1e-5, 1e-5]
+    return dict(
         cost=Quadratic(Q, R, state_target=x, control_target=u),
-        initial_state=UniformState(-corner, corner),
+        initial_state=UniformState([-1.0, -1.0, -50.0], [1.0, 1.0, 50.0]),
         control_bounds=(-max_voltage, max_voltage),
-        horizon=horizon,
     )

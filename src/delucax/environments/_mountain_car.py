@@ -3,7 +3,6 @@ MountainCar-v0."""
 
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -13,11 +12,10 @@ from .._module import parameter, positive
 from .._results import RESULTS
 from .._typing import BoolScalar, RealScalar, State
 from ..costs import Arrival
-from ..dynamics import AbstractDiscretization, AbstractDynamics
+from ..dynamics import AbstractDiscretization, Discretized
 from ..math import clip
 from ..systems import MountainCar
-from ._environment import Environment
-from ._task import gym_dynamics, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
@@ -91,17 +89,13 @@ class _AtGoal(eqx.Module):
         return (x[0] >= self.goal_position) & (x[1] >= self.goal_velocity)
 
 
+@task(MountainCar, gym=GymMountainCar, dt=1.0, horizon=999)
 def mountain_car(
-    system: MountainCar | None = None,
+    dynamics: GymMountainCar | Discretized,
     *,
-    dt: Any = 1.0,
-    horizon: int = 999,
     goal_position: Any = 0.45,
     goal_velocity: Any = 0.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+) -> dict[str, Any]:
     """Drive a car out of a valley by rocking it: Gym's MountainCarContinuous-v0.
 
     State (position, velocity); control (push), in +-1. Starts at rest with the position
@@ -149,30 +143,26 @@ def mountain_car(
         ```
     """
     goal = _goal(goal_position, goal_velocity, "mountain_car")
-    dynamics, others = gym_dynamics(
-        mountain_car, MountainCar, GymMountainCar, system, others, dt, solver, substeps
-    )
-    return task_environment(
-        others,
-        dynamics=dynamics,
+    return dict(
         cost=Arrival(goal, step_cost=0.0, control_weight=0.1, arrival_cost=-100.0),
-        horizon=horizon,
         terminated=goal,
         **_valley(dynamics),
     )
 
 
+@task(
+    MountainCar,
+    gym=GymMountainCar,
+    dt=1.0,
+    horizon=200,
+    arguments=lambda *, power=0.001: dict(power=power),
+)
 def mountain_car_discrete(
-    system: MountainCar | None = None,
+    dynamics: GymMountainCar | Discretized,
     *,
-    dt: Any = 1.0,
-    horizon: int = 200,
     goal_position: Any = 0.5,
     goal_velocity: Any = 0.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+) -> dict[str, Any]:
     """Drive a car out of a valley in the fewest steps: Gym's MountainCar-v0.
 
     As [`delucax.environments.mountain_car`][] with a weaker motor and a farther goal;
@@ -183,8 +173,8 @@ def mountain_car_discrete(
 
     **Arguments:**
 
-    - `system`: a [`delucax.systems.MountainCar`][]; made of `others` by default, with a
-        power of 0.001.
+    - `system`: a [`delucax.systems.MountainCar`][]; made of `others` by default.
+    - `power`: of its motor, 0.001 by default.
     - `dt`: the control interval in Gym's steps, 1 by default.
     - `horizon`: steps an episode, 200 by default.
     - `goal_position`: 0.5 by default.
@@ -213,23 +203,8 @@ def mountain_car_discrete(
         ```
     """
     goal = _goal(goal_position, goal_velocity, "mountain_car_discrete")
-    if system is None:
-        others.setdefault("power", 0.001)
-    dynamics, others = gym_dynamics(
-        mountain_car_discrete,
-        MountainCar,
-        GymMountainCar,
-        system,
-        others,
-        dt,
-        solver,
-        substeps,
-    )
-    return task_environment(
-        others,
-        dynamics=dynamics,
+    return dict(
         cost=Arrival(goal),
-        horizon=horizon,
         terminated=goal,
         actions=jnp.array([[-1.0], [0.0], [1.0]]),
         **_valley(dynamics),
@@ -242,7 +217,7 @@ def _goal(position: Any, velocity: Any, where: str) -> _AtGoal:
     return _AtGoal(position, velocity)
 
 
-def _valley(dynamics: AbstractDynamics) -> dict[str, Any]:
+def _valley(dynamics: GymMountainCar | Discretized) -> dict[str, Any]:
     """Where a car starts, and between what it stays."""
     bounds = None
     if isinstance(dynamics, GymMountainCar):

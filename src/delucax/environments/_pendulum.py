@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -12,11 +11,10 @@ from .._module import parameter, positive
 from .._results import RESULTS
 from .._typing import State, Vector
 from ..costs import PendulumCost
-from ..dynamics import AbstractDiscretization
+from ..dynamics import AbstractDiscretization, Discretized
 from ..math import clip, cos, sin
 from ..systems import Pendulum
-from ._environment import Environment
-from ._task import gym_dynamics, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
@@ -86,16 +84,10 @@ def pendulum_features(x: State) -> Vector:
     return jnp.stack([cos(x[0]), sin(x[0]), x[1]])
 
 
+@task(Pendulum, gym=GymPendulum, dt=0.05, horizon=200)
 def pendulum(
-    system: Pendulum | None = None,
-    *,
-    dt: Any = 0.05,
-    horizon: int = 200,
-    max_torque: Any = 2.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+    dynamics: GymPendulum | Discretized, *, max_torque: Any = 2.0
+) -> dict[str, Any]:
     """Swing up a pendulum and hold it upright with a torque too weak to lift it at
     once.
 
@@ -135,19 +127,13 @@ def pendulum(
         ```
     """
     check_range(max_torque, "max_torque", "pendulum")
-    dynamics, others = gym_dynamics(
-        pendulum, Pendulum, GymPendulum, system, others, dt, solver, substeps
-    )
     fastest = dynamics.max_speed if isinstance(dynamics, GymPendulum) else np.inf
     feature_bound = jnp.array([1.0, 1.0, fastest])
     corner = jnp.array([np.pi, 1.0])
-    return task_environment(
-        others,
-        dynamics=dynamics,
+    return dict(
         cost=PendulumCost(),
         initial_state=UniformState(-corner, corner),
         control_bounds=(-max_torque, max_torque),
-        horizon=horizon,
         encode=pendulum_features,
         observation_bounds=(-feature_bound, feature_bound),
     )

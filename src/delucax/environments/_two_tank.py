@@ -2,29 +2,17 @@
 
 from typing import Any
 
-import diffrax
-import jax.numpy as jnp
-
 from .._check import check_range
 from ..costs import Quadratic
-from ..dynamics import Discretized
 from ..systems import TwoTank
-from ._environment import Environment
-from ._task import system_of, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
+@task(TwoTank, dt=2.0, horizon=200)
 def two_tank(
-    system: TwoTank | None = None,
-    *,
-    level: Any = 10.0,
-    dt: Any = 2.0,
-    horizon: int = 200,
-    max_flow: Any = 30.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+    system: TwoTank, *, level: Any = 10.0, max_flow: Any = 30.0
+) -> dict[str, Any]:
     """Hold the lower of two tanks at a level.
 
     State (upper, lower) [cm]; control (flow) [cm^3/s], not negative. Starts with the
@@ -59,14 +47,9 @@ def two_tank(
     """
     check_range(max_flow, "max_flow", "two_tank")
     check_range(level, "level", "two_tank")
-    system, others = system_of(two_tank, TwoTank, system, others)
     x, u = system.equilibrium(level)
-    Q, R = jnp.array([0.0, 1.0]), 0.01 * jnp.ones(1)
-    return task_environment(
-        others,
-        dynamics=Discretized(system, dt, solver, substeps),
-        cost=Quadratic(Q, R, state_target=x, control_target=u),
-        initial_state=UniformState(jnp.zeros(2), jnp.full(2, 20.0)),
+    return dict(
+        cost=Quadratic([0.0, 1.0], [0.01], state_target=x, control_target=u),
+        initial_state=UniformState([0.0, 0.0], [20.0, 20.0]),
         control_bounds=(0.0, max_flow),
-        horizon=horizon,
     )

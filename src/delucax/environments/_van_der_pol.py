@@ -2,28 +2,15 @@
 
 from typing import Any
 
-import diffrax
-import jax.numpy as jnp
-
 from .._check import check_range
 from ..costs import Quadratic
-from ..dynamics import Discretized
 from ..systems import VanDerPol
-from ._environment import Environment
-from ._task import system_of, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
-def van_der_pol(
-    system: VanDerPol | None = None,
-    *,
-    dt: Any = 0.05,
-    horizon: int = 200,
-    max_control: Any = 3.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+@task(VanDerPol, dt=0.05, horizon=200)
+def van_der_pol(system: VanDerPol, *, max_control: Any = 3.0) -> dict[str, Any]:
     """Bring van der Pol's oscillator from its limit cycle to rest.
 
     State (x, v); control (u). Starts with each state uniform in +-2. Cost
@@ -55,13 +42,8 @@ def van_der_pol(
         ```
     """
     check_range(max_control, "max_control", "van_der_pol")
-    system, others = system_of(van_der_pol, VanDerPol, system, others)
-    corner = jnp.full(2, 2.0)
-    return task_environment(
-        others,
-        dynamics=Discretized(system, dt, solver, substeps),
-        cost=Quadratic(jnp.ones(2), 0.1 * jnp.ones(1)),
-        initial_state=UniformState(-corner, corner),
+    return dict(
+        cost=Quadratic([1.0, 1.0], [0.1]),
+        initial_state=UniformState([-2.0, -2.0], [2.0, 2.0]),
         control_bounds=(-max_control, max_control),
-        horizon=horizon,
     )
