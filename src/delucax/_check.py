@@ -4,7 +4,7 @@ import difflib
 import functools
 import inspect
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from ._message import shortened
-from ._module import as_float_array
+from ._module import as_float_array, indexed_names
 
 
 def is_concrete(x: Any) -> bool:
@@ -347,3 +347,39 @@ _UNTRACEABLE = (
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
 )
+
+
+def checked_names(
+    names: Sequence[str] | None, letter: str, size: int, argument: str, where: str
+) -> tuple[str, ...]:
+    """`names` as a tuple of `size`, indexed if there are none, or an error."""
+    if names is None:
+        return indexed_names(letter, size)
+    if isinstance(names, str) or len(names) != size:
+        raise ValueError(f"{where}: {argument} must have {size} names, got {names!r}.")
+    return tuple(names)
+
+
+def check_matrices(
+    A: Any, B: Any, C: Any, E: Any, where: str
+) -> tuple[Array, Array, Any, Any]:
+    """`A`, `B`, `C`, `E` as matrices of fitting shapes, or an error that names one."""
+    A = as_matrix(A, "A", where)
+    n = A.shape[0]
+    if A.shape != (n, n) or n == 0:
+        raise ValueError(f"{where}: A must be square, got shape {A.shape}.")
+    B = _as_part(B, "B", n, "rows", where)
+    C = None if C is None else _as_part(C, "C", n, "columns", where)
+    E = None if E is None else _as_part(E, "E", n, "rows", where)
+    return A, B, C, E
+
+
+def _as_part(value: Any, name: str, n: int, side: str, where: str) -> Array:
+    """`value` as a matrix with as many rows or columns as there are states."""
+    matrix = as_matrix(value, name, where)
+    if matrix.shape[side == "columns"] != n:
+        raise ValueError(
+            f"{where}: {name} must have as many {side} as A ({n}), got shape "
+            f"{matrix.shape}."
+        )
+    return matrix

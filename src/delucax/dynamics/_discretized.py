@@ -13,7 +13,7 @@ from .._jax import by_components
 from .._module import parameter
 from .._results import choose, first_of, or_none, promote, RESULTS
 from ..systems import AbstractSystem
-from ..systems._plant import zeros_if_none
+from ._base import zeros_if_none
 from ._runge_kutta import (
     join_state,
     RK4,

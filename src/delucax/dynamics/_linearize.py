@@ -13,8 +13,7 @@ from .._check import as_vector, check_instance, check_step
 from .._message import shortened
 from .._typing import RealScalar
 from ..systems import AbstractSystem, LinearSystem
-from ..systems._plant import zeros_if_none
-from ._base import AbstractDynamics
+from ._base import AbstractDynamics, zeros_if_none
 from ._discretized import evaluate_field
 from ._linear import LinearDynamics
 from ._operating_point import OperatingPoint

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import check_parameters
-from .._typing import Control, Disturbance, RealScalar, State
+from .._typing import Control, Disturbance, State, Time
 from ._plant import AbstractPlant, Noise
 
 
@@ -21,6 +21,7 @@ class AbstractSystem(AbstractPlant):
     **Class attributes** (or properties, where they depend on a field):
 
     - `state_names`, `control_names`: tuples of strings.
+    - `angle_names`: those of the states that `difference` wraps; none by default.
     - `disturbance_names`: tuple of strings, empty by default. If it is empty then `w`
         has the size of the state and is added to the next state by the discrete
         dynamics; otherwise `w` enters the vector field, and is held over a step.
@@ -79,9 +80,7 @@ class AbstractSystem(AbstractPlant):
         return super().disturbance_size if motions is None else motions
 
     @abc.abstractmethod
-    def vector_field(
-        self, t: RealScalar, x: State, u: Control, w: Disturbance | None
-    ) -> State:
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         """The time derivative of the state.
 
         **Arguments:**
@@ -105,7 +104,7 @@ class AbstractSystem(AbstractPlant):
         """
         return x
 
-    def diffusion(self, t: RealScalar, x: State, u: Control) -> Array | None:
+    def diffusion(self, t: Time, x: State, u: Control) -> Array | None:
         """The matrix g of `dx = f dt + g dB`; none by default.
 
         If it is given then `w` holds the increments of its k Brownian motions over the

@@ -8,6 +8,7 @@ from jaxtyping import Array
 
 from .._check import check_count
 from .._module import parameter, positive
+from .._typing import Control, Disturbance, State, Time
 from ._base import AbstractSystem
 
 
@@ -86,7 +87,7 @@ class MassSpringDamper(AbstractSystem):
         """Metres, then metres per second."""
         return ("m",) * self.masses + ("m/s",) * self.masses
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         n = self.masses
         m, k, c = (
             jnp.broadcast_to(a, (n,)).astype(x.dtype)
@@ -102,5 +103,5 @@ class MassSpringDamper(AbstractSystem):
         pulls = [(tension[i + 1] - tension[i]) * lightness[i] for i in range(n)]
         return jnp.stack([*(x[n + i] for i in range(n)), *pulls])
 
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         return jnp.zeros(2 * self.masses), jnp.zeros(1)
