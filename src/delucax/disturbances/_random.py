@@ -14,7 +14,7 @@ from .._module import parameter
 from .._typing import PRNGKey, Vector
 from ..math import clip
 from ..math._steps import step_between
-from ._base import AbstractDisturbance, AbstractEntrywise, Rows
+from ._base import AbstractDisturbance, AbstractEntrywise, Rows, size_field
 
 
 class Gaussian(AbstractEntrywise):
@@ -42,11 +42,8 @@ class Gaussian(AbstractEntrywise):
     """
 
     std: Array = parameter()
-    mean: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(self, std: Any, mean: Any = 0.0, *, size: int | None = None):
-        self._set_entries(size, std=std, mean=mean)
+    mean: Array = parameter(0.0)
+    size: int = size_field()
 
     def __check_init__(self):
         check_range(self.std, "std", "Gaussian")
@@ -81,10 +78,7 @@ class Uniform(AbstractEntrywise):
 
     low: Array = parameter()
     high: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(self, low: Any, high: Any, *, size: int | None = None):
-        self._set_entries(size, low=low, high=high)
+    size: int = size_field()
 
     def __check_init__(self):
         check_range(self.high, "high", "Uniform", self.low)
@@ -121,12 +115,9 @@ class RandomWalk(AbstractEntrywise):
         ```
     """
 
-    std: Array = parameter()
-    bound: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(self, std: Any = 0.3, bound: Any = 1.0, *, size: int | None = None):
-        self._set_entries(size, std=std, bound=bound)
+    std: Array = parameter(0.3)
+    bound: Array = parameter(1.0)
+    size: int = size_field()
 
     def __check_init__(self):
         check_range(self.std, "std", "RandomWalk")

@@ -9,8 +9,8 @@ from jaxtyping import Array
 
 from .._check import check_number, check_range
 from .._module import parameter, positive
-from .._results import RESULTS
-from .._typing import BoolScalar, RealScalar, State, Vector
+from .._results import Result, RESULTS
+from .._typing import BoolScalar, Control, Disturbance, State, Time, Vector
 from ..costs import Arrival
 from ..disturbances import AbstractDisturbance, Uniform
 from ..dynamics import AbstractDiscretization, Discretized, RK4
@@ -60,7 +60,9 @@ class GymAcrobot(AbstractDiscretization):
     max_velocity_1: Array = parameter(4 * np.pi, constraint=positive)
     max_velocity_2: Array = parameter(9 * np.pi, constraint=positive)
 
-    def advance(self, t, x, u, w):
+    def advance(
+        self, t: Time, x: State, u: Control, w: Disturbance
+    ) -> tuple[State, Result]:
         field = lambda t, x: self.system.vector_field(t, x, u, w)
         free = runge_kutta_step(RK4.tableau, field, t, x, self.dt)
         x_next = jnp.stack(
@@ -99,7 +101,7 @@ class _AboveLine(eqx.Module):
 
     goal_height: Array = parameter()
 
-    def __call__(self, t: RealScalar, x: State) -> BoolScalar:
+    def __call__(self, t: Time, x: State) -> BoolScalar:
         return -cos(x[0]) - cos(x[1] + x[0]) > self.goal_height
 
 
@@ -181,7 +183,7 @@ def acrobot(
     return dict(
         cost=Arrival(above, arrival_cost=-1.0),
         disturbance=disturbance,
-        initial_state=UniformState(jnp.full(4, -0.1), jnp.full(4, 0.1)),
+        initial_state=UniformState([-0.1] * 4, [0.1] * 4),
         control_bounds=(-max_torque, max_torque),
         terminated=above,
         actions=max_torque * jnp.array([[-1.0], [0.0], [1.0]]),

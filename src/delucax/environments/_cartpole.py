@@ -10,17 +10,17 @@ from jaxtyping import Array
 from .._check import check_bool, check_keywords, check_positive, check_range, check_step
 from .._jax import fence
 from .._module import as_float_array, parameter, positive
-from .._results import RESULTS
-from .._typing import BoolScalar, RealScalar, State
+from .._typing import BoolScalar, Control, State, Time
 from ..costs import Arrival, Quadratic
-from ..dynamics import AbstractDiscretization, Discretized, LinearDynamics
+from ..dynamics import Discretized, LinearDynamics
 from ..systems import CartPole
 from ._environment import Environment
+from ._gym import AbstractGymStep
 from ._task import task
 from ._uniform_state import UniformState
 
 
-class GymCartPole(AbstractDiscretization):
+class GymCartPole(AbstractGymStep):
     """Gym's arithmetic for the cart-pole: an explicit Euler step; then `w` is added.
 
     Smooth. The angle is not wrapped.
@@ -54,7 +54,7 @@ class GymCartPole(AbstractDiscretization):
     def __check_init__(self):
         check_bool(self.semi_implicit, "semi_implicit", "GymCartPole")
 
-    def advance(self, t, x, u, w):
+    def gym_step(self, x: State, u: Control) -> State:
         dt = self.dt
         position, velocity, angle, spin = x[0], x[1], x[2], x[3]
         acceleration, turn = fence(*self.system.accelerations(angle, spin, u[0]))
@@ -62,10 +62,7 @@ class GymCartPole(AbstractDiscretization):
         if self.semi_implicit:
             velocity, spin = velocity_next, spin_next
         position, angle = position + dt * velocity, angle + dt * spin
-        x_next = jnp.stack([position, velocity_next, angle, spin_next])
-        if w is not None:
-            x_next = x_next + w
-        return x_next.astype(x.dtype), RESULTS.successful
+        return jnp.stack([position, velocity_next, angle, spin_next])
 
 
 class _Fallen(eqx.Module):
@@ -74,7 +71,7 @@ class _Fallen(eqx.Module):
     max_position: Array = parameter()
     max_angle: Array = parameter()
 
-    def __call__(self, t: RealScalar, x: State) -> BoolScalar:
+    def __call__(self, t: Time, x: State) -> BoolScalar:
         return (abs(x[0]) > self.max_position) | (abs(x[2]) > self.max_angle)
 
 
@@ -138,7 +135,7 @@ def cartpole(
     feature_bound = jnp.array([2 * max_position, np.inf, 2 * max_angle, np.inf])
     return dict(
         cost=Arrival(step_cost=-1.0),
-        initial_state=UniformState(jnp.full(4, -0.05), jnp.full(4, 0.05)),
+        initial_state=UniformState([-0.05] * 4, [0.05] * 4),
         control_bounds=(-max_force, max_force),
         terminated=_Fallen(max_position, max_angle),
         actions=max_force * jnp.array([[-1.0], [1.0]]),
@@ -224,7 +221,7 @@ def cartpole_linear(
     task = dict(
         dynamics=dynamics,
         cost=Quadratic(jnp.ones(4), jnp.ones(1)),
-        initial_state=UniformState(jnp.full(4, -0.05), jnp.full(4, 0.05)),
+        initial_state=UniformState([-0.05] * 4, [0.05] * 4),
         horizon=horizon,
     )
     return Environment(**(task | others))

@@ -1,4 +1,4 @@
-"""What the two bicycles' task shares: to follow a straight lane."""
+"""Keep a car in its lane: the tasks of the two bicycles."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,6 +9,8 @@ from .._check import check_number, check_range, LARGEST
 from .._typing import State, Vector
 from ..costs import Quadratic
 from ..math import cos, sin, wrap
+from ..systems import DynamicBicycle, KinematicBicycle
+from ._task import task
 from ._uniform_state import UniformState
 
 
@@ -33,7 +35,7 @@ def bicycle_features(x: State) -> Vector:
     return jnp.concatenate([turned, x[3:]])
 
 
-def lane_keeping(
+def _lane_keeping(
     where: str,
     spread: Sequence[float],
     speed: Any,
@@ -74,3 +76,98 @@ def heading_difference(x: State, x_ref: State) -> State:
     d = x - x_ref
     rest = [d[i] for i in range(3, x.shape[0])]
     return jnp.stack([d[0], d[1], wrap(d[2]), *rest])
+
+
+@task(KinematicBicycle, dt=0.05, horizon=100)
+def kinematic_bicycle(
+    system: KinematicBicycle,
+    *,
+    speed: Any = 10.0,
+    max_acceleration: Any = 3.0,
+    max_steering: Any = 0.5,
+) -> dict[str, Any]:
+    """Bring a car that rolls without slip to the lane y = 0, and to a speed.
+
+    State (x, y, heading, speed); control (acceleration, steering). Starts at x = 0 with
+    y uniform in +-2 m, the heading in +-0.3 rad and the speed within 3 m/s of the one
+    to hold. Cost
+    `y^2 + heading^2 + 0.1 (speed - speed*)^2 + 0.1 acceleration^2 + steering^2` a step,
+    the heading wrapped. `encode` gives its cosine and sine. Never terminates.
+
+    **Arguments:**
+
+    - `system`: a [`delucax.systems.KinematicBicycle`][]; made of `others` by default.
+    - `speed`: to hold [m/s], 10 by default.
+    - `max_acceleration`: and least, with a minus [m/s^2]; 3 by default.
+    - `max_steering`: to either side [rad], 0.5 by default.
+    - `dt`: the control interval, 0.05 by default.
+    - `horizon`: steps an episode, 100 by default.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+    - `substeps`: solver steps an interval, 1 by default.
+    - `**others`: arguments of [`delucax.systems.KinematicBicycle`][] or
+        [`delucax.Environment`][], such as `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
+
+    Source: Kong, Pfeiffer, Schildbach and Borrelli, 2015.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("kinematic_bicycle", speed=5.0)
+        ```
+    """
+    where, spread = "kinematic_bicycle", [0.0, 2.0, 0.3, 3.0]
+    return _lane_keeping(where, spread, speed, max_acceleration, max_steering)
+
+
+@task(DynamicBicycle, dt=0.05, horizon=100, substeps=5)
+def dynamic_bicycle(
+    system: DynamicBicycle,
+    *,
+    speed: Any = 20.0,
+    max_acceleration: Any = 5.0,
+    max_steering: Any = 0.2,
+) -> dict[str, Any]:
+    """Bring a fast car on tyres to the lane y = 0, and to a speed.
+
+    State (x, y, heading, vx, vy, rate); control (acceleration, steering). Starts at
+    x = 0 with y uniform in +-2 m, the heading in +-0.1 rad, vx within 5 m/s of the
+    speed to hold, vy in +-0.5 m/s and the rate in +-0.2 rad/s. Cost
+    `y^2 + heading^2 + 0.1 ((vx - speed*)^2 + vy^2 + rate^2) + 0.1 acceleration^2 +
+    steering^2` a step, the heading wrapped. `encode` gives its cosine and sine. Never
+    terminates.
+
+    **Arguments:**
+
+    - `system`: a [`delucax.systems.DynamicBicycle`][]; made of `others` by default.
+    - `speed`: to hold [m/s], 20 by default.
+    - `max_acceleration`: and least, with a minus [m/s^2]; 5 by default.
+    - `max_steering`: to either side [rad], 0.2 by default.
+    - `dt`: the control interval, 0.05 by default.
+    - `horizon`: steps an episode, 100 by default.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+    - `substeps`: solver steps an interval, 5 by default.
+    - `**others`: arguments of [`delucax.systems.DynamicBicycle`][] or
+        [`delucax.Environment`][], such as `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
+
+    Source: Rajamani, 2012.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        icy = dlx.make("dynamic_bicycle", front_stiffness=3e4, rear_stiffness=3e4)
+        ```
+    """
+    where, spread = "dynamic_bicycle", [0.0, 2.0, 0.1, 5.0, 0.5, 0.2]
+    return _lane_keeping(where, spread, speed, max_acceleration, max_steering)

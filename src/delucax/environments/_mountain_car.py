@@ -9,17 +9,17 @@ from jaxtyping import Array
 
 from .._check import check_number, check_range
 from .._module import parameter, positive
-from .._results import RESULTS
-from .._typing import BoolScalar, RealScalar, State
+from .._typing import BoolScalar, Control, State, Time
 from ..costs import Arrival
-from ..dynamics import AbstractDiscretization, Discretized
+from ..dynamics import Discretized
 from ..math import clip
 from ..systems import MountainCar
+from ._gym import AbstractGymStep
 from ._task import task
 from ._uniform_state import UniformState
 
 
-class GymMountainCar(AbstractDiscretization):
+class GymMountainCar(AbstractGymStep):
     """Gym's arithmetic for the mountain car, a semi-implicit Euler step with limits:
 
     `velocity_next = clip(velocity + acceleration dt, -max_speed, max_speed)`,
@@ -64,7 +64,7 @@ class GymMountainCar(AbstractDiscretization):
         low = self.min_position
         check_range(self.max_position, "max_position", "GymMountainCar", low)
 
-    def advance(self, t, x, u, w):
+    def gym_step(self, x: State, u: Control) -> State:
         position, velocity = x[0], x[1]
         acceleration = self.system.acceleration(position, u[0])
         velocity = velocity + acceleration * self.dt
@@ -73,10 +73,7 @@ class GymMountainCar(AbstractDiscretization):
         position = clip(position, self.min_position, self.max_position)
         stopped = (position <= self.min_position) & (velocity < 0)
         velocity = jnp.where(stopped, 0, velocity)
-        x_next = jnp.stack([position, velocity])
-        if w is not None:
-            x_next = x_next + w
-        return x_next.astype(x.dtype), RESULTS.successful
+        return jnp.stack([position, velocity])
 
 
 class _AtGoal(eqx.Module):
@@ -85,7 +82,7 @@ class _AtGoal(eqx.Module):
     goal_position: Array = parameter()
     goal_velocity: Array = parameter()
 
-    def __call__(self, t: RealScalar, x: State) -> BoolScalar:
+    def __call__(self, t: Time, x: State) -> BoolScalar:
         return (x[0] >= self.goal_position) & (x[1] >= self.goal_velocity)
 
 
@@ -142,12 +139,9 @@ def mountain_car(
         )
         ```
     """
-    goal = _goal(goal_position, goal_velocity, "mountain_car")
-    return dict(
-        cost=Arrival(goal, step_cost=0.0, control_weight=0.1, arrival_cost=-100.0),
-        terminated=goal,
-        **_valley(dynamics),
-    )
+    goal, valley = _valley("mountain_car", dynamics, goal_position, goal_velocity)
+    cost = Arrival(goal, step_cost=0.0, control_weight=0.1, arrival_cost=-100.0)
+    return dict(cost=cost, **valley)
 
 
 @task(
@@ -202,31 +196,30 @@ def mountain_car_discrete(
         env.step(0.0, jnp.array([-0.5, 0.0]), 2)
         ```
     """
-    goal = _goal(goal_position, goal_velocity, "mountain_car_discrete")
-    return dict(
-        cost=Arrival(goal),
-        terminated=goal,
-        actions=jnp.array([[-1.0], [0.0], [1.0]]),
-        **_valley(dynamics),
-    )
+    where = "mountain_car_discrete"
+    goal, valley = _valley(where, dynamics, goal_position, goal_velocity)
+    return dict(cost=Arrival(goal), actions=[[-1.0], [0.0], [1.0]], **valley)
 
 
-def _goal(position: Any, velocity: Any, where: str) -> _AtGoal:
-    check_number(position, "goal_position", where)
-    check_number(velocity, "goal_velocity", where)
-    return _AtGoal(position, velocity)
-
-
-def _valley(dynamics: GymMountainCar | Discretized) -> dict[str, Any]:
-    """Where a car starts, and between what it stays."""
-    bounds = None
+def _valley(
+    where: str,
+    dynamics: GymMountainCar | Discretized,
+    goal_position: Any,
+    goal_velocity: Any,
+) -> tuple[_AtGoal, dict[str, Any]]:
+    """The goal, and what both tasks have: where a car starts, and between what it
+    stays."""
+    check_number(goal_position, "goal_position", where)
+    check_number(goal_velocity, "goal_velocity", where)
+    goal, bounds = _AtGoal(goal_position, goal_velocity), None
     if isinstance(dynamics, GymMountainCar):
         bounds = (
             jnp.stack([dynamics.min_position, -dynamics.max_speed]),
             jnp.stack([dynamics.max_position, dynamics.max_speed]),
         )
-    return dict(
-        initial_state=UniformState(jnp.array([-0.6, 0.0]), jnp.array([-0.4, 0.0])),
+    return goal, dict(
+        initial_state=UniformState([-0.6, 0.0], [-0.4, 0.0]),
         control_bounds=(-1.0, 1.0),
+        terminated=goal,
         observation_bounds=bounds,
     )

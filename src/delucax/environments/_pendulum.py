@@ -8,17 +8,17 @@ from jaxtyping import Array
 
 from .._check import check_range
 from .._module import parameter, positive
-from .._results import RESULTS
-from .._typing import State, Vector
+from .._typing import Control, State, Vector
 from ..costs import PendulumCost
-from ..dynamics import AbstractDiscretization, Discretized
+from ..dynamics import Discretized
 from ..math import clip, cos, sin
 from ..systems import Pendulum
+from ._gym import AbstractGymStep
 from ._task import task
 from ._uniform_state import UniformState
 
 
-class GymPendulum(AbstractDiscretization):
+class GymPendulum(AbstractGymStep):
     """Gym's arithmetic for the pendulum, which clips between its half-steps:
 
     `velocity_next = clip(velocity + acceleration dt, -max_speed, max_speed)`,
@@ -53,16 +53,13 @@ class GymPendulum(AbstractDiscretization):
     dt: Array = parameter(0.05, constraint=positive)
     max_speed: Array = parameter(8.0, constraint=positive)
 
-    def advance(self, t, x, u, w):
+    def gym_step(self, x: State, u: Control) -> State:
         angle, velocity = x[0], x[1]
         acceleration = self.system.acceleration(angle, velocity, u[0])
         velocity = velocity + acceleration * self.dt
         velocity = clip(velocity, -self.max_speed, self.max_speed)
         angle = angle + velocity * self.dt
-        x_next = jnp.stack([angle, velocity])
-        if w is not None:
-            x_next = x_next + w
-        return x_next.astype(x.dtype), RESULTS.successful
+        return jnp.stack([angle, velocity])
 
 
 def pendulum_features(x: State) -> Vector:

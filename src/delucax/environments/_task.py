@@ -2,15 +2,16 @@
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import diffrax
 
-from .._check import check_instance, check_keywords, check_step, keywords_of
+from .._check import check_instance, check_keywords, keywords_of
 from ..dynamics import AbstractDynamics, Discretized
 from ..systems import AbstractSystem
 from ._environment import Environment
+from ._gym import gym_or_solver
 
 
 # What a task observes has its bounds for the task as it is. They are left out where
@@ -52,7 +53,7 @@ def task(
     - `arguments`: makes arguments of the system of others, by keywords.
     - `accepts`: what a system may be; of that `kind` by default.
     """
-    default_solver = solver
+    default_solver, accepts = solver, accepts or kind
     arithmetic = () if gym is None else (gym,)
 
     def decorate(added: Callable[..., dict[str, Any]]) -> Callable[..., Environment]:
@@ -62,43 +63,44 @@ def task(
             system: Any = None,
             *,
             dt: Any = dt,
-            horizon: Any = horizon,
-            solver: Any = None,
-            substeps: Any = substeps,
+            horizon: int = horizon,
+            solver: diffrax.AbstractSolver | None = None,
+            substeps: int = substeps,
             **others: Any,
         ) -> Environment:
             check_keywords(others, where, make, kind, *arithmetic, Environment)
             chosen = _taken(others, [p.name for p in options])
-            derived = _taken(others, keywords_of(arguments))
+            special = _taken(others, keywords_of(arguments))
             constants = _taken(others, keywords_of(kind))
             if system is None:
-                system = kind(**(constants | arguments(**derived)))
-            elif derived or constants:
-                names = ", ".join([*derived, *constants])
+                system = kind(**(constants | arguments(**special)))
+            elif special or constants:
+                names = ", ".join([*special, *constants])
                 raise ValueError(f"{where}: give a system or its {names}, not both.")
-            check_instance(system, accepts or kind, "system", where)
+            check_instance(system, accepts, "system", where)
             if gym is None:
+                subject = system
                 dynamics = Discretized(system, dt, solver or default_solver, substeps)
-                fields = added(system, **chosen)
             else:
                 limits = _taken(others, keywords_of(gym))
-                dynamics = _gym_dynamics(
-                    gym, system, dt, solver, substeps, limits, where
-                )
-                fields = added(dynamics, **chosen)
+                step = functools.partial(gym, system, dt, **limits)
+                subject = dynamics = gym_or_solver(step, solver, substeps, where)
+            fields = added(subject, **chosen)
             fields = dict(dynamics=dynamics, horizon=horizon) | fields | others
             if "observation_bounds" not in others:
                 if not _CHANGES_OBSERVATIONS.isdisjoint(others):
                     fields["observation_bounds"] = None
             return Environment(**fields)
 
-        _, *options = inspect.signature(added).parameters.values()
+        # Documentation and the check of keywords read the arguments off the signature.
         signature = inspect.signature(make)
         system, *rest = signature.parameters.values()
+        system = system.replace(annotation=accepts | None)
+        _, *options = inspect.signature(added).parameters.values()
         derived = inspect.signature(arguments).parameters.values()
-        parameters = [system.replace(annotation=kind | None), *options, *derived, *rest]
+        signature = signature.replace(parameters=[system, *options, *derived, *rest])
         functools.update_wrapper(make, added)
-        vars(make)["__signature__"] = signature.replace(parameters=parameters)
+        vars(make)["__signature__"] = signature
         return make
 
     return decorate
@@ -107,26 +109,3 @@ def task(
 def _taken(arguments: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
     """Those of `arguments` that are called so, which they no longer hold then."""
     return {name: arguments.pop(name) for name in names if name in arguments}
-
-
-def _gym_dynamics(
-    gym: Callable[..., AbstractDynamics],
-    system: AbstractSystem,
-    dt: Any,
-    solver: diffrax.AbstractSolver | None,
-    substeps: Any,
-    limits: Mapping[str, Any],
-    where: str,
-) -> AbstractDynamics:
-    """Gym's arithmetic with its `limits`, or a solver in its place."""
-    check_step(dt, where)
-    if solver is None:
-        if substeps != 1:
-            raise ValueError(f"{where}: substeps needs a solver, such as RK4().")
-        return gym(system, dt, **limits)
-    for name in limits:
-        raise ValueError(
-            f"{where}: {name} is of Gym's arithmetic, and no solver has the like; give "
-            f"one of {name} and solver."
-        )
-    return Discretized(system, dt, solver, substeps)

@@ -1,12 +1,11 @@
 """The continuous-time system: a vector field and its names."""
 
 import abc
-from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
+import jax
 from jaxtyping import Array
 
+from .._check import output_of
 from .._module import check_parameters
 from .._typing import Control, Disturbance, State, Time
 from ._plant import AbstractPlant, Noise
@@ -123,16 +122,11 @@ def brownian_size(system: AbstractSystem) -> int | None:
     """The number of Brownian motions of `system`; `None` if it has no noise inside."""
     if type(system).diffusion is AbstractSystem.diffusion:
         return None
-    t, x, u = (
-        jnp.zeros(()),
-        jnp.zeros(system.state_size),
-        jnp.zeros(system.control_size),
-    )
-    g: Any = eqx.filter_eval_shape(system.diffusion, t, x, u)
+    name, n, names = type(system).__name__, system.state_size, system.disturbance_names
+    g = output_of(system.diffusion, (), (n,), (system.control_size,))
     if g is None:
         return None
-    name, n, names = type(system).__name__, system.state_size, system.disturbance_names
-    shape = getattr(g, "shape", None)
+    shape = g.shape if isinstance(g, jax.ShapeDtypeStruct) else None
     if shape is None or len(shape) not in (1, 2) or shape[0] != n:
         got = f"a {type(g).__name__}" if shape is None else f"shape {shape}"
         raise ValueError(

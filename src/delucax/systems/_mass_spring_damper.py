@@ -1,5 +1,6 @@
 """Masses on a line, joined by springs and dampers."""
 
+from dataclasses import KW_ONLY
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -10,6 +11,10 @@ from .._check import check_count
 from .._module import parameter, positive
 from .._typing import Control, Disturbance, State, Time
 from ._base import AbstractSystem
+
+
+def _as_count(masses: Any) -> int:
+    return check_count(masses, "masses", "MassSpringDamper")
 
 
 class MassSpringDamper(AbstractSystem):
@@ -44,26 +49,14 @@ class MassSpringDamper(AbstractSystem):
         ```
     """
 
-    mass: Array = parameter(constraint=positive)
-    stiffness: Array = parameter()
-    damping: Array = parameter()
-    masses: int = eqx.field(static=True)
+    mass: Array = parameter(1.0, constraint=positive)
+    stiffness: Array = parameter(1.0)
+    damping: Array = parameter(0.1)
+    _: KW_ONLY
+    masses: int = eqx.field(static=True, default=1, converter=_as_count)
 
     control_names: ClassVar = ("force",)
     control_units: ClassVar = ("N",)
-
-    def __init__(
-        self,
-        mass: Any = 1.0,
-        stiffness: Any = 1.0,
-        damping: Any = 0.1,
-        *,
-        masses: int = 1,
-    ):
-        self.mass = mass
-        self.stiffness = stiffness
-        self.damping = damping
-        self.masses = check_count(masses, "masses", "MassSpringDamper")
 
     def __check_init__(self):
         for name in ("mass", "stiffness", "damping"):

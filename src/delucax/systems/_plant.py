@@ -72,13 +72,13 @@ class AbstractPlant(eqx.Module):
     def observation_size(self) -> int:
         """The size of what `observe` returns."""
         y = output_of(self.observe, (), (self.state_size,))
-        shape = getattr(y, "shape", None)
-        if shape is None or len(shape) != 1:
-            got = type(y).__name__ if shape is None else f"an array of shape {shape}"
+        is_array = isinstance(y, jax.ShapeDtypeStruct)
+        if not is_array or len(y.shape) != 1:
+            got = f"an array of shape {y.shape}" if is_array else type(y).__name__
             raise ValueError(
                 f"{type(self).__name__}: observe must return a vector, got {got}."
             )
-        return shape[0]
+        return y.shape[0]
 
     @property
     def observes_state(self) -> bool:

@@ -132,23 +132,18 @@ class Quadrotor(AbstractSystem):
             push = 1 / self.mass
             ax, ay, az = ax + push * w[0], ay + push * w[1], az + push * w[2]
         jx, jy, jz = self.inertia_x, self.inertia_y, self.inertia_z
-        return jnp.stack(
-            [
-                x[7],
-                x[8],
-                x[9],
-                -0.5 * (qx * a + qy * b + qz * c),
-                0.5 * (qw * a + qy * c - qz * b),
-                0.5 * (qw * b + qz * a - qx * c),
-                0.5 * (qw * c + qx * b - qy * a),
-                ax,
-                ay,
-                az,
-                (wrench[1] - (jz - jy) * b * c) / jx,
-                (wrench[2] - (jx - jz) * c * a) / jy,
-                (wrench[3] - (jy - jx) * a * b) / jz,
-            ]
-        )
+        turning = [
+            -0.5 * (qx * a + qy * b + qz * c),
+            0.5 * (qw * a + qy * c - qz * b),
+            0.5 * (qw * b + qz * a - qx * c),
+            0.5 * (qw * c + qx * b - qy * a),
+        ]
+        spin = [
+            (wrench[1] - (jz - jy) * b * c) / jx,
+            (wrench[2] - (jx - jz) * c * a) / jy,
+            (wrench[3] - (jy - jx) * a * b) / jz,
+        ]
+        return jnp.stack([x[7], x[8], x[9], *turning, ax, ay, az, *spin])
 
     def project(self, x: State) -> State:
         return unit_attitude(x)
