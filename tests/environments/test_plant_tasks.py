@@ -1,5 +1,7 @@
 """The tasks that are not Gym's: the paper's numbers, and what each takes."""
 
+import inspect
+
 import diffrax
 import equinox as eqx
 import jax
@@ -230,6 +232,16 @@ def test_all_names_of_a_task_are_known():
         match="two_tank: no argument is called 'zzz'.*'upper_area'.*'cost'"
     ):
         dlx.make("two_tank", zzz=1.0)
+
+
+@once
+def test_the_signature_of_a_task_has_its_options():
+    names = list(inspect.signature(dlx.environments.planar_quadrotor).parameters)
+    options = ["wind", "wind_strength", "dt", "horizon", "solver", "substeps"]
+    assert names == ["system", *options, "others"]
+    assert dlx.environments.default_horizon("planar_quadrotor") == 100
+    with user_error(match="default_horizon: no task is called 'planar'; did you mean"):
+        dlx.environments.default_horizon("planar")
 
 
 @once

@@ -1,6 +1,7 @@
 """What a step costs and what an arrival is worth."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -38,10 +39,22 @@ class Arrival(AbstractCost):
         ```
     """
 
-    reached: Callable[[RealScalar, Array], Array] | None = function_field(None)
-    step_cost: Array = parameter(1.0)
-    control_weight: Array = parameter(0.0)
-    arrival_cost: Array = parameter(0.0)
+    reached: Callable[[RealScalar, Array], Array] | None = function_field()
+    step_cost: Array = parameter()
+    control_weight: Array = parameter()
+    arrival_cost: Array = parameter()
+
+    def __init__(
+        self,
+        reached: Callable[[RealScalar, Array], Array] | None = None,
+        step_cost: Any = 1.0,
+        control_weight: Any = 0.0,
+        arrival_cost: Any = 0.0,
+    ):
+        self.reached = reached
+        self.step_cost = step_cost
+        self.control_weight = control_weight
+        self.arrival_cost = arrival_cost
 
     def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
         effort = self.control_weight * sum(part * part for part in tuple(u))

@@ -108,51 +108,46 @@ class AbstractDisturbance(eqx.Module):
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
-def size_field() -> Any:
-    """A field of a size that need not be given beside a vector."""
-    # A converter lets None through to `__post_init__`.
-    any_size = lambda size: size
-    return eqx.field(static=True, kw_only=True, default=None, converter=any_size)
-
-
 class AbstractEntrywise(AbstractDisturbance):
     """A disturbance whose arguments are numbers, the same for each entry, or vectors of
     `size` entries.
     """
 
-    def __post_init__(self):
-        self.size = self._common_size()
+    def _set_entries(self, size: int | None, **values: Any) -> None:
+        """Set the fields of these names, and the size that they share."""
+        values["size"] = _common_size(type(self).__name__, size, values)
+        for name, value in values.items():
+            setattr(self, name, value)
 
     def __check_init__(self):
-        self._common_size()
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        _common_size(type(self).__name__, values.pop("size"), values)
 
     def _rows(self, w: Array, times: Vector) -> Array:
         """`w`, of one step or of all, for all `times`."""
         return jnp.broadcast_to(w, (len(times), self.size)).astype(times.dtype)
 
-    def _common_size(self) -> int:
-        """The size that the arguments share; numbers fit any size."""
-        where, size = type(self).__name__, self.size
-        for field in dataclasses.fields(self):
-            if field.name == "size":
-                continue
-            array = as_float_array(getattr(self, field.name))
-            if not eqx.is_inexact_array(array) or array.ndim > 1:
-                got = array.shape if eqx.is_array(array) else shortened(array)
-                raise ValueError(
-                    f"{where}: {field.name} must be a number or a vector with an entry "
-                    f"for each disturbance, got {got}."
-                )
-            if array.ndim == 1:
-                if size not in (None, len(array)):
-                    raise ValueError(
-                        f"{where}: {field.name} has {len(array)} entries where {size} "
-                        "are expected."
-                    )
-                size = len(array)
-        if size is None:
+
+def _common_size(where: str, size: int | None, values: dict[str, Any]) -> int:
+    """The size that arrays share; numbers fit any size."""
+    for name, value in values.items():
+        array = as_float_array(value)
+        if not eqx.is_inexact_array(array) or array.ndim > 1:
+            got = array.shape if eqx.is_array(array) else shortened(array)
             raise ValueError(
-                f"{where}: size must be given when every other argument is a number, "
-                f"such as {where}(..., size=2)."
+                f"{where}: {name} must be a number or a vector with an entry for each "
+                f"disturbance, got {got}."
             )
-        return check_count(size, "size", where)
+        if array.ndim == 1:
+            if size is not None and array.shape[0] != size:
+                raise ValueError(
+                    f"{where}: {name} has {array.shape[0]} entries where {size} are "
+                    "expected."
+                )
+            size = array.shape[0]
+    if size is None:
+        raise ValueError(
+            f"{where}: size must be given when every other argument is a number, such "
+            f"as {where}(..., size=2)."
+        )
+    return check_count(size, "size", where)

@@ -1,5 +1,7 @@
 """Disturbances that are known functions of time."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ from .._module import parameter, positive
 from .._typing import PRNGKey, Vector
 from ..math import sin
 from ..math._steps import coarsest, position, step_between
-from ._base import AbstractDisturbance, AbstractEntrywise, Rows, size_field
+from ._base import AbstractDisturbance, AbstractEntrywise, Rows
 
 
 class Zero(AbstractDisturbance):
@@ -58,7 +60,10 @@ class Constant(AbstractEntrywise):
     """
 
     value: Array = parameter()
-    size: int = size_field()
+    size: int = eqx.field(static=True)
+
+    def __init__(self, value: Any, *, size: int | None = None):
+        self._set_entries(size, value=value)
 
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         return self._rows(self.value, times)
@@ -90,9 +95,22 @@ class Sinusoid(AbstractEntrywise):
 
     amplitude: Array = parameter()
     frequency: Array = parameter()
-    phase: Array = parameter(0.0)
-    offset: Array = parameter(0.0)
-    size: int = size_field()
+    phase: Array = parameter()
+    offset: Array = parameter()
+    size: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        amplitude: Any,
+        frequency: Any,
+        phase: Any = 0.0,
+        offset: Any = 0.0,
+        *,
+        size: int | None = None,
+    ):
+        self._set_entries(
+            size, amplitude=amplitude, frequency=frequency, phase=phase, offset=offset
+        )
 
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         angle = 2 * np.pi * self.frequency * times[:, None] + self.phase
@@ -129,8 +147,13 @@ class Square(AbstractEntrywise):
 
     amplitude: Array = parameter()
     period: Array = parameter(constraint=positive)
-    duty: Array = parameter(0.5)
-    size: int = size_field()
+    duty: Array = parameter()
+    size: int = eqx.field(static=True)
+
+    def __init__(
+        self, amplitude: Any, period: Any, duty: Any = 0.5, *, size: int | None = None
+    ):
+        self._set_entries(size, amplitude=amplitude, period=period, duty=duty)
 
     def __check_init__(self):
         check_range(self.duty, "duty", "Square", 0, 1)

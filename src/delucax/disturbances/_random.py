@@ -14,7 +14,7 @@ from .._module import parameter
 from .._typing import PRNGKey, Vector
 from ..math import clip
 from ..math._steps import step_between
-from ._base import AbstractDisturbance, AbstractEntrywise, Rows, size_field
+from ._base import AbstractDisturbance, AbstractEntrywise, Rows
 
 
 class Gaussian(AbstractEntrywise):
@@ -42,8 +42,11 @@ class Gaussian(AbstractEntrywise):
     """
 
     std: Array = parameter()
-    mean: Array = parameter(0.0)
-    size: int = size_field()
+    mean: Array = parameter()
+    size: int = eqx.field(static=True)
+
+    def __init__(self, std: Any, mean: Any = 0.0, *, size: int | None = None):
+        self._set_entries(size, std=std, mean=mean)
 
     def __check_init__(self):
         check_range(self.std, "std", "Gaussian")
@@ -78,7 +81,10 @@ class Uniform(AbstractEntrywise):
 
     low: Array = parameter()
     high: Array = parameter()
-    size: int = size_field()
+    size: int = eqx.field(static=True)
+
+    def __init__(self, low: Any, high: Any, *, size: int | None = None):
+        self._set_entries(size, low=low, high=high)
 
     def __check_init__(self):
         check_range(self.high, "high", "Uniform", self.low)
@@ -115,9 +121,12 @@ class RandomWalk(AbstractEntrywise):
         ```
     """
 
-    std: Array = parameter(0.3)
-    bound: Array = parameter(1.0)
-    size: int = size_field()
+    std: Array = parameter()
+    bound: Array = parameter()
+    size: int = eqx.field(static=True)
+
+    def __init__(self, std: Any = 0.3, bound: Any = 1.0, *, size: int | None = None):
+        self._set_entries(size, std=std, bound=bound)
 
     def __check_init__(self):
         check_range(self.std, "std", "RandomWalk")

@@ -218,10 +218,10 @@ def cartpole_linear(
         state_names=("position", "angle", "velocity", "spin"),
         control_names=("force",),
     )
-    task = dict(
+    fields: dict[str, Any] = dict(
         dynamics=dynamics,
         cost=Quadratic(jnp.ones(4), jnp.ones(1)),
         initial_state=UniformState([-0.05] * 4, [0.05] * 4),
         horizon=horizon,
     )
-    return Environment(**(task | others))
+    return Environment(**(fields | others))

@@ -16,7 +16,12 @@ class AbstractGymStep(AbstractDiscretization):
 
     @abc.abstractmethod
     def gym_step(self, x: State, u: Control) -> State:
-        """The next state without disturbance."""
+        """The next state without disturbance.
+
+        **Arguments:** `x`: state. `u`: control.
+
+        **Returns:** the state, of any precision.
+        """
 
     def advance(
         self, t: Time, x: State, u: Control, w: Disturbance

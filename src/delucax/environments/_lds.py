@@ -92,7 +92,8 @@ def lds(
         dynamics = LinearDynamics(A, B, C, dt=1.0 if dt is None else dt)
     n, m = dynamics.state_size, dynamics.control_size
     cost = Quadratic(jnp.ones(n), jnp.ones(m))
-    return Environment(**(dict(dynamics=dynamics, cost=cost, horizon=horizon) | others))
+    fields: dict[str, Any] = dict(dynamics=dynamics, cost=cost, horizon=horizon)
+    return Environment(**(fields | others))
 
 
 def _sampled(system: Any, dt: Any) -> LinearDynamics:

@@ -85,8 +85,8 @@ def task(
                 limits = _taken(others, keywords_of(gym))
                 step = functools.partial(gym, system, dt, **limits)
                 subject = dynamics = gym_or_solver(step, solver, substeps, where)
-            fields = added(subject, **chosen)
-            fields = dict(dynamics=dynamics, horizon=horizon) | fields | others
+            fields: dict[str, Any] = dict(dynamics=dynamics, horizon=horizon)
+            fields = fields | added(subject, **chosen) | others
             if "observation_bounds" not in others:
                 if not _CHANGES_OBSERVATIONS.isdisjoint(others):
                     fields["observation_bounds"] = None

@@ -171,7 +171,7 @@ def ventilated(
     silent = isinstance(noise, int | float) and noise == 0
     where = tasks[0].__name__
     check_keywords(environment, where, *tasks, ventilated, Environment)
-    task: dict[str, Any] = dict(
+    fields: dict[str, Any] = dict(
         dynamics=sensed,
         cost=BreathCost(waveform, dynamics.state_size, expiration, limit),
         sensor_noise=None if silent else Gaussian(noise, size=1),
@@ -179,7 +179,7 @@ def ventilated(
         control_bounds=(jnp.zeros(2), jnp.array([100.0, 1.0])),
         horizon=horizon,
     )
-    return Environment(**(task | environment))
+    return Environment(**(fields | environment))
 
 
 def ventilation(

@@ -54,15 +54,21 @@ class AbstractSystem(AbstractPlant):
     """
 
     def __check_init__(self):
-        for name in ("state_names", "control_names", "disturbance_names"):
-            names = getattr(self, name)
+        where = type(self).__name__
+        for kind in ("state", "angle", "control", "disturbance"):
+            names = getattr(self, f"{kind}_names")
             if isinstance(names, str) or not isinstance(names, tuple | list):
                 raise ValueError(
-                    f"{type(self).__name__}: {name} must be a tuple of strings, such "
-                    f"as ('angle', 'velocity'), got {names!r}."
+                    f"{where}: {kind}_names must be a tuple of strings, such as "
+                    f"('angle', 'velocity'), got {names!r}."
                 )
         if not self.state_names:
-            raise ValueError(f"{type(self).__name__}: state_names must not be empty.")
+            raise ValueError(f"{where}: state_names must not be empty.")
+        if not set(self.angle_names) <= set(self.state_names):
+            raise ValueError(
+                f"{where}: angle_names must be among state_names, "
+                f"{self.state_names}, got {self.angle_names}."
+            )
         check_parameters(self)
 
     @property
