@@ -258,7 +258,7 @@ def test_a_linear_model_is_a_task():
 
 @once
 def test_a_fitted_field_is_a_task():
-    env = dlx.make("neural", system=dlx.systems.VanDerPol(), dt=0.1)
+    env = dlx.make("neural", system=dlx.systems.VanDerPol(), key=None, dt=0.1)
     expected = dlx.make("van_der_pol", dt=0.1).dynamics
     x, u = jnp.ones(2), jnp.ones(1)
     assert_close(env.dynamics(0.0, x, u), expected(0.0, x, u))

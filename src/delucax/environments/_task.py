@@ -55,6 +55,7 @@ def task(
     """
     default_solver, accepts = solver, accepts or kind
     arithmetic = () if gym is None else (gym,)
+    derived = inspect.signature(arguments).parameters
 
     def decorate(added: Callable[..., dict[str, Any]]) -> Callable[..., Environment]:
         where = added.__name__
@@ -70,7 +71,8 @@ def task(
         ) -> Environment:
             check_keywords(others, where, make, kind, *arithmetic, Environment)
             chosen = _taken(others, [p.name for p in options])
-            special = _taken(others, keywords_of(arguments))
+            special = _taken(others, derived)
+            special = {n: v for n, v in special.items() if v is not derived[n].default}
             constants = _taken(others, keywords_of(kind))
             if system is None:
                 system = kind(**(constants | arguments(**special)))
@@ -97,8 +99,8 @@ def task(
         system, *rest = signature.parameters.values()
         system = system.replace(annotation=accepts | None)
         _, *options = inspect.signature(added).parameters.values()
-        derived = inspect.signature(arguments).parameters.values()
-        signature = signature.replace(parameters=[system, *options, *derived, *rest])
+        parameters = [system, *options, *derived.values(), *rest]
+        signature = signature.replace(parameters=parameters)
         functools.update_wrapper(make, added)
         vars(make)["__signature__"] = signature
         return make
