@@ -1,7 +1,9 @@
 """Checks of arguments, with errors that name the argument and what was expected."""
 
+import difflib
 import functools
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,7 +15,7 @@ from jaxtyping import Array
 
 from ._files import as_path as as_path
 from ._message import shortened
-from ._module import as_float_array
+from ._module import as_float_array, indexed_names
 from ._typing import Bounds
 
 
@@ -318,3 +320,86 @@ def as_rows(
         raise ValueError(f"{where}: {name} must have at least one step.")
     check_real(array, name, where)
     return array
+
+
+def keywords_of(function: Callable[..., Any]) -> tuple[str, ...]:
+    """The names of the arguments that `function` takes as keywords."""
+    parameters = inspect.signature(function).parameters.values()
+    keyword = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
+    return tuple(p.name for p in parameters if p.kind in keyword)
+
+
+def check_keywords(
+    given: Iterable[str], where: str, *functions: Callable[..., Any]
+) -> None:
+    """Raise unless each name of `given` is a keyword of one of `functions`."""
+    names = list(dict.fromkeys(n for f in functions for n in keywords_of(f)))
+    for name in given:
+        if name not in names:
+            close = difflib.get_close_matches(name, names, n=3) or names
+            raise ValueError(
+                f"{where}: no argument is called {name!r}; did you mean "
+                f"{' or '.join(repr(n) for n in close)}?"
+            )
+
+
+LARGEST = float(np.finfo(np.float32).max)
+"""Ends a space where there is no bound, because Gymnasium advises against infinity."""
+
+
+def check_cost_sizes(cost: Any, sizes: tuple[int, int], name: str, where: str) -> None:
+    """Raise unless `cost` takes states and controls of these `sizes`."""
+    n, m = sizes
+    try:
+        output_of(cost, (), (n,), (m,))
+        output_of(cost.final, (), (n,))
+    except _UNTRACEABLE:  # it may still be called, one step after the other
+        return
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{where}: {name} does not fit a state of size {n} and a control of size "
+            f"{m}: {error}"
+        ) from error
+
+
+_UNTRACEABLE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+
+def checked_names(
+    names: Sequence[str] | None, letter: str, size: int, argument: str, where: str
+) -> tuple[str, ...]:
+    """`names` as a tuple of `size`, indexed if there are none, or an error."""
+    if names is None:
+        return indexed_names(letter, size)
+    if isinstance(names, str) or len(names) != size:
+        raise ValueError(f"{where}: {argument} must have {size} names, got {names!r}.")
+    return tuple(names)
+
+
+def check_matrices(
+    A: Any, B: Any, C: Any, E: Any, where: str
+) -> tuple[Array, Array, Any, Any]:
+    """`A`, `B`, `C`, `E` as matrices of fitting shapes, or an error that names one."""
+    A = as_matrix(A, "A", where)
+    n = A.shape[0]
+    if A.shape != (n, n) or n == 0:
+        raise ValueError(f"{where}: A must be square, got shape {A.shape}.")
+    B = _as_part(B, "B", n, "rows", where)
+    C = None if C is None else _as_part(C, "C", n, "columns", where)
+    E = None if E is None else _as_part(E, "E", n, "rows", where)
+    return A, B, C, E
+
+
+def _as_part(value: Any, name: str, n: int, side: str, where: str) -> Array:
+    """`value` as a matrix with as many rows or columns as there are states."""
+    matrix = as_matrix(value, name, where)
+    if matrix.shape[side == "columns"] != n:
+        raise ValueError(
+            f"{where}: {name} must have as many {side} as A ({n}), got shape "
+            f"{matrix.shape}."
+        )
+    return matrix

@@ -7,13 +7,14 @@ from jaxtyping import Array, Bool, Float, Key, Num, UInt32
 
 RealScalar: TypeAlias = Num[Array, ""] | int | float
 """A real number: a Python number or a rank-0 array."""
+Time: TypeAlias = RealScalar
 Vector: TypeAlias = Float[Array, "_"]  # noqa: F821
 """A rank-1 floating-point array."""
 Matrix: TypeAlias = Float[Array, "_ _"]
 """A rank-2 floating-point array."""
 State: TypeAlias = Float[Array, "states"]  # noqa: F821
 Control: TypeAlias = Float[Array, "controls"]  # noqa: F821
-Disturbance: TypeAlias = Float[Array, "disturbances"]  # noqa: F821
+Disturbance: TypeAlias = Float[Array, "disturbances"] | None  # noqa: F821
 Observation: TypeAlias = Float[Array, "observations"]  # noqa: F821
 Scalar: TypeAlias = Float[Array, ""]
 Bounds: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."]]

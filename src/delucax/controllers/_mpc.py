@@ -12,6 +12,7 @@ from .._check import (
     bounds_field,
     check_bool,
     check_control_bounds,
+    check_cost_sizes,
     check_count,
     check_finite,
     check_instance,
@@ -23,7 +24,6 @@ from .._module import as_float_array, check_parameters, function_field
 from .._results import Result, RESULTS
 from .._typing import Control, Observation, PRNGKey
 from ..costs import AbstractCost
-from ..costs._base import check_cost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ..planning import AbstractPlanner, Constraints, default_start, ILQR, Start
@@ -171,7 +171,7 @@ class MPC(AbstractController):
     ):
         where = "MPC"
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
-        check_cost(cost, "cost", where)
+        check_instance(cost, AbstractCost, "cost", where)
         horizon = check_count(horizon, "horizon", where)
         m = dynamics.control_size
         self.bounds = check_control_bounds(bounds, m, where)
@@ -205,7 +205,8 @@ class MPC(AbstractController):
         where, dynamics = "MPC", self.dynamics
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         n, m = dynamics.state_size, dynamics.control_size
-        check_cost(self.cost, "cost", where, (n, m))
+        check_instance(self.cost, AbstractCost, "cost", where)
+        check_cost_sizes(self.cost, (n, m), "cost", where)
         check_instance(self.planner, AbstractPlanner, "planner", where)
         check_parameters(self)
         check_instance(self.start, Start, "start", where)

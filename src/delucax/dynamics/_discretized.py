@@ -13,7 +13,7 @@ from .._jax import by_components, join_state, split_state
 from .._module import parameter
 from .._results import choose, first_of, or_none, promote, RESULTS
 from ..systems import AbstractSystem
-from ..systems._plant import zeros_if_none
+from ._base import zeros_if_none
 from ._runge_kutta import RK4, runge_kutta_step, tableau_of
 from ._solvers import (
     check_kind,

@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import as_matrix, check_real, is_concrete
+from .._check import as_matrix, check_matrices, check_real, checked_names, is_concrete
 from .._module import as_float_array, parameter
 from .._results import RESULTS
 from ..math import matvec
 from ..math._steps import row_at, step_at
-from ..systems._linear import check_matrices, checked_names
 from ._base import AbstractDynamics
 
 

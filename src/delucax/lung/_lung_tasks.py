@@ -6,11 +6,10 @@ from typing import Any
 
 import diffrax
 
-from .._check import check_count, check_instance
+from .._check import check_count, check_instance, check_keywords, keywords_of
 from .._module import load
 from ..dynamics import Delayed, Discretized
 from ..environments import Environment
-from ..environments._task import system_of
 from ._learned_lung import LearnedLung
 from ._lungs import (
     AbstractLung,
@@ -35,8 +34,15 @@ def _task(
     `task` is the function that a user called, which errors name, and `delay` the steps
     until a control acts.
     """
-    takers = _discretised, ventilated
-    system, options = system_of(task, kind, system, options, *takers)
+    where = task.__name__
+    check_keywords(options, where, task, kind, _discretised, ventilated, Environment)
+    constants = {n: options.pop(n) for n in keywords_of(kind) if n in options}
+    if system is None:
+        system = kind(**constants)
+    elif constants:
+        names = ", ".join(constants)
+        raise ValueError(f"{where}: give a system or its {names}, not both.")
+    check_instance(system, kind, "system", where)
     return _discretised(task, system, delay, **options)
 
 

@@ -7,14 +7,19 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from .._check import as_vector, check_count, check_positive, check_range
+from .._check import (
+    as_vector,
+    check_count,
+    check_keywords,
+    check_positive,
+    check_range,
+)
 from .._module import parameter
 from .._typing import Control, RealScalar, Scalar, State
 from ..costs import AbstractCost
 from ..disturbances import Gaussian
 from ..dynamics import AbstractDynamics, AbstractWrapper, Delayed
 from ..environments import Environment
-from ..environments._task import check_names, task_environment
 from ._learned_lung import LearnedLung
 from ._lung_models import LungModel
 from ._waveform import BreathWaveform, check_waveform, LENGTH
@@ -160,9 +165,8 @@ def ventilated(
         sensed = Delayed(sensor, sensor=delay)
         initial_state = sensed.filled(initial_state)
     silent = isinstance(noise, int | float) and noise == 0
-    check_names(task, environment, ventilated)
-    return task_environment(
-        environment,
+    check_keywords(environment, task.__name__, task, ventilated, Environment)
+    fields: dict[str, Any] = dict(
         dynamics=sensed,
         cost=BreathCost(waveform, dynamics.state_size, limit),
         sensor_noise=None if silent else Gaussian(noise, size=1),
@@ -170,6 +174,7 @@ def ventilated(
         control_bounds=(jnp.zeros(2), jnp.array([100.0, 1.0])),
         horizon=horizon,
     )
+    return Environment(**(fields | environment))
 
 
 def ventilation(
