@@ -5,19 +5,17 @@ import difflib
 import inspect
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
-from ._axes import Axis, axis_of, hashes_of, Mark, Marks, Param, shown_values
+from .._check import check_choice
+from ._axes import Axis, axis_of, Mark, Marks, Param
 from ._fingerprint import fingerprint
 from ._provenance import version
 from ._select import selector, words
 from ._store import RESERVED
-
-
-_SCOPES = ("case", "process")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,15 +28,6 @@ class Fixture:
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         return self.function(*args, **kwargs)
-
-
-class Choice(NamedTuple):
-    """One of the values of an axis: its place, what the table shows, and its hash."""
-
-    index: int
-    param: Param
-    shown: Mapping[str, Any]
-    hash: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,16 +165,7 @@ class Experiment:
         is_selected = selector(select, "select", where)
         is_marked = selector(marks, "marks", where)
         slow = slow or "slow" in words(marks)
-        choices = [
-            map(
-                Choice,
-                itertools.count(),
-                a.params,
-                shown_values(a),
-                hashes_of(a, where),
-            )
-            for a in self.all_axes()
-        ]
+        choices = [axis.choices(where) for axis in self.all_axes()]
         cases, names = [], set()
         for chosen in itertools.product(*choices):
             ids = "-".join(str(choice.param.id) for choice in chosen)
@@ -388,11 +368,7 @@ class experiment:  # noqa: N801
 
         **Raises:** `ValueError` on another scope.
         """
-        if scope not in _SCOPES:
-            raise ValueError(
-                f"experiment.fixture: scope must be {' or '.join(map(repr, _SCOPES))}, "
-                f"got {scope!r}."
-            )
+        check_choice(scope, ("case", "process"), "scope", "experiment.fixture")
         axis = None if params is None else axis_of("param", params, ids)
         make = lambda function: Fixture(function, scope, axis)
         return make if function is None else make(function)

@@ -9,16 +9,13 @@ from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
-from .._check import check_count
+from .._check import check_choice, check_count
 from ._execute import Outcome, Runner
 from ._experiment import as_experiment, as_seeds, Case, Experiment
 from ._provenance import provenance
 from ._results import FAILED, Results
 from ._store import Store
 from ._workers import Job, run_in_workers
-
-
-BACKENDS = ("loky", "dask")
 
 
 def run(
@@ -86,18 +83,14 @@ def run(
         ```
     """
     where = "run"
-    made = [as_experiment(one) for one in experiments]
+    made = [*map(as_experiment, experiments)]
     if not made:
         raise ValueError(f"{where}: experiments must be one at least.")
     names = [one.name for one in made]
     if len(set(names)) < len(names):
         raise ValueError(f"{where}: experiments must have different names: {names}.")
     workers = _workers(workers, where)
-    if backend not in BACKENDS:
-        raise ValueError(
-            f"{where}: backend must be one of {', '.join(map(repr, BACKENDS))}, got "
-            f"{backend!r}."
-        )
+    check_choice(backend, ("loky", "dask"), "backend", where)
     if mesh is not None and (workers > 1 or backend == "dask"):
         raise ValueError(f"{where}: mesh needs workers=1, got {workers} {backend}.")
     chosen = None if seeds is None else as_seeds(seeds, where)
