@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -14,8 +15,8 @@ from ... import lung
 from ..._typing import PRNGKey
 from ...controllers import LeakyPID, PID
 from ...environments import Environment
-from ._size import SEEN, Size
-from ._stacks import joined, taken
+from ._contenders import Trainer
+from ._settings import SEEN
 
 
 _STARTS = 4
@@ -65,20 +66,22 @@ def _errors(
     return jnp.where(jnp.isfinite(errors), errors, jnp.inf)
 
 
+def taken(tree: Any, index: Any) -> Any:
+    """What an index takes of each array of stacked modules."""
+    return jax.tree.map(lambda a: a[index] if eqx.is_array(a) else a, tree)
+
+
 def best_of(candidates: Any, errors: Any, shared: bool) -> Any:
     """The candidate with the least error in each lung, or on average over all; errors
     have the shape `(lungs, candidates)`."""
     if shared:
         return taken(candidates, jnp.argmin(jnp.mean(errors, axis=0)))
-    lungs = jnp.arange(errors.shape[0])
-    return taken(candidates, (jnp.argmin(errors, axis=1), lungs))
+    return taken(candidates, (jnp.argmin(errors, axis=1), jnp.arange(errors.shape[0])))
 
 
 def tuned_pids(
     envs: Environment,
-    waveform: lung.BreathWaveform,
-    size: Size,
-    key: PRNGKey,
+    trainer: Trainer,
     say: Callable[[str], Any],
     *,
     checkpoint: Path,
@@ -87,10 +90,11 @@ def tuned_pids(
     """The best of many at random and of the best few of them trained on, in each lung
     and for all: by their errors in the lungs themselves, which no network is given."""
     best: dict[str, Any] = {}
-    dt = envs.dt[0]
+    dt, size = envs.dt[0], trainer.size
     for k, (kind, name) in enumerate(((PID, "PID"), (LeakyPID, "leaky PID"))):
-        draw_key, search_key, fit_key, judge_key = jr.split(jr.fold_in(key, 20 + k), 4)
-        drawn = _drawn(kind, size.tuned, dt, waveform, draw_key)
+        keys = jr.split(jr.fold_in(trainer.key, 20 + k), 4)
+        draw_key, search_key, fit_key, judge_key = keys
+        drawn = _drawn(kind, size.tuned, dt, trainer.waveform, draw_key)
         errors = _errors(envs, drawn, search_key, False)
         for shared in (False, True):
             ranked = jnp.mean(errors, axis=0) if shared else errors.T
@@ -107,7 +111,9 @@ def tuned_pids(
                 progress=progress,
                 throw=False,
             )
-            candidates = joined(begin, trained.model)
+            candidates = lung.stack(
+                [*lung.unstack(begin), *lung.unstack(trained.model)]
+            )
             judged = _errors(envs, candidates, judge_key, not shared)
             if words := _lost(trained.history["diverged"], judged):
                 say(f"  {label}: {words}")

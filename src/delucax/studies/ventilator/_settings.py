@@ -1,4 +1,4 @@
-"""How large the study is, and of which lungs and peak pressures."""
+"""Settings of the study: its size, lungs and peak pressures."""
 
 from typing import NamedTuple
 
