@@ -14,12 +14,17 @@ import delucax as dlx
 from delucax import lung, studies
 from delucax.__main__ import main
 from delucax.studies.ventilator import _simulators
-from delucax.studies.ventilator._contenders import Contender, Trainer
+from delucax.studies.ventilator._contenders import (
+    _lost,
+    best_of,
+    Contender,
+    Trainer,
+    tuned_pids,
+)
 from delucax.studies.ventilator._report import save_controllers
 from delucax.studies.ventilator._settings import FULL
 from delucax.studies.ventilator._simulators import grouped, left_out
 from delucax.studies.ventilator._stages import Stages
-from delucax.studies.ventilator._tuned import _lost, best_of, tuned_pids
 
 
 pytestmark = once

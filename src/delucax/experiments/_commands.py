@@ -20,8 +20,10 @@ from ._tables import as_text
 
 def list_cases(file: str, suites: Mapping[str, str], select: str, marks: str) -> int:
     """Show the cases of a file."""
-    made = load(file, suites)
-    cases = [case for one in made for case in one.cases(select, marks, slow=True)]
+    experiments = load(file, suites)
+    cases = [
+        case for one in experiments for case in one.cases(select, marks, slow=True)
+    ]
     for case in cases:
         labels = ", ".join(mark.name for mark in case.marks)
         print(f"{case.id}  ({labels})" if labels else case.id)
@@ -37,9 +39,9 @@ def run_file(
     options: dict[str, Any],
 ) -> int:
     """Run the experiments of a file and show what came out."""
-    made = load(file, suites)
+    experiments = load(file, suites)
     place = Path("results") / f"{Path(file).stem}.jsonl" if store is None else store
-    results = run(*made, store=place, **options)
+    results = run(*experiments, store=place, **options)
     done = {row["case"] for row in results.rows if row["status"] != "skipped"}
     if not done:
         raise ValueError(

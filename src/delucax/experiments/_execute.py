@@ -46,10 +46,10 @@ class Outcome(NamedTuple):
 class Runner:
     """Runs cases of an experiment, and keeps what they share: programs and fixtures."""
 
-    def __init__(self, made: Experiment):
-        self.made, self.axes = made, made.all_axes()
-        self.fixtures = made.used_fixtures()
-        kinds = [p.kind for p in made.arguments.values()]
+    def __init__(self, experiment: Experiment):
+        self.experiment, self.axes = experiment, experiment.all_axes()
+        self.fixtures = experiment.used_fixtures()
+        kinds = [p.kind for p in experiment.arguments.values()]
         self.takes_any_name = inspect.Parameter.VAR_KEYWORD in kinds
         self.shared: dict[Any, Any] = {}
         self.closing = contextlib.ExitStack()
@@ -87,8 +87,8 @@ class Runner:
             raise
         except BaseException as raised:
             warnings.warn(
-                f"{self.made.name}: a fixture of the process could not be let go: "
-                f"{type(raised).__name__}: {raised}",
+                f"{self.experiment.name}: a fixture of the process could not be let "
+                f"go: {type(raised).__name__}: {raised}",
                 stacklevel=2,
             )
 
@@ -108,19 +108,21 @@ class Runner:
             known = [origins[w] for w in (*wanted, name) if w in origins]
             origins[name] = frozenset().union(*known)
             if fixture.scope == "case":
-                given[name] = _made(fixture.function, arguments, stack)
+                given[name] = _make(fixture.function, arguments, stack)
                 continue
             key = name, origins[name]
             if key not in self.shared:
-                self.shared[key] = _made(fixture.function, arguments, self.closing)
+                self.shared[key] = _make(fixture.function, arguments, self.closing)
             given[name] = self.shared[key]
         if self.takes_any_name:
             return given
-        return {n: value for n, value in given.items() if n in self.made.arguments}
+        return {
+            n: value for n, value in given.items() if n in self.experiment.arguments
+        }
 
     def _call(self, arguments: dict[str, Any], seeds: tuple[int, ...], mesh: Any):
         """What the function returns: a list by seed, or all seeds at once."""
-        function, known = self.made.function, self.made.arguments
+        function, known = self.experiment.function, self.experiment.arguments
         if "seed" in known:
             return [function(**arguments, seed=seed) for seed in seeds]
         if "key" not in known:
@@ -163,13 +165,13 @@ class Runner:
         arguments = eqx.combine(dynamic, static.tree)
 
         def one(number: Any) -> Any:
-            return self.made.function(**arguments, key=jax.random.key(number))
+            return self.experiment.function(**arguments, key=jax.random.key(number))
 
         return jax.vmap(one)(numbers)
 
     def _columns(self, returned: Any) -> dict[str, list]:
         """Lists with an entry for each seed, by name, of things that JSON knows."""
-        where = self.made.name
+        where = self.experiment.name
         if isinstance(returned, list):
             rows = [_as_mapping(row) for row in returned]
             if any(row.keys() != rows[0].keys() for row in rows):
@@ -233,7 +235,7 @@ def _split(arguments: dict[str, Any], kinds: tuple[type, ...]) -> tuple[dict, di
     return dynamic, static
 
 
-def _made(function: Callable, arguments: dict[str, Any], stack: Any) -> Any:
+def _make(function: Callable, arguments: dict[str, Any], stack: Any) -> Any:
     if not inspect.isgeneratorfunction(function):
         return function(**arguments)
     return stack.enter_context(contextlib.contextmanager(function)(**arguments))

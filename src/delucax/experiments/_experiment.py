@@ -41,6 +41,22 @@ class Case:
     marks: tuple[Mark, ...]
     hash: str
 
+    @property
+    def key(self) -> tuple[str, str]:
+        """What the store knows it by."""
+        return self.experiment, self.id
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What a line of the store tells of it."""
+        return {
+            "experiment": self.experiment,
+            "case": self.id,
+            "order": self.index,
+            "hash": self.hash,
+            "parameters": self.shown,
+        }
+
     def mark(self, name: str) -> Mark | None:
         """The mark of that name, if it has it."""
         return next((mark for mark in self.marks if mark.name == name), None)

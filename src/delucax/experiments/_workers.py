@@ -24,7 +24,7 @@ class Job(NamedTuple):
     """A case and the seeds to run it with."""
 
     number: int
-    made: Experiment
+    experiment: Experiment
     case: Case
     seeds: tuple[int, ...]
 
@@ -39,7 +39,7 @@ def run_in_workers(
     if backend == "dask":
         extra("distributed", "dask")
     pending = {job.number: job for job in jobs}
-    packed = {job.made.name: _packed(job.made) for job in jobs}
+    packed = {job.experiment.name: _packed(job.experiment) for job in jobs}
     with tempfile.TemporaryDirectory() as folder, _one_thread():
         marks = folder if backend == "loky" else None
         while pending:
@@ -54,15 +54,15 @@ def run_in_workers(
                 started = [n for n in pending if Path(folder, str(n)).exists()]
                 for job in [pending.pop(n) for n in (started if marks else [*pending])]:
                     yield job, _alone(job, packed, backend)
-        if any(_stays_open(job.made) for job in jobs):
+        if any(_stays_open(job.experiment) for job in jobs):
             _end(backend)
 
 
-def _stays_open(made: Experiment) -> bool:
+def _stays_open(experiment: Experiment) -> bool:
     """Whether something is to be done when its fixtures of a process are let go."""
     return any(
         fixture.scope == "process" and inspect.isgeneratorfunction(fixture.function)
-        for fixture in made.used_fixtures().values()
+        for fixture in experiment.used_fixtures().values()
     )
 
 
@@ -89,8 +89,8 @@ def _parallel(
     task = joblib.delayed(work)
     with joblib.parallel_config(backend=backend, n_jobs=workers):
         yield from joblib.Parallel(return_as="generator_unordered")(
-            task(*packed[made.name], number, case.index, seeds, precise, marks)
-            for number, made, case, seeds in jobs
+            task(*packed[experiment.name], number, case.index, seeds, precise, marks)
+            for number, experiment, case, seeds in jobs
         )
 
 
@@ -111,17 +111,17 @@ def _alone(job: Job, packed: dict[str, tuple[str, bytes]], backend: str) -> Outc
 _DEATHS = ("TerminatedWorkerError", "BrokenProcessPool", "KilledWorker")
 
 
-def _packed(made: Experiment) -> tuple[str, bytes]:
+def _packed(experiment: Experiment) -> tuple[str, bytes]:
     """The experiment as bytes that any process can read, and their hash."""
     cloudpickle = extra("cloudpickle", "experiments")
     # Its fixtures are found here: in another process it has no module's globals.
-    made = dataclasses.replace(made, fixtures=made.used_fixtures())
+    experiment = dataclasses.replace(experiment, fixtures=experiment.used_fixtures())
     try:
-        content = cloudpickle.dumps(made)
+        content = cloudpickle.dumps(experiment)
     except Exception as error:
         raise ValueError(
-            f"run: {made.name} cannot be sent to another process: {error}. Make what "
-            "cannot be sent in the function or in a fixture."
+            f"run: {experiment.name} cannot be sent to another process: {error}. Make "
+            "what cannot be sent in the function or in a fixture."
         ) from error
     # As bytes: an array would be put on one worker of a cluster, and die with it.
     return hashlib.sha256(content).hexdigest(), content

@@ -43,8 +43,7 @@ def estimator_variance(small: bool = False) -> Finding:
     def loss(controller, key):
         return rollout(env, controller, key=key, keep=(), throw=False).total_cost
 
-    ratios: dict[str, list[float]] = {}
-    rows, sizes = [], []
+    rows: list[dict[str, Any]] = []
     for width in widths:
         policy = MLP(2, 1, width, 1, key=jr.key(0))
         noisy = Gaussian(policy, float(np.log(ON_CONTROLS)))
@@ -65,12 +64,15 @@ def estimator_variance(small: bool = False) -> Finding:
             )
             samples[name] = jax.lax.map(estimate, jr.split(jr.key(1), draws))
         exact = samples["analytic"][0]
-        sizes.append(len(exact))
-        row: dict[str, Any] = {"parameters": len(exact)}
-        for name, drawn in samples.items():
-            row[name] = float(jnp.sum(jnp.var(drawn, axis=0)) / (exact @ exact))
-            ratios.setdefault(name, []).append(row[name])
-        rows.append(row)
+        scale = exact @ exact
+        variances = {
+            name: float(jnp.sum(jnp.var(drawn, axis=0)) / scale)
+            for name, drawn in samples.items()
+        }
+        rows.append({"parameters": len(exact), **variances})
+    sizes = [row["parameters"] for row in rows]
+    _, *names = rows[0]
+    ratios = {name: [row[name] for row in rows] for name in names}
     slope = {
         name: float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
         for name, values in ratios.items()

@@ -31,7 +31,6 @@ from ._report import (
 )
 from ._settings import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, UNSEEN
 from ._stages import Stages
-from ._tuned import tuned_pids
 
 
 def lung_study(
@@ -221,7 +220,9 @@ def _contenders(
     shared = training("shared", words, making.networks_for_all, trainer)
     if size.tuned:
         words = "PIDs with feed-forward tuned on the lungs"
-        tuned = training("tuned_pids", words, tuned_pids, envs, trainer, stages.say)
+        tuned = training(
+            "tuned_pids", words, making.tuned_pids, envs, trainer, stages.say
+        )
         contenders += pid_contenders(tuned)
     if size.extras:
         words = "PIDs trained on"
