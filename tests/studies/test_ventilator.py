@@ -15,9 +15,9 @@ from delucax import lung, studies
 from delucax.__main__ import main
 from delucax.studies.ventilator import _simulators
 from delucax.studies.ventilator._contenders import (
-    _lost,
     best_of,
     Contender,
+    divergence_note,
     Trainer,
     tuned_pids,
 )
@@ -161,9 +161,9 @@ def test_what_has_no_finite_error_is_not_chosen():
     errors = jnp.array([[jnp.inf, 2.0, 1.0], [3.0, jnp.inf, 4.0]])
     assert best_of(candidates, errors, False)["number"].tolist() == [4, 1]
     assert best_of(candidates, errors, True)["number"].tolist() == [4, 5]
-    assert _lost(np.zeros(5), errors[:, 2]) == ""
-    assert "2 of 6 errors are not finite" in _lost(np.zeros(5), errors)
-    assert "in 1 of 5 steps" in _lost(np.eye(5)[0], errors[:, 2])
+    assert divergence_note(np.zeros(5), errors[:, 2]) == ""
+    assert "2 of 6 errors are not finite" in divergence_note(np.zeros(5), errors)
+    assert "in 1 of 5 steps" in divergence_note(np.eye(5)[0], errors[:, 2])
 
 
 @thorough

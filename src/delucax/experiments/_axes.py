@@ -12,7 +12,7 @@ from ._fingerprint import fingerprint
 
 @dataclasses.dataclass(frozen=True)
 class Mark:
-    """What is known of a case beforehand; made by `experiment.mark`.
+    """A label of a case, such as `slow`; made by `experiment.mark`.
 
     **Arguments:**
 

@@ -32,7 +32,7 @@ _TRACED_KINDS = (bool, int, float, complex), (float, complex), ()
 
 
 class Outcome(NamedTuple):
-    """What became of a case, as it is stored, and the process that ran it."""
+    """The outcome of a case, as it is stored, and the process that ran it."""
 
     values: dict[str, list]
     error: str | None
@@ -79,7 +79,8 @@ class Runner:
         return Outcome(values, error, trace, *seconds, where, os.getpid())
 
     def close(self) -> None:
-        """Let the fixtures of the process go; one that fails harms no result."""
+        """End the fixtures of the process. If that fails, it is a warning: the results
+        are there."""
         self.shared.clear()
         try:
             self.closing.close()
@@ -221,7 +222,8 @@ def _comparable(leaf: Any) -> tuple:
 
 
 def _split(arguments: dict[str, Any], kinds: tuple[type, ...]) -> tuple[dict, dict]:
-    """What is traced of the arguments, and the rest; `kinds` of numbers are traced."""
+    """The arguments that are traced, and the static rest; numbers of `kinds` are
+    traced."""
 
     def is_traced(value: Any) -> Any:
         # A whole number inside a module is part of its structure.

@@ -1,4 +1,4 @@
-"""Experiments as pytest writes tests: a function, and what to call it with."""
+"""Experiments, declared as pytest declares tests: a function and its arguments."""
 
 import dataclasses
 import difflib
@@ -278,10 +278,11 @@ class experiment:  # noqa: N801
     - with `key`: it is traced, compiled, and called for all seeds at once by `vmap`,
       each with `jax.random.key(seed)`. Parameters that are arrays, modules' arrays or
       numbers are traced, so that other values compile nothing again; where a number
-      must be known when it is traced (a horizon, a width), it is, found by trying.
-    - with `seed`: it is called as it is, once for each seed, with an integer. For code
-      that cannot be traced, such as `fit`.
-    - with neither: it is called as it is, once.
+      must be known when it is traced (a horizon, a width), it is static: tracing is
+      tried first with all numbers, then with fewer.
+    - with `seed`: it is called without `jit`, once for each seed, with an integer. For
+      code that cannot be traced, such as `fit`.
+    - with neither: it is called once, without `jit`.
 
     **Arguments:**
 

@@ -7,7 +7,6 @@ import functools
 import hashlib
 import inspect
 import os
-import re
 import sys
 import sysconfig
 import textwrap
@@ -20,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 
 
-_ADDRESS = re.compile(r"0x[0-9a-f]+")
 _STANDARD = os.path.realpath(sysconfig.get_paths()["stdlib"])
 
 
@@ -194,12 +192,6 @@ class _Hasher:
     def other(self, value: Any) -> None:
         if isinstance(value, Iterator):
             raise TypeError(f"a {type(value).__name__}, which is used up when read")
-        leaves, structure = jax.tree.flatten(value)
-        if not (len(leaves) == 1 and leaves[0] is value):
-            self.word("tree", _ADDRESS.sub("", str(structure)))
-            self.nodes(structure)
-            self.feed(leaves)
-            return
         kind = type(value)
         if not self.visit(value):
             self.word("again", self.visited[id(value)][0])
@@ -217,15 +209,6 @@ class _Hasher:
         for k, part in enumerate(parts):
             # The fourth and fifth run over members of lists and of dictionaries.
             self.feed(list(part) if k in (3, 4) and part is not None else part)
-
-    def nodes(self, structure: Any) -> None:
-        """The classes of the nodes of a tree, and what these hold beside leaves."""
-        kind, static = structure.node_data() or (None, None)
-        if isinstance(kind, type) and self.own(kind.__module__):
-            self.type(kind)
-            self.feed_named(static)
-        for child in structure.children():
-            self.nodes(child)
 
 
 def _functions(member: Any) -> list[types.FunctionType]:

@@ -240,7 +240,7 @@ class Results:
 
 
 def _of_one_type(column: list) -> list:
-    """A column as it is if a file of typed columns can hold it, or as text."""
+    """A column as text, unless its values have one type, which Parquet needs."""
     types = {type(value) for value in column if value is not None}
     if len(types) < 2 or types == {int, float}:
         return column

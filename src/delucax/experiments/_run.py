@@ -34,10 +34,10 @@ def run(
 ) -> Results:
     """Run the cases of experiments that are not in the store yet.
 
-    A case that fails is recorded with its traceback and harms no other, one that kills
-    its worker neither. Each result is in the store as soon as it is there; what is
-    there already is not run again unless its code or parameters changed, so that a run
-    that was killed goes on with the same call.
+    A case that fails is recorded with its traceback, and the others run on; they also
+    run on if a case kills its worker. Each result is stored at once. What is stored is
+    not run again unless its code or parameters changed, so that the same call continues
+    a run that was killed.
 
     **Arguments:**
 

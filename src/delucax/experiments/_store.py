@@ -187,6 +187,6 @@ def _line(record: dict[str, Any]) -> bytes:
 def _lock(file: int) -> None:
     try:
         import fcntl
-    except ImportError:  # Windows: nobody watches that one run alone writes
+    except ImportError:  # Windows has no such lock, and two runs could write
         return
     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -32,9 +32,9 @@ class Job(NamedTuple):
 def run_in_workers(
     jobs: list[Job], workers: int, backend: str
 ) -> Generator[tuple[Job, Outcome], None, None]:
-    """By joblib. If a worker dies, those that were under way are run one by one, so
-    that the one that kills it is known. If there are fixtures to let go, the workers
-    end with the run."""
+    """Run jobs by joblib. If a worker dies, the jobs that were running are repeated one
+    by one, to know which one kills it. Workers end with the run if they hold fixtures
+    that must be ended."""
     extra("joblib", "experiments")
     if backend == "dask":
         extra("distributed", "dask")
@@ -54,23 +54,23 @@ def run_in_workers(
                 started = [n for n in pending if Path(folder, str(n)).exists()]
                 for job in [pending.pop(n) for n in (started if marks else [*pending])]:
                     yield job, _alone(job, packed, backend)
-        if any(_stays_open(job.experiment) for job in jobs):
-            _end(backend)
+        if any(_must_be_closed(job.experiment) for job in jobs):
+            _close_workers(backend)
 
 
-def _stays_open(experiment: Experiment) -> bool:
-    """Whether something is to be done when its fixtures of a process are let go."""
+def _must_be_closed(experiment: Experiment) -> bool:
+    """Whether code must run when its fixtures of a process end."""
     return any(
         fixture.scope == "process" and inspect.isgeneratorfunction(fixture.function)
         for fixture in experiment.used_fixtures().values()
     )
 
 
-def _end(backend: str) -> None:
-    """Let the fixtures of idle workers go: those of loky do so as they end."""
+def _close_workers(backend: str) -> None:
+    """End the fixtures of idle workers; those of loky end with the process."""
     if backend == "dask":
         client = extra("distributed", "dask").default_client()
-        client.run(_let_go, on_error="ignore")
+        client.run(_close_runners, on_error="ignore")
     else:
         loky = extra("joblib.externals.loky", "experiments")
         loky.get_reusable_executor(reuse=True).shutdown(wait=True)
@@ -133,7 +133,7 @@ _held: set[Runner] = set()
 
 
 @atexit.register
-def _let_go() -> None:
+def _close_runners() -> None:
     while _held:
         _held.pop().close()
 

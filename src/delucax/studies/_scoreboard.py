@@ -1,7 +1,7 @@
 """Every task crossed with the controllers that suit it.
 
-`python -m delucax run scoreboard` runs it for whoever wants to see; `python -m
-benchmarks.scoreboard` runs it for the committed results and their page.
+`python -m delucax run scoreboard` runs it; `python -m benchmarks.scoreboard` makes the
+committed results and their page.
 """
 
 import functools

@@ -10,15 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from ... import training
 from ...controllers import Linear
 from ...environments import pendulum
-from ...training import (
-    analytic,
-    EvolutionStrategies,
-    expected_cost,
-    fit,
-    Fitted,
-)
 from ._finding import Claim, draw_panels, Finding
 
 
@@ -35,8 +29,8 @@ def policy_gradient(small: bool = False) -> Finding:
         options: Any = dict(gradient=estimator, progress=False)
         return np.asarray(train_linear(steps, seed, rate, **options).history.loss)
 
-    exact = train(analytic, 0)
-    first, faster = _first(exact), _first(train(analytic, 0, TWICE))
+    exact = train(training.analytic, 0)
+    first, faster = _first(exact), _first(train(training.analytic, 0, TWICE))
     rows = [
         {
             "gradient": "through the rollout",
@@ -49,7 +43,7 @@ def policy_gradient(small: bool = False) -> Finding:
     curves, reached, total, fewest = {}, 0, 0, []
     for scale in scales:
         for count in pairs:
-            estimator = EvolutionStrategies(scale, 2 * count)
+            estimator = training.EvolutionStrategies(scale, 2 * count)
             runs = [train(estimator, seed) for seed in range(seeds)]
             when = [_first(run) for run in runs]
             # The loss itself, which is one more rollout a step, is not charged.
@@ -110,17 +104,17 @@ def policy_gradient(small: bool = False) -> Finding:
 def _mean_cost() -> Callable[..., Any]:
     """Of a step from hanging. One object, so that a second seed does not compile."""
     env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
-    total = expected_cost(env, batch=1, horizon=HORIZON)
+    total = training.expected_cost(env, batch=1, horizon=HORIZON)
     return lambda controller, key: total(controller, key) / HORIZON
 
 
 def train_linear(
     steps: int, seed: int = 0, rate: float = RATE, **options: Any
-) -> Fitted:
+) -> training.Fitted:
     """Descend with a linear policy from zero; with the options of `fit`."""
     options["key"] = jax.random.key(seed)
     start = Linear(jnp.zeros((1, 2)))
-    return fit(_mean_cost(), start, optax.sgd(rate), steps, **options)
+    return training.fit(_mean_cost(), start, optax.sgd(rate), steps, **options)
 
 
 def descent_claim(first: int | None, faster: int | None) -> Claim:

@@ -41,7 +41,7 @@ def reproduce(
     """Regenerate figures and tables of the Deluca paper, each claim with its number.
 
     A claim holds or it does not: the report says which, with what was measured. A study
-    that fails is a claim that does not hold, and harms no other.
+    that raises an error is a claim that does not hold, and the others run on.
 
     **Arguments:**
 
@@ -141,7 +141,7 @@ def _page(sections: list[str], rows: list[dict[str, Any]]) -> Page:
 
 
 def _section(finding: Finding) -> list[str]:
-    """The parts of a page that show what a study found."""
+    """The parts of a page that show the findings of a study."""
     section = Page(finding.title)
     section.heading(finding.title)
     for claim in finding.claims:

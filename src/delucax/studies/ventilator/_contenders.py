@@ -226,14 +226,14 @@ def tuned_pids(
                 [*lung.unstack(begin), *lung.unstack(trained.model)]
             )
             judged = _errors(envs, candidates, judge_key, not shared)
-            if words := _lost(trained.history["diverged"], judged):
+            if words := divergence_note(trained.history["diverged"], judged):
                 say(f"  {label}: {words}")
             best[label] = best_of(candidates, judged, shared)
     return best
 
 
-def _lost(diverged: Any, errors: Any) -> str:
-    """What there is to say of PIDs that diverged, nothing if none did."""
+def divergence_note(diverged: Any, errors: Any) -> str:
+    """A sentence about the PIDs that diverged; empty if none did."""
     lost, steps = int(jnp.sum(~jnp.isfinite(errors))), int(np.sum(diverged > 0))
     if not lost and not steps:
         return ""
@@ -319,7 +319,7 @@ def online_learners(
 
 
 class _Target(eqx.Module):
-    """The target of the first of so many states; the others have none."""
+    """A target for the first of `size` states; zero for the others."""
 
     waveform: lung.BreathWaveform
     size: int = eqx.field(static=True)

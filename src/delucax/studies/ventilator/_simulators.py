@@ -94,8 +94,7 @@ def grouped(breaths: lung.Breaths) -> Any:
 
 
 def left_out(recorded: lung.Breaths, breaths: lung.Breaths) -> str:
-    """What there is to say of recorded breaths that are not among those of each lung,
-    nothing if all are."""
+    """A sentence about the recorded breaths that are left out; empty if none is."""
     lungs, each = breaths.pressure.shape[:2]
     count = len(recorded) - lungs * each
     if not count:

@@ -19,16 +19,8 @@ from ..._check import check_count
 from ..._typing import PRNGKey
 from ...controllers import LeakyPID
 from ...environments import Environment
-from . import _contenders as making, _simulators as fitting
+from . import _contenders as making, _report as reporting, _simulators as fitting
 from ._contenders import Contender, pid_contenders, Trainer
-from ._report import (
-    best_of,
-    bound_rows,
-    error_rows,
-    PID_ROWS,
-    save_controllers,
-    summarise,
-)
 from ._settings import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, UNSEEN
 from ._stages import Stages
 
@@ -152,22 +144,22 @@ def lung_study(
             row["closed_loop_mae"] = float(errors[names.index(row["lung"])])
     stages.write_table("simulators.csv", table)
     keys = jr.split(jr.fold_in(key, 99), size.noises)
-    rows, runs = error_rows(contenders, envs, names, waveform, keys, between)
+    rows, runs = reporting.error_rows(contenders, envs, names, waveform, keys, between)
     if size.bound_steps:
         bound = stages.stage(
             "bound",
             "The least error, with the lung at hand",
             lambda: _least_errors(envs, size.bound_steps),
         )
-        rows += bound_rows(names, np.asarray(bound))
+        rows += reporting.bound_rows(names, np.asarray(bound))
     stages.write_table("report.csv", rows)
     place = stages.out / "controllers"
-    unsafe = save_controllers(place, contenders, names, waveform, rows)
-    summary = summarise(rows, table, stages.seconds, judge, unsafe)
+    unsafe = reporting.save_controllers(place, contenders, names, waveform, rows)
+    summary = reporting.summarise(rows, table, stages.seconds, judge, unsafe)
     stages.write("summary.json", json.dumps(summary, indent=1) + "\n")
     for line in summary["words"]:
         say(line)
-    best = {"best PID": best_of(rows, PID_ROWS, "unseen")[1]}
+    best = {"best PID": reporting.best_of(rows, reporting.PID_ROWS, "unseen")[1]}
     shown = {n: runs[best.get(n, n)] for n in ("best PID", "MLP", "MLP for all")}
     if importlib.util.find_spec("matplotlib") is None:
         say("No figures: they need matplotlib (pip install 'delucax[plot]').")
