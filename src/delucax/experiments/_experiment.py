@@ -49,13 +49,9 @@ class Case:
     @property
     def described(self) -> dict[str, Any]:
         """What a line of the store tells of it."""
-        return {
-            "experiment": self.experiment,
-            "case": self.id,
-            "order": self.index,
-            "hash": self.hash,
-            "parameters": self.shown,
-        }
+        named = {"experiment": self.experiment, "case": self.id}
+        content = {"hash": self.hash, "parameters": self.shown}
+        return named | {"order": self.index} | content
 
     def mark(self, name: str) -> Mark | None:
         """The mark of that name, if it has it."""

@@ -119,18 +119,15 @@ def run(
             missing = tuple(seed for seed in wanted if seed not in stored)
             if missing:
                 jobs.append(Job(len(jobs), one, case, missing))
-            changed += _with_new_status(
-                case, [stored[s] for s in wanted if s in stored]
-            )
-    if jobs or changed:
-        opened.open()
-    try:
+            kept = [stored[seed] for seed in wanted if seed in stored]
+            changed += _with_new_status(case, kept)
+    with contextlib.closing(opened):
+        if jobs or changed:
+            opened.open()
         for record in changed:
             opened.append(record)
         if jobs:
             _run_jobs(jobs, opened, workers, backend, mesh, progress)
-    finally:
-        opened.close()
     return Results._of(opened, asked)
 
 

@@ -49,16 +49,12 @@ def task_of(name: str) -> Environment:
         return make(name, width=8, key=jax.random.key(0))
     if name != "lds":
         return make(name)
-    box = UniformState(-jnp.ones(4), jnp.ones(4))
-    return make(
-        name,
-        key=jax.random.key(0),
-        states=4,
-        controls=2,
-        spectral_radius=1.05,
-        initial_state=box,
-        disturbance=Gaussian(0.1, size=4),
-    )
+    options: dict[str, Any] = {
+        "initial_state": UniformState(-jnp.ones(4), jnp.ones(4)),
+        "disturbance": Gaussian(0.1, size=4),
+        "spectral_radius": 1.05,
+    }
+    return make(name, key=jax.random.key(0), states=4, controls=2, **options)
 
 
 @functools.cache

@@ -126,13 +126,9 @@ def estimator_variance(small: bool = False) -> Finding:
         f"width 32, starts at any angle and speed, {DRAWN} rollouts an estimate; the "
         "norms are those of single rollouts."
     )
-    return Finding(
-        "Variance of gradient estimators",
-        claims,
-        {"Variance / squared gradient": rows, "Against the horizon": over},
-        {"estimator_variance": ax.figure},
-        notes,
-    )
+    title = "Variance of gradient estimators"
+    tables = {"Variance / squared gradient": rows, "Against the horizon": over}
+    return Finding(title, claims, tables, {"estimator_variance": ax.figure}, notes)
 
 
 def _at_horizon(horizon: int, draws: int) -> dict[str, Any]:

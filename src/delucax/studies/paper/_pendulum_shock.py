@@ -144,13 +144,9 @@ def pendulum_shock(small: bool = False) -> Finding:
         "defaults. The paper gives no settings. Ratios are of paired means, 95% "
         "intervals."
     )
-    return Finding(
-        "Adaptive control for the inverted pendulum",
-        claims,
-        {"Average cost": rows},
-        {"pendulum_shock": axes[0].figure},
-        notes,
-    )
+    title = "Adaptive control for the inverted pendulum"
+    tables = {"Average cost": rows}
+    return Finding(title, claims, tables, {"pendulum_shock": axes[0].figure}, notes)
 
 
 def _at_most(

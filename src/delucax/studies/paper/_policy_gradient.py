@@ -31,15 +31,7 @@ def policy_gradient(small: bool = False) -> Finding:
 
     exact = train(training.analytic, 0)
     first, faster = _first(exact), _first(train(training.analytic, 0, TWICE))
-    rows = [
-        {
-            "gradient": "through the rollout",
-            "runs": 1,
-            "reach 2.0": int(first is not None),
-            "rollouts, median": first,
-            "cost at the end, median": exact[-1],
-        }
-    ]
+    rows = [_row("through the rollout", 1, int(first is not None), first, exact[-1])]
     curves, reached, total, fewest = {}, 0, 0, []
     for scale in scales:
         for count in pairs:
@@ -50,15 +42,10 @@ def policy_gradient(small: bool = False) -> Finding:
             cost = [2 * count * w for w in when if w is not None]
             reached, total, fewest = reached + len(cost), total + seeds, fewest + cost
             curves[scale, count] = runs
-            rows.append(
-                {
-                    "gradient": f"evolution strategies, sigma {scale}, {count} pairs",
-                    "runs": seeds,
-                    "reach 2.0": len(cost),
-                    "rollouts, median": float(np.median(cost)) if cost else None,
-                    "cost at the end, median": float(np.median([r[-1] for r in runs])),
-                }
-            )
+            name = f"evolution strategies, sigma {scale}, {count} pairs"
+            median = float(np.median(cost)) if cost else None
+            at_end = float(np.median([run[-1] for run in runs]))
+            rows.append(_row(name, seeds, len(cost), median, at_end))
     least = min(fewest) if fewest else None
     claims = [
         descent_claim(first, faster),
@@ -74,14 +61,9 @@ def policy_gradient(small: bool = False) -> Finding:
     for (scale, count), runs in curves.items():
         x = 2 * count * np.arange(1, steps + 1)
         label = f"ES, sigma {scale}, {count} pairs"
-        ax.plot(
-            x,
-            np.median(runs, axis=0),
-            lw=1,
-            color=f"C{scales.index(scale)}",
-            alpha=1 - 0.2 * pairs.index(count),
-            label=label,
-        )
+        color, alpha = f"C{scales.index(scale)}", 1 - 0.2 * pairs.index(count)
+        median = np.median(runs, axis=0)
+        ax.plot(x, median, lw=1, color=color, alpha=alpha, label=label)
     ax.axhline(GOAL, color="0.5", lw=0.8, ls=":")
     ax.set(xscale="log", xlabel="rollouts", ylabel="mean cost of a step")
     ax.figure.legend(frameon=False, fontsize=7, loc="outside right center")
@@ -91,13 +73,20 @@ def policy_gradient(small: bool = False) -> Finding:
         "mean cost of Gym (with the sum it sticks at once). Evolution strategies are "
         f"antithetic, {seeds} seeds a setting, {steps} updates; lines are medians."
     )
-    return Finding(
-        "Policy gradient of the pendulum",
-        claims,
-        {"Rollouts to cost 2.0": rows},
-        {"policy_gradient": ax.figure},
-        notes,
-    )
+    tables, figures = {"Rollouts to cost 2.0": rows}, {"policy_gradient": ax.figure}
+    return Finding("Policy gradient of the pendulum", claims, tables, figures, notes)
+
+
+def _row(
+    gradient: str, runs: int, reached: int, rollouts: float | None, cost: float
+) -> dict[str, Any]:
+    return {
+        "gradient": gradient,
+        "runs": runs,
+        "reach 2.0": reached,
+        "rollouts, median": rollouts,
+        "cost at the end, median": cost,
+    }
 
 
 @functools.cache

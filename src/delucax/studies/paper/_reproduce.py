@@ -94,14 +94,8 @@ def reproduce(
         for claim in finding.claims:
             say(f"  {'holds' if claim.holds else 'DOES NOT HOLD'}: {claim.statement}")
             say(f"    {claim.measured}")
-            rows.append(
-                {
-                    "study": name,
-                    "claim": claim.statement,
-                    "measured": claim.measured,
-                    "holds": claim.holds,
-                }
-            )
+            words = {"claim": claim.statement, "measured": claim.measured}
+            rows.append({"study": name, **words, "holds": claim.holds})
         for title, figure in finding.figures.items():
             if not isinstance(figure, Path):
                 figure.savefig(out / f"{title}.png", dpi=150)

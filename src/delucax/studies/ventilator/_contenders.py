@@ -117,18 +117,14 @@ def trained_pids(
         pids["PID"], lung.stack([forward] * trainer.count)
     )
     starts["PID + feed-forward for all"] = lung.Summed(pids["PID for all"], forward)
-    trained = {}
+    trained, options = {}, dict(learning_rate=0.05, progress=progress)
     for name, start in starts.items():
         steps = trainer.size.pid_steps * (2 if "forward" in name else 1)
-        models = trainer(
-            lung.stack([start]),
-            steps,
-            6,
-            learning_rate=0.05,
+        options |= dict(
             shared=name.endswith("for all"),
             checkpoint=f"{checkpoint}.{name.replace(' ', '_')}",
-            progress=progress,
         )
+        models = trainer(lung.stack([start]), steps, 6, **options)
         trained[name] = lung.unstack(models)[0]
     return trained
 
@@ -202,6 +198,8 @@ def tuned_pids(
     and for all: by their errors in the lungs themselves, which no network is given."""
     best: dict[str, Any] = {}
     dt, size = envs.dt[0], trainer.size
+    options: Any = dict(steps=size.pid_steps, progress=progress)
+    options |= dict(learning_rate=0.03, throw=False)
     for k, (kind, name) in enumerate(((PID, "PID"), (LeakyPID, "leaky PID"))):
         keys = jr.split(jr.fold_in(trainer.key, 20 + k), 4)
         draw_key, search_key, fit_key, judge_key = keys
@@ -211,17 +209,9 @@ def tuned_pids(
             ranked = jnp.mean(errors, axis=0) if shared else errors.T
             begin = taken(drawn, jnp.argsort(ranked, axis=0)[:_TUNED_FURTHER])
             label = f"tuned {name} + feed-forward" + (" for all" if shared else "")
-            trained = lung.train_controllers(
-                envs,
-                begin,
-                key=fit_key,
-                shared=shared,
-                steps=size.pid_steps,
-                learning_rate=0.03,
-                checkpoint=Path(f"{checkpoint}.{label.replace(' ', '_')}"),
-                progress=progress,
-                throw=False,
-            )
+            file = Path(f"{checkpoint}.{label.replace(' ', '_')}")
+            options |= dict(checkpoint=file, shared=shared)
+            trained = lung.train_controllers(envs, begin, key=fit_key, **options)
             candidates = lung.stack(
                 [*lung.unstack(begin), *lung.unstack(trained.model)]
             )

@@ -139,16 +139,14 @@ def fitted(
     delay = size.sensor_delay
     models = [lung.LungModel(kind.make(k), train.dt[0], delay) for k in keys]
     system = "dynamics.dynamics.system."
-    return lung.fit_lungs(
-        lung.stack(models),
-        train,
-        key=jr.fold_in(key, 5),
+    options |= dict(
         steps=size.physics_steps * kind.steps,
         learning_rate=kind.learning_rate,
-        batch_size=32,
         trainable={f"{system}{n}": c for n, c in kind.trainable.items()} or None,
-        **options,
-    ).model
+    )
+    key = jr.fold_in(key, 5)
+    models = lung.stack(models)
+    return lung.fit_lungs(models, train, key=key, batch_size=32, **options).model
 
 
 def open_loop_rows(
