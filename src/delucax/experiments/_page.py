@@ -6,7 +6,6 @@ import io
 import os
 import string
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +98,7 @@ class Page:
         self.paragraph("; ".join(words), "made")
 
     def __str__(self) -> str:
-        template = resources.files(__package__).joinpath("page.html").read_text("utf-8")
+        template = Path(__file__).with_name("page.html").read_text("utf-8")
         return string.Template(template).substitute(
             title=escape(self.title), body="\n".join(self.parts)
         )

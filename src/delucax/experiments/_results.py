@@ -100,7 +100,7 @@ class Results:
         for record in records:
             metrics |= dict.fromkeys(record["values"])
             parameters |= dict.fromkeys(record["parameters"])
-            run = store.runs.get(record.get("run"), {})
+            run = store.runs.get(record.get("run", -1), {})
             row = {
                 **{name: record[name] for name in ("experiment", "case")},
                 **record["parameters"],

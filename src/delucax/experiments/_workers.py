@@ -82,7 +82,7 @@ def _parallel(
     workers: int,
     backend: str,
     marks: str | None,
-) -> Iterator[tuple[int, Outcome]]:
+) -> Iterator[Any]:
     import joblib
 
     precise = bool(jax.config.jax_enable_x64)
