@@ -49,9 +49,13 @@ class Case:
     @property
     def described(self) -> dict[str, Any]:
         """What a line of the store tells of it."""
-        named = {"experiment": self.experiment, "case": self.id}
-        content = {"hash": self.hash, "parameters": self.shown}
-        return named | {"order": self.index} | content
+        return {
+            "experiment": self.experiment,
+            "case": self.id,
+            "order": self.index,
+            "hash": self.hash,
+            "parameters": self.shown,
+        }
 
     def mark(self, name: str) -> Mark | None:
         """The mark of that name, if it has it."""
