@@ -2,7 +2,7 @@
 
 from typing import Literal, TypeAlias
 
-from jaxtyping import Array, Bool, Float, Key, Num, Shaped, UInt32
+from jaxtyping import Array, Bool, Float, Key, Num, UInt32
 
 
 RealScalar: TypeAlias = Num[Array, ""] | int | float
@@ -16,9 +16,10 @@ Control: TypeAlias = Float[Array, "controls"]  # noqa: F821
 Disturbance: TypeAlias = Float[Array, "disturbances"]  # noqa: F821
 Observation: TypeAlias = Float[Array, "observations"]  # noqa: F821
 Scalar: TypeAlias = Float[Array, ""]
+Bounds: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."]]
+"""`(low, high)`, each a number or one for each entry."""
 BoolScalar: TypeAlias = Bool[Array, ""]
 PRNGKey: TypeAlias = Key[Array, "..."] | UInt32[Array, "... 2"]
 """A key from `jax.random.key` (or the older `jax.random.PRNGKey`)."""
 Checkpoint: TypeAlias = Literal["step", "sqrt"] | None
 """What the gradient of a rollout stores."""
-AnyArray: TypeAlias = Shaped[Array, "..."]

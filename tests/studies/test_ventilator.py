@@ -142,7 +142,7 @@ def test_what_passed_the_limit_is_not_saved(tmp_path):
 @thorough
 def test_tuned_pids_are_the_best_that_were_tried(tmp_path):
     waveform = lung.BreathWaveform()
-    envs = lung.stack([lung.single_compartment(R) for R in (5.0, 50.0)])
+    envs = lung.stack([lung.single_compartment(resistance=R) for R in (5.0, 50.0)])
     size = FULL._replace(tuned=20, pid_steps=3)
     options = dict(checkpoint=tmp_path / "tuned.fit", progress=False)
     said = []

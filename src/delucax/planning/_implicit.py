@@ -13,7 +13,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._jax import by_lanes, poison
+from .._jax import by_lanes, nan_tangent
 from ..math import matvec
 from ._augmented import with_constraints
 from ._constraints import Multipliers
@@ -85,7 +85,7 @@ def _with_tangents(primals: Any, tangents: Any, options: Options) -> Any:
     _, dJ = jax.jvp(cost, (varied, X, U), (change, dX, dU))
     _, dK = jax.jvp(gains, (varied, X, U, y), (change, dX, dU, dy))
     ok = solved & definite
-    dX, dU, dK, dJ = (poison(d, ok) for d in (dX, dU, dK, dJ))
+    dX, dU, dK, dJ = (nan_tangent(d, ok) for d in (dX, dU, dK, dJ))
     return out, nothing._replace(states=dX, controls=dU, gains=dK, cost=dJ)
 
 

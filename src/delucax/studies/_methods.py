@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from .. import controllers
 from .._controller import AbstractController
+from ..controllers import mlp_policy
 from ..costs import AbstractCost, Function
 from ..disturbances import Gaussian
 from ..dynamics import linearize
@@ -180,14 +181,14 @@ FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
         "HInfinity": lambda name: _regulator(name, controllers.HInfinity),
     },
     "Online learning": {
-        "GPC": lambda name: _learning(name, controllers.GPC),
+        "GPC": lambda name: _learning(name, controllers.gpc),
         "Adaptive": lambda name: controllers.Adaptive(agent_of(name, "GPC")),
         "NeuralGPC": lambda name: _learning(
-            name, controllers.NeuralGPC, key=jax.random.key(0)
+            name, controllers.neural_gpc, key=jax.random.key(0)
         ),
-        "DRC": lambda name: _learning(name, controllers.DRC),
-        "SFC": lambda name: _learning(name, controllers.SFC),
-        "DSC": lambda name: _learning(name, controllers.DSC),
+        "DRC": lambda name: _learning(name, controllers.drc),
+        "SFC": lambda name: _learning(name, controllers.sfc),
+        "DSC": lambda name: _learning(name, controllers.dsc),
         "BPC": lambda name: controllers.BPC(
             task_of(name).dynamics, agent_of(name, "LQR")
         ),
@@ -198,8 +199,8 @@ FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
         "CEM": lambda name: _receding(name, CEM, samples=128, iterations=3),
     },
     "Training": {
-        "affine": lambda name: _by_gradient(name, controllers.Deep, width=1, depth=0),
-        "MLP": lambda name: _by_gradient(name, controllers.Deep, width=32, depth=1),
+        "affine": lambda name: _by_gradient(name, mlp_policy, width=1, depth=0),
+        "MLP": lambda name: _by_gradient(name, mlp_policy, width=32, depth=1),
         "GRU": lambda name: _by_gradient(name, _gru),
         "SHAC": lambda name: _by_actor_critic(name, SHAC),
         "PPO": lambda name: _by_actor_critic(name, PPO),

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..controllers import Sequence, Zero
+from ..controllers import OpenLoop, Zero
 from ..environments import Environment
 from ..experiments import experiment
 from ..planning import ilqr
@@ -47,12 +47,12 @@ def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
         problem = env.dynamics, env.cost, run.states[0], guess
         plan = ilqr(*problem, max_iterations=100, **options)
         for controls in (guess, plan.controls):
-            cost = float(_cost(env, Sequence(controls), key))
+            cost = float(_cost(env, OpenLoop(controls), key))
             if np.isfinite(cost) and cost < least:
                 best, least = controls, cost
     if best is None:
         raise Unsuitable("no plan was found")
-    return Sequence(best)
+    return OpenLoop(best)
 
 
 def _suited(task: str, method: str) -> Any:

@@ -70,8 +70,9 @@ class AbstractPlant(eqx.Module):
     @property
     def observes_state(self) -> bool:
         """Whether what `observe` returns is the state itself, as its program shows."""
-        x = jnp.zeros(self.state_size)
-        traced = jax.make_jaxpr(self.observe)(jnp.zeros(()), x).jaxpr
+        shapes = (), (self.state_size,)
+        t, x = (jax.ShapeDtypeStruct(s, jnp.result_type(float)) for s in shapes)
+        traced = jax.make_jaxpr(self.observe)(t, x).jaxpr
         return list(traced.outvars) == [traced.invars[1]]
 
     def observe(self, t: RealScalar, x: State) -> Observation:

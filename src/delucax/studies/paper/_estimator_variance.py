@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ... import training
-from ...controllers import Deep, Gaussian, MLP
+from ...controllers import Gaussian, MLP, mlp_policy
 from ...environments import pendulum
 from ...simulation import rollout
 from .._swing_up import spread_starts
@@ -134,7 +134,7 @@ def estimator_variance(small: bool = False) -> Finding:
 def _at_horizon(horizon: int, draws: int) -> dict[str, Any]:
     """Variances over a horizon, the start drawn, and how large the gradient is."""
     env = spread_starts(pendulum())
-    policy = Deep(env, width=32, depth=1, key=jr.key(0))
+    policy = mlp_policy(env, width=32, depth=1, key=jr.key(0))
     noisy = Gaussian(policy, -1.0, bounds=env.control_bounds)
     one = training.expected_cost(env, batch=1, horizon=horizon)
     score = training.scored_cost(env, horizon=horizon)

@@ -28,7 +28,7 @@ def lq_perturbations(small: bool = False) -> Finding:
     contenders = {
         "LQR": controllers.LQR(dynamics, jnp.eye(2), jnp.eye(1)),
         "H-infinity": controllers.HInfinity(dynamics, jnp.eye(2), jnp.eye(1)),
-        "GPC": controllers.GPC(dynamics, cost),
+        "GPC": controllers.gpc(dynamics, cost),
     }
     t = np.arange(steps)[:, None]
     phases = np.random.default_rng(0).uniform(0, 2 * np.pi, (seeds, 1, 1))

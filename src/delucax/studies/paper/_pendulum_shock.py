@@ -45,7 +45,7 @@ def pendulum_shock(small: bool = False) -> Finding:
         return ilqr(dynamics, cost, x0, guess, bounds=(-BOUND, BOUND))
 
     plans = jax.lax.map(planned, starts)
-    learner = controllers.GPC(dynamics, cost, base=lqr)
+    learner = controllers.gpc(dynamics, cost, base=lqr)
     # What LQR would cost from there on stands for all that lies beyond the horizon.
     ahead = Quadratic(jnp.eye(2), jnp.eye(1), final=lqr.P)
     mpc = controllers.MPC(dynamics, ahead, AHEAD, bounds=(-BOUND, BOUND))
@@ -54,10 +54,10 @@ def pendulum_shock(small: bool = False) -> Finding:
         "LQR": lambda plan: lqr,
         "GPC": lambda plan: learner,
         "AdaGPC": lambda plan: controllers.Adaptive(learner),
-        "iLQR, open loop": lambda plan: controllers.Sequence(plan.controls),
+        "iLQR, open loop": lambda plan: controllers.OpenLoop(plan.controls),
         "iLQR, with gains": lambda plan: plan,
         "MPC": lambda plan: mpc,
-        "GPC around the plan": lambda plan: controllers.GPC(
+        "GPC around the plan": lambda plan: controllers.gpc(
             dynamics, cost, base=plan, horizon=learner.loop.horizon
         ),
     }

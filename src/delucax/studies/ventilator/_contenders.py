@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from ... import lung
 from ..._typing import PRNGKey
-from ...controllers import GPC, LeakyPID, online_newton, OutputFeedback, PID
+from ...controllers import gpc, LeakyPID, online_newton, OutputFeedback, PID
 from ...costs import Tracking
 from ...dynamics import LinearDynamics
 from ...environments import Environment
@@ -297,12 +297,12 @@ def online_learners(
         base = LeakyPID(*gains, dt=dt, reference=waveform, output=0)
         error = jnp.zeros(n).at[0].set(1.0)
         cost = Tracking(error, jnp.zeros(1), _Target(waveform, n))
-        gpc = GPC(model, cost, base=base, horizon=10, optimiser=newton)
+        online = gpc(model, cost, base=base, horizon=10, optimiser=newton)
         # All that the fit leaves over moves the lung; the sensor is taken at its word.
         process = jnp.diag(_NOISE**2 * error)
         mean = error.at[1].set(1.0) * waveform.peep
         kalman = KalmanFilter(identified, process, 1e-4 * jnp.eye(1), mean=mean)
-        return OutputFeedback(gpc, kalman)
+        return OutputFeedback(online, kalman)
 
     each = lung.unstack(train), lung.unstack(pids["leaky PID"])
     return lung.stack([*map(learner, *each)])

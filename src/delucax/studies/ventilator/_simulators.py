@@ -68,11 +68,17 @@ KINDS = {
 }
 
 
+def task_of(resistance: float, compliance: float, sensor_delay: int) -> Environment:
+    """The task of a lung of the study."""
+    system = lung.DoubleCompartment(resistance, compliance)
+    return lung.double_compartment(system, sensor_delay=sensor_delay)
+
+
 def explored(size: Size) -> lung.Breaths:
     """Breaths of the lungs of the study, stacked over them."""
     made = []
     for i, (R, C) in enumerate(size.lungs):
-        env = lung.double_compartment(R, C, sensor_delay=size.sensor_delay)
+        env = task_of(R, C, size.sensor_delay)
         known: Any = dict(resistance=R, compliance=C)
         made.append(lung.explore(env, size.breaths, key=jr.key(i), **known))
     return stack_breaths(made)
