@@ -57,19 +57,9 @@ def train_swing_up(
     environment = pendulum() if environment is None else environment
     init_key, fit_key = jax.random.split(key)
     policy = mlp_policy(environment, width=32, depth=1, key=init_key)
-    return fit(
-        expected_cost(
-            spread_starts(environment),
-            batch=BATCH,
-            horizon=HORIZON,
-            gradient_decay=0.92,
-        ),
-        policy,
-        _optimiser(steps),
-        steps,
-        key=fit_key,
-        progress=progress,
-    )
+    starts = spread_starts(environment)
+    loss = expected_cost(starts, batch=BATCH, horizon=HORIZON, gradient_decay=0.92)
+    return fit(loss, policy, _optimiser(steps), steps, key=fit_key, progress=progress)
 
 
 def spread_starts(environment: Environment) -> Environment:

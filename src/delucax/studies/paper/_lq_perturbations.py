@@ -92,10 +92,6 @@ def lq_perturbations(small: bool = False) -> Finding:
         "with the same perturbations for all; all at their defaults. The paper gives "
         "neither matrices nor horizon. Intervals are 95%."
     )
-    return Finding(
-        "Linear-quadratic control with adversarial perturbations",
-        claims,
-        {"Average cost": rows},
-        {"lq_perturbations": axes[0].figure},
-        notes,
-    )
+    title = "Linear-quadratic control with adversarial perturbations"
+    tables = {"Average cost": rows}
+    return Finding(title, claims, tables, {"lq_perturbations": axes[0].figure}, notes)
