@@ -68,7 +68,7 @@ def test_help_shows_defaults(command, shown, capsys):
 def test_every_controller_is_listed(capsys):
     assert main(["list"]) == 0
     out = set(capsys.readouterr().out.split())
-    assert {"lqrd", "LQR", "Deep"} <= out
+    assert {"lqrd", "LQR", "mlp_policy"} <= out
     controllers = {
         name
         for name, member in vars(dlx.controllers).items()

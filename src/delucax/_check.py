@@ -1,6 +1,5 @@
 """Checks of arguments, with errors that name the argument and what was expected."""
 
-import difflib
 import functools
 import inspect
 from collections.abc import Callable, Iterable, Sequence
@@ -14,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from ._files import as_path as as_path
-from ._message import shortened
+from ._message import did_you_mean, shortened
 from ._module import as_float_array, indexed_names
 from ._typing import Bounds
 
@@ -336,10 +335,8 @@ def check_keywords(
     names = list(dict.fromkeys(n for f in functions for n in keywords_of(f)))
     for name in given:
         if name not in names:
-            close = difflib.get_close_matches(name, names, n=3) or names
             raise ValueError(
-                f"{where}: no argument is called {name!r}; did you mean "
-                f"{' or '.join(repr(n) for n in close)}?"
+                f"{where}: no argument is called {name!r}; {did_you_mean(name, names)}"
             )
 
 

@@ -48,7 +48,7 @@ BOX = dlx.environments.UniformState(-jnp.ones(2), jnp.ones(2))
         ),
         (
             lambda: environment(control_bounds=(jnp.zeros(2), jnp.ones(2))),
-            r"control_bounds must be numbers or have shape \(1,\), got \(2,\)",
+            r"control_bounds must be numbers or have shape \(1,\), got shape \(2,\)",
         ),
         (
             lambda: dlx.environments.UniformState(jnp.ones(2), jnp.ones(3)),

@@ -39,6 +39,7 @@ class _Forwarding(AbstractDynamics):
     disturbance_names = _forwarded("disturbance_names")
     disturbance_size = _forwarded("disturbance_size")
     noise = _forwarded("noise")
+    angle_names = _forwarded("angle_names")
     state_units = _forwarded_units("state")
     control_units = _forwarded_units("control")
     time_unit = _forwarded("time_unit")

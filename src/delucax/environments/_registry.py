@@ -1,11 +1,11 @@
 """Tasks by name."""
 
-import difflib
 import importlib
 import inspect
 from collections.abc import Callable
 from typing import Any
 
+from .._message import did_you_mean
 from ._environment import Environment
 
 
@@ -85,10 +85,10 @@ def _task(name: str, where: str) -> Callable[..., Any]:
     """The function that makes a task."""
     if not isinstance(name, str) or name not in _REGISTRY:
         names = sorted(_REGISTRY)
-        close = difflib.get_close_matches(str(name), names, n=3, cutoff=0.4) or names
         raise ValueError(
-            f"{where}: no task is called {name!r}; did you mean "
-            f"{' or '.join(repr(n) for n in close)}? All names: {', '.join(names)}."
+            f"{where}: no task is called {name!r}; "
+            f"{did_you_mean(str(name), names, cutoff=0.4)} "
+            f"All names: {', '.join(names)}."
         )
     module, _, function = _REGISTRY[name].partition(":")
     try:

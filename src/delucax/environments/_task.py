@@ -72,7 +72,7 @@ def task(
             check_keywords(others, where, make, kind, *arithmetic, Environment)
             chosen = _taken(others, [p.name for p in options])
             special = _taken(others, derived)
-            special = {n: v for n, v in special.items() if v is not derived[n].default}
+            special = {n: v for n, v in special.items() if v is not None}
             constants = _taken(others, keywords_of(kind))
             if system is None:
                 system = kind(**(constants | arguments(**special)))

@@ -26,6 +26,7 @@ def _task(
     task: Callable[..., Environment],
     kind: type[AbstractLung],
     system: AbstractLung | None,
+    horizon: int,
     options: dict[str, Any],
     delay: int = 0,
 ) -> Environment:
@@ -43,7 +44,7 @@ def _task(
         names = ", ".join(constants)
         raise ValueError(f"{where}: give a system or its {names}, not both.")
     check_instance(system, kind, "system", where)
-    return _discretised(task, system, delay, **options)
+    return _discretised(task, system, delay, horizon=horizon, **options)
 
 
 def _discretised(
@@ -71,7 +72,9 @@ def _discretised(
     return env
 
 
-def balloon_lung(system: BalloonLung | None = None, **options: Any) -> Environment:
+def balloon_lung(
+    system: BalloonLung | None = None, *, horizon: int = 100, **options: Any
+) -> Environment:
     """Make a balloon breathe as a waveform says.
 
     The controls, the observation, the state and the cost are those of
@@ -101,11 +104,15 @@ def balloon_lung(system: BalloonLung | None = None, **options: Any) -> Environme
         env = dlx.make("lung/balloon_lung", resistance=10.0)
         ```
     """
-    return _task(balloon_lung, BalloonLung, system, options)
+    return _task(balloon_lung, BalloonLung, system, horizon, options)
 
 
 def delay_lung(
-    system: DelayLung | None = None, *, delay: int = 5, **options: Any
+    system: DelayLung | None = None,
+    *,
+    delay: int = 5,
+    horizon: int = 100,
+    **options: Any,
 ) -> Environment:
     """Make a balloon breathe through a long pipe, which what is done must first pass.
 
@@ -137,11 +144,11 @@ def delay_lung(
     """
     delay = check_count(delay, "delay", "delay_lung", least=0)
     options = dict(substeps=4) | options
-    return _task(delay_lung, DelayLung, system, options, delay)
+    return _task(delay_lung, DelayLung, system, horizon, options, delay)
 
 
 def single_compartment(
-    system: SingleCompartment | None = None, **options: Any
+    system: SingleCompartment | None = None, *, horizon: int = 100, **options: Any
 ) -> Environment:
     """Make a lung of one compartment breathe as a waveform says.
 
@@ -165,11 +172,11 @@ def single_compartment(
         env = dlx.make("lung/single_compartment", resistance=50.0, compliance=10.0)
         ```
     """
-    return _task(single_compartment, SingleCompartment, system, options)
+    return _task(single_compartment, SingleCompartment, system, horizon, options)
 
 
 def double_compartment(
-    system: DoubleCompartment | None = None, **options: Any
+    system: DoubleCompartment | None = None, *, horizon: int = 100, **options: Any
 ) -> Environment:
     """Make a lung of a fast and a slow compartment breathe, with delay and noise.
 
@@ -197,10 +204,12 @@ def double_compartment(
         ```
     """
     options = dict(sensor_delay=2, noise=0.2, substeps=2) | options
-    return _task(double_compartment, DoubleCompartment, system, options)
+    return _task(double_compartment, DoubleCompartment, system, horizon, options)
 
 
-def learned_lung(model: LearnedLung | None = None, **options: Any) -> Environment:
+def learned_lung(
+    model: LearnedLung | None = None, *, horizon: int = 100, **options: Any
+) -> Environment:
     """Make a lung breathe that was learned from breaths.
 
     As `lung/balloon_lung`; its time step is that of the breaths, and what it is let out
@@ -234,4 +243,5 @@ def learned_lung(model: LearnedLung | None = None, **options: Any) -> Environmen
     if model is None:
         lung = load(Path(__file__).with_name("learned_lung.dlx"))
     check_instance(lung, LearnedLung, "model", "learned_lung")
-    return ventilated(learned_lung, lung, lung.resting(), **options)
+    rest = lung.resting()
+    return ventilated(learned_lung, lung, rest, horizon=horizon, **options)
