@@ -8,6 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._results import choose, Result, RESULTS
 from ._constraints import Multipliers
 from ._line_search import Iterate, search
 from ._lq import in_parallel, in_sequence, Policy, promised, Stages
@@ -18,8 +19,6 @@ from ._start import begin, controls_of, Start
 FACTOR = 2.0
 LEAST_MU = 1e-6
 MOST_MU = 1e10
-
-NOT_CONVERGED, CONVERGED, NO_DESCENT, DIVERGED, INFEASIBLE = range(5)
 
 
 class Options(eqx.Module):
@@ -49,7 +48,7 @@ class Outcome(NamedTuple):
     cost: Array
     residual: Array
     trace: Array
-    status: Array
+    result: Result
     iterations: Array
     rollouts: Array
     regularisation: Array
@@ -67,7 +66,7 @@ class _Progress(NamedTuple):
     residual: Array
     trace: Array
     iteration: Array
-    status: Array
+    result: Result
     done: Array
 
 
@@ -83,8 +82,7 @@ def optimise(
     follow from them if there is a guess of those; counting on from `before`, if that is
     given."""
     T, m = controls_of(start).shape
-    dtype = problem.x0.dtype
-    n = problem.x0.shape[0]
+    n, dtype = problem.x0.shape[0], problem.x0.dtype
     zero = jnp.zeros((), dtype)
     gaps = None
     if guess is None:
@@ -103,16 +101,9 @@ def optimise(
     if before is not None:
         earlier = jnp.arange(options.max_iterations + 1) < iteration
         trace = jnp.where(earlier, before.trace, trace)
-    now = Iterate(
-        states,
-        controls,
-        cost,
-        gaps,
-        jnp.asarray(True),
-        rollouts + (start.count if guess is None else 0),
-    )
+    rollouts = rollouts + (start.count if guess is None else 0)
     first = _Progress(
-        now=now,
+        now=Iterate(states, controls, cost, gaps, jnp.asarray(True), rollouts),
         gains=jnp.zeros((T, m, n), dtype),
         mu=zero,
         delta=jnp.ones((), dtype),
@@ -121,7 +112,7 @@ def optimise(
         residual=jnp.full((), jnp.inf, dtype),
         trace=trace,
         iteration=iteration,
-        status=jnp.where(lost, DIVERGED, NOT_CONVERGED),
+        result=choose(lost, RESULTS.diverged, RESULTS.not_converged),
         done=lost,
     )
 
@@ -137,7 +128,7 @@ def optimise(
         last.now.cost,
         last.residual,
         jnp.where(reached, last.trace, last.now.cost),
-        last.status,
+        last.result,
         last.iteration,
         last.now.rollouts,
         last.mu,
@@ -182,7 +173,8 @@ def _iterate(
     exact = jnp.where(flatten, False, before.exact | after.accepted)
     stuck = (mu > MOST_MU) & ~converged & ~out_of_time
     ended = converged | out_of_time
-    status = jnp.where(converged, CONVERGED, jnp.where(stuck, NO_DESCENT, 0))
+    result = choose(stuck, RESULTS.no_descent, RESULTS.not_converged)
+    result = choose(converged, RESULTS.successful, result)
     iteration = before.iteration + jnp.where(ended, 0, 1)
     return _Progress(
         after,
@@ -194,7 +186,7 @@ def _iterate(
         residual,
         before.trace.at[iteration].set(after.cost),
         iteration,
-        status,
+        result,
         ended | stuck,
     )
 
@@ -208,9 +200,7 @@ def directions(
     options: Options,
 ) -> tuple[Policy, Array, Array]:
     """The policy of the model, the residual, and whether that is small enough."""
-    box = None
-    if problem.low is not None and problem.high is not None:
-        box = (problem.low - controls, problem.high - controls)
+    box = problem.room(controls)
     if options.parallel:
         policy = in_parallel(stages, mu)
     else:

@@ -14,16 +14,11 @@ from .._check import (
     check_range,
 )
 from .._module import as_float_array, parameter
-from .._results import choose, RESULTS
 from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ._constraints import Constraints
 from ._descent import (
-    CONVERGED,
-    DIVERGED,
-    INFEASIBLE,
-    NO_DESCENT,
     Options,
     Tolerances,
 )
@@ -158,7 +153,7 @@ class ILQR(AbstractPlanner):
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
         del key
         where, dtype = "ILQR", start.controls.dtype
-        if self.parallel and problem.low is not None:
+        if self.parallel and problem.bounds is not None:
             raise ValueError(f"{where}: {_IN_SEQUENCE}")
         guess = self.states
         if guess is not None:
@@ -276,15 +271,6 @@ def _solve(
     options: Options,
 ) -> Plan:
     out = solution(problem, start, guess, tolerances, options=options)
-    result = RESULTS.not_converged
-    for code, kind in (
-        (CONVERGED, RESULTS.successful),
-        (NO_DESCENT, RESULTS.no_descent),
-        (DIVERGED, RESULTS.diverged),
-        (INFEASIBLE, RESULTS.infeasible),
-    ):
-        result = choose(out.status == code, kind, result)
-    rest = out._asdict()
-    for name in ("status", "multipliers"):
-        del rest[name]
-    return plan_of(problem, **rest, result=result)
+    fields = out._asdict()
+    del fields["multipliers"]
+    return plan_of(problem, **fields)

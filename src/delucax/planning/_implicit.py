@@ -14,10 +14,11 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._jax import by_lanes, poison
+from .._results import RESULTS
 from ..math import matvec
 from ._augmented import with_constraints
 from ._constraints import Multipliers
-from ._descent import CONVERGED, Options, Outcome, Tolerances
+from ._descent import Options, Outcome, Tolerances
 from ._lq import apply, in_parallel, in_sequence, product, solve_free, Stages
 from ._problem import costates_of, model, Problem
 from ._start import controls_of, Start
@@ -59,7 +60,7 @@ def _with_tangents(primals: Any, tangents: Any, options: Options) -> Any:
     choose = lambda f: jax.tree.map(f, change, problem, is_leaf=is_none)
     varied = choose(lambda t, p: None if t is None else p)
     rest = choose(lambda t, p: p if t is None else None)
-    solved = out.status == CONVERGED
+    solved = out.result == RESULTS.successful
     # What failed is not used, but must be finite for what is to have a derivative: so
     # the problem is looked at where it began.
     x0 = jnp.where(jnp.isfinite(problem.x0), problem.x0, 0)
@@ -116,16 +117,17 @@ def _change(
         c = None
         if problem.constraints is not None:
             c = [c for c, _ in problem.constraints_along(X, U)]
-        return (h, after, v), problem.x0, (problem.low, problem.high), c
+        return (h, after, v), problem.x0, problem.bounds, c
 
     at, linear = jax.jvp(conditions, (varied,), (change,))
-    ((slope, *_), *_), ((h, d, v), dx0, (dlow, dhigh), dc) = at, linear
+    ((slope, *_), *_), ((h, d, v), dx0, ends, dc) = at, linear
     free, fixed = jnp.ones_like(U, bool), jnp.zeros_like(U)
-    if problem.low is not None and problem.high is not None:
-        at_low = (U <= problem.low) & (slope[:, n:] > 0)
-        at_high = (U >= problem.high) & (slope[:, n:] < 0)
+    if problem.bounds is not None:
+        low, high = problem.bounds
+        at_low = (U <= low) & (slope[:, n:] > 0)
+        at_high = (U >= high) & (slope[:, n:] < 0)
         free = ~(at_low | at_high)
-        fixed = jnp.where(at_low, dlow, jnp.where(at_high, dhigh, fixed))
+        fixed = jnp.where(at_low, ends[0], jnp.where(at_high, ends[1], fixed))
     stages = stages._replace(h=h, d=d, v=v)
     if y is None:
         factors = factorise(stages, free)

@@ -124,14 +124,15 @@ def plan_of(
     """A plan for a problem."""
     zero = jnp.zeros((), cost.dtype)
     defaults = dict(violation=zero, regularisation=zero)
+    low, high = problem.bounds or (None, None)
     return Plan(
         states=states,
         controls=controls,
         cost=cost,
         t0=problem.t0,
         dt=problem.dynamics.dt,
-        low=problem.low,
-        high=problem.high,
+        low=low,
+        high=high,
         difference=problem.difference,
         **(defaults | rest),
     )

@@ -36,11 +36,10 @@ class Problem(eqx.Module):
     cost: AbstractCost
     x0: Array
     t0: Array
-    w: Array | None
-    low: Array | None
-    high: Array | None
-    difference: Callable[[Array, Array], Array] | None
-    constraints: Constraints | None
+    w: Array | None = None
+    bounds: tuple[Array, Array] | None = None
+    difference: Callable[[Array, Array], Array] | None = None
+    constraints: Constraints | None = None
     multipliers: Multipliers | None = None
 
     def deviation(self, x: Array, x_ref: Array) -> Array:
@@ -54,9 +53,17 @@ class Problem(eqx.Module):
 
     def clip(self, u: Array) -> Array:
         """The control between the bounds."""
-        if self.low is None or self.high is None:
+        if self.bounds is None:
             return u
-        return jnp.minimum(jnp.maximum(u, self.low), self.high)
+        low, high = self.bounds
+        return jnp.minimum(jnp.maximum(u, low), high)
+
+    def room(self, controls: Array) -> tuple[Array, Array] | None:
+        """The bounds of a change of each control, if there are any."""
+        if self.bounds is None:
+            return None
+        low, high = self.bounds
+        return low - controls, high - controls
 
     def step(self, t: Array, x: Array, u: Array, w: Array | None) -> Array:
         """The next state."""

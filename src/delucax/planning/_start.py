@@ -202,7 +202,7 @@ def _point(dynamics: AbstractDynamics, cost: AbstractCost) -> tuple[Array, Array
 @eqx.filter_jit
 def _expanded(dynamics, cost, x, u, t0):
     """The linear-quadratic problem about a point, and whether it is one."""
-    problem = Problem(dynamics, cost, x, t0, None, None, None, None, None)
+    problem = Problem(dynamics, cost, x, t0)
     stages = model(problem, jnp.stack([x, x]), u[None], None, False)
     n, F, H = x.shape[0], stages.F[0], stages.H[0]
     A, B, Q, R, S = F[:, :n], F[:, n:], H[:n, :n], H[n:, n:], H[:n, n:]
