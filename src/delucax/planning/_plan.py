@@ -22,7 +22,7 @@ class Plan(AbstractController):
 
     between the bounds that it was planned with. Outside the horizon the control is NaN,
     which a rollout reports. [`delucax.planning.ilqr`][] makes it, and so do
-    [`delucax.planning.mppi`][] and [`delucax.planning.cem`][], without gains, and
+    [`delucax.planning.MPPI`][] and [`delucax.planning.CEM`][], without gains, and
     [`delucax.planning.ilc`][] and [`delucax.planning.igpc`][].
 
     **Arguments:**
