@@ -122,7 +122,7 @@ def _run_feedback(
 ) -> tuple[Array, Array, Array]:
     """A run of the plant under the policy alone."""
     del model, rate
-    return roll_out(plant, states, controls, policy.K, policy.k, length, None)
+    return roll_out(plant, states, controls, policy.K, policy.k, length)
 
 
 class _Progress(NamedTuple):
@@ -151,7 +151,7 @@ def learn(
     dtype = plan.controls.dtype
     zero = jnp.zeros((), dtype)
     about = plan.states.astype(dtype), plan.controls, plan.gains.astype(dtype)
-    first = roll_out(plant, *about, None, zero, None)
+    first = roll_out(plant, *about)
     lost = ~jnp.isfinite(first[2])
 
     def policy_of(states, controls) -> tuple[Array, Policy]:

@@ -15,14 +15,7 @@ from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..dynamics._runge_kutta import join_state, split_state, stack_steps
 from ..math import matvec
-from ._constraints import (
-    at_end,
-    at_stage,
-    augmented,
-    Constraints,
-    Multipliers,
-    Values,
-)
+from ._constraints import augmented, Constraints, Multipliers, Values, values_of
 from ._lq import Stages
 
 
@@ -72,12 +65,14 @@ class Problem(eqx.Module):
     def stage_constraints(self, t: Array, x: Array, u: Array) -> Values:
         """The values of the constraints of a step."""
         assert self.constraints is not None
-        return at_stage(self.constraints, t, x, u)
+        functions = self.constraints.inequality, self.constraints.equality
+        return values_of(functions, (t, x, u), x.dtype)
 
     def final_constraints(self, t: Array, x: Array) -> Values:
         """The values of the constraints at the end."""
         assert self.constraints is not None
-        return at_end(self.constraints, t, x)
+        functions = self.constraints.final_inequality, self.constraints.final_equality
+        return values_of(functions, (t, x), x.dtype)
 
     def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
         """The values of the constraints of all steps, and at the end."""
@@ -127,10 +122,10 @@ def roll_out(
     problem: Problem,
     states: Array,
     controls: Array,
-    K: Array | None,
-    k: Array | None,
-    length: Array | float,
-    gaps: Array | None,
+    K: Array | None = None,
+    k: Array | None = None,
+    length: Array | float = 0.0,
+    gaps: Array | None = None,
 ) -> tuple[Array, Array, Array]:
     """The trajectory under `u - length k - K (x - x_planned)`, and its cost.
 

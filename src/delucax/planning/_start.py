@@ -250,8 +250,7 @@ def begin(problem: Problem, start: Start) -> tuple[Start, Array, Array, Array]:
         if states is None:
             T, n = start.controls.shape[0], problem.x0.shape[0]
             states = jnp.broadcast_to(problem.x0, (T + 1, n))
-        about = states, start.controls, gains, None, 0.0, None
-        states, controls, cost = roll_out(problem, *about)
+        states, controls, cost = roll_out(problem, states, start.controls, gains)
         # Of a start that diverges at least the controls are as they were given.
         given = jax.vmap(problem.clip)(start.controls)
         return states, jnp.where(jnp.isfinite(cost), controls, given), cost
