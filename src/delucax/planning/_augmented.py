@@ -1,13 +1,14 @@
 """Constraints, by the method of multipliers."""
 
+import dataclasses
+
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from .._results import choose, RESULTS
 from ._constraints import Multipliers, updated, violated
-from ._descent import optimise, Options, Outcome, Tolerances
+from ._descent import optimise, Options, Outcome
 from ._problem import Problem
 from ._start import begin, controls_of, Start
 
@@ -18,19 +19,13 @@ ENOUGH = 0.25
 """The weight stays if the violation falls to this share."""
 
 
-def with_constraints(
-    problem: Problem,
-    start: Start,
-    guess: Array | None,
-    tolerances: Tolerances,
-    options: Options,
-) -> Outcome:
+def with_constraints(problem: Problem, start: Start, options: Options) -> Outcome:
     """Minimise the augmented Lagrangian, update the multipliers, and so on.
 
     Source: Bertsekas, 1982; Howell, Jackson and Manchester, 2019 (in this setting).
     """
     if problem.constraints is None:
-        return optimise(problem, start, guess, tolerances.gradient, options)
+        return optimise(problem, start, options)
     T, m = controls_of(start).shape
     n, dtype = problem.x0.shape[0], problem.x0.dtype
     most_rho = 1 / jnp.finfo(dtype).eps ** 0.6
@@ -39,10 +34,13 @@ def with_constraints(
         """Minimise with the multipliers of `before`, and update them."""
         # The gains keep an unstable plant on the trajectory that it goes on from.
         start = Start(before.controls, before.states, before.gains)
-        states = None if guess is None else before.states
-        tolerance = jnp.maximum(tolerance, tolerances.gradient)
-        given = problem.with_multipliers(before.multipliers), start, states, tolerance
-        out = optimise(*given, options, before)
+        now = dataclasses.replace(
+            options,
+            tolerance=jnp.maximum(tolerance, options.tolerance),
+            states=None if options.states is None else before.states,
+        )
+        with_these = problem.with_multipliers(before.multipliers)
+        out = optimise(with_these, start, now, before)
         values = problem.constraints_along(out.states, out.controls)
         *known, rho = before.multipliers
         each = [(c, y, rho, e) for (c, e), y in zip(values, known, strict=True)]
@@ -56,8 +54,8 @@ def with_constraints(
     def body(carry):
         before, tolerance, _ = carry
         after = minimise(before, tolerance)
-        precise = tolerance <= tolerances.gradient
-        holds = after.violation <= tolerances.constraints
+        precise = tolerance <= options.tolerance
+        holds = after.violation <= options.constraint_tolerance
         settled = (after.result == RESULTS.successful) & precise & holds
         spent = after.iterations >= options.max_iterations
         enough = holds | (after.violation <= ENOUGH * before.violation)
@@ -83,7 +81,8 @@ def with_constraints(
     if start.count > 1:
         rollouts = start.count
         start = begin(problem.with_multipliers(multipliers), start)[0]
-    states, gains = start.states if guess is None else guess, start.gains
+    states, gains = options.states, start.gains
+    states = start.states if states is None else states
     if states is None:
         states = jnp.broadcast_to(problem.x0, (T + 1, n))
     if gains is None:

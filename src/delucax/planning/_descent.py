@@ -1,5 +1,6 @@
 """The iteration of iterative LQR and differential dynamic programming."""
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,21 +23,18 @@ MOST_MU = 1e10
 
 
 class Options(eqx.Module):
-    """What is fixed when the planner is compiled."""
+    """What the planner was asked for, defaults filled in."""
 
+    tolerance: Array
+    constraint_tolerance: Array
+    states: Array | None
+    """States to start from that need not follow from the controls."""
     second_order: bool = eqx.field(static=True)
     on_state: bool = eqx.field(static=True)
     line_search: str = eqx.field(static=True)
     parallel: bool = eqx.field(static=True)
     max_iterations: int = eqx.field(static=True)
     spacing: float | None = eqx.field(static=True, default=None)
-
-
-class Tolerances(NamedTuple):
-    """How precise the solution has to be."""
-
-    gradient: Array
-    constraints: Array
 
 
 class Outcome(NamedTuple):
@@ -73,23 +71,20 @@ class _Progress(NamedTuple):
 def optimise(
     problem: Problem,
     start: Start,
-    guess: Array | None,
-    tolerance: Array,
     options: Options,
     before: Outcome | None = None,
 ) -> Outcome:
-    """Iterate from the cheapest start, or from its controls and states that need not
-    follow from them if there is a guess of those; counting on from `before`, if that is
-    given."""
+    """Iterate from the cheapest start, or from its controls and the states of the
+    options if there are any; counting on from `before`, if that is given."""
     T, m = controls_of(start).shape
     n, dtype = problem.x0.shape[0], problem.x0.dtype
     zero = jnp.zeros((), dtype)
     gaps = None
-    if guess is None:
+    if options.states is None:
         _, states, controls, cost = begin(problem, start)
     else:
         controls = jax.vmap(problem.clip)(controls_of(start))
-        states = guess.at[0].set(problem.x0)
+        states = options.states.at[0].set(problem.x0)
         gaps = gaps_of(problem, states, controls)
         cost = problem.total(states, controls)
         good = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gaps))
@@ -101,7 +96,7 @@ def optimise(
     if before is not None:
         earlier = jnp.arange(options.max_iterations + 1) < iteration
         trace = jnp.where(earlier, before.trace, trace)
-    rollouts = rollouts + (start.count if guess is None else 0)
+    rollouts = rollouts + (start.count if options.states is None else 0)
     first = _Progress(
         now=Iterate(states, controls, cost, gaps, jnp.asarray(True), rollouts),
         gains=jnp.zeros((T, m, n), dtype),
@@ -116,9 +111,7 @@ def optimise(
         done=lost,
     )
 
-    def body(before):
-        return _iterate(problem, before, tolerance, options)
-
+    body = functools.partial(_iterate, problem, options)
     last = lax.while_loop(lambda progress: ~progress.done, body, first)
     reached = jnp.arange(options.max_iterations + 1) <= last.iteration
     return Outcome(
@@ -137,15 +130,12 @@ def optimise(
     )
 
 
-def _iterate(
-    problem: Problem, before: _Progress, tolerance: Array, options: Options
-) -> _Progress:
-    now, mu = before.now, before.mu
+def _iterate(problem: Problem, options: Options, before: _Progress) -> _Progress:
+    now, mu, tolerance = before.now, before.mu, options.tolerance
     about = problem, now.states, now.controls, now.gaps, options.second_order
     stages = model(*about, before.exact, options.spacing)
-    policy, residual, settled = directions(
-        problem, stages, now.controls, mu, tolerance, options
-    )
+    given = problem, stages, now.controls, mu, options
+    policy, residual, settled = directions(*given)
     penalty = _penalty(before.penalty, now, policy)
     missed = 0.0 if now.gaps is None else jnp.max(jnp.abs(now.gaps))
     precise = 1 + jnp.max(jnp.abs(now.states))
@@ -196,11 +186,10 @@ def directions(
     stages: Stages,
     controls: Array,
     mu: Array,
-    tolerance: Array,
     options: Options,
 ) -> tuple[Policy, Array, Array]:
     """The policy of the model, the residual, and whether that is small enough."""
-    box = problem.room(controls)
+    box, tolerance = problem.room(controls), options.tolerance
     if options.parallel:
         policy = in_parallel(stages, mu)
     else:

@@ -18,10 +18,7 @@ from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ._constraints import Constraints
-from ._descent import (
-    Options,
-    Tolerances,
-)
+from ._descent import Options
 from ._implicit import solution
 from ._line_search import SEARCHES
 from ._plan import Plan, plan_of
@@ -155,10 +152,10 @@ class ILQR(AbstractPlanner):
         where, dtype = "ILQR", start.controls.dtype
         if self.parallel and problem.bounds is not None:
             raise ValueError(f"{where}: {_IN_SEQUENCE}")
-        guess = self.states
-        if guess is not None:
+        states = self.states
+        if states is not None:
             shape = start.horizon + 1, problem.dynamics.state_size
-            guess = as_rows(guess, *shape, "states", where).astype(dtype)
+            states = as_rows(states, *shape, "states", where).astype(dtype)
         eps, spacing = float(jnp.finfo(dtype).eps), self.finite_difference
         tolerance, feasible = self.tolerance, self.constraint_tolerance
         if tolerance is None:
@@ -170,6 +167,9 @@ class ILQR(AbstractPlanner):
         if second_order is None:
             second_order = problem.constraints is not None and spacing is None
         options = Options(
+            tolerance=as_float_array(tolerance).astype(dtype),
+            constraint_tolerance=as_float_array(feasible).astype(dtype),
+            states=states,
             second_order=bool(second_order),
             on_state=self.regularise == "state",
             line_search=self.line_search,
@@ -177,8 +177,7 @@ class ILQR(AbstractPlanner):
             max_iterations=self.max_iterations,
             spacing=None if spacing is None else float(spacing),
         )
-        tolerances = (as_float_array(t).astype(dtype) for t in (tolerance, feasible))
-        return _solve(problem, start, guess, Tolerances(*tolerances), options)
+        return _solve(problem, start, options)
 
 
 _IN_SEQUENCE = (
@@ -263,14 +262,7 @@ def ilqr(
 
 
 @eqx.filter_jit
-def _solve(
-    problem: Problem,
-    start: Start,
-    guess: Array | None,
-    tolerances: Tolerances,
-    options: Options,
-) -> Plan:
-    out = solution(problem, start, guess, tolerances, options=options)
-    fields = out._asdict()
+def _solve(problem: Problem, start: Start, options: Options) -> Plan:
+    fields = solution(problem, start, options)._asdict()
     del fields["multipliers"]
     return plan_of(problem, **fields)

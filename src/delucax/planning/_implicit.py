@@ -4,7 +4,6 @@ At a solution the gradient of the Lagrangian is zero. So the change of the solut
 the problem solves one linear-quadratic problem, with the exact second derivatives.
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,9 +15,10 @@ from jaxtyping import Array
 from .._jax import by_lanes, poison
 from .._results import RESULTS
 from ..math import matvec
+from ..math._linear_solve import full_precision
 from ._augmented import with_constraints
 from ._constraints import Multipliers
-from ._descent import Options, Outcome, Tolerances
+from ._descent import Options, Outcome
 from ._lq import apply, in_parallel, in_sequence, product, solve_free, Stages
 from ._problem import costates_of, model, Problem
 from ._start import controls_of, Start
@@ -31,28 +31,16 @@ STIFFER = 10.0
 
 
 @eqx.filter_custom_jvp
-def solution(
-    problem: Problem,
-    start: Start,
-    guess: Array | None,
-    tolerances: Tolerances,
-    *,
-    options: Options,
-) -> Outcome:
+def solution(problem: Problem, start: Start, options: Options) -> Outcome:
     """What the iteration ends with; differentiable with respect to the problem."""
-    run = functools.partial(with_constraints, options=options)
-    return by_lanes(run, problem, start, guess, tolerances)
+    return by_lanes(with_constraints, problem, start, options)
 
 
 @solution.def_jvp
-def _solution_jvp(primals: Any, tangents: Any, *, options: Options) -> Any:
-    with jax.default_matmul_precision("highest"):
-        return _with_tangents(primals, tangents, options)
-
-
-def _with_tangents(primals: Any, tangents: Any, options: Options) -> Any:
-    out = solution(*primals, options=options)
-    problem, change = primals[0], tangents[0]
+@full_precision
+def _solution_jvp(primals: Any, tangents: Any) -> Any:
+    out = solution(*primals)
+    (problem, start, options), change = primals, tangents[0]
     nothing = jax.tree.map(lambda _: None, out)
     if not jax.tree.leaves(change):
         return out, nothing
@@ -65,7 +53,7 @@ def _with_tangents(primals: Any, tangents: Any, options: Options) -> Any:
     # the problem is looked at where it began.
     x0 = jnp.where(jnp.isfinite(problem.x0), problem.x0, 0)
     X = jnp.where(solved, out.states, x0)
-    U = jnp.where(solved, out.controls, controls_of(primals[1]))
+    U = jnp.where(solved, out.controls, controls_of(start))
     y = out.multipliers
 
     def given(varied) -> Problem:
