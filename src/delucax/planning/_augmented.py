@@ -59,8 +59,9 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         settled = (after.result == RESULTS.successful) & precise & holds
         spent = after.iterations >= options.max_iterations
         enough = holds | (after.violation <= ENOUGH * before.violation)
-        rho = after.multipliers.rho
-        rho = jnp.where(enough, rho, GROWTH * rho)
+        multipliers = after.multipliers
+        assert multipliers is not None
+        rho = jnp.where(enough, multipliers.rho, GROWTH * multipliers.rho)
         hopeless = (rho > most_rho) & ~settled & ~spent
         lost = after.result == RESULTS.diverged
         result = choose(settled, RESULTS.successful, RESULTS.not_converged)
@@ -68,15 +69,15 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         result = choose(lost, RESULTS.diverged, result)
         # Once the constraints hold, the last minimisations are to full precision.
         tolerance = tolerance * jnp.where(holds, 0, 0.1)
-        multipliers = after.multipliers._replace(rho=rho)
+        multipliers = multipliers._replace(rho=rho)
         after = after._replace(result=result, multipliers=multipliers)
         return after, tolerance, settled | spent | hopeless | lost
 
     zero = jnp.zeros((), dtype)
     like = jnp.zeros((T + 1, n), dtype)
     sizes = jax.eval_shape(problem.constraints_along, like, controls_of(start))
-    y = (jnp.zeros(c.shape, dtype) for c, _ in sizes)
-    multipliers = Multipliers(*y, jnp.full((), FIRST_RHO, dtype))
+    stage, final = (jnp.zeros(c.shape, dtype) for c, _ in sizes)
+    multipliers = Multipliers(stage, final, jnp.full((), FIRST_RHO, dtype))
     rollouts = 0
     if start.count > 1:
         rollouts = start.count

@@ -151,7 +151,7 @@ def learn(
     dtype = plan.controls.dtype
     zero = jnp.zeros((), dtype)
     about = plan.states.astype(dtype), plan.controls, plan.gains.astype(dtype)
-    first = roll_out(plant, *about)
+    first = roll_out(plant, *about, jnp.zeros_like(plan.controls), zero)
     lost = ~jnp.isfinite(first[2])
 
     def policy_of(states, controls) -> tuple[Array, Policy]:
