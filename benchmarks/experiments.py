@@ -330,7 +330,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 import delucax as dlx
 
 env = dlx.make("pendulum")
-controller = dlx.controllers.Deep(env, width=16, depth=1, key=jax.random.key(1))
+controller = dlx.controllers.mlp_policy(env, width=16, depth=1, key=jax.random.key(1))
 keys = jax.random.split(jax.random.key(0), 4096)
 
 @eqx.filter_jit

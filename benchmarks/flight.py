@@ -165,13 +165,13 @@ def figure_eight(quick: bool) -> dict[str, Any]:
     Q, R = (jnp.diag(jnp.array(w)) for w in weights)
     options: Any = dict(reference=reference(curve))
     start = dict(start=np.tile([HOVER, HOVER], (20, 1)))
-    learner = dlx.controllers.GPC(env.dynamics, cost, base=plan, horizon=20)
+    learner = dlx.controllers.gpc(env.dynamics, cost, base=plan, horizon=20)
     methods = {
         "LQR": dlx.controllers.LQR(model, Q, R, **options),
         "LQR, preview of 20 steps": dlx.controllers.LQR(
             model, Q, R, preview=20, **options
         ),
-        "plan, open loop": dlx.controllers.Sequence(plan.controls),
+        "plan, open loop": dlx.controllers.OpenLoop(plan.controls),
         "plan, with gains": plan,
         "MPC": dlx.controllers.MPC(
             env.dynamics,

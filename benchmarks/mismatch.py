@@ -140,7 +140,7 @@ def plans(task: Task) -> dict[str, Callable[[Any, Any], Any]]:
 
     def alone(x0, lack):
         plan = planned(task, x0, env.dynamics)
-        return run(dlx.controllers.Sequence(plan.controls), x0, lack)
+        return run(dlx.controllers.OpenLoop(plan.controls), x0, lack)
 
     def followed(x0, lack):
         return run(planned(task, x0, env.dynamics), x0, lack)

@@ -101,12 +101,12 @@ class Table:
 def speed(rounds: int) -> tuple[Table, list[dict[str, Any]]]:
     """Single precision, the double integrator, memory 10 and roll-out 10."""
     env = env_of(dlx.LinearDynamics(A, B))
-    learner = c.GPC(env.dynamics, env.cost, memory=10, horizon=10)
+    learner = c.gpc(env.dynamics, env.cost, memory=10, horizon=10)
     contenders = {
         "LQR": c.LQR(env.dynamics, np.eye(2), np.eye(1)),
         "GPC": learner,
-        "DRC": c.DRC(env.dynamics, env.cost, memory=10, horizon=10),
-        "SFC": c.SFC(env.dynamics, env.cost, horizon=10),
+        "DRC": c.drc(env.dynamics, env.cost, memory=10, horizon=10),
+        "SFC": c.sfc(env.dynamics, env.cost, horizon=10),
         "BPC": c.BPC(env.dynamics, learner.loop.base),
         "AdaGPC": c.Adaptive(learner, slots=8),
     }
@@ -184,7 +184,7 @@ def defaults(seeds: int) -> tuple[Table, list[dict[str, Any]]]:
     for name, w in kinds(seeds, 1000, 2, 100).items():
         for scale in (1.0, 1e-2, 1e2):
             env = env_of(dlx.LinearDynamics(A, B), scale)
-            learner = c.GPC(env.dynamics, env.cost)
+            learner = c.gpc(env.dynamics, env.cost)
             base = learner.loop.base
             unit = scale**3
             size = jnp.asarray(scale * w)
@@ -204,7 +204,7 @@ def defaults(seeds: int) -> tuple[Table, list[dict[str, Any]]]:
             table.add(label + "hindsight", ratio, "GPC / hindsight")
     w = jnp.asarray(kinds(1, 1000, 2, 100)["Gaussian"][0])
     env = env_of(dlx.LinearDynamics(A, B))
-    learner = c.GPC(env.dynamics, env.cost)
+    learner = c.gpc(env.dynamics, env.cost)
     options: Any = dict(key=jr.key(0), x0=jnp.zeros(2), horizon=1000, w=w)
     run = dlx.rollout(env, learner, **options)
     found = c.best_in_hindsight(env, learner.fixed(), run).trajectory.total_cost / 1000
@@ -226,7 +226,7 @@ def random_plants(count: int) -> tuple[Table, list[dict[str, Any]]]:
         A *= radius / np.max(np.abs(np.linalg.eigvals(A)))
         B = rng.normal(size=(n, m)) * np.exp(rng.uniform(-1, 1))
         env = env_of(dlx.LinearDynamics(A, B))
-        learner = c.GPC(env.dynamics, env.cost)
+        learner = c.gpc(env.dynamics, env.cost)
         K = np.asarray(learner.loop.base.K)
         row = {"n": n, "m": m, "radius": radius, "roll-out": learner.loop.horizon}
         for name, w in kinds(1, 1000, n, 500 + index).items():
@@ -262,7 +262,7 @@ def published(seeds: int) -> tuple[Table, list[dict[str, Any]]]:
     """What GPC and DRC reached in the settings that were published for them."""
     table = Table()
     env = env_of(dlx.LinearDynamics(A, B))
-    learner = c.GPC(env.dynamics, env.cost, **fading(0.005))
+    learner = c.gpc(env.dynamics, env.cost, **fading(0.005))
     base = learner.loop.base
     values = {"Gaussian": 1.027, "slow sine": 0.091, "constant": 0.073}
     for name, w in kinds(seeds, 1000, 2, 200).items():
@@ -277,11 +277,11 @@ def published(seeds: int) -> tuple[Table, list[dict[str, Any]]]:
     adam = optax.chain(optax.scale_by_adam(), optax.scale(-1.0))
     cost = dlx.costs.Quadratic(one, one)
     options: Any = dict(horizon=40, learning_rate=1e-3, optimiser=adam, radius=10.0)
-    alone = c.DRC(plant, cost, base=c.Zero(1), **options)
+    alone = c.drc(plant, cost, base=c.Zero(1), **options)
     observer = c.LQG(plant, C.T @ C, one, np.eye(2), 0.01 * one)
     others = {
         "LQG": observer,
-        "DRC on LQG": c.DRC(plant, cost, base=observer),
+        "DRC on LQG": c.drc(plant, cost, base=observer),
         "zero": c.Zero(1),
     }
     values = {"slow sine": (2.44, 0.362), "constant": (5.26, 2.61)}
@@ -337,14 +337,14 @@ def switching(seeds: int) -> tuple[Table, list[dict[str, Any]]]:
             "published step": fading(0.005),
             "defaults": {},
         }.items():
-            learner = c.GPC(env.dynamics, cost, **options)
-            stale = c.GPC(dlx.LinearDynamics(*first), cost, **options)
+            learner = c.gpc(env.dynamics, cost, **options)
+            stale = c.gpc(dlx.LinearDynamics(*first), cost, **options)
             steady: Any = dict(optimiser=optax.scale(-1.0), learning_rate=0.005)
             tried = {
                 "LQR": learner.loop.base,
                 "GPC, stale model": stale,
                 "GPC": learner,
-                "GPC, constant step": c.GPC(env.dynamics, cost, **steady),
+                "GPC, constant step": c.gpc(env.dynamics, cost, **steady),
                 "GPC, restarted": Restarted(learner, 300.0),
                 "AdaGPC": c.Adaptive(learner),
                 "AdaGPC, switching play": c.Adaptive(learner, play="switch"),

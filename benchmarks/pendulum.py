@@ -235,7 +235,7 @@ def memory(steps: int = 1_000_000) -> dict[str, float]:
 def calls(repeats: int = 200) -> dict[str, float]:
     """Milliseconds of single calls from Python, and seconds of compilation."""
     env, key = dlx.make("pendulum"), jax.random.key(0)
-    policy = dlx.controllers.Deep(env, width=32, depth=2, key=key)
+    policy = dlx.controllers.mlp_policy(env, width=32, depth=2, key=key)
     linear = dlx.controllers.Linear(jnp.array([[0.5, 0.0]]))
     x, u = jnp.array([1.0, 0.0]), jnp.zeros(1)
 

@@ -120,7 +120,7 @@ def by_gradient(env, keys, steps, batch=8, horizon=100, rate=1e-2):
         dlx.replace(env, SPREAD), batch=batch, horizon=horizon, gradient_decay=0.92
     )
     optimiser = optax.adam(optax.cosine_decay_schedule(rate, count))
-    make = lambda key: dlx.controllers.Deep(env, width=32, depth=1, key=key)
+    make = lambda key: dlx.controllers.mlp_policy(env, width=32, depth=1, key=key)
     models = eqx.filter_vmap(make)(keys)
     found = fit(loss, models, optimiser, count, key=keys, **QUIETLY)
     return found.model, batch * horizon * count

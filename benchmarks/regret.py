@@ -73,7 +73,7 @@ def plants() -> dict[str, Plant]:
     found = {}
 
     double = dlx.LinearDynamics(jnp.array([[1.0, 1.0], [0.0, 1.0]]), push)
-    learner = c.GPC(double, both)
+    learner = c.gpc(double, both)
     found["double integrator"] = Plant(
         "GPC",
         dlx.Environment(double, both),
@@ -86,7 +86,7 @@ def plants() -> dict[str, Plant]:
 
     C = jnp.array([[1.0, 0.0]])
     partial = dlx.LinearDynamics(jnp.array([[0.9, 0.5], [0.0, 0.9]]), push, C)
-    learner = c.DRC(partial, dlx.costs.Quadratic(one, one))
+    learner = c.drc(partial, dlx.costs.Quadratic(one, one))
     found["one output of two states"] = Plant(
         "DRC",
         dlx.Environment(partial, dlx.costs.Quadratic(C.T @ C, one)),
@@ -98,7 +98,7 @@ def plants() -> dict[str, Plant]:
     )
 
     pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
-    learner = c.GPC(pendulum, both)
+    learner = c.gpc(pendulum, both)
     found["pendulum, upright"] = Plant(
         "GPC",
         dlx.Environment(pendulum, both),
@@ -111,12 +111,12 @@ def plants() -> dict[str, Plant]:
     )
 
     stable = dlx.LinearDynamics(jnp.array([[0.8, 0.5], [0.0, 0.8]]), push)
-    learner = c.GPC(stable, both, horizon=15)
+    learner = c.gpc(stable, both, horizon=15)
 
     def build(model):
         # Newton's long steps follow the error of an estimated model; this is the
         # published first-order learner.
-        return c.GPC(model, both, horizon=15, optimiser=c.adagrad_norm())
+        return c.gpc(model, both, horizon=15, optimiser=c.adagrad_norm())
 
     found["unknown, stable"] = Plant(
         "Explore",
@@ -159,7 +159,7 @@ def attacks(plant: Plant, seeds: int, steps: int) -> Array:
     learner = plant.play(steps)
     if plant.anew:
         # Aimed at what it becomes once it knows the plant.
-        learner = c.GPC(plant.env.dynamics, plant.env.cost, horizon=15)
+        learner = c.gpc(plant.env.dynamics, plant.env.cost, horizon=15)
 
     def attack(key):
         options: Any = dict(x0=jnp.zeros(2), horizon=steps, iterations=4, starts=2)

@@ -240,7 +240,9 @@ def trained(env: dlx.Environment, starts: Any, name: str, seeds: Any) -> dict[st
     for seed in seeds:
         began = time.perf_counter()
         init, key = jr.split(jr.key(seed))
-        policy = dlx.controllers.Deep(env, width=chosen["width"], depth=2, key=init)
+        policy = dlx.controllers.mlp_policy(
+            env, width=chosen["width"], depth=2, key=init
+        )
         options: Any = dict(key=key, throw=False, progress=False)
         found = fit(loss, policy, optimiser, steps, **options).model
         jax.block_until_ready(eqx.filter(found, eqx.is_array))

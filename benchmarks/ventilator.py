@@ -26,7 +26,7 @@ from benchmarks._machine import describe
 from benchmarks._ventilator_page import write_page
 from delucax import lung, studies
 from delucax.studies.ventilator._report import PID_ROWS
-from delucax.studies.ventilator._size import FULL
+from delucax.studies.ventilator._settings import FULL
 
 
 RESULTS = Path(__file__).parent / "results" / "ventilator.json"
@@ -67,7 +67,8 @@ def parts() -> dict[str, float]:
     found["controller of one lung, s"] = time.perf_counter() - begin
 
     lungs = [(R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0)]
-    envs = lung.stack([lung.double_compartment(*each) for each in lungs])
+    tasks = [lung.double_compartment(resistance=R, compliance=C) for R, C in lungs]
+    envs = lung.stack(tasks)
     begin = time.perf_counter()
     grid = lung.pid_grid(envs, key=jax.random.key(5))
     jax.block_until_ready(grid.errors)

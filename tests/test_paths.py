@@ -12,6 +12,7 @@ from hypothesis import given, settings, strategies as st
 from jaxtyping import Array
 
 import delucax as dlx
+from delucax._module import _paths
 
 
 d = dlx.disturbances
@@ -259,9 +260,9 @@ def test_every_member_of_a_batch_is_checked():
 @once
 def test_a_large_batch(monkeypatch):
     """Of which the extreme members are looked at, and others, and a warning says so."""
-    monkeypatch.setattr(dlx._paths, "_MOST_MEMBERS", 64)
+    monkeypatch.setattr(_paths, "_MOST_MEMBERS", 64)
     batch = jax.vmap(lambda high: d.Uniform(-1.0, high, size=1))(jnp.ones(500))
-    assert 32 <= len(dlx._paths._members(batch)) <= 64
+    assert 32 <= len(_paths._members(batch)) <= 64
     with user_error(match="member 321 of a batch"):
         dlx.replace(batch, {"high": batch.high.at[321].set(-2.0)})
     with pytest.warns(UserWarning, match="Uniform is a batch of 500 members, of which"):

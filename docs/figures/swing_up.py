@@ -61,7 +61,7 @@ def main():
             policy = train_swing_up(env, key=jax.random.key(0), steps=steps).model
         else:
             key = jax.random.split(jax.random.key(0))[0]
-            policy = dlx.controllers.Deep(env, width=32, depth=1, key=key)
+            policy = dlx.controllers.mlp_policy(env, width=32, depth=1, key=key)
         panels[title] = angles(env, policy)
     count = next(iter(panels.values())).shape[1]
     # It rests on the last picture before it begins again.

@@ -76,21 +76,10 @@ if TYPE_CHECKING:
     __version__: str
 del TYPE_CHECKING
 
-_LAZY = (
-    "analysis",
-    "animate",
-    "controllers",
-    "estimators",
-    "experiments",
-    "interop",
-    "lung",
-    "planning",
-    "plot",
-    "plotting",
-    "riccati",
-    "studies",
-    "training",
-)
+_LAZY = """
+    analysis animate controllers estimators experiments interop lung planning plot
+    plotting riccati studies training
+""".split()
 
 
 def __getattr__(name: str):

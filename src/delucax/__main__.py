@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 
+_DEFAULT = "(default: %(default)s)"
+
 _COMMANDS: list[tuple[Callable, str, str, tuple]] = []
 """What is called with the options, its help, more of it, and what options it has; in
 the order in which they are shown."""
@@ -20,7 +22,7 @@ the order in which they are shown."""
 def _command(help: str, *options: tuple, more: str = "") -> Callable:
     """Make a command of a function that returns the exit status, by its name."""
 
-    def register(call: Callable[[Any], int | None]) -> Callable:
+    def register(call: Callable[..., int | None]) -> Callable:
         _COMMANDS.append((call, help, more, options))
         return call
 
@@ -49,7 +51,9 @@ def main(arguments: list[str] | None = None) -> int:
         if options.command is None:
             parser.print_help()
             return 0
-        return options.call(options) or 0
+        names = ("version", "command", "call")
+        given = {k: v for k, v in vars(options).items() if k not in names}
+        return options.call(**given) or 0
     except (OSError, ValueError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -73,22 +77,12 @@ def _parser() -> argparse.ArgumentParser:
             help=help,
             description=f"{help[0].upper()}{help[1:]}.",
             epilog=textwrap.dedent(more).strip() or None,
-            formatter_class=_Formatter,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         added.set_defaults(call=call)
         for names, settings in command_options:
             added.add_argument(*names, **settings)
     return parser
-
-
-class _Formatter(argparse.RawDescriptionHelpFormatter):
-    """Keeps the line breaks of examples, and adds the default to an option's help."""
-
-    def _get_help_string(self, action: argparse.Action) -> str | None:
-        shown = isinstance(action.default, str | int) and action.default not in ("", 0)
-        if not shown or action.default == argparse.SUPPRESS:
-            return action.help
-        return f"{action.help} (default: %(default)s)"
 
 
 _FILE = "a Python file of experiments, a module, or a suite that `list` names"
@@ -100,19 +94,19 @@ _CASES = (
 
 @_command(
     "swing the pendulum up, then the paper in small; in about two minutes",
-    _option("--out", default="demo", help="folder to write to"),
-    _option("--seeds", type=int, default=2, help="how many MLPs to train"),
+    _option("--out", default="demo", help=f"folder to write to {_DEFAULT}"),
+    _option("--seeds", type=int, default=2, help=f"how many MLPs to train {_DEFAULT}"),
 )
-def _demo(options: Any) -> None:
+def _demo(out: str, seeds: int) -> None:
     from .studies import demo
 
-    demo(options.out, seeds=options.seeds)
+    demo(out, seeds=seeds)
 
 
 @_command(
     "regenerate the figures and tables of the Deluca paper, claim by claim",
     _option("name", nargs="+", metavar="NAME", help="all, or some of these"),
-    _option("--out", default="paper", help="folder to write to"),
+    _option("--out", default="paper", help=f"folder to write to {_DEFAULT}"),
     _option("--small", action="store_true", help="fewer seeds and steps"),
     more="""
         names: all, oracle-complexity, policy-gradient, estimator-variance,
@@ -121,16 +115,18 @@ def _demo(options: Any) -> None:
         The exit status is 1 if a claim does not hold.
         """,
 )
-def _reproduce(options: Any) -> int:
+def _reproduce(name: list[str], out: str, small: bool) -> int:
     from .studies import reproduce
 
-    rows = reproduce(options.name, options.out, small=options.small)
+    rows = reproduce(name, out, small=small)
     return 0 if all(row["holds"] for row in rows) else 1
 
 
 @_command(
     "learn lungs from breaths, and controllers of a ventilator in them",
-    _option("--out", default="lung", help="folder to write to, or go on in"),
+    _option(
+        "--out", default="lung", help=f"folder to write to, or go on in {_DEFAULT}"
+    ),
     _option("--small", action="store_true", help="two lungs, in a minute"),
     _option(
         "--data",
@@ -145,14 +141,13 @@ def _reproduce(options: Any) -> int:
         "--sensor-delay",
         type=int,
         default=2,
-        help="how late the sensor reads, in samples; holds for DATA too",
+        help=f"how late the sensor reads, in samples; holds for DATA too {_DEFAULT}",
     ),
 )
-def _lung(options: Any) -> None:
+def _lung(out: str, **options: Any) -> None:
     from .studies import lung_study
 
-    names = ("small", "data", "seeds", "sensor_delay")
-    lung_study(options.out, **{name: getattr(options, name) for name in names})
+    lung_study(out, **options)
 
 
 @_command(
@@ -160,14 +155,14 @@ def _lung(options: Any) -> None:
     _option("file", nargs="?", metavar="FILE", help=f"{_FILE}; its cases are listed"),
     *_CASES,
 )
-def _list(options: Any) -> int | None:
+def _list(file: str | None, select: str, marks: str) -> int | None:
     from .studies._listing import list_names, SUITES
 
-    if options.file is None:
+    if file is None:
         return list_names()
     from .experiments._commands import list_cases
 
-    return list_cases(options.file, SUITES, options.select, options.marks)
+    return list_cases(file, SUITES, select, marks)
 
 
 @_command(
@@ -177,7 +172,10 @@ def _list(options: Any) -> int | None:
     _option("--slow", action="store_true", help="also cases marked slow"),
     _option("--seeds", type=int, help="how many seeds (default: as FILE says)"),
     _option(
-        "--workers", type=int, default=1, help="processes; -1 is one for each core"
+        "--workers",
+        type=int,
+        default=1,
+        help=f"processes; -1 is one for each core {_DEFAULT}",
     ),
     _option(
         "--dask", metavar="ADDRESS", help="run on the Dask cluster of this scheduler"
@@ -186,7 +184,7 @@ def _list(options: Any) -> int | None:
     _option("--html", metavar="PAGE", help="write a report too"),
     _option("--fresh", action="store_true", help="run also what is stored"),
     _option("--retry", action="store_true", help="run again what failed"),
-    _option("--quiet", action="store_true", help="show no progress"),
+    _option("--quiet", dest="progress", action="store_false", help="show no progress"),
     more="""
         examples:
           python -m delucax run sweep.py --workers 2
@@ -197,19 +195,18 @@ def _list(options: Any) -> int | None:
         stopped, and runs again only what changed.
         """,
 )
-def _run(options: Any) -> int:
+def _run(
+    file: str, store: str | None, html: str | None, dask: str | None, **options: Any
+) -> int:
     from .experiments._commands import run_file
     from .experiments._workers import dask_client
     from .studies._listing import SUITES
 
-    names = ("select", "marks", "slow", "seeds", "workers", "fresh", "retry")
-    passed = {name: getattr(options, name) for name in names}
-    passed["progress"] = not options.quiet
     with contextlib.ExitStack() as stack:
-        if options.dask is not None:
-            stack.enter_context(dask_client(options.dask))
-            passed["backend"] = "dask"
-        return run_file(options.file, SUITES, options.store, options.html, passed)
+        if dask is not None:
+            stack.enter_context(dask_client(dask))
+            options["backend"] = "dask"
+        return run_file(file, SUITES, store, html, options)
 
 
 @_command(
@@ -234,25 +231,26 @@ def _run(options: Any) -> int:
           python -m delucax report --diff before.jsonl after.jsonl
         """,
 )
-def _report(options: Any) -> int:
+def _report(
+    results: list[str], diff: bool, html: str | None, export: list[str], select: str
+) -> int:
     from .experiments._commands import report_diff, report_file
 
-    report = report_diff if options.diff else report_file
-    return report(options.results, options.select, options.html, options.export)
+    report = report_diff if diff else report_file
+    return report(results, select, html, export)
 
 
 @_command(
     "measure speed against other libraries, in a checkout",
     _option("name", nargs="?", help="one benchmark, such as pendulum (default: all)"),
 )
-def _bench(options: Any) -> int:
+def _bench(name: str | None) -> int:
     sys.path.insert(0, str(Path.cwd()))
     if importlib.util.find_spec("benchmarks") is None:
         raise ValueError(
             "bench: the benchmarks are in the repository and not in the package: run "
             "this in a checkout of it."
         )
-    name = options.name
     module = "benchmarks" if name is None else f"benchmarks.{name}"
     if importlib.util.find_spec(module) is None:
         raise ValueError(f"bench: there is no benchmark called {name!r}.")

@@ -1,8 +1,9 @@
 """Checks of arguments, with errors that name the argument and what was expected."""
 
+import difflib
 import functools
-import os
-from pathlib import Path
+import inspect
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -12,8 +13,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from ._files import as_path as as_path
 from ._message import shortened
-from ._module import as_float_array
+from ._module import as_float_array, indexed_names
+from ._typing import Bounds
+
+
+Shape = tuple[int, ...]
 
 
 def is_concrete(x: Any) -> bool:
@@ -27,24 +33,18 @@ def output_of(function: Any, *shapes: tuple[int, ...]) -> Any:
     dtype = jnp.result_type(float)
     inputs = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
     leaves, structure = jax.tree.flatten(function)
-    if not all(eqx.is_array(leaf) for leaf in leaves) or not _is_hashable(structure):
+    try:
+        hash(structure)
+        arrays = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
+    except (TypeError, AttributeError):  # a field without a hash, a leaf that is none
         return eqx.filter_eval_shape(function, *inputs)
-    arrays = (jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
-    return _traced(structure, tuple(arrays), tuple(inputs))
+    return _traced(structure, arrays, tuple(inputs))
 
 
 @functools.lru_cache(maxsize=256)
 def _traced(structure: Any, arrays: Any, inputs: Any) -> Any:
     call = lambda arrays, inputs: jax.tree.unflatten(structure, arrays)(*inputs)
     return jax.eval_shape(call, arrays, inputs)
-
-
-def _is_hashable(value: Any) -> bool:
-    try:
-        hash(value)
-    except TypeError:
-        return False
-    return True
 
 
 _HOW_TO_GET = {
@@ -88,12 +88,21 @@ def check_key(key: Any, where: str) -> Any:
     )
 
 
+def _as_array(
+    value: Any, name: str, where: str, rule: str, fits: Callable[[Shape], bool]
+) -> Array:
+    """`value` as a floating-point array of a shape that fits, or an error."""
+    array = as_float_array(value)
+    if not eqx.is_inexact_array(array) or not fits(array.shape):
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
+        raise ValueError(f"{where}: {name} must {rule}, got {got}.")
+    return array
+
+
 def as_vector(value: Any, size: int, name: str, where: str) -> Array:
     """`value` as a real floating-point vector of `size` entries, or an error."""
-    array = as_float_array(value)
-    if not eqx.is_inexact_array(array) or array.shape != (size,):
-        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
-        raise ValueError(f"{where}: {name} must have shape ({size},), got {got}.")
+    rule = f"have shape ({size},)"
+    array = _as_array(value, name, where, rule, lambda shape: shape == (size,))
     check_real(array, name, where)
     return array
 
@@ -104,21 +113,10 @@ def check_real(array: Array, name: str, where: str) -> None:
         raise ValueError(f"{where}: {name} must be real, got dtype {array.dtype}.")
 
 
-def as_path(value: Any, name: str, where: str) -> Path:
-    """`value` as a path, or an error."""
-    if not isinstance(value, str | os.PathLike):
-        raise ValueError(
-            f"{where}: {name} must be the path of a file, got {shortened(value)}."
-        )
-    return Path(value)
-
-
 def as_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
     """`value` as a floating-point array of `ndim` axes with finite entries."""
-    array = as_float_array(value)
-    if not eqx.is_inexact_array(array) or array.ndim != ndim:
-        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
-        raise ValueError(f"{where}: {name} must be a matrix, got {got}.")
+    fits = lambda shape: len(shape) == ndim
+    array = _as_array(value, name, where, "be a matrix", fits)
     check_finite(array, name, where)
     return array
 
@@ -144,7 +142,7 @@ def symmetric_matrix(value: Any, name: str, where: str) -> Array:
 
 def as_bounds(
     value: Any, where: str, name: str = "bounds", size: int | None = None
-) -> tuple[Array, Array] | None:
+) -> Bounds | None:
     """`value` as `(low, high)`, each a number or a vector (of `size`, if it is given),
     or an error."""
     if value is None:
@@ -154,12 +152,10 @@ def as_bounds(
             f"{where}: {name} must be a pair (low, high), got {shortened(value)}."
         )
     low, high = (as_float_array(end) for end in value)
-    for end in () if size is None else (low, high):
-        if not eqx.is_inexact_array(end) or end.shape not in ((), (size,)):
-            got = end.shape if eqx.is_array(end) else shortened(end)
-            raise ValueError(
-                f"{where}: {name} must be numbers or have shape ({size},), got {got}."
-            )
+    if size is not None:
+        rule, shapes = f"be numbers or have shape ({size},)", ((), (size,))
+        for end in (low, high):
+            _as_array(end, name, where, rule, lambda shape: shape in shapes)
     fit = all(eqx.is_inexact_array(end) and end.ndim <= 1 for end in (low, high))
     if not fit or low.ndim == high.ndim == 1 and low.shape != high.shape:
         raise ValueError(
@@ -174,9 +170,7 @@ def as_bounds(
     return low, high
 
 
-def check_control_bounds(
-    value: Any, size: int, where: str
-) -> tuple[Array, Array] | None:
+def check_control_bounds(value: Any, size: int, where: str) -> Bounds | None:
     """`value` as bounds of `size` controls, or an error."""
     bounds = as_bounds(value, where)
     for end in bounds or ():
@@ -188,9 +182,11 @@ def check_control_bounds(
     return bounds
 
 
-def bounds_field(where: str, name: str = "bounds") -> Any:
-    """A field that holds `(low, high)`, converted and checked by `as_bounds`."""
-    return eqx.field(converter=functools.partial(as_bounds, where=where, name=name))
+def bounds_field(where: str, name: str = "bounds", **options: Any) -> Any:
+    """A field that holds `(low, high)`, converted and checked by `as_bounds`; `options`
+    are those of a field."""
+    converter = functools.partial(as_bounds, where=where, name=name)
+    return eqx.field(converter=converter, **options)
 
 
 def check_finite(array: Any, name: str, where: str) -> None:
@@ -200,36 +196,35 @@ def check_finite(array: Any, name: str, where: str) -> None:
             raise ValueError(f"{where}: {name} must be finite, got {shortened(array)}.")
 
 
-def check_positive(value: Any, name: str, where: str) -> None:
-    """Raise unless a number is finite and above zero, as far as can be seen."""
+def _check_entries(
+    value: Any, name: str, where: str, rule: str, holds: Callable[[Any], Any]
+) -> None:
+    """Raise unless all entries of a number or an array are as they must be, as far as
+    can be seen."""
     array = as_float_array(value)
     if eqx.is_inexact_array(array):
-        if not is_concrete(array):
+        if not is_concrete(array) or np.all(holds(np.asarray(array))):
             return
-        at = np.asarray(array)
-        if np.all(np.isfinite(at)) and np.all(at > 0):
-            return
-        got = shortened(at)
-    else:
-        got = shortened(value)
-    raise ValueError(f"{where}: {name} must be positive and finite, got {got}.")
+        value = np.asarray(array)
+    raise ValueError(f"{where}: {name} must be {rule}, got {shortened(value)}.")
+
+
+def check_positive(value: Any, name: str, where: str) -> None:
+    """Raise unless numbers are finite and above zero, as far as can be seen."""
+    holds = lambda at: np.isfinite(at) & (at > 0)
+    _check_entries(value, name, where, "positive and finite", holds)
 
 
 def check_step(dt: Any, where: str, name: str = "dt") -> None:
     """Raise unless `dt`, or what has another name, is one positive number."""
     check_positive(dt, name, where)
-    if jnp.shape(dt) != ():
-        raise ValueError(
-            f"{where}: {name} must be a number, got shape {jnp.shape(dt)}."
-        )
+    if np.shape(dt) != ():
+        raise ValueError(f"{where}: {name} must be a number, got shape {np.shape(dt)}.")
 
 
 def check_number(value: Any, name: str, where: str) -> None:
     """Raise unless `value` is one finite real number, as far as can be seen."""
-    array = as_float_array(value)
-    if not eqx.is_inexact_array(array) or array.shape != ():
-        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
-        raise ValueError(f"{where}: {name} must be a number, got {got}.")
+    array = _as_array(value, name, where, "be a number", lambda shape: shape == ())
     check_real(array, name, where)
     check_finite(array, name, where)
 
@@ -257,16 +252,15 @@ def check_range(
     value: Any, name: str, where: str, low: Any = 0, high: float | int = np.inf
 ) -> None:
     """Raise unless numbers lie between `low` and `high`, as far as can be seen."""
-    array, least, got = as_float_array(value), as_float_array(low), shortened(value)
-    if eqx.is_inexact_array(array) and eqx.is_inexact_array(least):
-        if not (is_concrete(array) and is_concrete(least)):
-            return
-        at = np.asarray(array)
-        if np.all((at >= np.asarray(least)) & (at <= high)):
-            return
-        got = shortened(at)
-    ends = f"at least {low}" if high == np.inf else f"between {low} and {high}"
-    raise ValueError(f"{where}: {name} must be {ends}, got {got}.")
+    least = as_float_array(low)
+
+    def holds(at):
+        if not is_concrete(least):
+            return True
+        return eqx.is_inexact_array(least) and (at >= np.asarray(least)) & (at <= high)
+
+    rule = f"at least {low}" if high == np.inf else f"between {low} and {high}"
+    _check_entries(value, name, where, rule, holds)
 
 
 def check_choice(value: Any, choices: tuple[Any, ...], name: str, where: str) -> None:
@@ -297,3 +291,115 @@ def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
             f"{shortened(value)}."
         )
     return int(value)
+
+
+def check_at_most(
+    value: int, most: int, name: str, where: str, of: str | None = None
+) -> None:
+    """Raise unless a count is at most `most`, the number `of` something."""
+    if value > most:
+        limit = most if of is None else f"the {most} {of}"
+        raise ValueError(f"{where}: {name} must be at most {limit}, got {value}.")
+
+
+def as_rows(
+    value: Any, size: int, name: str, where: str, steps: int | None = None
+) -> Array:
+    """`value` as a real array of a row of `size` entries for each step (of `steps`, if
+    it is given), or an error."""
+    array = as_float_array(value)
+    fits = eqx.is_inexact_array(array) and array.ndim == 2 and array.shape[1] == size
+    if not fits or steps not in (None, array.shape[0]):
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
+        rows = "steps" if steps is None else steps
+        raise ValueError(
+            f"{where}: {name} must have shape ({rows}, {size}), a row for each step, "
+            f"got {got}."
+        )
+    if array.shape[0] == 0:
+        raise ValueError(f"{where}: {name} must have at least one step.")
+    check_real(array, name, where)
+    return array
+
+
+def keywords_of(function: Callable[..., Any]) -> tuple[str, ...]:
+    """The names of the arguments that `function` takes as keywords."""
+    parameters = inspect.signature(function).parameters.values()
+    keyword = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
+    return tuple(p.name for p in parameters if p.kind in keyword)
+
+
+def check_keywords(
+    given: Iterable[str], where: str, *functions: Callable[..., Any]
+) -> None:
+    """Raise unless each name of `given` is a keyword of one of `functions`."""
+    names = list(dict.fromkeys(n for f in functions for n in keywords_of(f)))
+    for name in given:
+        if name not in names:
+            close = difflib.get_close_matches(name, names, n=3) or names
+            raise ValueError(
+                f"{where}: no argument is called {name!r}; did you mean "
+                f"{' or '.join(repr(n) for n in close)}?"
+            )
+
+
+LARGEST = float(np.finfo(np.float32).max)
+"""Ends a space where there is no bound, because Gymnasium advises against infinity."""
+
+
+def check_cost_sizes(cost: Any, sizes: tuple[int, int], name: str, where: str) -> None:
+    """Raise unless `cost` takes states and controls of these `sizes`."""
+    n, m = sizes
+    try:
+        output_of(cost, (), (n,), (m,))
+        output_of(cost.final, (), (n,))
+    except _UNTRACEABLE:  # it may still be called, one step after the other
+        return
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{where}: {name} does not fit a state of size {n} and a control of size "
+            f"{m}: {error}"
+        ) from error
+
+
+_UNTRACEABLE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+
+def checked_names(
+    names: Sequence[str] | None, letter: str, size: int, argument: str, where: str
+) -> tuple[str, ...]:
+    """`names` as a tuple of `size`, indexed if there are none, or an error."""
+    if names is None:
+        return indexed_names(letter, size)
+    if isinstance(names, str) or len(names) != size:
+        raise ValueError(f"{where}: {argument} must have {size} names, got {names!r}.")
+    return tuple(names)
+
+
+def check_matrices(
+    A: Any, B: Any, C: Any, E: Any, where: str
+) -> tuple[Array, Array, Any, Any]:
+    """`A`, `B`, `C`, `E` as matrices of fitting shapes, or an error that names one."""
+    A = as_matrix(A, "A", where)
+    n = A.shape[0]
+    if A.shape != (n, n) or n == 0:
+        raise ValueError(f"{where}: A must be square, got shape {A.shape}.")
+    B = _as_part(B, "B", n, "rows", where)
+    C = None if C is None else _as_part(C, "C", n, "columns", where)
+    E = None if E is None else _as_part(E, "E", n, "rows", where)
+    return A, B, C, E
+
+
+def _as_part(value: Any, name: str, n: int, side: str, where: str) -> Array:
+    """`value` as a matrix with as many rows or columns as there are states."""
+    matrix = as_matrix(value, name, where)
+    if matrix.shape[side == "columns"] != n:
+        raise ValueError(
+            f"{where}: {name} must have as many {side} as A ({n}), got shape "
+            f"{matrix.shape}."
+        )
+    return matrix

@@ -1,11 +1,22 @@
-"""Files that appear whole or not at all."""
+"""Paths of files, and files that appear whole or not at all."""
 
 import contextlib
 import os
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+from ._message import shortened
+
+
+def as_path(value: Any, name: str, where: str) -> Path:
+    """`value` as a path, or an error."""
+    if not isinstance(value, str | os.PathLike):
+        raise ValueError(
+            f"{where}: {name} must be the path of a file, got {shortened(value)}."
+        )
+    return Path(value)
 
 
 @contextlib.contextmanager

@@ -1,5 +1,7 @@
 """What error messages say of values."""
 
+import difflib
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -22,3 +24,10 @@ def shortened(value: Any) -> str:
     if is_array and not isinstance(value, Tracer):
         return f"an array of shape {value.shape} and dtype {value.dtype}"
     return f"{' '.join(text[:_MOST].split())}... (a {type(value).__name__})"
+
+
+def did_you_mean(name: str, names: Iterable[str], cutoff: float = 0.6) -> str:
+    """The question that an error about an unknown name ends with."""
+    names = list(names)
+    close = difflib.get_close_matches(name, names, n=3, cutoff=cutoff) or names
+    return f"did you mean {' or '.join(map(repr, close))}?"

@@ -1,11 +1,14 @@
 """Outcomes of a solve, in one enumeration with Diffrax's and Lineax's own."""
 
-from typing import Any, TYPE_CHECKING, TypeAlias
+from collections.abc import Callable
+from typing import Any, TYPE_CHECKING, TypeAlias, TypeVar
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jax.core import Tracer
+from jaxtyping import Array, Bool
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
@@ -125,3 +128,43 @@ def first_of(results: Result | None) -> Result:
 def or_none(result: Result) -> Result | None:
     """`None` for what is statically a success, so that loops need not carry it."""
     return None if result is RESULTS.successful else result
+
+
+_T = TypeVar("_T")
+
+
+def raise_if(failed: Bool[Array, ""], value: _T, message: str) -> _T:
+    """`value`, or an error: now if it can be seen, else at run time."""
+    if isinstance(failed, Tracer):
+        return eqx.error_if(value, failed, message)
+    if failed:
+        raise RuntimeError(message)
+    return value
+
+
+def raise_on_failure(
+    solution: Any,
+    where: str,
+    throw: bool = True,
+    it: str = "the solution",
+    facts: Callable[[], str] = lambda: "",
+) -> Any:
+    """`solution`, or an error if its `result` is a failure and `throw` holds: now if
+    that can be seen, else at run time.
+
+    `it` names the solution in the error; `facts` says more of a failure that is seen.
+    """
+    if not throw:
+        return solution
+    result = solution.result
+    failed = result != RESULTS.successful
+    if isinstance(failed, Tracer):
+        return result.error_if(solution, failed)
+    if failed:
+        words = (
+            f"{where}: {RESULTS[result]}",
+            facts(),
+            f"Pass throw=False to look at {it}.",
+        )
+        raise RuntimeError(" ".join(filter(None, words)))
+    return solution

@@ -2,23 +2,25 @@
 
 from typing import Literal, TypeAlias
 
-from jaxtyping import Array, Bool, Float, Key, Num, Shaped, UInt32
+from jaxtyping import Array, Bool, Float, Key, Num, UInt32
 
 
 RealScalar: TypeAlias = Num[Array, ""] | int | float
 """A real number: a Python number or a rank-0 array."""
+Time: TypeAlias = RealScalar
 Vector: TypeAlias = Float[Array, "_"]  # noqa: F821
 """A rank-1 floating-point array."""
 Matrix: TypeAlias = Float[Array, "_ _"]
 """A rank-2 floating-point array."""
 State: TypeAlias = Float[Array, "states"]  # noqa: F821
 Control: TypeAlias = Float[Array, "controls"]  # noqa: F821
-Disturbance: TypeAlias = Float[Array, "disturbances"]  # noqa: F821
+Disturbance: TypeAlias = Float[Array, "disturbances"] | None  # noqa: F821
 Observation: TypeAlias = Float[Array, "observations"]  # noqa: F821
 Scalar: TypeAlias = Float[Array, ""]
+Bounds: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."]]
+"""`(low, high)`, each a number or one for each entry."""
 BoolScalar: TypeAlias = Bool[Array, ""]
 PRNGKey: TypeAlias = Key[Array, "..."] | UInt32[Array, "... 2"]
 """A key from `jax.random.key` (or the older `jax.random.PRNGKey`)."""
 Checkpoint: TypeAlias = Literal["step", "sqrt"] | None
 """What the gradient of a rollout stores."""
-AnyArray: TypeAlias = Shaped[Array, "..."]

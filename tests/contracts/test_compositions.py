@@ -604,7 +604,7 @@ def test_a_learner_takes_a_wrapped_plant_that_observes_its_state(key):
     game = dlx.dynamics.WorstCase(plant, 0.01 * np.eye(2))
     base = dlx.controllers.LQR(plant, np.eye(2), np.eye(1))
     cost = dlx.costs.Quadratic(np.eye(2), np.eye(1))
-    learner = dlx.controllers.GPC(game, cost, base=base)
+    learner = dlx.controllers.gpc(game, cost, base=base)
     run = dlx.rollout(dlx.Environment(game, cost), learner, key=key, horizon=20)
     assert np.isfinite(run.total_cost)
 

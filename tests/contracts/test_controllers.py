@@ -105,12 +105,12 @@ def swing(size):
     dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=DT)
     cost = dlx.costs.Quadratic(size * jnp.eye(2), 0.1 * jnp.eye(1))
     base = c.Linear(size * jnp.array([[20.0, 5.0]]))
-    return c.DRC(dynamics, cost, base=base, memory=2, horizon=3, learning_rate=size)
+    return c.drc(dynamics, cost, base=base, memory=2, horizon=3, learning_rate=size)
 
 
 def network(size):
     key = jax.random.key(int(10 * size))
-    return learner(c.NeuralGPC, size, memory=2, width=3, key=key)
+    return learner(c.neural_gpc, size, memory=2, width=3, key=key)
 
 
 def bandit(size):
@@ -121,7 +121,7 @@ def bandit(size):
 
 def build(model):
     cost = dlx.costs.Quadratic(jnp.eye(2), 0.1 * jnp.eye(1))
-    return c.GPC(model, cost, memory=2, horizon=3)
+    return c.gpc(model, cost, memory=2, horizon=3)
 
 
 def explorer(size):
@@ -154,7 +154,7 @@ CASES = {
     "Zero": Case(lambda size: c.Zero(1), reads_all=False),
     "Constant": Case(lambda size: c.Constant([size]), reads_all=False),
     "Random": Case(lambda size: c.Random([size], 0.1), reads_all=False),
-    "Sequence": Case(lambda size: c.Sequence(size * jnp.ones((4, 1))), False),
+    "OpenLoop": Case(lambda size: c.OpenLoop(size * jnp.ones((4, 1))), False),
     "Linear": Case(lambda size: c.Linear(size * FEEDBACK)),
     "LQR": Case(lqr),
     "LQR that looks ahead": Case(ahead),
@@ -162,9 +162,11 @@ CASES = {
     "LQI": Case(lqi),
     "LQG": Case(lqg),
     "LQG from the start": Case(lambda size: lqg(size, steady_state=False)),
-    "OutputFeedback": Case(lambda size: estimated(c.ExtendedKalmanFilter, size)),
+    "OutputFeedback": Case(
+        lambda size: estimated(dlx.estimators.ExtendedKalmanFilter, size)
+    ),
     "OutputFeedback of an unscented filter": Case(
-        lambda size: estimated(c.UnscentedKalmanFilter, size)
+        lambda size: estimated(dlx.estimators.UnscentedKalmanFilter, size)
     ),
     "HInfinity": Case(hinfinity),
     "HInfinity over a horizon": Case(lambda size: hinfinity(size, horizon=8)),
@@ -187,17 +189,17 @@ CASES = {
     "Categorical": Case(choosing, reads_all=False),
     "Likeliest": Case(lambda size: c.Likeliest(choosing(size)), reads_all=False),
     "Scheduled": Case(scheduled),
-    "GPC": Case(lambda size: learner(c.GPC, size, memory=2)),
-    "DRC": Case(lambda size: learner(c.DRC, size, memory=2)),
+    "GPC": Case(lambda size: learner(c.gpc, size, memory=2)),
+    "DRC": Case(lambda size: learner(c.drc, size, memory=2)),
     "DRC along the way": Case(swing),
-    "SFC": Case(lambda size: learner(c.SFC, size, memory=4, filters=2)),
-    "DSC": Case(lambda size: learner(c.DSC, size, memory=3, filters=1)),
+    "SFC": Case(lambda size: learner(c.sfc, size, memory=4, filters=2)),
+    "DSC": Case(lambda size: learner(c.dsc, size, memory=3, filters=1)),
     "NeuralGPC": Case(network),
     "GPC, fixed": Case(
-        lambda size: learner(c.GPC, size, memory=2).fixed(size * jnp.ones((1, 4)))
+        lambda size: learner(c.gpc, size, memory=2).fixed(size * jnp.ones((1, 4)))
     ),
     "Adaptive": Case(
-        lambda size: c.Adaptive(learner(c.GPC, size, memory=2), slots=2, every=3)
+        lambda size: c.Adaptive(learner(c.gpc, size, memory=2), slots=2, every=3)
     ),
     "BPC": Case(bandit),
     "Explore": Case(explorer),
@@ -236,8 +238,8 @@ KIN = (
 
 
 # What a controller without a state, or with little in it, shows no better than others.
-PLAIN = ("Zero", "Random", "Sequence", "Scheduled")
-STATELESS = ("Zero", "Sequence", "Linear", "LQR", "HInfinity", "MLP", "Scheduled")
+PLAIN = ("Zero", "Random", "OpenLoop", "Scheduled")
+STATELESS = ("Zero", "OpenLoop", "Linear", "LQR", "HInfinity", "MLP", "Scheduled")
 FEW = ("Gaussian", "GPC", "Linear", "LQR", "MLP")
 
 

@@ -114,9 +114,9 @@ LONG = {
     AbstractDisturbance analysis.disk_margin analysis.DiskMargin analysis.hinf_norm
     analysis.Margins analysis.margins c2d controllers.Adaptive
     controllers.best_in_hindsight controllers.BPC controllers.Categorical
-    controllers.DRC controllers.Explore estimators.ExtendedKalmanFilter
+    controllers.drc controllers.Explore estimators.ExtendedKalmanFilter
     estimators.Filtered controllers.FiniteHorizonLQR controllers.FixedPolicy
-    controllers.Gaussian controllers.GPC controllers.Hindsight controllers.HInfinity
+    controllers.Gaussian controllers.gpc controllers.Hindsight controllers.HInfinity
     estimators.KalmanFilter controllers.Linear
     controllers.LQG controllers.LQI controllers.LQR controllers.lqrd controllers.MLP
     controllers.MPC controllers.MPCState controllers.online_newton
@@ -128,7 +128,7 @@ LONG = {
     studies.train_swing_up lung.explore lung.fit_lungs lung.LearnedLung
     lung.least_error lung.pid_grid lung.ShootingMPC lung.train_controllers
     lung.write_example planning.Constraints planning.ilqr planning.Plan
-    plotting.phase_portrait randomise riccati.ContinuousGameSolution
+    plotting.phase_portrait randomise
     riccati.ContinuousHorizonSolution riccati.dre riccati.hinf_care riccati.hinf_cre
     riccati.hinf_dre simulate training.analytic training.EvolutionStrategies
     training.expected_cost training.fit training.PPO training.scored_cost

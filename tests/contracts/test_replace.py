@@ -59,7 +59,7 @@ CASES = {
     "UniformState": Case(lambda: dlx.environments.UniformState([0.0, 1.0], [2.0, 3.0])),
     "Linear": Case(lambda: dlx.controllers.Linear(A)),
     "Random": Case(lambda: dlx.controllers.Random([0.1, 0.2])),
-    "Sequence": Case(lambda: dlx.controllers.Sequence(A)),
+    "OpenLoop": Case(lambda: dlx.controllers.OpenLoop(A)),
     "PID": Case(
         lambda: dlx.controllers.PID([1.0, 2.0], 0.1, dt=0.1, anti_windup_time=0.5)
     ),
@@ -175,7 +175,7 @@ PARTS = {
     "Plan": lambda: dlx.planning.ilqr(
         dynamics(2), quadratic(2), np.ones(2), np.zeros((5, 1)), bounds=(-1, 1)
     ),
-    "GPC": lambda: dlx.controllers.GPC(
+    "GPC": lambda: dlx.controllers.gpc(
         dynamics(2), quadratic(2), base=dlx.controllers.Linear(A[:1]), memory=3
     ),
 }

@@ -76,7 +76,7 @@ def test_task(name, key, tmp_path):
     """It runs within its bounds at finite cost, encodes to the size that it says, and
     comes back from a file as it was."""
     env = task(name)
-    controller = dlx.controllers.Sequence(sequence(env, 6))
+    controller = dlx.controllers.OpenLoop(sequence(env, 6))
     run = dlx.rollout(env, controller, key=key, horizon=6)
     for array in (run.states, run.observations, run.costs, run.final_cost):
         assert np.all(np.isfinite(array)) and array.dtype == jnp.zeros(()).dtype
@@ -215,7 +215,7 @@ def gradient_of(name):
     def cost(theta):
         arrays, x0, controls = unravel(theta)
         plant = eqx.tree_at(lambda e: e.dynamics, env, eqx.combine(arrays, parts[1]))
-        controller = dlx.controllers.Sequence(controls)
+        controller = dlx.controllers.OpenLoop(controls)
         key = jax.random.key(0)
         run = dlx.rollout(plant, controller, key=key, x0=x0, horizon=steps)
         return run.total_cost / steps

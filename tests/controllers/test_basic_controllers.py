@@ -15,7 +15,7 @@ def test_what_they_do(key):
     assert_close(dlx.controllers.Constant([1.0, 2.0])(0.0, Y, None)[0], [1.0, 2.0])
     K = jnp.array([[2.0, 1.0]])
     assert_close(dlx.controllers.Linear(K)(0.0, Y, None)[0], [1.0])
-    given = dlx.controllers.Sequence([[1.0], [2.0]])
+    given = dlx.controllers.OpenLoop([[1.0], [2.0]])
     state, controls = given.init(), []
     for _ in range(3):
         u, state = given(0.0, Y, state)
@@ -42,7 +42,7 @@ def test_random_controls(key):
         (lambda c: c.Random(jnp.ones(1)).init(), "key must be one random key"),
         (lambda c: c.Linear(jnp.ones(2)), r"K must be a matrix, got shape \(2,\)"),
         (lambda c: c.Linear([[np.inf]]), "K must be finite"),
-        (lambda c: c.Sequence(jnp.ones((0, 1))), "values must have at least one row"),
+        (lambda c: c.OpenLoop(jnp.ones((0, 1))), "values must have at least one row"),
     ],
 )
 def test_wrong_arguments(make, match):

@@ -102,7 +102,7 @@ def test_told_what_was_applied(key):
     lqg = c.LQG(DYNAMICS, Q, R, W, V, mean=x0)
     run = dlx.rollout(env, lqg, key=key, x0=x0)
     assert_close(np.abs(run.controls[:4]), 0.3, rtol=1e-6)
-    filtered = c.run_filter(lqg.estimator, run.observations, run.controls)
+    filtered = dlx.estimators.run_filter(lqg.estimator, run.observations, run.controls)
     K = lqg.regulator.K
     expected = jnp.clip(-filtered.updated.mean @ K.T, -0.3, 0.3)
     close = dict(rtol=tolerance(1e-4, 1e-11), atol=tolerance(1e-5, 1e-12))
@@ -169,11 +169,11 @@ def test_output_feedback_of_anything(key):
     a, b = (dlx.rollout(env, law, key=key) for law in (lqg, same))
     np.testing.assert_array_equal(a.controls, b.controls)
 
-    class Luenberger(c.AbstractEstimator):
+    class Luenberger(dlx.estimators.AbstractEstimator):
         L: jax.Array = dlx.weight()
 
         def init(self, *, key=None):
-            return c.Belief(jnp.zeros(2), jnp.eye(2))
+            return dlx.estimators.Belief(jnp.zeros(2), jnp.eye(2))
 
         def update(self, t, y, belief):
             error = y - DYNAMICS.observe(t, belief.mean)

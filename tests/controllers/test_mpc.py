@@ -169,7 +169,7 @@ def first_costs():
         state = state._replace(controls=state.controls + controls)
         u, state = mpc(0.0, x0, state)
         U = jnp.concatenate([u[None], state.controls[:-1]])
-        followed = dlx.controllers.Sequence(U)
+        followed = dlx.controllers.OpenLoop(U)
         run = lambda c: dlx.rollout(short, c, key=KEY, x0=x0).total_cost
         return run(followed), run(lqr), state.failures.count
 
@@ -336,7 +336,7 @@ def test_learning_online_around_a_plan():
     cost = dlx.costs.Quadratic([1.0, 0.1], [0.1])
     x0 = jnp.array([1.0, 0.0])
     plan = dlx.planning.ilqr(dynamics, cost, x0, jnp.zeros((150, 1)))
-    learner = dlx.controllers.GPC(dynamics, cost, base=plan, memory=5, horizon=15)
+    learner = dlx.controllers.gpc(dynamics, cost, base=plan, memory=5, horizon=15)
     times = jnp.arange(150.0)
     shock = 0.2 * jnp.sin(times / (2 * jnp.pi))
     w = jnp.stack([0 * shock, jnp.where(times > 50, shock, 0)], axis=1)

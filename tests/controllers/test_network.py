@@ -9,7 +9,7 @@ from helpers import assert_close, once, user_error
 import delucax as dlx
 
 
-MLP, Deep = dlx.controllers.MLP, dlx.controllers.Deep
+MLP, mlp_policy = dlx.controllers.MLP, dlx.controllers.mlp_policy
 
 
 @once
@@ -41,7 +41,7 @@ def test_squashed_into_bounds(key):
 @once
 def test_deep_fits_the_environment(key):
     env = dlx.make("pendulum")
-    policy = Deep(env, width=8, depth=3, key=key)
+    policy = mlp_policy(env, width=8, depth=3, key=key)
     assert isinstance(policy, MLP)
     sizes = [layer.weight.shape for layer in policy.network.layers]
     assert sizes == [(8, 3), (8, 8), (8, 8), (1, 8)]
@@ -55,18 +55,18 @@ def test_deep_fits_the_environment(key):
 @once
 def test_deep_heads(key):
     env = dlx.make("pendulum")
-    policy = Deep(env, width=8, head="gaussian", key=key)
+    policy = mlp_policy(env, width=8, head="gaussian", key=key)
     assert isinstance(policy, dlx.controllers.Gaussian)
     assert_close(jnp.exp(policy.log_std), [1.0], rtol=1e-6)  # a quarter of -2 to 2
     assert policy.base.bounds is not None and policy.bounds is not None
     open_ended = dlx.make("lds", A=jnp.eye(2), B=jnp.ones((2, 1)))
-    policy = Deep(open_ended, width=8, head="gaussian", key=key)
+    policy = mlp_policy(open_ended, width=8, head="gaussian", key=key)
     assert policy.bounds is None and policy.base.bounds is None
     assert_close(policy.log_std, [0.0])
     half = dlx.make(
         "lds", A=jnp.eye(2), B=jnp.ones((2, 1)), control_bounds=(0.0, jnp.inf)
     )
-    policy = Deep(half, width=8, head="gaussian", key=key)
+    policy = mlp_policy(half, width=8, head="gaussian", key=key)
     assert policy.base.bounds is None
     run = dlx.rollout(half, policy, key=key, horizon=5)
     assert run.controls.min() >= 0
@@ -78,7 +78,7 @@ def test_deep_learns_what_lqr_knows(key):
     A, B = jnp.array([[0.9, 0.3], [0.0, 0.6]]), jnp.array([[0.0], [0.5]])
     env = dlx.make("lds", A=A, B=B, initial_state=jnp.array([1.0, 0.0]))
     loss = dlx.training.expected_cost(env, batch=1, horizon=20)
-    policy = Deep(env, width=8, depth=1, key=key)
+    policy = mlp_policy(env, width=8, depth=1, key=key)
     fitted = dlx.training.fit(loss, policy, optax.adam(0.03), steps=100, key=key)
     best = dlx.controllers.LQR(env.dynamics, jnp.eye(2), jnp.eye(1)).P[0, 0]
     assert loss(policy, key) > 1.1 * best
@@ -100,9 +100,9 @@ def test_wrong_arguments(key):
     with user_error(match="MLP: .*size 3, got size 2.*features=env.encode"):
         MLP(3, 1, key=key)(0.0, jnp.zeros(2), None)
     with user_error(match="environment must be an Environment, got GymPendulum"):
-        Deep(dlx.make("pendulum").dynamics, key=key)
+        mlp_policy(dlx.make("pendulum").dynamics, key=key)
     with user_error(match="head must be .* got 'softmax'"):
-        Deep(dlx.make("pendulum"), head="softmax", key=key)
+        mlp_policy(dlx.make("pendulum"), head="softmax", key=key)
 
 
 @once

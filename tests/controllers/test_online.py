@@ -54,10 +54,10 @@ def follow(env, controller, x0, w):
 
 PENDULUM = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
 LEARNERS = {
-    "GPC": lambda d, cost: c.GPC(d, cost),
-    "SFC": lambda d, cost: c.SFC(d, cost, memory=6, filters=2),
-    "NeuralGPC": lambda d, cost: c.NeuralGPC(d, cost, width=3, key=jax.random.key(0)),
-    "BPC": lambda d, cost: c.BPC(d, c.GPC(d, cost).loop.base, delta=5.0),
+    "GPC": lambda d, cost: c.gpc(d, cost),
+    "SFC": lambda d, cost: c.sfc(d, cost, memory=6, filters=2),
+    "NeuralGPC": lambda d, cost: c.neural_gpc(d, cost, width=3, key=jax.random.key(0)),
+    "BPC": lambda d, cost: c.BPC(d, c.gpc(d, cost).loop.base, delta=5.0),
 }
 
 
@@ -80,25 +80,25 @@ def test_recovered_disturbances(dynamics, make):
     env = dlx.Environment(dynamics, COST, control_bounds=(-0.4, 0.4))
     learner, x0 = make(dynamics, COST), jnp.array([0.3, -0.5])
     quiet, *_ = follow(env, learner, x0, jnp.zeros((12, dynamics.disturbance_size)))
-    assert np.all(np.asarray(quiet.signal) == 0)
+    assert np.all(np.asarray(quiet.loop.signal) == 0)
     w = 0.2 * np.random.default_rng(0).normal(size=(12, dynamics.disturbance_size))
     states, applied, asked, _ = follow(env, learner, x0, w)
     assert np.any(np.asarray(applied) != np.asarray(asked))
     if dynamics is PLANT:
-        assert_close(states.signal[1:, 0], w[:-1], rtol=0, atol=1e-14)
+        assert_close(states.loop.signal[1:, 0], w[:-1], rtol=0, atol=1e-14)
         return
     found = dlx.rollout(env, learner, key=jax.random.key(1), x0=x0, w=w, horizon=12)
     x = found.states
     undisturbed = jax.vmap(lambda x, u: dynamics(0.0, x, u))(x[:-1], applied)
-    assert np.any(np.abs(states.signal[1:, 0]) > 1e-3)
+    assert np.any(np.abs(states.loop.signal[1:, 0]) > 1e-3)
     if not isinstance(learner, c.BPC):  # which draws another key in a rollout
-        assert_close(states.signal[1:, 0], (x[1:] - undisturbed)[:-1], atol=1e-13)
+        assert_close(states.loop.signal[1:, 0], (x[1:] - undisturbed)[:-1], atol=1e-13)
 
 
 def partial(base=None):
     C = np.array([[1.0, 0.0]])
     plant = dlx.LinearDynamics(A, B, C)
-    return plant, c.DRC(plant, dlx.costs.Quadratic(R, R), base=base, memory=3)
+    return plant, c.drc(plant, dlx.costs.Quadratic(R, R), base=base, memory=3)
 
 
 @thorough
@@ -118,7 +118,7 @@ def test_natures_output():
         w=w,
     )
     assert np.any(np.asarray(applied) != np.asarray(asked))
-    assert_close(states.signal[:, 0], base.observations, rtol=0, atol=1e-12)
+    assert_close(states.loop.signal[:, 0], base.observations, rtol=0, atol=1e-12)
 
 
 class Filtering(dlx.AbstractController):
@@ -139,7 +139,7 @@ def test_loss_is_what_the_step_would_have_cost(along):
     """With a roll-out as long as the run, exactly so where the loop is linear."""
     gain = dlx.riccati.dare(A, B, Q, R).K
     base = Filtering(gain) if along else c.Linear(gain)
-    learner = c.GPC(PLANT, COST, base=base, memory=3, horizon=12)
+    learner = c.gpc(PLANT, COST, base=base, memory=3, horizon=12)
     assert (learner.loop.tangents is None) == along
     env = dlx.Environment(PLANT, COST)
     w = np.random.default_rng(2).normal(size=(12, 2))
@@ -173,7 +173,7 @@ def hindsight_policy(A, B, K, w, memory):
 @thorough
 def test_defaults_reach_what_is_possible():
     """Under noise, a slow sine and a constant, in any units of cost and disturbance."""
-    learner, base = c.GPC(PLANT, COST), c.LQR(PLANT, Q, R)
+    learner, base = c.gpc(PLANT, COST), c.LQR(PLANT, Q, R)
     rng = np.random.default_rng(0)
     w = np.stack([rng.normal(size=(STEPS, 2)), SLOW, np.ones((STEPS, 2))])
     total = jax.jit(jax.vmap(lambda c, w: run(c, w).total_cost, (None, 0)))
@@ -184,7 +184,7 @@ def test_defaults_reach_what_is_possible():
 
     def scaled(size, w):
         cost = dlx.costs.Quadratic(size * Q, size * R)
-        return run(c.GPC(PLANT, cost), size * w, cost=cost).total_cost
+        return run(c.gpc(PLANT, cost), size * w, cost=cost).total_cost
 
     for size in 1e-2, 1e2:
         again = jax.vmap(scaled, (None, 0))(size, w)
@@ -194,7 +194,7 @@ def test_defaults_reach_what_is_possible():
 def test_published_setting():
     """The averages over 1000 steps, relative to the regulator's, to 2 percent."""
     rate = optax.scale_by_schedule(lambda k: 1 / jnp.sqrt(k + 1.0))
-    learner = c.GPC(
+    learner = c.gpc(
         PLANT,
         COST,
         memory=10,
@@ -212,7 +212,7 @@ def test_published_setting():
 def test_best_in_hindsight():
     """The least-squares solution for a policy; a stationary point for a gain."""
     w = np.random.default_rng(4).normal(size=(200, 2))
-    learner = c.GPC(PLANT, COST, memory=4)
+    learner = c.gpc(PLANT, COST, memory=4)
     played = run(learner, w)
     env = dlx.Environment(PLANT, COST)
     found = c.best_in_hindsight(env, learner.fixed(), played)
@@ -261,7 +261,7 @@ def test_adaptive_keeps_up():
     rate = optax.scale_by_schedule(lambda k: 1 / jnp.sqrt(k + 1.0))
     optimiser = optax.chain(rate, optax.scale(-1.0))
     options = dict(horizon=10, learning_rate=0.005, optimiser=optimiser)
-    learner = c.GPC(plant, COST, **options)
+    learner = c.gpc(plant, COST, **options)
     assert isinstance(learner.loop.base, c.Scheduled)
     noise = 0.2 * np.random.default_rng(0).normal(size=(5, 600, 2))
     t = np.arange(600)[:, None]
@@ -276,7 +276,7 @@ def test_adaptive_keeps_up():
 def test_births_and_deaths():
     """Experts live as published, and one of the slots always holds the first."""
     slots, every, steps = 6, 2, 60
-    learner = c.Adaptive(c.GPC(PLANT, COST, memory=2), slots=slots, every=every)
+    learner = c.Adaptive(c.gpc(PLANT, COST, memory=2), slots=slots, every=every)
     env = dlx.Environment(PLANT, COST)
     w = np.random.default_rng(5).normal(size=(steps, 2))
     states, *_ = follow(env, learner, np.zeros(2), w)
@@ -302,7 +302,7 @@ def test_births_and_deaths():
 @thorough
 def test_switching_follows_one():
     w = np.random.default_rng(6).normal(size=(100, 2))
-    learner = c.Adaptive(c.GPC(PLANT, COST, memory=2), every=5, play="switch")
+    learner = c.Adaptive(c.gpc(PLANT, COST, memory=2), every=5, play="switch")
     states, applied, *_ = follow(dlx.Environment(PLANT, COST), learner, np.zeros(2), w)
     chosen = np.asarray(states.chosen)
     assert len(set(chosen)) > 1 and np.mean(chosen[1:] != chosen[:-1]) < 0.5
@@ -319,7 +319,7 @@ def test_bandit_feedback():
 
 
 def build(model):
-    return c.GPC(model, COST, horizon=15)
+    return c.gpc(model, COST, horizon=15)
 
 
 @thorough
@@ -332,7 +332,7 @@ def test_explore_identifies():
     states, *_, costs = follow(env, learner, np.zeros(2), w)
     model = jax.tree.map(lambda leaf: leaf[-1], states.model)
     assert np.max(np.abs(model.A - A)) < 0.1 and np.max(np.abs(model.B - B)) < 0.1
-    known = run(c.GPC(PLANT, COST), w).costs
+    known = run(c.gpc(PLANT, COST), w).costs
     assert np.mean(costs[3500:]) < 1.3 * np.mean(known[3500:])
     assert np.mean(costs[3500:]) < 0.3 * np.mean(run(c.Linear(K), w).costs[3500:])
 
@@ -382,7 +382,7 @@ def test_online_newton_is_recursive_least_squares():
 @needs_x64
 def test_the_curvature_of_a_cost():
     """A convex one in full, of another what is positive, of a flat one nothing."""
-    from delucax.controllers.online._newton import positive_root
+    from delucax.controllers.online._optimisers import positive_root
 
     A = np.random.default_rng(1).normal(size=(3, 3))
     for H in (A @ A.T, np.diag([1.0, 0.0, 2.0]), np.zeros((3, 3))):
@@ -406,7 +406,7 @@ def test_adagrad_norm():
 
 
 def test_projection_holds():
-    learner = c.GPC(PLANT, COST, learning_rate=100.0, radius=0.2)
+    learner = c.gpc(PLANT, COST, learning_rate=100.0, radius=0.2)
     states, *_ = follow(dlx.Environment(PLANT, COST), learner, np.zeros(2), SLOW[:200])
     norms = np.linalg.norm(states.theta[:, 0], axis=-1)
     assert np.max(norms) <= 0.2 * (1 + 1e-12) and np.max(norms) > 0.199
@@ -449,10 +449,10 @@ def test_the_default_memory_follows_the_closed_loop(decay, memory):
     plant = dlx.LinearDynamics(np.array([[decay]]), np.eye(1))
     cost = dlx.costs.Quadratic(np.eye(1), np.eye(1))
     base = c.Linear(np.zeros((1, 1)))
-    assert c.GPC(plant, cost, base=base).features.memory == memory
-    assert c.GPC(plant, cost, base=base, memory=3).features.memory == 3
-    neural = c.NeuralGPC(plant, cost, base=base, key=jax.random.key(0))
-    assert neural.features.memory == memory
+    assert c.gpc(plant, cost, base=base).loop.memory == memory
+    assert c.gpc(plant, cost, base=base, memory=3).loop.memory == 3
+    neural = c.neural_gpc(plant, cost, base=base, key=jax.random.key(0))
+    assert neural.loop.memory == memory
 
 
 def test_the_default_memory_of_a_loop_that_cannot_be_seen():
@@ -462,7 +462,7 @@ def test_the_default_memory_of_a_loop_that_cannot_be_seen():
         plant = dlx.LinearDynamics(a * jnp.eye(1), np.eye(1))
         cost = dlx.costs.Quadratic(np.eye(1), np.eye(1))
         base = c.Linear(np.zeros((1, 1)))
-        seen.append(c.GPC(plant, cost, base=base, horizon=20).features.memory)
+        seen.append(c.gpc(plant, cost, base=base, horizon=20).loop.memory)
         return a
 
     jax.eval_shape(make, jnp.asarray(0.9))
@@ -474,8 +474,8 @@ def test_a_slow_plant_needs_a_long_memory():
     A = np.array([[1, 0.1, 0], [0, 0.95, 0.2], [0, -0.1, 0.9]])
     plant = dlx.LinearDynamics(A, np.array([[0.0], [0.1], [1.0]]))
     cost = dlx.costs.Quadratic(np.eye(3), np.eye(1))
-    learner = c.GPC(plant, cost)
-    assert learner.features.memory == 21
+    learner = c.gpc(plant, cost)
+    assert learner.loop.memory == 21
     w = np.sin(2 * np.pi * TIMES / 57)[:, None] * np.ones(3)
     total = run(learner, w, plant, cost).total_cost
     assert total < 0.28 * run(learner.loop.base, w, plant, cost).total_cost
@@ -490,36 +490,36 @@ NO_POINT = dlx.Discretized(dlx.systems.Lorenz(), dt=0.01)
 @pytest.mark.parametrize(
     "make, match",
     [
-        (lambda: c.GPC(PLANT, COST, base=UNSTABLE), "must stabilise.*radius 1"),
-        (lambda: c.GPC(PLANT, COST, memory=0), "GPC: memory must be a whole"),
-        (lambda: c.GPC(PLANT, COST, horizon=0), "GPC: horizon must be a whole"),
-        (lambda: c.GPC(PLANT, vector), r"cost must give a scalar.*shape \(2,\)"),
+        (lambda: c.gpc(PLANT, COST, base=UNSTABLE), "must stabilise.*radius 1"),
+        (lambda: c.gpc(PLANT, COST, memory=0), "gpc: memory must be a whole"),
+        (lambda: c.gpc(PLANT, COST, horizon=0), "gpc: horizon must be a whole"),
+        (lambda: c.gpc(PLANT, vector), r"cost must give a scalar.*shape \(2,\)"),
         (
-            lambda: c.GPC(LOOSE, COST, base=c.Linear([[1.0]])),
-            r"GPC: cost must take the observation, of shape \(1,\).*Q has shape",
+            lambda: c.gpc(LOOSE, COST, base=c.Linear([[1.0]])),
+            r"gpc: cost must take the observation, of shape \(1,\).*Q has shape",
         ),
-        (lambda: c.GPC(PLANT, 3.0), "cost must be a function"),
-        (lambda: c.GPC(None, COST), "dynamics must be an AbstractDynamics.*Explore"),
-        (lambda: c.GPC(PLANT, COST, base=3), "base must be an AbstractController"),
-        (lambda: c.GPC(PLANT, COST, base=c.Zero(2)), "control of size 1.*shape"),
-        (lambda: c.GPC(PLANT, COST, base=c.Linear(np.ones((1, 3)))), "of size 2"),
-        (lambda: c.GPC(PLANT, COST, radius=-1.0), "radius must be positive"),
-        (lambda: c.GPC(PLANT, COST, learning_rate=np.nan), "learning_rate must be"),
-        (lambda: c.GPC(LOOSE, dlx.costs.Quadratic(R, R)), "must observe their state"),
-        (lambda: c.GPC(PLANT, lambda t, x, u: jnp.abs(u[0])), "base must be given"),
-        (lambda: c.DRC(LOOSE, dlx.costs.Quadratic(R, R), memory=0), "memory must be"),
-        (lambda: c.SFC(PLANT, COST, filters=9, memory=8), "filters must be at most"),
-        (lambda: c.SFC(PLANT, COST, margin=1.0), "margin must be a number between"),
-        (lambda: c.NeuralGPC(PLANT, COST, key=3), "key must be one random key"),
+        (lambda: c.gpc(PLANT, 3.0), "cost must be a function"),
+        (lambda: c.gpc(None, COST), "dynamics must be an AbstractDynamics.*Explore"),
+        (lambda: c.gpc(PLANT, COST, base=3), "base must be an AbstractController"),
+        (lambda: c.gpc(PLANT, COST, base=c.Zero(2)), "control of size 1.*shape"),
+        (lambda: c.gpc(PLANT, COST, base=c.Linear(np.ones((1, 3)))), "of size 2"),
+        (lambda: c.gpc(PLANT, COST, radius=-1.0), "radius must be positive"),
+        (lambda: c.gpc(PLANT, COST, learning_rate=np.nan), "learning_rate must be"),
+        (lambda: c.gpc(LOOSE, dlx.costs.Quadratic(R, R)), "must observe their state"),
+        (lambda: c.gpc(PLANT, lambda t, x, u: jnp.abs(u[0])), "base must be given"),
+        (lambda: c.drc(LOOSE, dlx.costs.Quadratic(R, R), memory=0), "memory must be"),
+        (lambda: c.sfc(PLANT, COST, filters=9, memory=8), "filters must be at most"),
+        (lambda: c.sfc(PLANT, COST, margin=1.0), "margin must be a number between"),
+        (lambda: c.neural_gpc(PLANT, COST, key=3), "key must be one random key"),
         (lambda: c.BPC(PLANT, UNSTABLE), "must stabilise"),
         (lambda: c.BPC(PLANT, c.LQR(PLANT, Q, R)).init(), "key must be one random"),
         (lambda: c.Adaptive(c.Zero(1)), "base must be an AbstractLearner"),
-        (lambda: c.Adaptive(c.GPC(PLANT, COST), slots=1), "slots must be a whole"),
-        (lambda: c.Adaptive(c.GPC(PLANT, COST), share=0.0), "share must be positive"),
-        (lambda: c.Adaptive(c.GPC(PLANT, COST), share=2.0), "share must be between"),
-        (lambda: c.GPC(PLANT, COST, radius=[1.0, 2.0]), "radius must be a number"),
-        (lambda: c.GPC(Twice(), COST, base=c.LQR(PLANT, Q, R)), "not observed"),
-        (lambda: c.Adaptive(c.GPC(PLANT, COST), play="both"), "'mix' or 'switch'"),
+        (lambda: c.Adaptive(c.gpc(PLANT, COST), slots=1), "slots must be a whole"),
+        (lambda: c.Adaptive(c.gpc(PLANT, COST), share=0.0), "share must be positive"),
+        (lambda: c.Adaptive(c.gpc(PLANT, COST), share=2.0), "share must be between"),
+        (lambda: c.gpc(PLANT, COST, radius=[1.0, 2.0]), "radius must be a number"),
+        (lambda: c.gpc(Twice(), COST, base=c.LQR(PLANT, Q, R)), "not observed"),
+        (lambda: c.Adaptive(c.gpc(PLANT, COST), play="both"), "'mix' or 'switch'"),
         (lambda: c.Explore(3, np.zeros((1, 2)), 100), "build must be a function"),
         (lambda: c.Explore(build, np.zeros((1, 2)), 3), "steps must be a whole"),
         (lambda: c.Scheduled(c.Linear(np.ones((1, 2))), 0.0), "dt must be positive"),
@@ -535,7 +535,7 @@ def test_bad_input(make, match):
 def test_traced_dynamics_need_a_horizon():
     def cost(b, **options):
         dynamics = dlx.LinearDynamics(A, b * B)
-        return run(c.GPC(dynamics, COST, **options), SLOW[:30], dynamics).total_cost
+        return run(c.gpc(dynamics, COST, **options), SLOW[:30], dynamics).total_cost
 
     with user_error(match="horizon must be given"):
         jax.jit(cost)(1.0)

@@ -148,7 +148,7 @@ def test_the_trapezoidal_rule_gives_no_minus_one():
 
 def test_bad_arguments_of_d2c():
     A, B = jnp.eye(2), jnp.ones((2, 1))
-    with user_error(match="d2c: dynamics must be LinearDynamics"):
+    with user_error(match="d2c: dynamics must be a LinearDynamics"):
         dlx.d2c(LinearSystem(A, B))
     with user_error(match="time-invariant, got matrices at 2 times"):
         dlx.d2c(dlx.LinearDynamics(jnp.stack([A, A]), B))

@@ -143,7 +143,7 @@ def test_what_is_passed_on_from_the_system():
     assert_close(step(0.0, x, u), x, rtol=1e-6)
     assert (step.state_units, step.control_units) == (("m",), ("N",))
     assert (step.state_names, step.control_names) == (("x",), ("u",))
-    assert step.noise is None and step.disturbance_size == 1
+    assert step.noise == "additive" and step.disturbance_size == 1
 
 
 def test_precision_follows_the_state():

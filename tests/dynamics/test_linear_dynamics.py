@@ -177,7 +177,7 @@ def test_open_loop():
         ((jnp.zeros(3), controls), "x0 must have shape"),
         ((jnp.zeros(2), jnp.ones((3, 2))), r"controls must have shape \(steps, 1\)"),
         ((jnp.zeros(2), jnp.ones((0, 1))), "at least one step"),
-        ((jnp.zeros(2), controls, jnp.ones((2, 2))), "as many steps as controls"),
+        ((jnp.zeros(2), controls, jnp.ones((2, 2))), r"w must have shape \(3, 2\)"),
     ]:
         with user_error(match=match):
             dlx.open_loop(dynamics, *arguments)

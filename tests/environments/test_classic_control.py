@@ -225,7 +225,7 @@ def test_a_smooth_acrobot_has_gradients(key):
     )
 
     def total(controls):
-        controller = dlx.controllers.Sequence(controls)
+        controller = dlx.controllers.OpenLoop(controls)
         return dlx.rollout(env, controller, key=key, x0=0.1 * jnp.ones(4)).total_cost
 
     slope = jax.grad(total)(jnp.zeros((20, 1)))

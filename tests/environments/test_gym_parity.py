@@ -269,7 +269,7 @@ def compare_episodes(case, seeds):
 
     @jax.vmap
     def replay(x0, controls):
-        controller = dlx.controllers.Sequence(controls)
+        controller = dlx.controllers.OpenLoop(controls)
         return dlx.rollout(env, controller, key=jax.random.key(0), x0=x0)
 
     ours = replay(np.stack([states[0] for states, *_ in runs]), controls)

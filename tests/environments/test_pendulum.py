@@ -55,7 +55,7 @@ def test_whole_episodes_agree(gym, count):
 
     @jax.vmap
     def replay(x0, actions):
-        sequence = dlx.controllers.Sequence(actions)
+        sequence = dlx.controllers.OpenLoop(actions)
         return dlx.rollout(env, sequence, key=jax.random.key(0), x0=x0)
 
     runs = replay(states[:, 0], actions)

@@ -1,5 +1,7 @@
 """The tasks that are not Gym's: the paper's numbers, and what each takes."""
 
+import inspect
+
 import diffrax
 import equinox as eqx
 import jax
@@ -233,6 +235,16 @@ def test_all_names_of_a_task_are_known():
 
 
 @once
+def test_the_signature_of_a_task_has_its_options():
+    names = list(inspect.signature(dlx.environments.planar_quadrotor).parameters)
+    options = ["wind", "wind_strength", "dt", "horizon", "solver", "substeps"]
+    assert names == ["system", *options, "others"]
+    assert dlx.environments.default_horizon("planar_quadrotor") == 100
+    with user_error(match="default_horizon: no task is called 'planar'; did you mean"):
+        dlx.environments.default_horizon("planar")
+
+
+@once
 def test_a_linear_model_is_a_task():
     upright = dlx.linearize(dlx.systems.Pendulum())
     env = dlx.make("lds", system=upright, dt=0.05)
@@ -246,7 +258,7 @@ def test_a_linear_model_is_a_task():
 
 @once
 def test_a_fitted_field_is_a_task():
-    env = dlx.make("neural", system=dlx.systems.VanDerPol(), dt=0.1)
+    env = dlx.make("neural", system=dlx.systems.VanDerPol(), key=None, dt=0.1)
     expected = dlx.make("van_der_pol", dt=0.1).dynamics
     x, u = jnp.ones(2), jnp.ones(1)
     assert_close(env.dynamics(0.0, x, u), expected(0.0, x, u))
@@ -306,7 +318,7 @@ FLOW = dlx.systems.LinearSystem(jnp.eye(1), jnp.eye(1))
         (
             "neural",
             dict(system=dlx.systems.VanDerPol(), key=jax.random.key(0)),
-            "got both",
+            "neural: give a system or its key, not both",
         ),
         (
             "neural",

@@ -188,7 +188,7 @@ from delucax.experiments import experiment
 
 assert jax.device_count() == 8
 env = dlx.make("pendulum")
-controller = dlx.controllers.Deep(env, width=4, depth=1, key=jax.random.key(1))
+controller = dlx.controllers.mlp_policy(env, width=4, depth=1, key=jax.random.key(1))
 keys = jax.random.split(jax.random.key(0), 64)
 
 @eqx.filter_jit

@@ -513,7 +513,10 @@ WRONG = {
         lambda: quiet(stored, mesh=jax.make_mesh((jax.device_count(),), ("seeds",))),
         "mesh spreads what takes a key",
     ),
-    "backend": (lambda: quiet(stored, backend="mpi"), "backend must be one of"),
+    "backend": (
+        lambda: quiet(stored, backend="mpi"),
+        "backend must be .loky. or .dask.",
+    ),
     "no experiment": (lambda: experiments.run(), "experiments must be one at least"),
     "one name": (
         lambda: experiments.run(stored, stored),

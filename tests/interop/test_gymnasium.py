@@ -108,7 +108,7 @@ def test_episode_is_a_rollout():
     env = dlx.make("pendulum", horizon=5)
     controls = np.linspace(-1, 3, 5, dtype=np.float32)[:, None]
     x0 = np.array([0.5, -0.2], np.float32)
-    sequence = dlx.controllers.Sequence(controls)
+    sequence = dlx.controllers.OpenLoop(controls)
     run = dlx.rollout(env, sequence, key=jax.random.key(0), x0=x0)
     made = interop.GymnasiumEnv(env)
     first, _ = made.reset(options={"state": x0})

@@ -58,7 +58,7 @@ class TestToGymnax:
         env = to_gymnax(task)
         params = env.default_params
         controls = jnp.linspace(-1, 3, 4)[:, None]
-        run = dlx.rollout(task, dlx.controllers.Sequence(controls), key=KEY)
+        run = dlx.rollout(task, dlx.controllers.OpenLoop(controls), key=KEY)
         seen, state = env.reset(KEY, params)
         for k in range(4):
             assert_close(state.state, run.states[k], atol=1e-6)
@@ -213,7 +213,7 @@ def test_noise_is_that_of_the_rollout(name):
     )
     env = to_gymnax(task)
     controls = jnp.linspace(-1, 3, horizon)[:, None]
-    run = dlx.rollout(task, dlx.controllers.Sequence(controls), key=KEY)
+    run = dlx.rollout(task, dlx.controllers.OpenLoop(controls), key=KEY)
     step = jax.jit(env.step_env)
     observation, state = env.reset(KEY)
     for k in range(horizon):

@@ -16,7 +16,7 @@ KEY = jax.random.key(0)
 
 @pytest.fixture(scope="module")
 def breaths():
-    env = lung.double_compartment(5.0, 20.0)
+    env = lung.double_compartment(resistance=5.0)
     lungs = dict(resistance=5.0, compliance=20.0)
     return lung.explore(env, 12, key=KEY, length=40, scale=0.5, **lungs)
 

@@ -19,7 +19,7 @@ KEY = jax.random.key(0)
 
 @pytest.fixture(scope="module")
 def breaths():
-    env = lung.double_compartment(20.0, 20.0)
+    env = lung.double_compartment()
     return lung.explore(env, 32, key=KEY, scale=0.3)
 
 
@@ -89,7 +89,7 @@ def test_controller_learns_and_the_grid_knows_the_best():
     gains = fitted.model.gain[0]
     assert gains[0] > gains[1]  # the narrow lung needs less flow
 
-    envs = lung.stack([lung.single_compartment(R) for R in (5.0, 50.0)])
+    envs = lung.stack([lung.single_compartment(resistance=R) for R in (5.0, 50.0)])
     grid = lung.pid_grid(envs, key=KEY, kp=[0.0, 1.0], ki=[0.0, 3.0], pips=[20.0, 30.0])
     assert grid.gains.shape == (4, 3) and grid.errors.shape == (2, 4)
     worst = np.argmax(grid.errors, axis=1)
@@ -98,10 +98,12 @@ def test_controller_learns_and_the_grid_knows_the_best():
         *grid.best()[0], dt=0.03, reference=lung.BreathWaveform()
     )
     own = lung.breath_error(
-        lung.single_compartment(5.0), pid, key=KEY, pips=[20.0, 30.0]
+        lung.single_compartment(resistance=5.0), pid, key=KEY, pips=[20.0, 30.0]
     )
     assert_close(jnp.mean(own), jnp.min(grid.errors[0]), rtol=1e-4)
-    least = lung.least_error(lung.single_compartment(5.0), pips=[20.0], steps=150)
+    least = lung.least_error(
+        lung.single_compartment(resistance=5.0), pips=[20.0], steps=150
+    )
     assert least[0] < own[0]
 
 

@@ -12,7 +12,7 @@ from delucax import lung
 
 
 KEY = jax.random.key(0)
-ENV = lung.single_compartment(20.0)
+ENV = lung.single_compartment()
 WAVEFORM = ENV.cost.waveform
 PID = dlx.controllers.LeakyPID(0.5, 1.0, dt=ENV.dt, reference=WAVEFORM)
 MODEL = lung.LungModel(lung.SingleCompartment())
@@ -103,7 +103,6 @@ def test_a_stack_is_not_one_task():
 @pytest.mark.parametrize(
     "kind, make",
     {
-        "ExpiratoryValve": lung.ExpiratoryValve,
         "BangBang": lung.BangBang,
         "FeedForward": lung.FeedForward,
         "BreathCost": lambda w: lung.BreathCost(w, index=0),

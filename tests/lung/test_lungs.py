@@ -212,7 +212,7 @@ def test_slope_where_the_valve_is_shut(name):
 
 def test_the_quickest_lung_rests_while_its_valve_is_open():
     """What rounding moves comes to rest again: the steps are short enough."""
-    env = lung.double_compartment(5.0, 10.0, noise=0.0)
+    env = lung.double_compartment(resistance=5.0, compliance=10.0, noise=0.0)
     x0 = env.initial_state.at[2].multiply(1.01)
     controls = jnp.tile(jnp.array([0.0, 1.0]), (200, 1))
     states = dlx.open_loop(env.dynamics, x0, controls)

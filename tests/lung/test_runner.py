@@ -15,7 +15,7 @@ from delucax import lung
 pytestmark = once
 
 KEY = jax.random.key(0)
-ENV = lung.single_compartment(50.0, 10.0)
+ENV = lung.single_compartment(resistance=50.0, compliance=10.0)
 WAVEFORM = ENV.cost.waveform
 
 
@@ -102,7 +102,7 @@ def test_cleans_up_after_an_error():
 
 
 def test_wrong_arguments():
-    with user_error(match="runner must have physical"):
+    with user_error(match="runner must have dt, observe"):
         lung.run_breaths(object(), breathing(0.5))
     with user_error(match="controller must be an AbstractController"):
         lung.run_breaths(lung.SimulatedRunner(ENV, key=KEY), print)

@@ -134,7 +134,7 @@ def test_a_plan_is_a_controller():
     assert_close(run.total_cost, plan.cost, rtol=tolerance(1e-5, 1e-12))
     # Feedback does better than the plan alone.
     x0 = plan.states[0] + 0.05
-    alone = dlx.controllers.Sequence(plan.controls)
+    alone = dlx.controllers.OpenLoop(plan.controls)
     closed, open_ = (
         dlx.rollout(env, c, key=key, x0=x0).total_cost for c in (plan, alone)
     )
@@ -377,7 +377,7 @@ def test_a_bad_member_of_a_batch_harms_no_other(line_search):
         (dict(t0=jnp.zeros(2)), "t0 must be a number"),
         (dict(cost=lambda t, x, u: 0.0), "cost must be an AbstractCost"),
         (dict(dynamics=dlx.make("pendulum")), "dynamics must be an AbstractDynamics"),
-        (dict(line_search="exact"), "line_search must be one of"),
+        (dict(line_search="exact"), "line_search must be .parallel. or .backtracking."),
         (dict(regularise="both"), "regularise must be"),
         (dict(parallel=True, bounds=(-1.0, 1.0)), "parallel"),
         (dict(parallel=True, regularise="state"), "parallel"),

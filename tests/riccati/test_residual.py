@@ -12,6 +12,7 @@ import riccati_systems
 from helpers import dtype, needs_x64, thorough
 
 import delucax as dlx
+from delucax.riccati._arguments import RiccatiData
 from delucax.riccati._residual import linear_residual, riccati_residual
 
 
@@ -22,7 +23,8 @@ N, M = 3, 2
 def measured(discrete, descriptor=False):
     def bound(accurately, A, B, Q, R, S, E, X):
         E = E if descriptor else None
-        return riccati_residual(discrete, A, B, Q, R, S, E, X, accurately).bounds[0]
+        data = RiccatiData(A, B, Q, R, S, E)
+        return riccati_residual(discrete, data, X, accurately).bounds[0]
 
     return jax.jit(bound)
 

@@ -110,7 +110,7 @@ def test_mpc_tells_of_its_plans(key):
 
 def test_what_is_inside_another_controller_is_counted(key):
     env = dlx.make("pendulum", horizon=10)
-    learner = dlx.controllers.GPC(
+    learner = dlx.controllers.gpc(
         env.dynamics, env.cost, base=dlx.controllers.Linear([[20.0, 5.0]])
     )
     adaptive = dlx.controllers.Adaptive(learner, slots=2, every=2)
@@ -127,7 +127,7 @@ def test_a_learner_refuses_what_is_not_finite(key):
     def cost(t, y, u):
         return jnp.where(t == 5, jnp.nan, 1.0) * fine(t, y, u)
 
-    learner = dlx.controllers.GPC(plant, cost, base=base, optimiser=optax.sgd(1.0))
+    learner = dlx.controllers.gpc(plant, cost, base=base, optimiser=optax.sgd(1.0))
     env = dlx.Environment(plant, fine, dlx.disturbances.Gaussian(0.1, size=2))
     with pytest.raises(RuntimeError, match="update of a learner"):
         dlx.rollout(env, learner, key=key, horizon=12)

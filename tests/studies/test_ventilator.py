@@ -13,13 +13,18 @@ from helpers import assert_close, once, thorough, user_error
 import delucax as dlx
 from delucax import lung, studies
 from delucax.__main__ import main
-from delucax.studies.ventilator import _study
-from delucax.studies.ventilator._contenders import Contender
+from delucax.studies.ventilator import _simulators
+from delucax.studies.ventilator._contenders import (
+    best_of,
+    Contender,
+    divergence_note,
+    Trainer,
+    tuned_pids,
+)
 from delucax.studies.ventilator._report import save_controllers
+from delucax.studies.ventilator._settings import FULL
 from delucax.studies.ventilator._simulators import grouped, left_out
-from delucax.studies.ventilator._size import FULL
 from delucax.studies.ventilator._stages import Stages
-from delucax.studies.ventilator._tuned import _lost, best_of, tuned_pids
 
 
 pytestmark = once
@@ -34,7 +39,7 @@ def begun(tmp_path, monkeypatch):
     def cut_off(size):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_study, "explored", cut_off)
+    monkeypatch.setattr(_simulators, "explored", cut_off)
     with pytest.raises(KeyboardInterrupt):
         studies.lung_study(tmp_path, small=True, say=lambda line: None)
     return tmp_path
@@ -111,7 +116,7 @@ def test_breaths_that_are_left_out_are_said(tmp_path, monkeypatch):
     def cut_off(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_study, "divided", cut_off)
+    monkeypatch.setattr(_simulators, "divided", cut_off)
     said, data = [], tmp_path / "train.csv"
     lung.write_breaths(data, recorded)
     for _ in range(2):  # also where the breaths are found
@@ -122,7 +127,7 @@ def test_breaths_that_are_left_out_are_said(tmp_path, monkeypatch):
 
 def test_what_passed_the_limit_is_not_saved(tmp_path):
     waveform = lung.BreathWaveform()
-    forward = lung.stack([lung.FeedForward(waveform)])
+    forward = lung.FeedForward(waveform)
     highest = (30.0, 61.0, float("nan"))
     contenders = [Contender("A", seed, forward, True) for seed in range(3)]
     rows = [
@@ -137,11 +142,12 @@ def test_what_passed_the_limit_is_not_saved(tmp_path):
 @thorough
 def test_tuned_pids_are_the_best_that_were_tried(tmp_path):
     waveform = lung.BreathWaveform()
-    envs = lung.stack([lung.single_compartment(R) for R in (5.0, 50.0)])
+    envs = lung.stack([lung.single_compartment(resistance=R) for R in (5.0, 50.0)])
     size = FULL._replace(tuned=20, pid_steps=3)
     options = dict(checkpoint=tmp_path / "tuned.fit", progress=False)
     said = []
-    found = tuned_pids(envs, waveform, size, KEY, said.append, **options)
+    trainer = Trainer(envs, waveform, size, KEY)
+    found = tuned_pids(envs, trainer, said.append, **options)
     assert len(found) == 4 and not said
     error = lambda env, pid: jnp.mean(lung.breath_error(env, pid, key=KEY))
     own = eqx.filter_vmap(error)(envs, found["tuned PID + feed-forward"])
@@ -155,9 +161,9 @@ def test_what_has_no_finite_error_is_not_chosen():
     errors = jnp.array([[jnp.inf, 2.0, 1.0], [3.0, jnp.inf, 4.0]])
     assert best_of(candidates, errors, False)["number"].tolist() == [4, 1]
     assert best_of(candidates, errors, True)["number"].tolist() == [4, 5]
-    assert _lost(np.zeros(5), errors[:, 2]) == ""
-    assert "2 of 6 errors are not finite" in _lost(np.zeros(5), errors)
-    assert "in 1 of 5 steps" in _lost(np.eye(5)[0], errors[:, 2])
+    assert divergence_note(np.zeros(5), errors[:, 2]) == ""
+    assert "2 of 6 errors are not finite" in divergence_note(np.zeros(5), errors)
+    assert "in 1 of 5 steps" in divergence_note(np.eye(5)[0], errors[:, 2])
 
 
 @thorough

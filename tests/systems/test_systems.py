@@ -97,6 +97,14 @@ def test_pendulum_angles_wrap():
     )
 
 
+def test_angles_are_states():
+    class Arm(Spring):
+        angle_names = ("y",)
+
+    with user_error(match=r"Arm: angle_names must be among state_names, .*got \('y',"):
+        Arm()
+
+
 def test_linear_system():
     A, B = jnp.array([[0.0, 1.0], [-2.0, -3.0]]), jnp.array([[0.0], [1.0]])
     point = dict(x_ref=jnp.ones(2), u_ref=jnp.ones(1), dx_ref=jnp.array([0.5, 0.0]))

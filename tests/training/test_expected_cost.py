@@ -125,7 +125,7 @@ def test_wrong_arguments_are_named():
             lambda: expected_cost(pendulum(), batch=1, horizon=0),
         ),
         (
-            "checkpoint must be 'step', 'sqrt' or None, got 'all'",
+            "checkpoint must be one of 'step', 'sqrt', None, got 'all'",
             lambda: expected_cost(pendulum(), batch=1, checkpoint="all"),
         ),
         ("environment must be an Environment", lambda: expected_cost(3, batch=1)),

@@ -145,7 +145,7 @@ def test_wrong_choices_are_named():
             "plant.steps",
         ),
         ("must be a floating-point array.*got 0.5.*delucax.parameter", "plant.rate"),
-        ("Plant has no 'mas'.*did you mean one of mass", ["plant.mas"]),
+        ("Plant has no 'mas'.*did you mean 'mass'", ["plant.mas"]),
         ("Model has no 'gan'", {"gan": dlx.positive}),
         ("each path to delucax.positive", {"gain": dlx.positive, "fraction": 3}),
         ("booleans in the structure of the model", [True, False]),

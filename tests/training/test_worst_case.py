@@ -54,7 +54,7 @@ def test_no_bounded_sequence_is_worse():
 
 @thorough
 def test_a_learner_under_attack():
-    learner = dlx.controllers.GPC(PLANT, COST, memory=2)
+    learner = dlx.controllers.gpc(PLANT, COST, memory=2)
     found = dlx.training.worst_case(
         ENV, learner, key=KEY, bound=0.5, x0=np.zeros(2), iterations=5
     )

@@ -53,81 +53,76 @@ def by_components(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _replay(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:
-    known: dict[Any, Any] = {}
+    env: dict[Any, Any] = {}
 
     def read(atom):
-        return atom.val if isinstance(atom, Literal) else known[atom]
+        return atom.val if isinstance(atom, Literal) else env[atom]
 
-    known.update(zip(jaxpr.constvars, consts, strict=True))
-    known.update(zip(jaxpr.invars, args, strict=True))
+    env.update(zip(jaxpr.constvars, consts, strict=True))
+    env.update(zip(jaxpr.invars, args, strict=True))
     for equation in jaxpr.eqns:
         values = [read(atom) for atom in equation.invars]
-        known.update(zip(equation.outvars, _apply(equation, values), strict=True))
+        env.update(zip(equation.outvars, _apply(equation, values), strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
 def _apply(equation: Any, values: list[Any]) -> Sequence[Any]:
     """The outputs of one equation."""
-    name, params = equation.primitive.name, equation.params
-    if name in ("jit", "pjit"):
+    primitive, params = equation.primitive, equation.params
+    if primitive.name in ("jit", "pjit"):
         inner = params["jaxpr"]
         return _replay(inner.jaxpr, inner.consts, values)
-    shape: Any = None
-    if equation.outvars:
-        shape = getattr(equation.outvars[0].aval, "shape", None)
-    if name in ("broadcast_in_dim", "reshape") and len(values) == 1 and shape == (1,):
-        if not isinstance(values[0], _Components) and jnp.shape(values[0]) == ():
-            return [_Components([values[0]])]
-    if name == "concatenate" and shape is not None and len(shape) == 1:
-        if shape[0] <= LARGEST and all(isinstance(v, _Components) for v in values):
-            return [_Components([e for v in values for e in v.entries])]
-    if name == "stack" and shape == (len(values),) and len(values) <= LARGEST:
-        return [_Components(values)]
-    if name == "unstack" and isinstance(values[0], _Components):
-        return values[0].entries
-    if any(isinstance(value, _Components) for value in values):
-        found = _of_components(equation.primitive, params, shape, values)
-        if found is not None:
-            return [found]
-    whole = [_whole(value) for value in values]
-    bound = equation.primitive.get_bind_params(params)
+    first_out = equation.outvars[0].aval if equation.outvars else None
+    shape = getattr(first_out, "shape", None)
+    out = _on_components(primitive, params, shape, values)
+    if out is not None:
+        return out
+    bound = primitive.get_bind_params(params)
     # JAX before 0.11 returns the functions inside apart from the other parameters.
     functions, bound = bound if isinstance(bound, tuple) else ((), bound)
-    out = equation.primitive.bind(*functions, *whole, **bound)
-    out = out if equation.primitive.multiple_results else [out]
+    out = primitive.bind(*functions, *map(_whole, values), **bound)
+    out = out if primitive.multiple_results else [out]
     # The sines of `delucax.math` are stored once. A solve has several outputs, and a
     # fence around them would ask for a cotangent of those that have none.
-    single = name == "custom_jvp_call" and len(out) == 1 and shape == ()
+    single = primitive.name == "custom_jvp_call" and len(out) == 1 and shape == ()
     return fence(*out) if single else out
 
 
-def _of_components(primitive, params, shape, values):
-    """What some primitives make of components; `None` for those that need the whole."""
-    name, first = primitive.name, values[0]
-    if name == "slice" and isinstance(first, _Components):
-        (start,), (stop,) = params["start_indices"], params["limit_indices"]
-        step = 1 if params["strides"] is None else params["strides"][0]
-        taken = first.entries[start:stop:step]
-        return _Components(taken) if taken else None
-    if (
-        name in ("squeeze", "reshape")
-        and shape == ()
-        and isinstance(first, _Components)
-    ):
-        return first.entries[0]
-    if name == "dynamic_slice" and isinstance(first, _Components):
-        start, (size,) = values[1], params["slice_sizes"]
-        if isinstance(start, int) or not isinstance(start, Tracer):
-            start = min(max(int(start), 0), len(first.entries) - size)
-            return _Components(first.entries[start : start + size])
-        return None
-    if name in _ELEMENTWISE and shape is not None and len(shape) == 1:
-        (size,) = shape
-        split = [_entries(value, size) for value in values]
-        if any(entries is None for entries in split):
+def _on_components(
+    primitive: Any, params: Any, shape: Any, values: list[Any]
+) -> Sequence[Any] | None:
+    """The outputs of a primitive that makes components, or acts on them; `None` if it
+    needs the whole arrays. `shape` is that of its first output."""
+    name, (first, *others) = primitive.name, values or [None]
+    split = [isinstance(value, _Components) for value in values]
+    size = shape[0] if shape and len(shape) == 1 else None
+    if name in ("broadcast_in_dim", "reshape") and not others and shape == (1,):
+        if not split[0] and jnp.shape(first) == ():
+            return [_Components([first])]
+    if name == "concatenate" and size is not None and size <= LARGEST and all(split):
+        return [_Components([entry for v in values for entry in v.entries])]
+    if name == "stack" and shape == (len(values),) and len(values) <= LARGEST:
+        return [_Components(values)]
+    if name in _ELEMENTWISE and size is not None and any(split):
+        columns = [_entries(value, size) for value in values]
+        if any(column is None for column in columns):
             return None
-        entries = zip(*split, strict=True)
-        return _Components([primitive.bind(*entry, **params) for entry in entries])
+        rows = zip(*columns, strict=True)
+        return [_Components([primitive.bind(*row, **params) for row in rows])]
+    if not isinstance(first, _Components):
+        return None
+    if name == "unstack":
+        return first.entries
+    if name in ("squeeze", "reshape") and shape == ():
+        return first.entries[:1]
+    if name == "slice":
+        ends = params["start_indices"] + params["limit_indices"]
+        taken = first.entries[slice(*ends, *(params["strides"] or ()))]
+        return [_Components(taken)] if taken else None
+    if name == "dynamic_slice" and not isinstance(others[0], Tracer):
+        (count,) = params["slice_sizes"]
+        start = min(max(int(others[0]), 0), len(first.entries) - count)
+        return [_Components(first.entries[start : start + count])]
     return None
 
 

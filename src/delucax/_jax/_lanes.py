@@ -21,12 +21,12 @@ def by_lanes(function: Callable[..., Any], *args: Any) -> Any:
     arrays, static = eqx.partition((closed, args), eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
 
-    def plain(*leaves):
+    def evaluate(*leaves):
         arrays = jax.tree.unflatten(structure, leaves)
         closed, args = eqx.combine(arrays, static)
         return closed(*args)
 
-    run = custom_vmap(plain)
+    run = custom_vmap(evaluate)
 
     @run.def_vmap
     def _(size, batched, *leaves):
@@ -36,7 +36,7 @@ def by_lanes(function: Callable[..., Any], *args: Any) -> Any:
         out = lax.platform_dependent(
             lanes,
             cpu=lambda lanes: lax.map(of(run), lanes),
-            default=jax.vmap(of(plain)),
+            default=jax.vmap(of(evaluate)),
         )
         return out, jax.tree.map(lambda _: True, out)
 

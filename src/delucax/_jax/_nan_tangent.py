@@ -1,6 +1,6 @@
-"""What has no derivative: NaN, where it is asked for."""
+"""Tangents of what has no derivative: NaN, where they are used."""
 
-from typing import Any
+import functools
 
 import jax.numpy as jnp
 from jax.extend.core import Primitive
@@ -8,17 +8,17 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 
-_poison = Primitive("poison")
+_nan_tangent = Primitive("nan_tangent")
 
 
-def poison(tangent: Array, ok: Array) -> Array:
-    """The tangent where all is well; elsewhere NaN, unless it is zero.
+def nan_tangent(tangent: Array, ok: Array) -> Array:
+    """The tangent where `ok` holds; elsewhere NaN, unless the tangent is zero.
 
-    In reverse too: what does not look at a failed solve (a masked lane of a batch)
-    keeps its gradient, and what does is told. No product with NaN does that, as the
-    product with zero is NaN.
+    The same in reverse: what does not depend on a failed solve (a masked lane of a
+    batch) keeps its gradient, and the gradient of what does is NaN. A product with NaN
+    would not do, because that of NaN and zero is NaN.
     """
-    return _poison.bind(tangent, jnp.broadcast_to(ok, tangent.shape))
+    return _nan_tangent.bind(tangent, jnp.broadcast_to(ok, tangent.shape))
 
 
 def _value(tangent, ok):
@@ -26,34 +26,27 @@ def _value(tangent, ok):
 
 
 def _batch(values, dims):
-    tangent, ok = values
     size = next(v.shape[d] for v, d in zip(values, dims, strict=True) if d is not None)
-    moved: list[Any] = []
-    for value, dim in ((tangent, dims[0]), (ok, dims[1])):
-        if dim is None:
-            value = jnp.broadcast_to(value, (size, *value.shape))
-        else:
-            value = jnp.moveaxis(value, dim, 0)
-        moved.append(value)
-    return _poison.bind(*moved), 0
+    at_front = functools.partial(batching.bdim_at_front, size=size)
+    return _nan_tangent.bind(*map(at_front, values, dims)), 0
 
 
 def _jvp(primals, tangents):
     tangent, ok = primals
     change = ad.instantiate_zeros(tangents[0])
-    return _poison.bind(tangent, ok), _poison.bind(change, ok)
+    return _nan_tangent.bind(tangent, ok), _nan_tangent.bind(change, ok)
 
 
 def _transpose(cotangent, tangent, ok):
     del tangent
     if type(cotangent) is ad.Zero:
         return cotangent, None
-    return _poison.bind(cotangent, ok), None
+    return _nan_tangent.bind(cotangent, ok), None
 
 
-_poison.def_impl(_value)
-_poison.def_abstract_eval(lambda tangent, ok: tangent)
-batching.primitive_batchers[_poison] = _batch
-ad.primitive_jvps[_poison] = _jvp
-ad.primitive_transposes[_poison] = _transpose
-mlir.register_lowering(_poison, mlir.lower_fun(_value, multiple_results=False))
+_nan_tangent.def_impl(_value)
+_nan_tangent.def_abstract_eval(lambda tangent, ok: tangent)
+batching.primitive_batchers[_nan_tangent] = _batch
+ad.primitive_jvps[_nan_tangent] = _jvp
+ad.primitive_transposes[_nan_tangent] = _transpose
+mlir.register_lowering(_nan_tangent, mlir.lower_fun(_value, multiple_results=False))

@@ -10,6 +10,7 @@ from ._fields import (
     marked_leaves as marked_leaves,
     parameter as parameter,
     parts_of as parts_of,
+    path_string as path_string,
     positive as positive,
     StaticFunction as StaticFunction,
     weight as weight,
@@ -18,7 +19,6 @@ from ._names import indexed_names as indexed_names, names_of as names_of
 from ._paths import (
     check_paths as check_paths,
     get_path as get_path,
-    path_string as path_string,
     replace as replace,
 )
 from ._serialise import load as load, save as save

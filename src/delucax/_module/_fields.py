@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -53,10 +53,10 @@ class _Positive(AbstractConstraint):
         ```
     """
 
-    def constrain(self, z):
+    def constrain(self, z: Array) -> Array:
         return _inside(jnp.exp(z), 0.0, np.inf)
 
-    def unconstrain(self, value):
+    def unconstrain(self, value: Array) -> Array:
         return jnp.log(value)
 
     def holds(self, value):
@@ -69,19 +69,15 @@ class _Positive(AbstractConstraint):
 def _inside(value: Array, low: float, high: float) -> Array:
     """`value` off the ends of an open interval, which rounding may put it on."""
     dtype = jnp.result_type(value)
-    tiny = float(jnp.finfo(dtype).tiny)
-    least, most = (
-        float(np.nextafter(np.asarray(end, dtype), np.asarray(other, dtype)))
-        for end, other in ((low, high), (high, low))
-    )
+    tiny, ends = jnp.finfo(dtype).tiny, np.asarray([low, high], dtype)
+    inner = np.nextafter(ends, ends[::-1])
     # Numbers below `tiny` are flushed to zero.
-    least = tiny if low == 0 else least
-    most = -tiny if high == 0 else most
-    return jnp.clip(value, least, most)
+    inner = np.where(np.abs(inner) < tiny, np.copysign(tiny, inner), inner)
+    return jnp.clip(value, *map(float, inner))
 
 
 positive = _Positive()
-"""The one there is need of."""
+"""The constraint that values are above zero."""
 
 
 class bounded(AbstractConstraint):
@@ -112,11 +108,11 @@ class bounded(AbstractConstraint):
         self.low = float(low)
         self.high = float(high)
 
-    def constrain(self, z):
+    def constrain(self, z: Array) -> Array:
         value = self.low + (self.high - self.low) * jax.nn.sigmoid(z)
         return _inside(value, self.low, self.high)
 
-    def unconstrain(self, value):
+    def unconstrain(self, value: Array) -> Array:
         return jnp.log(value - self.low) - jnp.log(self.high - value)
 
     def holds(self, value):
@@ -170,7 +166,7 @@ def parameter(
         ```python
         import delucax as dlx
         import jax.numpy as jnp
-        from jaxtyping import AbstractArray, Array, jaxtyped
+        from jaxtyping import Array
 
         class Oscillator(dlx.AbstractSystem):
             state_names = ("x", "v")
@@ -202,7 +198,7 @@ def weight(
 
         ```python
         import delucax as dlx
-        from jaxtyping import AbstractArray, Array, jaxtyped
+        from jaxtyping import Array
 
         class Proportional(dlx.AbstractController):
             gain: Array = dlx.weight(1.0)
@@ -245,15 +241,8 @@ class StaticFunction(eqx.Module):
 
 def as_module(value: Any) -> Any:
     """A plain function as a `StaticFunction`; anything else as it is."""
-    if callable(value) and not jax.tree.leaves(eqx.filter(value, eqx.is_array)):
-        if isinstance(value, eqx.Module) or not _is_leaf(value):
-            return value
-        return StaticFunction(value)
-    return value
-
-
-def _is_leaf(value: Any) -> bool:
-    return jax.tree.leaves(value) == [value]
+    is_plain = callable(value) and jax.tree_util.all_leaves([value])
+    return StaticFunction(value) if is_plain else value
 
 
 def function_field(default: Any = dataclasses.MISSING) -> Any:
@@ -261,31 +250,29 @@ def function_field(default: Any = dataclasses.MISSING) -> Any:
     return eqx.field(default=default, converter=as_module, metadata={_FUNCTION: True})
 
 
-def converter_of(module: eqx.Module, name: str) -> Callable[[Any], Any]:
-    """How field `name` of `module` converts what it is given."""
-    field = _fields(module).get(name)
-    return (lambda x: x) if field is None else field.metadata.get("converter", _same)
+def fields_of(node: Any) -> dict[str, dataclasses.Field]:
+    """The fields of a module, or of another dataclass, by name; none of other nodes."""
+    if not dataclasses.is_dataclass(node):
+        return {}
+    return {field.name: field for field in dataclasses.fields(node)}
 
 
-def is_static(module: Any, name: str) -> bool:
-    """Whether field `name` of `module` is part of its structure."""
-    field = _fields(module).get(name) if isinstance(module, eqx.Module) else None
-    return field is not None and field.metadata.get("static", False)
-
-
-def _same(x):
-    return x
-
-
-def _fields(module: Any) -> dict[str, dataclasses.Field]:
-    return {f.name: f for f in dataclasses.fields(module)}
+def children_of(node: Any) -> dict[str, Any]:
+    """What is inside a node, by the names that paths call it."""
+    if isinstance(node, Mapping):
+        return {str(key): child for key, child in node.items()}
+    if isinstance(node, tuple | list) and not hasattr(node, "_fields"):
+        return {str(i): child for i, child in enumerate(node)}
+    names = fields_of(node) or getattr(node, "_fields", ())
+    return {name: getattr(node, name, None) for name in names}
 
 
 _Part = TypeVar("_Part", bound=eqx.Module)
 
 
-def parts_of(module: eqx.Module, kind: type[_Part]) -> list[_Part]:
-    """The modules of a class inside of another one; not those inside of them."""
+def parts_of(module: Any, kind: type[_Part]) -> list[_Part]:
+    """The modules of a class inside of another one, or of any pytree; not those inside
+    of them."""
     is_part = lambda node: isinstance(node, kind) and node is not module
     nodes = jax.tree.leaves(module, is_leaf=is_part)
     return [node for node in nodes if is_part(node)]
@@ -298,21 +285,19 @@ def marked_leaves(
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         node, role, constraint = tree, None, None
         for key in path:
-            if isinstance(key, jax.tree_util.GetAttrKey) and eqx.is_array(node):
+            name, children = path_string((key,)), children_of(node)
+            if name not in children:  # of a node that is known to JAX alone
                 break
-            if isinstance(key, jax.tree_util.GetAttrKey):
-                if isinstance(node, eqx.Module):
-                    metadata = _fields(node)[key.name].metadata
-                    role = metadata.get(_ROLE, role)
-                    constraint = metadata.get(_CONSTRAINT, constraint)
-                node = getattr(node, key.name)
-            elif isinstance(key, jax.tree_util.SequenceKey):
-                node = node[key.idx]
-            elif isinstance(key, jax.tree_util.DictKey):
-                node = node[key.key]
-            else:
-                break
+            if name in (fields := fields_of(node)):
+                role = fields[name].metadata.get(_ROLE, role)
+                constraint = fields[name].metadata.get(_CONSTRAINT, constraint)
+            node = children[name]
         yield path, leaf, role, constraint
+
+
+def path_string(path: tuple) -> str:
+    """A JAX key path in the form that [`delucax.replace`][] takes."""
+    return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
 def check_parameters(module: eqx.Module) -> None:
@@ -321,44 +306,43 @@ def check_parameters(module: eqx.Module) -> None:
     Traced values cannot be looked at and are let through.
     """
     for field in dataclasses.fields(module):
-        if _FUNCTION in field.metadata:
-            function = getattr(module, field.name, None)
-            if function is not None and not callable(function):
-                raise ValueError(
-                    f"{type(module).__name__}: {field.name} must be a function, got "
-                    f"{shortened(function)}."
-                )
-            inner = getattr(function, "function", function)
-            if isinstance(function, StaticFunction) and isinstance(inner, type):
-                raise ValueError(
-                    f"{type(module).__name__}: {field.name} must be a function, got "
-                    f"the class {inner.__name__} where {inner.__name__}(...) may be "
-                    "meant."
-                )
-        if _ROLE not in field.metadata:
-            continue
         value = getattr(module, field.name, None)
-        if value is None and field.default not in (dataclasses.MISSING, None):
+        name = f"{type(module).__name__}: {field.name}"
+        if _FUNCTION in field.metadata and value is not None:
+            _check_function(value, name)
+        if _ROLE in field.metadata:
+            _check_numbers(value, name, field)
+
+
+def _check_function(value: Any, name: str) -> None:
+    if not callable(value):
+        raise ValueError(f"{name} must be a function, got {shortened(value)}.")
+    inner = value.function if isinstance(value, StaticFunction) else None
+    if isinstance(inner, type):
+        raise ValueError(
+            f"{name} must be a function, got the class {inner.__name__} where "
+            f"{inner.__name__}(...) may be meant."
+        )
+
+
+def _check_numbers(value: Any, name: str, field: dataclasses.Field) -> None:
+    constraint = field.metadata[_CONSTRAINT]
+    is_missing = value is None and field.default not in (dataclasses.MISSING, None)
+    for leaf in [None] if is_missing else jax.tree.leaves(value):
+        is_number = eqx.is_inexact_array(leaf)
+        # The leaves of a network may be anything.
+        is_alone = leaf is value or field.metadata[_ROLE] == "parameter"
+        if is_alone and not (callable(leaf) or is_number):
             raise ValueError(
-                f"{type(module).__name__}: {field.name} must be a number or an array, "
-                "got None."
+                f"{name} must be a number or an array, got {shortened(leaf)}."
             )
-        constraint = field.metadata[_CONSTRAINT]
-        for leaf in jax.tree.leaves(value):
-            name = f"{type(module).__name__}: {field.name}"
-            # Inside a network there may be anything.
-            bare = leaf is value or field.metadata[_ROLE] == "parameter"
-            if bare and not (callable(leaf) or eqx.is_inexact_array(leaf)):
-                raise ValueError(
-                    f"{name} must be a number or an array, got {shortened(leaf)}."
-                )
-            if isinstance(leaf, Tracer) or not eqx.is_inexact_array(leaf):
-                continue
-            leaf = np.asarray(leaf)
-            if not np.all(np.isfinite(leaf)):
-                raise ValueError(f"{name} must be finite, got {shortened(leaf)}.")
-            if constraint is not None and not np.all(constraint.holds(leaf)):
-                raise ValueError(f"{name} must be {constraint}, got {shortened(leaf)}.")
+        if isinstance(leaf, Tracer) or not is_number:
+            continue
+        leaf = np.asarray(leaf)
+        if not np.all(np.isfinite(leaf)):
+            raise ValueError(f"{name} must be finite, got {shortened(leaf)}.")
+        if constraint is not None and not np.all(constraint.holds(leaf)):
+            raise ValueError(f"{name} must be {constraint}, got {shortened(leaf)}.")
 
 
 def check_module(module: eqx.Module) -> None:

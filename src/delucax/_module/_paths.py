@@ -1,7 +1,5 @@
 """Leaves by their path: `replace(env, {"dynamics.system.length": 1.2})`."""
 
-import dataclasses
-import difflib
 import warnings
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -12,13 +10,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import PyTree
 
-from .._message import shortened
+from .._message import did_you_mean, shortened
 from ._fields import (
     as_float_array,
     check_module,
     check_parameters,
-    converter_of,
-    is_static,
+    children_of,
+    fields_of,
 )
 
 
@@ -38,33 +36,20 @@ def get_path(tree: PyTree, path: str) -> Any:
 
     **Raises:** `ValueError` naming the part that is not there, and the close ones.
     """
-    node = tree
+    return _nodes_along(tree, path)[-1]
+
+
+def _nodes_along(tree: Any, path: str) -> list[Any]:
+    """The nodes on the way from the root to that at `path`, both included."""
+    nodes = [tree]
     for part in path.split(".") if path else ():
-        node = _child(node, part, path)
-    return node
-
-
-def _child(node: Any, part: str, path: str) -> Any:
-    if isinstance(node, Mapping):
-        if part in node:
-            return node[part]
-        names = [str(name) for name in node]
-    elif isinstance(node, tuple | list) and not hasattr(node, "_fields"):
-        if part.isdigit() and int(part) < len(node):
-            return node[int(part)]
-        names = [str(i) for i in range(len(node))]
-    else:
-        if dataclasses.is_dataclass(node):
-            names = [field.name for field in dataclasses.fields(node)]
-        else:
-            names = list(getattr(node, "_fields", ()))
-        if part in names:
-            return getattr(node, part)
-    close = difflib.get_close_matches(part, names, n=3) or names
-    raise ValueError(
-        f"path: {type(node).__name__} has no {part!r} (in {path!r}); "
-        f"did you mean one of {', '.join(close) or 'nothing: it is a leaf'}?"
-    )
+        children = children_of(nodes[-1])
+        if part not in children:
+            hint = did_you_mean(part, children) if children else "it is a leaf."
+            kind = type(nodes[-1]).__name__
+            raise ValueError(f"path: {kind} has no {part!r} (in {path!r}); {hint}")
+        nodes.append(children[part])
+    return nodes
 
 
 def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
@@ -109,7 +94,7 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
     for path, value in changes.items():
         changed = _with(changed, path, value)
     for path in _owners(changes):
-        before = _node_or_none(tree, path)
+        before = get_path(tree, path)
         changed = _followed(changed, path, before, changes)
         _check(get_path(changed, path), before)
     return changed
@@ -135,17 +120,19 @@ def check_paths(changes: Mapping[Any, Any], where: str) -> None:
 
 def _with(tree: Any, path: str, value: Any) -> Any:
     """A copy of `tree` with `value`, converted as its owner does, at `path`."""
-    parent, old = None, tree
-    for name in path.split("."):
-        parent, old = old, _child(old, name, path)
-        if is_static(parent, name):
+    names, nodes = path.split("."), _nodes_along(tree, path)
+    for parent, name in zip(nodes, names, strict=False):
+        field = fields_of(parent).get(name)
+        if field is not None and field.metadata.get("static", False):
             raise ValueError(
                 f"replace: {path!r} is part of the structure of "
                 f"{type(parent).__name__}, not a leaf; build it anew with another "
                 f"{name}."
             )
+    *_, parent, old = nodes
     if isinstance(parent, eqx.Module):
-        value = converter_of(parent, path.rpartition(".")[2])(value)
+        convert = fields_of(parent)[names[-1]].metadata.get("converter")
+        value = value if convert is None else convert(value)
     elif eqx.is_inexact_array(old):
         value = as_float_array(value)
     return eqx.tree_at(
@@ -182,35 +169,38 @@ def _owners(changes: Mapping[str, Any]) -> list[str]:
     return sorted(owners, key=lambda path: (-len(path.split(".")), not path, path))
 
 
-def _node_or_none(tree: Any, path: str) -> Any:
-    try:
-        return get_path(tree, path)
-    except ValueError:
-        return None
-
-
 def _check(module: Any, before: Any) -> None:
     """Run the checks of one owner of a change, which was `before`."""
-    if not isinstance(module, eqx.Module):
+    error = _error_of(module)
+    if error is None:
         return
-    try:
-        check_module(module)
-    except (TypeError, ValueError) as error:
-        if type(before) is type(module) and not _passes(before):
-            # Its shapes are not those of one module, so it may be a batch.
-            check_parameters(module)
-            _check_members(module, before)
-            return
-        if isinstance(error, ValueError):
-            raise
+    if type(before) is type(module) and _error_of(before) is not None:
+        # Its shapes are not those of one module, so it may be a batch.
+        check_parameters(module)
+        _check_members(module, before)
+    elif isinstance(error, ValueError):
+        raise error
+    else:
         raise ValueError(
             f"replace: {type(module).__name__} cannot work with these values: {error}"
         ) from error
 
 
+def _error_of(module: Any) -> Exception | None:
+    """What the checks of a module say against it: a batch from `jax.vmap` has not the
+    shapes of one."""
+    try:
+        if isinstance(module, eqx.Module):
+            check_module(module)
+    except (TypeError, ValueError) as error:
+        return error
+
+
 def _check_members(module: eqx.Module, before: eqx.Module) -> None:
     """Run the checks of the members of a batch, as `before` was."""
-    legal = lambda one: _passes(one) or any(map(legal, _members(one).values()))
+    legal = lambda one: (
+        _error_of(one) is None or any(map(legal, _members(one).values()))
+    )
     like = next(filter(legal, _members(before).values()), None)
     if like is None:  # no batch, or one that cannot be looked at
         return
@@ -241,13 +231,13 @@ def _members(module: eqx.Module) -> dict[int, eqx.Module]:
     if len(lengths) != 1 or () in lengths:
         return {}
     (count,) = lengths.pop()
-    places = range(count) if count <= _MOST_MEMBERS else _telling(leaves, count)
+    places = range(count) if count <= _MOST_MEMBERS else _sampled(leaves, count)
     rows = zip(*(list(leaf[np.asarray(places)]) for leaf in leaves), strict=True)
-    whole = lambda row: eqx.combine(jax.tree.unflatten(structure, row), rest)
-    return {int(k): whole(row) for k, row in zip(places, rows, strict=True)}
+    member = lambda row: eqx.combine(jax.tree.unflatten(structure, row), rest)
+    return {int(k): member(row) for k, row in zip(places, rows, strict=True)}
 
 
-def _telling(leaves: list[Any], count: int) -> np.ndarray:
+def _sampled(leaves: list[Any], count: int) -> np.ndarray:
     """The members of a large batch to look at: those with the smallest or the largest
     entry of an array, and others spread evenly."""
     half = _MOST_MEMBERS // 2
@@ -255,27 +245,3 @@ def _telling(leaves: list[Any], count: int) -> np.ndarray:
     ends = [end for a in flat for end in (np.argmin(a, axis=0), np.argmax(a, axis=0))]
     extreme = np.unique(np.concatenate([*ends, np.zeros(0, int)]))[:half]
     return np.union1d(extreme, np.linspace(0, count - 1, half).astype(int))
-
-
-def _passes(module: eqx.Module) -> bool:
-    """Whether `module` passes its own checks, unlike a batch from `jax.vmap`."""
-    try:
-        check_module(module)
-    except (TypeError, ValueError):
-        return False
-    return True
-
-
-def path_string(path: tuple) -> str:
-    """A JAX key path in the form that [`delucax.replace`][] takes."""
-    parts = []
-    for key in path:
-        if isinstance(key, jax.tree_util.GetAttrKey):
-            parts.append(key.name)
-        elif isinstance(key, jax.tree_util.SequenceKey):
-            parts.append(str(key.idx))
-        elif isinstance(key, jax.tree_util.DictKey):
-            parts.append(str(key.key))
-        else:
-            parts.append(str(key))
-    return ".".join(parts)

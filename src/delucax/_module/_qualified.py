@@ -25,7 +25,6 @@ _JAX = (
     "jax.scipy.special",
     "jax.tree_util",
 )
-_NUMPY_TYPES = (np.ufunc, type)
 
 
 def name_of(thing: Any) -> str | None:
@@ -58,8 +57,8 @@ def thing_of(name: str, trust: tuple[str, ...]) -> Any:
     """
     module, _, path = name.partition(":")
     package = module.partition(".")[0]
-    named = any(module == t or module.startswith(t + ".") for t in trust)
-    if not named and package not in (*_TRUSTED, "jax", "numpy", "__main__"):
+    is_asked_for = _is_in(module, trust)
+    if not is_asked_for and package not in (*_TRUSTED, "jax", "numpy", "__main__"):
         raise ValueError(
             f"it needs {name!r}, and {package!r} is not a package that is trusted; if "
             f"you trust it, give trust=({package!r},)."
@@ -78,19 +77,23 @@ def thing_of(name: str, trust: tuple[str, ...]) -> Any:
             f"since.{hint}"
         )
     origin = getattr(thing, "__module__", None) or type(thing).__module__
-    allowed = (*_TRUSTED, *trust, package) if package in _TRUSTED else (*trust, package)
     if package == "jax":
-        fits = module in _JAX and origin.partition(".")[0] in ("jax", "jaxlib")
+        fits = module in _JAX and _is_in(origin, ("jax", "jaxlib"))
     elif package == "numpy":
-        fits = module == "numpy" and isinstance(thing, _NUMPY_TYPES)
+        fits = module == "numpy" and isinstance(thing, np.ufunc | type)
     else:
-        fits = any(origin == t or origin.startswith(t + ".") for t in allowed)
-    if not fits and not named:
+        others = _TRUSTED if package in _TRUSTED else ()
+        fits = _is_in(origin, (*others, *trust, package))
+    if not fits and not is_asked_for:
         raise ValueError(
             f"it needs {name!r}, which is not among what is trusted; if you trust it, "
             f"give trust=({module!r},)."
         )
     return thing
+
+
+def _is_in(module: str, packages: tuple[str, ...]) -> bool:
+    return any(f"{module}.".startswith(f"{package}.") for package in packages)
 
 
 def _places(module: str) -> tuple[str, ...]:

@@ -7,12 +7,12 @@ a line of JSON that describes the structure; and the bytes of the arrays.
 import dataclasses
 import functools
 import hashlib
-import importlib.metadata
 import json
 import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -22,15 +22,19 @@ import jax.random as jr
 import numpy as np
 from jax.core import Tracer
 
-from .._check import as_path
-from .._files import replaced
+from .._files import as_path, replaced
 from .._results import Result
 from ._qualified import name_of, thing_of
 
 
 _MAGIC = "delucax-file"
 _VERSION = 1
-_PARTIALS = {"partial": functools.partial, "Partial": jax.tree_util.Partial}
+_FROM_TEXT = {"float": float, "complex": complex, "dtype": jnp.dtype}
+_SEQUENCES = {"tuple": tuple, "list": list, "frozenset": frozenset}
+_PARTIALS: dict[str, Any] = {
+    "partial": functools.partial,
+    "Partial": jax.tree_util.Partial,
+}
 
 
 def save(path: str | os.PathLike, obj: Any) -> None:
@@ -58,9 +62,9 @@ def save(path: str | os.PathLike, obj: Any) -> None:
         controller = dlx.load("controller.dlx")
         ```
     """
-    path = as_path(path, "path", "save")
+    path = _file(path, "save")
     writer = _Writer()
-    header = {"library": _library(), "tree": writer.describe(obj, "obj")}
+    header = {"tree": writer.describe(obj, "obj")}
     header["arrays"] = [
         {"dtype": array.dtype.name, "shape": list(array.shape)}
         for array in writer.arrays
@@ -68,12 +72,9 @@ def save(path: str | os.PathLike, obj: Any) -> None:
     text = json.dumps(header, allow_nan=False, separators=(",", ":"))
     body = b"".join([text.encode(), b"\n", *(a.tobytes() for a in writer.arrays)])
     first = f"{_MAGIC} {_VERSION} {hashlib.sha256(body).hexdigest()}\n"
-    if path.is_dir():
-        raise ValueError(f"save: path must be that of a file, got the folder '{path}'.")
     try:
         with replaced(path) as file:
-            file.write(first.encode())
-            file.write(body)
+            file.write(first.encode() + body)
     except OSError as error:
         raise type(error)(f"save: '{path}' cannot be written: {error}") from error
 
@@ -110,20 +111,44 @@ def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
         env = dlx.load("pendulum.dlx")
         ```
     """
-    path = as_path(path, "path", "load")
+    path = _file(path, "load")
     trust = (trust,) if isinstance(trust, str) else trust
     listed = isinstance(trust, list | tuple | set | frozenset)
     if not (listed and all(isinstance(name, str) for name in trust)):
         raise ValueError(
             f"load: trust must be the names of packages or modules, got {trust!r}."
         )
-    if path.is_dir():
-        raise ValueError(f"load: path must be that of a file, got the folder '{path}'.")
+    text, payload = _checked(path)
     try:
-        content = path.read_bytes()
+        header = json.loads(text)
+        reader = _Reader(_split(payload, header["arrays"]), tuple(trust))
+        obj = reader.build(header["tree"])
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
+        raise ValueError(f"load: '{path}' cannot be used: {error}") from error
+    if reader.narrowed:
+        warnings.warn(
+            f"load: '{path}' holds arrays in double precision, which are read in "
+            "single precision; set jax_enable_x64 to keep them.",
+            stacklevel=2,
+        )
+    return obj
+
+
+def _file(path: Any, where: str) -> Path:
+    path = as_path(path, "path", where)
+    if path.is_dir():
+        raise ValueError(
+            f"{where}: path must be that of a file, got the folder '{path}'."
+        )
+    return path
+
+
+def _checked(path: Path) -> tuple[bytes, bytes]:
+    """The description, and the bytes of the arrays, of a file that is whole."""
+    try:
+        first, _, body = path.read_bytes().partition(b"\n")
     except OSError as error:
         raise type(error)(f"load: '{path}' cannot be read: {error}") from error
-    first, _, body = content.partition(b"\n")
     words = first.decode(errors="replace").split(" ")
     is_ours = len(words) == 3 and words[0] == _MAGIC and words[1].isdecimal()
     if not is_ours or int(words[1]) < 1:
@@ -139,27 +164,7 @@ def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
     if hashlib.sha256(body).hexdigest() != words[2]:
         raise ValueError(f"load: '{path}' is damaged: its checksum does not match.")
     text, _, payload = body.partition(b"\n")
-    try:
-        header = json.loads(text)
-        arrays = _split(payload, header["arrays"])
-        reader = _Reader(arrays, tuple(trust))
-        obj = reader.build(header["tree"])
-    except (ValueError, TypeError, LookupError, AttributeError) as error:
-        raise ValueError(f"load: '{path}' cannot be used: {error}") from error
-    if reader.narrowed:
-        warnings.warn(
-            f"load: '{path}' holds arrays in double precision, which are read in "
-            "single precision; set jax_enable_x64 to keep them.",
-            stacklevel=2,
-        )
-    return obj
-
-
-def _library() -> str:
-    try:
-        return importlib.metadata.version("delucax")
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"
+    return text, payload
 
 
 def _split(payload: bytes, descriptions: list[dict[str, Any]]) -> list[np.ndarray]:
@@ -174,73 +179,73 @@ def _split(payload: bytes, descriptions: list[dict[str, Any]]) -> list[np.ndarra
 
 
 class _Writer:
-    """Describes a tree in JSON, and collects its arrays."""
+    """Describes a tree in JSON, and collects its arrays.
+
+    What is neither a number, a string nor `None` is a dictionary, whose first key is
+    its kind.
+    """
 
     def __init__(self):
         self.arrays: list[np.ndarray] = []
 
     def describe(self, node: Any, path: str) -> Any:
-        if node is None or type(node) in (bool, int, str):
+        kind = type(node)
+        if node is None or kind in (bool, int, str):
             return node
-        if type(node) is float:
-            return node if math.isfinite(node) else {"float": repr(node)}
-        if type(node) is complex:
-            return {"complex": repr(node)}
+        if kind is float and math.isfinite(node):
+            return node
+        if kind in _FROM_TEXT.values():
+            return {kind.__name__: repr(node)}
         if isinstance(node, Tracer):
             raise ValueError(
                 f"save: {path} is being traced; save outside of jit, grad and vmap."
             )
-        if isinstance(node, jax.Array):
-            if jnp.issubdtype(node.dtype, jax.dtypes.prng_key):
-                impl = str(jr.key_impl(node))
-                return {"key": self.put(jr.key_data(node), path), "impl": impl}
-            kind = "weak" if node.weak_type else "array"
-            return {kind: self.put(node, path)}
-        if isinstance(node, np.ndarray | np.generic):
-            kind = "numpy" if isinstance(node, np.ndarray) else "scalar"
-            return {kind: self.put(node, path)}
+        if isinstance(node, jax.Array | np.ndarray | np.generic):
+            return self.array(node, path)
         if isinstance(node, np.dtype):
             return {"dtype": node.name}
         if isinstance(node, Result):
             return self.result(node, path)
         if isinstance(node, eqx.Module):
             return self.module(node, path)
-        if type(node) in _PARTIALS.values():
-            return {
-                "partial": type(node).__name__,
-                "function": self.describe(node.func, path),
-                "args": self.describe(node.args, f"{path}.args"),
-                "keywords": self.describe(node.keywords, f"{path}.keywords"),
-            }
+        if kind in _PARTIALS.values():
+            parts = {"function": node.func, "args": node.args}
+            parts["keywords"] = node.keywords
+            return {"partial": kind.__name__, **self.fields(parts, path)}
         if isinstance(node, tuple) and hasattr(node, "_fields"):
-            names = type(node)._fields  # pyright: ignore[reportAttributeAccessIssue]
-            fields = {
-                name: self.describe(child, f"{path}.{name}")
-                for name, child in zip(names, node, strict=True)
+            fields: Any = node._asdict()  # pyright: ignore[reportAttributeAccessIssue]
+            return {
+                "namedtuple": self.name(kind, path),
+                "fields": self.fields(fields, path),
             }
-            return {"namedtuple": self.name(type(node), path), "fields": fields}
-        if type(node) in (tuple, list):
-            items = [self.describe(c, f"{path}.{i}") for i, c in enumerate(node)]
-            return {type(node).__name__: items}
-        if type(node) is frozenset:
-            items = sorted(node, key=repr)
-            return {"frozenset": [self.describe(c, f"{path}.{c!r}") for c in items]}
+        if kind in _SEQUENCES.values():
+            items = sorted(node, key=repr) if kind is frozenset else node
+            items = [self.describe(c, f"{path}.{i}") for i, c in enumerate(items)]
+            return {kind.__name__: items}
         if type(node) is dict:
-            items = [
-                [self.describe(k, f"{path}.{k}"), self.describe(v, f"{path}.{k}")]
-                for k, v in node.items()
-            ]
-            return {"dict": items}
+            at = lambda part, key: self.describe(part, f"{path}.{key}")
+            return {"dict": [[at(k, k), at(v, k)] for k, v in node.items()]}
         return {"name": self.name(node, path)}
 
-    def put(self, array: Any, path: str) -> int:
-        array = np.asarray(array)
+    def fields(self, nodes: Mapping[Any, Any], path: str) -> dict[Any, Any]:
+        return {k: self.describe(node, f"{path}.{k}") for k, node in nodes.items()}
+
+    def array(self, node: Any, path: str) -> dict[str, Any]:
+        extra = {}
+        if not isinstance(node, jax.Array):
+            kind = "numpy" if isinstance(node, np.ndarray) else "scalar"
+        elif jnp.issubdtype(node.dtype, jax.dtypes.prng_key):
+            kind, extra["impl"] = "key", str(jr.key_impl(node))
+            node = jr.key_data(node)
+        else:
+            kind = "weak" if node.weak_type else "array"
+        array = np.asarray(node)
         if array.dtype.kind in "OMmSUT" or array.dtype.names is not None:
             raise ValueError(
                 f"save: {path} must be an array of numbers, got dtype {array.dtype}."
             )
         self.arrays.append(array.astype(array.dtype.newbyteorder("="), copy=False))
-        return len(self.arrays) - 1
+        return {kind: len(self.arrays) - 1, **extra}
 
     def name(self, thing: Any, path: str) -> str:
         name = name_of(thing)
@@ -262,20 +267,18 @@ class _Writer:
 
     def result(self, node: Any, path: str) -> dict[str, Any]:
         """An outcome, by the names of its items: their numbers differ by version."""
-        items = node._enumeration._name_to_item
-        names = {int(item._value): name for name, item in items.items()}
-        used = np.unique(np.asarray(node._value)).tolist()
+        enumeration, (value,) = node._enumeration, jax.tree.leaves(node)
+        names = {_number(item): n for n, item in enumeration._name_to_item.items()}
         return {
-            "result": self.name(node._enumeration, path),
-            "value": self.describe(node._value, path),
-            "items": {str(number): names[number] for number in used},
+            "result": self.name(enumeration, path),
+            "value": self.describe(value, path),
+            "items": {str(k): names[k] for k in np.unique(np.asarray(value)).tolist()},
         }
 
-    def module(self, node: eqx.Module, path: str) -> dict[str, Any]:
+    def module(self, node: Any, path: str) -> dict[str, Any]:
         held = vars(node)
         if "__func__" in held:
-            name = node.__func__.__name__  # pyright: ignore[reportAttributeAccessIssue]
-            owner = node.__self__  # pyright: ignore[reportAttributeAccessIssue]
+            name, owner = node.__func__.__name__, node.__self__
             again = getattr(owner, name, None)
             if getattr(again, "__func__", None) is not held["__func__"]:
                 raise ValueError(
@@ -286,12 +289,15 @@ class _Writer:
         names = [field.name for field in dataclasses.fields(node)]
         if set(held) != set(names):  # what Equinox made of a function
             return {"name": self.name(node, path)}
-        fields = {name: self.describe(held[name], f"{path}.{name}") for name in names}
+        fields = self.fields({name: held[name] for name in names}, path)
         return {"module": self.name(type(node), path), "fields": fields}
 
 
 class _Reader:
-    """Builds the tree that was described."""
+    """Builds the tree that was described.
+
+    `build_KIND` takes what is under the key of that kind, and the whole description.
+    """
 
     def __init__(self, arrays: list[np.ndarray], trust: tuple[str, ...]):
         self.arrays = arrays
@@ -302,13 +308,11 @@ class _Reader:
         if not isinstance(node, dict):
             return node
         kind, content = next(iter(node.items()))
+        if kind in _FROM_TEXT:
+            return _FROM_TEXT[kind](content)
+        if kind in _SEQUENCES:
+            return _SEQUENCES[kind](map(self.build, content))
         return getattr(self, f"build_{kind}")(content, node)
-
-    def build_float(self, content, node):
-        return float(content)
-
-    def build_complex(self, content, node):
-        return complex(content)
 
     def build_array(self, content, node):
         return jnp.asarray(self.fitted(self.arrays[content]))
@@ -330,39 +334,30 @@ class _Reader:
     def build_scalar(self, content, node):
         return self.arrays[content][()]
 
-    def build_dtype(self, content, node):
-        return jnp.dtype(content)
-
     def build_name(self, content, node):
         return thing_of(content, self.trust)
 
     def build_result(self, content, node):
-        enumeration = thing_of(content, self.trust)
-        value = self.build(node["value"])
-        numbers = np.asarray(value)
-        fitted = np.zeros_like(numbers)
+        enumeration, value = self.build_name(content, node), self.build(node["value"])
+        fitted = numbers = np.asarray(value)
         for number, name in node["items"].items():
-            item = enumeration._name_to_item.get(name)
+            item = getattr(enumeration, name, None)
             if item is None:
                 raise ValueError(f"it needs the item {name!r}, unknown to {content!r}.")
-            fitted = np.where(numbers == int(number), int(item._value), fitted)
+            fitted = np.where(numbers == int(number), _number(item), fitted)
         fitted = fitted.astype(numbers.dtype)
-        if isinstance(value, jax.Array):
-            fitted = jnp.asarray(fitted)
-        return _rebuilt(Result, {"_value": fitted, "_enumeration": enumeration})
+        fitted = jnp.asarray(fitted) if isinstance(value, jax.Array) else fitted
+        return Result(fitted, enumeration)  # pyright: ignore[reportCallIssue]
 
     def build_module(self, content, node):
-        cls = thing_of(content, self.trust)
-        if not (isinstance(cls, type) and issubclass(cls, eqx.Module)):
-            raise ValueError(f"it needs a module class, and {content!r} is not one.")
-        known = {field.name for field in dataclasses.fields(cls)}
-        there = set(node["fields"])
-        if there != known:
-            raise ValueError(
-                f"{content!r} has changed since it was written: its fields are "
-                f"{sorted(known)}, those of the file {sorted(there)}."
-            )
-        return _rebuilt(cls, {k: self.build(v) for k, v in node["fields"].items()})
+        cls = self.class_of(content, eqx.Module, "module class")
+        names = [field.name for field in dataclasses.fields(cls)]
+        _check_fields(content, sorted(names), sorted(node["fields"]))
+        # As Equinox unflattens one: its `__init__` is not called.
+        module = object.__new__(cls)
+        for name, value in node["fields"].items():
+            object.__setattr__(module, name, self.build(value))
+        return module
 
     def build_method(self, content, node):
         method = getattr(self.build(node["of"]), content, None)
@@ -372,32 +367,21 @@ class _Reader:
 
     def build_partial(self, content, node):
         args, keywords = self.build(node["args"]), self.build(node["keywords"])
-        function = self.build(node["function"])
-        return _PARTIALS[content](function, *args, **keywords)
+        return _PARTIALS[content](self.build(node["function"]), *args, **keywords)
 
     def build_namedtuple(self, content, node):
-        cls = thing_of(content, self.trust)
-        names = getattr(cls, "_fields", None)
-        if not (isinstance(cls, type) and issubclass(cls, tuple)) or names is None:
-            raise ValueError(f"it needs a named tuple, and {content!r} is not one.")
-        if list(names) != list(node["fields"]):
-            raise ValueError(
-                f"{content!r} has changed since it was written: its fields are "
-                f"{list(names)}, those of the file {list(node['fields'])}."
-            )
-        return tuple.__new__(cls, [self.build(v) for v in node["fields"].values()])
-
-    def build_tuple(self, content, node):
-        return tuple(self.build(child) for child in content)
-
-    def build_list(self, content, node):
-        return [self.build(child) for child in content]
-
-    def build_frozenset(self, content, node):
-        return frozenset(self.build(child) for child in content)
+        cls = self.class_of(content, tuple, "named tuple")
+        _check_fields(content, list(cls._fields), list(node["fields"]))
+        return tuple.__new__(cls, map(self.build, node["fields"].values()))
 
     def build_dict(self, content, node):
         return {self.build(key): self.build(value) for key, value in content}
+
+    def class_of(self, name: str, base: type, what: str) -> Any:
+        cls = thing_of(name, self.trust)
+        if not (isinstance(cls, type) and issubclass(cls, base)):
+            raise ValueError(f"it needs a {what}, and {name!r} is not one.")
+        return cls
 
     def fitted(self, array: np.ndarray) -> np.ndarray:
         """`array` in the precision that JAX has switched on."""
@@ -415,9 +399,14 @@ class _Reader:
         return narrow
 
 
-def _rebuilt(cls: Any, fields: dict[str, Any]) -> Any:
-    """An instance without a call of its `__init__`, as Equinox unflattens one."""
-    module = object.__new__(cls)
-    for name, value in fields.items():
-        object.__setattr__(module, name, value)
-    return module
+def _number(item: Any) -> int:
+    """The number of an item of an enumeration."""
+    return int(jax.tree.leaves(item)[0])
+
+
+def _check_fields(name: str, known: list[str], written: list[str]) -> None:
+    if known != written:
+        raise ValueError(
+            f"{name!r} has changed since it was written: its fields are {known}, those "
+            f"of the file {written}."
+        )

@@ -1,15 +1,13 @@
 """How large a disk of perturbations a feedback loop stands."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 
 from .._message import shortened
-from .._results import Result
-from .._typing import Scalar
+from .._results import raise_on_failure, Result
+from .._typing import RealScalar, Scalar
 from ._norms import peak_gain
-from ._state_space import LinearModel, raise_unless_successful, state_space, StateSpace
+from ._state_space import LinearModel, state_space, StateSpace
 
 
 class DiskMargin(eqx.Module):
@@ -47,7 +45,7 @@ class DiskMargin(eqx.Module):
 
 def disk_margin(
     loop: LinearModel,
-    skew: Any = 0.0,
+    skew: RealScalar = 0.0,
     *,
     channel: int | None = None,
     throw: bool = True,
@@ -104,7 +102,7 @@ def disk_margin(
                 f"for all, got {shortened(channel)}."
             )
     disk = disk_of(system, jnp.asarray(skew, system.A.dtype), channel)
-    return raise_unless_successful(disk, where) if throw else disk
+    return raise_on_failure(disk, where, throw)
 
 
 @eqx.filter_jit

@@ -1,7 +1,5 @@
 """What inputs reach and outputs show, as matrices."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
@@ -9,11 +7,11 @@ import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
 from .._check import check_count, check_positive
-from .._typing import BoolScalar, Scalar
+from .._results import raise_if
+from .._typing import BoolScalar, RealScalar, Scalar
 from ..math._linear_solve import full_precision, symmetric
-from ..riccati._lyapunov import lyapunov
-from ..riccati._stein import stein
-from ._state_space import LinearModel, raise_if, state_space, StateSpace
+from ..riccati._lyapunov import lyapunov, stein
+from ._state_space import LinearModel, state_space, StateSpace
 
 
 _DOUBLINGS = 60
@@ -75,7 +73,7 @@ def observability_matrix(model: LinearModel) -> Float[Array, "np n"]:
 
 def controllability_gramian(
     model: LinearModel,
-    horizon: Any = None,
+    horizon: RealScalar | None = None,
     *,
     inputs: str = "controls",
     throw: bool = True,
@@ -118,7 +116,7 @@ def controllability_gramian(
 
 
 def observability_gramian(
-    model: LinearModel, horizon: Any = None, *, throw: bool = True
+    model: LinearModel, horizon: RealScalar | None = None, *, throw: bool = True
 ) -> Float[Array, "n n"]:
     """The energy `x' W x` of the outputs from a state `x`,
 
@@ -158,7 +156,7 @@ def observability_gramian(
 
 
 def _gramian(
-    system: StateSpace, horizon: Any, throw: bool, where: str
+    system: StateSpace, horizon: RealScalar | None, throw: bool, where: str
 ) -> Float[Array, "n n"]:
     if horizon is not None and system.is_discrete:
         return _gramian_of_steps(system, check_count(horizon, "horizon", where))
@@ -226,9 +224,9 @@ def _gramian_of_time(system: StateSpace, horizon: Scalar) -> Float[Array, "n n"]
         W, power = carry
         more = k < doublings
         # Zero where it is not used: what overflows there must not reach a derivative.
-        held = jnp.where(more, power, 0)
-        W_next = W + held @ W @ held.T
-        return (W_next, jnp.where(more, held @ held, power)), None
+        safe_power = jnp.where(more, power, 0)
+        W_next = W + safe_power @ W @ safe_power.T
+        return (W_next, jnp.where(more, safe_power @ safe_power, power)), None
 
     (W, _), _ = lax.scan(double, (W, power), jnp.arange(_DOUBLINGS))
     return symmetric(W)

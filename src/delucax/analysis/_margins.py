@@ -1,24 +1,16 @@
 """How far a feedback loop is from instability."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._results import first_of, Result
+from .._results import first_of, raise_on_failure, Result
 from .._typing import BoolScalar, Scalar
+from ..math._linear_solve import lu_solve
 from ._disk import disk_of, DiskMargin
-from ._state_space import (
-    LinearModel,
-    raise_unless_successful,
-    size,
-    solve,
-    state_space,
-    StateSpace,
-)
+from ._state_space import frobenius_norm, LinearModel, state_space, StateSpace
 
 
 _HALVINGS = 60
@@ -121,8 +113,7 @@ def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
             f"{where}: loop must have one control and one output, got {m} and {p}; "
             "`disk_margin` takes more."
         )
-    solution = _margins(system)
-    return raise_unless_successful(solution, where) if throw else solution
+    return raise_on_failure(_margins(system), where, throw)
 
 
 @eqx.filter_jit
@@ -158,7 +149,7 @@ def _margins(loop: StateSpace) -> Margins:
     # Where there is none, a point at which all is finite.
     followed = jnp.where(exists, followed, 1)
     L = jax.vmap(lambda w, ok: jnp.where(ok, _scalar(loop, w), 1))(followed, exists)
-    factor = 1 / jax.vmap(size)(L)
+    factor = 1 / jax.vmap(frobenius_norm)(L)
     angle = jnp.arctan2(-jnp.imag(L), -jnp.real(L))
     lag = jnp.where(angle < 0, angle + 2 * jnp.pi, angle) / followed
     margins = jnp.stack([factor[0], factor[1], jnp.abs(angle[2]), lag[3]])
@@ -182,13 +173,15 @@ def _scalar(loop: StateSpace, omega: Scalar) -> Complex[Array, ""]:
     return loop.response(omega)[0, 0]
 
 
-def _crossing(kind: Any, L: Complex[Array, ""]) -> Scalar:
+def _crossing(kind: Int[Array, ""] | int, L: Complex[Array, ""]) -> Scalar:
     """Zero where `L` is real, or for the second kind where it is 1 in size."""
-    length = size(L)
+    length = frobenius_norm(L)
     return jnp.where(kind == 0, jnp.imag(L) / length, jnp.log(length))
 
 
-def _follow(loop: StateSpace, kind: Any, omega: Scalar, exists: BoolScalar) -> Scalar:
+def _follow(
+    loop: StateSpace, kind: Int[Array, ""] | int, omega: Scalar, exists: BoolScalar
+) -> Scalar:
     """`omega` itself, which moves with the loop as the crossing does.
 
     Two Newton steps from where it is already: their values change nothing but rounding,
@@ -201,14 +194,14 @@ def _follow(loop: StateSpace, kind: Any, omega: Scalar, exists: BoolScalar) -> S
         at_nyquist = omega * lax.stop_gradient(dt) > nearly
     moves = exists & (omega > 0) & ~at_nyquist
 
-    def newton(_, there):
+    def newton(_, crossed):
         crossing = lambda w: _crossing(kind, _scalar(loop, w))
-        g, slope = jax.jvp(crossing, (there,), (jnp.ones_like(there),))
-        return there - jnp.where(moves, g / jnp.where(moves, slope, 1), 0)
+        g, slope = jax.jvp(crossing, (crossed,), (jnp.ones_like(crossed),))
+        return crossed - jnp.where(moves, g / jnp.where(moves, slope, 1), 0)
 
-    there = lax.fori_loop(0, 2, newton, jnp.where(moves, omega, 1))
-    rest = omega if dt is None else jnp.where(at_nyquist, jnp.pi / dt, omega)
-    return jnp.where(moves, there, rest)
+    crossed = lax.fori_loop(0, 2, newton, jnp.where(moves, omega, 1))
+    fixed = omega if dt is None else jnp.where(at_nyquist, jnp.pi / dt, omega)
+    return jnp.where(moves, crossed, fixed)
 
 
 def _crossings(
@@ -247,13 +240,13 @@ def _crossings(
     between = (nodes[1:] + nodes[:-1]) / 2
     between = jnp.stack([between, between])
     signs = values(between)
-    # What is on the crossing but for rounding tells nothing.
-    tells = jnp.isfinite(signs) & (jnp.abs(signs) > eps**0.5)
+    # The sign of what is zero up to rounding is not reliable.
+    is_reliable = jnp.isfinite(signs) & (jnp.abs(signs) > eps**0.5)
     indices = jnp.arange(signs.shape[1])
-    last = lax.cummax(jnp.where(tells, indices, -1), axis=1)[:, :-1]
+    last = lax.cummax(jnp.where(is_reliable, indices, -1), axis=1)[:, :-1]
     low, high = jnp.take_along_axis(between, last, axis=1), between[:, 1:]
     low_sign = jnp.sign(jnp.take_along_axis(signs, last, axis=1))
-    crosses = tells[:, 1:] & (last >= 0) & (low_sign != jnp.sign(signs[:, 1:]))
+    crosses = is_reliable[:, 1:] & (last >= 0) & (low_sign != jnp.sign(signs[:, 1:]))
 
     def halve(_, bracket):
         low, high = bracket
@@ -282,7 +275,7 @@ def _real_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
     # Neither is likely to be a pole, or a zero itself.
     for point in (0.7368, 1.3719):
         right = jnp.concatenate([eye, both_B], axis=1)
-        solved = solve(point * eye - both_A, right)
+        solved = lu_solve(point * eye - both_A, right)
         F, FB = solved[:, : len(eye)], solved[:, len(eye) :]
         inverse = FB @ (both_C @ F) / (both_C @ FB) - F
         frequencies.append(jnp.imag(1 / jnp.linalg.eigvals(inverse)))
@@ -292,8 +285,8 @@ def _real_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
 def _unit_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
     """Zeros of `1 - L(-s) L(s)`: eigenvalues of a Hamiltonian."""
     A, B, C, D = loop.A, loop.B, loop.C, loop.D
-    rest = 1 - D[0, 0] ** 2
-    rest = jnp.where(rest == 0, jnp.finfo(A.dtype).eps, rest)
-    F = A + B @ C * D[0, 0] / rest
-    H = jnp.block([[F, B @ B.T / rest], [-C.T @ C / rest, -F.T]])
+    remainder = 1 - D[0, 0] ** 2
+    remainder = jnp.where(remainder == 0, jnp.finfo(A.dtype).eps, remainder)
+    F = A + B @ C * D[0, 0] / remainder
+    H = jnp.block([[F, B @ B.T / remainder], [-C.T @ C / remainder, -F.T]])
     return jnp.imag(jnp.linalg.eigvals(H))

@@ -1,7 +1,5 @@
 """Poles, and which modes the inputs reach and the outputs show."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.lax as lax
@@ -9,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float
 
 from .._check import check_positive
-from .._typing import BoolScalar, Scalar
+from .._typing import BoolScalar, RealScalar, Scalar
 from ._state_space import LinearModel, state_space, StateSpace
 
 
@@ -70,7 +68,7 @@ class ModalTest(eqx.Module):
 
 
 def modal_controllability(
-    model: LinearModel, *, inputs: str = "controls", tolerance: Any = None
+    model: LinearModel, *, inputs: str = "controls", tolerance: RealScalar | None = None
 ) -> ModalTest:
     """Which modes the inputs reach, by the test of Popov, Belevitch and Hautus,
 
@@ -104,7 +102,9 @@ def modal_controllability(
     return _modal_test(state_space(model, inputs, where), tolerance, where)
 
 
-def modal_observability(model: LinearModel, *, tolerance: Any = None) -> ModalTest:
+def modal_observability(
+    model: LinearModel, *, tolerance: RealScalar | None = None
+) -> ModalTest:
     """Which modes the outputs show, by the test of Popov, Belevitch and Hautus,
 
     `rank [A' - lambda I, C'] = n` at each eigenvalue `lambda` of `A`.
@@ -136,7 +136,7 @@ def modal_observability(model: LinearModel, *, tolerance: Any = None) -> ModalTe
 
 
 def is_controllable(
-    model: LinearModel, *, inputs: str = "controls", tolerance: Any = None
+    model: LinearModel, *, inputs: str = "controls", tolerance: RealScalar | None = None
 ) -> BoolScalar:
     """Whether the inputs reach every mode.
 
@@ -161,7 +161,7 @@ def is_controllable(
 
 
 def is_stabilizable(
-    model: LinearModel, *, inputs: str = "controls", tolerance: Any = None
+    model: LinearModel, *, inputs: str = "controls", tolerance: RealScalar | None = None
 ) -> BoolScalar:
     """Whether the inputs reach every unstable mode.
 
@@ -188,7 +188,9 @@ def is_stabilizable(
     return ~jnp.any(test.out_of_reach & test.unstable)
 
 
-def is_observable(model: LinearModel, *, tolerance: Any = None) -> BoolScalar:
+def is_observable(
+    model: LinearModel, *, tolerance: RealScalar | None = None
+) -> BoolScalar:
     """Whether the outputs show every mode.
 
     **Arguments:** `model` and `tolerance`: as in
@@ -210,7 +212,9 @@ def is_observable(model: LinearModel, *, tolerance: Any = None) -> BoolScalar:
     return ~jnp.any(modal_observability(model, tolerance=tolerance).out_of_reach)
 
 
-def is_detectable(model: LinearModel, *, tolerance: Any = None) -> BoolScalar:
+def is_detectable(
+    model: LinearModel, *, tolerance: RealScalar | None = None
+) -> BoolScalar:
     """Whether the outputs show every unstable mode.
 
     **Arguments:** `model` and `tolerance`: as in
@@ -261,19 +265,20 @@ def poles(model: LinearModel) -> Complex[Array, " n"]:
     return jnp.linalg.eigvals(state_space(model, "controls", "poles").A)
 
 
-def _modal_test(system: StateSpace, tolerance: Any, where: str) -> ModalTest:
-    if tolerance is not None:
-        check_positive(tolerance, "tolerance", where)
-    return _tested(system, tolerance)
+def _modal_test(
+    system: StateSpace, tolerance: RealScalar | None, where: str
+) -> ModalTest:
+    eps = jnp.finfo(system.A.dtype).eps
+    if tolerance is None:
+        tolerance = float(10 * len(system.A) * eps)
+    check_positive(tolerance, "tolerance", where)
+    return _tested(system, jnp.asarray(tolerance, system.A.dtype))
 
 
 @eqx.filter_jit
-def _tested(system: StateSpace, tolerance: Any) -> ModalTest:
+def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
     system = lax.stop_gradient(system)
-    n = system.A.shape[0]
     eps = jnp.finfo(system.A.dtype).eps
-    if tolerance is None:
-        tolerance = 10 * n * eps
     scale_A, scale_B = (
         jnp.where(norm > 0, norm, 1)
         for norm in (jnp.linalg.norm(system.A), jnp.linalg.norm(system.B))
@@ -305,4 +310,4 @@ def _tested(system: StateSpace, tolerance: Any) -> ModalTest:
     modes, distances = jax.vmap(nearby)(eigenvalues)
     modes = modes * scale_A
     unstable = system.growth(modes) >= 0
-    return ModalTest(modes, distances, unstable, jnp.asarray(tolerance, A.dtype))
+    return ModalTest(modes, distances, unstable, tolerance)

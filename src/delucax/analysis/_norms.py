@@ -5,17 +5,11 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 
-from .._results import choose, Result, RESULTS
+from .._results import choose, raise_on_failure, Result, RESULTS
 from .._typing import BoolScalar, Scalar
+from ..math._linear_solve import lu_solve
 from ._gramians import stable_gramian
-from ._state_space import (
-    largest_gain,
-    LinearModel,
-    raise_unless_successful,
-    solve,
-    state_space,
-    StateSpace,
-)
+from ._state_space import largest_gain, LinearModel, state_space, StateSpace
 
 
 _LEVELS = 30
@@ -105,13 +99,13 @@ def hinf_norm(
     `max over omega of sigma_max(C (s I - A)^-1 B)`, at `s = j omega`, or in discrete
     time at `exp(j omega dt)`.
 
-    A level just above the largest gain found so far is crossed at frequencies that are
+    A level just above the largest gain so far is crossed at frequencies that are
     eigenvalues of a Hamiltonian matrix; between two of them the gain is looked at
     again, until nothing is above the level, and Newton steps find the top. Infinite if
     a pole is on or outside the boundary of stability.
 
     It has first and second derivatives, in either mode, where one frequency and one
-    direction alone attain the maximum; elsewhere it has those of the one found.
+    direction alone attain the maximum; elsewhere it has those of one that does.
 
     **Arguments:**
 
@@ -144,7 +138,7 @@ def hinf_norm(
         ```
     """
     peak = peak_gain(state_space(model, inputs, "hinf_norm"))
-    return raise_unless_successful(peak, "hinf_norm") if throw else peak
+    return raise_on_failure(peak, "hinf_norm", throw)
 
 
 @eqx.filter_jit
@@ -261,9 +255,9 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
         m, p = D.shape[1], D.shape[0]
         R = level**2 * jnp.eye(m, dtype=D.dtype) - D.T @ D
         S = level**2 * jnp.eye(p, dtype=D.dtype) - D @ D.T
-        solved = solve(R, jnp.concatenate([D.T @ C, B.T], axis=1))
+        solved = lu_solve(R, jnp.concatenate([D.T @ C, B.T], axis=1))
         F = A + B @ solved[:, :n]
-        upper, lower = level * B @ solved[:, n:], level * C.T @ solve(S, C)
+        upper, lower = level * B @ solved[:, n:], level * C.T @ lu_solve(S, C)
         H = jnp.block([[F, upper], [-lower, -F.T]])
         # They come in pairs, s and -s.
         omegas = jnp.sort(jnp.abs(jnp.imag(jnp.linalg.eigvals(H))))[::2]

@@ -1,20 +1,20 @@
 """What a linear model makes of sinusoids and of constants."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex, Float
 
 from .._check import is_concrete
 from .._module import as_float_array
+from .._results import raise_if
 from .._typing import BoolScalar
-from ._state_space import LinearModel, raise_if, solve, state_space, StateSpace
+from ..math._linear_solve import lu_solve
+from ._state_space import LinearModel, state_space, StateSpace
 
 
 def frequency_response(
-    model: LinearModel, omega: Any, *, inputs: str = "controls"
+    model: LinearModel, omega: ArrayLike, *, inputs: str = "controls"
 ) -> Complex[Array, "*frequencies p m"]:
     """The complex gain `C (s I - A)^-1 B` from inputs to outputs,
 
@@ -48,11 +48,11 @@ def frequency_response(
     """
     where = "frequency_response"
     system = state_space(model, inputs, where)
-    omega = as_float_array(omega)
-    real = eqx.is_inexact_array(omega) and not jnp.iscomplexobj(omega)
-    if not real or is_concrete(omega) and not bool(jnp.all(jnp.isfinite(omega))):
-        raise ValueError(f"{where}: omega must be real and finite, got {omega}.")
-    return _responses(system, omega)
+    array = as_float_array(omega)
+    real = eqx.is_inexact_array(array) and not jnp.iscomplexobj(array)
+    if not real or is_concrete(array) and not bool(jnp.all(jnp.isfinite(array))):
+        raise ValueError(f"{where}: omega must be real and finite, got {array}.")
+    return _responses(system, array)
 
 
 @eqx.filter_jit
@@ -110,5 +110,5 @@ def _dcgain(system: StateSpace) -> tuple[Float[Array, "p m"], BoolScalar]:
     eps = jnp.finfo(values.dtype).eps
     singular = ~(values[-1] > len(values) * eps * values[0])
     invertible = jnp.where(singular, system.eye, matrix)
-    gain = system.C @ solve(invertible, system.B) + system.D
+    gain = system.C @ lu_solve(invertible, system.B) + system.D
     return jnp.where(singular, jnp.inf, gain), singular

@@ -1,19 +1,17 @@
 """The matrices that every analysis is about."""
 
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.lax as lax
 import jax.numpy as jnp
-import lineax as lx
 from jaxtyping import Array, Complex, Float, Inexact
 
-from .._check import is_concrete
-from .._results import RESULTS
+from .._check import check_choice
 from .._typing import BoolScalar, Scalar
 from ..dynamics import LinearDynamics
 from ..math import safe_norm
+from ..math._linear_solve import lu_solve
 from ..systems import LinearSystem
 
 
@@ -65,16 +63,16 @@ class StateSpace(eqx.Module):
         `exp(j omega dt)`, of the boundary of stability."""
         s = 1j * omega if self.dt is None else jnp.exp(1j * omega * self.dt)
         resolvent = s * self.eye - self.A
-        return self.C @ solve(resolvent, self.B.astype(resolvent.dtype)) + self.D
+        return self.C @ lu_solve(resolvent, self.B.astype(resolvent.dtype)) + self.D
 
     def on_the_axis(self) -> "StateSpace":
         """The system in continuous time with the gains of this one in discrete time:
         with `z = (1 + s) / (1 - s)` the circle becomes the axis."""
         n, eye = self.A.shape[0], self.eye
         right = jnp.concatenate([self.A - eye, self.B], axis=1)
-        both = solve(eye + self.A, right)
+        both = lu_solve(eye + self.A, right)
         D = self.D - self.C @ both[:, n:]
-        C = 2**0.5 * solve((eye + self.A).T, self.C.T).T
+        C = 2**0.5 * lu_solve((eye + self.A).T, self.C.T).T
         return StateSpace(both[:, :n], 2**0.5 * both[:, n:], C, D, None)
 
 
@@ -86,52 +84,35 @@ def state_space(model: Any, inputs: str, where: str) -> StateSpace:
             "(`delucax.linearize` makes one of any system or dynamics), got "
             f"{type(model).__name__}."
         )
-    discrete = isinstance(model, LinearDynamics)
-    if discrete and model.is_time_varying:
+    check_choice(inputs, ("controls", "disturbances"), "inputs", where)
+    dt = model.dt if isinstance(model, LinearDynamics) else None
+    if isinstance(model, LinearDynamics) and model.is_time_varying:
         raise ValueError(
             f"{where}: model must be time-invariant, got matrices at "
             f"{model.A.shape[0]} times; `dynamics.at(t)` are those at one time."
         )
-    eye = jnp.eye(model.A.shape[0], dtype=model.A.dtype)
-    if inputs == "controls":
-        B = model.B
-    elif inputs == "disturbances":
-        if model.E is None and not discrete:
-            raise ValueError(
-                f"{where}: inputs='disturbances' needs a model with E, which says how "
-                "they enter the vector field, got a LinearSystem whose E is None."
-            )
-        B = eye if model.E is None else model.E
-    else:
+    if inputs == "disturbances" and model.E is None and dt is None:
         raise ValueError(
-            f"{where}: inputs must be 'controls' or 'disturbances', got {inputs!r}."
+            f"{where}: inputs='disturbances' needs a model with E, which says how "
+            "they enter the vector field, got a LinearSystem whose E is None."
         )
+    eye = jnp.eye(model.A.shape[0], dtype=model.A.dtype)
+    B = model.B if inputs == "controls" else model.E
+    B = eye if B is None else B
     C = eye if model.C is None else model.C
     dtype = jnp.result_type(model.A, B, C)
     A, B, C = (M.astype(dtype) for M in (model.A, B, C))
     D = jnp.zeros((C.shape[0], B.shape[1]), dtype)
-    dt = jnp.asarray(model.dt, dtype) if isinstance(model, LinearDynamics) else None
-    return StateSpace(A, B, C, D, dt)
+    return StateSpace(A, B, C, D, None if dt is None else jnp.asarray(dt, dtype))
 
 
-def solve(matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"]) -> Array:
-    """`matrix^-1 right`, with one factorisation; NaN where `matrix` is singular."""
-    operator, solver = lx.MatrixLinearOperator(matrix), lx.LU()
-    state = solver.init(operator, {})
-
-    def column(b):
-        return lx.linear_solve(operator, b, solver, state=state, throw=False).value
-
-    return jax.vmap(column, in_axes=1, out_axes=1)(right)
-
-
-def size(M: Array) -> Array:
-    """The Frobenius norm, complex or real, with gradient 0 at 0."""
+def frobenius_norm(M: Inexact[Array, "..."]) -> Scalar:
+    """The norm of all entries, complex or real, with gradient 0 at 0."""
     parts = jnp.stack([jnp.real(M), jnp.imag(M)]) if jnp.iscomplexobj(M) else M
     return safe_norm(parts, axis=None)
 
 
-def largest_gain(G: Array) -> Array:
+def largest_gain(G: Inexact[Array, "p m"]) -> Scalar:
     """The largest singular value, with derivatives to second order.
 
     Those of `jnp.linalg.svd` divide by the gaps between all singular values, which are
@@ -140,34 +121,13 @@ def largest_gain(G: Array) -> Array:
     makes of it, which errs with the square of the vector's error.
     """
     if 1 in G.shape:
-        return size(G)
-    still = lax.stop_gradient(G)
-    squares, vectors = jnp.linalg.eigh(still.conj().T @ still)
+        return frobenius_norm(G)
+    frozen = lax.stop_gradient(G)
+    squares, vectors = jnp.linalg.eigh(frozen.conj().T @ frozen)
     gaps = squares[-1] - squares
     open_gaps = gaps > jnp.finfo(gaps.dtype).eps ** 0.5 * squares[-1]
     weights = jnp.where(open_gaps, 1 / jnp.where(open_gaps, gaps, 1), 0)
     top = vectors[:, -1]
-    moved = vectors.conj().T @ (G.conj().T @ (G @ top))
-    follows = top + vectors @ (weights * moved)
-    return size(G @ follows) / size(follows)
-
-
-Value = TypeVar("Value")
-
-
-def raise_if(failed: BoolScalar, value: Value, message: str) -> Value:
-    """`value`, or an error: now if it can be seen, else at run time."""
-    if not is_concrete(failed):
-        return eqx.error_if(value, failed, message)
-    if failed:
-        raise RuntimeError(message)
-    return value
-
-
-def raise_unless_successful(solution: Any, where: str) -> Any:
-    """A solution that has a `result`, or an error."""
-    failed = solution.result != RESULTS.successful
-    if not is_concrete(failed):
-        return solution.result.error_if(solution, failed)
-    hint = "Pass throw=False to look at what was found."
-    return raise_if(failed, solution, f"{where}: {RESULTS[solution.result]} {hint}")
+    change = vectors.conj().T @ (G.conj().T @ (G @ top))
+    vector = top + vectors @ (weights * change)
+    return frobenius_norm(G @ vector) / frobenius_norm(vector)

@@ -4,38 +4,41 @@ from .._controller import Tally as Tally
 from ._basic import (
     Constant as Constant,
     Linear as Linear,
+    OpenLoop as OpenLoop,
     Random as Random,
-    Sequence as Sequence,
     Zero as Zero,
 )
-from ._categorical import Categorical as Categorical, Likeliest as Likeliest
 from ._finite_horizon import FiniteHorizonLQR as FiniteHorizonLQR
-from ._gaussian import Gaussian as Gaussian
 from ._hinfinity import HInfinity as HInfinity
 from ._lqg import LQG as LQG
 from ._lqi import LQI as LQI
 from ._lqr import LQR as LQR
 from ._mpc import MPC as MPC, MPCState as MPCState
-from ._network import Deep as Deep, MLP as MLP
+from ._network import MLP as MLP, mlp_policy as mlp_policy
 from ._output_feedback import OutputFeedback as OutputFeedback
 from ._pid import LeakyPID as LeakyPID, PID as PID
 from ._recurrent import GRU as GRU, History as History, Standardise as Standardise
 from ._sampled import lqrd as lqrd, sampled_weights as sampled_weights
 from ._scheduled import Scheduled as Scheduled
+from ._stochastic import (
+    Categorical as Categorical,
+    Gaussian as Gaussian,
+    Likeliest as Likeliest,
+)
 from .online import (
     adagrad_norm as adagrad_norm,
     Adaptive as Adaptive,
     best_in_hindsight as best_in_hindsight,
     BPC as BPC,
-    DRC as DRC,
-    DSC as DSC,
+    drc as drc,
+    dsc as dsc,
     Explore as Explore,
     FixedPolicy as FixedPolicy,
-    GPC as GPC,
+    gpc as gpc,
     Hindsight as Hindsight,
-    NeuralGPC as NeuralGPC,
+    neural_gpc as neural_gpc,
     online_newton as online_newton,
     OnlineLearner as OnlineLearner,
     regret as regret,
-    SFC as SFC,
+    sfc as sfc,
 )

@@ -1,7 +1,5 @@
 """The simplest controllers."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
@@ -35,8 +33,8 @@ class Zero(AbstractController):
 
     control_size: int = eqx.field(static=True)
 
-    def __init__(self, control_size: int):
-        self.control_size = check_count(control_size, "control_size", "Zero", least=0)
+    def __check_init__(self):
+        check_count(self.control_size, "control_size", "Zero", least=0)
 
     def __call__(self, t, y, state):
         return jnp.zeros(self.control_size, y.dtype), state
@@ -62,9 +60,6 @@ class Constant(AbstractController):
     """
 
     value: Array = weight()
-
-    def __init__(self, value: Any):
-        self.value = value
 
     def __check_init__(self):
         if not eqx.is_array(self.value) or self.value.ndim != 1:
@@ -100,10 +95,7 @@ class Random(AbstractController):
     """
 
     std: Array = parameter()
-    mean: Array = parameter()
-
-    def __init__(self, std: Any, mean: Any = 0.0):
-        self.std, self.mean = std, mean
+    mean: Array = parameter(0.0)
 
     def __check_init__(self):
         if not eqx.is_array(self.std) or self.std.ndim != 1:
@@ -120,8 +112,7 @@ class Random(AbstractController):
             raise ValueError(f"Random: std must not be negative, got {self.std}.")
 
     def init(self, *, key=None):
-        check_key(key, "Random.init")
-        return key
+        return check_key(key, "Random.init")
 
     def __call__(self, t, y, state):
         state, now = jr.split(state)
@@ -151,9 +142,6 @@ class Linear(AbstractController):
 
     K: Array = weight()
 
-    def __init__(self, K: Any):
-        self.K = K
-
     def __check_init__(self):
         as_matrix(self.K, "K", "Linear")
 
@@ -163,7 +151,7 @@ class Linear(AbstractController):
         return -matvec(self.K, y).astype(y.dtype), state
 
 
-class Sequence(AbstractController):
+class OpenLoop(AbstractController):
     """Given controls, one after the other: open loop.
 
     `u_k = values[k]`; the last is held after the end.
@@ -180,21 +168,18 @@ class Sequence(AbstractController):
         import jax
         import jax.numpy as jnp
 
-        replay = dlx.controllers.Sequence(0.5 * jnp.ones((20, 1)))
+        replay = dlx.controllers.OpenLoop(0.5 * jnp.ones((20, 1)))
         dlx.rollout(dlx.make("pendulum"), replay, key=jax.random.key(0)).total_cost
         ```
     """
 
     values: Array = weight()
 
-    def __init__(self, values: Any):
-        self.values = values
-
     def __check_init__(self):
-        as_matrix(self.values, "values", "Sequence")
-        check_real(self.values, "values", "Sequence")
+        as_matrix(self.values, "values", "OpenLoop")
+        check_real(self.values, "values", "OpenLoop")
         if self.values.shape[0] == 0:
-            raise ValueError("Sequence: values must have at least one row, got none.")
+            raise ValueError("OpenLoop: values must have at least one row, got none.")
 
     def init(self, *, key=None):
         return jnp.zeros((), jnp.int32)

@@ -11,10 +11,11 @@ from jaxtyping import Array, Float
 
 from .._check import as_vector, output_of
 from .._module import function_field, parameter
+from .._typing import RealScalar
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..references import Constant
-from ._operating_point import deviation
+from ._operating_point import deviation, Difference
 
 
 Signal = Callable[[Any], Array]
@@ -33,63 +34,54 @@ class KnownSignals(eqx.Module):
     reference: Signal | None = function_field()
     control_reference: Signal | None = function_field()
     disturbance: Signal | None = function_field()
-    difference: Callable[[Array, Array], Array] | None = function_field()
+    difference: Difference | None = function_field()
 
     def check(self, where: str) -> None:
         """Raise unless the signals have the sizes of the dynamics."""
-        point = self.dynamics
-        as_signal(self.reference, point.state_size, "reference", where)
-        push = self.control_reference
-        as_signal(push, point.control_size, "control_reference", where)
-        as_signal(self.disturbance, point.disturbance_size, "disturbance", where)
+        given = self.reference, self.control_reference, self.disturbance
+        as_signals(self.dynamics, *given, where)
 
-    def state(self, t: Any) -> Array:
+    def state(self, t: RealScalar) -> Float[Array, " n"]:
         """`r(t)`."""
         return self.dynamics.x_ref if self.reference is None else self.reference(t)
 
-    def control(self, t: Any) -> Array:
+    def control(self, t: RealScalar) -> Float[Array, " m"]:
         """`u_r(t)`."""
         if self.control_reference is None:
             return self.dynamics.u_ref
         return self.control_reference(t)
 
-    def moved(self, t: Any) -> Array:
+    def next_state(self, t: RealScalar) -> Float[Array, " n"]:
         """Where the dynamics go from `r(t)` under `u_r(t)` and the disturbance."""
         point = self.dynamics
         here = deviation(self.state(t), point.x_ref, self.difference)
-        moved = point.x_next + matvec(point.A, here)
-        moved = moved + matvec(point.B, self.control(t) - point.u_ref)
+        after = point.x_next + matvec(point.A, here)
+        after = after + matvec(point.B, self.control(t) - point.u_ref)
         if self.disturbance is None:
-            return moved
+            return after
         w = self.disturbance(t)
-        return moved + (w if point.E is None else matvec(point.E, w))
+        return after + (w if point.E is None else matvec(point.E, w))
 
-    def offset(self, t: Any) -> Array:
+    def offset(self, t: RealScalar) -> Float[Array, " n"]:
         """`d` at time `t`."""
         ahead = self.state(t + self.dynamics.dt)
-        return deviation(self.moved(t), ahead, self.difference)
+        return deviation(self.next_state(t), ahead, self.difference)
 
 
-def known_signals(
+def as_signals(
     dynamics: LinearDynamics,
     reference: Any,
     control_reference: Any,
     disturbance: Any,
-    difference: Any,
     where: str,
-) -> KnownSignals | None:
-    """The signals that were given, checked at time 0; `None` if none was."""
-    sizes = {
-        "reference": (reference, dynamics.state_size),
-        "control_reference": (control_reference, dynamics.control_size),
-        "disturbance": (disturbance, dynamics.disturbance_size),
-    }
-    if all(signal is None for signal, _ in sizes.values()):
-        return None
-    follow, push, disturb = (
-        as_signal(*given, name, where) for name, given in sizes.items()
+) -> tuple[Signal | None, Signal | None, Signal | None]:
+    """The signals that were given, checked at time 0."""
+    n, m, k = dynamics.state_size, dynamics.control_size, dynamics.disturbance_size
+    return (
+        as_signal(reference, n, "reference", where),
+        as_signal(control_reference, m, "control_reference", where),
+        as_signal(disturbance, k, "disturbance", where),
     )
-    return KnownSignals(dynamics, follow, push, disturb, difference)
 
 
 def as_signal(value: Any, size: int, name: str, where: str) -> Any:
@@ -121,15 +113,14 @@ class Preview(eqx.Module):
     closed_loop: Float[Array, "n n"] = parameter()
     steps: int = eqx.field(static=True)
 
-    def __call__(self, t: Any) -> Array:
+    def __call__(self, t: RealScalar) -> Float[Array, " m"]:
         """`v` at time `t`."""
         loop = self.closed_loop.T
         times = t + self.signals.dynamics.dt * jnp.arange(self.steps + 1)
         pushes = jax.vmap(lambda t: self.P @ self.signals.offset(t))(times)
         # A constant push for ever sums to (I - loop)^-1 times it.
-        operator = lx.MatrixLinearOperator(
-            jnp.eye(loop.shape[0], dtype=loop.dtype) - loop
-        )
+        eye = jnp.eye(loop.shape[0], dtype=loop.dtype)
+        operator = lx.MatrixLinearOperator(eye - loop)
         ahead = lx.linear_solve(operator, pushes[-1], lx.LU()).value
         back = lambda total, push: (push + loop @ total, None)  # noqa: E731
         ahead, _ = jax.lax.scan(back, ahead, pushes[:-1], reverse=True)

@@ -1,6 +1,5 @@
 """The linear-quadratic regulator over a finite horizon."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,8 +13,13 @@ from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..math._steps import row_at, step_at
 from ..riccati import dre
-from ._feed_forward import as_signal, KnownSignals
-from ._operating_point import check_linear, check_observed, check_state, deviation
+from ._feed_forward import as_signals, KnownSignals
+from ._operating_point import (
+    check_linear_state_feedback,
+    check_state,
+    deviation,
+    Difference,
+)
 
 
 class FiniteHorizonLQR(AbstractController):
@@ -77,7 +81,7 @@ class FiniteHorizonLQR(AbstractController):
     x_ref: Float[Array, "T n"] = parameter()
     u_ref: Float[Array, "T m"] = parameter()
     dt: Float[Array, ""] = parameter()
-    difference: Callable[[Array, Array], Array] | None = function_field()
+    difference: Difference | None = function_field()
 
     def __init__(
         self,
@@ -91,55 +95,48 @@ class FiniteHorizonLQR(AbstractController):
         reference: Any = None,
         control_reference: Any = None,
         disturbance: Any = None,
-        difference: Callable[[Array, Array], Array] | None = None,
+        difference: Difference | None = None,
         parallel: bool = False,
     ):
         where = "FiniteHorizonLQR"
-        check_linear(dynamics, where)
-        check_observed(dynamics, where)
+        check_linear_state_feedback(dynamics, where)
         steps = dynamics.A.shape[0] if dynamics.is_time_varying else None
-        if horizon is None and steps is None:
+        if horizon is not None:
+            T = check_count(horizon, "horizon", where)
+        elif steps is not None:
+            T = steps
+        else:
             raise ValueError(
                 f"{where}: horizon must be given, as dynamics are time-invariant."
             )
-        T = steps if horizon is None else check_count(horizon, "horizon", where)
-        assert T is not None
         if steps is not None and T > steps:
             raise ValueError(
                 f"{where}: horizon must be at most {steps}, the steps of dynamics, got "
                 f"{T}."
             )
-        signals = dict(
-            reference=(reference, dynamics.state_size),
-            control_reference=(control_reference, dynamics.control_size),
-            disturbance=(disturbance, dynamics.disturbance_size),
-        )
-        follow, push, disturb = (
-            as_signal(*given, name, where) for name, given in signals.items()
-        )
+        given = reference, control_reference, disturbance
+        signals = as_signals(dynamics, *given, where)
 
         def along(t):
-            here = KnownSignals(dynamics.at(t), follow, push, disturb, difference)
-            return here.state(t), here.control(t), here.moved(t)
+            here = KnownSignals(dynamics.at(t), *signals, difference)
+            return here.state(t), here.control(t), here.next_state(t)
 
         times = jnp.arange(T) * dynamics.dt
-        self.x_ref, self.u_ref, moved = jax.vmap(along)(times)
+        self.x_ref, self.u_ref, x_next = jax.vmap(along)(times)
         end = T * dynamics.dt
-        if follow is not None:
-            last = follow(end)
+        if signals[0] is not None:
+            last = signals[0](end)
         elif steps == T:
             last = dynamics.x_next[-1]
         else:
             last = dynamics.at(end).x_ref
         targets = jnp.concatenate([self.x_ref[1:], last[None]])
-        d = jax.vmap(lambda a, b: deviation(a, b, difference))(moved, targets)
+        d = jax.vmap(lambda a, b: deviation(a, b, difference))(x_next, targets)
         A, B = dynamics.A, dynamics.B
-        if steps is not None:
-            A, B = A[:T], B[:T]
+        A, B = (A, B) if steps is None else (A[:T], B[:T])
         solution = dre(A, B, Q, R, S, final=final, horizon=T, d=d, parallel=parallel)
         self.K, self.k, self.P = solution.K, solution.k, solution.X
-        self.dt = dynamics.dt
-        self.difference = difference
+        self.dt, self.difference = dynamics.dt, difference
 
     def __check_init__(self):
         check_step(self.dt, "FiniteHorizonLQR")
@@ -147,7 +144,6 @@ class FiniteHorizonLQR(AbstractController):
     def __call__(self, t, y, state):
         check_state(self, y, self.x_ref.shape[1])
         step = step_at(t, self.dt, len(self.K), type(self).__name__)
-        rows = row_at((self.x_ref, self.u_ref, self.K, self.k), step)
-        x_ref, u_ref, K, k = rows
+        x_ref, u_ref, K, k = row_at((self.x_ref, self.u_ref, self.K, self.k), step)
         u = u_ref - matvec(K, deviation(y, x_ref, self.difference)) - k
         return u.astype(y.dtype), state

@@ -1,6 +1,5 @@
 """The H-infinity controller."""
 
-from collections.abc import Callable
 from typing import Any
 
 from jaxtyping import Array, Float
@@ -13,12 +12,11 @@ from ..math import matvec
 from ..math._steps import row_at, step_at
 from ..riccati import hinf_dare, hinf_dre
 from ._operating_point import (
-    check_linear,
-    check_observed,
+    check_linear_state_feedback,
     check_state,
     deviation,
-    equilibrium,
-    path,
+    Difference,
+    operating_state,
 )
 
 
@@ -86,7 +84,7 @@ class HInfinity(AbstractController):
     x_ref: Float[Array, "... n"] = parameter()
     u_ref: Float[Array, "... m"] = parameter()
     dt: Float[Array, ""] | None = parameter()
-    difference: Callable[[Array, Array], Array] | None = function_field()
+    difference: Difference | None = function_field()
 
     def __init__(
         self,
@@ -97,32 +95,25 @@ class HInfinity(AbstractController):
         gamma: Any = None,
         horizon: int | None = None,
         final: Any = None,
-        difference: Callable[[Array, Array], Array] | None = None,
+        difference: Difference | None = None,
     ):
         where = "HInfinity"
-        check_linear(dynamics, where)
-        check_observed(dynamics, where)
+        check_linear_state_feedback(dynamics, where)
         varies = dynamics.is_time_varying
         is_finite = varies or horizon is not None
         if final is not None and not is_finite:
             raise ValueError(f"{where}: final is given, which needs a horizon.")
-        if varies:
-            self.x_ref = path(dynamics, difference, where)
-        else:
-            self.x_ref = equilibrium(dynamics, difference, where)
-        self.u_ref = dynamics.u_ref
-        self.difference = difference
+        self.x_ref = operating_state(dynamics, difference, where)
+        self.u_ref, self.difference = dynamics.u_ref, difference
         matrices = dynamics.A, dynamics.B, dynamics.E, Q, R
         if is_finite:
             steps = dynamics.A.shape[0] if varies else None
             T = steps if horizon is None else check_count(horizon, "horizon", where)
             solution = hinf_dre(*matrices, final=final, horizon=T, gamma=gamma)
-            self.dt = dynamics.dt
         else:
             solution = hinf_dare(*matrices, gamma=gamma)
-            self.dt = None
         self.K, self.P, self.L = solution.K, solution.X, solution.L
-        self.gamma = solution.gamma
+        self.gamma, self.dt = solution.gamma, dynamics.dt if is_finite else None
 
     def __check_init__(self):
         check_positive(self.gamma, "gamma", "HInfinity")
@@ -135,7 +126,7 @@ class HInfinity(AbstractController):
         if self.dt is not None:
             step = step_at(t, self.dt, len(K), "HInfinity")
             K = row_at(K, step)
-            x_ref = row_at(x_ref, step) if x_ref.ndim == 2 else x_ref
-            u_ref = row_at(u_ref, step) if u_ref.ndim == 2 else u_ref
+            if x_ref.ndim == 2:
+                x_ref, u_ref = row_at((x_ref, u_ref), step)
         u = u_ref - matvec(K, deviation(y, x_ref, self.difference))
         return u.astype(y.dtype), state

@@ -1,17 +1,18 @@
 """The linear-quadratic-Gaussian regulator."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._check import check_instance
 from .._controller import AbstractController
 from .._module import parameter
 from ..dynamics import LinearDynamics
 from ..estimators import KalmanFilter
 from ._lqr import LQR
+from ._operating_point import Difference
 from ._output_feedback import OutputFeedback
 
 
@@ -100,13 +101,13 @@ class LQG(AbstractController):
         covariance: Any = None,
         steady_state: bool = True,
         y_ref: Any = None,
-        difference: Callable[[Array, Array], Array] | None = None,
-        observation_difference: Callable[[Array, Array], Array] | None = None,
+        difference: Difference | None = None,
+        observation_difference: Difference | None = None,
     ):
-        seen: Any = dynamics
+        plant: Any = dynamics
         if isinstance(dynamics, LinearDynamics) and dynamics.C is not None:
-            seen = eqx.tree_at(lambda d: d.C, dynamics, None)
-        self.regulator = LQR(seen, Q, R, S, difference=difference)
+            plant = eqx.tree_at(lambda d: d.C, dynamics, None)
+        self.regulator = LQR(plant, Q, R, S, difference=difference)
         self.estimator = KalmanFilter(
             dynamics,
             W,
@@ -121,18 +122,14 @@ class LQG(AbstractController):
         covariance = self.estimator.updated_covariance
         if covariance is not None:
             noise = self.estimator._noise(dynamics)
-            price = _price(dynamics.B, self.regulator, R)
-            self.average_cost = jnp.trace(self.regulator.P @ noise) + jnp.trace(
-                price @ covariance
-            )
+            K, P, B = self.regulator.K, self.regulator.P, dynamics.B
+            # The weight of an error of the estimate.
+            weight = K.T @ (jnp.asarray(R) + B.T @ P @ B) @ K
+            self.average_cost = jnp.trace(P @ noise) + jnp.trace(weight @ covariance)
 
     def __check_init__(self):
-        for name, kind in (("regulator", LQR), ("estimator", KalmanFilter)):
-            if not isinstance(getattr(self, name), kind):
-                raise ValueError(
-                    f"LQG: {name} must be a {kind.__name__}, got "
-                    f"{type(getattr(self, name)).__name__}."
-                )
+        check_instance(self.regulator, LQR, "regulator", "LQG")
+        check_instance(self.estimator, KalmanFilter, "estimator", "LQG")
         dynamics = self.estimator.dynamics
         shape = dynamics.control_size, dynamics.state_size
         if self.regulator.K.shape != shape:
@@ -153,9 +150,3 @@ class LQG(AbstractController):
 
     def applied(self, u, cost, state):
         return self._feedback.applied(u, cost, state)
-
-
-def _price(B: Array, regulator: LQR, R: Any) -> Array:
-    """The weight of an error of the estimate: `K' (R + B'PB) K`."""
-    K = regulator.K
-    return K.T @ (jnp.asarray(R) + B.T @ regulator.P @ B) @ K

@@ -7,19 +7,19 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float
 
-from .._check import as_matrix, check_finite, check_step
+from .._check import as_matrix, check_step
 from .._controller import AbstractController
-from .._module import as_float_array, function_field, parameter, weight
+from .._module import function_field, parameter, weight
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..riccati import dare
 from ._feed_forward import as_signal
 from ._operating_point import (
-    check_observed,
+    check_linear_state_feedback,
     check_state,
-    check_time_invariant,
     deviation,
-    equilibrium,
+    Difference,
+    operating_state,
 )
 
 
@@ -93,7 +93,7 @@ class LQI(AbstractController):
     u_ref: Float[Array, " m"] = parameter()
     dt: Float[Array, ""] = parameter()
     reference: Callable[[Any], Array] | None = function_field()
-    difference: Callable[[Array, Array], Array] | None = function_field()
+    difference: Difference | None = function_field()
 
     def __init__(
         self,
@@ -104,34 +104,27 @@ class LQI(AbstractController):
         *,
         output: Any,
         reference: Any = None,
-        difference: Callable[[Array, Array], Array] | None = None,
+        difference: Difference | None = None,
     ):
         where = "LQI"
-        check_time_invariant(dynamics, where)
-        check_observed(dynamics, where)
+        check_linear_state_feedback(dynamics, where, time_invariant=True)
         n, m = dynamics.B.shape
-        C = as_matrix(as_float_array(output), "output", where)
-        check_finite(C, "output", where)
+        C = as_matrix(output, "output", where)
         p = C.shape[0]
         if C.shape != (p, n) or not 1 <= p <= m:
             raise ValueError(
                 f"{where}: output must have shape (p, {n}) with p from 1 to {m}, the "
                 f"number of controls, got {C.shape}."
             )
-        self.x_ref = equilibrium(dynamics, difference, where)
+        self.x_ref = operating_state(dynamics, difference, where)
         self.u_ref, self.dt, self.difference = dynamics.u_ref, dynamics.dt, difference
         self.output = C.astype(dynamics.A.dtype)
         self.reference = as_signal(reference, p, "reference", where)
-        A = jnp.block(
-            [
-                [dynamics.A, jnp.zeros((n, p), C.dtype)],
-                [-dynamics.dt * C, jnp.eye(p, dtype=C.dtype)],
-            ]
-        )
+        integrals = [-dynamics.dt * C, jnp.eye(p, dtype=C.dtype)]
+        A = jnp.block([[dynamics.A, jnp.zeros((n, p), C.dtype)], integrals])
         B = jnp.concatenate([dynamics.B, jnp.zeros((p, m), C.dtype)])
         solution = dare(A, B, Q, R, S)
-        self.K, self.Ki = solution.K[:, :n], solution.K[:, n:]
-        self.P = solution.X
+        self.K, self.Ki, self.P = solution.K[:, :n], solution.K[:, n:], solution.X
 
     def __check_init__(self):
         check_step(self.dt, "LQI")

@@ -1,6 +1,5 @@
 """The linear-quadratic regulator over an infinite horizon."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,14 +14,14 @@ from ..math import matvec
 from ..math._linear_solve import solve
 from ..riccati import dare
 from ..riccati._arguments import riccati_arguments
-from ._feed_forward import known_signals, Preview
+from ._feed_forward import as_signals, KnownSignals, Preview
 from ._operating_point import (
-    check_observed,
+    check_linear_state_feedback,
     check_state,
-    check_time_invariant,
     deviation,
-    equilibrium,
+    Difference,
     linear_at,
+    operating_state,
 )
 
 
@@ -98,7 +97,7 @@ class LQR(AbstractController):
     P: Float[Array, "n n"] = parameter()
     x_ref: Float[Array, " n"] = parameter()
     u_ref: Float[Array, " m"] = parameter()
-    difference: Callable[[Array, Array], Array] | None = function_field()
+    difference: Difference | None = function_field()
     feed_forward: Preview | None
 
     def __init__(
@@ -112,7 +111,7 @@ class LQR(AbstractController):
         control_reference: Any = None,
         disturbance: Any = None,
         preview: int = 0,
-        difference: Callable[[Array, Array], Array] | None = None,
+        difference: Difference | None = None,
         point: OperatingPoint | None = None,
     ):
         where = "LQR"
@@ -123,16 +122,13 @@ class LQR(AbstractController):
                 "`delucax.Discretized`, or use `delucax.controllers.lqrd`."
             )
         linear, difference = linear_at(dynamics, point, difference, where)
-        check_time_invariant(linear, where)
-        check_observed(linear, where)
-        self.x_ref = equilibrium(linear, difference, where)
-        self.u_ref = linear.u_ref
-        self.difference = difference
-        signals = known_signals(
-            linear, reference, control_reference, disturbance, difference, where
-        )
+        check_linear_state_feedback(linear, where, time_invariant=True)
+        self.x_ref = operating_state(linear, difference, where)
+        self.u_ref, self.difference = linear.u_ref, difference
+        given = as_signals(linear, reference, control_reference, disturbance, where)
+        is_known = any(signal is not None for signal in given)
         steps = isinstance(preview, int | np.integer) and not isinstance(preview, bool)
-        if not steps or preview < 0 or (preview and signals is None):
+        if not steps or preview < 0 or (preview and not is_known):
             raise ValueError(
                 f"{where}: preview must be a number of steps, from 0, at which a "
                 f"reference or disturbance is looked up, got {shortened(preview)}."
@@ -140,14 +136,13 @@ class LQR(AbstractController):
         A, B = linear.A, linear.B
         A, B, Q, R, S, _ = riccati_arguments(where, A, B, Q, R, S, None, definite=False)
         solution = dare(A, B, Q, R, S)
-        self.K, self.P = solution.K, solution.X
-        if signals is None:
-            self.feed_forward = None
-        else:
+        self.K, self.P, self.feed_forward = solution.K, solution.X, None
+        if is_known:
             B, P = linear.B, solution.X
             M = solve(jnp.asarray(R, P.dtype) + B.T @ P @ B, B.T)
-            loop = solution.closed_loop
-            self.feed_forward = Preview(signals, P, M, loop, int(preview))
+            signals = KnownSignals(linear, *given, difference)
+            known = signals, P, M, solution.closed_loop
+            self.feed_forward = Preview(*known, int(preview))
 
     def __check_init__(self):
         if self.feed_forward is None:

@@ -1,32 +1,33 @@
 """Model predictive control."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 
 from .._check import (
+    bounds_field,
     check_bool,
     check_control_bounds,
+    check_cost_sizes,
     check_count,
     check_finite,
     check_instance,
     check_key,
 )
-from .._controller import AbstractController, Tally, wrong_observation
+from .._controller import AbstractController, Tally
 from .._message import shortened
-from .._module import as_float_array, check_parameters, function_field, parameter
+from .._module import as_float_array, check_parameters, function_field
 from .._results import Result, RESULTS
-from .._typing import Control, Observation
+from .._typing import Control, Observation, PRNGKey
 from ..costs import AbstractCost
-from ..costs._base import check_cost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ..planning import AbstractPlanner, Constraints, default_start, ILQR, Start
+from ._operating_point import check_state, deviation, Difference
 
 
 class MPCState(NamedTuple):
@@ -52,13 +53,13 @@ class MPCState(NamedTuple):
         ```
     """
 
-    controls: Array
-    states: Array
-    gains: Array
+    controls: Float[Array, "T m"]
+    states: Float[Array, "T+1 n"]
+    gains: Float[Array, "T m n"]
     result: Result
     failures: Tally
-    iterations: Array
-    key: Any
+    iterations: Int[Array, ""]
+    key: PRNGKey | None
 
 
 class MPC(AbstractController):
@@ -149,11 +150,10 @@ class MPC(AbstractController):
     dynamics: AbstractDynamics
     cost: AbstractCost
     start: Start
-    low: Array | None = parameter()
-    high: Array | None = parameter()
+    bounds: tuple[Array, Array] | None = bounds_field("MPC")
     planner: AbstractPlanner
     constraints: Constraints | None
-    difference: Callable[[Array, Array], Array] | None = function_field()
+    difference: Difference | None = function_field()
     throw: bool = eqx.field(static=True)
 
     def __init__(
@@ -167,14 +167,14 @@ class MPC(AbstractController):
         start: Any = None,
         throw: bool = True,
         constraints: Constraints | None = None,
-        difference: Callable[[Array, Array], Array] | None = None,
+        difference: Difference | None = None,
     ):
         where = "MPC"
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
-        check_cost(cost, "cost", where)
+        check_instance(cost, AbstractCost, "cost", where)
         horizon = check_count(horizon, "horizon", where)
         m = dynamics.control_size
-        ends = check_control_bounds(bounds, m, where)
+        self.bounds = check_control_bounds(bounds, m, where)
         if isinstance(start, Start):
             start = start.checked(dynamics.state_size, m, "start", where)
             if start.horizon != horizon:
@@ -184,19 +184,19 @@ class MPC(AbstractController):
                 )
         else:
             if start is not None:
-                start = as_float_array(start)
-                if not eqx.is_inexact_array(start) or start.shape != (horizon, m):
-                    array = eqx.is_array(start)
-                    got = f"shape {start.shape}" if array else shortened(start)
+                array = as_float_array(start)
+                if not eqx.is_inexact_array(array) or array.shape != (horizon, m):
+                    got = shortened(start)
+                    got = f"shape {array.shape}" if eqx.is_array(array) else got
                     raise ValueError(
                         f"{where}: start must have shape (horizon, controls) = "
                         f"({horizon}, {m}), got {got}."
                     )
-                check_finite(start, "start", where)
+                check_finite(array, "start", where)
+                start = array
             start = default_start(dynamics, cost, horizon, controls=start)
         self.dynamics, self.cost = dynamics, cost
         self.start = _stacked(start, dynamics.state_size)
-        self.low, self.high = (None, None) if ends is None else ends
         self.planner = ILQR() if planner is None else planner
         self.constraints, self.difference = constraints, difference
         self.throw = check_bool(throw, "throw", where)
@@ -205,7 +205,8 @@ class MPC(AbstractController):
         where, dynamics = "MPC", self.dynamics
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         n, m = dynamics.state_size, dynamics.control_size
-        check_cost(self.cost, "cost", where, (n, m))
+        check_instance(self.cost, AbstractCost, "cost", where)
+        check_cost_sizes(self.cost, (n, m), "cost", where)
         check_instance(self.planner, AbstractPlanner, "planner", where)
         check_parameters(self)
         check_instance(self.start, Start, "start", where)
@@ -215,34 +216,28 @@ class MPC(AbstractController):
                 f"{where}: start.controls must have shape (c, horizon, {m}), with "
                 f"states and gains, got shape {start.controls.shape}."
             )
-        if self.low is not None or self.high is not None:
-            check_control_bounds((self.low, self.high), m, where)
+        check_control_bounds(self.bounds, m, where)
 
     def init(self, *, key=None):
         draws = self.planner.is_stochastic
         if draws:
             check_key(key, "MPC.init")
-        result = jax.tree.map(jnp.asarray, RESULTS.successful)
-        zero = jnp.zeros((), int)
         first = jax.tree.map(lambda a: a[0], self.start)
         return MPCState(
             first.controls,
             first.states,
             first.gains,
-            result,
-            Tally("failed_plan"),
-            zero,
-            key if draws else None,
+            result=jax.tree.map(jnp.asarray, RESULTS.successful),
+            failures=Tally("failed_plan"),
+            iterations=jnp.zeros((), int),
+            key=key if draws else None,
         )
 
     def __call__(self, t, y, state):
-        size = self.dynamics.state_size
-        if y.shape != (size,):
-            raise wrong_observation(self, size, y)
+        check_state(self, y, self.dynamics.state_size)
         key, draw = state.key, None
         if self.planner.is_stochastic:
             key, draw = jr.split(key)
-        bounds = None if self.low is None else (self.low, self.high)
         last = Start(state.controls, state.states, state.gains)
         starts = state.controls
         if not self.planner.starts_from_states:
@@ -254,7 +249,7 @@ class MPC(AbstractController):
             y,
             starts,
             t,
-            bounds=bounds,
+            bounds=self.bounds,
             constraints=self.constraints,
             difference=self.difference,
             fallback=last,
@@ -269,15 +264,14 @@ class MPC(AbstractController):
         later = Start(*(shift(a) for a in (plan.controls, plan.states, plan.gains)))
         renewed = lambda new, old: jnp.where(lost, old[0], new).astype(old.dtype)
         later = jax.tree.map(renewed, later, self.start)
-        failed = plan.result != RESULTS.successful
         after = MPCState(
             later.controls,
             later.states,
             later.gains,
-            plan.result,
-            state.failures.add(failed),
-            jnp.asarray(plan.iterations, state.iterations.dtype),
-            key,
+            result=plan.result,
+            failures=state.failures.add(plan.result != RESULTS.successful),
+            iterations=jnp.asarray(plan.iterations, state.iterations.dtype),
+            key=key,
         )
         return u.astype(y.dtype), after
 
@@ -285,12 +279,12 @@ class MPC(AbstractController):
         """The first control of the last plan, under its gains."""
         assert last.states is not None and last.gains is not None
         x, u = last.states[0], last.controls[0]
-        e = y - x if self.difference is None else self.difference(y, x)
-        tried = u - matvec(last.gains[0], e)
+        tried = u - matvec(last.gains[0], deviation(y, x, self.difference))
         u = jnp.where(jnp.isfinite(tried), tried, u)
-        if self.low is not None and self.high is not None:
-            u = jnp.minimum(jnp.maximum(u, self.low), self.high)
-        return u
+        if self.bounds is None:
+            return u
+        low, high = self.bounds
+        return jnp.minimum(jnp.maximum(u, low), high)
 
 
 def _stacked(start: Start, n: int) -> Start:

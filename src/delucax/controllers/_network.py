@@ -7,11 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._check import (
     as_bounds,
     bounds_field,
+    check_choice,
     check_count,
     check_instance,
     check_key,
@@ -21,7 +22,7 @@ from .._controller import AbstractController, wrong_observation
 from .._module import as_module, function_field, weight
 from .._typing import PRNGKey
 from ..environments import Environment
-from ._gaussian import Gaussian
+from ._stochastic import Gaussian
 
 
 class MLP(AbstractController):
@@ -91,16 +92,11 @@ class MLP(AbstractController):
                 f"{activation!r}."
             )
         check_key(key, where)
-        out_size = check_count(out_size, "out_size", where)
-        if isinstance(depth, bool) or not isinstance(depth, int) or depth < 0:
-            raise ValueError(
-                f"{where}: depth must be a whole number of at least 0, got {depth!r}."
-            )
         self.network = eqx.nn.MLP(
             check_count(in_size, "in_size", where),
-            out_size,
+            check_count(out_size, "out_size", where),
             check_count(width, "width", where),
-            depth,
+            check_count(depth, "depth", where, least=0),
             as_module(activation),
             as_module(jax.nn.identity),
             key=key,
@@ -112,32 +108,38 @@ class MLP(AbstractController):
         check_squash(self.bounds, int(self.network.out_size), "MLP")
 
     def __call__(self, t, y, state):
-        z = y if self.features is None else jnp.asarray(self.features(y))
-        if z.shape != (self.network.in_size,):
-            raise wrong_observation(self, int(self.network.in_size), z)
-        u = self.network(z)
-        if self.bounds is not None:
-            low, high = self.bounds
-            u = (high + low) / 2 + (high - low) / 2 * jnp.tanh(u)
-        return u.astype(y.dtype), state
+        z = features_of(self, y, int(self.network.in_size))
+        return squash(self.network(z), self.bounds).astype(y.dtype), state
+
+
+def features_of(controller: Any, y: Array, size: int) -> Float[Array, " size"]:
+    """The features of an observation, or an error if there are not `size`."""
+    features = controller.features
+    z = y if features is None else jnp.asarray(features(y))
+    if z.shape != (size,):
+        raise wrong_observation(controller, size, z)
+    return z
+
+
+def squash(u: Array, bounds: tuple[Array, Array] | None) -> Array:
+    """The real line mapped between the bounds."""
+    if bounds is None:
+        return u
+    low, high = bounds
+    return (high + low) / 2 + (high - low) / 2 * jnp.tanh(u)
 
 
 def check_squash(bounds: Any, size: int, where: str) -> None:
     """Raise unless the bounds, if any, are ones that `size` controls can be squashed
     into."""
-    for end in as_bounds(bounds, where) or ():
-        if end.shape not in ((), (size,)):
-            raise ValueError(
-                f"{where}: bounds must be numbers or have shape ({size},), got shape "
-                f"{end.shape}."
-            )
+    for end in as_bounds(bounds, where, size=size) or ():
         if is_concrete(end) and not np.all(np.isfinite(end)):
             raise ValueError(
                 f"{where}: bounds must be finite to squash into, got {end}."
             )
 
 
-def Deep(
+def mlp_policy(
     environment: Environment,
     width: int = 64,
     depth: int = 2,
@@ -175,30 +177,20 @@ def Deep(
         import jax
 
         env = dlx.make("pendulum")
-        policy = dlx.controllers.Deep(env, width=32, key=jax.random.key(0))
+        policy = dlx.controllers.mlp_policy(env, width=32, key=jax.random.key(0))
         dlx.rollout(env, policy, key=jax.random.key(1)).total_cost
         ```
     """
-    where = "Deep"
+    where = "mlp_policy"
     check_instance(environment, Environment, "environment", where)
-    if head not in ("deterministic", "gaussian"):
-        raise ValueError(
-            f"{where}: head must be 'deterministic' or 'gaussian', got {head!r}."
-        )
+    check_choice(head, ("deterministic", "gaussian"), "head", where)
     bounds = environment.control_bounds
     if bounds is not None:
         if not all(np.all(np.isfinite(end)) for end in bounds if is_concrete(end)):
             bounds = None
-    size = environment.control_size
-    network = MLP(
-        environment.feature_size,
-        size,
-        width,
-        depth,
-        features=environment.encode,
-        bounds=bounds,
-        key=key,
-    )
+    size, encode = environment.control_size, environment.encode
+    sizes = environment.feature_size, size, width, depth
+    network = MLP(*sizes, features=encode, bounds=bounds, key=key)
     if head == "deterministic":
         return network
     std = jnp.ones(size)

@@ -1,26 +1,27 @@
 """A state feedback that acts on an estimate."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._controller import AbstractController
-from ..estimators import AbstractEstimator, Belief
+from .._check import check_instance
+from .._controller import AbstractController, check_controller
+from ..estimators import AbstractEstimator
 
 
 class _State(NamedTuple):
     controller: PyTree
-    belief: Belief
+    estimator: PyTree
     time: Array
 
 
 class OutputFeedback(AbstractController):
     """Any controller of the state, run on an estimate of it.
 
-    At each step the estimator's belief is updated with the observation, the controller
-    acts on its mean, and the belief is moved on with the control that was really
+    At each step the estimator takes in the observation, the controller acts on the mean
+    of its estimate, and the estimator moves on with the control that was really
     applied, after saturation.
 
     **Arguments:**
@@ -54,33 +55,24 @@ class OutputFeedback(AbstractController):
     controller: AbstractController
     estimator: AbstractEstimator
 
-    def __init__(self, controller: AbstractController, estimator: AbstractEstimator):
-        self.controller, self.estimator = controller, estimator
-
     def __check_init__(self):
-        for name, value, kind in (
-            ("controller", self.controller, AbstractController),
-            ("estimator", self.estimator, AbstractEstimator),
-        ):
-            if not isinstance(value, kind):
-                raise ValueError(
-                    f"OutputFeedback: {name} must be an {kind.__name__}, got "
-                    f"{type(value).__name__}."
-                )
+        check_controller(self.controller, "controller", "OutputFeedback")
+        check_instance(self.estimator, AbstractEstimator, "estimator", "OutputFeedback")
 
     def init(self, *, key=None):
         keys = (None, None) if key is None else jax.random.split(key)
-        belief = self.estimator.init(key=keys[1])
-        time = jnp.zeros((), belief.mean.dtype)
-        return _State(self.controller.init(key=keys[0]), belief, time)
+        state = self.estimator.init(key=keys[1])
+        time = jnp.zeros((), self.estimator.estimate(state).mean.dtype)
+        return _State(self.controller.init(key=keys[0]), state, time)
 
     def __call__(self, t, y, state):
-        belief = self.estimator.update(t, y, state.belief)
-        u, memory = self.controller(t, belief.mean.astype(y.dtype), state.controller)
+        after = self.estimator.update(t, y, state.estimator)
+        mean = self.estimator.estimate(after).mean.astype(y.dtype)
+        u, memory = self.controller(t, mean, state.controller)
         time = jnp.asarray(t, state.time.dtype)
-        return u, _State(memory, belief, time)
+        return u, _State(memory, after, time)
 
     def applied(self, u, cost, state):
         memory = self.controller.applied(u, cost, state.controller)
-        belief: Any = self.estimator.predict(state.time, u, state.belief)
-        return _State(memory, belief, state.time)
+        after = self.estimator.predict(state.time, u, state.estimator)
+        return _State(memory, after, state.time)

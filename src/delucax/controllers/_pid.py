@@ -1,6 +1,7 @@
 """Proportional-integral-derivative control."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import equinox as eqx
@@ -9,10 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_bounds, as_matrix, bounds_field, check_step, is_concrete
+from .._check import (
+    as_bounds,
+    as_matrix,
+    bounds_field,
+    check_choice,
+    check_step,
+    is_concrete,
+)
 from .._controller import AbstractController, wrong_observation
 from .._message import shortened
-from .._module import as_float_array, function_field, parameter, positive, weight
+from .._module import as_float_array, as_module, parameter, positive, weight
 from ..math import clip, matvec
 
 
@@ -35,6 +43,64 @@ class _Project(eqx.Module):
 
     def __call__(self, y):
         return matvec(self.C, y)
+
+
+def _as_output(output: Any) -> Any:
+    """What the loops follow, as a function of the observation."""
+    if output is None or callable(output):
+        return as_module(output)
+    if isinstance(output, int | np.integer) and not isinstance(output, bool):
+        output = (output,)
+    if isinstance(output, Sequence) and len(output) > 0:
+        if all(isinstance(i, int | np.integer) and i >= 0 for i in output):
+            return _Select(tuple(int(i) for i in output))
+    array = as_float_array(output)
+    if not eqx.is_inexact_array(array) or array.ndim != 2:
+        raise ValueError(
+            "PID: output must be an index from 0, a tuple of them, a matrix or a "
+            f"function, got {shortened(output)}."
+        )
+    return _Project(array)
+
+
+def _output_field() -> Any:
+    return eqx.field(default=None, converter=_as_output)
+
+
+def _count_loops(pid: Any) -> int:
+    """The number of loops: the size that all vectors have; 1 where all are numbers."""
+    where = type(pid).__name__
+    low, high = (None, None) if pid.bounds is None else pid.bounds
+    vectors = {"low bounds": low, "high bounds": high}
+    vectors |= {name: getattr(pid, name) for name in ("kp", "ki", "kd", *pid._times)}
+    if not callable(pid.reference):
+        vectors["reference"] = pid.reference
+    sizes = {}
+    for name, value in vectors.items():
+        if value is None:
+            continue
+        array = as_float_array(value)
+        if not eqx.is_inexact_array(array) or array.ndim > 1:
+            raise ValueError(
+                f"{where}: {name} must be a number or a vector, got {shortened(value)}."
+            )
+        if array.ndim == 1:
+            sizes[name] = array.shape[0]
+    if isinstance(pid.output, _Select):
+        sizes["output"] = len(pid.output.indices)
+    elif isinstance(pid.output, _Project):
+        sizes["output"] = pid.output.C.shape[0]
+    if len(set(sizes.values())) > 1 or 0 in sizes.values():
+        got = ", ".join(f"{name} of size {size}" for name, size in sizes.items())
+        raise ValueError(f"{where}: there must be one entry a loop; got {got}.")
+    return next(iter(sizes.values()), 1)
+
+
+def _check(pid: Any) -> None:
+    where = type(pid).__name__
+    check_step(pid.dt, where)
+    as_bounds(pid.bounds, where)
+    _count_loops(pid)
 
 
 class _Memory(NamedTuple):
@@ -95,54 +161,28 @@ class PID(AbstractController):
     """
 
     kp: Array = weight()
-    ki: Array = weight()
-    kd: Array = weight()
+    ki: Array = weight(0.0)
+    kd: Array = weight(0.0)
+    _: KW_ONLY
     dt: Array = parameter(constraint=positive)
-    reference: Array | Callable[[Any], Array] | None = parameter()
-    output: Callable[[Array], Array] | None = function_field()
-    bounds: tuple[Array, Array] | None = bounds_field("PID")
-    derivative_time_constant: Array = parameter()
-    derivative_on: Literal["measurement", "error"] = eqx.field(static=True)
-    anti_windup_time: Array | None = parameter(constraint=positive)
+    reference: Array | Callable[[Any], Array] | None = parameter(None)
+    output: Callable[[Array], Array] | None = _output_field()
+    bounds: tuple[Array, Array] | None = bounds_field("PID", default=None)
+    derivative_time_constant: Array | None = parameter(None)
+    derivative_on: Literal["measurement", "error"] = eqx.field(
+        default="measurement", static=True
+    )
+    anti_windup_time: Array | None = parameter(None, constraint=positive)
 
     _times: ClassVar = ("derivative_time_constant", "anti_windup_time")
 
-    def __init__(
-        self,
-        kp: Any,
-        ki: Any = 0.0,
-        kd: Any = 0.0,
-        *,
-        dt: Any,
-        reference: Any = None,
-        output: Any = None,
-        bounds: Any = None,
-        derivative_time_constant: Any = None,
-        derivative_on: Literal["measurement", "error"] = "measurement",
-        anti_windup_time: Any = None,
-    ):
-        where = "PID"
-        if derivative_on not in ("measurement", "error"):
-            raise ValueError(
-                f"{where}: derivative_on must be 'measurement' or 'error', got "
-                f"{derivative_on!r}."
-            )
-        self.kp, self.ki, self.kd, self.dt = kp, ki, kd, dt
-        self.reference = reference
-        self.output = _as_output(output, where)
-        self.bounds = bounds
-        if derivative_time_constant is None:
-            derivative_time_constant = dt
-        self.derivative_time_constant = derivative_time_constant
-        self.derivative_on = derivative_on
-        self.anti_windup_time = anti_windup_time
-
     def __check_init__(self):
-        check_step(self.dt, "PID")
-        as_bounds(self.bounds, "PID")
-        _count_loops(self)
+        _check(self)
+        check_choice(
+            self.derivative_on, ("measurement", "error"), "derivative_on", "PID"
+        )
         lag, windup, dt = self.derivative_time_constant, self.anti_windup_time, self.dt
-        if is_concrete(lag) and np.any(np.asarray(lag) < 0):
+        if lag is not None and is_concrete(lag) and np.any(np.asarray(lag) < 0):
             raise ValueError(
                 f"PID: derivative_time_constant must not be negative, got {lag}."
             )
@@ -152,13 +192,10 @@ class PID(AbstractController):
                     f"PID: anti_windup_time must be at least dt = {dt}, got {windup}."
                 )
 
-    @property
-    def loops(self) -> int:
-        """The number of loops."""
-        return _count_loops(self)
+    loops = property(_count_loops)
 
     def init(self, *, key=None):
-        zeros = _zeros(self.loops, self.kp, self.ki, self.kd, self.dt)
+        zeros = _zeros(self)
         return _Memory(zeros, zeros, zeros, jnp.zeros((), bool), zeros)
 
     def __call__(self, t, y, state):
@@ -166,16 +203,16 @@ class PID(AbstractController):
         moving = -measured if self.derivative_on == "measurement" else error
         step = jnp.where(state.started, moving - state.previous, 0)
         lag = self.derivative_time_constant
+        lag = self.dt if lag is None else lag
         slope = (lag * state.slope + step) / (lag + self.dt)
         asked = self.kp * error + state.integral + self.kd * slope
         integral = state.integral + self.dt * self.ki * error
         after = _Memory(integral, slope, moving, jnp.ones((), bool), asked)
-        return _clip(asked, self.bounds).astype(y.dtype), _as(after, state)
+        return _clip(self, asked, y), _as(after, state)
 
     def applied(self, u, cost, state):
         correction = self.dt * self._windup_rate() * (u - state.asked)
-        after = state._replace(integral=state.integral + correction)
-        return _as(after, state)
+        return _as(state._replace(integral=state.integral + correction), state)
 
     def _windup_rate(self):
         """`1 / T_a`, and 0 where there is no integral to wind up."""
@@ -236,48 +273,25 @@ class LeakyPID(AbstractController):
         ```
     """
 
-    kp: Array = weight()
-    ki: Array = weight()
-    kd: Array = weight()
+    kp: Array = weight(3.0)
+    ki: Array = weight(4.0)
+    kd: Array = weight(0.0)
+    _: KW_ONLY
     dt: Array = parameter(constraint=positive)
-    time_constant: Array = parameter(constraint=positive)
-    reference: Array | Callable[[Any], Array] | None = parameter()
-    output: Callable[[Array], Array] | None = function_field()
-    bounds: tuple[Array, Array] | None = bounds_field("LeakyPID")
+    time_constant: Array = parameter(0.5, constraint=positive)
+    reference: Array | Callable[[Any], Array] | None = parameter(None)
+    output: Callable[[Array], Array] | None = _output_field()
+    bounds: tuple[Array, Array] | None = bounds_field("LeakyPID", default=None)
 
     _times: ClassVar = ("time_constant",)
 
-    def __init__(
-        self,
-        kp: Any = 3.0,
-        ki: Any = 4.0,
-        kd: Any = 0.0,
-        *,
-        dt: Any,
-        time_constant: Any = 0.5,
-        reference: Any = None,
-        output: Any = None,
-        bounds: Any = None,
-    ):
-        where = "LeakyPID"
-        self.kp, self.ki, self.kd, self.dt = kp, ki, kd, dt
-        self.time_constant = time_constant
-        self.reference = reference
-        self.output = _as_output(output, where)
-        self.bounds = bounds
-
     def __check_init__(self):
-        check_step(self.dt, "LeakyPID")
-        as_bounds(self.bounds, "LeakyPID")
-        _count_loops(self)
+        _check(self)
 
-    @property
-    def loops(self) -> int:
-        """The number of loops."""
-        return _count_loops(self)
+    loops = property(_count_loops)
 
     def init(self, *, key=None):
-        zeros = _zeros(self.loops, self.kp, self.ki, self.kd, self.dt)
+        zeros = _zeros(self)
         return _Averages(zeros, zeros, zeros)
 
     def __call__(self, t, y, state):
@@ -287,91 +301,43 @@ class LeakyPID(AbstractController):
         change = error - state.error
         derivative = state.derivative + share * (change - state.derivative)
         u = self.kp * error + self.ki * integral + self.kd * derivative
-        after = _Averages(error, integral, derivative)
-        return _clip(u, self.bounds).astype(y.dtype), _as(after, state)
+        return _clip(self, u, y), _as(_Averages(error, integral, derivative), state)
 
 
-def _as_output(output: Any, where: str) -> Any:
-    if output is None or callable(output):
-        return output
-    if isinstance(output, int | np.integer) and not isinstance(output, bool):
-        output = (output,)
-    if isinstance(output, Sequence) and len(output) > 0:
-        whole = all(isinstance(i, int | np.integer) and i >= 0 for i in output)
-        if whole:
-            return _Select(tuple(int(i) for i in output))
-    array = as_float_array(output)
-    if not eqx.is_inexact_array(array) or array.ndim != 2:
-        raise ValueError(
-            f"{where}: output must be an index from 0, a tuple of them, a matrix or a "
-            f"function, got {shortened(output)}."
-        )
-    return _Project(array)
-
-
-def _count_loops(pid: Any) -> int:
-    """The size that all the vectors have; 1 where all are numbers."""
-    where = type(pid).__name__
-    low, high = (None, None) if pid.bounds is None else pid.bounds
-    vectors = {"low bounds": low, "high bounds": high}
-    vectors |= {name: getattr(pid, name) for name in ("kp", "ki", "kd", *pid._times)}
-    if not callable(pid.reference):
-        vectors["reference"] = pid.reference
-    sizes = {}
-    for name, value in vectors.items():
-        if value is None:
-            continue
-        array = as_float_array(value)
-        if not eqx.is_inexact_array(array) or array.ndim > 1:
-            raise ValueError(
-                f"{where}: {name} must be a number or a vector, got {shortened(value)}."
-            )
-        if array.ndim == 1:
-            sizes[name] = array.shape[0]
-    if isinstance(pid.output, _Select):
-        sizes["output"] = len(pid.output.indices)
-    elif isinstance(pid.output, _Project):
-        sizes["output"] = pid.output.C.shape[0]
-    if len(set(sizes.values())) > 1 or 0 in sizes.values():
-        got = ", ".join(f"{name} of size {size}" for name, size in sizes.items())
-        raise ValueError(f"{where}: there must be one entry a loop; got {got}.")
-    return next(iter(sizes.values()), 1)
-
-
-def _zeros(loops: int, *like: Array) -> Array:
-    return jnp.zeros(loops, jnp.result_type(*like))
+def _zeros(pid: Any) -> Array:
+    return jnp.zeros(pid.loops, jnp.result_type(pid.kp, pid.ki, pid.kd, pid.dt))
 
 
 def _error(pid: Any, t: Any, y: Array) -> tuple[Array, Array]:
     """`(r(t) - h(y), h(y))`, checked to have an entry for each loop."""
-    name = type(pid).__name__
-    if isinstance(pid.output, _Select) and max(pid.output.indices) >= y.shape[0]:
+    name, output, loops = type(pid).__name__, pid.output, pid.loops
+    if isinstance(output, _Select) and max(output.indices) >= y.shape[0]:
         raise ValueError(
-            f"{name}: output selects component {max(pid.output.indices)}, but the "
+            f"{name}: output selects component {max(output.indices)}, but the "
             f"observation has size {y.shape[0]}."
         )
-    if isinstance(pid.output, _Project) and y.shape != pid.output.C.shape[1:]:
-        raise wrong_observation(pid, pid.output.C.shape[1], y)
-    measured = y if pid.output is None else jnp.atleast_1d(pid.output(y))
-    if measured.shape != (pid.loops,):
-        what = "the observation has" if pid.output is None else "output gives"
+    if isinstance(output, _Project) and y.shape != output.C.shape[1:]:
+        raise wrong_observation(pid, output.C.shape[1], y)
+    measured = y if output is None else jnp.atleast_1d(output(y))
+    if measured.shape != (loops,):
+        what = "the observation has" if output is None else "output gives"
         raise ValueError(
-            f"{name}: expects {pid.loops} outputs, one a loop, but {what} shape "
+            f"{name}: expects {loops} outputs, one a loop, but {what} shape "
             f"{measured.shape}; choose what each loop follows, such as output=0."
         )
     given: Any = pid.reference
     reference: Any = given(t) if callable(given) else given
     reference = 0 if reference is None else jnp.asarray(reference)
-    if jnp.shape(reference) not in ((), (pid.loops,)):
+    if jnp.shape(reference) not in ((), (loops,)):
         raise ValueError(
-            f"{name}: reference must have an entry for each of {pid.loops} loops, got "
+            f"{name}: reference must have an entry for each of {loops} loops, got "
             f"shape {jnp.shape(reference)}."
         )
     return reference - measured, measured
 
 
-def _clip(u: Array, bounds: tuple[Array, Array] | None) -> Array:
-    return u if bounds is None else clip(u, *bounds)
+def _clip(pid: Any, u: Array, y: Array) -> Array:
+    return (u if pid.bounds is None else clip(u, *pid.bounds)).astype(y.dtype)
 
 
 def _as(after: Any, before: Any) -> Any:

@@ -1,6 +1,7 @@
 """Policies with a memory: a recurrent network, and a window of the past."""
 
 from collections.abc import Callable
+from dataclasses import KW_ONLY
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,11 +10,11 @@ import jax.random as jr
 from jaxtyping import Array, PyTree
 
 from .._check import bounds_field, check_count, check_finite, check_key, check_positive
-from .._controller import AbstractController, check_controller, wrong_observation
+from .._controller import AbstractController, check_controller
 from .._message import shortened
 from .._module import as_float_array, function_field, parameter, weight
 from .._typing import PRNGKey
-from ._network import check_squash
+from ._network import check_squash, features_of, squash
 
 
 class GRU(AbstractController):
@@ -72,15 +73,13 @@ class GRU(AbstractController):
         bounds: Any = None,
         key: PRNGKey,
     ):
-        where = "GRU"
-        cell_key, readout_key = jr.split(check_key(key, where))
-        in_size = check_count(in_size, "in_size", where)
-        out_size = check_count(out_size, "out_size", where)
-        width = check_count(width, "width", where)
+        cell_key, readout_key = jr.split(check_key(key, "GRU"))
+        in_size = check_count(in_size, "in_size", "GRU")
+        out_size = check_count(out_size, "out_size", "GRU")
+        width = check_count(width, "width", "GRU")
         self.cell = eqx.nn.GRUCell(in_size, width, key=cell_key)
         self.readout = eqx.nn.Linear(width, out_size, key=readout_key)
-        self.features = features
-        self.bounds = bounds
+        self.features, self.bounds = features, bounds
 
     def __check_init__(self):
         check_squash(self.bounds, int(self.readout.out_features), "GRU")
@@ -90,22 +89,16 @@ class GRU(AbstractController):
         return jnp.zeros(self.cell.hidden_size, self.readout.weight.dtype)
 
     def __call__(self, t, y, state):
-        z = y if self.features is None else jnp.asarray(self.features(y))
-        if z.shape != (self.cell.input_size,):
-            raise wrong_observation(self, int(self.cell.input_size), z)
+        z = features_of(self, y, int(self.cell.input_size))
         after = self.cell(z.astype(state.dtype), state)
-        u = self.readout(after)
-        if self.bounds is not None:
-            low, high = self.bounds
-            u = (high + low) / 2 + (high - low) / 2 * jnp.tanh(u)
-        return u.astype(y.dtype), after
+        return squash(self.readout(after), self.bounds).astype(y.dtype), after
 
 
 class _Past(NamedTuple):
     base: PyTree
     observations: Array
     controls: Array
-    seen: Array
+    started: Array
 
 
 class History(AbstractController):
@@ -147,27 +140,14 @@ class History(AbstractController):
     base: AbstractController
     size: int = eqx.field(static=True)
     controls: int = eqx.field(static=True)
-    length: int = eqx.field(static=True)
-    features: Callable[[Array], Array] | None = function_field()
-
-    def __init__(
-        self,
-        base: AbstractController,
-        size: int,
-        controls: int,
-        length: int = 1,
-        *,
-        features: Callable[[Array], Array] | None = None,
-    ):
-        where = "History"
-        self.base = base
-        self.size = check_count(size, "size", where)
-        self.controls = check_count(controls, "controls", where)
-        self.length = check_count(length, "length", where)
-        self.features = features
+    length: int = eqx.field(default=1, static=True)
+    _: KW_ONLY
+    features: Callable[[Array], Array] | None = function_field(None)
 
     def __check_init__(self):
         check_controller(self.base, "base", "History")
+        for name in ("size", "controls", "length"):
+            check_count(getattr(self, name), name, "History")
 
     def init(self, *, key=None):
         return _Past(
@@ -178,16 +158,12 @@ class History(AbstractController):
         )
 
     def __call__(self, t, y, state):
-        z = y if self.features is None else jnp.asarray(self.features(y))
-        if z.shape != (self.size,):
-            raise wrong_observation(self, self.size, z)
-        z = z.astype(state.observations.dtype)
-        past = jnp.where(state.seen, state.observations, z)
+        z = features_of(self, y, self.size).astype(state.observations.dtype)
+        past = jnp.where(state.started, state.observations, z)
         window = jnp.concatenate([z, past.ravel(), state.controls.ravel()])
         u, base = self.base(t, window.astype(y.dtype), state.base)
         observations = jnp.concatenate([z[None], past[:-1]])
-        seen = jnp.ones((), bool)
-        return u, _Past(base, observations, state.controls, seen)
+        return u, _Past(base, observations, state.controls, jnp.ones((), bool))
 
     def applied(self, u, cost, state):
         u = u.astype(state.controls.dtype)

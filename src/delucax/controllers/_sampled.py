@@ -1,6 +1,5 @@
 """Continuous problems under a control that is held between samples."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,7 +11,7 @@ from .._check import as_matrix, check_instance, check_positive, symmetric_matrix
 from ..dynamics import c2d, linearize, OperatingPoint
 from ..systems import AbstractSystem, LinearSystem
 from ._lqr import LQR
-from ._operating_point import linear_at
+from ._operating_point import Difference, linear_at
 
 
 _MOST_DOUBLINGS = 20
@@ -74,18 +73,17 @@ def sampled_weights(
     block = jnp.block([[-field.T, charge], [zero, field]])
     # Over all of `dt` the exponential of `-A'` would overflow where `A` is stiff, so it
     # is taken over a part in which little happens, which is then doubled.
-    size_of_step = jax.lax.stop_gradient(jnp.linalg.norm(field) * dt)
-    doublings = jnp.clip(jnp.ceil(jnp.log2(size_of_step)), 0, _MOST_DOUBLINGS)
+    step = jax.lax.stop_gradient(jnp.linalg.norm(field) * dt)
+    doublings = jnp.clip(jnp.ceil(jnp.log2(step)), 0, _MOST_DOUBLINGS)
     exponential = jsl.expm(block * (dt * 2**-doublings))
     flow = exponential[size:, size:]
     total = flow.T @ exponential[:size, size:]
 
     def double(carry, k):
         flow, total = carry
-        after = flow @ flow, total + flow.T @ total @ flow
-        more = k < doublings
-        keep = lambda a, b: jnp.where(more, a, b)  # noqa: E731
-        return jax.tree.map(keep, after, carry), None
+        doubled = flow @ flow, total + flow.T @ total @ flow
+        keep = lambda a, b: jnp.where(k < doublings, a, b)
+        return jax.tree.map(keep, doubled, carry), None
 
     steps = jnp.arange(_MOST_DOUBLINGS)
     (_, total), _ = jax.lax.scan(double, (flow, total), steps)
@@ -100,7 +98,7 @@ def lqrd(
     dt: Any,
     S: Any = None,
     *,
-    difference: Callable[[Array, Array], Array] | None = None,
+    difference: Difference | None = None,
     point: OperatingPoint | None = None,
 ) -> LQR:
     """The sampled-data regulator of a continuous problem: of all controls held over

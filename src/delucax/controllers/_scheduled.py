@@ -55,18 +55,10 @@ class Scheduled(AbstractController):
     controllers: AbstractController
     dt: Array = parameter()
 
-    def __init__(self, controllers: AbstractController, dt: Any):
-        self.controllers, self.dt = controllers, dt
-
     def __check_init__(self):
+        where, hint = "Scheduled", " whose arrays have a leading axis"
         controllers = self.controllers
-        check_instance(
-            controllers,
-            AbstractController,
-            "controllers",
-            "Scheduled",
-            " whose arrays have a leading axis",
-        )
+        check_instance(controllers, AbstractController, "controllers", where, hint)
         check_step(self.dt, "Scheduled")
         arrays = jax.tree.leaves(eqx.filter(controllers, eqx.is_array))
         lengths = {array.shape[:1] for array in arrays}

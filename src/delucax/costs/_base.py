@@ -4,20 +4,11 @@ import abc
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_instance, output_of
 from .._module import check_parameters, parts_of
 from .._typing import Control, RealScalar, State
-
-
-_UNTRACEABLE = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-)
 
 
 class AbstractCost(eqx.Module):
@@ -103,23 +94,3 @@ class AbstractCost(eqx.Module):
         """
         del t
         return jnp.zeros((), x.dtype)
-
-
-def check_cost(
-    value: Any, name: str, where: str, sizes: tuple[int, int] | None = None
-) -> None:
-    """Raise unless `value` is a cost, of states and controls of these `sizes`."""
-    check_instance(value, AbstractCost, name, where)
-    if sizes is None:
-        return
-    n, m = sizes
-    try:
-        output_of(value, (), (n,), (m,))
-        output_of(value.final, (), (n,))
-    except _UNTRACEABLE:  # it may still be called, one step after the other
-        return
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"{where}: {name} does not fit a state of size {n} and a control of size "
-            f"{m}: {error}"
-        ) from error

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 from jaxtyping import Array
 
-from .._check import check_number, check_step
+from .._check import check_instance, check_number, check_step
 from .._module import function_field, parameter
 from .._typing import Control, RealScalar, State
-from ._base import AbstractCost, check_cost
+from ._base import AbstractCost
 
 
 class Function(AbstractCost):
@@ -72,7 +72,7 @@ class Sum(AbstractCost):
         if not self.terms:
             raise ValueError("Sum: at least one cost must be given.")
         for term in self.terms:
-            check_cost(term, "every term", "Sum")
+            check_instance(term, AbstractCost, "every term", "Sum")
 
     def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
         return functools.reduce(operator.add, (c(t, x, u) for c in self.terms))
@@ -105,7 +105,7 @@ class Scaled(AbstractCost):
     factor: Array = parameter()
 
     def __check_init__(self):
-        check_cost(self.cost, "cost", "Scaled")
+        check_instance(self.cost, AbstractCost, "cost", "Scaled")
         check_number(self.factor, "factor", "Scaled")
 
     def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
@@ -140,7 +140,7 @@ class Rate(AbstractCost):
     dt: Array = parameter()
 
     def __check_init__(self):
-        check_cost(self.cost, "cost", "Rate")
+        check_instance(self.cost, AbstractCost, "cost", "Rate")
         check_step(self.dt, "Rate")
 
     def __call__(self, t: RealScalar, x: State, u: Control) -> Array:

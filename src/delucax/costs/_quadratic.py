@@ -102,8 +102,13 @@ class Quadratic(_AbstractQuadratic):
         self.difference = difference
 
     def __check_init__(self):
-        _check_target(self.state_target, self.Q, "state_target")
-        _check_target(self.control_target, self.R, "control_target")
+        for name, weight in (("state_target", self.Q), ("control_target", self.R)):
+            target = getattr(self, name)
+            if target is not None and jnp.shape(target) != weight.shape[:1]:
+                raise ValueError(
+                    f"Quadratic: {name} must have shape {weight.shape[:1]}, got "
+                    f"{jnp.shape(target)}."
+                )
 
     @property
     def targets(self) -> tuple[Array | None, Array | None]:
@@ -223,13 +228,3 @@ def _weight(value: Any, name: str, where: str) -> Array:
             f"{where}: {name} must be a matrix or its diagonal, got {got}."
         )
     return symmetric_matrix(value, name, where)
-
-
-def _check_target(value: Any, weight: Array, name: str) -> None:
-    if value is None:
-        return
-    if not eqx.is_array(value) or value.shape != weight.shape[:1]:
-        raise ValueError(
-            f"Quadratic: {name} must have shape {weight.shape[:1]}, got "
-            f"{jnp.shape(value)}."
-        )

@@ -2,14 +2,14 @@
 systems."""
 
 from ._base import AbstractDynamics as AbstractDynamics
-from ._d2c import d2c as d2c
 from ._delayed import Delayed as Delayed
 from ._discretized import Discretized as Discretized
 from ._linear import LinearDynamics as LinearDynamics
-from ._linearize import c2d as c2d, linearize as linearize
+from ._linearize import linearize as linearize
 from ._open_loop import open_loop as open_loop
 from ._operating_point import OperatingPoint as OperatingPoint
 from ._runge_kutta import RK4 as RK4
+from ._sampling import c2d as c2d, d2c as d2c
 from ._trim import trim as trim
 from ._worst_case import WorstCase as WorstCase
 from ._wrapper import (

@@ -4,14 +4,14 @@ import abc
 from typing import Any, ClassVar, TYPE_CHECKING
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from .._check import check_step
+from .._check import as_vector, check_step
 from .._module import check_parameters
 from .._results import Result, RESULTS
 from .._typing import RealScalar
 from ..systems import AbstractPlant
-from ..systems._plant import validate_io
 
 
 class AbstractDynamics(AbstractPlant):
@@ -79,7 +79,17 @@ class AbstractDynamics(AbstractPlant):
         **Raises:** `ValueError` on a wrong shape, and an error at run time if the
         solver fails.
         """
-        x_next, result = self.advance(t, *validate_io(self, x, u, w))
+        where = type(self).__name__
+        x = as_vector(x, self.state_size, "x (the state)", where)
+        u = as_vector(u, self.control_size, "u (the control)", where)
+        if w is not None:
+            w = as_vector(w, self.disturbance_size, "w (the disturbance)", where)
+        x_next, result = self.advance(t, x, u, w)
         if result is RESULTS.successful:
             return x_next
         return result.error_if(x_next, result != RESULTS.successful)
+
+
+def zeros_if_none(w: Array | None, size: int, like: Array) -> Array:
+    """A zero disturbance where none is given."""
+    return jnp.zeros(size, like.dtype) if w is None else w

@@ -24,7 +24,7 @@ class Delayed(AbstractWrapper):
 
     - `dynamics`: the plant.
     - `controls`: steps until a control acts, 0 by default.
-    - `sensor`: steps until an observation is seen, 0 by default.
+    - `sensor`: steps until an observation is read, 0 by default.
 
     **Raises:** `ValueError` if `dynamics` are none, or a delay is not a whole number of
     at least 0.
@@ -60,8 +60,8 @@ class Delayed(AbstractWrapper):
             for k in range(self.controls)
             for name in inner.control_names
         ]
-        seen = range(inner.observation_size if self.sensor else 0)
-        late += [f"y{i}[-{k + 1}]" for k in range(self.sensor) for i in seen]
+        outputs = range(inner.observation_size if self.sensor else 0)
+        late += [f"y{i}[-{k + 1}]" for k in range(self.sensor) for i in outputs]
         return (*inner.state_names, *late)
 
     def _cut(self, x: Array) -> tuple[Array, Array, Array]:
@@ -101,7 +101,7 @@ class Delayed(AbstractWrapper):
         return jnp.concatenate([x, *late]).astype(x.dtype)
 
     def advance(self, t, x, u, w):
-        own, controls, seen = self._cut(x)
+        own, controls, observed = self._cut(x)
         acting, late = u, []
         if self.controls:
             m = u.shape[0]
@@ -110,7 +110,7 @@ class Delayed(AbstractWrapper):
             late += [controls[:-m]] if self.controls > 1 else []
         if self.sensor:
             y = self.dynamics.observe(t, own).astype(x.dtype)
-            late += [y, seen[: -y.shape[0]]] if self.sensor > 1 else [y]
+            late += [y, observed[: -y.shape[0]]] if self.sensor > 1 else [y]
         after, result = self.dynamics.advance(t, own, acting, w)
         return jnp.concatenate([after, *late]), result
 
@@ -121,10 +121,10 @@ class Delayed(AbstractWrapper):
         return not delayed and self.dynamics.observes_state
 
     def observe(self, t, x):
-        own, _, seen = self._cut(x)
+        own, _, observed = self._cut(x)
         if not self.sensor:
             return self.dynamics.observe(t, own)
-        return seen[-(seen.shape[0] // self.sensor) :]
+        return observed[-(observed.shape[0] // self.sensor) :]
 
     def difference(self, x, x_ref):
         n = self.dynamics.state_size

@@ -9,27 +9,18 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_count, check_instance
-from .._jax import by_components
+from .._jax import by_components, join_state, split_state
 from .._module import parameter
 from .._results import choose, first_of, or_none, promote, RESULTS
 from ..systems import AbstractSystem
-from ..systems._plant import zeros_if_none
-from ._runge_kutta import (
-    join_state,
-    RK4,
-    runge_kutta_step,
-    split_state,
-    tableau_of,
-)
+from ._base import zeros_if_none
+from ._runge_kutta import RK4, runge_kutta_step, tableau_of
 from ._solvers import (
-    check_adaptive,
-    check_adjoint,
-    check_fixed_step,
-    check_solver,
-    check_stepsize_controller,
+    check_kind,
+    check_method,
     for_fixed_steps,
-    loud,
-    outcome,
+    raise_on_failure,
+    solve_result,
 )
 from ._start import Start
 from ._wrapper import AbstractDiscretization
@@ -139,54 +130,38 @@ class Discretized(AbstractDiscretization):
         if stepsize_controller is not None:
             if adjoint is None:
                 adjoint = diffrax.RecursiveCheckpointAdjoint()
-            max_steps = check_count(
-                256 if max_steps is None else max_steps, "max_steps", where
-            )
-        self.solver = solver
-        self.stepsize_controller = stepsize_controller
-        self.adjoint = adjoint
-        self.max_steps = max_steps
+            max_steps = 256 if max_steps is None else max_steps
+            max_steps = check_count(max_steps, "max_steps", where)
+        self.solver, self.stepsize_controller = solver, stepsize_controller
+        self.adjoint, self.max_steps = adjoint, max_steps
 
     def __check_init__(self):
         where, system, solver = "Discretized", self.system, self.solver
         check_instance(system, AbstractSystem, "system", where)
         noisy = system.noise == "brownian"
-        check_solver(solver, where)
-        if self.stepsize_controller is None:
-            if self.adjoint is not None:
-                raise ValueError(
-                    f"{where}: adjoint is given without stepsize_controller. Fixed "
-                    "steps are differentiated as they are written; give "
-                    "stepsize_controller=diffrax.PIDController(rtol=..., atol=...), or "
-                    "choose what `rollout` stores with its checkpoint= argument."
-                )
-            if self.max_steps is not None:
-                raise ValueError(
-                    f"{where}: max_steps needs stepsize_controller; with fixed steps "
-                    "give substeps."
-                )
-            if noisy and not isinstance(solver, _SDE_SOLVERS):
-                fitting = ", ".join(s.__name__ for s in _SDE_SOLVERS)
-                raise ValueError(
-                    f"{where}: solver {type(solver).__name__} does not fit a system "
-                    f"with a diffusion; use one of {fitting}."
-                )
-            if not noisy:
-                check_fixed_step(solver, where)
-        else:
-            check_stepsize_controller(self.stepsize_controller, where)
-            check_adaptive(solver, where)
-            if noisy:
-                raise ValueError(
-                    f"{where}: stepsize_controller does not fit a system with a "
-                    "diffusion, whose Brownian increments are drawn for fixed steps."
-                )
-            if self.substeps != 1:
-                raise ValueError(
-                    f"{where}: substeps must be 1 with a stepsize_controller, which "
-                    f"chooses the steps, got {self.substeps}."
-                )
-            check_adjoint(self.adjoint, where)
+        fixed = self.stepsize_controller is None
+        if fixed and self.adjoint is not None:
+            raise ValueError(
+                f"{where}: adjoint is given without stepsize_controller. Fixed "
+                "steps are differentiated as they are written; give "
+                "stepsize_controller=diffrax.PIDController(rtol=..., atol=...), or "
+                "choose what `rollout` stores with its checkpoint= argument."
+            )
+        method = solver, self.stepsize_controller, self.substeps, self.max_steps
+        check_method(*method, where, with_diffusion=noisy)
+        if not fixed:
+            check_kind(self.adjoint, "adjoint", where)
+        if noisy and not fixed:
+            raise ValueError(
+                f"{where}: stepsize_controller does not fit a system with a "
+                "diffusion, whose Brownian increments are drawn for fixed steps."
+            )
+        if noisy and not isinstance(solver, _SDE_SOLVERS):
+            fitting = ", ".join(s.__name__ for s in _SDE_SOLVERS)
+            raise ValueError(
+                f"{where}: solver {type(solver).__name__} does not fit a system "
+                f"with a diffusion; use one of {fitting}."
+            )
 
     @property
     def disturbance_size(self):
@@ -295,12 +270,12 @@ class Discretized(AbstractDiscretization):
             y0=x,
             args=args,
             stepsize_controller=self.stepsize_controller,
-            adjoint=loud(self.adjoint),
+            adjoint=raise_on_failure(self.adjoint),
             max_steps=self.max_steps,
             throw=False,
         )
         assert solution.ys is not None
-        result = outcome(solution, self.stepsize_controller, x.dtype)
+        result = solve_result(solution, self.stepsize_controller, x.dtype)
         return solution.ys[0], result
 
 
@@ -327,8 +302,8 @@ class _BrownianTerm(diffrax.AbstractTerm):
 
 
 def _field(s, x, args):
-    """The vector field at `s` after the start of the interval. An adjoint sees what is
-    in `args`, not what a function closes over.
+    """The vector field at `s` after the start of the interval. An adjoint reaches what
+    is in `args`, not what a function closes over.
     """
     system, start, u, held = args
     return start.after(s, lambda t: evaluate_field(system, t, x, u, held))
@@ -367,6 +342,6 @@ def _solver_step(solver, term, s, x, h, args):
     )
     if result is diffrax.RESULTS.successful:
         return x_next, RESULTS.successful
-    # Diffrax says to take more steps of a kind that there is none of here.
+    # The words of Diffrax for it speak of the steps of a step-size controller.
     solved = promote(result) == RESULTS.successful
     return x_next, choose(solved, RESULTS.successful, RESULTS.stage_not_solved)

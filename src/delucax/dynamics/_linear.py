@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import as_matrix, as_vector, is_concrete
+from .._check import as_matrix, check_matrices, check_real, checked_names, is_concrete
 from .._module import as_float_array, parameter
 from .._results import RESULTS
 from ..math import matvec
 from ..math._steps import row_at, step_at
-from ..systems._linear import check_matrices, checked_names
 from ._base import AbstractDynamics
 
 
@@ -82,13 +81,13 @@ class LinearDynamics(AbstractDynamics):
     ):
         where = "LinearDynamics"
         A, B, C, E = _checked_matrices(A, B, C, E)
-        steps = A.shape[0] if A.ndim == 3 else None
+        self.A, self.B, self.C, self.E, self.dt = A, B, C, E, dt
         n, m = B.shape[-2:]
-        self.A, self.B, self.C, self.E = A, B, C, E
-        self.dt = dt
-        self.x_ref = _point(x_ref, n, steps, "x_ref", jnp.zeros(n, A.dtype))
-        self.u_ref = _point(u_ref, m, steps, "u_ref", jnp.zeros(m, A.dtype))
-        self.x_next = _point(x_next, n, steps, "x_next", self.x_ref)
+        x_ref = jnp.zeros(n, A.dtype) if x_ref is None else x_ref
+        u_ref = jnp.zeros(m, A.dtype) if u_ref is None else u_ref
+        x_next = x_ref if x_next is None else x_next
+        points = (as_float_array(point) for point in (x_ref, u_ref, x_next))
+        self.x_ref, self.u_ref, self.x_next = (_over_time(p, 1, A) for p in points)
         self.state_names = checked_names(state_names, "x", n, "state_names", where)
         self.control_names = checked_names(
             control_names, "u", m, "control_names", where
@@ -97,17 +96,18 @@ class LinearDynamics(AbstractDynamics):
     def __check_init__(self):
         where = "LinearDynamics"
         _checked_matrices(self.A, self.B, self.C, self.E)
-        time = self.A.shape[:-2]
         n, m = self.B.shape[-2:]
         k = None if self.E is None else self.E.shape[-1]
         shapes = dict(B=(n, m), E=(n, k), x_ref=(n,), u_ref=(m,), x_next=(n,))
         for name, shape in shapes.items():
-            array = getattr(self, name)
-            if array is not None and array.shape != (*time, *shape):
+            array, shape = getattr(self, name), (*self.A.shape[:-2], *shape)
+            if array is None:
+                continue
+            if jnp.shape(array) != shape:
                 raise ValueError(
-                    f"{where}: {name} must have shape {(*time, *shape)}, got "
-                    f"{array.shape}."
+                    f"{where}: {name} must have shape {shape}, got {jnp.shape(array)}."
                 )
+            check_real(array, name, where)
         checked_names(self.state_names, "x", n, "state_names", where)
         checked_names(self.control_names, "u", m, "control_names", where)
 
@@ -165,41 +165,27 @@ def _checked_matrices(A: Any, B: Any, C: Any, E: Any) -> tuple[Array, Array, Any
     A, B, E = as_float_array(A), as_float_array(B), as_float_array(E)
     if not eqx.is_array(A) or A.ndim != 3:
         return check_matrices(A, B, C, E, where)
-    A, steps = as_matrix(A, "A", where, ndim=3), A.shape[0]
-    B = _in_time(as_matrix(B, "B", where, ndim=jnp.ndim(B)), steps, 2, "B")
-    if E is not None:
-        E = _in_time(as_matrix(E, "E", where, ndim=jnp.ndim(E)), steps, 2, "E")
-    if steps == 0:
+    A = as_matrix(A, "A", where, ndim=3)
+    if len(A) == 0:
         raise ValueError(f"{where}: A must have at least one time step.")
-    E0 = None if E is None else E[0]
-    return A, B, check_matrices(A[0], B[0], C, E0, where)[2], E
+    inputs: list[Any] = []
+    for name, value in (("B", B), ("E", E)):
+        if value is not None:
+            value = as_matrix(value, name, where, ndim=jnp.ndim(value))
+            value = _over_time(value, 2, A)
+            if value.ndim != 3 or len(value) != len(A):
+                raise ValueError(
+                    f"{where}: {name} must have 2 axes, or a leading time axis of "
+                    f"{len(A)} as A has, got shape {value.shape}."
+                )
+        inputs.append(value)
+    B, E = inputs
+    first = check_matrices(A[0], B[0], C, None if E is None else E[0], where)
+    return A, B, first[2], E
 
 
-def _in_time(array: Array, steps: int, ndim: int, name: str) -> Array:
-    """`array` with a leading time axis of `steps`, broadcast if it has none."""
-    if array.ndim == ndim:
-        return jnp.broadcast_to(array, (steps, *array.shape))
-    if array.ndim != ndim + 1 or array.shape[0] != steps:
-        raise ValueError(
-            f"LinearDynamics: {name} must have {ndim} axes, or a leading time axis of "
-            f"{steps} as A has, got shape {array.shape}."
-        )
-    return array
-
-
-def _point(value: Any, size: int, steps: int | None, name: str, default: Array):
-    if value is None:
-        array = default
-    else:
-        array = as_float_array(value)
-        if not (steps is not None and jnp.ndim(array) == 2):
-            array = as_vector(array, size, name, "LinearDynamics")
-    if steps is None:
+def _over_time(array: Any, ndim: int, A: Array) -> Any:
+    """`array`, of `ndim` axes, at each time of `A`, if that has a time axis."""
+    if A.ndim == 2 or not eqx.is_array(array) or array.ndim != ndim:
         return array
-    array = _in_time(array, steps, 1, name)
-    if array.shape[-1] != size:
-        raise ValueError(
-            f"LinearDynamics: {name} must have {size} entries a step, got shape "
-            f"{array.shape}."
-        )
-    return array
+    return jnp.broadcast_to(array, (len(A), *array.shape))

@@ -1,19 +1,15 @@
-"""First-order models by automatic differentiation, and their sampled form."""
+"""First-order models by automatic differentiation."""
 
 import functools
 from typing import Any, overload
 
-import jax
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
-import lineax as lx
-from jaxtyping import Array
 
-from .._check import as_vector, check_instance, check_step
+from .._check import as_vector
+from .._jax import jacobian
 from .._message import shortened
-from .._typing import RealScalar
+from .._typing import Control, RealScalar, State
 from ..systems import AbstractSystem, LinearSystem
-from ..systems._plant import zeros_if_none
 from ._base import AbstractDynamics
 from ._discretized import evaluate_field
 from ._linear import LinearDynamics
@@ -63,60 +59,37 @@ def linearize(
         upright.A
         ```
     """
+    hint = "for an environment, its `dynamics`"
+    model, x, u = at_point(model, t, x, u, "linearize", hint)
+    t = jnp.asarray(t, x.dtype)
+    C = jacobian(lambda x: model.observe(t, x))(x)
+    names = dict(state_names=model.state_names, control_names=model.control_names)
+    w = jnp.zeros(model.disturbance_size, x.dtype)
+    if isinstance(model, AbstractSystem):
+        held, E = (w if model.disturbance_names else None), None
+        f = functools.partial(evaluate_field, model)
+        A, B = jacobian(f, (1, 2))(t, x, u, held)
+        if model.disturbance_names:
+            E = jacobian(f, 3)(t, x, u, w)
+        dx = f(t, x, u, held)
+        return LinearSystem(A, B, C, E, x_ref=x, u_ref=u, dx_ref=dx, **names)
+    step = functools.partial(model, t)
+    A, B, E = jacobian(step, (0, 1, 2))(x, u, w)
+    return LinearDynamics(A, B, C, E, model.dt, x, u, step(x, u, w), **names)
+
+
+def at_point(
+    model: Any, t: RealScalar, x: Any, u: Any, where: str, hint: str
+) -> tuple[Any, State, Control]:
+    """`model` as it is at time `t`, with the state and control that are given, or else
+    those of its equilibrium."""
+    if not isinstance(model, AbstractSystem | AbstractDynamics):
+        raise ValueError(
+            f"{where}: model must be an AbstractSystem or AbstractDynamics ({hint}), "
+            f"got {type(model).__name__}."
+        )
     if isinstance(model, LinearDynamics):
         model = model.at(t)
-    is_system = isinstance(model, AbstractSystem)
-    if not is_system and not isinstance(model, AbstractDynamics):
-        raise ValueError(
-            "linearize: model must be an AbstractSystem or AbstractDynamics (for an "
-            f"environment, its `dynamics`), got {type(model).__name__}."
-        )
-    x, u = point_of(model, x, u, "linearize")
-    t = jnp.asarray(t, x.dtype)
-    C = _jacobian(lambda x: model.observe(t, x))(x)
-    if is_system:
-        w = jnp.zeros(model.disturbance_size, x.dtype)
-        held = w if model.disturbance_names else None
-        f = functools.partial(evaluate_field, model)
-        A, B = _jacobian(f, (1, 2))(t, x, u, held)
-        E = None
-        if model.disturbance_names:
-            E = _jacobian(f, 3)(t, x, u, w)
-        return LinearSystem(
-            A,
-            B,
-            C,
-            E,
-            x_ref=x,
-            u_ref=u,
-            dx_ref=f(t, x, u, held),
-            state_names=model.state_names,
-            control_names=model.control_names,
-        )
-
-    dynamics: Any = model
-
-    def step(x, u, w):
-        return dynamics(t, x, u, w)
-
-    w = zeros_if_none(None, model.disturbance_size, x)
-    A, B, E = _jacobian(step, (0, 1, 2))(x, u, w)
-    return LinearDynamics(
-        A,
-        B,
-        C,
-        E,
-        model.dt,
-        x,
-        u,
-        step(x, u, w),
-        state_names=model.state_names,
-        control_names=model.control_names,
-    )
-
-
-def point_of(model: Any, x: Any, u: Any, where: str) -> tuple[Array, Array]:
-    """The state and control that are given, or else those of the equilibrium."""
     if isinstance(x, OperatingPoint):
         if u is not None:
             raise ValueError(
@@ -129,92 +102,4 @@ def point_of(model: Any, x: Any, u: Any, where: str) -> tuple[Array, Array]:
         x = x_rest if x is None else x
         u = u_rest if u is None else u
     x = as_vector(x, model.state_size, "x (the state)", where)
-    return x, as_vector(u, model.control_size, "u (the control)", where)
-
-
-def c2d(system: LinearSystem, dt: Any, method: str = "zoh") -> LinearDynamics:
-    """The sampled form of a continuous linear system.
-
-    `"zoh"`, exact for a control held over the step, by one matrix exponential:
-    `A_d = exp(A dt)`, `B_d = (integral over [0, dt] of exp(A s) ds) B`.
-    `"tustin"`, the trapezoidal rule under a held control:
-    `A_d = (I - A dt/2)^-1 (I + A dt/2)`, `B_d = (I - A dt/2)^-1 B dt`.
-
-    **Arguments:**
-
-    - `system`: the linear system (from [`delucax.linearize`][], for instance).
-    - `dt`: the step, a positive number.
-    - `method`: `"zoh"` (default) or `"tustin"`.
-
-    **Returns:** [`delucax.LinearDynamics`][] about the same operating point. A
-    disturbance that enters the vector field is held too.
-
-    **Raises:** `ValueError` if `system` is not a `LinearSystem`, `dt` is not positive,
-    or `method` is unknown.
-
-    Source: Van Loan, 1978 (`"zoh"`); Tustin, 1947.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-
-        upright = dlx.linearize(dlx.systems.Pendulum())
-        dlx.c2d(upright, dt=0.05).A
-        ```
-    """
-    check_instance(system, LinearSystem, "system", "c2d")
-    check_step(dt, "c2d")
-    n = system.state_size
-    inputs = [system.B, system.dx_ref[:, None]]
-    if system.E is not None:
-        inputs.append(system.E)
-    stacked = jnp.concatenate(inputs, axis=1)
-    if method == "zoh":
-        k = stacked.shape[1]
-        block = jnp.zeros((n + k, n + k), stacked.dtype)
-        block = block.at[:n, :n].set(system.A).at[:n, n:].set(stacked)
-        exponential = jsl.expm(block * dt)
-        A, columns = exponential[:n, :n], exponential[:n, n:]
-    elif method == "tustin":
-        half = system.A * (dt / 2)
-        eye = jnp.eye(n, dtype=half.dtype)
-        right = jnp.concatenate([eye + half, stacked * dt], axis=1)
-        solved = _solve(eye - half, right)
-        A, columns = solved[:, :n], solved[:, n:]
-    else:
-        raise ValueError(f"c2d: method must be 'zoh' or 'tustin', got {method!r}.")
-    m = system.control_size
-    B, drift, E = columns[:, :m], columns[:, m], columns[:, m + 1 :]
-    return LinearDynamics(
-        A,
-        B,
-        system.C,
-        None if system.E is None else E,
-        dt,
-        system.x_ref,
-        system.u_ref,
-        system.x_ref + drift,
-        state_names=system.state_names,
-        control_names=system.control_names,
-    )
-
-
-def _solve(matrix: Array, right: Array) -> Array:
-    operator = lx.MatrixLinearOperator(matrix)
-    solve = lambda b: lx.linear_solve(operator, b, lx.LU()).value  # noqa: E731
-    return jax.vmap(solve, in_axes=1, out_axes=1)(right)
-
-
-def _jacobian(f: Any, argnums: Any = 0) -> Any:
-    """Forward mode; reverse where a solver inside has only that."""
-
-    def jacobian(*args):
-        try:
-            return jax.jacfwd(f, argnums)(*args)
-        except TypeError as error:
-            if "forward-mode" not in str(error):
-                raise
-            return jax.jacrev(f, argnums)(*args)
-
-    return jacobian
+    return model, x, as_vector(u, model.control_size, "u (the control)", where)

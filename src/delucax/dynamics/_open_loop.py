@@ -8,14 +8,12 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_vector, check_instance, check_real
-from .._jax import by_components
-from .._message import shortened
+from .._check import as_rows, as_vector, check_instance
+from .._jax import by_components, join_state, split_state, stack_steps
 from .._module import as_float_array
 from .._results import choose, first_failure, first_of, or_none, RESULTS
 from .._typing import RealScalar
 from ._base import AbstractDynamics
-from ._runge_kutta import join_state, split_state, stack_steps
 
 
 def open_loop(
@@ -56,14 +54,9 @@ def open_loop(
     where = "open_loop"
     check_instance(dynamics, AbstractDynamics, "dynamics", where)
     x0 = as_vector(x0, dynamics.state_size, "x0", where)
-    controls = _sequence(controls, dynamics.control_size, "controls", where)
+    controls = as_rows(controls, dynamics.control_size, "controls", where)
     if w is not None:
-        w = _sequence(w, dynamics.disturbance_size, "w", where)
-        if w.shape[0] != controls.shape[0]:
-            raise ValueError(
-                f"{where}: w must have as many steps as controls "
-                f"({controls.shape[0]}), got shape {w.shape}."
-            )
+        w = as_rows(w, dynamics.disturbance_size, "w", where, controls.shape[0])
     return _open_loop(dynamics, x0, controls, w, as_float_array(t0))
 
 
@@ -86,14 +79,3 @@ def _open_loop(dynamics, x0, controls, w, t0):
     end = choose(finite, RESULTS.successful, RESULTS.diverged)
     result = first_failure(first_of(results), end)
     return result.error_if(states, result != RESULTS.successful)
-
-
-def _sequence(value: Any, size: int, name: str, where: str) -> Array:
-    array = as_float_array(value)
-    if not eqx.is_inexact_array(array) or array.ndim != 2 or array.shape[1] != size:
-        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
-        raise ValueError(f"{where}: {name} must have shape (steps, {size}), got {got}.")
-    if array.shape[0] == 0:
-        raise ValueError(f"{where}: {name} must have at least one step.")
-    check_real(array, name, where)
-    return array

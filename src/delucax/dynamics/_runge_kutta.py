@@ -10,18 +10,11 @@ from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import diffrax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._jax import fence
+from .._jax import COMPONENTS_UP_TO, fence, join_state, split_state
 from .._typing import RealScalar
-
-
-COMPONENTS_UP_TO = 16
-"""States larger than this are combined as whole arrays, to keep programs short."""
-STACKED_FIRST_UP_TO = 6
-"""Trajectories of more components are extended before they are stacked."""
 
 
 class RK4(diffrax.AbstractERK):
@@ -80,12 +73,11 @@ def tableau_of(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau | None:
     if type(solver) is diffrax.Euler:
         return _EULER
     # A wrapped solver passes for the one inside, but has no tableau of its own.
-    tableau = getattr(solver, "tableau", None)
-    if isinstance(solver, diffrax.AbstractERK) and isinstance(
-        tableau, diffrax.ButcherTableau
-    ):
-        return tableau
-    return None
+    is_wrapped = isinstance(solver, diffrax.AbstractWrappedSolver)
+    if is_wrapped or not isinstance(solver, diffrax.AbstractERK):
+        return None
+    tableau = solver.tableau
+    return tableau if isinstance(tableau, diffrax.ButcherTableau) else None
 
 
 def runge_kutta_step(
@@ -100,14 +92,14 @@ def runge_kutta_step(
     rows = [(), *(tuple(map(float, row)) for row in tableau.a_lower)][:used]
     nodes = [0.0, *map(float, tableau.c)][:used]
     weights = tuple(map(float, tableau.b_sol))[:used]
-    split = x.shape[0] <= COMPONENTS_UP_TO
-    base = tuple(x) if split else (x,)
+    size = x.shape[0]
+    base = split_state(x)
     slopes: list[Sequence[Array]] = []
     for row, node in zip(rows, nodes, strict=True):
-        stage = join(_combine(base, row, slopes, h), split)
+        stage = join_state(_combine(base, row, slopes, h), size)
         slope = field(t + node * h if node else t, stage)
-        slopes.append(fence(*slope) if split else (slope,))
-    return join(_combine(base, weights, slopes, h), split).astype(x.dtype)
+        slopes.append(fence(*slope) if size <= COMPONENTS_UP_TO else (slope,))
+    return join_state(_combine(base, weights, slopes, h), size).astype(x.dtype)
 
 
 def _combine(base, weights, slopes, h):
@@ -122,41 +114,3 @@ def _combine(base, weights, slopes, h):
             total = total + a * k[j]
         combined.append(start + h * total)
     return tuple(combined)
-
-
-def split_state(x: Array) -> tuple[Array, ...]:
-    """A small state as its components, which is how loops carry it."""
-    return tuple(x) if x.shape[0] <= COMPONENTS_UP_TO else (x,)
-
-
-def join_state(parts: tuple[Array, ...], size: int) -> Array:
-    """The inverse of `split_state`."""
-    return join(parts, size <= COMPONENTS_UP_TO)
-
-
-def stack_steps(
-    parts: tuple[Array, ...], size: int, last: tuple[Array, ...] = ()
-) -> Array:
-    """Vectors over time, shape `(T, size)`, from the components of each step.
-
-    `last` is put behind them: of a few components when they are one array, of more
-    one by one, which is what a batch on CPU transposes fastest. (And a loop that keeps
-    the state before each step, not the one after it, does not tempt XLA to compute the
-    step twice, once to carry it and once to keep it.)
-    """
-    if size <= STACKED_FIRST_UP_TO:
-        # A reshape of one component is free, where a stack would copy it.
-        steps = parts[0][:, None] if size == 1 else jnp.stack(parts, axis=1)
-        if last:
-            steps = jnp.concatenate([steps, jnp.stack(last)[None].astype(steps.dtype)])
-        return steps
-    if last:
-        parts = tuple(
-            jnp.concatenate([a, b[None].astype(a.dtype)])
-            for a, b in zip(parts, last, strict=True)
-        )
-    return jnp.stack(parts, axis=1) if size <= COMPONENTS_UP_TO else parts[0]
-
-
-def join(parts: Sequence[Array], split: bool) -> Array:
-    return jnp.stack(parts) if split else parts[0]

@@ -1,5 +1,6 @@
-"""Which Diffrax solvers fit, and how they are made to."""
+"""Diffrax solvers: which of them fit, and implicit ones at fixed steps."""
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -15,39 +16,57 @@ from .._results import choose, promote, Result, RESULTS
 from ._runge_kutta import tableau_of
 
 
-def check_solver(solver: Any, where: str) -> None:
-    """Raise unless `solver` is a Diffrax solver."""
-    if not isinstance(solver, diffrax.AbstractSolver):
+_KINDS: dict[str, tuple[type, str]] = {
+    "solver": (
+        diffrax.AbstractSolver,
+        "a Diffrax solver such as diffrax.Tsit5() (an instance, not the class), got",
+    ),
+    "stepsize_controller": (
+        diffrax.AbstractAdaptiveStepSizeController,
+        "adaptive, such as diffrax.PIDController(rtol=1e-6, atol=1e-8); for fixed "
+        "steps leave it out and give substeps. Got",
+    ),
+    "adjoint": (
+        diffrax.AbstractAdjoint,
+        "a Diffrax adjoint such as diffrax.RecursiveCheckpointAdjoint(), got",
+    ),
+}
+
+
+def check_kind(value: Any, name: str, where: str) -> None:
+    """Raise unless `value` is what Diffrax takes as its argument `name`."""
+    kind, words = _KINDS[name]
+    if not isinstance(value, kind):
+        raise ValueError(f"{where}: {name} must be {words} {value!r}.")
+
+
+def check_method(
+    solver: Any,
+    stepsize_controller: Any,
+    substeps: int,
+    max_steps: Any,
+    where: str,
+    *,
+    with_diffusion: bool = False,
+) -> None:
+    """Raise unless `solver` takes the steps that the other arguments ask for."""
+    check_kind(solver, "solver", where)
+    if stepsize_controller is not None:
+        check_kind(stepsize_controller, "stepsize_controller", where)
+        check_adaptive(solver, where)
+        if substeps != 1:
+            raise ValueError(
+                f"{where}: substeps must be 1 with a stepsize_controller, which "
+                f"chooses the steps, got {substeps}."
+            )
+    elif max_steps is not None:
         raise ValueError(
-            f"{where}: solver must be a Diffrax solver such as diffrax.Tsit5() (an "
-            f"instance, not the class), got {solver!r}."
+            f"{where}: max_steps needs stepsize_controller; with fixed steps give "
+            "substeps."
         )
-
-
-def check_stepsize_controller(stepsize_controller: Any, where: str) -> None:
-    """Raise unless `stepsize_controller` chooses steps by their error."""
-    if not isinstance(stepsize_controller, diffrax.AbstractAdaptiveStepSizeController):
-        raise ValueError(
-            f"{where}: stepsize_controller must be adaptive, such as "
-            "diffrax.PIDController(rtol=1e-6, atol=1e-8); for fixed steps leave it "
-            f"out and give substeps. Got {stepsize_controller!r}."
-        )
-
-
-def check_adjoint(adjoint: Any, where: str) -> None:
-    """Raise unless `adjoint` is a Diffrax adjoint."""
-    if not isinstance(adjoint, diffrax.AbstractAdjoint):
-        raise ValueError(
-            f"{where}: adjoint must be a Diffrax adjoint such as "
-            f"diffrax.RecursiveCheckpointAdjoint(), got {adjoint!r}."
-        )
-
-
-def check_fixed_step(solver: diffrax.AbstractSolver, where: str) -> None:
-    """Raise unless `solver` takes fixed steps of `dx/dt = f(t, x, u, w)`."""
-    if isinstance(solver, diffrax.AbstractImplicitSolver):
+    elif isinstance(solver, diffrax.AbstractImplicitSolver) and not with_diffusion:
         _check_implicit(solver, where)
-    elif tableau_of(solver) is None:
+    elif tableau_of(solver) is None and not with_diffusion:
         raise ValueError(
             f"{where}: solver {type(solver).__name__} does not fit fixed steps of "
             "dx/dt = f(t, x, u, w); use an explicit Runge-Kutta method "
@@ -61,8 +80,8 @@ def check_adaptive(solver: diffrax.AbstractSolver, where: str) -> None:
     """Raise unless a step-size controller can steer `solver`."""
     name = type(solver).__name__
     tableau = tableau_of(solver)
-    exact = tableau is not None and not tableau.b_error.any()
-    if exact or not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+    no_error = tableau is not None and not tableau.b_error.any()
+    if no_error or not isinstance(solver, diffrax.AbstractAdaptiveSolver):
         raise ValueError(
             f"{where}: solver {name} estimates no error, so a stepsize_controller "
             "cannot steer it; use diffrax.Tsit5(), or wrap it: "
@@ -79,57 +98,45 @@ def _check_implicit(solver: diffrax.AbstractSolver, where: str) -> None:
             "non-stiff parts; use diffrax.ImplicitEuler, Kvaerno3, Kvaerno4 or "
             "Kvaerno5."
         )
-    if not hasattr(solver, "root_finder"):
+    if isinstance(solver, diffrax.AbstractWrappedSolver):
         raise ValueError(
             f"{where}: solver {type(solver).__name__} hides the root finder of the "
             "implicit solver that it wraps; use that one by itself."
         )
 
 
-def outcome(solution: diffrax.Solution, controller: Any, dtype: Any) -> Result:
-    """What became of a solve. Where the steps ran out, and the tolerance is finer than
-    rounding of the state, it is the tolerance that is to blame."""
+def solve_result(solution: diffrax.Solution, controller: Any, dtype: Any) -> Result:
+    """The result of a solve with a step-size controller, or without one (`None`).
+
+    Where the steps ran out, and the tolerance is finer than rounding of the state, the
+    tolerance is to blame.
+    """
     result = promote(solution.result)
-    while not hasattr(controller, "rtol") and hasattr(controller, "controller"):
-        controller = controller.controller
-    rtol = getattr(controller, "rtol", 1.0)
-    fine = rtol < 4 * float(jnp.finfo(dtype).eps)
-    if fine is False:
+    if controller is None:
         return result
-    blamed = fine & (result == RESULTS.max_steps_reached)
+    is_fine = controller.rtol < 4 * float(jnp.finfo(dtype).eps)
+    if is_fine is False:
+        return result
+    blamed = is_fine & (result == RESULTS.max_steps_reached)
     return choose(blamed, RESULTS.beyond_precision, result)
 
 
+def _forwarded(name: str) -> Any:
+    return property(lambda self: getattr(self.solver, name))
+
+
 class AbstractTransparentSolver(diffrax.AbstractWrappedSolver):
-    """A solver around another, which Diffrax sees through."""
+    """A solver around another, with the attributes of that one."""
 
     solver: eqx.AbstractVar[diffrax.AbstractSolver]
 
-    @property
-    def term_structure(self):
-        return self.solver.term_structure
-
-    @property
-    def term_compatible_contr_kwargs(self):
-        return self.solver.term_compatible_contr_kwargs
-
-    @property
-    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self.solver.interpolation_cls
-
+    term_structure = _forwarded("term_structure")
+    term_compatible_contr_kwargs = _forwarded("term_compatible_contr_kwargs")
+    interpolation_cls = _forwarded("interpolation_cls")
     # Diffrax looks for these on what passes for an implicit or Runge-Kutta solver.
-
-    @property
-    def root_finder(self):
-        return self.solver.root_finder  # pyright: ignore
-
-    @property
-    def root_find_max_steps(self):
-        return self.solver.root_find_max_steps  # pyright: ignore
-
-    @property
-    def scan_kind(self):
-        return self.solver.scan_kind  # pyright: ignore
+    root_finder = _forwarded("root_finder")
+    root_find_max_steps = _forwarded("root_find_max_steps")
+    scan_kind = _forwarded("scan_kind")
 
     def order(self, terms):
         return self.solver.order(terms)
@@ -175,12 +182,11 @@ class _Chord(optx.AbstractRootFinder):
         del fn, y, args, options, tags
         size = state.diffsize  # of the last change, in units of the tolerance
         rate = size / state.diffsize_prev
-        left = size * rate / (1 - rate)  # what is left to go, if it goes on like this
+        left = size * rate / (1 - rate)  # the distance to the root at this rate
         enough = state.step >= 2
         # Close to the root rounding takes over, and the rate says nothing.
         converged = enough & ((size < 0.1) | (rate < 1) & (left < 0.01))
-        lost = ~jnp.isfinite(size) | (rate > 2)
-        diverged = enough & ~converged & lost
+        diverged = enough & ~converged & (~jnp.isfinite(size) | (rate > 2))
         result = optx.RESULTS.where(
             diverged, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
         )
@@ -189,7 +195,7 @@ class _Chord(optx.AbstractRootFinder):
         return failed | converged | diverged, result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        return self._chord.postprocess(fn, y, aux, args, options, state, tags, result)
+        return y, aux, {}
 
 
 class _FixedStep(AbstractTransparentSolver):
@@ -204,63 +210,57 @@ class _FixedStep(AbstractTransparentSolver):
 
     @property
     def root_finder(self):
-        return self._with_tolerances(1.0).root_finder
+        return self._with_tolerances(1e-3, 1.0).root_finder
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        rtol, atol = _tolerances(y0.dtype)
+        is_double = y0.dtype == jnp.float64
+        rtol, atol = (1e-10, 1e-12) if is_double else (1e-5, 1e-6)
         scale = lax.stop_gradient(atol + rtol * jnp.abs(y0))
-        tableau = getattr(self.solver, "tableau", None)
-        if tableau is not None and tableau.fsal:  # then Diffrax solves for the slope
+        solver: Any = self.solver
+        is_runge_kutta = isinstance(self.solver, diffrax.AbstractDIRK)
+        if is_runge_kutta and solver.tableau.fsal:
+            # Then Diffrax solves for the slope.
             scale = scale / lax.stop_gradient(t1 - t0)
-        solver = self._with_tolerances(scale, rtol)
+        solver = self._with_tolerances(rtol, scale)
         return solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
 
-    def _with_tolerances(self, atol: Any, rtol: float = 1e-3) -> Any:
+    def _with_tolerances(self, rtol: float, atol: Any) -> Any:
         finder = self.solver.root_finder  # pyright: ignore
         if isinstance(finder, diffrax.VeryChord | optx.Chord):
             finder = _Chord(rtol=rtol, atol=atol, linear_solver=finder.linear_solver)
-        else:
-            values = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
-            names = _unset(finder)
-            finder = eqx.tree_at(
-                lambda f: [getattr(f, name) for name in names],
-                finder,
-                [values[name] for name in names],
-                is_leaf=lambda leaf: leaf is getattr(finder, names[0]),
-            )
+        values = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
+        for name in _unset(finder):
+            get = operator.attrgetter(name)
+            finder = eqx.tree_at(get, finder, values[name])
         return eqx.tree_at(lambda s: s.root_finder, self.solver, finder)
 
 
-def _tolerances(dtype: Any) -> tuple[float, float]:
-    return (1e-10, 1e-12) if dtype == jnp.float64 else (1e-5, 1e-6)
+_Unset = type(diffrax.with_stepsize_controller_tols(optx.Newton)().rtol)
+"""What Diffrax puts in the place of a tolerance that a step-size controller sets. The
+class itself has no public name."""
 
 
-def _unset(finder: Any) -> list[str]:
+def _unset(finder: optx.AbstractRootFinder) -> list[str]:
     """The tolerances that a root finder leaves to a step-size controller."""
-    # Diffrax's mark for them has no public name.
-    return [
-        name
-        for name in ("rtol", "atol", "norm")
-        if "stepsize" in repr(getattr(finder, name, None)).replace("_", "")
-    ]
+    names = ("rtol", "atol", "norm")
+    return [name for name in names if isinstance(getattr(finder, name), _Unset)]
 
 
 def for_fixed_steps(solver: Any) -> Any:
     """An implicit solver that works without a step-size controller and outside of
     `diffeqsolve`, and can be differentiated both ways there.
     """
-    if getattr(solver, "scan_kind", "bounded") is None:
-        solver = eqx.tree_at(
-            lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None
-        )
+    if isinstance(solver, diffrax.AbstractDIRK) and solver.scan_kind is None:
+        is_none = lambda leaf: leaf is None
+        solver = eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=is_none)
     return _FixedStep(solver) if _unset(solver.root_finder) else solver
 
 
-def loud(adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractAdjoint:
+def raise_on_failure(adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractAdjoint:
     """An adjoint that raises where a solve of its own fails.
 
     The backward solve of `BacksolveAdjoint` takes over `throw` from the forward one,
-    which has it off to return a status; a gradient has no status to be wrong by.
+    which is false to return a status. A gradient has no status.
     """
     if not isinstance(adjoint, diffrax.BacksolveAdjoint):
         return adjoint

@@ -61,8 +61,8 @@ def _change(function, time, off):
 def _varies(function, t):
     """Whether `function` has derivatives with respect to time that are not all zero.
 
-    They are traced and not compiled. What cannot be differentiated says so in many
-    ways, and what is wrong with the function itself is seen when it is evaluated.
+    They are traced and not compiled. A function without them raises one of many errors;
+    what is wrong with the function itself raises when it is evaluated.
     """
     try:
         traced = jax.make_jaxpr(lambda t, off: _change(function, t, off)[1])(t, t)

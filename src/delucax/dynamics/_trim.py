@@ -14,19 +14,16 @@ from .._check import check_bool, check_finite, check_number, is_concrete
 from .._message import shortened
 from .._results import choose, RESULTS
 from .._typing import RealScalar
+from ..math._drift import relative_drift, ULPS, units_of
 from ..systems import AbstractSystem
 from ._base import AbstractDynamics
 from ._discretized import Discretized, evaluate_field
-from ._linear import LinearDynamics
-from ._linearize import point_of
+from ._linearize import at_point
 from ._operating_point import OperatingPoint
 
 
 _MAX_STEPS = 256
 """Of each of the two methods."""
-
-_ULPS = 4
-"""What rounding leaves, in units of the last place."""
 
 
 def trim(
@@ -93,16 +90,10 @@ def trim(
         ```
     """
     where = "trim"
-    if not isinstance(model, AbstractSystem | AbstractDynamics):
-        raise ValueError(
-            f"{where}: model must be an AbstractSystem or AbstractDynamics (an "
-            f"environment has `env.trim()`), got {type(model).__name__}."
-        )
     check_bool(throw, "throw", where)
     check_number(t, "t", where)
-    if isinstance(model, LinearDynamics):
-        model = model.at(t)
-    x, u = point_of(model, x, u, where)
+    hint = "an environment has `env.trim()`"
+    model, x, u = at_point(model, t, x, u, where, hint)
     check_finite(x, "x (the state)", where)
     check_finite(u, "u (the control)", where)
     guess = jnp.concatenate([x, u])
@@ -133,26 +124,6 @@ def trim(
     return point
 
 
-def relative_drift(
-    drift: Array, jacobian: Array, x: Array, u: Array, *, is_map: bool
-) -> Array:
-    """How far from rest a point is: the largest share of `drift` among its terms,
-
-    `|drift_i| / (|drift_i| + sum_j |jacobian_ij| unit_j)`, row by row. Of a map the
-    drift is `F(x) - x`, and what the rounding of `x_i` may leave is taken off. Axes in
-    front are times, along which a unit is that of the largest value.
-    """
-    largest = lambda z: jnp.max(jnp.abs(z).reshape(-1, z.shape[-1]), axis=0)
-    terms = jnp.abs(jacobian) @ jnp.concatenate(
-        [_units(largest(x)), _units(largest(u))]
-    )
-    left = jnp.abs(drift)
-    if is_map:
-        rounding = _ULPS * jnp.finfo(x.dtype).eps * largest(x)
-        left = jnp.maximum(left - rounding, 0)
-    return jnp.max(jnp.where(left == 0, 0, left / (left + terms)))
-
-
 def _fixed(model: Any, fix: Any, where: str) -> dict[int, Any]:
     """From the index of each state and control that is held to its value, if given."""
     if isinstance(fix, str):
@@ -179,15 +150,6 @@ def _fixed(model: Any, fix: Any, where: str) -> dict[int, Any]:
     return values
 
 
-def _units(z: Array) -> Array:
-    """The size of each entry, or where it is zero up to rounding 1, or that of the
-    largest entry if this is less and not zero."""
-    size = jnp.abs(z)
-    largest = jnp.max(size, initial=0)
-    floor = jnp.where(largest > 0, jnp.minimum(largest, 1), 1)
-    return jnp.where(size > 100 * jnp.finfo(z.dtype).eps * floor, size, floor)
-
-
 class _Problem(eqx.Module):
     """Unknowns are changes of what is free, relative to its units."""
 
@@ -199,18 +161,18 @@ class _Problem(eqx.Module):
     @property
     def units(self) -> Array:
         n = self.model.state_size
-        return jnp.concatenate([_units(self.guess[:n]), _units(self.guess[n:])])
+        return jnp.concatenate([units_of(self.guess[:n]), units_of(self.guess[n:])])
 
     def at(self, z: Array) -> Array:
-        moves, units = jnp.array(self.free), self.units
-        y = self.guess.at[moves].add(units[moves] * z)
+        free, units = jnp.array(self.free), self.units
+        y = self.guess.at[free].add(units[free] * z)
         # Set to zero where it is rounding alone; its derivative stays.
-        tiny = jnp.abs(y) <= _ULPS * jnp.finfo(y.dtype).eps * units
-        tiny = tiny & jnp.zeros(y.shape, bool).at[moves].set(True)
+        tiny = jnp.abs(y) <= ULPS * jnp.finfo(y.dtype).eps * units
+        tiny = tiny & jnp.zeros(y.shape, bool).at[free].set(True)
         return y - lax.stop_gradient(jnp.where(tiny, y, 0))
 
     def drift(self, y: Array) -> Array:
-        """How fast, or in a step how far, the state moves."""
+        """The rate of change of the state, or its change in a step."""
         model, n = self.model, self.model.state_size
         x, u = y[:n], y[n:]
         if isinstance(model, AbstractSystem):
@@ -226,28 +188,28 @@ class _Problem(eqx.Module):
 
         def along(pair):
             first = lambda y: jax.jvp(self.drift, (y,), (pair[0],))
-            (drift, slope), (_, bend) = jax.jvp(first, (y,), (pair[1],))
-            return drift, slope, bend
+            (drift, slope), (_, curvature) = jax.jvp(first, (y,), (pair[1],))
+            return drift, slope, curvature
 
         # A pair of directions after the other: a batch of them compiles for longer.
         pairs = jnp.repeat(eye, k, 0), jnp.tile(eye[jnp.array(self.free)], (y.size, 1))
-        drift, slopes, bends = lax.map(along, pairs)
-        return drift[0], slopes[::k].T, bends.reshape(y.size, k, -1).transpose(2, 0, 1)
+        drift, slopes, H = lax.map(along, pairs)
+        return drift[0], slopes[::k].T, H.reshape(y.size, k, -1).transpose(2, 0, 1)
 
     def terms(self, J: Array) -> Array:
-        """The size of what moves each state at the guess, in which residuals are."""
+        """The size of the terms of each equation at the guess, a unit of it."""
         terms = jnp.abs(J) @ self.units
         return jnp.where(terms > 0, terms, 1)
 
 
 class _Point(eqx.Module):
-    """What a step of the solve looks at.
+    """The conditions of the nearest point, expanded at one.
 
     With the residual r and its Jacobian J, the nearest point z is that of its own
     linear model, `z = J^+ (J z - r)`: then `J' r = 0`, and z has no part in the null
     space of J. That holds for as many equations as unknowns, for fewer, for more, and
-    where J has not full rank. `off` is the difference of the two sides, and `slope` its
-    derivative.
+    where J has not full rank. `offset` is the difference of the two sides, and `slope`
+    its derivative.
     """
 
     drift: Array
@@ -256,30 +218,30 @@ class _Point(eqx.Module):
     cost: Array
     gradient: Array
     gram: Array
-    off: Array
+    offset: Array
     slope: Array
 
 
-def _look(problem: _Problem, z: Array, terms: Array) -> _Point:
+def _expand(problem: _Problem, z: Array, terms: Array) -> _Point:
     """The point at `z`, whose terms are those given, or if these are zero its own."""
-    moves, units = jnp.array(problem.free), problem.units
+    free, units = jnp.array(problem.free), problem.units
     drift, jacobian, H = problem.expansion(problem.at(z))
     terms = jnp.where(terms > 0, terms, problem.terms(jacobian))
-    unit = units[moves]
-    r, J = drift / terms, jacobian[:, moves] * unit / terms[:, None]
-    H = H[:, moves] * unit[:, None] * unit / terms[:, None, None]
+    unit = units[free]
+    r, J = drift / terms, jacobian[:, free] * unit / terms[:, None]
+    H = H[:, free] * unit[:, None] * unit / terms[:, None, None]
     rtol = float(100 * max(J.shape) * jnp.finfo(J.dtype).eps)
     # Not by Lineax, whose solves raise in their derivative where there is NaN.
     P = jnp.linalg.pinv(J, rtol=rtol)
     linear = J @ z - r
     near = P @ linear
-    off = z - near
+    offset = z - near
     # The derivative of P by that of J (Golub and Pereyra, 1973).
     eye = jnp.eye(z.size, dtype=z.dtype)
-    slope = eye - P @ jnp.einsum("ijk,j->ik", H, off)
+    slope = eye - P @ jnp.einsum("ijk,j->ik", H, offset)
     slope -= P @ P.T @ jnp.einsum("ijk,i->jk", H, linear - J @ near)
     slope -= (eye - P @ J) @ jnp.einsum("ijk,i->jk", H, P.T @ near)
-    return _Point(drift, jacobian, terms, r @ r, J.T @ r, J.T @ J, off, slope)
+    return _Point(drift, jacobian, terms, r @ r, J.T @ r, J.T @ J, offset, slope)
 
 
 @eqx.filter_custom_jvp
@@ -295,7 +257,7 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
     eps = jnp.finfo(dtype).eps
     zero, zeros = jnp.zeros(len(problem.free), dtype), jnp.zeros(n, dtype)
     one, inf = jnp.ones((), dtype), jnp.full((), jnp.inf, dtype)
-    blank = jax.eval_shape(_look, problem, zero, zeros)
+    blank = jax.eval_shape(_expand, problem, zero, zeros)
     blank = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, dtype), blank)
     blank = eqx.tree_at(lambda point: (point.cost, point.terms), blank, (inf, zeros))
     select = lambda which, a, b: jax.tree.map(functools.partial(jnp.where, which), a, b)
@@ -305,8 +267,8 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
         return (step < 2 * _MAX_STEPS) & ~done & jnp.all(jnp.isfinite(d))
 
     def body(carry):
-        step, newton, last, _, z, d, damping, radius, old, best = carry
-        new = _look(problem, z + d, old.terms)
+        step, newton, converged, _, z, d, damping, radius, old, best = carry
+        new = _expand(problem, z + d, old.terms)
         finite = jnp.isfinite(jnp.sum(new.slope) + jnp.sum(new.gram))
         better = newton | (finite & (new.cost < old.cost))
         z, new = select(better, (z + d, new), (z, old))
@@ -316,19 +278,20 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
         floor = eps * (jnp.max(diagonal) + eps)
         damped = new.gram + jnp.diag(damping * (diagonal + floor))
         matrix = jnp.where(newton, new.slope, damped)
-        d = -jnp.linalg.solve(matrix, jnp.where(newton, new.off, new.gradient))
+        d = -jnp.linalg.solve(matrix, jnp.where(newton, new.offset, new.gradient))
         length = jnp.max(jnp.abs(d))
         d = jnp.where(newton | (length <= radius), d, d * (radius / length))
         gap = jnp.max(jnp.abs(d))
         small = gap <= 1e3 * eps * (1 + jnp.max(jnp.abs(z)))
-        turn = newton | small | (step >= _MAX_STEPS)
         here = new.cost, z, new.drift, new.jacobian
         best = (
             *select(new.cost < best[0], here, best[:-1]),
             jnp.where(newton, best[-1], gap),
         )
-        newton_ends = newton & small
-        return step + 1, turn, newton_ends, last, z, d, damping, radius, new, best
+        # One more step after Newton's method has converged.
+        converged, done = newton & small, converged
+        newton = newton | small | (step >= _MAX_STEPS)
+        return step + 1, newton, converged, done, z, d, damping, radius, new, best
 
     no = jnp.array(False)
     best = inf, zero, blank.drift, blank.jacobian, inf
@@ -349,13 +312,14 @@ def _nearest_jvp(primals, tangents):
     """By the implicit function theorem."""
     z, *rest = _nearest(*primals)
 
-    def off(problem, z):
-        return _look(problem, z, problem.terms(problem.expansion(problem.guess)[1])).off
+    def offset(problem, z):
+        _, jacobian, _ = problem.expansion(problem.guess)
+        return _expand(problem, z, problem.terms(jacobian)).offset
 
-    _, change = eqx.filter_jvp(lambda problem: off(problem, z), primals, tangents)
-    dz = -jnp.linalg.solve(jax.jacfwd(off, 1)(primals[0], z), change)
-    moved = lambda problem, z: problem.drift(problem.at(z))
-    _, drift = eqx.filter_jvp(moved, (*primals, z), (*tangents, dz))
+    _, change = eqx.filter_jvp(lambda problem: offset(problem, z), primals, tangents)
+    dz = -jnp.linalg.solve(jax.jacfwd(offset, 1)(primals[0], z), change)
+    drift_at = lambda problem, z: problem.drift(problem.at(z))
+    _, drift = eqx.filter_jvp(drift_at, (*primals, z), (*tangents, dz))
     return (z, *rest), (dz, drift, *(jnp.zeros_like(each) for each in rest[1:]))
 
 
@@ -365,13 +329,13 @@ def _solve(model: Any, t: Array, guess: Array, free: tuple[int, ...]):
     n = model.state_size
     eps = jnp.finfo(guess.dtype).eps
     problem = _Problem(model, t, guess, free)
-    z, drift, jacobian, off = _nearest(problem)
+    z, drift, jacobian, offset = _nearest(problem)
     y = problem.at(z)
     x, u = y[:n], y[n:]
     is_system = isinstance(model, AbstractSystem)
-    moved = relative_drift(drift, jacobian, x, u, is_map=not is_system)
-    rests = lax.stop_gradient(moved) <= eps**0.5
-    settled = _settled(off, z)
+    share = relative_drift(drift, jacobian, x, u, is_map=not is_system)
+    rests = lax.stop_gradient(share) <= eps**0.5
+    settled = _settled(offset, z)
     failure = choose(settled, RESULTS.no_equilibrium, RESULTS.not_converged)
     failure = choose(jnp.all(jnp.isfinite(drift)), failure, RESULTS.diverged)
     if is_system:

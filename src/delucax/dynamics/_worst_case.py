@@ -1,4 +1,4 @@
-"""An adversary that sees the state."""
+"""An adversary that acts on the state."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from ._wrapper import AbstractWrapper
 
 
 class WorstCase(AbstractWrapper):
-    """Dynamics with an adversary who sees the state and adds to the disturbance,
+    """Dynamics with an adversary that measures the state and adds to the disturbance,
 
     `x_next = F(t, x, u, w + L difference(x, x_ref))`,
 

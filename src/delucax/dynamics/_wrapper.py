@@ -10,56 +10,38 @@ from ..systems import AbstractPlant, AbstractSystem
 from ._base import AbstractDynamics
 
 
+def _forwarded(name: str) -> Any:
+    """A property of the plant inside."""
+    return property(
+        lambda self: getattr(self._inside, name), doc="That of the plant inside."
+    )
+
+
+def _forwarded_units(what: str) -> Any:
+    """The units of the plant inside, where its names are the wrapper's too."""
+
+    def units(self):
+        same = getattr(self, f"{what}_names") == getattr(self._inside, f"{what}_names")
+        return getattr(self._inside, f"{what}_units") if same else ()
+
+    return property(units, doc="Those of the plant inside, where the names are.")
+
+
 class _Forwarding(AbstractDynamics):
-    """Whatever a subclass does not say is asked of the plant inside."""
+    """Dynamics whose names, sizes and hooks are those of a plant inside by default."""
 
     @property
     @abc.abstractmethod
     def _inside(self) -> AbstractPlant: ...
 
-    @property
-    def state_names(self):
-        """Those of the plant inside."""
-        return self._inside.state_names
-
-    @property
-    def control_names(self):
-        """Those of the plant inside."""
-        return self._inside.control_names
-
-    if not TYPE_CHECKING:  # properties in place of class attributes
-
-        @property
-        def disturbance_names(self):
-            """Those of the plant inside."""
-            return self._inside.disturbance_names
-
-        @property
-        def state_units(self):
-            """Those of the plant inside, where the states are its own."""
-            same = self.state_names == self._inside.state_names
-            return self._inside.state_units if same else ()
-
-        @property
-        def control_units(self):
-            """Those of the plant inside, where the controls are its own."""
-            same = self.control_names == self._inside.control_names
-            return self._inside.control_units if same else ()
-
-        @property
-        def time_unit(self):
-            """That of the plant inside."""
-            return self._inside.time_unit
-
-    @property
-    def disturbance_size(self):
-        """That of the plant inside."""
-        return self._inside.disturbance_size
-
-    @property
-    def noise(self):
-        """That of the plant inside."""
-        return self._inside.noise
+    state_names = _forwarded("state_names")
+    control_names = _forwarded("control_names")
+    disturbance_names = _forwarded("disturbance_names")
+    disturbance_size = _forwarded("disturbance_size")
+    noise = _forwarded("noise")
+    state_units = _forwarded_units("state")
+    control_units = _forwarded_units("control")
+    time_unit = _forwarded("time_unit")
 
     @property
     def observes_state(self):
@@ -154,12 +136,5 @@ class AbstractWrapper(_Forwarding):
     def _inside(self):
         return self.dynamics
 
-    @property
-    def dt(self):
-        """That of the dynamics inside."""
-        return self.dynamics.dt
-
-    @property
-    def increments(self):
-        """Those of the dynamics inside."""
-        return self.dynamics.increments
+    dt = _forwarded("dt")
+    increments = _forwarded("increments")

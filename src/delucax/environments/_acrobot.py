@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -10,16 +9,15 @@ from jaxtyping import Array
 
 from .._check import check_number, check_range
 from .._module import parameter, positive
-from .._results import RESULTS
-from .._typing import BoolScalar, RealScalar, State, Vector
+from .._results import Result, RESULTS
+from .._typing import BoolScalar, Control, Disturbance, State, Time, Vector
 from ..costs import Arrival
-from ..disturbances import Uniform
-from ..dynamics import AbstractDiscretization, RK4
+from ..disturbances import AbstractDisturbance, Uniform
+from ..dynamics import AbstractDiscretization, Discretized, RK4
 from ..dynamics._runge_kutta import runge_kutta_step
 from ..math import clip, cos, sin, wrap
 from ..systems import Acrobot
-from ._environment import Environment
-from ._task import gym_dynamics, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
@@ -62,7 +60,9 @@ class GymAcrobot(AbstractDiscretization):
     max_velocity_1: Array = parameter(4 * np.pi, constraint=positive)
     max_velocity_2: Array = parameter(9 * np.pi, constraint=positive)
 
-    def advance(self, t, x, u, w):
+    def advance(
+        self, t: Time, x: State, u: Control, w: Disturbance
+    ) -> tuple[State, Result]:
         field = lambda t, x: self.system.vector_field(t, x, u, w)
         free = runge_kutta_step(RK4.tableau, field, t, x, self.dt)
         x_next = jnp.stack(
@@ -101,22 +101,19 @@ class _AboveLine(eqx.Module):
 
     goal_height: Array = parameter()
 
-    def __call__(self, t: RealScalar, x: State) -> BoolScalar:
+    def __call__(self, t: Time, x: State) -> BoolScalar:
         return -cos(x[0]) - cos(x[1] + x[0]) > self.goal_height
 
 
+@task(Acrobot, gym=GymAcrobot, dt=0.2, horizon=500)
 def acrobot(
-    system: Acrobot | None = None,
+    dynamics: GymAcrobot | Discretized,
     *,
-    dt: Any = 0.2,
-    horizon: int = 500,
     max_torque: Any = 1.0,
     torque_noise: Any = None,
     goal_height: Any = 1.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+    disturbance: AbstractDisturbance | None = None,
+) -> dict[str, Any]:
     """Swing the tip of two hanging links above a line, by a torque at the elbow.
 
     State (angle_1, angle_2, velocity_1, velocity_2), hanging at 0; control (torque);
@@ -139,12 +136,13 @@ def acrobot(
         added, beyond the bounds too, as by Gym's `torque_noise_max`; none by default.
     - `goal_height`: of the line above the first joint, in lengths of a link, 1 by
         default.
+    - `disturbance`: of the environment, in place of `torque_noise`; none by default.
     - `solver`: a Diffrax solver in place of Gym's arithmetic; no angle is wrapped and
         no velocity clipped then.
     - `substeps`: solver steps an interval, with `solver`.
     - `**others`: arguments of [`delucax.systems.Acrobot`][], of
         [`delucax.environments.GymAcrobot`][], such as `max_velocity_1`, without a
-        `solver`, or of [`delucax.Environment`][], such as `disturbance`.
+        `solver`, or of [`delucax.Environment`][], such as `cost`.
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -171,30 +169,24 @@ def acrobot(
     """
     check_range(max_torque, "max_torque", "acrobot")
     check_number(goal_height, "goal_height", "acrobot")
-    dynamics, others = gym_dynamics(
-        acrobot, Acrobot, GymAcrobot, system, others, dt, solver, substeps
-    )
-    noise = None
+    bounded = disturbance is None
     if torque_noise is not None:
-        if "disturbance" in others:
+        if disturbance is not None:
             raise ValueError("acrobot: give torque_noise or a disturbance, not both.")
         check_range(torque_noise, "torque_noise", "acrobot")
-        noise = Uniform(-torque_noise, torque_noise, size=1)
+        disturbance = Uniform(-torque_noise, torque_noise, size=1)
     fastest = np.inf, np.inf
     if isinstance(dynamics, GymAcrobot):
         fastest = dynamics.max_velocity_1, dynamics.max_velocity_2
     feature_bound = jnp.array([1.0, 1.0, 1.0, 1.0, *fastest])
     above = _AboveLine(goal_height)
-    return task_environment(
-        others,
-        dynamics=dynamics,
+    return dict(
         cost=Arrival(above, arrival_cost=-1.0),
-        disturbance=noise,
-        initial_state=UniformState(jnp.full(4, -0.1), jnp.full(4, 0.1)),
+        disturbance=disturbance,
+        initial_state=UniformState([-0.1] * 4, [0.1] * 4),
         control_bounds=(-max_torque, max_torque),
-        horizon=horizon,
         terminated=above,
         actions=max_torque * jnp.array([[-1.0], [0.0], [1.0]]),
         encode=acrobot_features,
-        observation_bounds=(-feature_bound, feature_bound),
+        observation_bounds=(-feature_bound, feature_bound) if bounded else None,
     )

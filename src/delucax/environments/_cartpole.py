@@ -2,26 +2,25 @@
 
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_bool, check_positive, check_range, check_step
+from .._check import check_bool, check_keywords, check_positive, check_range, check_step
 from .._jax import fence
 from .._module import as_float_array, parameter, positive
-from .._results import RESULTS
-from .._typing import BoolScalar, RealScalar, State
+from .._typing import BoolScalar, Control, State, Time
 from ..costs import Arrival, Quadratic
-from ..dynamics import AbstractDiscretization, LinearDynamics
+from ..dynamics import Discretized, LinearDynamics
 from ..systems import CartPole
 from ._environment import Environment
-from ._task import check_names, gym_dynamics, task_environment
+from ._gym import AbstractGymStep
+from ._task import task
 from ._uniform_state import UniformState
 
 
-class GymCartPole(AbstractDiscretization):
+class GymCartPole(AbstractGymStep):
     """Gym's arithmetic for the cart-pole: an explicit Euler step; then `w` is added.
 
     Smooth. The angle is not wrapped.
@@ -55,7 +54,7 @@ class GymCartPole(AbstractDiscretization):
     def __check_init__(self):
         check_bool(self.semi_implicit, "semi_implicit", "GymCartPole")
 
-    def advance(self, t, x, u, w):
+    def gym_step(self, x: State, u: Control) -> State:
         dt = self.dt
         position, velocity, angle, spin = x[0], x[1], x[2], x[3]
         acceleration, turn = fence(*self.system.accelerations(angle, spin, u[0]))
@@ -63,10 +62,7 @@ class GymCartPole(AbstractDiscretization):
         if self.semi_implicit:
             velocity, spin = velocity_next, spin_next
         position, angle = position + dt * velocity, angle + dt * spin
-        x_next = jnp.stack([position, velocity_next, angle, spin_next])
-        if w is not None:
-            x_next = x_next + w
-        return x_next.astype(x.dtype), RESULTS.successful
+        return jnp.stack([position, velocity_next, angle, spin_next])
 
 
 class _Fallen(eqx.Module):
@@ -75,22 +71,18 @@ class _Fallen(eqx.Module):
     max_position: Array = parameter()
     max_angle: Array = parameter()
 
-    def __call__(self, t: RealScalar, x: State) -> BoolScalar:
+    def __call__(self, t: Time, x: State) -> BoolScalar:
         return (abs(x[0]) > self.max_position) | (abs(x[2]) > self.max_angle)
 
 
+@task(CartPole, gym=GymCartPole, dt=0.02, horizon=500)
 def cartpole(
-    system: CartPole | None = None,
+    dynamics: GymCartPole | Discretized,
     *,
-    dt: Any = 0.02,
-    horizon: int = 500,
     max_force: Any = 10.0,
     max_position: Any = 2.4,
     max_angle: Any = 12 * 2 * np.pi / 360,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+) -> dict[str, Any]:
     """Keep a pole upright on a cart that a force pushes to and fro.
 
     State (position, velocity, angle, spin), upright at 0; control (force), continuous
@@ -137,20 +129,14 @@ def cartpole(
         ```
     """
     check_range(max_force, "max_force", "cartpole")
-    dynamics, others = gym_dynamics(
-        cartpole, CartPole, GymCartPole, system, others, dt, solver, substeps
-    )
     check_positive(max_position, "max_position", "cartpole")
     check_positive(max_angle, "max_angle", "cartpole")
     # Gym's own: twice where the episode ends, which no state of an episode reaches.
     feature_bound = jnp.array([2 * max_position, np.inf, 2 * max_angle, np.inf])
-    return task_environment(
-        others,
-        dynamics=dynamics,
+    return dict(
         cost=Arrival(step_cost=-1.0),
-        initial_state=UniformState(jnp.full(4, -0.05), jnp.full(4, 0.05)),
+        initial_state=UniformState([-0.05] * 4, [0.05] * 4),
         control_bounds=(-max_force, max_force),
-        horizon=horizon,
         terminated=_Fallen(max_position, max_angle),
         actions=max_force * jnp.array([[-1.0], [1.0]]),
         observation_bounds=(-feature_bound, feature_bound),
@@ -210,7 +196,7 @@ def cartpole_linear(
         ```
     """
     where = "cartpole_linear"
-    check_names(cartpole_linear, others)
+    check_keywords(others, where, cartpole_linear, Environment)
     check_positive(cart_mass, "cart_mass", where)
     check_positive(pole_mass, "pole_mass", where)
     check_positive(length, "length", where)
@@ -232,10 +218,10 @@ def cartpole_linear(
         state_names=("position", "angle", "velocity", "spin"),
         control_names=("force",),
     )
-    return task_environment(
-        others,
+    fields: dict[str, Any] = dict(
         dynamics=dynamics,
         cost=Quadratic(jnp.ones(4), jnp.ones(1)),
-        initial_state=UniformState(jnp.full(4, -0.05), jnp.full(4, 0.05)),
+        initial_state=UniformState([-0.05] * 4, [0.05] * 4),
         horizon=horizon,
     )
+    return Environment(**(fields | others))

@@ -13,6 +13,7 @@ from .._check import (
     as_bounds,
     as_vector,
     bounds_field,
+    check_cost_sizes,
     check_count,
     check_finite,
     check_instance,
@@ -30,18 +31,13 @@ from .._module import (
     parameter,
 )
 from .._results import Result
-from .._typing import PRNGKey, RealScalar
+from .._typing import Control, Disturbance, Observation, PRNGKey, State, Time, Vector
 from ..costs import AbstractCost
-from ..costs._base import check_cost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics, OperatingPoint, trim
 from ..dynamics._noise import check_noise
 from ..dynamics._operating_point import operating_point
 from ..math import clip
-
-
-# A number to end a space where there is no bound; Gymnasium advises against infinity.
-LARGEST = float(np.finfo(np.float32).max)
 
 
 class Step(NamedTuple):
@@ -117,9 +113,9 @@ class Environment(eqx.Module):
         "Environment", "control_bounds"
     )
     horizon: int = eqx.field(static=True)
-    terminated: Callable[[RealScalar, Array], Array] | None = function_field()
+    terminated: Callable[[Time, State], Array] | None = function_field()
     actions: Array | None = parameter()
-    encode: Callable[[Array], Array] = function_field()
+    encode: Callable[[Observation], Vector] = function_field()
     observation_bounds: tuple[Array, Array] | None = bounds_field(
         "Environment", "observation_bounds"
     )
@@ -133,19 +129,20 @@ class Environment(eqx.Module):
         initial_state: Any = None,
         control_bounds: tuple[Any, Any] | None = None,
         horizon: int = 200,
-        terminated: Callable[[RealScalar, Array], Array] | None = None,
+        terminated: Callable[[Time, State], Array] | None = None,
         actions: Any = None,
-        encode: Callable[[Array], Array] | None = None,
+        encode: Callable[[Observation], Vector] | None = None,
         observation_bounds: tuple[Any, Any] | None = None,
     ):
+        check_instance(dynamics, AbstractDynamics, "dynamics", "Environment")
+        if disturbance is None:
+            disturbance = _default_disturbance(dynamics)
+        if initial_state is None:
+            initial_state = jnp.zeros(dynamics.state_size)
         self.dynamics = dynamics
         self.cost = cost
-        if disturbance is None and isinstance(dynamics, AbstractDynamics):
-            disturbance = _default_disturbance(dynamics)
-        self.disturbance = disturbance  # pyright: ignore[reportAttributeAccessIssue]
+        self.disturbance = disturbance
         self.sensor_noise = sensor_noise
-        if initial_state is None and isinstance(dynamics, AbstractDynamics):
-            initial_state = jnp.zeros(dynamics.state_size)
         self.initial_state = initial_state
         self.control_bounds = control_bounds
         self.horizon = check_count(horizon, "horizon", "Environment")
@@ -158,34 +155,25 @@ class Environment(eqx.Module):
         where, dynamics = "Environment", self.dynamics
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         check_noise(dynamics, where)
-        sizes = dynamics.state_size, dynamics.control_size
-        check_cost(self.cost, "cost", where, sizes)
-        sized = [("disturbance", self.disturbance, dynamics.disturbance_size)]
+        n, m = dynamics.state_size, dynamics.control_size
+        check_instance(self.cost, AbstractCost, "cost", where)
+        check_cost_sizes(self.cost, (n, m), "cost", where)
+        _check_signal(self.disturbance, dynamics.disturbance_size, "disturbance")
         if self.sensor_noise is not None:
-            sized.append(("sensor_noise", self.sensor_noise, dynamics.observation_size))
-        for name, signal, size in sized:
-            check_instance(signal, AbstractDisturbance, name, where)
-            if signal.size != size:
-                raise ValueError(
-                    f"{where}: {name} has size {signal.size} where {size} is expected."
-                )
+            _check_signal(self.sensor_noise, dynamics.observation_size, "sensor_noise")
         check_parameters(self)
-        m = dynamics.control_size
         if not callable(self.initial_state):
-            x0 = as_vector(
-                self.initial_state, dynamics.state_size, "initial_state", where
-            )
+            x0 = as_vector(self.initial_state, n, "initial_state", where)
             check_finite(x0, "initial_state", where)
         as_bounds(self.control_bounds, where, "control_bounds", m)
         if self.observation_bounds is not None:
             size = self.feature_size
             as_bounds(self.observation_bounds, where, "observation_bounds", size)
-        if self.actions is not None:
-            if self.actions.ndim != 2 or self.actions.shape[1] != m:
-                raise ValueError(
-                    f"{where}: actions must have shape (actions, {m}), got "
-                    f"{self.actions.shape}."
-                )
+        shape = (1, m) if self.actions is None else self.actions.shape
+        if len(shape) != 2 or shape[1] != m:
+            raise ValueError(
+                f"{where}: actions must have shape (actions, {m}), got {shape}."
+            )
 
     def __replaced__(self, before: "Environment") -> dict[str, Any]:
         """What `before` had by default of its dynamics, by default of the new ones."""
@@ -281,7 +269,7 @@ class Environment(eqx.Module):
         start, disturbance, noise, controller = jr.split(key, 4)
         return start, disturbance, noise, controller
 
-    def reset(self, key: PRNGKey) -> Array:
+    def reset(self, key: PRNGKey) -> State:
         """A first state.
 
         **Arguments:** `key`: a random key.
@@ -330,7 +318,7 @@ class Environment(eqx.Module):
         return clip(u, low, high).astype(u.dtype)
 
     def step(
-        self, t: RealScalar, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None
+        self, t: Time, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None
     ) -> Step:
         """One step: clip the control, charge the stage cost, advance the state.
 
@@ -357,12 +345,12 @@ class Environment(eqx.Module):
             w = as_vector(w, size, "w (the disturbance)", "Environment.step")
         return self._advance(t, x, self._applied(u), w)
 
-    def _applied(self, u: Any) -> Array:
+    def _applied(self, u: Any) -> Control:
         """The control or action `u` as a control within the bounds."""
         u = self.saturate(as_float_array(u) if self.actions is None else u)
         return as_vector(u, self.control_size, "u (the control)", "Environment.step")
 
-    def _advance(self, t: Any, x: Array, u: Array, w: Array | None) -> Step:
+    def _advance(self, t: Time, x: State, u: Control, w: Disturbance) -> Step:
         """A step with arguments that were checked."""
         cost = jnp.asarray(self.cost(t, x, u))
         if cost.shape != ():
@@ -383,8 +371,17 @@ class Environment(eqx.Module):
         return Step(x_next, u, cost, terminated, result)
 
 
-def _identity(x):
-    return x
+def _identity(y: Any) -> Any:
+    return y
+
+
+def _check_signal(signal: Any, size: int, name: str) -> None:
+    """Raise unless `signal` is a disturbance with entries of that size."""
+    check_instance(signal, AbstractDisturbance, name, "Environment")
+    if signal.size != size:
+        raise ValueError(
+            f"Environment: {name} has size {signal.size} where {size} is expected."
+        )
 
 
 def _default_disturbance(dynamics: AbstractDynamics) -> AbstractDisturbance:

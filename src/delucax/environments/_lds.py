@@ -6,13 +6,12 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
-from .._check import check_count, check_instance, check_key, is_concrete
+from .._check import check_count, check_instance, check_key, check_keywords, is_concrete
 from .._typing import PRNGKey
 from ..costs import Quadratic
 from ..dynamics import c2d, LinearDynamics
 from ..systems import LinearSystem
 from ._environment import Environment
-from ._task import check_names, task_environment
 
 
 def lds(
@@ -69,7 +68,7 @@ def lds(
         sampled = dlx.make("lds", system=upright, dt=0.05)
         ```
     """
-    check_names(lds, others)
+    check_keywords(others, "lds", lds, Environment)
     if system is not None:
         for name, value in {"A": A, "B": B, "C": C, "key": key}.items():
             if value is not None:
@@ -92,12 +91,9 @@ def lds(
             raise ValueError("lds: give A and B, or a key to draw them with, not both.")
         dynamics = LinearDynamics(A, B, C, dt=1.0 if dt is None else dt)
     n, m = dynamics.state_size, dynamics.control_size
-    return task_environment(
-        others,
-        dynamics=dynamics,
-        cost=Quadratic(jnp.ones(n), jnp.ones(m)),
-        horizon=horizon,
-    )
+    cost = Quadratic(jnp.ones(n), jnp.ones(m))
+    fields: dict[str, Any] = dict(dynamics=dynamics, cost=cost, horizon=horizon)
+    return Environment(**(fields | others))
 
 
 def _sampled(system: Any, dt: Any) -> LinearDynamics:

@@ -3,25 +3,23 @@ MountainCar-v0."""
 
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_number, check_range
 from .._module import parameter, positive
-from .._results import RESULTS
-from .._typing import BoolScalar, RealScalar, State
+from .._typing import BoolScalar, Control, State, Time
 from ..costs import Arrival
-from ..dynamics import AbstractDiscretization, AbstractDynamics
+from ..dynamics import Discretized
 from ..math import clip
 from ..systems import MountainCar
-from ._environment import Environment
-from ._task import gym_dynamics, task_environment
+from ._gym import AbstractGymStep
+from ._task import task
 from ._uniform_state import UniformState
 
 
-class GymMountainCar(AbstractDiscretization):
+class GymMountainCar(AbstractGymStep):
     """Gym's arithmetic for the mountain car, a semi-implicit Euler step with limits:
 
     `velocity_next = clip(velocity + acceleration dt, -max_speed, max_speed)`,
@@ -66,7 +64,7 @@ class GymMountainCar(AbstractDiscretization):
         low = self.min_position
         check_range(self.max_position, "max_position", "GymMountainCar", low)
 
-    def advance(self, t, x, u, w):
+    def gym_step(self, x: State, u: Control) -> State:
         position, velocity = x[0], x[1]
         acceleration = self.system.acceleration(position, u[0])
         velocity = velocity + acceleration * self.dt
@@ -75,10 +73,7 @@ class GymMountainCar(AbstractDiscretization):
         position = clip(position, self.min_position, self.max_position)
         stopped = (position <= self.min_position) & (velocity < 0)
         velocity = jnp.where(stopped, 0, velocity)
-        x_next = jnp.stack([position, velocity])
-        if w is not None:
-            x_next = x_next + w
-        return x_next.astype(x.dtype), RESULTS.successful
+        return jnp.stack([position, velocity])
 
 
 class _AtGoal(eqx.Module):
@@ -87,21 +82,17 @@ class _AtGoal(eqx.Module):
     goal_position: Array = parameter()
     goal_velocity: Array = parameter()
 
-    def __call__(self, t: RealScalar, x: State) -> BoolScalar:
+    def __call__(self, t: Time, x: State) -> BoolScalar:
         return (x[0] >= self.goal_position) & (x[1] >= self.goal_velocity)
 
 
+@task(MountainCar, gym=GymMountainCar, dt=1.0, horizon=999)
 def mountain_car(
-    system: MountainCar | None = None,
+    dynamics: GymMountainCar | Discretized,
     *,
-    dt: Any = 1.0,
-    horizon: int = 999,
     goal_position: Any = 0.45,
     goal_velocity: Any = 0.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+) -> dict[str, Any]:
     """Drive a car out of a valley by rocking it: Gym's MountainCarContinuous-v0.
 
     State (position, velocity); control (push), in +-1. Starts at rest with the position
@@ -148,31 +139,24 @@ def mountain_car(
         )
         ```
     """
-    goal = _goal(goal_position, goal_velocity, "mountain_car")
-    dynamics, others = gym_dynamics(
-        mountain_car, MountainCar, GymMountainCar, system, others, dt, solver, substeps
-    )
-    return task_environment(
-        others,
-        dynamics=dynamics,
-        cost=Arrival(goal, step_cost=0.0, control_weight=0.1, arrival_cost=-100.0),
-        horizon=horizon,
-        terminated=goal,
-        **_valley(dynamics),
-    )
+    goal, valley = _valley("mountain_car", dynamics, goal_position, goal_velocity)
+    cost = Arrival(goal, step_cost=0.0, control_weight=0.1, arrival_cost=-100.0)
+    return dict(cost=cost, **valley)
 
 
+@task(
+    MountainCar,
+    gym=GymMountainCar,
+    dt=1.0,
+    horizon=200,
+    arguments=lambda *, power=0.001: dict(power=power),
+)
 def mountain_car_discrete(
-    system: MountainCar | None = None,
+    dynamics: GymMountainCar | Discretized,
     *,
-    dt: Any = 1.0,
-    horizon: int = 200,
     goal_position: Any = 0.5,
     goal_velocity: Any = 0.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+) -> dict[str, Any]:
     """Drive a car out of a valley in the fewest steps: Gym's MountainCar-v0.
 
     As [`delucax.environments.mountain_car`][] with a weaker motor and a farther goal;
@@ -183,8 +167,8 @@ def mountain_car_discrete(
 
     **Arguments:**
 
-    - `system`: a [`delucax.systems.MountainCar`][]; made of `others` by default, with a
-        power of 0.001.
+    - `system`: a [`delucax.systems.MountainCar`][]; made of `others` by default.
+    - `power`: of its motor, 0.001 by default.
     - `dt`: the control interval in Gym's steps, 1 by default.
     - `horizon`: steps an episode, 200 by default.
     - `goal_position`: 0.5 by default.
@@ -212,46 +196,30 @@ def mountain_car_discrete(
         env.step(0.0, jnp.array([-0.5, 0.0]), 2)
         ```
     """
-    goal = _goal(goal_position, goal_velocity, "mountain_car_discrete")
-    if system is None:
-        others.setdefault("power", 0.001)
-    dynamics, others = gym_dynamics(
-        mountain_car_discrete,
-        MountainCar,
-        GymMountainCar,
-        system,
-        others,
-        dt,
-        solver,
-        substeps,
-    )
-    return task_environment(
-        others,
-        dynamics=dynamics,
-        cost=Arrival(goal),
-        horizon=horizon,
-        terminated=goal,
-        actions=jnp.array([[-1.0], [0.0], [1.0]]),
-        **_valley(dynamics),
-    )
+    where = "mountain_car_discrete"
+    goal, valley = _valley(where, dynamics, goal_position, goal_velocity)
+    return dict(cost=Arrival(goal), actions=[[-1.0], [0.0], [1.0]], **valley)
 
 
-def _goal(position: Any, velocity: Any, where: str) -> _AtGoal:
-    check_number(position, "goal_position", where)
-    check_number(velocity, "goal_velocity", where)
-    return _AtGoal(position, velocity)
-
-
-def _valley(dynamics: AbstractDynamics) -> dict[str, Any]:
-    """Where a car starts, and between what it stays."""
-    bounds = None
+def _valley(
+    where: str,
+    dynamics: GymMountainCar | Discretized,
+    goal_position: Any,
+    goal_velocity: Any,
+) -> tuple[_AtGoal, dict[str, Any]]:
+    """The goal, and what both tasks have: where a car starts, and between what it
+    stays."""
+    check_number(goal_position, "goal_position", where)
+    check_number(goal_velocity, "goal_velocity", where)
+    goal, bounds = _AtGoal(goal_position, goal_velocity), None
     if isinstance(dynamics, GymMountainCar):
         bounds = (
             jnp.stack([dynamics.min_position, -dynamics.max_speed]),
             jnp.stack([dynamics.max_position, dynamics.max_speed]),
         )
-    return dict(
-        initial_state=UniformState(jnp.array([-0.6, 0.0]), jnp.array([-0.4, 0.0])),
+    return goal, dict(
+        initial_state=UniformState([-0.6, 0.0], [-0.4, 0.0]),
         control_bounds=(-1.0, 1.0),
+        terminated=goal,
         observation_bounds=bounds,
     )

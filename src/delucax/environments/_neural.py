@@ -2,30 +2,30 @@
 
 from typing import Any
 
-import diffrax
 import jax.numpy as jnp
 
 from .._check import check_range
 from .._typing import PRNGKey
 from ..costs import Quadratic
-from ..dynamics import Discretized
 from ..systems import AbstractSystem, NeuralSystem
-from ._environment import Environment
-from ._task import system_of, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
-def neural(
-    system: AbstractSystem | None = None,
-    *,
-    key: PRNGKey | None = None,
-    max_control: Any = 1.0,
-    dt: Any = 0.05,
-    horizon: int = 100,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+def _drawn(
+    *, key: PRNGKey | None = None, states: Any = 2, controls: Any = 1, width: int = 32
+) -> dict[str, Any]:
+    """The arguments of a network with random weights."""
+    if key is None:
+        raise ValueError(
+            "neural: give a system, or a key to draw the weights of one, such as "
+            "key=jax.random.key(0), got neither."
+        )
+    return dict(key=key, states=states, controls=controls, width=width)
+
+
+@task(NeuralSystem, dt=0.05, horizon=100, arguments=_drawn, accepts=AbstractSystem)
+def neural(system: AbstractSystem, *, max_control: Any = 1.0) -> dict[str, Any]:
     """Bring the state of a learned vector field to the origin.
 
     Starts with each state uniform in +-1. Cost `|x|^2 + 0.1 |u|^2` a step. Never
@@ -36,14 +36,15 @@ def neural(
     - `system`: a [`delucax.systems.NeuralSystem`][], such as one that was fitted to
         data, or any other system. One with random weights by default.
     - `key`: a random key, for random weights.
+    - `states`, `controls`, `width`: of a network with random weights, 2, 1 and 32 by
+        default; see [`delucax.systems.NeuralSystem`][].
     - `max_control`: of each control, to either side; 1 by default.
     - `dt`: the control interval, 0.05 by default.
     - `horizon`: steps an episode, 100 by default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
     - `substeps`: solver steps an interval, 1 by default.
     - `**others`: arguments of [`delucax.Environment`][], such as `disturbance`, or,
-        without a `system`, of [`delucax.systems.NeuralSystem`][]: `states`, `controls`
-        and `width` are 2, 1 and 32 by default.
+        without a `system`, of [`delucax.systems.NeuralSystem`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -63,23 +64,9 @@ def neural(
         ```
     """
     check_range(max_control, "max_control", "neural")
-    if (system is None) == (key is None):
-        got = "neither" if key is None else "both"
-        raise ValueError(
-            "neural: give a system, or a key to draw the weights of one, such as "
-            f"key=jax.random.key(0), got {got}."
-        )
-    if system is None:
-        others = dict(states=2, controls=1, width=32, key=key) | others
-    system, others = system_of(
-        neural, NeuralSystem, system, others, base=AbstractSystem
-    )
-    n, m = system.state_size, system.control_size
-    return task_environment(
-        others,
-        dynamics=Discretized(system, dt, solver, substeps),
-        cost=Quadratic(jnp.ones(n), 0.1 * jnp.ones(m)),
-        initial_state=UniformState(-jnp.ones(n), jnp.ones(n)),
+    corner = jnp.ones(system.state_size)
+    return dict(
+        cost=Quadratic(corner, 0.1 * jnp.ones(system.control_size)),
+        initial_state=UniformState(-corner, corner),
         control_bounds=(-max_control, max_control),
-        horizon=horizon,
     )

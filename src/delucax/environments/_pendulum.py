@@ -2,25 +2,23 @@
 
 from typing import Any
 
-import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from .._check import check_range
 from .._module import parameter, positive
-from .._results import RESULTS
-from .._typing import State, Vector
+from .._typing import Control, State, Vector
 from ..costs import PendulumCost
-from ..dynamics import AbstractDiscretization
+from ..dynamics import Discretized
 from ..math import clip, cos, sin
 from ..systems import Pendulum
-from ._environment import Environment
-from ._task import gym_dynamics, task_environment
+from ._gym import AbstractGymStep
+from ._task import task
 from ._uniform_state import UniformState
 
 
-class GymPendulum(AbstractDiscretization):
+class GymPendulum(AbstractGymStep):
     """Gym's arithmetic for the pendulum, which clips between its half-steps:
 
     `velocity_next = clip(velocity + acceleration dt, -max_speed, max_speed)`,
@@ -55,16 +53,13 @@ class GymPendulum(AbstractDiscretization):
     dt: Array = parameter(0.05, constraint=positive)
     max_speed: Array = parameter(8.0, constraint=positive)
 
-    def advance(self, t, x, u, w):
+    def gym_step(self, x: State, u: Control) -> State:
         angle, velocity = x[0], x[1]
         acceleration = self.system.acceleration(angle, velocity, u[0])
         velocity = velocity + acceleration * self.dt
         velocity = clip(velocity, -self.max_speed, self.max_speed)
         angle = angle + velocity * self.dt
-        x_next = jnp.stack([angle, velocity])
-        if w is not None:
-            x_next = x_next + w
-        return x_next.astype(x.dtype), RESULTS.successful
+        return jnp.stack([angle, velocity])
 
 
 def pendulum_features(x: State) -> Vector:
@@ -86,16 +81,10 @@ def pendulum_features(x: State) -> Vector:
     return jnp.stack([cos(x[0]), sin(x[0]), x[1]])
 
 
+@task(Pendulum, gym=GymPendulum, dt=0.05, horizon=200)
 def pendulum(
-    system: Pendulum | None = None,
-    *,
-    dt: Any = 0.05,
-    horizon: int = 200,
-    max_torque: Any = 2.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+    dynamics: GymPendulum | Discretized, *, max_torque: Any = 2.0
+) -> dict[str, Any]:
     """Swing up a pendulum and hold it upright with a torque too weak to lift it at
     once.
 
@@ -135,19 +124,13 @@ def pendulum(
         ```
     """
     check_range(max_torque, "max_torque", "pendulum")
-    dynamics, others = gym_dynamics(
-        pendulum, Pendulum, GymPendulum, system, others, dt, solver, substeps
-    )
     fastest = dynamics.max_speed if isinstance(dynamics, GymPendulum) else np.inf
     feature_bound = jnp.array([1.0, 1.0, fastest])
     corner = jnp.array([np.pi, 1.0])
-    return task_environment(
-        others,
-        dynamics=dynamics,
+    return dict(
         cost=PendulumCost(),
         initial_state=UniformState(-corner, corner),
         control_bounds=(-max_torque, max_torque),
-        horizon=horizon,
         encode=pendulum_features,
         observation_bounds=(-feature_bound, feature_bound),
     )

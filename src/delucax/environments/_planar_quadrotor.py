@@ -8,10 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..costs import Quadratic
-from ..dynamics import Discretized
 from ..systems import ConstantWind, DissipativeWind, PlanarQuadrotor, VortexWind
-from ._environment import Environment
-from ._task import system_of, task_environment
+from ._task import task
 
 
 _WINDS: dict[str, Callable[..., Any]] = {
@@ -21,17 +19,28 @@ _WINDS: dict[str, Callable[..., Any]] = {
 }
 
 
-def planar_quadrotor(
-    system: PlanarQuadrotor | None = None,
-    *,
-    wind: str | Callable[..., Array] | None = None,
-    wind_strength: Any = None,
-    dt: Any = 0.05,
-    horizon: int = 100,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+def _wind(
+    *, wind: str | Callable[..., Array] | None = None, wind_strength: Any = None
+) -> dict[str, Any]:
+    """The wind of a system, by its name or as it is."""
+    where = "planar_quadrotor"
+    if not isinstance(wind, str):
+        if wind_strength is not None:
+            raise ValueError(
+                f"{where}: wind_strength needs a wind that is named, such as "
+                f"'dissipative', got wind={wind!r}."
+            )
+        return dict(wind=wind)
+    if wind not in _WINDS:
+        raise ValueError(
+            f"{where}: wind must be one of {', '.join(map(repr, _WINDS))}, a "
+            f"function (t, x) -> force, or None, got {wind!r}."
+        )
+    return dict(wind=_WINDS[wind](0.1 if wind_strength is None else wind_strength))
+
+
+@task(PlanarQuadrotor, dt=0.05, horizon=100, solver=diffrax.Euler(), arguments=_wind)
+def planar_quadrotor(system: PlanarQuadrotor) -> dict[str, Any]:
     """Fly a planar quadrotor to the origin and hover there.
 
     State (x, y, angle, vx, vy, rate); control (left, right), the thrusts, without
@@ -70,34 +79,9 @@ def planar_quadrotor(
         env = dlx.make("planar_quadrotor", wind="dissipative", wind_strength=0.4)
         ```
     """
-    wind = _wind(wind, wind_strength)
-    if wind is not None:
-        others["wind"] = wind
-    system, others = system_of(planar_quadrotor, PlanarQuadrotor, system, others)
     windless = PlanarQuadrotor(system.mass, system.length, system.gravity)
     _, hover = windless.equilibrium()
-    return task_environment(
-        others,
-        dynamics=Discretized(system, dt, solver or diffrax.Euler(), substeps),
+    return dict(
         cost=Quadratic(jnp.ones(6), 0.1 * jnp.ones(2), control_target=hover),
         initial_state=jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0]),
-        horizon=horizon,
     )
-
-
-def _wind(wind: Any, strength: Any) -> Callable[..., Array] | None:
-    """A wind, by its name or as it is."""
-    where = "planar_quadrotor"
-    if isinstance(wind, str):
-        if wind not in _WINDS:
-            raise ValueError(
-                f"{where}: wind must be one of {', '.join(map(repr, _WINDS))}, a "
-                f"function (t, x) -> force, or None, got {wind!r}."
-            )
-        return _WINDS[wind](0.1 if strength is None else strength)
-    if strength is not None:
-        raise ValueError(
-            f"{where}: wind_strength needs a wind that is named, such as "
-            f"'dissipative', got wind={wind!r}."
-        )
-    return wind

@@ -2,20 +2,17 @@
 
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_range
+from .._check import check_range, LARGEST
 from .._module import as_float_array
 from .._typing import PRNGKey, State, Vector
 from ..costs import Quadratic
-from ..dynamics import Discretized
 from ..systems import Quadrotor
 from ..systems._quadrotor import attitude_difference, unit_attitude
-from ._environment import Environment, LARGEST
-from ._task import system_of, task_environment
+from ._task import task
 from ._uniform_state import UniformState
 
 
@@ -65,16 +62,8 @@ def quadrotor_features(x: State) -> Vector:
     return jnp.concatenate([x[:3], jnp.stack(rotation), x[7:]])
 
 
-def quadrotor(
-    system: Quadrotor | None = None,
-    *,
-    dt: Any = 0.02,
-    horizon: int = 250,
-    max_thrust: Any = 6.0,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+@task(Quadrotor, dt=0.02, horizon=250)
+def quadrotor(system: Quadrotor, *, max_thrust: Any = 6.0) -> dict[str, Any]:
     """Fly a quadrotor to the origin and hover there.
 
     State (position, quaternion, velocity, body rates), 13 entries; control (front,
@@ -111,7 +100,6 @@ def quadrotor(
         ```
     """
     check_range(max_thrust, "max_thrust", "quadrotor")
-    system, others = system_of(quadrotor, Quadrotor, system, others)
     x, hover = system.equilibrium()
     low, high = 0.0, as_float_array(max_thrust)
     if system.inputs == "wrench":
@@ -120,9 +108,7 @@ def quadrotor(
         low = -high.at[0].set(0.0)
     feature_bound = jnp.full(18, LARGEST).at[3:12].set(_ROTATION)
     corner = jnp.array([1.0] * 3 + [0.0] + [0.2] * 3 + [0.5] * 6)
-    return task_environment(
-        others,
-        dynamics=Discretized(system, dt, solver, substeps),
+    return dict(
         cost=Quadratic(
             jnp.array([1.0] * 7 + [0.1] * 6),
             0.1 * jnp.ones(4),
@@ -132,7 +118,6 @@ def quadrotor(
         ),
         initial_state=_Start(UniformState(x - corner, x + corner)),
         control_bounds=(low, high),
-        horizon=horizon,
         encode=quadrotor_features,
         observation_bounds=(-feature_bound, feature_bound),
     )

@@ -8,14 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_finite
+from .._check import check_finite, LARGEST
 from .._module import parameter
 from ..costs import AbstractCost
-from ..dynamics import Discretized
 from ..math import cos, sin
 from ..systems import Reacher
-from ._environment import Environment, LARGEST
-from ._task import system_of, task_environment
+from ._task import task
 
 
 class ReacherCost(AbstractCost):
@@ -80,16 +78,8 @@ class _Features(eqx.Module):
         return jnp.stack([*angles, x[2], x[3], offset[0], offset[1]])
 
 
-def reacher(
-    system: Reacher | None = None,
-    *,
-    goal: Any = (0.0, 1.8),
-    dt: Any = 0.01,
-    horizon: int = 200,
-    solver: diffrax.AbstractSolver | None = None,
-    substeps: int = 1,
-    **others: Any,
-) -> Environment:
+@task(Reacher, dt=0.01, horizon=200, solver=diffrax.Euler())
+def reacher(system: Reacher, *, goal: Any = (0.0, 1.8)) -> dict[str, Any]:
     """Bring the tip of an arm of two links to a goal.
 
     State (shoulder, elbow, shoulder_rate, elbow_rate); control (shoulder_torque,
@@ -128,19 +118,15 @@ def reacher(
         plant = dlx.make("reacher", gravity=-10.0)
         ```
     """
-    system, others = system_of(reacher, Reacher, system, others)
     cost = ReacherCost(system, goal)
     reach = system.length_1 + system.length_2
     low, high = (
         jnp.array([sign] * 4 + [sign * LARGEST] * 2 + [*(sign * reach - cost.goal)])
         for sign in (-1.0, 1.0)
     )
-    return task_environment(
-        others,
-        dynamics=Discretized(system, dt, solver or diffrax.Euler(), substeps),
+    return dict(
         cost=cost,
         initial_state=jnp.array([np.pi / 4, np.pi / 2, 0.0, 0.0]),
-        horizon=horizon,
         encode=_Features(cost),
         observation_bounds=(low, high),
     )

@@ -51,21 +51,7 @@ def make(name: str, **kwargs: Any) -> Environment:
         env = dlx.make("pendulum", length=1.2)
         ```
     """
-    if not isinstance(name, str) or name not in _REGISTRY:
-        names = sorted(_REGISTRY)
-        close = difflib.get_close_matches(str(name), names, n=3, cutoff=0.4) or names
-        raise ValueError(
-            f"make: no task is called {name!r}; did you mean "
-            f"{' or '.join(repr(n) for n in close)}? All names: {', '.join(names)}."
-        )
-    try:
-        task = _imported(_REGISTRY[name])
-    except (ImportError, AttributeError) as error:
-        raise ValueError(
-            f"make: {name!r} is registered as {_REGISTRY[name]!r}, which cannot be "
-            f"imported: {error}."
-        ) from error
-    env = task(**kwargs)
+    env = _task(name, "make")(**kwargs)
     if not isinstance(env, Environment):
         raise ValueError(
             f"make: {name!r} must be an Environment, but {_REGISTRY[name]!r} returned "
@@ -74,15 +60,44 @@ def make(name: str, **kwargs: Any) -> Environment:
     return env
 
 
-def horizon_of(name: str) -> int:
-    """The horizon of one of our own tasks, unless another is given."""
-    signature = inspect.signature(_imported(_REGISTRY[name]))
+def default_horizon(name: str) -> int:
+    """The horizon of a task if no other is given, without making it.
+
+    **Arguments:** `name`: of a task of delucax, as in [`delucax.make`][].
+
+    **Returns:** steps an episode.
+
+    **Raises:** `ValueError` on an unknown name, with the close ones.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        dlx.environments.default_horizon("pendulum")
+        ```
+    """
+    signature = inspect.signature(_task(name, "default_horizon"))
     return signature.parameters["horizon"].default
 
 
-def _imported(entry_point: str) -> Callable[..., Any]:
-    module, _, function = entry_point.partition(":")
-    return getattr(importlib.import_module(module), function)
+def _task(name: str, where: str) -> Callable[..., Any]:
+    """The function that makes a task."""
+    if not isinstance(name, str) or name not in _REGISTRY:
+        names = sorted(_REGISTRY)
+        close = difflib.get_close_matches(str(name), names, n=3, cutoff=0.4) or names
+        raise ValueError(
+            f"{where}: no task is called {name!r}; did you mean "
+            f"{' or '.join(repr(n) for n in close)}? All names: {', '.join(names)}."
+        )
+    module, _, function = _REGISTRY[name].partition(":")
+    try:
+        return getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"{where}: {name!r} is registered as {_REGISTRY[name]!r}, which cannot be "
+            f"imported: {error}."
+        ) from error
 
 
 def register(name: str, entry_point: str) -> None:

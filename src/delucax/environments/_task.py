@@ -1,21 +1,21 @@
-"""The arguments of a task, sorted by who takes them."""
+"""What the tasks of a system share: its arguments, its dynamics and their solver."""
 
-import difflib
+import functools
 import inspect
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import diffrax
 
-from .._check import check_instance, check_step
+from .._check import check_instance, check_keywords, keywords_of
 from ..dynamics import AbstractDynamics, Discretized
 from ..systems import AbstractSystem
 from ._environment import Environment
+from ._gym import gym_or_solver
 
 
-_System = TypeVar("_System", bound=AbstractSystem)
-
-# What changes which observations there are, and so the bounds of a task's features.
+# What a task observes has its bounds for the task as it is. They are left out where
+# one of these is given.
 _CHANGES_OBSERVATIONS = {
     "disturbance",
     "dynamics",
@@ -26,109 +26,88 @@ _CHANGES_OBSERVATIONS = {
 }
 
 
-def _parameters(function: Callable[..., Any]) -> list[str]:
-    """The names that `function` takes as keywords."""
-    parameters = inspect.signature(function).parameters.values()
-    keyword = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
-    return [p.name for p in parameters if p.kind in keyword]
-
-
-def _split(
-    arguments: Mapping[str, Any], function: Callable[..., Any]
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Those of `arguments` that `function` takes, and the rest."""
-    names = _parameters(function)
-    taken = {name: value for name, value in arguments.items() if name in names}
-    return taken, {n: value for n, value in arguments.items() if n not in taken}
-
-
-def check_names(
-    task: Callable[..., Environment],
-    others: Mapping[str, Any],
-    *takers: Callable[..., Any],
-) -> None:
-    """Raise unless `Environment` or one of `takers` takes each of `others`."""
-    known = [name for f in (*takers, Environment) for name in _parameters(f)]
-    for name in others:
-        if name not in known:
-            names = list(dict.fromkeys([*_parameters(task), *known]))
-            close = difflib.get_close_matches(name, names, n=3) or names
-            raise ValueError(
-                f"{task.__name__}: no argument is called {name!r}; did you mean "
-                f"{' or '.join(repr(n) for n in close)}?"
-            )
-
-
-def system_of(
-    task: Callable[..., Environment],
-    kind: type[_System],
-    system: _System | None,
-    others: Mapping[str, Any],
-    *takers: Callable[..., Any],
-    base: type[AbstractSystem] | None = None,
-) -> tuple[_System, dict[str, Any]]:
-    """The system of a task, and those of `others` that are not arguments of it.
-
-    `system` itself, or the `kind` that the arguments in `others` make. The rest is what
-    `takers` and `Environment` take.
-
-    **Raises:** `ValueError` if nothing takes one of `others`, if there are both a
-    system and arguments of one, or if it is not of that kind, or of its `base`.
-    """
-    where = task.__name__
-    check_names(task, others, kind, *takers)
-    constants, others = _split(others, kind)
-    if system is None:
-        return kind(**constants), others
-    check_instance(system, base or kind, "system", where)
-    if constants:
-        names = ", ".join(constants)
-        raise ValueError(f"{where}: give a system or its {names}, not both.")
-    return system, others
-
-
-def gym_dynamics(
-    task: Callable[..., Environment],
+def task(
     kind: type[AbstractSystem],
-    gym: Callable[..., AbstractDynamics],
-    system: AbstractSystem | None,
-    others: Mapping[str, Any],
-    dt: Any,
-    solver: diffrax.AbstractSolver | None,
-    substeps: int,
-) -> tuple[AbstractDynamics, dict[str, Any]]:
-    """The dynamics of a task with Gym's arithmetic, or a solver in its place, and those
-    of `others` that are arguments of `Environment`.
+    *,
+    dt: float,
+    horizon: int,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+    gym: Callable[..., AbstractDynamics] | None = None,
+    arguments: Callable[..., dict[str, Any]] = lambda: {},
+    accepts: type[AbstractSystem] | None = None,
+) -> Callable[[Callable[..., dict[str, Any]]], Callable[..., Environment]]:
+    """A decorator that makes a task of what the task adds to a system.
 
-    `gym` takes the system, `dt`, and what `others` hold of its arguments. See
-    `system_of` for the rest.
+    It decorates a function of the system (with `gym`, of the dynamics) and of options
+    to arguments of `Environment`. The task takes a system or the arguments of one, the
+    options, `dt`, `horizon`, `solver` and `substeps`, the arguments of `gym`, and those
+    of `Environment`, which hold instead of what the function returns.
 
-    **Raises:** `ValueError` as `system_of` does, if `dt` is not positive, on `substeps`
-    without a solver, or on an argument of `gym` with it.
+    **Arguments:**
+
+    - `kind`: the class of the system, if none is given.
+    - `dt`, `horizon`, `solver`, `substeps`: defaults of the task.
+    - `gym`: Gym's arithmetic, of a system, `dt` and limits, for which a solver can be
+        given instead.
+    - `arguments`: makes arguments of the system of others, by keywords.
+    - `accepts`: what a system may be; of that `kind` by default.
     """
-    where = task.__name__
-    system, others = system_of(task, kind, system, others, gym)
-    check_step(dt, where)
-    limits, others = _split(others, gym)
-    if solver is None:
-        if substeps != 1:
-            raise ValueError(f"{where}: substeps needs a solver, such as RK4().")
-        return gym(system, dt, **limits), others
-    for name in limits:
-        raise ValueError(
-            f"{where}: {name} is of Gym's arithmetic, and no solver has the like; give "
-            f"one of {name} and solver."
-        )
-    return Discretized(system, dt, solver, substeps), others
+    default_solver, accepts = solver, accepts or kind
+    arithmetic = () if gym is None else (gym,)
+    derived = inspect.signature(arguments).parameters
+
+    def decorate(added: Callable[..., dict[str, Any]]) -> Callable[..., Environment]:
+        where = added.__name__
+
+        def make(
+            system: Any = None,
+            *,
+            dt: Any = dt,
+            horizon: int = horizon,
+            solver: diffrax.AbstractSolver | None = None,
+            substeps: int = substeps,
+            **others: Any,
+        ) -> Environment:
+            check_keywords(others, where, make, kind, *arithmetic, Environment)
+            chosen = _taken(others, [p.name for p in options])
+            special = _taken(others, derived)
+            special = {n: v for n, v in special.items() if v is not derived[n].default}
+            constants = _taken(others, keywords_of(kind))
+            if system is None:
+                system = kind(**(constants | arguments(**special)))
+            elif special or constants:
+                names = ", ".join([*special, *constants])
+                raise ValueError(f"{where}: give a system or its {names}, not both.")
+            check_instance(system, accepts, "system", where)
+            if gym is None:
+                subject = system
+                dynamics = Discretized(system, dt, solver or default_solver, substeps)
+            else:
+                limits = _taken(others, keywords_of(gym))
+                step = functools.partial(gym, system, dt, **limits)
+                subject = dynamics = gym_or_solver(step, solver, substeps, where)
+            fields: dict[str, Any] = dict(dynamics=dynamics, horizon=horizon)
+            fields = fields | added(subject, **chosen) | others
+            if "observation_bounds" not in others:
+                if not _CHANGES_OBSERVATIONS.isdisjoint(others):
+                    fields["observation_bounds"] = None
+            return Environment(**fields)
+
+        # Documentation and the check of keywords read the arguments off the signature.
+        signature = inspect.signature(make)
+        system, *rest = signature.parameters.values()
+        system = system.replace(annotation=accepts | None)
+        _, *options = inspect.signature(added).parameters.values()
+        parameters = [system, *options, *derived.values(), *rest]
+        signature = signature.replace(parameters=parameters)
+        functools.update_wrapper(make, added)
+        vars(make)["__signature__"] = signature
+        return make
+
+    return decorate
 
 
-def task_environment(others: Mapping[str, Any], **arguments: Any) -> Environment:
-    """The environment of a task, in which `others` hold instead of `arguments`.
-
-    The task's `observation_bounds` hold for the task as it is: they are left out where
-    something is given that changes what is observed.
-    """
-    given = not _CHANGES_OBSERVATIONS.isdisjoint(others)
-    if given and "observation_bounds" not in others:
-        arguments["observation_bounds"] = None
-    return Environment(**(arguments | dict(others)))
+def _taken(arguments: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    """Those of `arguments` that are called so, which they no longer hold then."""
+    return {name: arguments.pop(name) for name in names if name in arguments}

@@ -1,5 +1,7 @@
 """A first state from a box."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.random as jr
 import numpy as np
@@ -31,6 +33,10 @@ class UniformState(eqx.Module):
 
     low: Array = parameter()
     high: Array = parameter()
+
+    def __init__(self, low: Any, high: Any):
+        self.low = low
+        self.high = high
 
     def __check_init__(self):
         size = np.size(self.low)

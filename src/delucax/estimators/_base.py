@@ -1,13 +1,15 @@
-"""What a state estimator is; the protocol alone."""
+"""The protocol of state estimators."""
 
 import abc
 from typing import NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
 
 from .._module import check_parameters
-from .._typing import PRNGKey, RealScalar
+from .._results import choose, Result, RESULTS
+from .._typing import BoolScalar, Control, Observation, PRNGKey, RealScalar
 
 
 class Belief(NamedTuple):
@@ -31,14 +33,29 @@ class Belief(NamedTuple):
     mean: Float[Array, "*T n"]
     covariance: Float[Array, "*T n n"]
 
+    @property
+    def is_finite(self) -> BoolScalar:
+        """Whether no entry is NaN or infinite."""
+        return jnp.all(jnp.isfinite(self.mean)) & jnp.all(jnp.isfinite(self.covariance))
+
 
 class AbstractEstimator(eqx.Module):
-    """Estimates a state from observations.
+    r"""Estimates the state of a plant, recursively, from controls and observations
 
-    At each step, in this order: `update` takes in the observation at `t`; `predict`
-    moves the belief on over the step from `t`, with the control that was really
-    applied. [`delucax.controllers.OutputFeedback`][] makes the calls in a closed loop,
-    and [`delucax.estimators.run_filter`][] on a record.
+    `x_{k+1} = F(t_k, x_k, u_k, w_k)`, `y_k = h(t_k, x_k) + v_k`.
+
+    At each step, in this order: `update` takes in the observation `y_k`; `predict`
+    moves on over the step from `t_k`, with the control `u_k` that was really applied.
+    Whatever the estimator carries from step to step is its state, a pytree of arrays.
+    `estimate` reads a belief off it, and `status` says what became of the last step.
+    [`delucax.controllers.OutputFeedback`][] makes the calls in a closed loop, and
+    [`delucax.estimators.run_filter`][] on a record.
+
+    To write an estimator, subclass this and give `init`, `update` and `predict`. The
+    state of a filter is a [`delucax.estimators.Belief`][], and there is no more to
+    write. One that carries something else also gives `estimate`: a moving-horizon
+    estimator, say, carries the observations and controls of its window and the last
+    solution. One that solves a problem gives `status`.
 
     !!! example
 
@@ -55,12 +72,12 @@ class AbstractEstimator(eqx.Module):
                 n = self.dynamics.state_size
                 return dlx.estimators.Belief(jnp.zeros(n), jnp.eye(n))
 
-            def update(self, t, y, belief):
-                error = y - self.dynamics.observe(t, belief.mean)
-                return belief._replace(mean=belief.mean + self.L @ error)
+            def update(self, t, y, state):
+                error = y - self.dynamics.observe(t, state.mean)
+                return state._replace(mean=state.mean + self.L @ error)
 
-            def predict(self, t, u, belief):
-                return belief._replace(mean=self.dynamics(t, belief.mean, u))
+            def predict(self, t, u, state):
+                return state._replace(mean=self.dynamics(t, state.mean, u))
 
         observer = Luenberger(dlx.make("pendulum").dynamics, 0.5 * jnp.eye(2))
         observer.update(0.0, jnp.array([0.1, 0.0]), observer.init()).mean
@@ -71,36 +88,56 @@ class AbstractEstimator(eqx.Module):
         check_parameters(self)
 
     @abc.abstractmethod
-    def init(self, *, key: PRNGKey | None = None) -> Belief:
-        """What is known before the first observation.
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
+        """The state before the first observation.
 
         **Arguments:** `key`: a random key, for estimators that draw.
 
-        **Returns:** a [`delucax.estimators.Belief`][].
+        **Returns:** a pytree of arrays.
         """
 
     @abc.abstractmethod
-    def update(self, t: RealScalar, y: Array, belief: Belief) -> Belief:
-        """The measurement update: what is known once `y` is observed.
+    def update(self, t: RealScalar, y: Observation, state: PyTree) -> PyTree:
+        """The measurement update, with the observation `y`.
 
         **Arguments:**
 
         - `t`: time of the observation, a scalar.
         - `y`: the observation, shape `(p,)`.
-        - `belief`: what was known of the state at `t`.
+        - `state`: the estimator's state; its estimate is of the plant at `t`.
 
-        **Returns:** the new belief of the state at `t`.
+        **Returns:** the new state; its estimate is of the plant at `t`.
         """
 
     @abc.abstractmethod
-    def predict(self, t: RealScalar, u: Array, belief: Belief) -> Belief:
-        """The time update: what is known of the next state.
+    def predict(self, t: RealScalar, u: Control, state: PyTree) -> PyTree:
+        """The time update, over one step.
 
         **Arguments:**
 
         - `t`: time at the start of the step, a scalar.
         - `u`: the control that was applied over the step, shape `(m,)`.
-        - `belief`: what is known of the state at `t`.
+        - `state`: the estimator's state; its estimate is of the plant at `t`.
 
-        **Returns:** the belief of the state at the end of the step.
+        **Returns:** the new state; its estimate is of the plant at the end of the step.
         """
+
+    def estimate(self, state: PyTree) -> Belief:
+        """The belief that a state stands for; by default the state is the belief.
+
+        **Arguments:** `state`: the estimator's state.
+
+        **Returns:** a [`delucax.estimators.Belief`][].
+        """
+        return state
+
+    def status(self, state: PyTree) -> Result:
+        """What became of the last `update` or `predict`.
+
+        **Arguments:** `state`: the estimator's state after it.
+
+        **Returns:** one of `delucax.RESULTS`; by default `RESULTS.diverged` if the
+        estimate is not finite, and success otherwise.
+        """
+        finite = self.estimate(state).is_finite
+        return choose(finite, RESULTS.successful, RESULTS.diverged)

@@ -2,16 +2,16 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar, TYPE_CHECKING
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._check import as_vector, check_finite, is_concrete, symmetric_matrix
 from .._controller import wrong_observation
-from .._typing import RealScalar
+from .._typing import Control, Observation, RealScalar, Scalar
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ._base import AbstractEstimator, Belief
@@ -25,39 +25,20 @@ class AbstractGaussianFilter(AbstractEstimator):
     state.
     """
 
-    if TYPE_CHECKING:  # a static checker would ask for abstract fields as arguments
-        dynamics: ClassVar[Any]
-        W: ClassVar[Any]
-        V: ClassVar[Any]
-        mean: ClassVar[Any]
-        covariance: ClassVar[Any]
-        observation_difference: ClassVar[Any]
-    else:
-        dynamics: eqx.AbstractVar[AbstractDynamics]
-        W: eqx.AbstractVar[Array]
-        V: eqx.AbstractVar[Array]
-        mean: eqx.AbstractVar[Array]
-        covariance: eqx.AbstractVar[Array]
-        observation_difference: eqx.AbstractVar[Callable | None]
+    dynamics: eqx.AbstractVar[AbstractDynamics]
+    W: eqx.AbstractVar[Float[Array, "k k"]]
+    V: eqx.AbstractVar[Float[Array, "p p"]]
+    mean: eqx.AbstractVar[Float[Array, " n"]]
+    covariance: eqx.AbstractVar[Float[Array, "n n"]]
+    observation_difference: eqx.AbstractVar[Callable[[Array, Array], Array] | None]
 
     @abc.abstractmethod
     def _observation(self, t: RealScalar, belief: Belief) -> AbstractJoint:
         """The moments of what will be observed at `t`."""
 
     @abc.abstractmethod
-    def _transition(self, t: RealScalar, u: Array, belief: Belief) -> AbstractJoint:
+    def _transition(self, t: RealScalar, u: Control, belief: Belief) -> AbstractJoint:
         """The moments of the next state."""
-
-    def init(self, *, key=None):
-        del key
-        return Belief(self.mean, self.covariance)
-
-    def update(self, t, y, belief):
-        return self._corrected(belief, *self._compared(t, y, belief))
-
-    def predict(self, t, u, belief):
-        joint = self._moved(t, u, belief)
-        return _like(Belief(joint.mean, joint.covariance), belief)
 
     def __check_init__(self):
         where, n = type(self).__name__, self.dynamics.state_size
@@ -65,7 +46,18 @@ class AbstractGaussianFilter(AbstractEstimator):
         as_vector(self.mean, n, "mean", where)
         covariance_matrix(self.covariance, n, "covariance", "the state", where)
 
-    def log_likelihood(self, t: RealScalar, y: Array, belief: Belief) -> Array:
+    def init(self, *, key=None):
+        del key
+        return Belief(self.mean, self.covariance)
+
+    def update(self, t, y, state):
+        return self._corrected(state, *self._innovation(t, y, state))
+
+    def predict(self, t, u, state):
+        joint = self._prediction(t, u, state)
+        return _like(Belief(joint.mean, joint.covariance), state)
+
+    def log_likelihood(self, t: RealScalar, y: Observation, belief: Belief) -> Scalar:
         """The log-density of an observation, given what is known before it.
 
         Summed over a record, it is the log-likelihood of the model.
@@ -78,10 +70,10 @@ class AbstractGaussianFilter(AbstractEstimator):
 
         **Returns:** a scalar; NaN if the covariance of the observation is not definite.
         """
-        return self._density(belief, *self._compared(t, y, belief))
+        return self._log_density(belief, *self._innovation(t, y, belief))
 
-    def _compared(self, t, y, belief):
-        """The moments of what was expected, and by how much `y` differs from it."""
+    def _innovation(self, t, y, belief):
+        """The moments of the expected observation, and how far `y` is from its mean."""
         if y.shape != self.V.shape[:1]:
             raise wrong_observation(self, self.V.shape[0], y)
         joint = self._observation(t, belief)
@@ -89,16 +81,16 @@ class AbstractGaussianFilter(AbstractEstimator):
             return joint, y - joint.mean
         return joint, self.observation_difference(y, joint.mean)
 
-    def _corrected(self, belief, joint, residual):
+    def _corrected(self, belief, joint, innovation):
         G = joint.gain()
-        mean = belief.mean + matvec(G, residual)
+        mean = belief.mean + matvec(G, innovation)
         return _like(Belief(mean, joint.remainder(G)), belief)
 
-    def _density(self, belief, joint, residual):
+    def _log_density(self, belief, joint, innovation):
         S = joint.covariance
-        return log_density(residual.astype(S.dtype), S).astype(belief.mean.dtype)
+        return log_density(innovation.astype(S.dtype), S).astype(belief.mean.dtype)
 
-    def _moved(self, t, u, belief):
+    def _prediction(self, t, u, belief):
         m = self.dynamics.control_size
         if u.shape != (m,):
             raise ValueError(
@@ -109,7 +101,7 @@ class AbstractGaussianFilter(AbstractEstimator):
 
     def _smoothed(self, t, u, belief, after):
         """The belief once that of the next state, `after`, is known from all data."""
-        joint = self._moved(t, u, belief)
+        joint = self._prediction(t, u, belief)
         G = joint.gain()
         shift = self.dynamics.difference(after.mean, joint.mean)
         covariance = joint.remainder(G) + G @ after.covariance @ G.T
@@ -150,15 +142,24 @@ def covariance_matrix(value: Any, size: int, name: str, of: str, where: str) -> 
     return matrix
 
 
-def first_belief(
-    mean: Any, covariance: Any, default: Array, like: tuple[Array, ...], where: str
-) -> tuple[Array, Array]:
-    """The mean and covariance to start from, in the precision of all."""
-    (n,) = default.shape
+def gaussian_model(
+    dynamics: AbstractDynamics,
+    W: Any,
+    V: Any,
+    mean: Any,
+    covariance: Any,
+    default: Array | None,
+    where: str,
+) -> tuple[Array, Array, Array, Array]:
+    """The covariances `W` and `V` of the noise, and the mean (`default`, or zero, if
+    there is none) and covariance of the first state, in the precision of all."""
+    W, V = noise_covariances(dynamics, W, V, where)
+    n = dynamics.state_size
+    default = jnp.zeros(n, W.dtype) if default is None else default
     mean = default if mean is None else as_vector(mean, n, "mean", where)
     check_finite(mean, "mean", where)
     if covariance is None:
         covariance = jnp.eye(n, dtype=mean.dtype)
     covariance = covariance_matrix(covariance, n, "covariance", "the state", where)
-    dtype = jnp.result_type(mean, covariance, *like)
-    return mean.astype(dtype), covariance.astype(dtype)
+    dtype = jnp.result_type(mean, covariance, default, W, V)
+    return W, V, mean.astype(dtype), covariance.astype(dtype)

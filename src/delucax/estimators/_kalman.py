@@ -6,12 +6,13 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._check import as_vector
+from .._check import as_vector, check_bool, check_instance
 from .._module import function_field, parameter, weight
 from ..dynamics import LinearDynamics
+from ..math._linear_solve import symmetric
 from ..riccati import filter_dare
 from ..riccati._solution import checked
-from ._gaussian import AbstractGaussianFilter, first_belief, noise_covariances
+from ._gaussian import AbstractGaussianFilter, gaussian_model
 from ._moments import congruence, LinearJoint
 
 
@@ -93,23 +94,17 @@ class KalmanFilter(AbstractGaussianFilter):
     ):
         where = "KalmanFilter"
         _check_linear(dynamics)
-        if not isinstance(steady_state, bool):
-            raise ValueError(
-                f"{where}: steady_state must be True or False, got {steady_state!r}."
-            )
-        self.dynamics = dynamics
-        self.W, self.V = noise_covariances(dynamics, W, V, where)
-        self.y_ref = None
+        steady_state = check_bool(steady_state, "steady_state", where)
+        self.dynamics, self.observation_difference = dynamics, observation_difference
+        x_ref = dynamics.at(0.0).x_ref
+        x_ref = x_ref.astype(jnp.result_type(x_ref, dynamics.A))
+        self.W, self.V, self.mean, self.covariance = gaussian_model(
+            dynamics, W, V, mean, covariance, x_ref, where
+        )
+        self.y_ref = self.L = self.updated_covariance = None
         if y_ref is not None:
             self.y_ref = as_vector(y_ref, self.V.shape[0], "y_ref", where)
-        self.observation_difference = observation_difference
-        self.L = self.updated_covariance = None
-        first_ref = dynamics.at(0.0).x_ref
-        like = dynamics.A, self.W, self.V
         if not steady_state:
-            self.mean, self.covariance = first_belief(
-                mean, covariance, first_ref, like, where
-            )
             return
         _check_time_invariant(dynamics)
         if covariance is not None:
@@ -117,17 +112,14 @@ class KalmanFilter(AbstractGaussianFilter):
                 f"{where}: covariance must not be given with steady_state, of which it "
                 "follows."
             )
-        C = self._C
-        noise = self._noise(dynamics)
+        C, noise = self._C, self._noise(dynamics)
         solution = filter_dare(dynamics.A, C, noise, self.V, throw=False)
         what = f"{where}: there is no steady state. Of A', C' in the places of A, B"
-        covariance = checked(solution, what, True).X
-        self.mean, self.covariance = first_belief(
-            mean, covariance, first_ref, like, where
-        )
+        covariance = symmetric(checked(solution, what, True).X)
+        self.covariance = covariance.astype(self.mean.dtype)
         joint = LinearJoint(C @ self.mean, self.covariance, C, self.V)
-        L = joint.gain()
-        self.L, self.updated_covariance = L, joint.remainder(L)
+        self.L = joint.gain()
+        self.updated_covariance = joint.remainder(self.L)
 
     def __check_init__(self):
         _check_linear(self.dynamics)
@@ -172,11 +164,8 @@ class KalmanFilter(AbstractGaussianFilter):
 
 
 def _check_linear(dynamics: Any) -> None:
-    if not isinstance(dynamics, LinearDynamics):
-        raise ValueError(
-            "KalmanFilter: dynamics must be LinearDynamics (ExtendedKalmanFilter and "
-            f"UnscentedKalmanFilter take any), got {type(dynamics).__name__}."
-        )
+    hint = " (ExtendedKalmanFilter and UnscentedKalmanFilter take any)"
+    check_instance(dynamics, LinearDynamics, "dynamics", "KalmanFilter", hint)
 
 
 def _check_time_invariant(dynamics: LinearDynamics) -> None:

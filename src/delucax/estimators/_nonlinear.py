@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._check import check_instance, check_number, check_positive, is_concrete
+from .._jax import jacobian
 from .._module import function_field, parameter, positive
 from .._results import RESULTS
 from ..dynamics import AbstractDynamics
-from ..dynamics._linearize import _jacobian
-from ._gaussian import AbstractGaussianFilter, first_belief, noise_covariances
+from ._gaussian import AbstractGaussianFilter, gaussian_model
 from ._moments import congruence, LinearJoint, SampledJoint, square_root
 
 
@@ -83,10 +83,8 @@ class ExtendedKalmanFilter(AbstractGaussianFilter):
         where = "ExtendedKalmanFilter"
         _check_dynamics(dynamics, where)
         self.dynamics = dynamics
-        self.W, self.V = noise_covariances(dynamics, W, V, where)
-        zero = jnp.zeros(dynamics.state_size, self.W.dtype)
-        self.mean, self.covariance = first_belief(
-            mean, covariance, zero, (self.W, self.V), where
+        self.W, self.V, self.mean, self.covariance = gaussian_model(
+            dynamics, W, V, mean, covariance, None, where
         )
         self.observation_difference = observation_difference
 
@@ -95,19 +93,19 @@ class ExtendedKalmanFilter(AbstractGaussianFilter):
 
     def _observation(self, t, belief):
         observe = lambda x: self.dynamics.observe(t, x)
-        C = _jacobian(observe)(belief.mean)
+        C = jacobian(observe)(belief.mean)
         return LinearJoint(observe(belief.mean), belief.covariance, C, self.V)
 
     def _transition(self, t, u, belief):
-        A = _jacobian(lambda x: _advanced(self.dynamics, t, x, u))(belief.mean)
+        A = jacobian(lambda x: _advanced(self.dynamics, t, x, u))(belief.mean)
         mean = _advanced(self.dynamics, t, belief.mean, u)
         noise = _added_covariance(self, t, u, belief.mean)
         return LinearJoint(mean, belief.covariance, A, noise)
 
 
 class UnscentedKalmanFilter(AbstractGaussianFilter):
-    r"""The Kalman filter whose moments are those of `2 n + 1` points, moved by the
-    dynamics and seen by the sensor as they are:
+    r"""The Kalman filter whose moments are those of `2 n + 1` points, each passed
+    through the dynamics and the sensor:
 
     `x_next = F(t, x, u, w)`, `w ~ N(0, W)`, `y = h(t, x) + v`, `v ~ N(0, V)`.
 
@@ -190,10 +188,8 @@ class UnscentedKalmanFilter(AbstractGaussianFilter):
         where = "UnscentedKalmanFilter"
         _check_dynamics(dynamics, where)
         self.dynamics = dynamics
-        self.W, self.V = noise_covariances(dynamics, W, V, where)
-        zero = jnp.zeros(dynamics.state_size, self.W.dtype)
-        self.mean, self.covariance = first_belief(
-            mean, covariance, zero, (self.W, self.V), where
+        self.W, self.V, self.mean, self.covariance = gaussian_model(
+            dynamics, W, V, mean, covariance, None, where
         )
         self.alpha, self.beta, self.kappa = alpha, beta, kappa
         self.observation_difference = observation_difference
@@ -264,5 +260,5 @@ def _added_covariance(estimator: Any, t: Any, u: Array, x: Array) -> Array:
     """`E W E'`, what the disturbance adds to the covariance of the next state."""
     dynamics, W = estimator.dynamics, estimator.W
     w = jnp.zeros(W.shape[0], x.dtype)
-    E = _jacobian(lambda w: _advanced(dynamics, t, x, u, w))(w)
+    E = jacobian(lambda w: _advanced(dynamics, t, x, u, w))(w)
     return congruence(E, W)

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_finite, is_concrete
-from .._message import shortened
+from .._check import as_rows, check_finite, check_number, is_concrete
 from .._module import as_float_array
 from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision
@@ -218,27 +217,16 @@ def _record(estimator, observations, controls, t0, where):
             f"{where}: estimator must be a KalmanFilter, ExtendedKalmanFilter or "
             f"UnscentedKalmanFilter, got {type(estimator).__name__}."
         )
-    p, m = estimator.V.shape[0], estimator.dynamics.control_size
-    y = as_float_array(observations)
-    if not eqx.is_inexact_array(y) or y.ndim != 2 or y.shape[1] != p or not len(y):
-        got = f"shape {y.shape}" if eqx.is_array(y) else shortened(observations)
-        raise ValueError(
-            f"{where}: observations must have shape (T, {p}), T at least 1, got {got}."
-        )
+    m = estimator.dynamics.control_size
+    y = as_rows(observations, estimator.V.shape[0], "observations", where)
     check_finite(y, "observations", where)
-    shape = (y.shape[0], m)
-    u = jnp.zeros(shape, y.dtype) if controls is None else as_float_array(controls)
-    if not eqx.is_inexact_array(u) or u.shape != shape:
-        got = f"shape {u.shape}" if eqx.is_array(u) else shortened(controls)
-        raise ValueError(
-            f"{where}: controls must have shape {shape}, a row for each observation, "
-            f"got {got}."
-        )
+    u = jnp.zeros((len(y), m), y.dtype)
+    if controls is not None:
+        u = as_rows(controls, m, "controls", where, len(y))
     check_finite(u, "controls", where)
-    t0 = as_float_array(t0)
-    if jnp.shape(t0) != ():
-        raise ValueError(f"{where}: t0 must be a number, got shape {jnp.shape(t0)}.")
-    return y, u, (t0 + jnp.arange(len(y)) * estimator.dynamics.dt).astype(y.dtype)
+    check_number(t0, "t0", where)
+    times = as_float_array(t0) + jnp.arange(len(y)) * estimator.dynamics.dt
+    return y, u, times.astype(y.dtype)
 
 
 @eqx.filter_jit
@@ -246,30 +234,30 @@ def _filter(estimator, y, u, times) -> Filtered:
     first = estimator.init()
 
     def step(carry, inputs):
-        belief, well = carry
+        belief, ok = carry
         t, y, u = inputs
-        expected = estimator._compared(t, y, belief)
-        density = estimator._density(belief, *expected)
+        expected = estimator._innovation(t, y, belief)
+        density = estimator._log_density(belief, *expected)
         updated = estimator._corrected(belief, *expected)
         after = estimator.predict(t, u, updated)
-        well &= _is_finite(updated) & _is_finite(after)
+        ok &= updated.is_finite & after.is_finite
         # From a failure on, steps are taken from the start again, and then masked: so
         # no NaN of one member of a batch gets into the derivative of the others.
-        after = jax.tree.map(lambda a, b: jnp.where(well, a, b), after, first)
-        return (after, well), (updated, after, density, well)
+        after = jax.tree.map(lambda a, b: jnp.where(ok, a, b), after, first)
+        return (after, ok), (updated, after, density, ok)
 
-    start = first, _is_finite(first)
-    _, (updated, after, densities, well) = lax.scan(step, start, (times, y, u))
+    start = first, first.is_finite
+    _, (updated, after, densities, ok) = lax.scan(step, start, (times, y, u))
     predicted = jax.tree.map(
-        lambda a, b: jnp.concatenate([a[None], _masked(well, b)]), first, after
+        lambda a, b: jnp.concatenate([a[None], _masked(ok, b)]), first, after
     )
-    clear = jnp.all(jnp.isfinite(densities))
-    result = choose(clear, RESULTS.successful, RESULTS.ill_posed)
+    definite = jnp.all(jnp.isfinite(densities))
+    result = choose(definite, RESULTS.successful, RESULTS.ill_posed)
     return Filtered(
         predicted=predicted,
-        updated=jax.tree.map(lambda a: _masked(well, a), updated),
-        log_likelihoods=_masked(well, densities),
-        result=choose(jnp.all(well), result, RESULTS.diverged),
+        updated=jax.tree.map(lambda a: _masked(ok, a), updated),
+        log_likelihoods=_masked(ok, densities),
+        result=choose(jnp.all(ok), result, RESULTS.diverged),
     )
 
 
@@ -277,12 +265,9 @@ def _filter(estimator, y, u, times) -> Filtered:
 @full_precision
 def _smooth(estimator, y, u, times) -> Smoothed:
     filtered = _filter(estimator, y, u, times)
-    well = jnp.isfinite(filtered.log_likelihoods)
-    first = estimator.init()
+    ok = jnp.isfinite(filtered.log_likelihoods)
     updated = jax.tree.map(
-        lambda a, b: jnp.where(well.reshape(-1, *(1,) * b.ndim), a, b),
-        filtered.updated,
-        first,
+        lambda a, b: _masked(ok, a, b), filtered.updated, estimator.init()
     )
 
     def back(after, inputs):
@@ -294,32 +279,27 @@ def _smooth(estimator, y, u, times) -> Smoothed:
     inputs = jax.tree.map(lambda a: a[:-1], (times, u, updated))
     _, smoothed = lax.scan(back, last, inputs, reverse=True)
     whole = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), smoothed, last)
-    good = filtered.result == RESULTS.successful
-    sound = _is_finite(whole)
-    result = choose(sound | ~good, filtered.result, RESULTS.diverged)
-    whole = jax.tree.map(lambda a: jnp.where(good, a, jnp.nan), whole)
+    filter_ok = filtered.result == RESULTS.successful
+    result = choose(whole.is_finite | ~filter_ok, filtered.result, RESULTS.diverged)
+    whole = jax.tree.map(lambda a: jnp.where(filter_ok, a, jnp.nan), whole)
     return Smoothed(whole.mean, whole.covariance, filtered, result)
 
 
-def _is_finite(belief: Belief) -> Array:
-    return jnp.all(jnp.isfinite(belief.mean)) & jnp.all(jnp.isfinite(belief.covariance))
+def _masked(ok: Array, values: Array, otherwise: Any = jnp.nan) -> Array:
+    return jnp.where(ok.reshape(-1, *(1,) * (values.ndim - 1)), values, otherwise)
 
 
-def _masked(well: Array, values: Array) -> Array:
-    return jnp.where(well.reshape(-1, *(1,) * (values.ndim - 1)), values, jnp.nan)
-
-
-def _checked(found, where):
-    """Raise if the run failed: now if it can be seen, else at run time."""
-    failed = found.result != RESULTS.successful
+def _checked(solution, where):
+    """Raise if the run failed: now if its values are known, else at run time."""
+    failed = solution.result != RESULTS.successful
     if not is_concrete(failed):
-        return found.result.error_if(found, failed)
+        return solution.result.error_if(solution, failed)
     if failed:
-        filtered = found if isinstance(found, Filtered) else found.filtered
+        filtered = solution if isinstance(solution, Filtered) else solution.filtered
         finite = np.isfinite(filtered.log_likelihoods)
-        where_to = "" if finite.all() else f" At observation {finite.argmin()}."
+        place = "" if finite.all() else f" At observation {finite.argmin()}."
         raise RuntimeError(
-            f"{where}: {RESULTS[found.result]}{where_to} Pass throw=False to look at "
+            f"{where}: {RESULTS[solution.result]}{place} Pass throw=False to look at "
             "the beliefs."
         )
-    return found
+    return solution

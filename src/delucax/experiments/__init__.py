@@ -1,4 +1,4 @@
-"""Experiments as pytest writes tests."""
+"""Experiments, declared as pytest declares tests."""
 
 from ._axes import Mark as Mark
 from ._experiment import Experiment as Experiment, experiment as experiment

@@ -2,8 +2,8 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from ._fingerprint import fingerprint
 
 @dataclasses.dataclass(frozen=True)
 class Mark:
-    """What is known of a case beforehand; made by `experiment.mark`.
+    """A label of a case, such as `slow`; made by `experiment.mark`.
 
     **Arguments:**
 
@@ -60,12 +60,48 @@ class Param:
     marks: tuple[Mark, ...] = ()
 
 
+class Choice(NamedTuple):
+    """One of the values of an axis: its place, what the table shows, and its hash."""
+
+    index: int
+    param: Param
+    shown: Mapping[str, Any]
+    hash: str
+
+
 @dataclasses.dataclass(frozen=True)
 class Axis:
     """One `parametrize`: names, and what they are called with, each with its id."""
 
     names: tuple[str, ...]
     params: tuple[Param, ...]
+
+    def choices(self, where: str) -> Iterator[Choice]:
+        """What there is to choose from; `where` is named in errors."""
+        for index, param in enumerate(self.params):
+            named = dict(zip(self.names, param.values, strict=True))
+            shown = {name: self._shown(v, param) for name, v in named.items()}
+            hashes = [(n, _hash(v, n, param, where)) for n, v in named.items()]
+            yield Choice(index, param, shown, fingerprint(hashes))
+
+    def _shown(self, value: Any, param: Param) -> Any:
+        """What the table shows: a simple value itself, of another its name or id."""
+        value = value.item() if isinstance(value, np.generic) else value
+        if _is_simple(value):
+            return value
+        return (_label(value) if len(self.names) > 1 else None) or param.id
+
+
+def _hash(value: Any, name: str, param: Param, where: str) -> str:
+    """What tells a value from others by its content."""
+    try:
+        return fingerprint(value)
+    except (TypeError, RecursionError) as error:
+        raise ValueError(
+            f"{where}: the parameter {name!r} of case {param.id!r} cannot be "
+            f"written down: it holds {error}. Give a name instead, and make "
+            "the thing in the function or in a fixture."
+        ) from error
 
 
 def axis_of(names: Any, values: Any, ids: Any) -> Axis:
@@ -92,12 +128,8 @@ def axis_of(names: Any, values: Any, ids: Any) -> Axis:
                 f"{where}: each value must have {len(names)} parts, for "
                 f"{', '.join(names)}; got {param.values!r}."
             )
-    labels = _ids(params, names, ids, where)
-    params = [
-        dataclasses.replace(param, id=label)
-        for param, label in zip(params, labels, strict=True)
-    ]
-    return Axis(names, tuple(params))
+    pairs = zip(params, _ids(params, names, ids, where), strict=True)
+    return Axis(names, tuple(dataclasses.replace(p, id=label) for p, label in pairs))
 
 
 def _as_param(value: Any, names: tuple[str, ...]) -> Param:
@@ -146,42 +178,3 @@ def _label(value: Any) -> str | None:
         return str(value)
     label = getattr(value, "__name__", None)
     return label if isinstance(label, str) and label != "<lambda>" else None
-
-
-def shown_values(axis: Axis) -> list[dict[str, Any]]:
-    """What the table shows of each value: itself if it is simple, or its id."""
-
-    def shown(value: Any, param: Param) -> Any:
-        value = value.item() if isinstance(value, np.generic) else value
-        if _is_simple(value):
-            return value
-        return (_label(value) if len(axis.names) > 1 else None) or param.id
-
-    return [
-        {n: shown(v, param) for n, v in zip(axis.names, param.values, strict=True)}
-        for param in axis.params
-    ]
-
-
-def hashes_of(axis: Axis, where: str) -> list[str]:
-    """What tells each value from the others by its content."""
-
-    def hashed(value: Any, name: str, param: Param) -> str:
-        try:
-            return fingerprint(value)
-        except (TypeError, RecursionError) as error:
-            raise ValueError(
-                f"{where}: the parameter {name!r} of case {param.id!r} cannot be "
-                f"written down: it holds {error}. Give a name instead, and make "
-                "the thing in the function or in a fixture."
-            ) from error
-
-    return [
-        fingerprint(
-            [
-                (name, hashed(value, name, param))
-                for name, value in zip(axis.names, param.values, strict=True)
-            ]
-        )
-        for param in axis.params
-    ]

@@ -4,13 +4,14 @@ import dataclasses
 import importlib
 import importlib.util
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from ._experiment import Experiment
-from ._report import diff, DIFFERENCES, summary
+from ._page import Page
+from ._report import diff, DIFFERENCES, report, summary
 from ._results import Results
 from ._run import run
 from ._select import selector
@@ -19,8 +20,10 @@ from ._tables import as_text
 
 def list_cases(file: str, suites: Mapping[str, str], select: str, marks: str) -> int:
     """Show the cases of a file."""
-    made = load(file, suites)
-    cases = [case for one in made for case in one.cases(select, marks, slow=True)]
+    experiments = load(file, suites)
+    cases = [
+        case for one in experiments for case in one.cases(select, marks, slow=True)
+    ]
     for case in cases:
         labels = ", ".join(mark.name for mark in case.marks)
         print(f"{case.id}  ({labels})" if labels else case.id)
@@ -36,9 +39,9 @@ def run_file(
     options: dict[str, Any],
 ) -> int:
     """Run the experiments of a file and show what came out."""
-    made = load(file, suites)
+    experiments = load(file, suites)
     place = Path("results") / f"{Path(file).stem}.jsonl" if store is None else store
-    results = run(*made, store=place, **options)
+    results = run(*experiments, store=place, **options)
     done = {row["case"] for row in results.rows if row["status"] != "skipped"}
     if not done:
         raise ValueError(
@@ -50,7 +53,7 @@ def run_file(
         first = str(row["error"] or "passed though it was expected to fail")
         print(f"FAILED {case}: {first.splitlines()[0]}", file=sys.stderr)
     print(f"{len(done)} cases in {place}")
-    _write_report(results, html, file)
+    _write_page(html, lambda: report(results, Path(file).stem))
     return 1 if failed else 0
 
 
@@ -65,7 +68,7 @@ def report_file(
     for path in exports:
         results.export(path)
         print(f"written {path}")
-    _write_report(results, html, paths[0])
+    _write_page(html, lambda: report(results, Path(paths[0]).stem))
     return 0
 
 
@@ -87,9 +90,7 @@ def report_diff(
             print(f"{case}: only in {name}")
     differ = {tuple(line[:2]) for line in difference.changed}
     print(f"{difference.same} cases are the same, {len(differ)} differ")
-    if html is not None:
-        difference.page((paths[0], paths[1])).write(html)
-        print(f"report in {html}")
+    _write_page(html, lambda: difference.page((paths[0], paths[1])))
     return 0
 
 
@@ -100,10 +101,10 @@ def _show(results: Results) -> None:
         print(f"\n{name}\n\n{as_text('markdown', columns, rows)}")
 
 
-def _write_report(results: Results, html: str | None, file: str) -> None:
-    if html is not None:
-        results.report(html, title=Path(file).stem)
-        print(f"report in {html}")
+def _write_page(path: str | None, make: Callable[[], Page]) -> None:
+    if path is not None:
+        make().write(path)
+        print(f"report in {path}")
 
 
 def load(file: str, suites: Mapping[str, str]) -> list[Experiment]:
@@ -151,8 +152,6 @@ def _module_at(path: Path) -> ModuleType:
 def _read(path: str, select: str) -> Results:
     results = Results.read(path)
     is_selected = selector(select, "select", "report")
-
-    def matches(row: dict[str, Any]) -> bool:
-        return is_selected(lambda word: word.lower() in row["case"].lower())
-
-    return dataclasses.replace(results, rows=[*filter(matches, results.rows)])
+    contains = lambda row: lambda word: word.lower() in row["case"].lower()
+    rows = [row for row in results.rows if is_selected(contains(row))]
+    return dataclasses.replace(results, rows=rows)

@@ -1,6 +1,7 @@
 """One case after another, in the process that it is called in."""
 
 import contextlib
+import functools
 import inspect
 import os
 import threading
@@ -31,7 +32,7 @@ _TRACED_KINDS = (bool, int, float, complex), (float, complex), ()
 
 
 class Outcome(NamedTuple):
-    """What became of a case, as it is stored, and the process that ran it."""
+    """The outcome of a case, as it is stored, and the process that ran it."""
 
     values: dict[str, list]
     error: str | None
@@ -45,10 +46,10 @@ class Outcome(NamedTuple):
 class Runner:
     """Runs cases of an experiment, and keeps what they share: programs and fixtures."""
 
-    def __init__(self, made: Experiment):
-        self.made, self.axes = made, made.all_axes()
-        self.fixtures = made.used_fixtures()
-        kinds = [p.kind for p in made.arguments.values()]
+    def __init__(self, experiment: Experiment):
+        self.experiment, self.axes = experiment, experiment.all_axes()
+        self.fixtures = experiment.used_fixtures()
+        kinds = [p.kind for p in experiment.arguments.values()]
         self.takes_any_name = inspect.Parameter.VAR_KEYWORD in kinds
         self.shared: dict[Any, Any] = {}
         self.closing = contextlib.ExitStack()
@@ -78,7 +79,8 @@ class Runner:
         return Outcome(values, error, trace, *seconds, where, os.getpid())
 
     def close(self) -> None:
-        """Let the fixtures of the process go; one that fails harms no result."""
+        """End the fixtures of the process. If that fails, it is a warning: the results
+        are there."""
         self.shared.clear()
         try:
             self.closing.close()
@@ -86,8 +88,8 @@ class Runner:
             raise
         except BaseException as raised:
             warnings.warn(
-                f"{self.made.name}: a fixture of the process could not be let go: "
-                f"{type(raised).__name__}: {raised}",
+                f"{self.experiment.name}: a fixture of the process could not be let "
+                f"go: {type(raised).__name__}: {raised}",
                 stacklevel=2,
             )
 
@@ -107,22 +109,25 @@ class Runner:
             known = [origins[w] for w in (*wanted, name) if w in origins]
             origins[name] = frozenset().union(*known)
             if fixture.scope == "case":
-                given[name] = _made(fixture.function, arguments, stack)
+                given[name] = _make(fixture.function, arguments, stack)
                 continue
             key = name, origins[name]
             if key not in self.shared:
-                self.shared[key] = _made(fixture.function, arguments, self.closing)
+                self.shared[key] = _make(fixture.function, arguments, self.closing)
             given[name] = self.shared[key]
         if self.takes_any_name:
             return given
-        return {n: value for n, value in given.items() if n in self.made.arguments}
+        return {
+            n: value for n, value in given.items() if n in self.experiment.arguments
+        }
 
     def _call(self, arguments: dict[str, Any], seeds: tuple[int, ...], mesh: Any):
         """What the function returns: a list by seed, or all seeds at once."""
-        function, known = self.made.function, self.made.arguments
+        function, known = self.experiment.function, self.experiment.arguments
+        if "seed" in known:
+            return [function(**arguments, seed=seed) for seed in seeds]
         if "key" not in known:
-            each = [{"seed": seed} for seed in seeds] if "seed" in known else [{}]
-            return [function(**arguments, **seed) for seed in each]
+            return [function(**arguments)]
         numbers = np.asarray(seeds, np.int32)
         if mesh is not None:
             spread = NamedSharding(mesh, PartitionSpec(mesh.axis_names[0]))
@@ -136,19 +141,12 @@ class Runner:
         none. What worked is remembered by what tracing depends on, so that which it is
         follows from the case alone and not from those that ran before it.
         """
-        previous = None
         for kinds in _TRACED_KINDS:
             dynamic, rest = _split(arguments, kinds)
             static = _Static(rest)
-            if static == previous:
-                continue
-            previous = static
-            shapes = jax.tree.map(
-                lambda x: (np.shape(x), jax.dtypes.result_type(x), type(x).__name__),
-                dynamic,
-            )
-            leaves, structure = jax.tree.flatten(shapes)
-            key = (static, tuple(leaves), structure, numbers.shape)
+            leaves, structure = jax.tree.flatten(dynamic)
+            shapes = [(np.shape(x), jax.dtypes.result_type(x), type(x)) for x in leaves]
+            key = static, structure, tuple(shapes), numbers.shape
             if key not in self.is_traceable:
                 if len(self.is_traceable) >= _PROGRAMS:
                     self.is_traceable.clear()
@@ -168,13 +166,13 @@ class Runner:
         arguments = eqx.combine(dynamic, static.tree)
 
         def one(number: Any) -> Any:
-            return self.made.function(**arguments, key=jax.random.key(number))
+            return self.experiment.function(**arguments, key=jax.random.key(number))
 
         return jax.vmap(one)(numbers)
 
     def _columns(self, returned: Any) -> dict[str, list]:
         """Lists with an entry for each seed, by name, of things that JSON knows."""
-        where = self.made.name
+        where = self.experiment.name
         if isinstance(returned, list):
             rows = [_as_mapping(row) for row in returned]
             if any(row.keys() != rows[0].keys() for row in rows):
@@ -200,57 +198,46 @@ class Runner:
 
 
 class _Static:
-    """The part of the arguments that is no array, comparable by `jax.jit`."""
+    """The part of the arguments that is no array, comparable by `jax.jit`: by its
+    content, or as the same object where that cannot be hashed."""
 
     def __init__(self, tree: Any):
         self.tree = tree
-        self.leaves, self.structure = jax.tree.flatten(tree)
+        leaves, structure = jax.tree.flatten(tree)
+        self._content = structure, tuple(map(_comparable, leaves))
 
     def __hash__(self) -> int:
-        return hash((self.structure, *map(_hash, self.leaves)))
+        return hash(self._content)
 
     def __eq__(self, other: Any) -> bool:
-        if not isinstance(other, _Static) or self.structure != other.structure:
-            return False
-        return all(
-            a is b or (type(a) is type(b) and _same(a, b))
-            for a, b in zip(self.leaves, other.leaves, strict=True)
-        )
+        return isinstance(other, _Static) and self._content == other._content
 
 
-def _hash(leaf: Any) -> int:
+def _comparable(leaf: Any) -> tuple:
     try:
-        return hash(leaf)
+        hash(leaf)
     except TypeError:
-        return id(leaf)
-
-
-def _same(a: Any, b: Any) -> bool:
-    try:
-        return bool(a == b)
-    except Exception:
-        return False
+        return (id(leaf),)
+    return type(leaf), leaf  # 1 and True are equal, and are traced differently
 
 
 def _split(arguments: dict[str, Any], kinds: tuple[type, ...]) -> tuple[dict, dict]:
-    """What is traced of the arguments, and the rest; `kinds` of numbers are traced."""
+    """The arguments that are traced, and the static rest; numbers of `kinds` are
+    traced."""
 
-    def is_array(leaf: Any) -> bool:
-        return isinstance(leaf, jax.Array | np.ndarray | np.generic)
-
-    def is_traced(leaf: Any) -> bool:
-        return is_array(leaf) or type(leaf) in kinds
-
-    dynamic, static = {}, {}
-    for name, value in arguments.items():
+    def is_traced(value: Any) -> Any:
         # A whole number inside a module is part of its structure.
         plain = type(value) in (*_TRACED_KINDS[0], list, tuple, dict)
-        test = is_traced if plain else is_array
-        dynamic[name], static[name] = eqx.partition(value, test)
+        traced = kinds if plain else ()
+        is_array = lambda leaf: isinstance(leaf, jax.Array | np.ndarray | np.generic)
+        return lambda leaf: is_array(leaf) or type(leaf) in traced
+
+    parts = {name: eqx.partition(v, is_traced(v)) for name, v in arguments.items()}
+    dynamic, static = ({name: p[k] for name, p in parts.items()} for k in (0, 1))
     return dynamic, static
 
 
-def _made(function: Callable, arguments: dict[str, Any], stack: Any) -> Any:
+def _make(function: Callable, arguments: dict[str, Any], stack: Any) -> Any:
     if not inspect.isgeneratorfunction(function):
         return function(**arguments)
     return stack.enter_context(contextlib.contextmanager(function)(**arguments))
@@ -296,23 +283,18 @@ class _Clock:
         # One function is traced within another: what is covered counts once.
         covered, last = 0.0, self._begin
         for begin, end in sorted(spans):
-            begin = max(begin, last)
-            if end > begin:
-                covered += end - begin
-                last = end
+            covered += max(end - max(begin, last), 0.0)
+            last = max(end, last)
         self.compiling = min(covered, total)
         self.running = total - self.compiling
 
 
 _local = threading.local()
-_listening = False
 
 
+@functools.cache
 def _listen() -> None:
-    global _listening
-    if not _listening:
-        jax.monitoring.register_event_duration_secs_listener(_heard)
-        _listening = True
+    jax.monitoring.register_event_duration_secs_listener(_heard)
 
 
 def _heard(event: str, duration_secs: float, **kwargs: str | int) -> None:

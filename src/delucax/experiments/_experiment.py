@@ -1,23 +1,21 @@
-"""Experiments as pytest writes tests: a function, and what to call it with."""
+"""Experiments, declared as pytest declares tests: a function and its arguments."""
 
 import dataclasses
 import difflib
 import inspect
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
-from ._axes import Axis, axis_of, hashes_of, Mark, Marks, Param, shown_values
+from .._check import check_choice
+from ._axes import Axis, axis_of, Mark, Marks, Param
 from ._fingerprint import fingerprint
 from ._provenance import version
 from ._select import selector, words
 from ._store import RESERVED
-
-
-_SCOPES = ("case", "process")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,15 +30,6 @@ class Fixture:
         return self.function(*args, **kwargs)
 
 
-class Choice(NamedTuple):
-    """One of the values of an axis: its place, what the table shows, and its hash."""
-
-    index: int
-    param: Param
-    shown: Mapping[str, Any]
-    hash: str
-
-
 @dataclasses.dataclass(frozen=True)
 class Case:
     """One call of an experiment: a value of each axis, for all seeds."""
@@ -51,6 +40,22 @@ class Case:
     shown: Mapping[str, Any]
     marks: tuple[Mark, ...]
     hash: str
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """What the store knows it by."""
+        return self.experiment, self.id
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What a line of the store tells of it."""
+        return {
+            "experiment": self.experiment,
+            "case": self.id,
+            "order": self.index,
+            "hash": self.hash,
+            "parameters": self.shown,
+        }
 
     def mark(self, name: str) -> Mark | None:
         """The mark of that name, if it has it."""
@@ -176,16 +181,7 @@ class Experiment:
         is_selected = selector(select, "select", where)
         is_marked = selector(marks, "marks", where)
         slow = slow or "slow" in words(marks)
-        choices = [
-            map(
-                Choice,
-                itertools.count(),
-                a.params,
-                shown_values(a),
-                hashes_of(a, where),
-            )
-            for a in self.all_axes()
-        ]
+        choices = [axis.choices(where) for axis in self.all_axes()]
         cases, names = [], set()
         for chosen in itertools.product(*choices):
             ids = "-".join(str(choice.param.id) for choice in chosen)
@@ -282,10 +278,11 @@ class experiment:  # noqa: N801
     - with `key`: it is traced, compiled, and called for all seeds at once by `vmap`,
       each with `jax.random.key(seed)`. Parameters that are arrays, modules' arrays or
       numbers are traced, so that other values compile nothing again; where a number
-      must be known when it is traced (a horizon, a width), it is, found by trying.
-    - with `seed`: it is called as it is, once for each seed, with an integer. For code
-      that cannot be traced, such as `fit`.
-    - with neither: it is called as it is, once.
+      must be known when it is traced (a horizon, a width), it is static: tracing is
+      tried first with all numbers, then with fewer.
+    - with `seed`: it is called without `jit`, once for each seed, with an integer. For
+      code that cannot be traced, such as `fit`.
+    - with neither: it is called once, without `jit`.
 
     **Arguments:**
 
@@ -388,11 +385,7 @@ class experiment:  # noqa: N801
 
         **Raises:** `ValueError` on another scope.
         """
-        if scope not in _SCOPES:
-            raise ValueError(
-                f"experiment.fixture: scope must be {' or '.join(map(repr, _SCOPES))}, "
-                f"got {scope!r}."
-            )
+        check_choice(scope, ("case", "process"), "scope", "experiment.fixture")
         axis = None if params is None else axis_of("param", params, ids)
         make = lambda function: Fixture(function, scope, axis)
         return make if function is None else make(function)

@@ -3,12 +3,10 @@
 import ast
 import copyreg
 import dataclasses
-import enum
 import functools
 import hashlib
 import inspect
 import os
-import re
 import sys
 import sysconfig
 import textwrap
@@ -21,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 
 
-_ADDRESS = re.compile(r"0x[0-9a-f]+")
 _STANDARD = os.path.realpath(sysconfig.get_paths()["stdlib"])
 
 
@@ -50,13 +47,11 @@ def is_library(module: str | None) -> bool:
     if loaded is None:  # made by `exec`, in the tests of the pages
         return False
     file = getattr(loaded, "__file__", None)
-    if file is None:
-        return True
-    return _installed(file)
+    return file is None or _is_installed(file)
 
 
 @functools.cache
-def _installed(file: str) -> bool:
+def _is_installed(file: str) -> bool:
     file = os.path.realpath(file)
     return "site-packages" in file or file.startswith(_STANDARD + os.sep)
 
@@ -85,17 +80,12 @@ class _Hasher:
 
     def feed(self, value: Any) -> None:
         kind = type(value)
-        if value is None or kind in (bool, int, float, complex, str, bytes, range):
-            self.word(kind.__name__, repr(value))
-            return
         # One of the user's is more than the list or the mapping that it also is.
         own = self.own(kind.__module__)
-        if isinstance(value, jax.Array | np.ndarray | np.generic):
+        if value is None or kind in (bool, int, float, complex, str, bytes, range):
+            self.word(kind.__name__, repr(value))
+        elif isinstance(value, jax.Array | np.ndarray | np.generic):
             self.array(value)
-        elif isinstance(value, enum.Enum):
-            self.type(kind)
-            self.word(value.name)
-            self.feed_named(value.value)
         elif isinstance(value, Mapping) and not own:
             self.word("mapping", len(value))
             for _, key in sorted((repr(key), key) for key in value):
@@ -109,13 +99,6 @@ class _Hasher:
             self.word(kind.__name__, len(value))
             for member in value:
                 self.feed(member)
-        elif isinstance(value, np.dtype | os.PathLike) and not own:
-            self.word(kind.__qualname__, value)
-        elif isinstance(value, functools.partial):
-            self.word("partial")
-            self.feed((value.func, value.args, value.keywords))
-        elif isinstance(value, types.MethodType):
-            self.feed((value.__self__, value.__func__))
         elif isinstance(value, types.FunctionType):
             self.function(value)
         elif isinstance(value, types.BuiltinFunctionType | np.ufunc):
@@ -156,18 +139,14 @@ class _Hasher:
         else:
             self.word(f.__module__)
         self.feed([f.__defaults__, f.__kwdefaults__])
-        self.closure(f)
-        for name in sorted(names):
-            if name in f.__globals__:
-                self.word(name)
-                self.feed_named(f.__globals__[name])
-
-    def closure(self, f: types.FunctionType) -> None:
         for cell in f.__closure__ or ():
             try:
                 self.feed_named(cell.cell_contents)
             except ValueError:  # not yet set
                 self.word("empty")
+        for name in sorted(names & f.__globals__.keys()):
+            self.word(name)
+            self.feed_named(f.__globals__[name])
 
     def feed_named(self, value: Any) -> None:
         """A value that the code names: one without content counts by its type."""
@@ -186,31 +165,15 @@ class _Hasher:
 
     def type(self, cls: type) -> None:
         self.word("type", cls.__module__, cls.__qualname__)
-        if self.own(cls.__module__) and self.visit(cls):
-            try:
-                source = _plain(inspect.getsource(cls))
-                if not source.startswith(f"class {cls.__name__}"):
-                    raise OSError("another piece of the file")
-            except (OSError, TypeError, SyntaxError):
-                for name, member in sorted(vars(cls).items()):
-                    code = _functions(member)
-                    if code or not name.startswith("__"):
-                        self.word(name)
-                        self.feed_named(code or member)
-            else:
-                self.word(source)
-                # What its methods name; they may be wrapped, and are read as text.
-                scope = vars(sys.modules[cls.__module__])
-                nodes = ast.walk(ast.parse(source))
-                named = {node.id for node in nodes if isinstance(node, ast.Name)}
-                for name in sorted(named & scope.keys()):
-                    self.word(name)
-                    self.feed_named(scope[name])
-                for member in vars(cls).values():
-                    for f in _functions(member):
-                        self.closure(f)
-            for base in cls.__bases__:
-                self.type(base)
+        if not (self.own(cls.__module__) and self.visit(cls)):
+            return
+        for name, member in sorted(vars(cls).items()):
+            code = [f for f in _functions(member) if self.own(f.__module__)]
+            if code or not name.startswith("__"):
+                self.word(name)
+                self.feed_named(code or member)
+        for base in cls.__bases__:
+            self.type(base)
 
     def module(self, module: types.ModuleType) -> None:
         self.word("module", module.__name__)
@@ -229,12 +192,6 @@ class _Hasher:
     def other(self, value: Any) -> None:
         if isinstance(value, Iterator):
             raise TypeError(f"a {type(value).__name__}, which is used up when read")
-        leaves, structure = jax.tree.flatten(value)
-        if not (len(leaves) == 1 and leaves[0] is value):
-            self.word("tree", _ADDRESS.sub("", str(structure)))
-            self.nodes(structure)
-            self.feed(leaves)
-            return
         kind = type(value)
         if not self.visit(value):
             self.word("again", self.visited[id(value)][0])
@@ -253,26 +210,16 @@ class _Hasher:
             # The fourth and fifth run over members of lists and of dictionaries.
             self.feed(list(part) if k in (3, 4) and part is not None else part)
 
-    def nodes(self, structure: Any) -> None:
-        """The classes of the nodes of a tree, and what these hold beside leaves."""
-        kind, static = structure.node_data() or (None, None)
-        if isinstance(kind, type) and self.own(kind.__module__):
-            self.type(kind)
-            self.feed_named(static)
-        for child in structure.children():
-            self.nodes(child)
-
 
 def _functions(member: Any) -> list[types.FunctionType]:
     """The functions of a member of a class: a method, a property or the like."""
-    if isinstance(member, staticmethod | classmethod):
-        member = member.__func__
-    functions = [member]
     if isinstance(member, property):
-        functions = [member.fget, member.fset, member.fdel]
+        parts = [member.fget, member.fset, member.fdel]
     elif isinstance(member, functools.cached_property):
-        functions = [member.func]
-    return [f for f in functions if isinstance(f, types.FunctionType)]
+        parts = [member.func]
+    else:
+        parts = [member]
+    return [f for f in map(inspect.unwrap, parts) if isinstance(f, types.FunctionType)]
 
 
 def source_of(f: types.FunctionType) -> str:

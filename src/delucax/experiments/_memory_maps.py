@@ -1,4 +1,4 @@
-"""The memory maps that compiled programs hold, of which a process has only so many."""
+"""Compiled programs hold memory maps, whose number is limited in each process."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ def release_programs(limit: int | None = None) -> bool:
     """Forget all compiled programs if they hold too many memory maps.
 
     A program that XLA has compiled holds tens of the maps that Linux allows a process,
-    65,530 unless it is told otherwise, and the compilation that finds none left is a
+    65,530 by default, and a compilation that finds none left ends in a
     segmentation fault. Programs that are still needed are compiled anew. Elsewhere than
     on Linux nothing is done.
 

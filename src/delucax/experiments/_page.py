@@ -4,6 +4,7 @@ import base64
 import dataclasses
 import io
 import os
+import string
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,49 +12,6 @@ from typing import Any
 from .._files import replaced
 from ._provenance import device, provenance
 from ._tables import as_text, escape
-
-
-_STYLE = """
-:root { color-scheme: light dark; --line: #8884; --faint: #888; --bad: #c62828; }
-@media (prefers-color-scheme: dark) { :root { --bad: #ef7f7f; } }
-body { font: 15px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 76rem;
-       padding: 1rem; }
-h1 { font-size: 1.6rem; } h2 { font-size: 1.25rem; margin-top: 2.2rem; }
-p.made, caption { color: var(--faint); }
-div.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { border-bottom: 1px solid var(--line); padding: .25rem .7rem;
-         text-align: left; white-space: nowrap; }
-td.n, th.n { text-align: right; }
-th button { all: unset; cursor: pointer; font-weight: 600; }
-th button:focus-visible { outline: 2px solid currentColor; }
-th[aria-sort=ascending] button::after { content: " \\25B2"; }
-th[aria-sort=descending] button::after { content: " \\25BC"; }
-.bad { color: var(--bad); }
-figure { margin: 1rem 0; background: #fff; display: inline-block; max-width: 100%; }
-figure svg, figure img { max-width: 100%; height: auto; display: block; }
-pre { overflow-x: auto; font-size: 12px; }
-"""
-
-_SCRIPT = """
-for (const table of document.querySelectorAll('table.sortable')) {
-  const heads = table.tHead.rows[0].cells;
-  for (const head of heads) head.firstElementChild.addEventListener('click', () => {
-    const up = head.getAttribute('aria-sort') !== 'ascending';
-    for (const other of heads) other.removeAttribute('aria-sort');
-    head.setAttribute('aria-sort', up ? 'ascending' : 'descending');
-    const k = head.cellIndex, body = table.tBodies[0];
-    const value = row => row.cells[k].dataset.v ?? row.cells[k].textContent;
-    const rows = [...body.rows].sort((a, b) => {
-      const x = value(a), y = value(b), d = Number(x) - Number(y);
-      const order = x === '' ? (y === '' ? 0 : 1) : y === '' ? -1
-        : Number.isNaN(d) ? x.localeCompare(y) : up ? d : -d;
-      return Number.isNaN(d) && !up ? -order : order;
-    });
-    body.append(...rows);
-  });
-}
-"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,13 +98,9 @@ class Page:
         self.paragraph("; ".join(words), "made")
 
     def __str__(self) -> str:
-        title, body = escape(self.title), "\n".join(self.parts)
-        return (
-            '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">'
-            f"<title>{title}</title><style>{_STYLE}</style></head><body>\n"
-            f"<h1>{title}</h1>\n{body}"
-            f"\n<script>{_SCRIPT}</script></body></html>\n"
+        template = Path(__file__).with_name("page.html").read_text("utf-8")
+        return string.Template(template).substitute(
+            title=escape(self.title), body="\n".join(self.parts)
         )
 
     def write(self, path: str | os.PathLike) -> None:

@@ -49,14 +49,8 @@ def _git(folder: Path) -> tuple[str | None, bool | None]:
     all; nothing outside a repository. Other new files may be what a run wrote."""
 
     def ask(*words: str) -> str:
-        done = subprocess.run(
-            ["git", *words],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            timeout=20,
-            check=True,
-        )
+        how: Any = dict(cwd=folder, timeout=20, check=True)
+        done = subprocess.run(["git", *words], capture_output=True, text=True, **how)
         return done.stdout.strip()
 
     try:

@@ -56,44 +56,34 @@ def summary(results: Results) -> tuple[list[str], list[list]]:
     many = any(row["seed"] != results.rows[0]["seed"] for row in results.rows)
     labels = [p for p in results.parameters if any(p in row for row in results.rows)]
     labels = labels or ["case"]
-    numbers = {
-        name: {case: _numbers(rows, name) for case, rows in cases.items()}
-        for name in results.metrics
-    }
-    numbers = {name: values for name, values in numbers.items() if any(values.values())}
-    words = [
-        name
-        for name in results.metrics
-        if name not in numbers
-        and any(isinstance(row.get(name), str) for row in results.rows)
+    columns: list[tuple[str, list]] = [
+        (label, [rows[0].get(label) for rows in cases.values()]) for label in labels
     ]
-    spread = {
-        name
-        for name in numbers
-        if many and any(_varies(rows, name) for rows in cases.values())
-    }
-    columns = [*labels, *(["seeds"] if many else []), "status"]
-    for name in numbers:
-        columns += [name, *([f"{name} 25%", f"{name} 75%"] if name in spread else [])]
-    columns += [*words, "compile s", "run s"]
-    body = []
-    for case, rows in cases.items():
-        first = rows[0]
-        line = [first.get(label) for label in labels]
-        line += [len(rows)] if many else []
-        line.append(", ".join(dict.fromkeys(row["status"] for row in rows)))
-        for name, values in numbers.items():
-            quartiles = [0.25, 0.75] if name in spread else []
-            if not values[case]:
-                line += [None, *(None for _ in quartiles)]
-                continue
-            with np.errstate(invalid="ignore"):
-                line.append(interquartile_mean(values[case]))
-                line += map(float, np.quantile(values[case], quartiles))
-        line += [first.get(name) for name in words]
-        line += [first["compile_seconds"], first["run_seconds"]]
-        body.append(line)
-    return columns, body
+    if many:
+        columns.append(("seeds", [*map(len, cases.values())]))
+    states = [dict.fromkeys(row["status"] for row in rows) for rows in cases.values()]
+    columns.append(("status", [*map(", ".join, states)]))
+    words = []
+    for name in results.metrics:
+        values = [_numbers(rows, name) for rows in cases.values()]
+        if not any(values):
+            if any(isinstance(row.get(name), str) for row in results.rows):
+                words.append((name, name))
+            continue
+        with np.errstate(invalid="ignore"):
+            means = [interquartile_mean(v) if v else None for v in values]
+            columns.append((name, means))
+            if many and any(_varies(rows, name) for rows in cases.values()):
+                for k in (25, 75):
+                    ends = [
+                        float(np.quantile(v, k / 100)) if v else None for v in values
+                    ]
+                    columns.append((f"{name} {k}%", ends))
+    times = ("compile s", "compile_seconds"), ("run s", "run_seconds")
+    for heading, name in (*words, *times):
+        columns.append((heading, [rows[0].get(name) for rows in cases.values()]))
+    headings, values = zip(*columns, strict=True)
+    return list(headings), [list(row) for row in zip(*values, strict=True)]
 
 
 def _numbers(rows: list[dict[str, Any]], metric: str) -> list[float]:

@@ -10,6 +10,7 @@ from typing import Any
 from .._check import as_path
 from .._extras import extra
 from .._files import replaced
+from ._experiment import Case
 from ._store import CASE_COLUMNS, RUN_COLUMNS, Store
 from ._tables import as_text, FORMS
 
@@ -70,56 +71,46 @@ class Results:
         path = as_path(path, "path", "Results.read")
         if not path.exists():
             raise FileNotFoundError(f"Results.read: there is no file '{path}'.")
-        book = Store(path, "Results.read")
-        names = list(dict.fromkeys(name for name, _ in book.cases))
-        cases = sorted(
-            book.cases.items(),
-            key=lambda item: (names.index(item[0][0]), item[1]["order"]),
-        )
-        seeds = [(key, sorted(entry["seeds"].items())) for key, entry in cases]
-        return cls._from(book, seeds)
+        store = Store(path, "Results.read")
+        names = list(dict.fromkeys(name for name, _ in store.cases))
+        order = lambda key: (names.index(key[0]), store.cases[key]["order"])
+        ordered = (store.cases[key]["seeds"] for key in sorted(store.cases, key=order))
+        return cls._from(store, [seeds[s] for seeds in ordered for s in sorted(seeds)])
 
     @classmethod
-    def _of(cls, book: Store, asked: Iterable) -> "Results":
+    def _of(
+        cls, store: Store, asked: Iterable[tuple[Case, tuple[int, ...]]]
+    ) -> "Results":
         """Those of the cases and seeds asked for."""
         records = []
         for case, seeds in asked:
-            key = case.experiment, case.id
+            stored = store.stored(case.key, case.hash)
             if case.mark("skip"):
-                record = dict.fromkeys(CASE_COLUMNS) | {
-                    "values": {},
-                    "status": "skipped",
-                }
-                record |= {"parameters": case.shown, "hash": case.hash}
-                stored = dict.fromkeys(seeds, (record, 0))
-            else:
-                stored = book.cases[key]["seeds"]
-            records.append((key, [(seed, stored[seed]) for seed in seeds]))
-        return cls._from(book, records)
+                skipped = dict.fromkeys(CASE_COLUMNS) | case.described
+                skipped |= {"values": {}, "status": "skipped"}
+                stored = {seed: {**skipped, "seed": seed} for seed in seeds}
+            records += [stored[seed] for seed in seeds]
+        return cls._from(store, records)
 
     @classmethod
-    def _from(cls, book: Store, records: list) -> "Results":
+    def _from(cls, store: Store, records: list[dict[str, Any]]) -> "Results":
         rows: list[dict[str, Any]] = []
         metrics: dict[str, None] = {}
         parameters: dict[str, None] = {}
-        for key, seeds in records:
-            for seed, (record, place) in seeds:
-                values = {name: v[place] for name, v in record["values"].items()}
-                metrics |= dict.fromkeys(values)
-                parameters |= dict.fromkeys(record["parameters"])
-                run = book.runs.get(record.get("run"), {})
-                row = {
-                    "experiment": key[0],
-                    "case": key[1],
-                    **record["parameters"],
-                    "seed": seed,
-                    "status": record["status"],
-                    **values,
-                    **{name: record[name] for name in CASE_COLUMNS},
-                    **{name: run.get(name) for name in RUN_COLUMNS},
-                    "versions": run.get("versions", {}),
-                }
-                rows.append(row)
+        for record in records:
+            metrics |= dict.fromkeys(record["values"])
+            parameters |= dict.fromkeys(record["parameters"])
+            run = store.runs.get(record.get("run", -1), {})
+            row = {
+                **{name: record[name] for name in ("experiment", "case")},
+                **record["parameters"],
+                **{name: record[name] for name in ("seed", "status")},
+                **record["values"],
+                **{name: record[name] for name in CASE_COLUMNS},
+                **{name: run.get(name) for name in RUN_COLUMNS},
+                "versions": run.get("versions", {}),
+            }
+            rows.append(row)
         return cls(rows, tuple(metrics), tuple(parameters))
 
     @property
@@ -249,7 +240,7 @@ class Results:
 
 
 def _of_one_type(column: list) -> list:
-    """A column as it is if a file of typed columns can hold it, or as text."""
+    """A column as text, unless its values have one type, which Parquet needs."""
     types = {type(value) for value in column if value is not None}
     if len(types) < 2 or types == {int, float}:
         return column

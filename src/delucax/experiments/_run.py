@@ -9,16 +9,13 @@ from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
-from .._check import check_count
+from .._check import check_choice, check_count
 from ._execute import Outcome, Runner
 from ._experiment import as_experiment, as_seeds, Case, Experiment
 from ._provenance import provenance
 from ._results import FAILED, Results
 from ._store import Store
 from ._workers import Job, run_in_workers
-
-
-BACKENDS = ("loky", "dask")
 
 
 def run(
@@ -37,10 +34,10 @@ def run(
 ) -> Results:
     """Run the cases of experiments that are not in the store yet.
 
-    A case that fails is recorded with its traceback and harms no other, one that kills
-    its worker neither. Each result is in the store as soon as it is there; what is
-    there already is not run again unless its code or parameters changed, so that a run
-    that was killed goes on with the same call.
+    A case that fails is recorded with its traceback, and the others run on; they also
+    run on if a case kills its worker. Each result is stored at once. What is stored is
+    not run again unless its code or parameters changed, so that the same call continues
+    a run that was killed.
 
     **Arguments:**
 
@@ -86,25 +83,21 @@ def run(
         ```
     """
     where = "run"
-    made = [as_experiment(one) for one in experiments]
-    if not made:
+    chosen = [*map(as_experiment, experiments)]
+    if not chosen:
         raise ValueError(f"{where}: experiments must be one at least.")
-    names = [one.name for one in made]
+    names = [one.name for one in chosen]
     if len(set(names)) < len(names):
         raise ValueError(f"{where}: experiments must have different names: {names}.")
     workers = _workers(workers, where)
-    if backend not in BACKENDS:
-        raise ValueError(
-            f"{where}: backend must be one of {', '.join(map(repr, BACKENDS))}, got "
-            f"{backend!r}."
-        )
+    check_choice(backend, ("loky", "dask"), "backend", where)
     if mesh is not None and (workers > 1 or backend == "dask"):
         raise ValueError(f"{where}: mesh needs workers=1, got {workers} {backend}.")
-    chosen = None if seeds is None else as_seeds(seeds, where)
-    book = Store(store, where)
-    jobs, asked, judged = [], [], []
-    for one in made:
-        wanted = one.seeds if chosen is None else chosen
+    other_seeds = None if seeds is None else as_seeds(seeds, where)
+    opened = Store(store, where)
+    jobs, asked, changed = [], [], []
+    for one in chosen:
+        wanted = one.seeds if other_seeds is None else other_seeds
         wanted = wanted if one.is_random else wanted[:1]
         if mesh is not None and "key" not in one.arguments:
             raise ValueError(
@@ -120,31 +113,34 @@ def run(
             asked.append((case, wanted))
             if case.mark("skip"):
                 continue
-            stored = {} if fresh else book.stored(case.experiment, case.id, case.hash)
+            stored = {} if fresh else opened.stored(case.key, case.hash)
             if retry:
-                stored = {s: r for s, r in stored.items() if r[0]["error"] is None}
+                stored = {s: r for s, r in stored.items() if r["error"] is None}
             missing = tuple(seed for seed in wanted if seed not in stored)
             if missing:
                 jobs.append(Job(len(jobs), one, case, missing))
-            kept = {seed: stored[seed] for seed in wanted if seed in stored}
-            judged += _judged_again(case, kept)
-    if jobs or judged:
-        book.open()
-    try:
-        for record in judged:
-            book.append(record)
+            kept = [stored[seed] for seed in wanted if seed in stored]
+            changed += _with_new_status(case, kept)
+    with contextlib.closing(opened):
+        if jobs or changed:
+            opened.open()
+        for record in changed:
+            opened.append(record)
         if jobs:
-            _run_jobs(jobs, book, workers, backend, mesh, progress)
-    finally:
-        book.close()
-    return Results._of(book, asked)
+            _run_jobs(jobs, opened, workers, backend, mesh, progress)
+    return Results._of(opened, asked)
 
 
 def _run_jobs(
-    jobs: list[Job], book: Store, workers: int, backend: str, mesh: Any, progress: bool
+    jobs: list[Job],
+    opened: Store,
+    workers: int,
+    backend: str,
+    mesh: Any,
+    progress: bool,
 ) -> None:
     """Run the jobs, and write each result down as it arrives."""
-    number = book.begin(provenance(_folder(jobs[0].made)))
+    number = opened.begin(provenance(_folder(jobs[0].experiment)))
     outcomes = (
         _run_here(jobs, mesh)
         if workers == 1 and backend == "loky"
@@ -153,45 +149,32 @@ def _run_jobs(
     bars = _progress(len(jobs), workers, progress)
     with bars as tick, contextlib.closing(outcomes):
         for job, outcome in outcomes:
-            case, status = job.case, _status(job.case, outcome.error)
+            status = _status(job.case, outcome.error)
             fields = outcome._asdict()
             worker = fields.pop("worker")
             record = {
                 "kind": "case",
                 "run": number,
-                "experiment": case.experiment,
-                "case": case.id,
-                "order": case.index,
-                "hash": case.hash,
-                "parameters": case.shown,
+                **job.case.described,
                 "seeds": job.seeds,
                 "status": status,
                 **fields,
             }
-            book.append(record)
-            tick(worker, case.id, status)
+            opened.append(record)
+            tick(worker, job.case.id, status)
 
 
-def _judged_again(
-    case: Case, stored: dict[int, tuple[dict[str, Any], int]]
-) -> list[dict[str, Any]]:
+def _with_new_status(case: Case, stored: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Lines for what is not run again, where a mark came or went since."""
-    groups: dict[int, tuple[dict[str, Any], dict[int, int]]] = {}
-    for seed, (record, place) in stored.items():
-        if record["status"] != _status(case, record["error"]):
-            groups.setdefault(id(record), (record, {}))[1][seed] = place
-    return [
-        {
-            **record,
-            "seeds": list(places),
-            "status": _status(case, record["error"]),
-            "values": {
-                name: [column[place] for place in places.values()]
-                for name, column in record["values"].items()
-            },
-        }
-        for record, places in groups.values()
-    ]
+    again = []
+    for record in stored:
+        status = _status(case, record["error"])
+        if record["status"] != status:
+            line = {name: v for name, v in record.items() if name != "seed"}
+            values = {name: [value] for name, value in record["values"].items()}
+            line |= {"seeds": [record["seed"]], "status": status, "values": values}
+            again.append(line)
+    return again
 
 
 def _status(case: Case, error: str | None) -> str:
@@ -200,9 +183,11 @@ def _status(case: Case, error: str | None) -> str:
     return "passed" if error is None else "failed"
 
 
-def _folder(made: Experiment) -> Path:
+def _folder(experiment: Experiment) -> Path:
     try:
-        return Path(inspect.getfile(inspect.unwrap(made.function))).resolve().parent
+        return (
+            Path(inspect.getfile(inspect.unwrap(experiment.function))).resolve().parent
+        )
     except (TypeError, OSError):
         return Path.cwd()
 
@@ -215,9 +200,9 @@ def _workers(workers: Any, where: str) -> int:
 
 
 def _run_here(jobs: list[Job], mesh: Any) -> Generator[tuple[Job, Outcome], None, None]:
-    for _, group in itertools.groupby(jobs, key=lambda job: job.made.name):
+    for _, group in itertools.groupby(jobs, key=lambda job: job.experiment.name):
         same = list(group)
-        with contextlib.closing(Runner(same[0].made)) as runner:
+        with contextlib.closing(Runner(same[0].experiment)) as runner:
             for job in same:
                 yield job, runner.run(job.case.index, job.seeds, mesh)
 

@@ -35,8 +35,8 @@ RESERVED = (
 class Store:
     """The lines of a results file, or of none: then they are kept in memory alone.
 
-    `cases` is by experiment and case; each holds `hash`, `order` and, by seed, the
-    line that counts.
+    `cases` is by experiment and case; each holds `hash`, `order` and `seeds`: what
+    counts of each seed, as a line has it but with its own values.
     """
 
     def __init__(self, path: Any, where: str):
@@ -99,22 +99,20 @@ class Store:
         entry = self.cases.get(key)
         if entry is None or entry["hash"] != record["hash"]:
             entry = self.cases[key] = {"hash": record["hash"], "seeds": {}}
-        for column in record["values"].values():
-            if len(column) != len(record["seeds"]):
-                raise ValueError
+        values, seeds = record["values"], record["seeds"]
+        if any(len(column) != len(seeds) for column in values.values()):
+            raise ValueError
         entry["order"] = tuple(record["order"])
         for name in ("run", "parameters", "status", "error", "device"):
             if name not in record:
                 raise KeyError(name)
-        for place, seed in enumerate(record["seeds"]):
-            entry["seeds"][seed] = (record, place)
+        for place, seed in enumerate(seeds):
+            own = {name: column[place] for name, column in values.items()}
+            entry["seeds"][seed] = {**record, "seed": seed, "values": own}
 
-    def stored(
-        self, experiment: str, case: str, hash: str
-    ) -> dict[int, tuple[dict[str, Any], int]]:
-        """The lines of a case that count, and the place there, by seed: of the code
-        and the values that have this hash."""
-        entry = self.cases.get((experiment, case), {"hash": None})
+    def stored(self, key: tuple[str, str], hash: str) -> dict[int, dict[str, Any]]:
+        """What counts of a case by seed: of the code and the values of this hash."""
+        entry = self.cases.get(key, {"hash": None})
         return entry["seeds"] if entry["hash"] == hash else {}
 
     def open(self) -> None:
@@ -189,6 +187,6 @@ def _line(record: dict[str, Any]) -> bytes:
 def _lock(file: int) -> None:
     try:
         import fcntl
-    except ImportError:  # Windows: nobody watches that one run alone writes
+    except ImportError:  # Windows has no such lock, and two runs could write
         return
     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

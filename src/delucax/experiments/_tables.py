@@ -76,7 +76,7 @@ def _html(columns: Sequence[str], rows: Sequence[Sequence], is_number: list) -> 
 
 
 def _sort_key(value: float) -> str:
-    """The number as JavaScript reads it; one that is none comes last."""
+    """The number as JavaScript reads it; NaN is empty, and sorts last."""
     return json.dumps(value).replace("NaN", "")
 
 

@@ -24,7 +24,7 @@ class Job(NamedTuple):
     """A case and the seeds to run it with."""
 
     number: int
-    made: Experiment
+    experiment: Experiment
     case: Case
     seeds: tuple[int, ...]
 
@@ -32,98 +32,99 @@ class Job(NamedTuple):
 def run_in_workers(
     jobs: list[Job], workers: int, backend: str
 ) -> Generator[tuple[Job, Outcome], None, None]:
-    """By joblib. If a worker dies, those that were under way are run one by one, so
-    that the one that kills it is known. If there are fixtures to let go, the workers
-    end with the run."""
-    joblib = extra("joblib", "experiments")
+    """Run jobs by joblib. If a worker dies, the jobs that were running are repeated one
+    by one, to know which one kills it. Workers end with the run if they hold fixtures
+    that must be ended."""
+    extra("joblib", "experiments")
     if backend == "dask":
         extra("distributed", "dask")
     pending = {job.number: job for job in jobs}
-    packed = {job.made.name: _packed(job.made) for job in jobs}
+    packed = {job.experiment.name: _packed(job.experiment) for job in jobs}
     with tempfile.TemporaryDirectory() as folder, _one_thread():
+        marks = folder if backend == "loky" else None
         while pending:
-            marks = folder if backend == "loky" else None
             try:
                 for number, outcome in _parallel(
-                    joblib, list(pending.values()), packed, workers, backend, marks
+                    list(pending.values()), packed, workers, backend, marks
                 ):
                     yield pending.pop(number), outcome
             except Exception as error:
-                if not _died(error):
+                if type(error).__name__ not in _DEATHS:
                     raise
                 started = [n for n in pending if Path(folder, str(n)).exists()]
-                for n in started if marks else list(pending):
-                    job = pending.pop(n)
-                    yield job, _alone(joblib, job, packed, backend)
-        if any(_stays_open(job.made) for job in jobs):
-            _end(backend)
+                for job in [pending.pop(n) for n in (started if marks else [*pending])]:
+                    yield job, _alone(job, packed, backend)
+        if any(_must_be_closed(job.experiment) for job in jobs):
+            _close_workers(backend)
 
 
-def _stays_open(made: Experiment) -> bool:
-    """Whether something is to be done when its fixtures of a process are let go."""
+def _must_be_closed(experiment: Experiment) -> bool:
+    """Whether code must run when its fixtures of a process end."""
     return any(
         fixture.scope == "process" and inspect.isgeneratorfunction(fixture.function)
-        for fixture in made.used_fixtures().values()
+        for fixture in experiment.used_fixtures().values()
     )
 
 
-def _end(backend: str) -> None:
-    """Let the fixtures of idle workers go: those of loky do so as they end."""
+def _close_workers(backend: str) -> None:
+    """End the fixtures of idle workers; those of loky end with the process."""
     if backend == "dask":
         client = extra("distributed", "dask").default_client()
-        client.run(_let_go, on_error="ignore")
+        client.run(_close_runners, on_error="ignore")
     else:
         loky = extra("joblib.externals.loky", "experiments")
         loky.get_reusable_executor(reuse=True).shutdown(wait=True)
 
 
-def _parallel(joblib, jobs, packed, workers, backend, marks) -> Iterator:
+def _parallel(
+    jobs: list[Job],
+    packed: dict[str, tuple[str, bytes]],
+    workers: int,
+    backend: str,
+    marks: str | None,
+) -> Iterator[Any]:
+    import joblib
+
     precise = bool(jax.config.jax_enable_x64)
     task = joblib.delayed(work)
     with joblib.parallel_config(backend=backend, n_jobs=workers):
-        parallel = joblib.Parallel(return_as="generator_unordered")
-        yield from parallel(
-            task(*packed[made.name], number, case.index, seeds, precise, marks)
-            for number, made, case, seeds in jobs
+        yield from joblib.Parallel(return_as="generator_unordered")(
+            task(*packed[experiment.name], number, case.index, seeds, precise, marks)
+            for number, experiment, case, seeds in jobs
         )
 
 
-def _alone(joblib, job: Job, packed, backend) -> Outcome:
+def _alone(job: Job, packed: dict[str, tuple[str, bytes]], backend: str) -> Outcome:
     try:
         # Two workers, for joblib runs a single one in this process.
-        ((_, outcome),) = _parallel(joblib, [job], packed, 2, backend, None)
+        ((_, outcome),) = _parallel([job], packed, 2, backend, None)
         return outcome
     except Exception as error:
-        if not _died(error):
+        if type(error).__name__ not in _DEATHS:
             raise
         message = "WorkerDied: the process that ran the case was killed, or crashed."
         trace = "".join(traceback.format_exception(error))
         return Outcome({}, message, trace, 0.0, 0.0, None, 0)
 
 
-def _died(error: Exception) -> bool:
-    return type(error).__name__ in (
-        "TerminatedWorkerError",
-        "BrokenProcessPool",
-        "KilledWorker",
-    )
+# By their names: the classes are in packages that need not be there.
+_DEATHS = ("TerminatedWorkerError", "BrokenProcessPool", "KilledWorker")
 
 
-def _packed(made: Experiment) -> tuple[str, bytes]:
+def _packed(experiment: Experiment) -> tuple[str, bytes]:
     """The experiment as bytes that any process can read, and their hash."""
     cloudpickle = extra("cloudpickle", "experiments")
+    # Its fixtures are found here: in another process it has no module's globals.
+    experiment = dataclasses.replace(experiment, fixtures=experiment.used_fixtures())
     try:
-        # Its fixtures are found here: in another process it has no module's globals.
-        made = dataclasses.replace(made, fixtures=made.used_fixtures())
-        content = cloudpickle.dumps(made)
+        content = cloudpickle.dumps(experiment)
     except Exception as error:
         raise ValueError(
-            f"run: {made.name} cannot be sent to another process: {error}. Make what "
-            "cannot be sent in the function or in a fixture."
+            f"run: {experiment.name} cannot be sent to another process: {error}. Make "
+            "what cannot be sent in the function or in a fixture."
         ) from error
-    name = hashlib.sha256(content).hexdigest()
     # As bytes: an array would be put on one worker of a cluster, and die with it.
-    return name, content
+    return hashlib.sha256(content).hexdigest(), content
 
 
 _local = threading.local()
@@ -132,7 +133,7 @@ _held: set[Runner] = set()
 
 
 @atexit.register
-def _let_go() -> None:
+def _close_runners() -> None:
     while _held:
         _held.pop().close()
 

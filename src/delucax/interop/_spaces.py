@@ -9,8 +9,6 @@ from .._check import check_bool, is_concrete
 from ..environments import Environment
 
 
-# A number to end a space where there is no bound; Gymnasium advises against infinity.
-LARGEST = float(np.finfo(np.float32).max)
 # Samples are drawn of an action space.
 LARGEST_ACTION = 1e3
 

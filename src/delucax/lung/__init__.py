@@ -4,7 +4,6 @@ from ._breath_controllers import (
     BangBang as BangBang,
     Breathing as Breathing,
     BreathPolicy as BreathPolicy,
-    ExpiratoryValve as ExpiratoryValve,
     FeedForward as FeedForward,
     Summed as Summed,
 )

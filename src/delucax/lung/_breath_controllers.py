@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, PyTree
 
-from .._check import check_count, check_key, check_step
+from .._check import check_choice, check_count, check_key, check_step
 from .._controller import AbstractController, check_controller
 from .._module import parameter, positive, weight
 from .._typing import PRNGKey
@@ -17,56 +17,26 @@ from ._tanh_network import tanh_network
 from ._waveform import BreathWaveform, check_waveform
 
 
-class ExpiratoryValve(AbstractController):
-    """Opens the expiratory valve in the expiratory phase: `u_out` is 0, then 1.
-
-    **Arguments:** `waveform`: a [`delucax.lung.BreathWaveform`][].
-
-    **Raises:** `ValueError` if it is none.
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax.lung import BreathWaveform, ExpiratoryValve
-
-        valve = ExpiratoryValve(BreathWaveform())
-        valve(1.2, jnp.array([20.0]), valve.init())
-        ```
-    """
-
-    waveform: BreathWaveform
-
-    def __check_init__(self):
-        check_waveform(self.waveform, "ExpiratoryValve")
-
-    def __call__(self, t, y, state):
-        closed = self.waveform.is_inspiration(t)
-        return jnp.reshape(jnp.where(closed, 0.0, 1.0), (1,)).astype(y.dtype), state
-
-
 class _Phases(NamedTuple):
-    inner: Any
-    valve: Any
+    inner: PyTree
     inhaling: Array
 
 
 class Breathing(AbstractController):
     r"""A controller of the inspiratory valve, made one of whole breaths.
 
-    In the inspiratory phase `u = (clip(inspiratory(y), 0, 100), valve(y))`. In the
-    expiratory phase the inspiratory valve is closed; or, with a `hold`, once half a
-    period has gone by it is opened to `hold (1 - exp(-5 s))`, `s` being the time since,
-    which keeps the airway open against a leak. The inspiratory controller begins each
-    breath as it began the first one, and sees none of the expiratory phase.
+    In the inspiratory phase `u = (clip(inspiratory(y), 0, 100), 0)`. In the expiratory
+    phase the expiratory valve is open and the inspiratory valve closed; or, with a
+    `hold`, once half a period has gone by it is opened to `hold (1 - exp(-5 s))`, `s`
+    being the time since, which keeps the airway open against a leak. The inspiratory
+    controller begins each breath as it began the first one, and observes none of the
+    expiratory phase.
 
     **Arguments:**
 
     - `inspiratory`: any controller of one control, such as a
         [`delucax.controllers.PID`][] whose reference is the waveform.
     - `waveform`: a [`delucax.lung.BreathWaveform`][].
-    - `valve`: the controller of the expiratory valve, an
-        [`delucax.lung.ExpiratoryValve`][] by default.
     - `hold`: [%], 0 by default; that of the original is 5.
 
     **Raises:** `ValueError` if what is given is no controller, or no waveform.
@@ -91,50 +61,29 @@ class Breathing(AbstractController):
 
     inspiratory: AbstractController
     waveform: BreathWaveform
-    valve: AbstractController
-    hold: Array = parameter()
-
-    def __init__(
-        self,
-        inspiratory: AbstractController,
-        waveform: BreathWaveform,
-        valve: AbstractController | None = None,
-        hold: Any = 0.0,
-    ):
-        check_waveform(waveform, "Breathing")
-        self.inspiratory, self.waveform = inspiratory, waveform
-        self.valve = ExpiratoryValve(waveform) if valve is None else valve
-        self.hold = hold
+    hold: Array = parameter(0.0)
 
     def __check_init__(self):
         check_waveform(self.waveform, "Breathing")
         check_controller(self.inspiratory, "inspiratory", "Breathing")
-        check_controller(self.valve, "valve", "Breathing")
 
     def init(self, *, key=None):
-        keys = (None, None) if key is None else jr.split(key)
-        inner = self.inspiratory.init(key=keys[0])
-        return _Phases(inner, self.valve.init(key=keys[1]), jnp.zeros((), bool))
+        return _Phases(self.inspiratory.init(key=key), jnp.zeros((), bool))
 
     def __call__(self, t, y, state):
         inhale = self.waveform.is_inspiration(t)
         begins = inhale & ~state.inhaling
         inner = _where(begins, self.inspiratory.init(key=None), state.inner)
         u_in, after = self.inspiratory(t, y, inner)
-        u_out, valve = self.valve(t, y, state.valve)
-        period = self.waveform.period
-        late = jnp.maximum(self.waveform.share(t) - 0.5, 0) * period
+        late = jnp.maximum(self.waveform.share(t) - 0.5, 0) * self.waveform.period
         held = self.hold * (1 - jnp.exp(-5 * late))
         u_in = jnp.where(inhale, clip(u_in[0], 0, 100), held)
-        u = jnp.stack([u_in, u_out[0]]).astype(y.dtype)
-        return u, _Phases(_where(inhale, after, inner), valve, inhale)
+        u = jnp.stack([u_in, jnp.where(inhale, 0.0, 1.0)]).astype(y.dtype)
+        return u, _Phases(_where(inhale, after, inner), inhale)
 
     def applied(self, u, cost, state):
         inner = self.inspiratory.applied(u[:1], cost, state.inner)
-        return state._replace(
-            inner=_where(state.inhaling, inner, state.inner),
-            valve=self.valve.applied(u[1:], cost, state.valve),
-        )
+        return state._replace(inner=_where(state.inhaling, inner, state.inner))
 
 
 def _where(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
@@ -156,7 +105,7 @@ class BangBang(AbstractController):
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `high`: the control below it [%], 100 by default.
 
-    **Raises:** `ValueError` if `waveform` is none.
+    **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`.
 
     !!! example
 
@@ -214,7 +163,7 @@ class BreathPolicy(AbstractController):
     a little open.
 
     **Raises:** `ValueError` if a size is below its least, the kind is unknown,
-    `waveform` is none or there is no key.
+    `waveform` is not a `BreathWaveform` or there is no key.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -253,8 +202,7 @@ class BreathPolicy(AbstractController):
         key: PRNGKey,
     ):
         where = "BreathPolicy"
-        if kind not in ("mlp", "cnn"):
-            raise ValueError(f"{where}: kind must be 'mlp' or 'cnn', got {kind!r}.")
+        check_choice(kind, ("mlp", "cnn"), "kind", where)
         key, filter_key = jr.split(check_key(key, where))
         width = check_count(width, "width", where)
         self.waveform, self.dt, self.kind = waveform, dt, kind
@@ -305,13 +253,12 @@ class BreathPolicy(AbstractController):
 class Summed(AbstractController):
     """The sum of two controllers, such as a PID and a network trained on top of it,
 
-    `u = first(y) + scale (second(y) - offset)`.
+    `u = first(y) + second(y) - offset`.
 
     **Arguments:**
 
     - `first`: any controller.
     - `second`: another one of as many controls.
-    - `scale`: 1 by default.
     - `offset`: 0 by default.
 
     **Raises:** `ValueError` if what is given is no controller.
@@ -332,7 +279,6 @@ class Summed(AbstractController):
 
     first: AbstractController
     second: AbstractController
-    scale: Array = parameter(1.0)
     offset: Array = parameter(0.0)
 
     def __check_init__(self):
@@ -346,7 +292,7 @@ class Summed(AbstractController):
     def __call__(self, t, y, state):
         u, first = self.first(t, y, state[0])
         v, second = self.second(t, y, state[1])
-        return (u + self.scale * (v - self.offset)).astype(y.dtype), (first, second)
+        return (u + (v - self.offset)).astype(y.dtype), (first, second)
 
     def applied(self, u, cost, state):
         first = self.first.applied(u, cost, state[0])
@@ -364,7 +310,7 @@ class FeedForward(AbstractController):
     - `gain`: [%/cmH2O], 1 by default. Trainable.
     - `offset`: [%], 0 by default. Trainable.
 
-    **Raises:** `ValueError` if `waveform` is none.
+    **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`.
 
     !!! example
 

@@ -2,9 +2,10 @@
 
 import array
 import csv
+import itertools
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,8 @@ from ._waveform import LENGTH
 
 
 COLUMNS = ("id", "breath_id", "R", "C", "time_step", "u_in", "u_out", "pressure")
-RESISTANCES = (5.0, 20.0, 50.0)
-COMPLIANCES = (10.0, 20.0, 50.0)
+ALLOWED = dict(R=(5.0, 20.0, 50.0), C=(10.0, 20.0, 50.0), u_out=(0.0, 1.0))
+"""The values that a column may hold."""
 _WHERE = "read_breaths"
 
 
@@ -32,8 +33,6 @@ def read_breaths(
     *,
     length: int = LENGTH,
     dt: Any = None,
-    resistances: Sequence[float] = RESISTANCES,
-    compliances: Sequence[float] = COMPLIANCES,
 ) -> Breaths:
     """The inspirations of a file with the columns of the "Ventilator Pressure
     Prediction" data set.
@@ -51,8 +50,6 @@ def read_breaths(
     - `path`: the file.
     - `length`: samples an inspiration, 29 by default.
     - `dt`: the time between samples [s]; the median of the file's by default.
-    - `resistances`, `compliances`: the values of `R` and `C` that there may be;
-        5, 20, 50 and 10, 20, 50 by default.
 
     **Returns:** a [`delucax.lung.Breaths`][], with the resistance and compliance of
         each.
@@ -60,9 +57,9 @@ def read_breaths(
     **Raises:** `ValueError` that names the column and the row, which is the line of the
         file as an editor counts it (the header is in row 1, and blank lines count),
         where a column is missing, a value is not a finite number, `u_in` is out of its
-        bounds, `R`, `C` or `u_out` is none of those there may be, `R` or `C` changes
-        within a breath, time does not go on, or a breath is too short; `OSError` if the
-        file cannot be read.
+        bounds, `R` is not 5, 20 or 50, `C` not 10, 20 or 50 or `u_out` not 0 or 1, `R`
+        or `C` changes within a breath, time does not go on, or a breath is too short;
+        `OSError` if the file cannot be read.
 
     Source: Google Brain, 2021 (the data set); Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu,
     Singh, Zhang, Minasyan, LaChance, Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -89,7 +86,6 @@ def read_breaths(
     if dt is not None:
         check_positive(dt, "dt", _WHERE)
     table = _table(path)
-    _check_values(path, table, dict(R=resistances, C=compliances, u_out=(0.0, 1.0)))
     starts, ends = _breaths(path, table)
     time = table["time_step"]
     if dt is None:
@@ -125,81 +121,57 @@ def _wrong(path: Path, line: Any, column: str, words: str) -> ValueError:
     return ValueError(f"{_WHERE}: '{path}' row {line}, column {column}: {words}.")
 
 
-def _check_values(
-    path: Path, table: dict[str, np.ndarray], known: dict[str, Sequence[float]]
-) -> None:
-    """Raise unless each value is one that there may be."""
-    checks = [
-        (
-            name,
-            ~np.isin(table[name], np.asarray(allowed, float)),
-            f"one of {', '.join(f'{value:g}' for value in allowed)}",
-        )
-        for name, allowed in known.items()
-    ]
-    u_in = table["u_in"]
-    checks.append(("u_in", (u_in < 0) | (u_in > 100), "between 0 and 100"))
-    for name, bad, words in checks:
-        if bad.any():
-            row = int(np.argmax(bad))
-            got = f"must be {words}, got {table[name][row]:g}"
-            raise _wrong(path, table["line"][row], name, got)
-
-
 def _breaths(path: Path, table: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Where each breath begins and ends, if each is one breath of one lung."""
-    number, time = table["breath_id"], table["time_step"]
-    starts = np.flatnonzero(np.diff(number, prepend=np.nan) != 0)
+    number, u_in = table["breath_id"], table["u_in"]
+    begins = np.diff(number, prepend=np.nan) != 0
+    starts = np.flatnonzero(begins)
     ends = np.append(starts[1:], len(number))
-    inner = np.ones(len(number), bool)
-    inner[starts] = False
-    _, first = np.unique(number[starts], return_index=True)
-    again = np.ones(len(starts), bool)
-    again[first] = False
-
-    def check(column: str, bad: np.ndarray, words: Callable[[int], str]) -> None:
-        if len(bad):
-            row = int(bad[0])
-            raise _wrong(path, table["line"][row], column, words(row))
-
-    check(
-        "breath_id",
-        starts[again],
-        lambda row: (
-            "the rows of a breath must follow each other, but breath "
-            f"{number[row]:g} was before"
-        ),
+    first = starts[np.unique(number[starts], return_index=True)[1]]
+    again = begins & ~np.isin(np.arange(len(number)), first)
+    single = begins & np.append(begins[1:], True)
+    step = {name: np.diff(column, prepend=0.0) for name, column in table.items()}
+    one_of = lambda values: f"must be one of {', '.join(f'{v:g}' for v in values)}"
+    constant = (
+        "must be the same for all of breath {breath:g}, got {now:g} after {last:g}"
     )
-    check(
-        "breath_id",
-        starts[ends - starts < 2],
-        lambda row: (
-            f"a breath must have at least 2 rows, got 1 of breath {number[row]:g}"
+    checks = [
+        (name, ~np.isin(table[name], values), f"{one_of(values)}, got {{now:g}}")
+        for name, values in ALLOWED.items()
+    ]
+    checks += [
+        ("u_in", (u_in < 0) | (u_in > 100), "must be between 0 and 100, got {now:g}"),
+        (
+            "breath_id",
+            again,
+            "the rows of a breath must follow each other, but breath {now:g} was "
+            "before",
         ),
-    )
-    check(
-        "time_step",
-        np.flatnonzero(inner & (np.diff(time, prepend=0.0) <= 0)),
-        lambda row: (
-            f"must increase within a breath, got {time[row]:g} after {time[row - 1]:g}"
+        (
+            "breath_id",
+            single,
+            "a breath must have at least 2 rows, got 1 of breath {now:g}",
         ),
-    )
-    for name in ("R", "C"):
-        values = table[name]
-        check(
-            name,
-            np.flatnonzero(inner & (np.diff(values, prepend=values[0]) != 0)),
-            lambda row, values=values: (
-                f"must be the same for all of breath "
-                f"{number[row]:g}, got {values[row]:g} after {values[row - 1]:g}"
-            ),
-        )
+        (
+            "time_step",
+            ~begins & (step["time_step"] <= 0),
+            "must increase within a breath, got {now:g} after {last:g}",
+        ),
+        ("R", ~begins & (step["R"] != 0), constant),
+        ("C", ~begins & (step["C"] != 0), constant),
+    ]
+    for name, bad, words in checks:
+        if bad.any():
+            k = int(np.argmax(bad))
+            now, last = table[name][k], table[name][k - 1]
+            words = words.format(now=now, last=last, breath=number[k])
+            raise _wrong(path, table["line"][k], name, words)
     return starts, ends
 
 
 def _table(path: Path) -> dict[str, np.ndarray]:
     """The columns by name, as numbers, and of each row its `line` in the file."""
-    # What is no text is a value like any other that is no number.
+    # Bytes that are not text are rejected later, as values that are not numbers.
     with open(path, newline="", encoding="utf-8-sig", errors="replace") as file:
         reader = csv.reader(file)
         header = [name.strip() for name in next(reader, [])]
@@ -286,16 +258,9 @@ def write_breaths(path: str | os.PathLike, breaths: Breaths) -> None:
         np.tile(float(breaths.dt) * np.arange(length), count),
         *(np.ravel(a) for a in (breaths.u_in, breaths.u_out, breaths.pressure)),
     ]
-    formats = ["%d", "%d", "%g", "%g", "%.6f", "%.6f", "%d", "%.6f"]
+    form = "%d,%d,%g,%g,%.6f,%.6f,%d,%.6f"
     header = ",".join(COLUMNS)
-    np.savetxt(
-        path,
-        np.stack(columns, 1),
-        fmt=formats,
-        delimiter=",",
-        header=header,
-        comments="",
-    )
+    np.savetxt(path, np.stack(columns, 1), form, header=header, comments="")
 
 
 def write_example(
@@ -303,19 +268,15 @@ def write_example(
     breaths: int = 20,
     *,
     key: PRNGKey,
-    length: int = 80,
-    scale: Any = 0.5,
 ) -> None:
     """Write a file of that kind, made by exploring the nine lungs of the task
-    `lung/double_compartment`.
+    `lung/double_compartment`; 80 rows a breath, with the expiratory phase.
 
     **Arguments:**
 
     - `path`: the file to write.
     - `breaths`: of each lung, 20 by default.
     - `key`: a random key.
-    - `length`: rows a breath, 80 by default, with the expiratory phase.
-    - `scale`: of the PID gains that are drawn, 0.5 by default.
 
     **Raises:** `OSError` if the file cannot be written.
 
@@ -329,25 +290,22 @@ def write_example(
 
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "train.csv"
-            lung.write_example(path, 1, key=jax.random.key(0), length=2)
+            lung.write_example(path, 1, key=jax.random.key(0))
         ```
     """
     check_key(key, "write_example")
-    lungs = [(R, C) for R in RESISTANCES for C in COMPLIANCES]
+    lungs = list(itertools.product(ALLOWED["R"], ALLOWED["C"]))
     parts = [
         explore(
-            double_compartment(R, C),
+            double_compartment(resistance=R, compliance=C),
             breaths,
             key=own,
-            length=length,
-            scale=scale,
+            length=80,
+            scale=0.5,
             resistance=R,
             compliance=C,
         )
         for (R, C), own in zip(lungs, jr.split(key, len(lungs)), strict=True)
     ]
-    whole = jax.tree.map(
-        lambda *columns: jnp.concatenate(columns) if columns[0].ndim else columns[0],
-        *parts,
-    )
-    write_breaths(path, whole)
+    join = lambda *columns: jnp.concatenate(columns) if columns[0].ndim else columns[0]
+    write_breaths(path, jax.tree.map(join, *parts))

@@ -63,13 +63,11 @@ class Breaths(eqx.Module):
             raise ValueError(
                 f"Breaths: pressure must have shape (breaths, samples), got {shape}."
             )
-        for name, fits, which in (
-            ("u_in", shape, " like pressure"),
-            ("u_out", shape, " like pressure"),
-            ("truth", shape, " like pressure"),
-            ("resistance", shape[:-1], ", an entry for each breath"),
-            ("compliance", shape[:-1], ", an entry for each breath"),
-        ):
+        per_sample = shape, " like pressure"
+        per_breath = shape[:-1], ", an entry for each breath"
+        expected = dict.fromkeys(("u_in", "u_out", "truth"), per_sample)
+        expected |= dict.fromkeys(("resistance", "compliance"), per_breath)
+        for name, (fits, which) in expected.items():
             given = getattr(self, name)
             if given is not None and jnp.shape(given) != fits:
                 raise ValueError(

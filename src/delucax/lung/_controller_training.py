@@ -1,6 +1,5 @@
 """Training controllers of breaths."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +10,6 @@ from jaxtyping import Array
 
 from .._check import check_bool, check_count, check_key, check_positive
 from .._controller import AbstractController, check_controller
-from .._module import function_field
 from .._typing import PRNGKey
 from ..environments import Environment
 from ..simulation import rollout
@@ -114,29 +112,25 @@ class _TrackingError(eqx.Module):
 
 
 class _FiniteGradients(eqx.Module):
-    """A gradient that counts as 0 for a controller for which it is not finite.
+    """The analytic gradient, 0 for a controller for which it is not finite.
 
     Controllers are stacked along the first `axes` axes of each leaf.
     """
 
-    gradient: Callable[..., Any] = function_field()
     axes: int = eqx.field(static=True)
 
     def __call__(self, loss: Any, values: Any, key: PRNGKey) -> tuple[Any, Any]:
-        value, slope = self.gradient(loss, values, key)
-        finite: Any = True
-        for leaf in jax.tree.leaves(slope):
-            inner = tuple(range(self.axes, leaf.ndim))
-            finite = finite & jnp.all(jnp.isfinite(leaf), axis=inner)
-
-        def finite_or_zero(leaf):
-            inner = tuple(range(self.axes, leaf.ndim))
-            return jnp.where(jnp.expand_dims(finite, inner), leaf, 0)
-
-        cost, metrics = value if isinstance(value, tuple) else (value, {})
-        diverged = jnp.sum(~finite).astype(cost.dtype)
-        value = cost, metrics | {"diverged": diverged}
-        return value, jax.tree.map(finite_or_zero, slope)
+        cost, slope = analytic(loss, values, key)
+        own = lambda leaf: tuple(range(self.axes, leaf.ndim))
+        of_leaves = [
+            jnp.all(jnp.isfinite(leaf), axis=own(leaf))
+            for leaf in jax.tree.leaves(slope)
+        ]
+        finite = jnp.all(jnp.stack(of_leaves), axis=0)
+        slope = jax.tree.map(
+            lambda leaf: jnp.where(jnp.expand_dims(finite, own(leaf)), leaf, 0), slope
+        )
+        return (cost, {"diverged": jnp.sum(~finite).astype(cost.dtype)}), slope
 
 
 def train_controllers(
@@ -150,7 +144,6 @@ def train_controllers(
     pips: Any = PIPS,
     horizon: int = LENGTH,
     trainable: Any = None,
-    gradient: Any = None,
     progress: bool = False,
     checkpoint: Any = None,
     throw: bool = True,
@@ -158,8 +151,9 @@ def train_controllers(
     """Train controllers in lungs, by the gradient of their error.
 
     The loss is [`delucax.lung.breath_error`][] over all peak pressures, with fresh
-    noise in each step; Adam with a learning rate that falls to 0 along a cosine. As
-    Adam moves each weight by itself, those of one controller do not feel the others.
+    noise in each step; Adam with a learning rate that falls to 0 along a cosine.
+    Because Adam scales each weight by itself, the gradients of one controller do not
+    affect the others.
 
     **Arguments:**
 
@@ -174,11 +168,11 @@ def train_controllers(
     - `learning_rate`: 1e-2 by default.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
     - `horizon`: steps an episode, 29 by default.
-    - `trainable`, `gradient`, `progress`, `checkpoint`: of [`delucax.training.fit`][];
-        the weights, the analytic gradient, no bar and no file by default.
+    - `trainable`, `progress`, `checkpoint`: of [`delucax.training.fit`][]; the weights,
+        no bar and no file by default.
     - `throw`: raise if an error or its gradient is NaN or infinite (default); if false,
         that gradient counts as 0, the other controllers are trained as if nothing were,
-        and `history["diverged"]` says of how many it was in each step.
+        and `history["diverged"]` counts those controllers at each step.
 
     **Returns:** a [`delucax.training.Fitted`][].
 
@@ -194,7 +188,7 @@ def train_controllers(
         import jax
         from delucax import lung
 
-        envs = lung.stack([lung.single_compartment(R) for R in (5.0, 20.0)])
+        envs = lung.stack([lung.single_compartment(resistance=R) for R in (5.0, 20.0)])
         forward = lung.FeedForward(lung.BreathWaveform(), gain=0.5)
         one = lung.stack([lung.stack([forward, forward])])
         few = dict(steps=3, horizon=2, pips=[20.0])
@@ -218,7 +212,6 @@ def train_controllers(
         check_bool(shared, "shared", where),
         check_bool(throw, "throw", where),
     )
-    gradient = analytic if gradient is None else gradient
     return fit(
         loss,
         controllers,
@@ -226,7 +219,7 @@ def train_controllers(
         steps,
         key=check_key(key, where),
         trainable=trainable,
-        gradient=gradient if throw else _FiniteGradients(gradient, 1 if shared else 2),
+        gradient=analytic if throw else _FiniteGradients(1 if shared else 2),
         progress=progress,
         throw=throw,
         **kept_at(checkpoint),

@@ -30,21 +30,21 @@ class Explorer(AbstractController):
     r"""A PID whose inspiratory control is disturbed, to learn a lung from.
 
     Its control is `(clip(pid + bump(t), 0, 100), 0)`, and `(0, 1)` in the expiratory
-    phase. For each episode a bump is drawn: a triangle of a height between -30 and 30
+    phase. The gains `kp` and `ki` of the [`delucax.controllers.LeakyPID`][] are drawn
+    for each episode from {0, 0.1, ..., 0.9, 1, 2, ..., 10}, times `scale`. A bump is
+    drawn too: a triangle of a height between -30 and 30
     and a width between 0.1 and 0.5 s somewhere in the inspiration; with probability
     0.15 a ramp instead, which begins at a height between 0 and 100 and is gone within
     0.05 to 0.3 s.
 
     **Arguments:**
 
-    - `kp`, `ki`: the gains of a [`delucax.controllers.LeakyPID`][]. Drawn for each
-        episode from {0, 0.1, ..., 0.9, 1, 2, ..., 10} by default, times `scale`.
     - `dt`: the control interval.
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `scale`: of the gains that are drawn, 1 by default.
 
-    **Raises:** `ValueError` if a number is none or not finite, `dt` is not positive, or
-    `waveform` is none.
+    **Raises:** `ValueError` if a number is not one or not finite, `dt` is not positive,
+    or `waveform` is not a `BreathWaveform`.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -62,23 +62,9 @@ class Explorer(AbstractController):
         ```
     """
 
-    kp: Array | None = parameter()
-    ki: Array | None = parameter()
     dt: Array = parameter(constraint=positive)
     waveform: BreathWaveform
-    scale: Array = parameter()
-
-    def __init__(
-        self,
-        kp: Any = None,
-        ki: Any = None,
-        *,
-        dt: Any,
-        waveform: BreathWaveform,
-        scale: Any = 1.0,
-    ):
-        self.kp, self.ki, self.dt, self.scale = kp, ki, dt, scale
-        self.waveform = waveform
+    scale: Array = parameter(1.0)
 
     def __check_init__(self):
         check_waveform(self.waveform, "Explorer")
@@ -91,12 +77,6 @@ class Explorer(AbstractController):
         key = jr.key(0) if key is None else key
         keys = jr.split(key, 4)
         gains = self.scale * jr.choice(keys[0], jnp.array(GAINS), (2,))
-        gains = jnp.stack(
-            [
-                drawn if given is None else given
-                for drawn, given in zip(gains, (self.kp, self.ki), strict=True)
-            ]
-        )
         low = jnp.array([-30.0, 0.1, 0.0, 0.0, 0.05])
         high = jnp.array([30.0, 0.5, 1.0, 100.0, 0.3])
         bump = low + (high - low) * jr.uniform(keys[1], (5,))
@@ -210,8 +190,6 @@ def explore(
         jnp.asarray(np.concatenate(column)[:breaths])
         for column in zip(*kept, strict=True)
     )
-    known = {
-        name: None if value is None else jnp.full(breaths, float(value))
-        for name, value in (("resistance", resistance), ("compliance", compliance))
-    }
-    return Breaths(u_in, u_out, pressure, env.dt, truth=truth, **known)
+    each = lambda value: None if value is None else jnp.full(breaths, float(value))
+    lungs = each(resistance), each(compliance)
+    return Breaths(u_in, u_out, pressure, env.dt, *lungs, truth)

@@ -34,7 +34,8 @@ class LearnedLung(AbstractDynamics):
     As published: `p[k + 1] = network(z)` of the controls as they are, for
     `k < boundary` its last term instead, and the history is 0 before an inspiration.
 
-    The `boundary` networks are one stacked array, of which a step takes its slice.
+    The `boundary` networks have 16 hidden units each, and are one stacked array,
+    of which a step takes its slice.
     While `u_out` is above 1/2 the lung is as before an inspiration. The state is (the
     controls, the pressures, both newest first, and the count of steps), and the
     observation is the pressure [cmH2O].
@@ -45,7 +46,6 @@ class LearnedLung(AbstractDynamics):
         before an inspiration are taken.
     - `width`, `depth`: of the network, 24 and 1 by default.
     - `boundary`: how many first steps have networks of their own, 5 by default.
-    - `boundary_width`: hidden units of each, 16 by default.
     - `u_window`, `p_window`: how many controls and pressures the network is given, 8
         and 6 by default.
     - `published`: as published (see above); false by default.
@@ -97,7 +97,6 @@ class LearnedLung(AbstractDynamics):
         depth: int = 1,
         *,
         boundary: int = 5,
-        boundary_width: int = 16,
         u_window: int = 8,
         p_window: int = 6,
         published: bool = False,
@@ -106,20 +105,15 @@ class LearnedLung(AbstractDynamics):
         where = "LearnedLung"
         check_instance(breaths, Breaths, "breaths", where)
         check_key(key, where)
-        for name, value in (
-            ("width", width),
-            ("depth", depth),
-            ("boundary", boundary),
-            ("boundary_width", boundary_width),
-            ("u_window", u_window),
-            ("p_window", p_window),
-        ):
+        sizes = dict(width=width, depth=depth, boundary=boundary)
+        sizes |= dict(u_window=u_window, p_window=p_window)
+        for name, value in sizes.items():
             check_count(value, name, where)
         hidden_key, output_key, valve_key, key = jr.split(key, 4)
         size = 2 * max(u_window, p_window, boundary)
-        shape = boundary, boundary_width
+        shape = boundary, 16
         self.hidden = jr.normal(hidden_key, (*shape, size)) / size**0.5
-        self.output = 0.1 * jr.normal(output_key, shape) / boundary_width**0.5
+        self.output = 0.1 * jr.normal(output_key, shape) / 16**0.5
         self.line = jnp.zeros(u_window + p_window)
         self.valve = tanh_network("scalar", "scalar", 8, 1, key=valve_key)
         inputs = u_window + p_window
@@ -213,14 +207,7 @@ class LearnedLung(AbstractDynamics):
         history = jnp.concatenate([controls, pressures])
         early = self._early(history, late, self.hidden[i], self.output[i])
         predicted = self._bound(jnp.where(step < first - 0.5, early, late))
-        after = jnp.concatenate(
-            [
-                controls,
-                jnp.reshape(predicted, (1,)),
-                pressures[: n - 1],
-                jnp.reshape(step + 1, (1,)),
-            ]
-        )
+        after = jnp.hstack([controls, predicted, pressures[: n - 1], step + 1])
         after = jnp.where(u[1] > 0.5, self.resting(), after)
         return after.astype(x.dtype), RESULTS.successful
 

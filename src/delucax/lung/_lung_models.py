@@ -19,13 +19,13 @@ from ._valves import Valves
 
 
 class LungModel(eqx.Module):
-    """A lung as a differential equation, seen by a sensor: what is fitted to breaths.
+    """A lung as a differential equation and a sensor, to be fitted to breaths.
 
     **Arguments:**
 
     - `system`: a [`delucax.lung.AbstractLung`][].
     - `dt`: the time between samples [s], 0.03 by default.
-    - `sensor_delay`: steps until a pressure is seen, 2 by default.
+    - `sensor_delay`: steps until a pressure is observed, 2 by default.
     - `peep`: the pressure at which it rests before an inspiration [cmH2O], 5 by
         default.
     - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
@@ -90,7 +90,7 @@ class LungModel(eqx.Module):
 
 
 class NeuralLung(AbstractLung):
-    r"""A neural ODE: what a pressure does, and some states that are not seen,
+    r"""A neural ODE: a pressure and some hidden states,
 
     `dz/dt = rate network(z, flow(u_in) / max_flow, u_out)`, `p = p_mean + p_std z[0]`.
 
@@ -98,14 +98,13 @@ class NeuralLung(AbstractLung):
 
     **Arguments:**
 
-    - `hidden`: states that are not seen, 2 by default.
+    - `hidden`: hidden states, 2 by default.
     - `width`, `depth`: of the network, 24 and 1 by default.
-    - `p_mean`, `p_std`: the scale of the pressures [cmH2O], 20 and 10 by default.
-    - `rate`: the scale of the time derivatives [1/s], 10 by default.
     - `valves`: whose curve of the flow is used; the default ones by default.
     - `key`: a random key, for the first weights.
 
-    **Attributes:** `network`, trainable.
+    **Attributes:** `network`, trainable; `p_mean` and `p_std`, the scale of the
+        pressures, 20 and 10 cmH2O; `rate`, that of the time derivatives, 10 / s.
 
     **Raises:** `ValueError` if a size is below 1, or there is no key.
 
@@ -136,9 +135,6 @@ class NeuralLung(AbstractLung):
         width: int = 24,
         depth: int = 1,
         *,
-        p_mean: Any = 20.0,
-        p_std: Any = 10.0,
-        rate: Any = 10.0,
         valves: Valves | None = None,
         key: PRNGKey,
     ):
@@ -149,7 +145,8 @@ class NeuralLung(AbstractLung):
         check_key(key, where)
         sizes = self.hidden + 3, self.hidden + 1, width, depth
         self.network = tanh_network(*sizes, key=key)
-        self.p_mean, self.p_std, self.rate = p_mean, p_std, rate
+        scales: Any = 20.0, 10.0, 10.0
+        self.p_mean, self.p_std, self.rate = scales
         self.valves = Valves() if valves is None else valves
 
     @property
@@ -160,8 +157,8 @@ class NeuralLung(AbstractLung):
         return self.p_mean + self.p_std * x[0]
 
     def resting(self, pressure: RealScalar) -> State:
-        first = jnp.reshape((pressure - self.p_mean) / self.p_std, (1,))
-        return jnp.concatenate([first, jnp.zeros(self.hidden)])
+        first = (pressure - self.p_mean) / self.p_std
+        return jnp.hstack([first, jnp.zeros(self.hidden)])
 
     def vector_field(self, t, x, u, w):
         flow = self.valves.flow(u[0]) / self.valves.max_flow
@@ -182,11 +179,10 @@ class GreyBoxLung(AbstractLung):
 
     - `single`: a [`delucax.lung.SingleCompartment`][]; the default one by default.
     - `width`: hidden units of both networks, 16 by default.
-    - `p_std`: the scale of the pressures [cmH2O], 10 by default.
-    - `rate`: the scale of the time derivative of h [1/s], 5 by default.
     - `key`: a random key, for the first weights.
 
-    **Attributes:** `network` and `memory`, trainable.
+    **Attributes:** `network` and `memory`, trainable; `p_std`, the scale of the
+        pressures, 10 cmH2O; `rate`, that of the time derivative of h, 5 / s.
 
     **Raises:** `ValueError` if a size is below 1, or there is no key.
 
@@ -216,8 +212,6 @@ class GreyBoxLung(AbstractLung):
         single: SingleCompartment | None = None,
         width: int = 16,
         *,
-        p_std: Any = 10.0,
-        rate: Any = 5.0,
         key: PRNGKey,
     ):
         where = "GreyBoxLung"
@@ -229,7 +223,8 @@ class GreyBoxLung(AbstractLung):
         )
         last = lambda mlp: mlp.layers[-1].weight  # noqa: E731
         self.network = eqx.tree_at(last, network, 0.1 * last(network))
-        self.p_std, self.rate = p_std, rate
+        scales: Any = 10.0, 5.0
+        self.p_std, self.rate = scales
 
     @property
     def valves(self) -> Valves:
@@ -245,10 +240,9 @@ class GreyBoxLung(AbstractLung):
         return self.single.pressure(x[:3]) + self.p_std * rest
 
     def resting(self, pressure: RealScalar) -> State:
-        physical = self.single.resting(pressure)
-        return jnp.concatenate([physical, jnp.zeros(1)])
+        return jnp.append(self.single.resting(pressure), 0.0)
 
     def vector_field(self, t, x, u, w):
         physical = self.single.vector_field(t, x[:3], u, w)
         memory = self.rate * self.memory(self._inputs(x))
-        return jnp.concatenate([physical, jnp.reshape(memory, (1,))])
+        return jnp.append(physical, memory)

@@ -6,7 +6,7 @@ from typing import Any
 
 import diffrax
 
-from .._check import check_count, check_instance
+from .._check import check_count, check_instance, check_keywords, keywords_of
 from .._module import load
 from ..dynamics import Delayed, Discretized
 from ..environments import Environment
@@ -18,15 +18,38 @@ from ._lungs import (
     DoubleCompartment,
     SingleCompartment,
 )
-from ._valves import Valves
 from ._ventilation import ventilated
 from ._waveform import BreathWaveform, check_peep
 
 
 def _task(
     task: Callable[..., Environment],
-    plant: AbstractLung,
+    kind: type[AbstractLung],
+    system: AbstractLung | None,
+    options: dict[str, Any],
     delay: int = 0,
+) -> Environment:
+    """A lung, `system` or one of `kind`, that is to breathe.
+
+    `task` is the function that a user called, which errors name, and `delay` the steps
+    until a control acts.
+    """
+    where = task.__name__
+    check_keywords(options, where, task, kind, _discretised, ventilated, Environment)
+    constants = {n: options.pop(n) for n in keywords_of(kind) if n in options}
+    if system is None:
+        system = kind(**constants)
+    elif constants:
+        names = ", ".join(constants)
+        raise ValueError(f"{where}: give a system or its {names}, not both.")
+    check_instance(system, kind, "system", where)
+    return _discretised(task, system, delay, **options)
+
+
+def _discretised(
+    task: Callable[..., Environment],
+    system: AbstractLung,
+    delay: int,
     /,
     waveform: BreathWaveform | None = None,
     *,
@@ -35,32 +58,20 @@ def _task(
     substeps: int = 1,
     **options: Any,
 ) -> Environment:
-    """A lung that rests at the PEEP of its valves and is to breathe.
-
-    `task` is the function that a user called, which errors name, and `delay` the steps
-    until a control acts.
-    """
-    valves: Any = plant.valves  # pyright: ignore[reportAttributeAccessIssue]
+    """The task of a lung that rests at the PEEP of its valves."""
+    valves: Any = system.valves  # pyright: ignore[reportAttributeAccessIssue]
     waveform = BreathWaveform() if waveform is None else waveform
-    rest = plant.resting(valves.peep)
-    dynamics = Discretized(plant, dt, solver, substeps)
+    rest = system.resting(valves.peep)
+    dynamics = Discretized(system, dt, solver, substeps)
     if delay:
         dynamics = Delayed(dynamics, controls=delay)
         rest = dynamics.filled(rest)
-    env = ventilated((task, _task), dynamics, rest, waveform, **options)
+    env = ventilated(task, dynamics, rest, waveform, **options)
     check_peep(waveform, valves, task.__name__)
     return env
 
 
-def balloon_lung(
-    resistance: Any = 20.0,
-    stiffness: Any = 40.0,
-    rest: Any = 1.5,
-    *,
-    valves: Valves | None = None,
-    horizon: int = 100,
-    **options: Any,
-) -> Environment:
+def balloon_lung(system: BalloonLung | None = None, **options: Any) -> Environment:
     """Make a balloon breathe as a waveform says.
 
     The controls, the observation, the state and the cost are those of
@@ -68,16 +79,16 @@ def balloon_lung(
 
     **Arguments:**
 
-    - `resistance`, `stiffness`, `rest`, `valves`: of [`delucax.lung.BalloonLung`][].
-    - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `**options`: the control interval `dt` (0.03 by default), `solver` and `substeps`
-        of [`delucax.Discretized`][]; `waveform`, `sensor_delay`, `noise` and others of
+    - `system`: a [`delucax.lung.BalloonLung`][]; made of `options` by default.
+    - `**options`: arguments of the lung; the control interval `dt` (0.03 by default),
+        `solver` and `substeps` of [`delucax.Discretized`][]; `waveform`,
+        `sensor_delay`, `noise`, `horizon` and others of
         [`delucax.lung.ventilation`][]; those of [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
     **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
-    that of `valves`.
+    that of its valves.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca), retuned.
@@ -90,21 +101,11 @@ def balloon_lung(
         env = dlx.make("lung/balloon_lung", resistance=10.0)
         ```
     """
-    plant = BalloonLung(resistance, stiffness, rest, valves or Valves())
-    return _task(balloon_lung, plant, horizon=horizon, **options)
+    return _task(balloon_lung, BalloonLung, system, options)
 
 
 def delay_lung(
-    resistance: Any = 20.0,
-    stiffness: Any = 40.0,
-    rest: Any = 1.5,
-    pipe: Any = 5.0,
-    *,
-    delay: int = 5,
-    valves: Valves | None = None,
-    horizon: int = 100,
-    substeps: int = 4,
-    **options: Any,
+    system: DelayLung | None = None, *, delay: int = 5, **options: Any
 ) -> Environment:
     """Make a balloon breathe through a long pipe, which what is done must first pass.
 
@@ -113,20 +114,15 @@ def delay_lung(
 
     **Arguments:**
 
-    - `resistance`, `stiffness`, `rest`, `pipe`, `valves`: of
-        [`delucax.lung.DelayLung`][].
+    - `system`: a [`delucax.lung.DelayLung`][]; made of `options` by default.
     - `delay`: steps until a control acts, 5 by default.
-    - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `substeps`: solver steps an interval, 4 by default: air rushes out of the pipe in
-        some 25 ms.
-    - `**options`: the control interval `dt` (0.03 by default), `solver` and `substeps`
-        of [`delucax.Discretized`][]; `waveform`, `sensor_delay`, `noise` and others of
-        [`delucax.lung.ventilation`][]; those of [`delucax.Environment`][].
+    - `**options`: as of `lung/balloon_lung`; `substeps` is 4 by default, because air
+        rushes out of the pipe in some 25 ms.
 
     **Returns:** an [`delucax.Environment`][].
 
     **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
-    that of `valves`.
+    that of its valves.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca), as a differential equation and retuned.
@@ -139,19 +135,13 @@ def delay_lung(
         env = dlx.make("lung/delay_lung", delay=3)
         ```
     """
-    plant = DelayLung(resistance, stiffness, rest, pipe, valves or Valves())
     delay = check_count(delay, "delay", "delay_lung", least=0)
-    options = dict(options, horizon=horizon, substeps=substeps)
-    return _task(delay_lung, plant, delay, **options)
+    options = dict(substeps=4) | options
+    return _task(delay_lung, DelayLung, system, options, delay)
 
 
 def single_compartment(
-    resistance: Any = 20.0,
-    compliance: Any = 20.0,
-    *,
-    valves: Valves | None = None,
-    horizon: int = 100,
-    **options: Any,
+    system: SingleCompartment | None = None, **options: Any
 ) -> Environment:
     """Make a lung of one compartment breathe as a waveform says.
 
@@ -159,15 +149,13 @@ def single_compartment(
 
     **Arguments:**
 
-    - `resistance`, `compliance`, `valves`: of [`delucax.lung.SingleCompartment`][].
-    - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `**options`: `waveform`, `sensor_delay`, `noise` and others of
-        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
+    - `system`: a [`delucax.lung.SingleCompartment`][]; made of `options` by default.
+    - `**options`: as of `lung/balloon_lung`.
 
     **Returns:** an [`delucax.Environment`][].
 
     **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
-    that of `valves`.
+    that of its valves.
 
     !!! example
 
@@ -177,45 +165,28 @@ def single_compartment(
         env = dlx.make("lung/single_compartment", resistance=50.0, compliance=10.0)
         ```
     """
-    plant = SingleCompartment(resistance, compliance, valves or Valves())
-    return _task(single_compartment, plant, horizon=horizon, **options)
+    return _task(single_compartment, SingleCompartment, system, options)
 
 
 def double_compartment(
-    resistance: Any = 20.0,
-    compliance: Any = 20.0,
-    central: Any = 0.3,
-    share: Any = 0.1,
-    imbalance: Any = 10.0,
-    *,
-    valves: Valves | None = None,
-    sensor_delay: int = 2,
-    noise: Any = 0.2,
-    horizon: int = 100,
-    substeps: int = 2,
-    **options: Any,
+    system: DoubleCompartment | None = None, **options: Any
 ) -> Environment:
-    """Make a lung of a fast and a slow compartment breathe, seen late and with noise.
+    """Make a lung of a fast and a slow compartment breathe, with delay and noise.
 
     The plant of the ventilator study: as `lung/single_compartment`, with another lung
     and a real sensor.
 
     **Arguments:**
 
-    - `resistance`, `compliance`, `central`, `share`, `imbalance`, `valves`: of
-        [`delucax.lung.DoubleCompartment`][].
-    - `sensor_delay`: steps until a pressure is seen, 2 by default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
-    - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `substeps`: solver steps an interval, 2 by default: with the expiratory valve open
-        the fast compartment of a narrow lung is empty within some 10 ms.
-    - `**options`: `waveform`, `sensor_delay`, `noise` and others of
-        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
+    - `system`: a [`delucax.lung.DoubleCompartment`][]; made of `options` by default.
+    - `**options`: as of `lung/balloon_lung`; `sensor_delay` is 2 steps and `noise`
+        0.2 cmH2O by default, and `substeps` is 2, because with the expiratory valve
+        open the fast compartment of a narrow lung is empty within some 10 ms.
 
     **Returns:** an [`delucax.Environment`][].
 
     **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
-    that of `valves`.
+    that of its valves.
 
     !!! example
 
@@ -225,20 +196,11 @@ def double_compartment(
         env = dlx.make("lung/double_compartment", resistance=50.0, compliance=10.0)
         ```
     """
-    plant = DoubleCompartment(
-        resistance, compliance, central, share, imbalance, valves or Valves()
-    )
-    options = dict(options, sensor_delay=sensor_delay, noise=noise)
-    options = dict(options, horizon=horizon, substeps=substeps)
-    return _task(double_compartment, plant, **options)
+    options = dict(sensor_delay=2, noise=0.2, substeps=2) | options
+    return _task(double_compartment, DoubleCompartment, system, options)
 
 
-def learned_lung(
-    model: LearnedLung | None = None,
-    *,
-    horizon: int = 100,
-    **options: Any,
-) -> Environment:
+def learned_lung(model: LearnedLung | None = None, **options: Any) -> Environment:
     """Make a lung breathe that was learned from breaths.
 
     As `lung/balloon_lung`; its time step is that of the breaths, and what it is let out
@@ -250,8 +212,7 @@ def learned_lung(
         library, learned from breaths of the task `lung/double_compartment`; its sensor
         is two samples late, and so is its pressure. In the repository,
         `python -m benchmarks.learned_lung` makes it.
-    - `horizon`: steps an episode, 100 by default, which is one breath.
-    - `**options`: `waveform`, `noise` and others of
+    - `**options`: `waveform`, `noise`, `horizon` and others of
         [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
@@ -273,5 +234,4 @@ def learned_lung(
     if model is None:
         lung = load(Path(__file__).with_name("learned_lung.dlx"))
     check_instance(lung, LearnedLung, "model", "learned_lung")
-    rest = lung.resting()
-    return ventilated((learned_lung,), lung, rest, horizon=horizon, **options)
+    return ventilated(learned_lung, lung, lung.resting(), **options)

@@ -1,5 +1,6 @@
 """The lungs of the original Deluca, step by step and with its constants."""
 
+import abc
 from typing import Any
 
 import equinox as eqx
@@ -9,6 +10,7 @@ from jaxtyping import Array
 from .._check import check_bool, check_count
 from .._module import parameter, positive
 from .._results import RESULTS
+from .._typing import Control, State
 from ..dynamics import AbstractDynamics
 from ._lungs import balloon_pressure
 
@@ -33,7 +35,24 @@ def original_valve(u_in: Any) -> Array:
     return jnp.clip(jnp.tanh(0.03 * (3 * u_in - 130)) + 1, 0, 1.72)
 
 
-class OriginalBalloonLung(AbstractDynamics):
+class _AbstractOriginalLung(AbstractDynamics):
+    """A step of the original, whose state begins with a volume and a pressure."""
+
+    control_names = ("u_in", "u_out")
+
+    @abc.abstractmethod
+    def _step(self, x: State, u: Control) -> State:
+        """The state one step on."""
+
+    def advance(self, t, x, u, w):
+        after = self._step(x, u)
+        return (after if w is None else after + w).astype(x.dtype), RESULTS.successful
+
+    def observe(self, t, x):
+        return x[1:2]
+
+
+class OriginalBalloonLung(_AbstractOriginalLung):
     r"""The balloon lung of the original, an Euler step of `dt`:
 
     `flow = clip(gain valve(u_in), 0, 2)`, less `0.05 p` if `p > peep` and `u_out > 0`;
@@ -78,12 +97,11 @@ class OriginalBalloonLung(AbstractDynamics):
     dt: Array = parameter(0.03, constraint=positive)
 
     state_names = ("volume", "pressure")
-    control_names = ("u_in", "u_out")
 
     def __check_init__(self):
         check_bool(self.leak, "leak", "OriginalBalloonLung")
 
-    def advance(self, t, x, u, w):
+    def _step(self, x, u):
         volume, pressure = x[0], x[1]
         flow = jnp.clip(self.gain * original_valve(u[0]), 0, 2)
         out = (pressure > self.peep) & (u[1] > 0)
@@ -92,14 +110,10 @@ class OriginalBalloonLung(AbstractDynamics):
         if self.leak:
             after = after + self.dt / (5 + self.dt) * (self.rest - after)
         pressure = self.offset + balloon_pressure(after, self.rest, self.stiffness)
-        after = jnp.stack([after, pressure])
-        return (after if w is None else after + w).astype(x.dtype), RESULTS.successful
-
-    def observe(self, t, x):
-        return x[1:]
+        return jnp.stack([after, pressure])
 
 
-class OriginalDelayLung(AbstractDynamics):
+class OriginalDelayLung(_AbstractOriginalLung):
     r"""The delay lung of the original, with the delay that it was to have:
 
     `v_next = max(v + dt p / resistance, rest)`,
@@ -145,8 +159,6 @@ class OriginalDelayLung(AbstractDynamics):
     delay: int = eqx.field(static=True, default=25)
     dt: Array = parameter(0.03, constraint=positive)
 
-    control_names = ("u_in", "u_out")
-
     def __check_init__(self):
         check_count(self.delay, "delay", "OriginalDelayLung")
 
@@ -159,7 +171,7 @@ class OriginalDelayLung(AbstractDynamics):
         ]
         return ("volume", "pressure", "pipe", *late)
 
-    def advance(self, t, x, u, w):
+    def _step(self, x, u):
         volume, pressure, pipe, late = x[0], x[1], x[2], x[3:]
         volume = jnp.maximum(volume + pressure / self.resistance * self.dt, self.rest)
         late = jnp.concatenate([u.astype(x.dtype), late])
@@ -167,14 +179,10 @@ class OriginalDelayLung(AbstractDynamics):
         inside = balloon_pressure(volume, self.rest, self.stiffness)
         pressure = jnp.maximum(0, pipe - inside)
         pipe = jnp.where(late[-1] > 0, 0.995 * pipe, pipe)
-        after = jnp.concatenate([jnp.stack([volume, pressure, pipe]), late[:-2]])
-        return (after if w is None else after + w).astype(x.dtype), RESULTS.successful
-
-    def observe(self, t, x):
-        return x[1:2]
+        return jnp.concatenate([jnp.stack([volume, pressure, pipe]), late[:-2]])
 
 
-class OriginalSingleCompartment(AbstractDynamics):
+class OriginalSingleCompartment(_AbstractOriginalLung):
     r"""The single compartment of the original, an Euler step of `dt`:
 
     `flow = clip(valve(u_in), 0, 2)`, `p_next = flow resistance + v / compliance + P0`,
@@ -212,13 +220,8 @@ class OriginalSingleCompartment(AbstractDynamics):
     dt: Array = parameter(0.03, constraint=positive)
 
     state_names = ("volume", "pressure")
-    control_names = ("u_in", "u_out")
 
-    def advance(self, t, x, u, w):
+    def _step(self, x, u):
         flow = jnp.clip(original_valve(u[0]), 0, 2)
         pressure = flow * self.resistance + x[0] / self.compliance + self.offset
-        after = jnp.stack([x[0] + flow * self.dt, pressure])
-        return (after if w is None else after + w).astype(x.dtype), RESULTS.successful
-
-    def observe(self, t, x):
-        return x[1:]
+        return jnp.stack([x[0] + flow * self.dt, pressure])

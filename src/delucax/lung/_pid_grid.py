@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_finite, check_key
+from .._check import check_choice, check_finite, check_key
 from .._module import as_float_array
 from .._typing import PRNGKey
 from ..controllers import LeakyPID, PID
@@ -19,6 +19,9 @@ from ._ventilation import waveform_of
 from ._waveform import as_pips, PIPS
 
 
+_KINDS: dict[str, Any] = {"leaky": LeakyPID, "true": PID}
+
+
 class PIDGrid(eqx.Module):
     """The errors of a grid of PIDs in some lungs.
 
@@ -26,7 +29,6 @@ class PIDGrid(eqx.Module):
 
     - `gains`: (kp, ki, kd) of each, shape `(grid, 3)`.
     - `errors`: the mean error of each in each lung, shape `(lungs, grid)` [cmH2O].
-    - `kind`: `"leaky"` or `"true"`.
 
     !!! example
 
@@ -34,14 +36,13 @@ class PIDGrid(eqx.Module):
         import jax.numpy as jnp
         from delucax.lung import PIDGrid
 
-        grid = PIDGrid(jnp.ones((2, 3)), jnp.array([[3.0, 2.0]]), "leaky")
+        grid = PIDGrid(jnp.ones((2, 3)), jnp.array([[3.0, 2.0]]))
         grid.best()
         ```
     """
 
     gains: Array
     errors: Array
-    kind: Literal["leaky", "true"] = eqx.field(static=True)
 
     def best(self) -> Array:
         """The gains with the least error in each lung, shape `(lungs, 3)`."""
@@ -55,13 +56,12 @@ class PIDGrid(eqx.Module):
 @eqx.filter_jit
 def _searched(envs, lists, pips, key, kind):
     """All combinations of the lists of gains, and the error of each in each lung."""
-    kinds = {"leaky": LeakyPID, "true": PID}
     lists = [jnp.ravel(values).astype(float) for values in lists]
     gains = jnp.stack(jnp.meshgrid(*lists, indexing="ij"), -1).reshape(-1, 3)
 
     def in_lung(env):
         def one(gains):
-            pid = kinds[kind](*gains, dt=env.dt, reference=env.cost.waveform)
+            pid = _KINDS[kind](*gains, dt=env.dt, reference=env.cost.waveform)
             return jnp.mean(breath_error(env, pid, key=key, pips=pips))
 
         return jax.vmap(one)(gains)
@@ -103,7 +103,7 @@ def pid_grid(
         import jax
         from delucax import lung
 
-        envs = lung.stack([lung.single_compartment(R) for R in (5.0, 20.0)])
+        envs = lung.stack([lung.single_compartment(resistance=R) for R in (5.0, 20.0)])
         few = dict(kp=[0.5, 1.0], ki=[1.0], pips=[20.0])
         lung.pid_grid(envs, key=jax.random.key(0), **few).best()
         ```
@@ -111,8 +111,7 @@ def pid_grid(
     where = "pid_grid"
     pips = as_pips(pips, waveform_of(envs, where, stacked=True), where)
     check_key(key, where)
-    if kind not in ("leaky", "true"):
-        raise ValueError(f"{where}: kind must be 'leaky' or 'true', got {kind!r}.")
+    check_choice(kind, tuple(_KINDS), "kind", where)
     lists = []
     for name, values in (("kp", kp), ("ki", ki), ("kd", kd)):
         array = as_float_array(values)
@@ -121,4 +120,4 @@ def pid_grid(
         check_finite(array, name, where)
         lists.append(array)
     envs = envs if jnp.ndim(envs.dt) else stack([envs])
-    return PIDGrid(*_searched(envs, lists, pips, key, kind), kind)
+    return PIDGrid(*_searched(envs, lists, pips, key, kind))

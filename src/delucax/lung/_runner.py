@@ -33,7 +33,7 @@ class Runner(Protocol):
 
     Write one for a machine: none of it needs JAX, and any of it may block or raise.
 
-    **Attributes:** `physical`, whether there is a machine; `dt`, the time of a step.
+    **Attributes:** `dt`, the time of a step.
 
     !!! example
 
@@ -48,13 +48,11 @@ class Runner(Protocol):
         ```
     """
 
-    physical: bool
     dt: float
 
     @abc.abstractmethod
     def observe(self) -> float:
         """The pressure that the sensor reads now [cmH2O]."""
-        ...
 
     @abc.abstractmethod
     def actuate(self, u_in: float, u_out: float) -> None:
@@ -62,12 +60,10 @@ class Runner(Protocol):
 
         **Arguments:** `u_in`: from 0 to 100 %. `u_out`: from 0 to 1.
         """
-        ...
 
     @abc.abstractmethod
     def wait(self) -> None:
         """Return when the next step is due."""
-        ...
 
     @abc.abstractmethod
     def should_abort(self, pressure: float) -> bool:
@@ -75,12 +71,10 @@ class Runner(Protocol):
 
         **Arguments:** `pressure`: what was read last [cmH2O].
         """
-        ...
 
     @abc.abstractmethod
     def cleanup(self) -> None:
         """Leave the machine safe; called once at the end, whatever happened."""
-        ...
 
 
 class SimulatedRunner:
@@ -109,8 +103,6 @@ class SimulatedRunner:
         runner.observe()
         ```
     """
-
-    physical = False
 
     def __init__(
         self,
@@ -174,7 +166,7 @@ class SimulatedRunner:
         return _step(self.environment, t, self.state, u).state
 
     def should_abort(self, pressure: float) -> bool:
-        """Whether the pressure is above the limit, or no number.
+        """Whether the pressure is above the limit, or is not a number.
 
         **Arguments:** `pressure`: what was read last [cmH2O].
         """
@@ -225,7 +217,7 @@ def run_breaths(
 ) -> Recording:
     """Run a controller at a ventilator.
 
-    Each step: read the pressure; give up if `runner.should_abort` says so; ask the
+    Each step: read the pressure; stop if `runner.should_abort` is true; ask the
     controller; set the valves; wait. At the end, and also after an error in any of it
     or an interruption, `runner.cleanup()` is called, and the error goes on.
 
@@ -258,7 +250,7 @@ def run_breaths(
     where = "run_breaths"
     if not isinstance(runner, Runner):
         raise ValueError(
-            f"{where}: runner must have physical, dt, observe, actuate, wait, "
+            f"{where}: runner must have dt, observe, actuate, wait, "
             f"should_abort and cleanup, got {type(runner).__name__}."
         )
     check_controller(controller, "controller", where)

@@ -1,4 +1,4 @@
-"""Controls of a breath that are found by gradient descent through a lung."""
+"""Controls of a breath by gradient descent through a lung."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -62,30 +62,17 @@ class ShootingMPC(AbstractController):
 
     model: LearnedLung
     waveform: BreathWaveform
-    learning_rate: Array = parameter(constraint=positive)
-    memory: Array = parameter()
-    horizon: int = eqx.field(static=True)
-    iterations: int = eqx.field(static=True)
-
-    def __init__(
-        self,
-        model: LearnedLung,
-        waveform: BreathWaveform,
-        horizon: int = 10,
-        iterations: int = 30,
-        learning_rate: Any = 0.1,
-        memory: Any = 0.7,
-    ):
-        where = "ShootingMPC"
-        self.model, self.waveform = model, waveform
-        self.horizon = check_count(horizon, "horizon", where)
-        self.iterations = check_count(iterations, "iterations", where)
-        self.learning_rate, self.memory = learning_rate, memory
+    horizon: int = eqx.field(static=True, default=10)
+    iterations: int = eqx.field(static=True, default=30)
+    learning_rate: Array = parameter(0.1, constraint=positive)
+    memory: Array = parameter(0.7)
 
     def __check_init__(self):
         where = "ShootingMPC"
         check_instance(self.model, LearnedLung, "model", where)
         check_waveform(self.waveform, where)
+        check_count(self.horizon, "horizon", where)
+        check_count(self.iterations, "iterations", where)
 
     def init(self, *, key=None):
         lung = self.model.resting()

@@ -18,7 +18,7 @@ def stack(trees: Sequence[Any]) -> Any:
 
     **Returns:** the stacked module.
 
-    **Raises:** `ValueError` if there are none, or their structures differ.
+    **Raises:** `ValueError` if `trees` is empty, or their structures differ.
 
     !!! example
 

@@ -7,14 +7,19 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from .._check import as_vector, check_count, check_positive, check_range
+from .._check import (
+    as_vector,
+    check_count,
+    check_keywords,
+    check_positive,
+    check_range,
+)
 from .._module import parameter
 from .._typing import Control, RealScalar, Scalar, State
 from ..costs import AbstractCost
 from ..disturbances import Gaussian
 from ..dynamics import AbstractDynamics, AbstractWrapper, Delayed
 from ..environments import Environment
-from ..environments._task import check_names, task_environment
 from ._learned_lung import LearnedLung
 from ._lung_models import LungModel
 from ._waveform import BreathWaveform, check_waveform, LENGTH
@@ -28,7 +33,8 @@ class PressureSensor(AbstractWrapper):
 
     **Arguments:** `dynamics`: of a lung; it observes one number.
 
-    **Raises:** `ValueError` if `dynamics` are none or observe more than one number.
+    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or observes
+    more than one number.
 
     !!! example
 
@@ -89,20 +95,19 @@ class PressureSensor(AbstractWrapper):
 
 
 class BreathCost(AbstractCost):
-    r"""How far the pressure is from the target, `weight |p - r(t)|`.
+    r"""How far the pressure is from the target, `|p - r(t)|`, in inspiration.
 
-    The weight is 1 in the inspiratory phase and `expiration` in the other. With a limit
-    each cmH2O above it costs ten more, as an alarm is worse than an error. Not smooth
-    on the target, and at the limit.
+    With a limit each cmH2O above it costs ten more, in expiration too, as an alarm is
+    worse than an error. Not smooth on the target, and at the limit.
 
     **Arguments:**
 
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `index`: the place of the pressure in the state.
-    - `expiration`: 0 by default.
     - `limit`: a pressure [cmH2O]; none by default.
 
-    **Raises:** `ValueError` if `waveform` is none, or the limit is not positive.
+    **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`, or the limit is
+    not positive.
 
     !!! example
 
@@ -117,7 +122,6 @@ class BreathCost(AbstractCost):
 
     waveform: BreathWaveform
     index: int = eqx.field(static=True)
-    expiration: Array = parameter(0.0)
     limit: Array | None = parameter(None)
 
     def __check_init__(self):
@@ -128,15 +132,14 @@ class BreathCost(AbstractCost):
     def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
         pressure = x[self.index]
         error = jnp.abs(pressure - self.waveform.pressure(t))
-        weight = jnp.where(self.waveform.is_inspiration(t), 1, self.expiration)
-        cost = weight * error
+        cost = self.waveform.is_inspiration(t) * error
         if self.limit is not None:
             cost = cost + 10 * jnp.maximum(pressure - self.limit, 0)
         return cost.astype(x.dtype)
 
 
 def ventilated(
-    tasks: tuple[Callable[..., Environment], ...],
+    task: Callable[..., Environment],
     dynamics: AbstractDynamics,
     rest: ArrayLike | None,
     /,
@@ -144,17 +147,15 @@ def ventilated(
     *,
     sensor_delay: int = 0,
     noise: Any = 0.0,
-    expiration: Any = 0.0,
     limit: Any = None,
     horizon: int = 100,
     **environment: Any,
 ) -> Environment:
     """The environment of a task of a lung, see `ventilation`.
 
-    `tasks` are the functions that take other arguments of it; errors name the first.
+    `task` is the function that a user called, which errors name.
     """
     check_range(noise, "noise", "ventilation")
-    check_range(expiration, "expiration", "ventilation")
     delay = check_count(sensor_delay, "sensor_delay", "ventilation", least=0)
     waveform = BreathWaveform() if waveform is None else waveform
     rest = jnp.zeros(dynamics.state_size) if rest is None else rest
@@ -164,16 +165,16 @@ def ventilated(
         sensed = Delayed(sensor, sensor=delay)
         initial_state = sensed.filled(initial_state)
     silent = isinstance(noise, int | float) and noise == 0
-    check_names(tasks[0], environment, *tasks[1:], ventilated)
-    return task_environment(
-        environment,
+    check_keywords(environment, task.__name__, task, ventilated, Environment)
+    fields: dict[str, Any] = dict(
         dynamics=sensed,
-        cost=BreathCost(waveform, dynamics.state_size, expiration, limit),
+        cost=BreathCost(waveform, dynamics.state_size, limit),
         sensor_noise=None if silent else Gaussian(noise, size=1),
         initial_state=initial_state,
         control_bounds=(jnp.zeros(2), jnp.array([100.0, 1.0])),
         horizon=horizon,
     )
+    return Environment(**(fields | environment))
 
 
 def ventilation(
@@ -197,16 +198,17 @@ def ventilation(
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20
         times a minute, by default.
     - `rest`: the first state of the dynamics; zero by default.
-    - `sensor_delay`: steps until a pressure is seen, 0 by default.
+    - `sensor_delay`: steps until a pressure is observed, 0 by default.
     - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
-    - `expiration`, `limit`: of the cost; 0 and none by default.
+    - `limit`: of the cost; none by default.
     - `horizon`: steps an episode, 100 by default.
     - `**options`: of the above, and other arguments of [`delucax.Environment`][], which
         hold instead.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or if `waveform` is none.
+    **Raises:** `ValueError` on illegal numbers, or if `waveform` is not a
+    `BreathWaveform`.
 
     !!! example
 
@@ -219,7 +221,7 @@ def ventilation(
         env = lung.ventilation(dynamics, rest=plant.resting(5.0), noise=0.2)
         ```
     """
-    return ventilated((ventilation,), dynamics, rest, waveform, **options)
+    return ventilated(ventilation, dynamics, rest, waveform, **options)
 
 
 def lung_environment(
@@ -243,7 +245,8 @@ def lung_environment(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if it is no such model, or `waveform` is none.
+    **Raises:** `ValueError` if it is no such model, or `waveform` is not a
+    `BreathWaveform`.
 
     !!! example
 
@@ -264,13 +267,12 @@ def lung_environment(
             "lung_environment: model must be a LearnedLung or a LungModel, got "
             f"{type(model).__name__}."
         )
-    return ventilated((lung_environment,), dynamics, rest, waveform, **options)
+    return ventilated(lung_environment, dynamics, rest, waveform, **options)
 
 
 def waveform_of(env: Any, where: str, *, stacked: bool = False) -> BreathWaveform:
     """The waveform of a task of a lung, or of several that are stacked."""
-    waveform = getattr(getattr(env, "cost", None), "waveform", None)
-    if not isinstance(env, Environment) or not isinstance(waveform, BreathWaveform):
+    if not isinstance(env, Environment) or not isinstance(env.cost, BreathCost):
         raise ValueError(
             f"{where}: env must be a task with a breath waveform, such as "
             f"delucax.make('lung/double_compartment'), got {type(env).__name__}."
@@ -280,4 +282,4 @@ def waveform_of(env: Any, where: str, *, stacked: bool = False) -> BreathWavefor
             f"{where}: env must be one task, got {jnp.shape(env.dt)[0]} that are "
             "stacked: map over them with equinox.filter_vmap."
         )
-    return waveform
+    return env.cost.waveform

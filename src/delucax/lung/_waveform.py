@@ -3,10 +3,9 @@
 from typing import Any, TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._check import (
     check_finite,
@@ -17,7 +16,7 @@ from .._check import (
     is_concrete,
 )
 from .._message import shortened
-from .._module import as_float_array, check_parameters, parameter, positive
+from .._module import as_float_array, check_parameters, parameter, parts_of, positive
 
 
 _T = TypeVar("_T")
@@ -70,25 +69,12 @@ class BreathWaveform(eqx.Module):
         ```
     """
 
-    pip: Array = parameter()
-    peep: Array = parameter()
-    rate: Array = parameter(constraint=positive)
-    keypoints: Array = parameter()
-    levels: Array = parameter()
-    inspiration: Array = parameter()
-
-    def __init__(
-        self,
-        pip: Any = 35.0,
-        peep: Any = 5.0,
-        rate: Any = 20.0,
-        keypoints: Any = (0.0, 1 / 3, 1 / 2, 1.0),
-        levels: Any = (1.0, 1.0, 0.0, 0.0),
-        inspiration: Any = 1 / 3,
-    ):
-        self.pip, self.peep, self.rate = pip, peep, rate
-        self.keypoints, self.levels = keypoints, levels
-        self.inspiration = inspiration
+    pip: Array = parameter(35.0)
+    peep: Array = parameter(5.0)
+    rate: Array = parameter(20.0, constraint=positive)
+    keypoints: Float[Array, " points"] = parameter((0.0, 1 / 3, 1 / 2, 1.0))
+    levels: Float[Array, " points"] = parameter((1.0, 1.0, 0.0, 0.0))
+    inspiration: Array = parameter(1 / 3)
 
     def __check_init__(self):
         where = "BreathWaveform"
@@ -109,11 +95,7 @@ class BreathWaveform(eqx.Module):
                 raise ValueError(
                     f"{where}: keypoints must increase from 0 to 1, got {points}."
                 )
-        if is_concrete(self.pip) and is_concrete(self.peep):
-            if not np.all(np.asarray(self.pip) >= np.asarray(self.peep)):
-                raise ValueError(
-                    f"{where}: pip must be at least peep = {self.peep}, got {self.pip}."
-                )
+        _check_pip(self.pip, self.peep, "pip", where)
         share = self.inspiration
         if is_concrete(share) and not 0 < float(share) < 1:
             raise ValueError(
@@ -173,8 +155,8 @@ def check_waveform(waveform: Any, where: str) -> None:
 
 
 def check_peep(waveform: BreathWaveform, valves: Any, where: str) -> None:
-    """Raise if the PEEP of a waveform is below what the valves let a lung out to, as
-    far as can be seen."""
+    """Raise if the PEEP of a waveform is below what the valves let a lung out to, if
+    their values are known."""
     asked, least = waveform.peep, valves.peep
     if is_concrete(asked) and is_concrete(least):
         # Numbers of another precision may differ by their rounding.
@@ -204,12 +186,11 @@ def as_pips(pips: Any, tree: Any, where: str) -> Array:
 
 def _waveforms(tree: Any) -> list[BreathWaveform]:
     """The breath waveforms in a pytree."""
-    is_waveform = lambda node: isinstance(node, BreathWaveform)
-    return list(filter(is_waveform, jax.tree.leaves(tree, is_leaf=is_waveform)))
+    return parts_of((tree,), BreathWaveform)
 
 
 def _check_pip(pip: Array, peep: Any, name: str, where: str) -> None:
-    """Raise unless a peak pressure is at least PEEP, as far as can be seen."""
+    """Raise unless a peak pressure is at least PEEP, if both are known."""
     check_finite(pip, name, where)
     if is_concrete(pip) and is_concrete(peep):
         if not np.all(np.asarray(pip) >= np.asarray(peep)):

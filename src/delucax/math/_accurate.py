@@ -38,28 +38,27 @@ def _term_by_term(left, right, *added):
     Source: Ogita, Rump and Oishi, 2005.
     """
     eps, k = jnp.finfo(left.dtype).eps, left.shape[1]
-    (high_left, low_left), (high_right, low_right) = _halves(left), _halves(right)
-    total = off = size = jnp.zeros((len(left), right.shape[1]), left.dtype)
+    nothing = jnp.zeros((len(left), right.shape[1]), left.dtype)
+    total, *added = added or (nothing,)
+    off, size = nothing, jnp.abs(total)
     for part in added:
         total, error = _sum(total, part)
         off, size = off + error, size + jnp.abs(part)
 
-    def add(i, carry):
+    def add(carry, factors):
         total, off, size = carry
-        high, low = high_left[:, i, None], low_left[:, i, None]
+        column, row = factors
+        (high, low), (high_row, low_row) = _halves(column[:, None]), _halves(row)
         # Products without rounding: no fused operation changes these sums.
-        for part in high * high_right[i], high * low_right[i], low * high_right[i]:
+        for part in high * high_row, high * low_row, low * high_row:
             total, error = _sum(total, part)
             off += error
-        return (
-            total,
-            off + low * low_right[i],
-            size + jnp.abs(left[:, i, None] * right[i]),
-        )
+        off += low * low_row
+        return (total, off, size + jnp.abs(column[:, None] * row)), None
 
-    total, off, size = lax.fori_loop(0, k, add, (total, off, size))
+    (total, off, size), _ = lax.scan(add, (total, off, size), (left.T, right))
     total += off
-    return total, eps * jnp.abs(total) + (4 * (k + len(added)) * eps) ** 2 * size
+    return total, eps * jnp.abs(total) + (4 * (k + len(added) + 1) * eps) ** 2 * size
 
 
 def _by_slices(left, right, *added):

@@ -8,7 +8,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Inexact
 
 
 SMALL = 5
@@ -36,10 +36,17 @@ def full_precision(function: Callable) -> Callable:
 def solve(
     matrix: Float[Array, "n n"], right: Float[Array, "n k"]
 ) -> Float[Array, "n k"]:
-    """`matrix^-1 right`, with one factorisation; not finite where `matrix` is singular.
+    """`matrix^-1 right`; not finite where `matrix` is singular."""
+    return factorised(matrix)(right)
 
-    A small matrix is eliminated entry by entry: one member of a batch is
-    then a lane of vector instructions, where LAPACK would be called for each.
+
+def factorised(
+    matrix: Float[Array, "n n"],
+) -> Callable[[Float[Array, "n k"]], Float[Array, "n k"]]:
+    """`right -> matrix^-1 right`, for more than one right side in turn.
+
+    A small matrix is eliminated entry by entry: one member of a batch is then a lane of
+    vector instructions, where LAPACK would be called for each.
     """
     operator = lx.MatrixLinearOperator(matrix)
     solver = _Elimination() if matrix.shape[0] <= SMALL else lx.LU()
@@ -48,7 +55,7 @@ def solve(
     def column(b):
         return lx.linear_solve(operator, b, solver, state=state, throw=False).value
 
-    return jax.vmap(column, in_axes=1, out_axes=1)(right)
+    return jax.vmap(column, in_axes=1, out_axes=1)
 
 
 class _Elimination(lx.AbstractLinearSolver):
@@ -72,8 +79,8 @@ class _Elimination(lx.AbstractLinearSolver):
             chosen = x[k]
             for i in range(k + 1, n):
                 is_pivot = pivots[k] == i
-                chosen = jnp.where(is_pivot, x[i], chosen)
-                x[i] = jnp.where(is_pivot, x[k], x[i])
+                chosen = lax.select(is_pivot, x[i], chosen)
+                x[i] = lax.select(is_pivot, x[k], x[i])
             x[k] = chosen
         for k in range(n):
             for i in range(k + 1, n):
@@ -115,15 +122,16 @@ def _factor(matrix):
         for i in range(k + 1, n):
             size = jnp.abs(rows[i][k])
             larger = size > best
-            best, pivot = jnp.where(larger, size, best), jnp.where(larger, i, pivot)
+            best = lax.select(larger, size, best)
+            pivot = lax.select(larger, jnp.asarray(i), pivot)
         rows, pivot = _apart((rows, pivot))
         pivots.append(pivot)
         chosen = list(rows[k])
         for i in range(k + 1, n):
             is_pivot = pivot == i
             for j in range(n):
-                chosen[j] = jnp.where(is_pivot, rows[i][j], chosen[j])
-                rows[i][j] = jnp.where(is_pivot, rows[k][j], rows[i][j])
+                chosen[j] = lax.select(is_pivot, rows[i][j], chosen[j])
+                rows[i][j] = lax.select(is_pivot, rows[k][j], rows[i][j])
         rows[k] = _apart(chosen)
         for i in range(k + 1, n):
             multiplier = rows[i][k] / rows[k][k]
@@ -149,9 +157,9 @@ def is_definite(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
     return definite
 
 
-def symmetric(X: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def symmetric(X: Float[Array, "*T n n"]) -> Float[Array, "*T n n"]:
     """The symmetric part."""
-    return (X + X.T) / 2
+    return (X + X.mT) / 2
 
 
 def no_tangent(tree: Any) -> Any:
@@ -163,3 +171,16 @@ def no_tangent(tree: Any) -> Any:
         return jnp.zeros(x.shape, jax.dtypes.float0)
 
     return jax.tree.map(zero, tree)
+
+
+def lu_solve(
+    matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"]
+) -> Inexact[Array, "n k"]:
+    """`solve` by LAPACK at every size, of complex matrices too."""
+    operator, solver = lx.MatrixLinearOperator(matrix), lx.LU()
+    state = solver.init(operator, {})
+
+    def column(b):
+        return lx.linear_solve(operator, b, solver, state=state, throw=False).value
+
+    return jax.vmap(column, in_axes=1, out_axes=1)(right)

@@ -5,23 +5,37 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 
-def size(*matrices: Array) -> Array:
-    """The sum of the Frobenius norms."""
-    scale = _largest(*matrices)
-    return scale * sum(jnp.linalg.norm(M / scale) for M in matrices)
+def size(matrix: Array) -> Array:
+    """The Frobenius norm."""
+    scale = _divisor(jnp.max(jnp.abs(matrix)))
+    return scale * _norm(matrix / scale)
 
 
 def relative_size(error: Array, *terms: Array) -> Array:
     """The norm of what is left of an equation, over the sum of those of its terms."""
-    scale = _largest(*terms)
-    total = sum(jnp.linalg.norm(M / scale) for M in terms)
-    return jnp.linalg.norm(error / scale) / jnp.where(total == 0, 1, total)
+    return relative_and_total_size(error, jnp.stack(terms))[0]
 
 
-def _largest(*matrices):
-    """The largest magnitude, or 1 if there is none. A NaN stays one."""
-    largest = jnp.max(jnp.stack([jnp.max(jnp.abs(M), initial=0) for M in matrices]))
-    return jnp.where(largest == 0, 1, largest)
+def relative_and_total_size(error: Array, terms: Array) -> tuple[Array, Array]:
+    """The norm of what is left of an equation, or of a stack of such, over the sum of
+    those of its terms, which are stacked; and this sum."""
+    scale = _divisor(jnp.max(jnp.abs(terms)))
+    total = jnp.sum(_norm(terms / scale))
+    return _norm(error / scale) / _divisor(total), scale * total
+
+
+def one_if_zero(x: Array) -> Array:
+    """Numbers, with 1 for each that is zero."""
+    return x + (x == 0)
+
+
+def _divisor(x):
+    # A NaN stays one.
+    return lax.max(x, jnp.finfo(x.dtype).tiny)
+
+
+def _norm(matrix):
+    return jnp.sqrt(jnp.sum(matrix * matrix, axis=(-2, -1)))
 
 
 def power_of_two(x: Array) -> Array:

@@ -73,10 +73,10 @@ def position(t: Any, dt: Any, origin: Any, eps: float) -> Position:
     coarse = jnp.round(coarse)
     high = lax.reduce_precision(dt, info.nexp, (info.nmant + 1) // 2)
     fine = (since - coarse * high - coarse * (dt - high)) / dt
-    near = jnp.round(fine)
+    nearest = jnp.round(fine)
     size = (jnp.abs(t) + jnp.abs(origin)) / dt + 1
-    on_step = jnp.abs(fine - near) <= jnp.minimum(2 * eps * size, 0.5)
-    return Position(coarse + near, jnp.where(on_step, 0, fine - near))
+    on_step = jnp.abs(fine - nearest) <= jnp.minimum(2 * eps * size, 0.5)
+    return Position(coarse + nearest, jnp.where(on_step, 0, fine - nearest))
 
 
 def coarsest(*arrays: Array) -> float:
@@ -111,5 +111,5 @@ def reached(times: Array, mark: Array, dt: Any) -> Array:
     if dt is None:
         return times >= mark
     eps = coarsest(times, mark)
-    here, there = (position(t, dt, times[0], eps) for t in (times, mark))
-    return (here.whole - there.whole) + (here.off - there.off) >= 0
+    at_time, at_mark = (position(t, dt, times[0], eps) for t in (times, mark))
+    return (at_time.whole - at_mark.whole) + (at_time.off - at_mark.off) >= 0

@@ -17,7 +17,7 @@ from ..dynamics import AbstractDynamics
 from ._descent import LEAST_MU, MOST_MU
 from ._line_search import first_accepted
 from ._lq import in_sequence, Policy
-from ._plan import Plan, plan_of, raise_on_failure
+from ._plan import checked_plan, Plan, plan_of
 from ._planner import as_rows
 from ._problem import model as local_model, Problem, roll_out
 
@@ -229,7 +229,7 @@ def learn(
 def raise_if_diverged(plan: Plan, where: str) -> Plan:
     """Raise if the first run diverged. That a search failed is no failure here."""
     fine = choose(plan.result == RESULTS.diverged, RESULTS.diverged, RESULTS.successful)
-    checked = raise_on_failure(eqx.tree_at(lambda p: p.result, plan, fine), where)
+    checked = checked_plan(eqx.tree_at(lambda p: p.result, plan, fine), where)
     return eqx.tree_at(lambda p: p.result, checked, plan.result)
 
 

@@ -12,7 +12,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._jax import by_lanes, poison
+from .._jax import by_lanes, nan_tangent
 from .._results import RESULTS
 from ..math import matvec
 from ..math._linear_solve import full_precision
@@ -74,7 +74,7 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
     _, dJ = jax.jvp(cost, (varied, X, U), (change, dX, dU))
     _, dK = jax.jvp(gains, (varied, X, U, y), (change, dX, dU, dy))
     ok = solved & definite
-    dX, dU, dK, dJ = (poison(d, ok) for d in (dX, dU, dK, dJ))
+    dX, dU, dK, dJ = (nan_tangent(d, ok) for d in (dX, dU, dK, dJ))
     return out, nothing._replace(states=dX, controls=dU, gains=dK, cost=dJ)
 
 

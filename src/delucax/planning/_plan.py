@@ -6,10 +6,10 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._check import as_bounds, check_step, is_concrete
+from .._check import as_bounds, check_step
 from .._controller import AbstractController, wrong_observation
 from .._module import function_field, parameter, weight
-from .._results import Result, RESULTS
+from .._results import raise_on_failure, Result, RESULTS
 from ..math import matvec
 from ..math._steps import row_at, step_at
 from ._problem import Problem
@@ -138,15 +138,13 @@ def plan_of(
     )
 
 
-def raise_on_failure(plan: Plan, where: str) -> Plan:
-    """Raise unless the plan is a solution: now if it can be seen, else at run time."""
-    failed = plan.result != RESULTS.successful
-    if not is_concrete(failed):
-        return plan.result.error_if(plan, failed)
-    if failed:
-        raise RuntimeError(
-            f"{where}: {RESULTS[plan.result]} After {int(plan.iterations)} iterations "
-            f"the cost is {float(plan.cost):.6g} and the residual "
-            f"{float(plan.residual):.2g}. Pass throw=False to look at the plan."
+def checked_plan(plan: Plan, where: str, throw: bool = True) -> Plan:
+    """Raise if asked to, unless the plan is a solution."""
+
+    def facts():
+        return (
+            f"After {int(plan.iterations)} iterations the cost is "
+            f"{float(plan.cost):.6g} and the residual {float(plan.residual):.2g}."
         )
-    return plan
+
+    return raise_on_failure(plan, where, throw, "the plan", facts)

@@ -26,7 +26,7 @@ from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ._constraints import Constraints
-from ._plan import Plan, raise_on_failure
+from ._plan import checked_plan, Plan
 from ._problem import Problem
 from ._start import control_at_rest, default_start, Start
 
@@ -158,7 +158,7 @@ class AbstractPlanner(eqx.Module):
         plan = self.solve(problem, start, key)
         if fallback is not None:
             plan = _with_fallback(plan, fallback)
-        return raise_on_failure(plan, where) if throw else plan
+        return checked_plan(plan, where, throw)
 
 
 @eqx.filter_jit

@@ -9,11 +9,10 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._jax import by_components
+from .._jax import by_components, first_possible, join_state, split_state, stack_steps
 from .._results import first_of, or_none, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ..dynamics._runge_kutta import join_state, split_state, stack_steps
 from ..math import matvec
 from ._constraints import augmented, Constraints, Multipliers, Values, values_of
 from ._lq import Stages
@@ -247,22 +246,6 @@ def costates_of(F: Array, h: Array, v: Array) -> Array:
         return h[:size] + matvec(F[:, :size].T, costate), costate
 
     return lax.scan(back, v.astype(h.dtype), (F, h), reverse=True)[1]
-
-
-def first_possible(*derivatives: Callable[..., Array]) -> Callable[..., Array]:
-    """The first of some ways to take a derivative that the solvers inside have: some
-    have none in reverse, others none forward."""
-
-    def evaluate(*args):
-        for derivative in derivatives[:-1]:
-            try:
-                return derivative(*args)
-            except (RuntimeError, TypeError, ValueError) as error:
-                if "-mode" not in str(error):
-                    raise
-        return derivatives[-1](*args)
-
-    return evaluate
 
 
 def jacobian(f: Callable[..., Array]) -> Callable[..., Array]:

@@ -13,7 +13,6 @@ from .._message import shortened
 from .._module import as_float_array, parameter
 from .._typing import RealScalar
 from ..costs import AbstractCost
-from ..costs._base import check_cost
 from ..dynamics import AbstractDynamics
 from ..dynamics._operating_point import operating_point
 from ..math._linear_solve import is_definite
@@ -173,7 +172,7 @@ def default_start(
         ```
     """
     check_instance(dynamics, AbstractDynamics, "dynamics", "default_start")
-    check_cost(cost, "cost", "default_start")
+    check_instance(cost, AbstractCost, "cost", "default_start")
     T = check_count(horizon, "horizon", "default_start")
     dynamics, cost = (_constant(tree) for tree in (dynamics, cost))
     point = _point(dynamics, cost)

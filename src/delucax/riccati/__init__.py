@@ -9,7 +9,6 @@ from ._dare import dare as dare
 from ._filter import filter_care as filter_care, filter_dare as filter_dare
 from ._finite_horizon import dre as dre, FiniteHorizonSolution as FiniteHorizonSolution
 from ._hinfinity import (
-    ContinuousGameSolution as ContinuousGameSolution,
     GameSolution as GameSolution,
     hinf_care as hinf_care,
     hinf_dare as hinf_dare,

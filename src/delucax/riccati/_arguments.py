@@ -1,12 +1,24 @@
 """What the Riccati and Lyapunov solvers accept."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from .._check import as_matrix, is_concrete
+
+
+class RiccatiData(NamedTuple):
+    """The data of an algebraic Riccati equation."""
+
+    A: Array
+    B: Array
+    Q: Array
+    R: Array
+    S: Array
+    E: Array | None
 
 
 def square_matrix(value: Any, name: str, where: str) -> Array:
@@ -47,7 +59,7 @@ def riccati_arguments(
     definite: bool,
     names: tuple[str, ...] = ("A", "B", "Q", "R", "S", "E"),
     dual: bool = False,
-) -> tuple[Any, ...]:
+) -> RiccatiData:
     """The arguments as matrices of one precision that fit each other.
 
     `R` must be positive `definite`, or else semidefinite. `names` are those that the
@@ -77,7 +89,8 @@ def riccati_arguments(
     given = [A, B, Q, R, S, E]
     dtype = jnp.result_type(*(M for M in given if M is not None))
     S = jnp.zeros((n, m), dtype) if S is None else S
-    return tuple(None if M is None else M.astype(dtype) for M in (A, B, Q, R, S, E))
+    given = RiccatiData(A, B, Q, R, S, E)
+    return jax.tree.map(lambda M: M.astype(dtype), given)
 
 
 def check_definite(R: Array, name: str, where: str, definite: bool) -> None:

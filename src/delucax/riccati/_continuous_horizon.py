@@ -5,18 +5,20 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
-from .._check import as_matrix, check_finite, is_concrete, symmetric_matrix
-from .._message import shortened
-from .._module import as_float_array
+from .._check import as_matrix, symmetric_matrix
 from .._results import choose, Result, RESULTS
-from ..math._linear_solve import full_precision, solve
-from ._finite_horizon import raised
+from ..math._linear_solve import full_precision, solve, symmetric
 from ._flow import flow_values
-from ._horizon_arguments import common_dtype, final_weight
-from ._recursion import is_clearly_definite, symmetric
+from ._horizon_arguments import (
+    check_shapes,
+    checked_times,
+    common_dtype,
+    final_weight,
+)
+from ._recursion import failed_step, is_clearly_definite
+from ._solution import checked
 
 
 class ContinuousHorizonSolution(eqx.Module):
@@ -115,40 +117,19 @@ def cre(
     given["R"] = symmetric_matrix(R, "R", where)
     if S is not None:
         given["S"] = as_matrix(S, "S", where)
-    n, m = given["A"].shape[0], given["B"].shape[1]
-    check_shapes(where, given, n, m)
-    final = final_weight(final, n, where)
+    check_shapes(where, given)
     dtype = common_dtype(where, given)
+    n, m = given["B"].shape
+    final = final_weight(final, n, where, dtype)
     given.setdefault("S", jnp.zeros((n, m)))
-    final = jnp.zeros((n, n)) if final is None else final
-    arguments = (*(given[name] for name in "ABQRS"), final, checked_times(times, where))
-    solution = _solution(*(M.astype(dtype) for M in arguments))
-    reason = "There is no solution over the time from point {} of the grid."
-    return raised(where, solution, reason) if throw else solution
+    matrices = (given[name].astype(dtype) for name in "ABQRS")
+    solution = _solution(*matrices, final, checked_times(times, where).astype(dtype))
+    return checked(solution, where, throw, _first_failure)
 
 
-def check_shapes(where: str, given: dict[str, Array], n: int, m: int) -> None:
-    """Raise unless the matrices fit each other."""
-    shapes = {"A": (n, n), "B": (n, m), "Q": (n, n), "R": (m, m), "S": (n, m)}
-    for name, matrix in given.items():
-        shape = shapes.get(name, matrix.shape)
-        if matrix.shape != shape or 0 in shape:
-            raise ValueError(
-                f"{where}: {name} must have shape {shape} to fit the other matrices, "
-                f"got {matrix.shape}."
-            )
-
-
-def checked_times(times: Any, where: str) -> Array:
-    """`times` as an increasing vector of at least two, or an error."""
-    array = as_float_array(times)
-    if not eqx.is_inexact_array(array) or array.ndim != 1 or array.shape[0] < 2:
-        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(times)
-        raise ValueError(f"{where}: times must be at least two numbers, got {got}.")
-    check_finite(array, "times", where)
-    if is_concrete(array) and not np.all(np.diff(np.asarray(array)) > 0):
-        raise ValueError(f"{where}: times must increase, got {array}.")
-    return array
+def _first_failure(solution: ContinuousHorizonSolution) -> str:
+    point = failed_step(solution.X)
+    return f"There is no solution over the time from point {point} of the grid."
 
 
 @eqx.filter_jit

@@ -6,9 +6,8 @@ import equinox as eqx
 
 from .._check import as_matrix
 from ._arguments import riccati_arguments
-from ._care import continuous_solution
-from ._dare import discrete_solution
 from ._solution import checked, RiccatiSolution
+from ._stabilising import stabilising_solution
 
 
 _NAMES = ("A", "C", "W", "V", "S", "E")
@@ -63,8 +62,8 @@ def filter_dare(
         ```
     """
     where = "filter_dare"
-    arguments = _transposed(where, A, C, W, V, S, definite=False)
-    return checked(_dual(discrete_solution(*arguments)), where, throw)
+    data = _transposed(where, A, C, W, V, S, definite=False)
+    return checked(_dual(stabilising_solution(True, data)), where, throw)
 
 
 def filter_care(
@@ -114,8 +113,8 @@ def filter_care(
         ```
     """
     where = "filter_care"
-    arguments = _transposed(where, A, C, W, V, S, definite=True)
-    return checked(_dual(continuous_solution(*arguments)), where, throw)
+    data = _transposed(where, A, C, W, V, S, definite=True)
+    return checked(_dual(stabilising_solution(False, data)), where, throw)
 
 
 def _transposed(where, A, C, W, V, S, definite):

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_vector, is_concrete
+from .._check import as_vector
 from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision, solve
 from ._horizon_arguments import final_weight, in_time, symmetric_stack
-from ._recursion import gain, linear_recursion, sanitised, values
+from ._recursion import failed_step, gain, linear_recursion, sanitised, values
+from ._solution import checked
 
 
 class FiniteHorizonSolution(eqx.Module):
@@ -136,34 +137,17 @@ def dre(
     stage, _ = in_time(where, horizon, stage)
     n = stage["A"].shape[-1]
     dtype = stage["A"].dtype
-    final = final_weight(final, n, where)
-    final = jnp.zeros((n, n), dtype) if final is None else final.astype(dtype)
+    final = final_weight(final, n, where, dtype)
     is_affine = any(v is not None for v in (d, q, r, final_q))
     if final_q is None:
         final_q = jnp.zeros(n, dtype)
     final_q = as_vector(final_q, n, "final_q", where).astype(dtype)
     solution = _solution(*stage.values(), final, final_q, is_affine, bool(parallel))
-    if not throw:
-        return solution
-    reason = "R + B'XB is not positive definite at step {}."
-    return raised(where, solution, reason)
+    return checked(solution, where, throw, _first_failure)
 
 
-def raised(where: str, solution: Any, reason: str) -> Any:
-    """Raise if a finite-horizon solve failed: now if it can be seen, else at run time.
-
-    `reason` names the step that failed.
-    """
-    failed = solution.result != RESULTS.successful
-    if not is_concrete(failed):
-        return solution.result.error_if(solution, failed)
-    if failed:
-        step = int(jnp.sum(jnp.isnan(solution.X[:, 0, 0]))) - 1
-        raise RuntimeError(
-            f"{where}: {RESULTS[solution.result]} {reason.format(step)} Pass "
-            "throw=False to look at the solution."
-        )
-    return solution
+def _first_failure(solution: FiniteHorizonSolution) -> str:
+    return f"R + B'XB is not positive definite at step {failed_step(solution.X)}."
 
 
 @eqx.filter_jit

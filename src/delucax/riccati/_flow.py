@@ -7,9 +7,8 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..math._linear_solve import full_precision, solve
-from ._recursion import joined, symmetric
-from ._stein import stein
+from ..math._linear_solve import full_precision, solve, symmetric
+from ._recursion import joined
 
 
 _MAX_HALVINGS = 40
@@ -171,16 +170,3 @@ def passed(element, X):
     n = A.shape[0]
     moved = solve(jnp.eye(n, dtype=A.dtype) + C @ X, A)
     return symmetric(J + A.T @ X @ moved)
-
-
-def lyapunov(A: Float[Array, "n n"], Q: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The solution of `A'X + XA + Q = 0` for a stable `A`.
-
-    The Cayley transform `(s I - A)^-1 (s I + A)` makes a Stein equation of it.
-    """
-    n = A.shape[0]
-    size = lax.stop_gradient(jnp.linalg.norm(A))
-    s = jnp.where(size > 0, size, 1) * jnp.eye(n, dtype=A.dtype)
-    turned = solve(s - A, s + A)
-    right = solve((s - A).T, solve((s - A).T, Q).T)
-    return stein(turned, 2 * s[0, 0] * symmetric(right))

@@ -1,5 +1,6 @@
 """The stationary H-infinity games."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -7,35 +8,30 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_matrix, check_positive, is_concrete, symmetric_matrix
+from .._check import as_matrix, check_positive, symmetric_matrix
 from .._message import shortened
 from .._module import as_float_array
 from .._results import choose, Result, RESULTS
-from ..math._linear_solve import full_precision, solve
+from ..math._linear_solve import full_precision
 from ._arguments import check_definite
-from ._continuous_game import (
-    continuous_attached,
-    continuous_barrier,
-    continuous_game,
-    continuous_start,
-    joint_gain,
-)
 from ._game import (
-    discrete_attached,
-    discrete_game,
-    discrete_start,
-    players,
+    attached,
+    barrier,
+    game_start,
+    joint,
+    joint_gain,
     rounding,
     sanitised_game,
+    solve_game,
 )
-from ._horizon_arguments import common_dtype
-from ._level import followed, Search, search
-from ._recursion import gain
+from ._horizon_arguments import check_shapes, common_dtype
+from ._level import bisect_level, Bisection, followed
+from ._solution import checked
 from ._spectrum import spectral_abscissa, spectral_radius
 
 
 class GameSolution(eqx.Module):
-    """The saddle point of a stationary game in discrete time.
+    """The saddle point of a stationary game.
 
     **Attributes:**
 
@@ -46,11 +42,15 @@ class GameSolution(eqx.Module):
     - `residual`: the norm of the equation's residual over the sum of the norms of its
         terms: an upper bound, with rounding of its own evaluation counted.
     - `closed_loop`: the matrix `A - B K`, shape `(n, n)`.
-    - `spectral_radius`: an upper bound on that of `closed_loop`, close to it.
+    - `spectral_radius`: in discrete time, an upper bound on that of `closed_loop`,
+        close to it. `None` in continuous time.
     - `iterations`: doublings taken at `gamma`.
     - `result`: success, or why not; one of `delucax.RESULTS`.
+    - `spectral_abscissa`: in continuous time, the largest real part of an eigenvalue of
+        `closed_loop`, up to rounding. `None` in discrete time.
 
-    `residual` and `spectral_radius` are measurements and have no gradient.
+    `residual`, `spectral_radius` and `spectral_abscissa` are measurements and have no
+    gradient.
 
     !!! example
 
@@ -72,52 +72,10 @@ class GameSolution(eqx.Module):
     gamma: Array
     residual: Array
     closed_loop: Array
-    spectral_radius: Array
+    spectral_radius: Array | None
     iterations: Array
     result: Result
-
-
-class ContinuousGameSolution(eqx.Module):
-    """The saddle point of a stationary game in continuous time.
-
-    **Attributes:**
-
-    - `X`: the solution of the game equation, shape `(n, n)`, symmetric.
-    - `K`: the gain of the control `u = -K x`, shape `(m, n)`.
-    - `L`: the gain of the worst disturbance `w = L x`, shape `(k, n)`.
-    - `gamma`: the level that is attained.
-    - `residual`: the norm of the equation's residual over the sum of the norms of its
-        terms: an upper bound, with rounding of its own evaluation counted.
-    - `closed_loop`: the matrix `A - B K`, shape `(n, n)`.
-    - `spectral_abscissa`: the largest real part of its eigenvalues, up to rounding.
-    - `iterations`: doublings taken at `gamma`.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
-
-    `residual` and `spectral_abscissa` are measurements and have no gradient.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
-        B = jnp.array([[0.0], [1.0]])
-        Q, R = jnp.eye(2), jnp.eye(1)
-        solution = dlx.riccati.hinf_care(A, B, None, Q, R, gamma=5.0)
-        solution.K, solution.L, solution.spectral_abscissa
-        ```
-    """
-
-    X: Array
-    K: Array
-    L: Array
-    gamma: Array
-    residual: Array
-    closed_loop: Array
-    spectral_abscissa: Array
-    iterations: Array
-    result: Result
+    spectral_abscissa: Array | None = None
 
 
 def hinf_dare(
@@ -188,8 +146,8 @@ def hinf_dare(
     where = "hinf_dare"
     arguments = checked_game(where, A, B, D, Q, R)
     gamma, tolerance = checked_level(where, gamma, tolerance, arguments[0].dtype)
-    solution = _discrete(arguments, gamma, tolerance)
-    return thrown(where, solution) if throw else solution
+    solution = _solution(True, arguments, gamma, tolerance)
+    return checked(solution, where, throw, level_of)
 
 
 def hinf_care(
@@ -202,7 +160,7 @@ def hinf_care(
     gamma: Any = None,
     tolerance: Any = None,
     throw: bool = True,
-) -> ContinuousGameSolution:
+) -> GameSolution:
     r"""The stationary H-infinity game in continuous time,
 
     `A'X + XA - X (B R^-1 B' - gamma^-2 D D') X + Q = 0`,
@@ -231,7 +189,7 @@ def hinf_care(
         its digits suffice to tell that it is a solution, some 1e-5 above.
     - `throw`: raise unless the game is solved (default); if false, look at `result`.
 
-    **Returns:** a [`delucax.riccati.ContinuousGameSolution`][]. Its matrices are NaN if
+    **Returns:** a [`delucax.riccati.GameSolution`][]. Its matrices are NaN if
     there is no solution, as when `gamma` is below the least attainable level.
 
     **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite or not
@@ -255,11 +213,10 @@ def hinf_care(
     where = "hinf_care"
     arguments = checked_game(where, A, B, D, Q, R)
     dtype = arguments[0].dtype
-    gamma, tolerance = checked_level(
-        where, gamma, tolerance, dtype, LOOSE[dtype.itemsize]
-    )
-    solution = _continuous(arguments, gamma, tolerance)
-    return thrown(where, solution) if throw else solution
+    loose = LOOSE[dtype.itemsize]
+    gamma, tolerance = checked_level(where, gamma, tolerance, dtype, loose)
+    solution = _solution(False, arguments, gamma, tolerance)
+    return checked(solution, where, throw, level_of)
 
 
 LOOSE = {4: 1e-3, 8: 1e-6}
@@ -274,14 +231,7 @@ def checked_game(where, A, B, D, Q, R):
     given["Q"] = symmetric_matrix(Q, "Q", where)
     given["R"] = symmetric_matrix(R, "R", where)
     check_definite(given["Q"], "Q", where, False)
-    m, k = given["B"].shape[1], given["D"].shape[1]
-    shapes = {"A": (n, n), "B": (n, m), "D": (n, k), "Q": (n, n), "R": (m, m)}
-    for name, shape in shapes.items():
-        if given[name].shape != shape or 0 in shape:
-            raise ValueError(
-                f"{where}: {name} must have shape {shape} to fit the other matrices, "
-                f"got {given[name].shape}."
-            )
+    check_shapes(where, given)
     if D is None:
         del given["D"]
     dtype = common_dtype(where, given)
@@ -310,80 +260,55 @@ def checked_level(where, gamma, tolerance, dtype, default=None):
     return gamma, tolerance
 
 
-def thrown(where: str, solution: Any) -> Any:
-    """Raise if a game is not solved: now if it can be seen, else at run time."""
-    failed = solution.result != RESULTS.successful
-    if not is_concrete(failed):
-        return solution.result.error_if(solution, failed)
-    if failed:
-        raise RuntimeError(
-            f"{where}: {RESULTS[solution.result]} Level gamma "
-            f"{float(solution.gamma):.6g}. Pass throw=False to look at the solution."
-        )
-    return solution
+def level_of(solution: Any) -> str:
+    """What to say of a game that is not solved."""
+    return f"Level gamma {float(solution.gamma):.6g}."
 
 
 @eqx.filter_jit
 @full_precision
-def _discrete(problem, gamma, tolerance):
-    start = discrete_start(problem)
-    found, level = search(discrete_game, problem, start, gamma, tolerance)
+def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
+    end, level = bisect_level(
+        functools.partial(solve_game, discrete),
+        problem,
+        game_start(discrete, problem),
+        gamma,
+        tolerance,
+    )
     if gamma is None:
-        gamma = followed(_barrier, problem, level)
+        gamma = followed(functools.partial(barrier, discrete), problem, level)
     else:
         level = gamma
-    game, level = found.game, jnp.where(level > 0, level, 1)
-    X = discrete_attached(problem, level, game)
-    (A, B, D, _, R), X = sanitised_game(game.good, problem, X)
-    both, weight = players(B, D, R, level)
-    K, _ = gain(A, both, weight, jnp.zeros_like(both), X)
+    game, level = end.game, jnp.where(level > 0, level, 1)
+    X = attached(discrete, problem, level, game)
+    safe, X = sanitised_game(game.good, problem, X)
+    A, B, *_ = safe
+    K = joint_gain(discrete, joint(safe, level), X)
     m = B.shape[1]
     loop = A - B @ K[:m]
-    radius = spectral_radius(lax.stop_gradient(loop))
+    bound = (spectral_radius if discrete else spectral_abscissa)(
+        lax.stop_gradient(loop)
+    )
     masked = lambda M: jnp.where(game.good, M, jnp.nan)
-    matrices = masked(X), masked(K[:m]), masked(-K[m:]), gamma, game.residual
-    measured = masked(radius), game.iterations, outcome(found)
-    return GameSolution(*matrices, masked(loop), *measured)
+    bound = masked(bound)
+    return GameSolution(
+        X=masked(X),
+        K=masked(K[:m]),
+        L=masked(-K[m:]),
+        gamma=gamma,
+        residual=game.residual,
+        closed_loop=masked(loop),
+        spectral_radius=bound if discrete else None,
+        iterations=game.iterations,
+        result=_outcome(end),
+        spectral_abscissa=None if discrete else bound,
+    )
 
 
-@eqx.filter_jit
-@full_precision
-def _continuous(problem, gamma, tolerance):
-    start = continuous_start(problem)
-    found, level = search(continuous_game, problem, start, gamma, tolerance)
-    if gamma is None:
-        gamma = followed(continuous_barrier, problem, level)
-    else:
-        level = gamma
-    game, level = found.game, jnp.where(level > 0, level, 1)
-    X = continuous_attached(problem, level, game)
-    (A, B, D, _, R), X = sanitised_game(game.good, problem, X)
-    both, weight = players(B, D, R, level)
-    K, _ = joint_gain(A, both, weight, X)
-    m = B.shape[1]
-    loop = A - B @ K[:m]
-    abscissa = spectral_abscissa(lax.stop_gradient(loop))
-    masked = lambda M: jnp.where(game.good, M, jnp.nan)
-    matrices = masked(X), masked(K[:m]), masked(-K[m:]), gamma, game.residual
-    measured = masked(abscissa), game.iterations, outcome(found)
-    return ContinuousGameSolution(*matrices, masked(loop), *measured)
-
-
-def _barrier(problem, gamma):
-    _, _, D, _, _ = problem
-    found, _ = search(discrete_game, problem, discrete_start(problem), gamma)
-    X = discrete_attached(problem, gamma, found.game)
-    eye = jnp.eye(D.shape[1], dtype=D.dtype)
-    margin = solve(gamma**2 * eye - D.T @ X @ D, eye)
-    scale = lax.stop_gradient(gamma**2 * jnp.linalg.norm(X))
-    return scale * jnp.trace(margin) + jnp.trace(X)
-
-
-def outcome(found: Search) -> Result:
-    """What became of a search."""
-    game = found.game
+def _outcome(end: Bisection) -> Result:
+    game = end.game
     # A little below the least level the equation nearly has a solution.
     near = game.residual < 100 * rounding(game.X.shape[0], game.X.dtype)
     failure = choose(game.holds & near, RESULTS.not_converged, RESULTS.infeasible)
-    failure = choose(found.calm, failure, RESULTS.not_stabilising)
+    failure = choose(end.solvable, failure, RESULTS.not_stabilising)
     return choose(game.good, RESULTS.successful, failure)

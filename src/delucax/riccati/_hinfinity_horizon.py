@@ -1,23 +1,23 @@
 """The H-infinity games over a finite horizon."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._results import choose, Result, RESULTS
-from ..math._linear_solve import full_precision, solve
-from ._continuous_game import joint_gain
-from ._continuous_horizon import checked_times
+from ..math._linear_solve import full_precision, solve, symmetric
 from ._flow import flow_values
-from ._game import players
-from ._hinfinity import checked_game, checked_level, LOOSE, thrown
-from ._horizon_arguments import final_weight, in_time, symmetric_stack
-from ._level import followed, Game, search
-from ._recursion import gain, is_clearly_definite, sanitised, symmetric, values
+from ._game import inverse_margins, joint, joint_gain, players
+from ._hinfinity import checked_game, checked_level, level_of, LOOSE
+from ._horizon_arguments import checked_times, final_weight, in_time, symmetric_stack
+from ._level import bisect_level, followed, Game
+from ._recursion import gain, is_clearly_definite, sanitised, values
+from ._solution import checked
+from ._stabilising import shifted
 
 
 class HorizonGameSolution(eqx.Module):
@@ -134,11 +134,10 @@ def hinf_dre(
     }
     stage, _ = in_time(where, horizon, stage)
     n, dtype = stage["A"].shape[-1], stage["A"].dtype
-    final = final_weight(final, n, where)
-    final = jnp.zeros((n, n), dtype) if final is None else final.astype(dtype)
+    final = final_weight(final, n, where, dtype)
     gamma, tolerance = checked_level(where, gamma, tolerance, dtype)
-    solution = _discrete((*stage.values(), final), gamma, tolerance)
-    return thrown(where, solution) if throw else solution
+    solution = _solution(True, (*stage.values(), final), gamma, tolerance)
+    return checked(solution, where, throw, level_of)
 
 
 def hinf_cre(
@@ -208,116 +207,81 @@ def hinf_cre(
     where = "hinf_cre"
     problem = checked_game(where, A, B, D, Q, R)
     n, dtype = problem[0].shape[0], problem[0].dtype
-    final = final_weight(final, n, where)
-    final = jnp.zeros((n, n), dtype) if final is None else final.astype(dtype)
+    final = final_weight(final, n, where, dtype)
     times = checked_times(times, where).astype(dtype)
     loose = LOOSE[dtype.itemsize]
     gamma, tolerance = checked_level(where, gamma, tolerance, dtype, loose)
-    solution = _continuous((*problem, final, times), gamma, tolerance)
-    return thrown(where, solution) if throw else solution
+    solution = _solution(False, (*problem, final, times), gamma, tolerance)
+    return checked(solution, where, throw, level_of)
 
 
-def _discrete_values(problem, gamma):
-    A, B, D, Q, R, final = problem
-    both, weight = players(B, D, R, gamma)
-    S = jnp.zeros_like(both)
-    return values(A, both, Q, weight, S, final, D.shape[-1], False)
-
-
-def _continuous_values(problem, gamma):
-    A, B, D, Q, R, final, times = problem
+def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
+    """`X` at the steps or times of the game `(A, B, D, Q, R, final, *times)`."""
+    A, B, D, Q, R, final, *times = problem
+    if discrete:
+        both, weight = players(B, D, R, gamma)
+        S = jnp.zeros_like(both)
+        return values(A, both, Q, weight, S, final, D.shape[-1], False)
     definite = is_clearly_definite(R)
-    safe = jnp.where(definite, R, jnp.eye(R.shape[0], dtype=R.dtype))
+    safe = jnp.where(definite, R, shifted(1, R))
     G = symmetric(B @ solve(safe, B.T) - D @ D.T / gamma**2)
-    X = flow_values(A, G, Q, final, times, True)
+    X = flow_values(A, G, Q, final, *times, True)
     return jnp.where(definite, X, jnp.nan)
 
 
-def _game(function):
-    """A recursion as what a search calls: there is no equation left to be solved."""
-
-    def solve(problem, gamma, X0):
-        del X0
-        X = function(problem, gamma)
-        good = jnp.all(jnp.isfinite(X))
-        nothing = jnp.zeros((), X.dtype)
-        return Game(X, nothing, good, jnp.ones((), bool), jnp.asarray(0))
-
-    return solve
+def _game(discrete: bool, problem: tuple, gamma: Array, X0: Array) -> Game:
+    """What the search for a level calls: there is no equation left to be solved."""
+    del X0
+    X = _values(discrete, problem, gamma)
+    good = jnp.all(jnp.isfinite(X))
+    nothing = jnp.zeros((), X.dtype)
+    return Game(X, nothing, good, jnp.ones((), bool), jnp.asarray(0))
 
 
-_discrete_game = _game(_discrete_values)
-_continuous_game = _game(_continuous_values)
-
-
-def _discrete_barrier(problem, gamma):
-    _, _, D, *_ = problem
-    X = _discrete_values(problem, gamma)[1:]
-    eye = jnp.eye(D.shape[-1], dtype=D.dtype)
-    margins = gamma**2 * eye - jnp.swapaxes(D, 1, 2) @ X @ D
-    margins = jax.vmap(lambda M: jnp.trace(solve(M, eye)))(margins)
-    scale = lax.stop_gradient(gamma**2 * jnp.linalg.norm(X))
-    return scale * jnp.sum(margins) + jnp.trace(X[0])
-
-
-def _continuous_barrier(problem, gamma):
-    return jnp.trace(_continuous_values(problem, gamma)[0])
-
-
-def _found(game, barrier, problem, points, gamma, tolerance):
-    """The level, the level to compute with, and the result; `points` is that of `X`."""
-    A = problem[0]
-    nothing = jnp.zeros((points, *A.shape[-2:]), A.dtype)
-    found, level = search(game, problem, nothing, gamma, tolerance)
-    if gamma is None:
-        gamma = followed(barrier, problem, level)
-    else:
-        level = gamma
-    result = choose(found.game.good, RESULTS.successful, RESULTS.infeasible)
-    return gamma, jnp.where(level > 0, level, 1), result
+def _barrier(discrete: bool, problem: tuple, gamma: Array) -> Array:
+    """What becomes steep at the least level."""
+    X = _values(discrete, problem, gamma)
+    total = jnp.trace(X[0])
+    if discrete:
+        total += inverse_margins(problem[2], X[1:], gamma)
+    return total
 
 
 @eqx.filter_jit
 @full_precision
-def _discrete(problem, gamma, tolerance):
-    A, B, D, Q, R, _ = problem
-    points = A.shape[0] + 1
-    gamma, level, result = _found(
-        _discrete_game, _discrete_barrier, problem, points, gamma, tolerance
-    )
-    X = _discrete_values(problem, level)
-    good = jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
-    both, weight = players(B, D, R, level)
-    S = jnp.zeros_like(both)
-    A, both, Q, weight, S, after = sanitised(good, A, both, Q, weight, S, X[1:])
-    K, _ = jax.vmap(gain)(A, both, weight, S, after)
-    m = B.shape[-1]
-    loop = A - both[..., :m] @ K[:, :m]
-    masked = lambda M: jnp.where(good[:, None, None], M, jnp.nan)
-    gains = masked(K[:, :m]), masked(-K[:, m:])
-    return HorizonGameSolution(X, *gains, gamma, masked(loop), result)
-
-
-@eqx.filter_jit
-@full_precision
-def _continuous(problem, gamma, tolerance):
-    A, B, D, _, R, _, times = problem
-    gamma, level, result = _found(
-        _continuous_game,
-        _continuous_barrier,
+def _solution(discrete: bool, problem, gamma, tolerance) -> HorizonGameSolution:
+    A, B, D, Q, R, _, *times = problem
+    points = times[0].shape[0] if times else A.shape[0] + 1
+    end, level = bisect_level(
+        functools.partial(_game, discrete),
         problem,
-        times.shape[0],
+        jnp.zeros((points, *A.shape[-2:]), A.dtype),
         gamma,
         tolerance,
     )
-    X = _continuous_values(problem, level)
+    if gamma is None:
+        gamma = followed(functools.partial(_barrier, discrete), problem, level)
+    else:
+        level = gamma
+    level = jnp.where(level > 0, level, 1)
+    X = _values(discrete, problem, level)
     good = jnp.all(jnp.isfinite(X), axis=(1, 2))
     masked = lambda M: jnp.where(good[:, None, None], M, jnp.nan)
-    known = jnp.where(good[:, None, None], X, 0)
-    safe = jnp.where(jnp.any(good), R, jnp.eye(R.shape[0], dtype=R.dtype))
-    both, weight = players(B, D, safe, level)
-    K, _ = jax.vmap(lambda X: joint_gain(A, both, weight, X))(known)
-    m = B.shape[1]
-    loop = A - B @ K[:, :m]
-    gains = masked(K[:, :m]), masked(-K[:, m:])
-    return HorizonGameSolution(masked(known), *gains, gamma, masked(loop), result)
+    m = B.shape[-1]
+    if discrete:
+        good = good[:-1]
+        both, weight = players(B, D, R, level)
+        S = jnp.zeros_like(both)
+        A, both, Q, weight, S, after = sanitised(good, A, both, Q, weight, S, X[1:])
+        K, _ = jax.vmap(gain)(A, both, weight, S, after)
+        B = both[..., :m]
+    else:
+        known, X = jnp.where(good[:, None, None], X, 0), masked(X)
+        R = jnp.where(jnp.any(good), R, shifted(1, R))
+        data = joint((A, B, D, Q, R), level)
+        K = jax.vmap(lambda X: joint_gain(False, data, X))(known)
+    loop = masked(A - B @ K[:, :m])
+    result = choose(end.game.good, RESULTS.successful, RESULTS.infeasible)
+    return HorizonGameSolution(
+        X, masked(K[:, :m]), masked(-K[:, m:]), gamma, loop, result
+    )

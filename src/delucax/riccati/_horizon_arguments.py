@@ -116,13 +116,39 @@ def symmetric_stack(value: Any, name: str, where: str) -> Array:
     return (array + turned) / 2
 
 
-def final_weight(value: Any, n: int, where: str) -> Array | None:
-    """The final weight, if one is given, or an error."""
+def final_weight(value: Any, n: int, where: str, dtype: Any) -> Array:
+    """The final weight, zero if none is given, or an error."""
     if value is None:
-        return None
+        return jnp.zeros((n, n), dtype)
     final = symmetric_matrix(value, "final", where)
     if final.shape != (n, n):
         raise ValueError(
             f"{where}: final must have shape {(n, n)} to fit A, got {final.shape}."
         )
-    return final
+    return final.astype(dtype)
+
+
+def check_shapes(where: str, given: dict[str, Array]) -> None:
+    """Raise unless the matrices fit each other."""
+    n, m = given["A"].shape[0], given["B"].shape[1]
+    shapes = {"A": (n, n), "B": (n, m), "Q": (n, n), "R": (m, m), "S": (n, m)}
+    if "D" in given:
+        shapes["D"] = (n, given["D"].shape[1])
+    for name, matrix in given.items():
+        if matrix.shape != shapes[name] or 0 in matrix.shape:
+            raise ValueError(
+                f"{where}: {name} must have shape {shapes[name]} to fit the other "
+                f"matrices, got {matrix.shape}."
+            )
+
+
+def checked_times(times: Any, where: str) -> Array:
+    """`times` as an increasing vector of at least two, or an error."""
+    array = as_float_array(times)
+    if not eqx.is_inexact_array(array) or array.ndim != 1 or array.shape[0] < 2:
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(times)
+        raise ValueError(f"{where}: times must be at least two numbers, got {got}.")
+    check_finite(array, "times", where)
+    if is_concrete(array) and not np.all(np.diff(np.asarray(array)) > 0):
+        raise ValueError(f"{where}: times must increase, got {array}.")
+    return array

@@ -35,14 +35,14 @@ class Game(NamedTuple):
         return self.holds & self.solved
 
 
-class Search(NamedTuple):
+class Bisection(NamedTuple):
     """Where a search for the least level has come to."""
 
     low: Array
     high: Array
     start: Array
-    calm: Array  # whether there is a solution without a disturbance
-    felt: Array  # whether the disturbance has any effect on the cost
+    solvable: Array  # whether there is a solution without a disturbance
+    affected: Array  # whether the disturbance has any effect on the cost
     base: Array  # the solution without a disturbance
     game: Game
     trials: Array
@@ -53,17 +53,17 @@ Solve = Callable[[tuple, Array, Array], Game]
 below the solution, from which the iteration rises to it."""
 
 
-def search(
+def bisect_level(
     solve: Solve,
     problem: tuple,
     start: Array,
     gamma: Array | None = None,
     tolerance: Array | float = 0.0,
-) -> tuple[Search, Array]:
+) -> tuple[Bisection, Array]:
     """The game at `gamma`, or at the least level; and the level. No derivatives.
 
     The first trial is without a disturbance, from `start`. It tells whether there is
-    any level, and about where; and the others start at what it found. The level is the
+    any level, and about where; and the others start at its solution. The level is the
     upper, feasible end of a bracket that is narrower than `tolerance`, relatively. It
     is 0 where no disturbance has any effect.
     """
@@ -73,33 +73,33 @@ def search(
 
     def more(now):
         if gamma is not None:
-            return (now.trials == 0) | (now.calm & (now.trials < 2))
+            return (now.trials == 0) | (now.solvable & (now.trials < 2))
         open_end = jnp.isinf(now.high) | (now.low == 0)
         wide = now.high > now.low * (1 + tolerance)
         near = (now.low < _WIDEST * now.start) & (now.high > now.start / _WIDEST)
         going = jnp.where(open_end, near, wide) & (now.trials < _MAX_TRIALS)
-        return (now.trials == 0) | (now.calm & now.felt & going)
+        return (now.trials == 0) | (now.solvable & now.affected & going)
 
     def body(now):
         first = now.trials == 0
         trial = _next(now) if gamma is None else gamma
         trial = jnp.where(first, one, trial)
         tried = (A, B, jnp.where(first, 0, D), *others)
-        found = solve(tried, trial, now.base)
-        good = found.good
+        game = solve(tried, trial, now.base)
+        good = game.good
         # What a disturbance does to the cost when it is not resisted at all.
-        X = found.X[1:] if D.ndim == 3 else found.X
-        felt = jnp.einsum("...ik,...ij,...jk->", D, X, D)
+        X = game.X[1:] if D.ndim == 3 else game.X
+        effect = jnp.einsum("...ik,...ij,...jk->", D, X, D)
         size = jnp.linalg.norm(X) * jnp.sum(D**2)
         slack = 10 * A.shape[-1] * jnp.finfo(A.dtype).eps * size
-        at_first = Search(
+        at_first = Bisection(
             low=now.low,
             high=now.high,
-            start=jnp.sqrt(jnp.maximum(felt, jnp.finfo(A.dtype).tiny)),
-            calm=good,
-            felt=felt > slack,
-            base=found.X,
-            game=found,
+            start=jnp.sqrt(jnp.maximum(effect, jnp.finfo(A.dtype).tiny)),
+            solvable=good,
+            affected=effect > slack,
+            base=game.X,
+            game=game,
             trials=now.trials,
         )
         # Between neighbouring numbers there is nothing left to try.
@@ -109,17 +109,17 @@ def search(
         later = now._replace(
             low=jnp.where(stuck, now.high, jnp.where(good, now.low, trial)),
             high=jnp.where(better, trial, now.high),
-            game=_where(keep | (now.trials == 1), found, now.game),
+            game=_where(keep | (now.trials == 1), game, now.game),
         )
         return _where(first, at_first, later)._replace(trials=now.trials + 1)
 
     unknown = jax.eval_shape(solve, problem, one, start)
-    begin = Search(
+    begin = Bisection(
         low=0 * one,
         high=jnp.inf * one,
         start=one,
-        calm=jnp.zeros((), bool),
-        felt=jnp.zeros((), bool),
+        solvable=jnp.zeros((), bool),
+        affected=jnp.zeros((), bool),
         base=start,
         game=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), unknown),
         trials=jnp.asarray(0),
@@ -127,11 +127,11 @@ def search(
     end = lax.while_loop(more, body, begin)
     if gamma is not None:
         return end, gamma
-    level = jnp.where(jnp.isfinite(end.high) & end.calm, end.high, one)
-    return end, jnp.where(end.calm & ~end.felt, 0, level)
+    level = jnp.where(jnp.isfinite(end.high) & end.solvable, end.high, one)
+    return end, jnp.where(end.solvable & ~end.affected, 0, level)
 
 
-def _next(now: Search) -> Array:
+def _next(now: Bisection) -> Array:
     """Up by factors until feasible, down until not, and then into the middle."""
     known = jnp.where(jnp.isinf(now.high), 1, now.high)
     up = jnp.where(now.low == 0, now.start, _FACTOR * now.low)
@@ -161,8 +161,8 @@ def _followed_jvp(barrier, primals, tangents):
     level = once(level)
     problem = jax.tree.map(once, problem)
     still = jax.tree.map(jnp.zeros_like, problem)
-    felt = level > 0
-    safe = jnp.where(felt, level, 1)
+    attained = level > 0
+    safe = jnp.where(attained, level, 1)
 
     def following(away):
         along = functools.partial(jax.jvp, barrier, (problem, safe * (1 + away)))
@@ -174,7 +174,7 @@ def _followed_jvp(barrier, primals, tangents):
     # boundary. From four distances follows the limit without the first terms.
     away = jnp.finfo(level.dtype).eps ** (3 / 8) * jnp.asarray(_AWAY, level.dtype)
     tangent = jax.vmap(following)(away) @ jnp.asarray(_WEIGHTS, level.dtype)
-    return primals[1], jnp.where(felt, tangent, 0)
+    return primals[1], jnp.where(attained, tangent, 0)
 
 
 @jax.custom_jvp

@@ -10,15 +10,14 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_matrix
-from .._results import choose, Result, RESULTS
+from .._results import choose, RESULTS
 from ..math._linear_solve import full_precision, no_tangent, solve
 from ._arguments import complex_form, is_complex, real_form, square_matrix
-from ._lyapunov import stable_sylvester
+from ._lyapunov import smith, stable_sylvester
 from ._residual import linear_residual
 from ._search import tolerance
 from ._solution import checked, MatrixSolution
 from ._spectrum import spectral_abscissa
-from ._stein import smith
 
 
 _DENSE = 256
@@ -212,16 +211,18 @@ def _solution(discrete, A, B, C) -> MatrixSolution:
     complex_data = is_complex(A, B, C)
     if complex_data:
         A, B, C = jax.tree.map(real_form, (A, B, C))
-    found = _find(discrete, A, B, C)
+    solution = _solved(discrete, A, B, C)
+    failure = RESULTS.ill_posed if C.size <= _DENSE else RESULTS.not_separated
+    result = choose(solution.solved, RESULTS.successful, failure)
     return MatrixSolution(
-        X=complex_form(found.X) if complex_data else found.X,
-        residual=lax.stop_gradient(found.residual),
-        iterations=found.iterations,
-        result=_verdict(found, C.size),
+        X=complex_form(solution.X) if complex_data else solution.X,
+        residual=lax.stop_gradient(solution.residual),
+        iterations=solution.iterations,
+        result=choose(solution.finite, result, RESULTS.ill_posed),
     )
 
 
-class _Found(NamedTuple):
+class _Candidate(NamedTuple):
     X: Array
     residual: Array
     iterations: Array
@@ -232,12 +233,6 @@ class _Found(NamedTuple):
         return self.residual <= tolerance(self.X.dtype)
 
 
-def _verdict(found: _Found, unknowns: int) -> Result:
-    failure = RESULTS.ill_posed if unknowns <= _DENSE else RESULTS.not_separated
-    result = choose(found.solved, RESULTS.successful, failure)
-    return choose(found.finite, result, RESULTS.ill_posed)
-
-
 def _left_side(discrete, A, B, X):
     """`A X + X B`, or `X - A X B`."""
     B = A.T if B is None else B
@@ -246,37 +241,33 @@ def _left_side(discrete, A, B, X):
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 @full_precision
-def _find(discrete, A, B, C) -> _Found:
+def _solved(discrete, A, B, C) -> _Candidate:
     """The solution of `A X + X B = C` or `X - A X B = C`; `B` is `A'` by default."""
     given = [M for M in (A, B, C) if M is not None]
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in given]))
     last = _DENSELY if C.size <= _DENSE else _SHIFTED
-
-    def attempt(kind):
-        plain, shifted = kind == _PLAIN, kind == _SHIFTED
-        X, iterations = _separated(discrete, A, B, C, plain, shifted)
-        if last == _DENSELY:
-            X = _densely(discrete, A, B, C, X, kind == _DENSELY)
-        other = A.T if B is None else B
-        return X, linear_residual(discrete, A, other, C, X), iterations
 
     def more(carry):
         return carry[0] != _DONE
 
     def body(carry):
         kind, before = carry
-        X, residual, iterations = attempt(kind)
+        plain, shifted = kind == _PLAIN, kind == _SHIFTED
+        X, iterations = _separated(discrete, A, B, C, plain, shifted)
+        if last == _DENSELY:
+            X = _densely(discrete, A, B, C, X, kind == _DENSELY)
+        residual = linear_residual(discrete, A, A.T if B is None else B, C, X)
         # The equation is linear: if its residual is small, it is solved.
-        better = (residual < before.residual) | (kind == _PLAIN)
-        found = before._replace(
+        better = (residual < before.residual) | plain
+        after = before._replace(
             X=jnp.where(better, X, before.X),
             residual=jnp.where(better, residual, before.residual),
             iterations=before.iterations + iterations,
         )
-        over = found.solved | (kind == last)
-        return jnp.where(over, _DONE, kind + 1), found
+        over = after.solved | (kind == last)
+        return jnp.where(over, _DONE, kind + 1), after
 
-    nothing = _Found(
+    nothing = _Candidate(
         jnp.full_like(C, jnp.nan),
         jnp.asarray(jnp.inf, C.dtype),
         jnp.asarray(0),
@@ -354,15 +345,15 @@ def _densely(discrete, A, B, C, X, wanted):
     return lax.while_loop(lambda carry: carry[1], body, (X, wanted))[0]
 
 
-@_find.defjvp
+@_solved.defjvp
 @full_precision
-def _find_jvp(discrete, primals, tangents):
+def _solved_jvp(discrete, primals, tangents):
     A, B, _ = primals
-    found = _find(discrete, *primals)
-    ok = found.solved
+    solution = _solved(discrete, *primals)
+    ok = solution.solved
     # Guarded at both ends: what is not finite in a failed member stays in it.
     dA, dB, dC = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents)
-    X = jnp.where(ok, found.X, 0)
+    X = jnp.where(ok, solution.X, 0)
     half = functools.partial(jnp.where, ok)
     A, B = jax.tree.map(lambda M: half(M, -jnp.eye(len(M), dtype=M.dtype) / 2), (A, B))
     other, d_other = (A.T, dA.T) if B is None else (B, dB)
@@ -374,7 +365,7 @@ def _find_jvp(discrete, primals, tangents):
     dX = lax.custom_linear_solve(
         lambda X: _left_side(discrete, A, B, X),
         jnp.where(ok, right, 0),
-        solve=lambda _, C: _find(discrete, A, B, C).X,
-        transpose_solve=lambda _, C: _find(discrete, A.T, across, C).X,
+        solve=lambda _, C: _solved(discrete, A, B, C).X,
+        transpose_solve=lambda _, C: _solved(discrete, A.T, across, C).X,
     )
-    return found, no_tangent(found)._replace(X=jnp.where(ok, dX, 0))
+    return solution, no_tangent(solution)._replace(X=jnp.where(ok, dX, 0))

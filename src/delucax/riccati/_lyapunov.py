@@ -1,15 +1,60 @@
-"""The Sylvester and Lyapunov equations of stable matrices, by a Cayley transform."""
+"""The Stein, Lyapunov and Sylvester equations of stable matrices, by doubling."""
 
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..math._linear_solve import solve
+from ..math._linear_solve import factorised
 from ..math._size import relative_size
-from ._stein import smith
 
 
 _REFINEMENTS = 3
+MAX_DOUBLINGS = 60
+"""Beyond it the spectral radius cannot be told from 1: 2**60 > 1 / eps in float64."""
+
+
+def stein(A: Float[Array, "n n"], Q: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The solution of `X = A' X A + Q` for a stable `A`, by doubling.
+
+    It is differentiated as the linear solve that it is, to any order and in either
+    mode.
+    """
+    return lax.custom_linear_solve(
+        lambda X: X - A.T @ X @ A,
+        Q,
+        solve=lambda _, right: smith(A.T, None, right)[0],
+        transpose_solve=lambda _, right: smith(A, None, right)[0],
+    )
+
+
+def smith(
+    A: Float[Array, "n n"], B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
+) -> tuple[Float[Array, "n m"], Array]:
+    """`X = A X B + C` for stable `A` and `B` (default `A'`), and the doublings taken.
+
+    `X_2k = X_k + A^k X_k B^k`, the sum of the first 2k terms of the series.
+
+    Source: Smith, 1968.
+    """
+    eps = jnp.finfo(C.dtype).eps
+    powers = (A,) if B is None else (A, B)
+
+    def more(carry):
+        *_, relative, k = carry
+        return (k < MAX_DOUBLINGS) & (relative > eps / 4)
+
+    def body(carry):
+        X, powers, _, k = carry
+        left, right = powers if len(powers) == 2 else (powers[0], powers[0].T)
+        change = left @ X @ right
+        X = X + change
+        # A NaN compares false, so that a lane that diverges stops.
+        relative = relative_size(change, X)
+        return X, tuple(power @ power for power in powers), relative, k + 1
+
+    start = (C, powers, jnp.asarray(jnp.inf, C.dtype), jnp.asarray(0))
+    X, *_, iterations = lax.while_loop(more, body, start)
+    return X, iterations
 
 
 def lyapunov(F: Float[Array, "n n"], Q: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -43,37 +88,39 @@ def stable_sylvester(
     logs = jnp.linalg.slogdet(A)[1]
     logs = 2 * logs if B is None else logs + jnp.linalg.slogdet(B)[1]
     c = jnp.exp(logs / (2 * n if B is None else n + m))
-    eye_A, eye_B = jnp.eye(n, dtype=A.dtype), jnp.eye(m, dtype=A.dtype)
-    moved_A, moved_B = A - c * eye_A, other.T - c * eye_B
-    power_A = solve(moved_A, A + c * eye_A)
-    power_B = None if B is None else solve(moved_B, B.T + c * eye_B).T
-
-    def once(C):
-        left = solve(moved_A, C)
-        both = solve(moved_B, left.T).T
-        return smith(power_A, power_B, -2 * c * both)
-
-    def measured(X):
-        left, right = A @ X, X @ other
-        rest = C - left - right
-        return rest, relative_size(rest, left, right, C)
+    shifted_A, power_A = _cayley(A, c)
+    shifted_B, power_B = (shifted_A, None) if B is None else _cayley(B.T, c)
 
     def more(carry):
         *_, going, k = carry
-        return going & (k < _REFINEMENTS)
+        return going & (k <= _REFINEMENTS)
 
     def body(carry):
         X, rest, residual, iterations, _, k = carry
-        change, doublings = once(rest)
-        rest, found = measured(X + change)
-        better = found < residual
-        X = jnp.where(better, X + change, X)
-        residual = jnp.where(better, found, residual)
+        scaled = shifted_B(shifted_A(rest).T).T
+        change, doublings = smith(
+            power_A, None if power_B is None else power_B.T, -2 * c * scaled
+        )
+        candidate = X + change
+        left, right = A @ candidate, candidate @ other
+        left_over = C - left - right
+        relative = relative_size(left_over, left, right, C)
+        # The first round solves, those after it refine.
+        better = (relative < residual) | (k == 0)
+        X = jnp.where(better, candidate, X)
+        residual = jnp.where(better, relative, residual)
         going = better & (residual > 10 * eps)
-        return X, rest, residual, iterations + doublings, going, k + 1
+        return X, left_over, residual, iterations + doublings, going, k + 1
 
-    X, iterations = once(C)
-    rest, residual = measured(X)
-    start = (X, rest, residual, iterations, residual > 10 * eps, jnp.asarray(0))
+    unknown = jnp.asarray(jnp.inf, C.dtype)
+    zero = jnp.asarray(0)
+    start = jnp.zeros_like(C), C, unknown, zero, jnp.asarray(True), zero
     X, _, _, iterations, *_ = lax.while_loop(more, body, start)
     return X, iterations
+
+
+def _cayley(A, c):
+    """The solution with `A - c`, and `(A - c)^-1 (A + c)`."""
+    shift = c * jnp.eye(len(A), dtype=A.dtype)
+    solved = factorised(A - shift)
+    return solved, solved(A + shift)

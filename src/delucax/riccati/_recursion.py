@@ -7,12 +7,12 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..math._linear_solve import full_precision, solve
+from ..math._linear_solve import full_precision, solve, symmetric
 
 
-def symmetric(X: Float[Array, "*T n n"]) -> Float[Array, "*T n n"]:
-    """The symmetric part."""
-    return (X + jnp.swapaxes(X, -1, -2)) / 2
+Element = tuple[Array, Array, Array]
+"""`A, C, J` of an interval: from `X` at its end follows `J + A' X (I + C X)^-1 A` at
+its start."""
 
 
 def is_clearly_definite(M: Float[Array, "n n"]) -> Bool[Array, ""]:
@@ -35,6 +35,11 @@ def is_saddle(M: Float[Array, "k k"], players: int) -> Bool[Array, ""]:
     concave = is_clearly_definite(W)
     safe = jnp.where(concave, W, jnp.eye(players, dtype=M.dtype))
     return concave & is_clearly_definite(symmetric(U + C @ solve(safe, C.T)))
+
+
+def failed_step(X: Float[Array, "T n n"]) -> int:
+    """The last step without a solution: it is NaN there and at all before it."""
+    return int(jnp.sum(jnp.isnan(X[:, 0, 0]))) - 1
 
 
 def gain(A, B, R, S, X):
@@ -92,8 +97,6 @@ def _in_sequence(A, B, Q, R, S, final):
 
 
 def _in_parallel(A, B, Q, R, S, final):
-    # An element is the cost between two times as a function of the states there, in
-    # dual form: from `X` at its end follows `J + A' X (I + C X)^-1 A` at its start.
     # Adding x_next' P x_next - x' P x to each step changes no decision, and makes the
     # control weight definite even where R is not.
     n = A.shape[-1]
@@ -102,10 +105,8 @@ def _in_parallel(A, B, Q, R, S, final):
     P = jnp.where(size > 0, size, 1) * jnp.eye(n, dtype=A.dtype)
 
     def element(A, B, Q, R, S):
-        cross = B.T @ P @ A + S.T
-        solved = solve(R + B.T @ P @ B, jnp.concatenate([cross, B.T], axis=1))
-        K, C = solved[:, :n], symmetric(B @ solved[:, n:])
-        return A - B @ K, C, symmetric(A.T @ P @ A - P + Q - cross.T @ K)
+        cross = A.T @ P @ B + S
+        return step_element(A, B, R + B.T @ P @ B, cross, A.T @ P @ A - P, Q)
 
     def combine(later, earlier):
         # The scan runs backwards, so that the later of two comes first.
@@ -122,7 +123,19 @@ def _in_parallel(A, B, Q, R, S, final):
     return X.at[:-1].set(jax.vmap(one_step)(A, B, Q, R, S, K, X[1:]))
 
 
-def joined(first, second):
+def step_element(A, B, weight, cross, linear, Q) -> Element:
+    """The element of a step, about some `X0`.
+
+    There `weight` is `R + B'X0 B`, `cross` is `A'X0 B + S`, and `linear` is
+    `A'X0 A - X0`.
+    """
+    n = A.shape[0]
+    solved = solve(weight, jnp.concatenate([cross.T, B.T], axis=1))
+    K, G = solved[:, :n], symmetric(B @ solved[:, n:])
+    return A - B @ K, G, symmetric(linear - cross @ K + Q)
+
+
+def joined(first: Element, second: Element) -> Element:
     """The element of two intervals, one after the other.
 
     Source: Sarkka and Garcia-Fernandez, 2023.
@@ -134,7 +147,7 @@ def joined(first, second):
     solved = solve(eye + C1 @ J2, jnp.concatenate([A1, C1], axis=1))
     moved, weighted = solved[:, :n], solved[:, n:]
     C = symmetric(C2 + A2 @ weighted @ A2.T)
-    return A2 @ moved, C, symmetric(J1 + A1.T @ J2 @ moved)
+    return A2 @ moved, C, J1 + symmetric(A1.T @ (J2 @ moved))
 
 
 def linear_recursion(loop, added, final, parallel: bool, product):

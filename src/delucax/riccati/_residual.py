@@ -9,7 +9,8 @@ from jaxtyping import Array, Bool, Float
 
 from ..math._accurate import in_parts, product
 from ..math._linear_solve import solve, symmetric
-from ..math._size import relative_size, size
+from ..math._size import relative_and_total_size
+from ._arguments import RiccatiData
 
 
 _MARGIN = 1.01
@@ -25,25 +26,24 @@ class Residual(NamedTuple):
       each of the units that were asked for.
     - `closed_loop`: `A - B K`, or `E^-1 (A - B K)`.
     - `terms`: the sum of the norms of the terms, in each of these units.
-    - `K`: the gain.
     """
 
-    error: Array
-    relative: Array
-    bounds: Array
-    closed_loop: Array
-    terms: Array
-    K: Array
+    error: Float[Array, "n n"]
+    relative: Float[Array, ""]
+    bounds: Float[Array, " units"]
+    closed_loop: Float[Array, "n n"]
+    terms: Float[Array, " units"]
+
+
+def no_residual(X: Float[Array, "n n"], units: int) -> Residual:
+    """A residual of nothing, of the shapes of that at `X`."""
+    matrix, number, vector = (jnp.zeros(s, X.dtype) for s in (X.shape, (), units))
+    return Residual(matrix, number, vector, matrix, vector)
 
 
 def riccati_residual(
     discrete: bool,
-    A: Float[Array, "n n"],
-    B: Float[Array, "n m"],
-    Q: Float[Array, "n n"],
-    R: Float[Array, "m m"],
-    S: Float[Array, "n m"],
-    E: Float[Array, "n n"] | None,
+    data: RiccatiData,
     X: Float[Array, "n n"],
     accurately: Bool[Array, ""] | bool,
     *others: Float[Array, " n"],
@@ -65,12 +65,10 @@ def riccati_residual(
     units of the states the equation is this one, with rows and columns times those of
     `others`.
     """
-    n, m = B.shape
-    dtype = A.dtype
+    A, B, Q, _, _, E = data
+    (n, m), dtype = B.shape, A.dtype
+    moved, cross, weight = stationary(discrete, data, X)
     weighted = X if E is None else E.T @ X
-    moved = A.T @ X if discrete else weighted
-    cross = moved @ B + S
-    weight = R + symmetric(B.T @ (X @ B)) if discrete else R
     solved = solve(weight, jnp.concatenate([cross.T, jnp.eye(m, dtype=dtype)], axis=1))
     K, inverse = solved[:, :n], jnp.abs(solved[:, n:])
     first = m - players
@@ -81,15 +79,14 @@ def riccati_residual(
     if players:
         terms.append(cross[:, first:] @ K[first:])
 
-    data = A, B, Q, R, S, E, X
-    working, left = _evaluated(discrete, *data, K)
+    working, left = _evaluated(discrete, *data, X, K)
     closed_loop = working[1] if E is None else solve(E, working[1])
     needed = jnp.asarray(accurately)
     if accurately is not False:
 
         def more_accurate(carry):
             _, working, left = carry
-            left = _sharper(discrete, *data, working, left)
+            left = _sharper(discrete, *data, X, working, left)
             return jnp.zeros_like(needed), jax.tree.map(jnp.zeros_like, working), left
 
         # A loop of one round is not run for a batch in which no member needs it. What
@@ -100,15 +97,31 @@ def riccati_residual(
     gap = jnp.abs(gap) + gap_lost
     bound = jnp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
 
+    both, terms = jnp.stack([error, bound]), jnp.stack(terms)
+
     def in_units(d):
-        rest, *parts = (M * (d[:, None] * d) for M in (bound, *terms))
-        return _MARGIN * relative_size(rest, *parts), size(*parts)
+        factor = d[:, None] * d
+        return relative_and_total_size(both * factor, terms * factor)
 
     # Powers of two: their products have no rounding.
     units = jnp.stack([jnp.ones(n, dtype), *others])
-    bounds, sizes = jax.vmap(in_units)(units)
-    relative = jnp.where(needed, bounds[0], relative_size(error, *terms))
-    return Residual(error, relative, bounds, closed_loop, sizes, K)
+    relative, sizes = jax.vmap(in_units)(units)
+    bounds = _MARGIN * relative[:, 1]
+    relative = jnp.where(needed, bounds[0], relative[0, 0])
+    return Residual(error, relative, bounds, closed_loop, sizes)
+
+
+def stationary(
+    discrete: bool, data: RiccatiData, X: Float[Array, "n n"]
+) -> tuple[Array, Array, Array]:
+    """`E'X`, `E'XB + S` and `R`, or `A'X`, `A'XB + S` and `R + B'XB` in discrete time:
+    of the last two follows the best gain."""
+    A, B, _, R, S, E = data
+    if discrete:
+        moved, weight = A.T @ X, R + symmetric(B.T @ (X @ B))
+    else:
+        moved, weight = X if E is None else E.T @ X, R
+    return moved, moved @ B + S, weight
 
 
 class _Left(NamedTuple):

@@ -1,12 +1,21 @@
 """What the solvers of matrix equations return."""
 
-from typing import TypeVar
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable, TypeVar
 
 import equinox as eqx
 from jaxtyping import Array
 
 from .._check import is_concrete
 from .._results import Result, RESULTS
+
+
+@runtime_checkable
+class _HasResult(Protocol):
+    result: Result
+
+
+Solution = TypeVar("Solution", bound=_HasResult)
 
 
 class RiccatiSolution(eqx.Module):
@@ -89,27 +98,35 @@ class MatrixSolution(eqx.Module):
     result: Result
 
 
-Solution = TypeVar("Solution", RiccatiSolution, MatrixSolution)
+def checked(
+    solution: Solution,
+    where: str,
+    throw: bool,
+    facts: Callable[[Any], str] | None = None,
+) -> Solution:
+    """Raise if asked to and it failed: now if that can be seen, else at run time.
 
-
-def checked(solution: Solution, where: str, throw: bool) -> Solution:
-    """Raise if asked to and it failed: now if that can be seen, else at run time."""
+    `facts` says of a solution what helps to understand its failure.
+    """
     failed = solution.result != RESULTS.successful
     if not throw:
         return solution
     if not is_concrete(failed):
         return solution.result.error_if(solution, failed)
     if failed:
-        facts = f"Relative residual {float(solution.residual):.1e}"
-        if isinstance(solution, RiccatiSolution):
-            if solution.spectral_radius is not None:
-                name, value = "radius", solution.spectral_radius
-            else:
-                name, value = "abscissa", solution.spectral_abscissa
-            assert value is not None
-            facts += f", spectral {name} of the closed loop {float(value):.6g}"
+        known = (_facts if facts is None else facts)(solution)
         raise RuntimeError(
-            f"{where}: {RESULTS[solution.result]} {facts}. Pass throw=False to look "
-            "at the solution."
+            f"{where}: {RESULTS[solution.result]} {known} Pass throw=False to look at "
+            "the solution."
         )
     return solution
+
+
+def _facts(solution: Any) -> str:
+    known = f"Relative residual {float(solution.residual):.1e}"
+    if isinstance(solution, RiccatiSolution):
+        radius, abscissa = solution.spectral_radius, solution.spectral_abscissa
+        name, bound = ("abscissa", abscissa) if radius is None else ("radius", radius)
+        assert bound is not None
+        known += f", spectral {name} of the closed loop {float(bound):.6g}"
+    return f"{known}."

@@ -27,10 +27,10 @@ def spectral_radius(A: Float[Array, "n n"]) -> Float[Array, ""]:
     `log(cond) / N`, with `cond` the condition of the eigenvectors. Of a large matrix a
     few squarings leave only few directions; the rest is done in their span.
     """
-    logarithm, found, span, _ = _growth(A, A.shape[0] > _LARGE)
+    logarithm, is_narrow, span, _ = _growth(A, A.shape[0] > _LARGE)
     if A.shape[0] > _LARGE:
         within, *_ = _growth(span.T @ A @ span, False)
-        logarithm = jnp.where(found, within, logarithm)
+        logarithm = jnp.where(is_narrow, within, logarithm)
     return jnp.exp(logarithm)
 
 
@@ -47,13 +47,13 @@ def abscissa_and_size(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The spectral abscissa, and the norm of the balanced matrix that it came from."""
     A = balanced(A)
-    value, found, span, kept = _slowest(A, A.shape[0] > _LARGE)
+    value, is_narrow, span, kept = _slowest(A, A.shape[0] > _LARGE)
     if A.shape[0] > _LARGE:
         part = span.T @ A @ span
         # Directions left out come last.
         part = part - jnp.diag(jnp.where(kept, 0, size(part)))
         within, *_ = _slowest(balanced(part), False)
-        value = jnp.where(found, within, value)
+        value = jnp.where(is_narrow, within, value)
     return value, size(A)
 
 

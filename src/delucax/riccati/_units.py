@@ -5,7 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..math._linear_solve import solve
-from ..math._size import power_of_two
+from ..math._size import one_if_zero, power_of_two
+from ._arguments import RiccatiData
 
 
 _SWEEPS = 100
@@ -13,13 +14,7 @@ _APART = 4
 """Units that are no more powers of two apart are left as they are."""
 
 
-def units(
-    A: Float[Array, "n n"],
-    B: Float[Array, "n m"],
-    Q: Float[Array, "n n"],
-    R: Float[Array, "m m"],
-    E: Float[Array, "n n"] | None,
-) -> Float[Array, "2 n"]:
+def units(data: RiccatiData) -> Float[Array, "2 n"]:
     """Powers of two, by which the states and the rows of A, B and E are multiplied.
 
     In them a row of the Hamiltonian matrix is as large as its column: what moves a
@@ -30,17 +25,18 @@ def units(
 
     Source: Parlett and Reinsch, 1969 (balancing); Benner, 2001 (of a Hamiltonian).
     """
+    A, B, Q, R, _, E = lax.stop_gradient(data)
     n, dtype = A.shape[0], A.dtype
     lowest = jnp.finfo(dtype).minexp
     plain_A, plain_B = (A, B) if E is None else (solve(E, A), solve(E, B))
 
     def logarithm(M):
-        usable = (M > 0) & jnp.isfinite(M)
-        return jnp.where(usable, jnp.log2(jnp.where(usable, M, 1)), lowest)
+        exponent = jnp.log2(M)
+        return jnp.where(jnp.isfinite(exponent), exponent, lowest)
 
-    effort = jnp.sqrt(jnp.abs(jnp.diagonal(R)))
-    force = jnp.max(jnp.abs(plain_B) / jnp.where(effort > 0, effort, 1), axis=1)
-    weight = logarithm(jnp.sqrt(jnp.abs(jnp.diagonal(Q))))
+    effort = jnp.sqrt(_diagonal_sizes(R))
+    force = jnp.max(jnp.abs(plain_B) / one_if_zero(effort), axis=1)
+    weight = logarithm(jnp.sqrt(_diagonal_sizes(Q)))
     other = ~jnp.eye(n, dtype=bool)
     inside, force = logarithm(jnp.abs(plain_A) * other), logarithm(force)
 
@@ -69,12 +65,19 @@ def units(
     both = jnp.stack([d, f])
     apart = jnp.any(jnp.max(both, axis=1) - jnp.min(both, axis=1) > _APART)
     both = jnp.where(apart, both, 0)
-    return lax.stop_gradient(power_of_two(jnp.exp2(both)))
+    return power_of_two(jnp.exp2(both))
 
 
-def in_units(by: Float[Array, "2 n"], A, B, Q, R, S, E) -> tuple:
+def _diagonal_sizes(M):
+    # `jnp.diagonal` gathers, which is slower to compile.
+    return jnp.max(jnp.where(jnp.eye(len(M), dtype=bool), jnp.abs(M), 0), axis=1)
+
+
+def in_units(by: Float[Array, "2 n"], data: RiccatiData) -> RiccatiData:
     """The data of the equation with states and rows that are `by` times these."""
-    d, f = by
-    row, across = f[:, None], f[:, None] / d
+    A, B, Q, R, S, E = data
+    state, row = (unit[:, None] for unit in by)
+    across = row / by[0]
     E = None if E is None else E * across
-    return A * across, B * row, Q / (d[:, None] * d), R, S / d[:, None], E
+    Q = Q / (state * by[0])
+    return RiccatiData(A * across, B * row, Q, R, S / state, E)

@@ -1,5 +1,6 @@
 """Zero-order hold inside one solve, exact at the switch."""
 
+import operator
 from typing import Any, NamedTuple
 
 import diffrax
@@ -13,14 +14,14 @@ from ..dynamics._discretized import evaluate_field
 from ..dynamics._solvers import AbstractTransparentSolver
 from ..dynamics._start import Start
 from ..systems import AbstractSystem
-from ._answer import answer, check_state
+from ._controller_calls import call_controller, check_control, check_state
 
 
 class Inputs(eqx.Module):
     """The `args` of the solve: all that a gradient may be taken with respect to.
 
-    Which control holds is said by `index`, an integer, rather than by the control
-    itself, so that the adjoint equations reach `controls`.
+    `index`, an integer, tells which control is held, in place of the control itself, so
+    that the adjoint equations reach `controls`.
     """
 
     system: AbstractSystem
@@ -30,7 +31,7 @@ class Inputs(eqx.Module):
     controls: Array | None
     disturbances: Array | None
     index: Array
-    u: Array | None  # what a held controller asked for at the last switch
+    u: Array | None  # the control that a held controller returned at the last switch
 
     def control(self, t: Array, x: Array) -> Array:
         """The control at time `t`."""
@@ -40,32 +41,27 @@ class Inputs(eqx.Module):
             return self.controls[self.index]
         if isinstance(self.source, AbstractController):
             y = self.system.observe(t, x)
-            u, _ = answer(self.source, t, y, self.memory)
+            u, _ = call_controller(self.source, t, y, self.memory)
         else:
             u = self.source(t)
-        check_control(u, self.source, self.system)
+        check_control(u, self.source, self.system.control_size, "system")
         return u
-
-    def disturbance(self, x: Array) -> Array | None:
-        if self.disturbances is not None:
-            return self.disturbances[self.index]
-        if self.system.disturbance_names:
-            return jnp.zeros(self.system.disturbance_size, x.dtype)
-        return None
 
     def field(self, t: Array, x: Array) -> Array:
         """The vector field at time `t`."""
-        u, w = self.control(t, x), self.disturbance(x)
+        u, w = self.control(t, x), None
+        if self.disturbances is not None:
+            w = self.disturbances[self.index]
+        elif self.system.disturbance_names:
+            w = jnp.zeros(self.system.disturbance_size, x.dtype)
         return evaluate_field(self.system, t, x, u, w).astype(x.dtype)
 
     def act(self, s: Array, x: Array, memory: Any) -> tuple[Array, Any]:
         """A held controller's answer at a switch, and its state after it."""
         t = self.start.t + s
-        arrays, static = memory, eqx.filter(self.memory, eqx.is_array, inverse=True)
-        y = self.system.observe(t, x)
-        state = eqx.combine(arrays, static)
-        u, after = answer(self.source, t, y, state)
-        check_control(u, self.source, self.system)
+        state = eqx.combine(memory, eqx.filter(self.memory, eqx.is_array, inverse=True))
+        u, after = call_controller(self.source, t, self.system.observe(t, x), state)
+        check_control(u, self.source, self.system.control_size, "system")
         u = u.astype(x.dtype)
         after = self.source.applied(u, jnp.zeros((), x.dtype), after)
         check_state(self.source, self.memory, after)
@@ -77,14 +73,7 @@ def field(s, x, args):
     return args.start.after(s, lambda t: args.field(t, x))
 
 
-def check_control(u: Any, source: Any, system: AbstractSystem) -> None:
-    """Raise, with names, unless `u` is a control of the right size."""
-    if jnp.shape(u) != (system.control_size,):
-        raise ValueError(
-            f"{getattr(source, '__name__', type(source).__name__)}: returned a control "
-            f"of shape {jnp.shape(u)}, but the system takes shape "
-            f"({system.control_size},)."
-        )
+_index = operator.attrgetter("index")
 
 
 class Recorded(NamedTuple):
@@ -153,7 +142,7 @@ class Hold(AbstractTransparentSolver):
         return ends
 
     def init(self, terms, t0, t1, y0, args):
-        args = _at(args, self._interval(terms, t0, t1))
+        args = eqx.tree_at(_index, args, self._interval(terms, t0, t1))
         inner = self.solver.init(terms, t0, t1, y0, args)
         held = (args.u, eqx.filter(args.memory, eqx.is_array)) if self.sampled else None
         return inner, jnp.full((), -1, jnp.int32), held
@@ -162,7 +151,7 @@ class Hold(AbstractTransparentSolver):
         inner, last, held = solver_state
         index = self._interval(terms, t0, t1)
         switched = index != last
-        args = _at(args, index)
+        args = eqx.tree_at(_index, args, index)
         if self.sampled:
 
             def act(held):
@@ -181,12 +170,12 @@ class Hold(AbstractTransparentSolver):
     def func(self, terms, t0, y0, args):
         forwards = terms.direction == 1
         t = jnp.where(forwards, t0, -t0)
-        ahead = jnp.where(
-            forwards,
-            _interval_from(self.switches, t),
+        after, before = (
+            interval_from(self.switches, t),
             interval_before(self.switches, t),
         )
-        return self.solver.func(terms, t0, y0, _at(args, ahead))
+        args = eqx.tree_at(_index, args, jnp.where(forwards, after, before))
+        return self.solver.func(terms, t0, y0, args)
 
     def _interval(self, terms, t0, t1):
         """The interval that the step from `t0` to `t1` lies in.
@@ -197,17 +186,13 @@ class Hold(AbstractTransparentSolver):
         forwards = terms.direction == 1
         low = jnp.where(forwards, t0, -t1)
         high = jnp.where(forwards, t1, -t0)
-        index = _interval_from(self.switches, low)
+        index = interval_from(self.switches, low)
         switch = self.switches[index + 1]
         later = (high - switch > switch - low).astype(index.dtype)
         return jnp.minimum(index + later, self.switches.shape[0] - 2)
 
 
-def _at(args: Inputs, index: Array) -> Inputs:
-    return eqx.tree_at(lambda a: a.index, args, index)
-
-
-def _interval_from(switches: Array, t: Array) -> Array:
+def interval_from(switches: Array, t: Array) -> Array:
     """k with `switches[k] <= t < switches[k + 1]`, of equal intervals."""
     count = switches.shape[0] - 1
     share = (t - switches[0]) / (switches[-1] - switches[0])
@@ -219,5 +204,5 @@ def _interval_from(switches: Array, t: Array) -> Array:
 
 def interval_before(switches: Array, t: Array) -> Array:
     """k with `switches[k] < t <= switches[k + 1]`."""
-    k = _interval_from(switches, t)
+    k = interval_from(switches, t)
     return jnp.maximum(k - (t == switches[k]).astype(k.dtype), 0)

@@ -11,24 +11,29 @@ import jax.numpy as jnp
 
 from .._check import (
     as_number,
+    as_rows,
     as_vector,
     check_bool,
+    check_choice,
     check_count,
     check_finite,
     check_instance,
     check_key,
 )
 from .._controller import AbstractController, initial_state, tallies
-from .._jax import by_components
-from .._message import shortened
+from .._jax import by_components, join_state, split_state, stack_steps
 from .._module import as_float_array
 from .._results import choose, first_failure, first_of, or_none, RESULTS
 from .._typing import Checkpoint, PRNGKey
 from ..disturbances import Zero
-from ..dynamics._runge_kutta import join_state, split_state, stack_steps
 from ..environments import Environment
-from ._answer import answer, check_state, outcome_of
-from ._trajectory import checked, Trajectory
+from ._controller_calls import (
+    call_controller,
+    check_control,
+    check_state,
+    controller_result,
+)
+from ._trajectory import checked, plant_fields, Trajectory
 
 
 KEEP = (
@@ -128,14 +133,7 @@ def rollout(
         x0 = as_vector(x0, environment.state_size, "x0", where)
         check_finite(x0, "x0", where)
     if w is not None:
-        w = as_float_array(w)
-        shape = (horizon, environment.disturbance_size)
-        if not eqx.is_inexact_array(w) or w.shape != shape:
-            got = w.shape if eqx.is_array(w) else shortened(w)
-            raise ValueError(
-                f"{where}: w must have shape (horizon, disturbances) = {shape}, got "
-                f"{got}."
-            )
+        w = as_rows(w, environment.disturbance_size, "w", where, horizon)
         check_finite(w, "w", where)
     keep = (keep,) if isinstance(keep, str) else keep
     named = isinstance(keep, tuple | list | set | frozenset)
@@ -143,10 +141,8 @@ def rollout(
         raise ValueError(
             f"{where}: keep must be some of {', '.join(KEEP)}; got {keep!r}."
         )
-    if checkpoint not in ("step", "sqrt", None):
-        raise ValueError(
-            f"{where}: checkpoint must be 'step', 'sqrt' or None, got {checkpoint!r}."
-        )
+    keep = tuple(name for name in KEEP if name in keep)
+    check_choice(checkpoint, ("step", "sqrt", None), "checkpoint", where)
     if isinstance(gradient_decay, int | float) and gradient_decay == 1:
         decay = None
     else:
@@ -154,22 +150,13 @@ def rollout(
     if truncate is not None:
         truncate = check_count(truncate, "truncate", where)
     trajectory = _rollout(
-        environment,
-        controller,
-        key,
-        x0,
-        w,
-        decay,
-        truncate,
-        horizon,
-        tuple(name for name in KEEP if name in keep),
-        checkpoint,
+        environment, controller, key, x0, w, horizon, keep, checkpoint, decay, truncate
     )
     return checked(trajectory, where) if throw else trajectory
 
 
 @eqx.filter_jit
-def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkpoint):
+def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, truncate):
     dynamics = env.dynamics
     start_key, w_key, noise_key, controller_key = env.split_key(key)
     if x0 is None:
@@ -180,14 +167,14 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
     noise = None
     if env.sensor_noise is not None:
         noise = env.sensor_noise.draw(noise_key, dt, horizon, dtype)
-    ends = env.terminated is not None
-    plain_sight = True  # whether the observation is the state itself, found by tracing
+    can_end = env.terminated is not None
+    # A trajectory reads observations off the states where they are the same.
+    keeps_y = not ("states" in keep and noise is None and dynamics.observes_state)
 
     first = initial_state(controller, controller_key)
     first, static = eqx.partition(first, eqx.is_array)
 
     def body(carry, inputs):
-        nonlocal plain_sight
         parts, memory, ended, total = carry
         k, w, noise = inputs
         t = (k * dt).astype(dtype)
@@ -199,27 +186,29 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
         y = dynamics.observe(t, x)
         if not eqx.is_inexact_array(y) or y.ndim != 1:
             y = as_vector(y, env.observation_size, "observe(t, x)", "rollout")
-        plain_sight = noise is None and y is x
         y = y if noise is None else (y + noise).astype(dtype)
-        seen, (done, length) = y, ended or (None, None)
+        observed, (done, length) = y, ended or (None, None)
         if done is not None:
             # What is computed after the end is not used, but its derivatives must be
             # finite: so it is computed where the episode began.
-            live = lambda now, first: jnp.where(done, first, now)  # noqa: E731
-            seen = live(y, lax.stop_gradient(dynamics.observe(t, x0)).astype(y.dtype))
-            x = live(x, lax.stop_gradient(x0))
-        u, after = answer(controller, t, seen, eqx.combine(memory, static))
-        _check_control(controller, u, env)
+            y0 = lax.stop_gradient(dynamics.observe(t, x0)).astype(y.dtype)
+            observed = jnp.where(done, y0, y)
+            x = jnp.where(done, lax.stop_gradient(x0), x)
+        state = eqx.combine(memory, static)
+        u, after = call_controller(controller, t, observed, state)
+        is_action = jnp.issubdtype(jnp.result_type(u), jnp.integer)
+        if env.actions is None or not is_action:
+            check_control(u, controller, env.control_size, "environment")
         step = env._advance(t, x, env._applied(u), w)
         cost, x_next, result = step.cost.astype(dtype), step.state, step.result
         applied = step.control
-        if x_next.shape != x.shape or cost.shape != ():
+        if x_next.shape != x.shape:
             raise ValueError(
                 f"rollout: a step must give a state of shape {x.shape} and a scalar "
                 f"cost, got shapes {x_next.shape} and {cost.shape}. If a constant has "
                 "a batch axis, run a batch of environments: jax.vmap."
             )
-        after = controller.applied(step.control, cost, after)
+        after = controller.applied(applied, cost, after)
         check_state(controller, eqx.combine(first, static), after)
         after = eqx.filter(after, eqx.is_array)
         incidents = {}
@@ -240,12 +229,10 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
         after_parts = split_state(x_next.astype(dtype))
         kept = {
             "states": parts,
-            "observations": None
-            if plain_sight and "states" in keep
-            else split_state(y),
+            "observations": split_state(y) if keeps_y else None,
             "controls": split_state(applied),
             "costs": cost,
-            "terminated": ended[0] if ends else None,
+            "terminated": ended[0] if can_end else None,
             "incidents": incidents,
         }
         kept = {name: value for name, value in kept.items() if name in keep}
@@ -255,7 +242,7 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
     carry = (
         split_state(x0),
         first,
-        (jnp.zeros((), bool), jnp.zeros((), int)) if ends else None,
+        (jnp.zeros((), bool), jnp.zeros((), int)) if can_end else None,
         None if "costs" in keep else jnp.zeros((), dtype),
     )
     inputs = (jnp.arange(horizon), w, noise)
@@ -264,12 +251,14 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
     final_state = join_state(parts, size)
 
     def over_time(name: str, size: int, last: Any = ()) -> Any:
-        found = kept.get(name)
-        if size == 0 and found is not None:
-            return jnp.zeros((horizon, 0), dtype)
-        return None if found is None else stack_steps(found, size, last)
+        values = kept.get(name)
+        if values is None:
+            return None
+        return (
+            stack_steps(values, size, last) if size else jnp.zeros((horizon, 0), dtype)
+        )
 
-    length = jnp.asarray(horizon) if ended is None else ended[1]
+    has_ended, length = ended or (jnp.zeros((), bool), jnp.asarray(horizon))
     end = (length * dt).astype(dtype)
     final_cost = jnp.asarray(env.cost.final(end, final_state), dtype)
     if final_cost.shape != ():
@@ -280,8 +269,8 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
     costs = kept.get("costs")
     total_cost = (jnp.sum(costs) if total is None else total) + final_cost
     finite = jnp.all(jnp.isfinite(final_state)) & jnp.isfinite(total_cost)
-    outcome = choose(finite, RESULTS.successful, RESULTS.diverged)
-    outcome = first_failure(outcome, outcome_of(tallies(last), tallies(first)))
+    result = choose(finite, RESULTS.successful, RESULTS.diverged)
+    result = first_failure(result, controller_result(tallies(last), tallies(first)))
     return Trajectory(
         states=over_time("states", size, parts),
         controls=over_time("controls", env.control_size),
@@ -290,8 +279,8 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
         final_cost=final_cost,
         total_cost=total_cost,
         length=length,
-        ended=jnp.zeros((), bool) if ended is None else ended[0],
-        result=first_failure(first_of(results), outcome),
+        ended=has_ended,
+        result=first_failure(first_of(results), result),
         dt=dt,
         steps=horizon,
         keep=keep,
@@ -301,24 +290,16 @@ def _rollout(env, controller, key, x0, w, decay, truncate, horizon, keep, checkp
         recorded_terminated=kept.get("terminated"),
         incidents=kept.get("incidents"),
         controller_state=last if "controller_state" in keep else None,
-        disturbance_size=env.disturbance_size,
-        state_names=dynamics.state_names,
-        control_names=dynamics.control_names,
-        state_units=dynamics.state_units,
-        control_units=dynamics.control_units,
-        time_unit=dynamics.time_unit,
+        **plant_fields(dynamics),
     )
 
 
 def _cut(now, tree):
     """`tree` without its derivatives where `now` holds."""
 
-    def one(leaf):
-        if not eqx.is_inexact_array(leaf):
-            return leaf
-        return jnp.where(now, lax.stop_gradient(leaf), leaf)
-
-    return jax.tree.map(one, tree)
+    real, rest = eqx.partition(tree, eqx.is_inexact_array)
+    cut = lambda leaf: jnp.where(now, lax.stop_gradient(leaf), leaf)
+    return eqx.combine(jax.tree.map(cut, real), rest)
 
 
 def _scan(body, carry, inputs, horizon, checkpoint):
@@ -343,15 +324,3 @@ def _scan(body, carry, inputs, horizon, checkpoint):
         carry, last = lax.scan(inner, carry, tail)
         kept = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), kept, last)
     return carry, kept
-
-
-def _check_control(controller, u, env) -> None:
-    """Raise, with names, unless the controller returned a control of the right size."""
-    integer = env.actions is not None and jnp.issubdtype(
-        jnp.result_type(u), jnp.integer
-    )
-    if not integer and jnp.shape(u) != (env.control_size,):
-        raise ValueError(
-            f"{type(controller).__name__}: returned a control of shape {jnp.shape(u)}, "
-            f"but the environment takes shape ({env.control_size},)."
-        )

@@ -10,8 +10,10 @@ from jaxtyping import Array
 
 from .._check import (
     as_number,
+    as_rows,
     as_vector,
     check_bool,
+    check_choice,
     check_count,
     check_finite,
     check_key,
@@ -21,35 +23,23 @@ from .._controller import AbstractController, tallies
 from .._results import choose, first_failure, RESULTS
 from .._typing import PRNGKey
 from ..dynamics._solvers import (
-    check_adaptive,
-    check_fixed_step,
-    check_solver,
-    check_stepsize_controller,
+    check_method,
     for_fixed_steps,
-    loud,
-    outcome,
+    raise_on_failure,
+    solve_result,
 )
 from ..dynamics._start import Start
 from ..math._steps import check_steps
 from ..systems import AbstractSystem
-from ._answer import outcome_of
-from ._hold import (
-    check_control,
-    field,
-    Hold,
-    Inputs,
-    interval_before,
-    Recorded,
-    recorded,
-)
-from ._horizon import (
+from ._controller_calls import check_control, controller_result
+from ._hold import field, Hold, Inputs, interval_before, Recorded, recorded
+from ._simulate_checks import (
     as_save_times,
-    as_sequence,
-    check_adjoint_fits,
+    check_adjoint,
     check_system,
     count_intervals,
 )
-from ._trajectory import checked, Trajectory
+from ._trajectory import checked, plant_fields, Trajectory
 
 
 def simulate(
@@ -170,9 +160,8 @@ def simulate(
         ```
     """
     where = "simulate"
-    check_system(system, where)
-    if hold not in ("zero", None):
-        raise ValueError(f"{where}: hold must be 'zero' or None, got {hold!r}.")
+    check_system(system, w, where)
+    check_choice(hold, ("zero", None), "hold", where)
     check_bool(throw, "throw", where)
     x0 = as_vector(x0, system.state_size, "x0", where)
     check_finite(x0, "x0", where)
@@ -184,25 +173,20 @@ def simulate(
         raise ValueError(f"{where}: t1 must be above t0, got t0 = {t0}, t1 = {t1}.")
     source = controller_or_controls
     if not callable(source):
-        source = as_sequence(
-            source, system.control_size, "controller_or_controls", where
-        )
+        name = "controller_or_controls"
+        source = as_rows(source, system.control_size, name, where)
+        check_finite(source, name, where)
         if hold is None:
             raise ValueError(
                 f"{where}: hold=None needs a controller or a function of time; an "
                 "array of controls is held, hold='zero'."
             )
     if w is not None:
-        if not system.disturbance_names:
-            raise ValueError(
-                f"{where}: w cannot be given, as {type(system).__name__} names no "
-                "disturbances: w would be added to the state after each interval, "
-                "which one solve cannot do. Use `delucax.open_loop` or "
-                "`delucax.rollout` with delucax.Discretized(system, dt)."
-            )
-        w = as_sequence(w, system.disturbance_size, "w", where)
+        w = as_rows(w, system.disturbance_size, "w", where)
+        check_finite(w, "w", where)
     substeps = check_count(substeps, "substeps", where)
     adaptive = stepsize_controller is not None
+    sampled = hold == "zero" and isinstance(source, AbstractController)
     steps = count_intervals(t0, t1, dt, source, w, where)
     if steps is None and (hold == "zero" or not adaptive or ts is None):
         raise ValueError(
@@ -214,69 +198,32 @@ def simulate(
         ts = as_save_times(ts, t0, t1, where)
     check_steps((steps or 1) * substeps, x0.dtype, "the horizon", where)
     solver = diffrax.Tsit5() if solver is None else solver
-    check_solver(solver, where)
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-    check_adjoint_fits(adjoint, adaptive, hold, source, where)
-    if adaptive:
-        check_stepsize_controller(stepsize_controller, where)
-        if substeps != 1:
-            raise ValueError(
-                f"{where}: substeps must be 1 with a stepsize_controller, which "
-                f"chooses the steps, got {substeps}."
-            )
-        check_adaptive(solver, where)
-        most = max(4096, 64 * (steps or 0)) if max_steps is None else max_steps
-        max_steps = check_count(most, "max_steps", where)
-    else:
-        if max_steps is not None:
-            raise ValueError(
-                f"{where}: max_steps needs stepsize_controller; with fixed steps give "
-                "substeps."
-            )
-        check_fixed_step(solver, where)
+    check_method(solver, stepsize_controller, substeps, max_steps, where)
+    check_adjoint(adjoint, adaptive, sampled, where)
+    if not adaptive:
         max_steps = (steps or 1) * substeps
-    if progress_meter is None:
-        progress_meter = diffrax.NoProgressMeter()
+    elif max_steps is None:
+        max_steps = max(4096, 64 * (steps or 0))
+    options = dict(
+        solver=solver,
+        stepsize_controller=stepsize_controller,
+        adjoint=adjoint,
+        max_steps=check_count(max_steps, "max_steps", where),
+        progress_meter=progress_meter or diffrax.NoProgressMeter(),
+    )
+    start = jnp.asarray(t0, x0.dtype)
+    # The length of the horizon before its ends are rounded, if they are known.
+    length = jnp.asarray(t1 - t0, x0.dtype)
     trajectory = _simulate(
-        system,
-        source,
-        w,
-        x0,
-        jnp.asarray(t0, x0.dtype),
-        # Before they are rounded, if they are known.
-        jnp.asarray(t1 - t0, x0.dtype),
-        ts,
-        key,
-        solver,
-        stepsize_controller,
-        adjoint,
-        progress_meter,
-        steps,
-        substeps,
-        max_steps,
-        hold,
+        system, source, w, x0, start, length, ts, key, hold, steps, substeps, options
     )
     return checked(trajectory, where) if throw else trajectory
 
 
 @eqx.filter_jit
 def _simulate(
-    system,
-    source,
-    w,
-    x0,
-    t0,
-    length,
-    ts,
-    key,
-    solver,
-    stepsize_controller,
-    adjoint,
-    progress_meter,
-    steps,
-    substeps,
-    max_steps,
-    hold,
+    system, source, w, x0, t0, length, ts, key, hold, steps, substeps, options
 ):
     # The solve's own time is from 0 to `length`, which is not rounded to what `t0` is.
     dtype = x0.dtype
@@ -288,89 +235,39 @@ def _simulate(
         switches = grid[::substeps]
     saves: Any = switches if ts is None else _since(t0, ts.astype(dtype), grid, length)
     times: Any = t0 + saves if ts is None else ts.astype(dtype)
+    count = times.shape[0]
 
     sampled = hold == "zero" and isinstance(source, AbstractController)
-    controls: Any = None
-    memory: Any = None
-    u: Any = None
-    if isinstance(source, AbstractController):
-        memory = source.init(key=key)
-        if hold is None and jax.tree.leaves(memory):
-            raise ValueError(
-                f"simulate: hold=None needs a controller without a state of its own, "
-                f"got {type(source).__name__}, whose state is only defined from one "
-                "sample to the next; use hold='zero' with dt."
-            )
-        # The solve's loop keeps the types that it starts with: no weak ones.
-        memory = jax.tree.map(
-            lambda a: jnp.asarray(a, a.dtype) if eqx.is_array(a) else a, memory
-        )
-    elif not callable(source):
-        controls = source
-    elif hold == "zero":
-        controls = jax.vmap(source)(t0 + switches[:-1])
-        check_control(controls[0], source, system)
-    if controls is not None:
-        controls, source = controls.astype(dtype), None
-    index = jnp.zeros((), jnp.int32)
-    args = Inputs(system, Start(t0), source, memory, controls, w, index, u)
+    args = _inputs(system, source, w, x0, t0, switches, key, hold)
     if sampled:
-        u, _ = args.act(grid[0], x0, eqx.filter(memory, eqx.is_array))
+        u, _ = args.act(grid[0], x0, eqx.filter(args.memory, eqx.is_array))
         args = eqx.tree_at(lambda a: a.u, args, u, is_leaf=lambda leaf: leaf is None)
-
     start = Start(t0, lambda t: args.field(t, x0))
     args = eqx.tree_at(lambda a: a.start, args, start)
 
-    held = hold == "zero" or w is not None
-
-    def fitted(solver):
-        return Hold(solver, switches, sampled) if held else solver
-
-    def clipped(controller):
-        if not held or steps == 1:
-            return controller
-        return diffrax.ClipStepSizeController(controller, step_ts=switches[1:-1])
-
-    if stepsize_controller is None:
-        stepsize_controller = diffrax.StepTo(grid)
-        if isinstance(solver, diffrax.AbstractImplicitSolver):
-            solver = for_fixed_steps(solver)
-    else:
-        stepsize_controller = clipped(stepsize_controller)
-    if isinstance(adjoint, diffrax.BacksolveAdjoint):
-        backwards = dict(adjoint.kwargs)
-        for name, fit in (("solver", fitted), ("stepsize_controller", clipped)):
-            if name in backwards:
-                backwards[name] = fit(backwards[name])
-        adjoint = diffrax.BacksolveAdjoint(**backwards)
     saved: dict[str, Any] = (
         dict(t0=True, ts=saves[1:]) if ts is None else dict(t1=True, ts=saves)
     )
     if sampled:
         saved["fn"] = recorded
+    held = hold == "zero" or w is not None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
-        fitted(solver),
-        jnp.zeros((), dtype),
-        length,
+        t0=jnp.zeros((), dtype),
+        t1=length,
         dt0=None,
         y0=x0,
         args=args,
         saveat=diffrax.SaveAt(**saved),
-        stepsize_controller=stepsize_controller,
-        adjoint=loud(adjoint),
-        max_steps=max_steps,
-        progress_meter=progress_meter,
         throw=False,
+        **_with_switches(options, held, sampled, grid, switches),
     )
     states: Any = solution.ys
     applied: Any = None
     counts: dict[str, Any] = {}
     if isinstance(states, Recorded):
         states, applied, counts = states
-    final_state = states[-1]
-    count = times.shape[0]
-    states = states[:count]
+    final_state, states = states[-1], states[:count]
 
     def before(held):
         """Of a held sequence, what is in force just before each time but the first."""
@@ -380,20 +277,19 @@ def _simulate(
 
     if applied is not None:
         controls = applied[1:count]
-    elif controls is not None:
-        controls = before(controls)
+    elif args.controls is not None:
+        controls = before(args.controls)
     else:
         controls = jax.vmap(args.control)(times[:-1], states[:-1])
     finite = jnp.all(jnp.isfinite(final_state))
-    result = outcome(solution, stepsize_controller, dtype)
     diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
-    last = {name: totals[-1] for name, totals in counts.items()}
+    result = solve_result(solution, options["stepsize_controller"], dtype)
     result = first_failure(result, diverged)
-    result = first_failure(result, outcome_of(last, tallies(memory)))
+    last = {name: totals[-1] for name, totals in counts.items()}
+    result = first_failure(result, controller_result(last, tallies(args.memory)))
     sensor = None
-    if type(system).observe is not AbstractSystem.observe:
+    if not system.observes_state:
         sensor = jax.vmap(system.observe)(times[:-1], states[:-1])
-    spacing = length / steps if ts is None else (times[-1] - times[0]) / (count - 1)
     return Trajectory(
         states=states,
         controls=controls,
@@ -404,7 +300,7 @@ def _simulate(
         length=jnp.asarray(count - 1),
         ended=jnp.zeros((), bool),
         result=result,
-        dt=spacing,
+        dt=length / steps if ts is None else (times[-1] - times[0]) / (count - 1),
         recorded_times=times,
         recorded_observations=sensor,
         recorded_disturbances=before(w),
@@ -416,13 +312,60 @@ def _simulate(
         steps=count - 1,
         # There is no cost to keep, which is not to have left it out.
         keep=("states", "observations", "controls", "disturbances", "costs"),
-        disturbance_size=system.disturbance_size,
-        state_names=system.state_names,
-        control_names=system.control_names,
-        state_units=system.state_units,
-        control_units=system.control_units,
-        time_unit=system.time_unit,
+        **plant_fields(system),
     )
+
+
+def _inputs(system, source, w, x0, t0, switches, key, hold) -> Inputs:
+    """What the solve's vector field takes, before a controller is first asked."""
+    controls: Any = None
+    memory: Any = None
+    if isinstance(source, AbstractController):
+        memory = source.init(key=key)
+        if hold is None and jax.tree.leaves(memory):
+            raise ValueError(
+                f"simulate: hold=None needs a controller without a state of its own, "
+                f"got {type(source).__name__}, whose state is only defined from one "
+                "sample to the next; use hold='zero' with dt."
+            )
+        # The solve's loop keeps the types that it starts with: no weak ones.
+        strong = lambda a: jnp.asarray(a, a.dtype) if eqx.is_array(a) else a
+        memory = jax.tree.map(strong, memory)
+    elif not callable(source):
+        controls = source
+    elif hold == "zero":
+        controls = jax.vmap(source)(t0 + switches[:-1])
+        check_control(controls[0], source, system.control_size, "system")
+    if controls is not None:
+        controls, source = controls.astype(x0.dtype), None
+    index = jnp.zeros((), jnp.int32)
+    return Inputs(system, Start(t0), source, memory, controls, w, index, None)
+
+
+def _with_switches(options, held: bool, sampled: bool, grid, switches):
+    """The options of a solve whose steps end at the switches of what is held."""
+
+    def fitted(options):
+        options = dict(options)
+        if held and "solver" in options:
+            options["solver"] = Hold(options["solver"], switches, sampled)
+        controller = options.get("stepsize_controller")
+        if held and controller is not None and switches.shape[0] > 2:
+            clipped = diffrax.ClipStepSizeController(controller, step_ts=switches[1:-1])
+            options["stepsize_controller"] = clipped
+        return options
+
+    solver, adjoint = options["solver"], options["adjoint"]
+    fixed = options["stepsize_controller"] is None
+    if fixed and isinstance(solver, diffrax.AbstractImplicitSolver):
+        solver = for_fixed_steps(solver)
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        adjoint = diffrax.BacksolveAdjoint(**fitted(adjoint.kwargs))
+    adjoint = raise_on_failure(adjoint)
+    options = fitted(options | dict(solver=solver, adjoint=adjoint))
+    if fixed:
+        options["stepsize_controller"] = diffrax.StepTo(grid)
+    return options
 
 
 def _since(t0: Array, ts: Array, grid: Array | None, length: Array) -> Array:

@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 from .._check import is_concrete
 from .._extras import extra
 from .._results import choose, INCIDENTS, Result, RESULTS
+from ..systems import AbstractPlant
 
 
 if TYPE_CHECKING:
@@ -144,16 +145,13 @@ class Trajectory(eqx.Module):
     @property
     def incident_times(self) -> dict[str, Array]:
         """When each of `incidents` happened first; NaN where it never did."""
-        return {
-            name: jnp.where(
-                jnp.any(now, -1),
-                jnp.take_along_axis(
-                    self.times, jnp.argmax(now, -1, keepdims=True), axis=-1
-                )[..., 0],
-                jnp.nan,
-            )
-            for name, now in self._incidents().items()
-        }
+
+        def first(now):
+            k = jnp.argmax(now, -1, keepdims=True)
+            time = jnp.take_along_axis(self.times, k, axis=-1)[..., 0]
+            return jnp.where(jnp.any(now, -1), time, jnp.nan)
+
+        return {name: first(now) for name, now in self._incidents().items()}
 
     def _incidents(self) -> dict[str, Array]:
         if self.incidents is None:
@@ -195,13 +193,9 @@ class Trajectory(eqx.Module):
                 "keep= without them."
             )
 
-        def ends(leaf):
-            return None if leaf is None else leaf[start : stop + 1]
-
-        def steps(leaf):
-            return None if leaf is None else leaf[start:stop]
-
-        costs = steps(self.costs)
+        ends = lambda tree: jax.tree.map(lambda leaf: leaf[start : stop + 1], tree)
+        steps = lambda tree: jax.tree.map(lambda leaf: leaf[start:stop], tree)
+        costs, incidents = steps(self.costs), steps(self.incidents)
         is_end = stop == self.steps
         final_cost = self.final_cost if is_end else jnp.zeros_like(self.final_cost)
         return dataclasses.replace(
@@ -214,12 +208,12 @@ class Trajectory(eqx.Module):
             total_cost=final_cost if costs is None else jnp.sum(costs) + final_cost,
             length=jnp.clip(self.length - start, 0, stop - start),
             ended=self.ended & (self.length <= stop),
-            result=_result_of(self.result, jax.tree.map(steps, self.incidents)),
+            result=_result_of(self.result, incidents),
             recorded_times=ends(self.times),
             recorded_observations=steps(self.recorded_observations),
             recorded_disturbances=steps(self.recorded_disturbances),
             recorded_terminated=steps(self.recorded_terminated),
-            incidents=jax.tree.map(steps, self.incidents),
+            incidents=incidents,
             controller_state=self.controller_state if is_end else None,
             steps=stop - start,
         )
@@ -246,14 +240,13 @@ class Trajectory(eqx.Module):
             columns[name] = np.broadcast_to(index, shape)
         columns["time"] = np.broadcast_to(self.times, shape)
 
-        def put(kind, names, array, pad):
+        def put(kind, names, array):
             if array is None:
                 return
             array = np.asarray(array)
-            if pad:
-                width = [(0, 0)] * array.ndim
-                width[len(axes)] = (0, 1)
-                array = np.pad(array, width, constant_values=np.nan)
+            width = [(0, 0)] * array.ndim
+            width[-2] = (0, shape[-1] - array.shape[-2])
+            array = np.pad(array, width, constant_values=np.nan)
             for i, name in enumerate(names):
                 # Names are the user's: two may be the same, or one of ours.
                 name = f"{kind} {name}" if name in columns else name
@@ -261,13 +254,11 @@ class Trajectory(eqx.Module):
                 columns[name] = array[..., i]
 
         cost = None if self.costs is None else self.costs[..., None]
-        put("", ["cost"], cost, pad=True)
-        put("state", self.state_names, self.states, pad=False)
-        put("control", self.control_names, self.controls, pad=True)
-        if self.disturbances is not None:
-            size = self.disturbances.shape[-1]
-            names = [f"w{i}" for i in range(size)]
-            put("disturbance", names, self.disturbances, pad=True)
+        put("", ["cost"], cost)
+        put("state", self.state_names, self.states)
+        put("control", self.control_names, self.controls)
+        names = [f"w{i}" for i in range(self.disturbance_size)]
+        put("disturbance", names, self.disturbances)
         if "cost" in columns:
             columns["cost"] = columns.pop("cost")  # the last column
         return pd.DataFrame({k: np.ravel(v) for k, v in columns.items()})
@@ -356,8 +347,15 @@ def _result_of(result: Result, incidents: dict[str, Array] | None) -> Result:
     return result
 
 
+def plant_fields(plant: AbstractPlant) -> dict[str, Any]:
+    """The fields of a trajectory that its plant gives."""
+    names = ("disturbance_size", "state_names", "control_names")
+    names += ("state_units", "control_units", "time_unit")
+    return {name: getattr(plant, name) for name in names}
+
+
 def checked(trajectory: Trajectory, where: str) -> Trajectory:
-    """Raise if the trajectory failed: now if it can be seen, else at run time."""
+    """Raise if the trajectory failed: now if its values are known, else at run time."""
     failed = trajectory.failed
     if not is_concrete(failed):
         # A random key in the controller's state is no argument of a run-time check.

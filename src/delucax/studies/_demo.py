@@ -97,21 +97,18 @@ def demo(
     say(f"\nMLP by gradient descent through the ODE, {seeds} seeds")
     evaluate = eqx.filter_jit(_evaluate)
     starts = jax.vmap(env.reset)(jax.random.split(jax.random.key(2**20), STARTS))
-    seconds, held = [], []
+    seconds = []
     for seed in range(seeds):
         begin = time.perf_counter()
         fitted = train_swing_up(env, key=jax.random.key(seed), steps=steps)
         seconds.append(time.perf_counter() - begin)
-        policy = fitted.model
-        runs = evaluate(env, policy, starts)
-        held.append(int(jnp.sum(holds_upright(runs))))
+        held = int(jnp.sum(holds_upright(evaluate(env, fitted.model, starts))))
         first = "" if seed else ", compilation included"
         say(
             f"  seed {seed}: {seconds[-1]:.1f} s{first}; swings up and holds from "
-            f"{held[-1]} of {STARTS} starts"
+            f"{held} of {STARTS} starts"
         )
-        if seed == 0:
-            controllers["MLP"] = policy
+        controllers.setdefault("MLP", fitted.model)
 
     disturbed = pendulum(disturbance=_SHOCK)
     rows, shown = [], {}

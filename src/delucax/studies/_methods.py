@@ -10,24 +10,9 @@ import numpy as np
 import optax
 from jaxtyping import Array
 
+from .. import controllers
 from .._controller import AbstractController
-from ..controllers import (
-    Adaptive,
-    BPC,
-    Deep,
-    DRC,
-    DSC,
-    FiniteHorizonLQR,
-    GPC,
-    GRU,
-    HInfinity,
-    LeakyPID,
-    LQR,
-    MPC,
-    NeuralGPC,
-    SFC,
-    Zero,
-)
+from ..controllers import mlp_policy
 from ..costs import AbstractCost, Function
 from ..disturbances import Gaussian
 from ..dynamics import linearize
@@ -65,16 +50,12 @@ def task_of(name: str) -> Environment:
         return make(name, width=8, key=jax.random.key(0))
     if name != "lds":
         return make(name)
-    box = UniformState(-jnp.ones(4), jnp.ones(4))
-    return make(
-        name,
-        key=jax.random.key(0),
-        states=4,
-        controls=2,
-        spectral_radius=1.05,
-        initial_state=box,
-        disturbance=Gaussian(0.1, size=4),
-    )
+    options: dict[str, Any] = {
+        "initial_state": UniformState(-jnp.ones(4), jnp.ones(4)),
+        "disturbance": Gaussian(0.1, size=4),
+        "spectral_radius": 1.05,
+    }
+    return make(name, key=jax.random.key(0), states=4, controls=2, **options)
 
 
 @functools.cache
@@ -110,7 +91,7 @@ def _following(name: str) -> Any:
     waveform = getattr(env.cost, "waveform", None)
     if waveform is None:
         raise Unsuitable("the cost follows no waveform")
-    return Breathing(LeakyPID(dt=env.dt, reference=waveform), waveform)
+    return Breathing(controllers.LeakyPID(dt=env.dt, reference=waveform), waveform)
 
 
 def _learning(name: str, learner: Callable[..., Any], **options: Any) -> Any:
@@ -131,7 +112,7 @@ def _receding(name: str, kind: type[AbstractPlanner], **options: Any) -> Any:
         width = high - low
         options["scale"] = np.where(np.isfinite(width), width / 4, 1.0)
     how: dict[str, Any] = {"planner": kind(**options), "bounds": bounds, "throw": False}
-    return MPC(env.dynamics, _with_cost_to_go(name), LOOKAHEAD, **how)
+    return controllers.MPC(env.dynamics, _with_cost_to_go(name), LOOKAHEAD, **how)
 
 
 def _with_cost_to_go(name: str) -> AbstractCost:
@@ -163,7 +144,7 @@ def _gru(env: Environment, key: Any) -> Any:
     bounds = env.control_bounds
     if bounds is not None and not np.all(np.isfinite(bounds)):
         bounds = None
-    return GRU(*sizes, 32, features=env.encode, bounds=bounds, key=key)
+    return controllers.GRU(*sizes, 32, features=env.encode, bounds=bounds, key=key)
 
 
 def _by_actor_critic(name: str, method: type[PPO] | type[SHAC]) -> Any:
@@ -191,22 +172,26 @@ def _fitted(loss: Any, model: Any, steps: int, key: Any) -> Any:
 
 FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
     "Feedback": {
-        "zero": lambda name: Zero(task_of(name).control_size),
+        "zero": lambda name: controllers.Zero(task_of(name).control_size),
         "PID": _following,
-        "LQR": lambda name: _regulator(name, LQR),
+        "LQR": lambda name: _regulator(name, controllers.LQR),
         "FiniteHorizonLQR": lambda name: _regulator(
-            name, FiniteHorizonLQR, horizon=task_of(name).horizon
+            name, controllers.FiniteHorizonLQR, horizon=task_of(name).horizon
         ),
-        "HInfinity": lambda name: _regulator(name, HInfinity),
+        "HInfinity": lambda name: _regulator(name, controllers.HInfinity),
     },
     "Online learning": {
-        "GPC": lambda name: _learning(name, GPC),
-        "Adaptive": lambda name: Adaptive(agent_of(name, "GPC")),
-        "NeuralGPC": lambda name: _learning(name, NeuralGPC, key=jax.random.key(0)),
-        "DRC": lambda name: _learning(name, DRC),
-        "SFC": lambda name: _learning(name, SFC),
-        "DSC": lambda name: _learning(name, DSC),
-        "BPC": lambda name: BPC(task_of(name).dynamics, agent_of(name, "LQR")),
+        "GPC": lambda name: _learning(name, controllers.gpc),
+        "Adaptive": lambda name: controllers.Adaptive(agent_of(name, "GPC")),
+        "NeuralGPC": lambda name: _learning(
+            name, controllers.neural_gpc, key=jax.random.key(0)
+        ),
+        "DRC": lambda name: _learning(name, controllers.drc),
+        "SFC": lambda name: _learning(name, controllers.sfc),
+        "DSC": lambda name: _learning(name, controllers.dsc),
+        "BPC": lambda name: controllers.BPC(
+            task_of(name).dynamics, agent_of(name, "LQR")
+        ),
     },
     "Planning": {
         "MPC": lambda name: _receding(name, ILQR, max_iterations=8),
@@ -214,8 +199,8 @@ FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
         "CEM": lambda name: _receding(name, CEM, samples=128, iterations=3),
     },
     "Training": {
-        "affine": lambda name: _by_gradient(name, Deep, width=1, depth=0),
-        "MLP": lambda name: _by_gradient(name, Deep, width=32, depth=1),
+        "affine": lambda name: _by_gradient(name, mlp_policy, width=1, depth=0),
+        "MLP": lambda name: _by_gradient(name, mlp_policy, width=32, depth=1),
         "GRU": lambda name: _by_gradient(name, _gru),
         "SHAC": lambda name: _by_actor_critic(name, SHAC),
         "PPO": lambda name: _by_actor_critic(name, PPO),

@@ -1,7 +1,7 @@
 """Every task crossed with the controllers that suit it.
 
-`python -m delucax run scoreboard` runs it for whoever wants to see; `python -m
-benchmarks.scoreboard` runs it for the committed results and their page.
+`python -m delucax run scoreboard` runs it; `python -m benchmarks.scoreboard` makes the
+committed results and their page.
 """
 
 import functools
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..controllers import Sequence, Zero
+from ..controllers import OpenLoop, Zero
 from ..environments import Environment
 from ..experiments import experiment
 from ..planning import ilqr
@@ -42,23 +42,17 @@ def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
     for agent in (Zero(env.control_size), *guides):
         run: Any = rollout(env, agent, key=key, throw=False)
         guess = jnp.nan_to_num(run.controls)
-        plan = ilqr(
-            env.dynamics,
-            env.cost,
-            run.states[0],
-            guess,
-            w=run.disturbances if env.disturbance_size else None,
-            bounds=env.control_bounds,
-            max_iterations=100,
-            throw=False,
-        )
+        w = run.disturbances if env.disturbance_size else None
+        options: Any = dict(w=w, bounds=env.control_bounds, throw=False)
+        problem = env.dynamics, env.cost, run.states[0], guess
+        plan = ilqr(*problem, max_iterations=100, **options)
         for controls in (guess, plan.controls):
-            cost = float(_cost(env, Sequence(controls), key))
+            cost = float(_cost(env, OpenLoop(controls), key))
             if np.isfinite(cost) and cost < least:
                 best, least = controls, cost
     if best is None:
         raise Unsuitable("no plan was found")
-    return Sequence(best)
+    return OpenLoop(best)
 
 
 def _suited(task: str, method: str) -> Any:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 
 from .._module import replace
 from .._typing import PRNGKey
-from ..controllers import Deep
+from ..controllers import mlp_policy
 from ..environments import Environment, pendulum
 from ..math import wrap
 from ..simulation import Trajectory
@@ -56,20 +56,10 @@ def train_swing_up(
     """
     environment = pendulum() if environment is None else environment
     init_key, fit_key = jax.random.split(key)
-    policy = Deep(environment, width=32, depth=1, key=init_key)
-    return fit(
-        expected_cost(
-            spread_starts(environment),
-            batch=BATCH,
-            horizon=HORIZON,
-            gradient_decay=0.92,
-        ),
-        policy,
-        _optimiser(steps),
-        steps,
-        key=fit_key,
-        progress=progress,
-    )
+    policy = mlp_policy(environment, width=32, depth=1, key=init_key)
+    starts = spread_starts(environment)
+    loss = expected_cost(starts, batch=BATCH, horizon=HORIZON, gradient_decay=0.92)
+    return fit(loss, policy, _optimiser(steps), steps, key=fit_key, progress=progress)
 
 
 def spread_starts(environment: Environment) -> Environment:

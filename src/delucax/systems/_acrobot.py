@@ -9,7 +9,8 @@ from jaxtyping import Array
 
 from .._check import check_choice
 from .._module import parameter, positive
-from ..math import cos, sin, wrap
+from .._typing import Control, Disturbance, State, Time
+from ..math import cos, sin
 from ._base import AbstractSystem
 
 
@@ -73,6 +74,7 @@ class Acrobot(AbstractSystem):
     form: str = eqx.field(static=True, default="book")
 
     state_names: ClassVar = ("angle_1", "angle_2", "velocity_1", "velocity_2")
+    angle_names: ClassVar = ("angle_1", "angle_2")
     control_names: ClassVar = ("torque",)
     disturbance_names: ClassVar = ("push",)
     state_units: ClassVar = ("rad", "rad", "rad/s", "rad/s")
@@ -81,7 +83,7 @@ class Acrobot(AbstractSystem):
     def __check_init__(self):
         check_choice(self.form, ("book", "nips"), "form", "Acrobot")
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         m1, m2, l1 = self.mass_1, self.mass_2, self.length_1
         c1, c2, g = self.center_1, self.center_2, self.gravity
         angle_1, angle_2, velocity_1, velocity_2 = x[0], x[1], x[2], x[3]
@@ -102,11 +104,5 @@ class Acrobot(AbstractSystem):
         acceleration_1 = -(d2 * acceleration_2 + phi1) / d1
         return jnp.stack([velocity_1, velocity_2, acceleration_1, acceleration_2])
 
-    def difference(self, x, x_ref):
-        deviation = x - x_ref
-        return jnp.stack(
-            [wrap(deviation[0]), wrap(deviation[1]), deviation[2], deviation[3]]
-        )
-
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         return jnp.array([np.pi, 0.0, 0.0, 0.0]), jnp.zeros(1)

@@ -1,14 +1,13 @@
 """The continuous-time system: a vector field and its names."""
 
 import abc
-from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
+import jax
 from jaxtyping import Array
 
+from .._check import output_of
 from .._module import check_parameters
-from .._typing import Control, Disturbance, RealScalar, State
+from .._typing import Control, Disturbance, State, Time
 from ._plant import AbstractPlant, Noise
 
 
@@ -21,6 +20,7 @@ class AbstractSystem(AbstractPlant):
     **Class attributes** (or properties, where they depend on a field):
 
     - `state_names`, `control_names`: tuples of strings.
+    - `angle_names`: those of the states that `difference` wraps; none by default.
     - `disturbance_names`: tuple of strings, empty by default. If it is empty then `w`
         has the size of the state and is added to the next state by the discrete
         dynamics; otherwise `w` enters the vector field, and is held over a step.
@@ -54,15 +54,21 @@ class AbstractSystem(AbstractPlant):
     """
 
     def __check_init__(self):
-        for name in ("state_names", "control_names", "disturbance_names"):
-            names = getattr(self, name)
+        where = type(self).__name__
+        for kind in ("state", "angle", "control", "disturbance"):
+            names = getattr(self, f"{kind}_names")
             if isinstance(names, str) or not isinstance(names, tuple | list):
                 raise ValueError(
-                    f"{type(self).__name__}: {name} must be a tuple of strings, such "
-                    f"as ('angle', 'velocity'), got {names!r}."
+                    f"{where}: {kind}_names must be a tuple of strings, such as "
+                    f"('angle', 'velocity'), got {names!r}."
                 )
         if not self.state_names:
-            raise ValueError(f"{type(self).__name__}: state_names must not be empty.")
+            raise ValueError(f"{where}: state_names must not be empty.")
+        if not set(self.angle_names) <= set(self.state_names):
+            raise ValueError(
+                f"{where}: angle_names must be among state_names, "
+                f"{self.state_names}, got {self.angle_names}."
+            )
         check_parameters(self)
 
     @property
@@ -79,9 +85,7 @@ class AbstractSystem(AbstractPlant):
         return super().disturbance_size if motions is None else motions
 
     @abc.abstractmethod
-    def vector_field(
-        self, t: RealScalar, x: State, u: Control, w: Disturbance | None
-    ) -> State:
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         """The time derivative of the state.
 
         **Arguments:**
@@ -105,7 +109,7 @@ class AbstractSystem(AbstractPlant):
         """
         return x
 
-    def diffusion(self, t: RealScalar, x: State, u: Control) -> Array | None:
+    def diffusion(self, t: Time, x: State, u: Control) -> Array | None:
         """The matrix g of `dx = f dt + g dB`; none by default.
 
         If it is given then `w` holds the increments of its k Brownian motions over the
@@ -124,16 +128,11 @@ def brownian_size(system: AbstractSystem) -> int | None:
     """The number of Brownian motions of `system`; `None` if it has no noise inside."""
     if type(system).diffusion is AbstractSystem.diffusion:
         return None
-    t, x, u = (
-        jnp.zeros(()),
-        jnp.zeros(system.state_size),
-        jnp.zeros(system.control_size),
-    )
-    g: Any = eqx.filter_eval_shape(system.diffusion, t, x, u)
+    name, n, names = type(system).__name__, system.state_size, system.disturbance_names
+    g = output_of(system.diffusion, (), (n,), (system.control_size,))
     if g is None:
         return None
-    name, n, names = type(system).__name__, system.state_size, system.disturbance_names
-    shape = getattr(g, "shape", None)
+    shape = g.shape if isinstance(g, jax.ShapeDtypeStruct) else None
     if shape is None or len(shape) not in (1, 2) or shape[0] != n:
         got = f"a {type(g).__name__}" if shape is None else f"shape {shape}"
         raise ValueError(

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import parameter, positive
-from ..math import cos, sin, wrap
+from .._typing import Control, Disturbance, State, Time
+from ..math import cos, sin
 from ._base import AbstractSystem
 
 
@@ -55,6 +56,7 @@ class CartPole(AbstractSystem):
     gravity: Array = parameter(9.8)
 
     state_names: ClassVar = ("position", "velocity", "angle", "spin")
+    angle_names: ClassVar = ("angle",)
     control_names: ClassVar = ("force",)
     state_units: ClassVar = ("m", "m/s", "rad", "rad/s")
     control_units: ClassVar = ("N",)
@@ -76,13 +78,9 @@ class CartPole(AbstractSystem):
         turn = (self.gravity * lean - upright * push) / (self.half_length * inertia)
         return push - moment * turn * upright / total, turn
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         acceleration, turn = self.accelerations(x[2], x[3], u[0])
         return jnp.stack([x[1], acceleration, x[3], turn])
 
-    def difference(self, x, x_ref):
-        deviation = x - x_ref
-        return jnp.stack([deviation[0], deviation[1], wrap(deviation[2]), deviation[3]])
-
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         return jnp.zeros(4), jnp.zeros(1)

@@ -9,6 +9,7 @@ from jaxtyping import Array
 from .._check import is_concrete
 from .._message import shortened
 from .._module import parameter, positive
+from .._typing import Control, Disturbance, State, Time
 from ._base import AbstractSystem
 
 
@@ -70,7 +71,7 @@ class CSTR(AbstractSystem):
     time_unit: ClassVar = "min"
     control_units: ClassVar = ("K",)
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         c, T = x[0], x[1]
         # Nothing reacts near absolute zero, below which a solver's stage may be.
         reaction = self.rate * jnp.exp(-self.activation / jnp.maximum(T, 1.0)) * c
@@ -78,7 +79,7 @@ class CSTR(AbstractSystem):
         warming = self.flow * (self.feed_temperature - T) + self.heat * reaction
         return jnp.stack([dc, warming + self.cooling * (u[0] - T)])
 
-    def equilibrium(self, concentration: Any = 0.5):
+    def equilibrium(self, concentration: Any = 0.5) -> tuple[State, Control]:
         """Where the coolant holds the tank at a concentration.
 
         **Arguments:** `concentration`: of the reactant, between 0 and that of the feed

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import parameter, positive
+from .._typing import Control, Disturbance, State, Time
 from ._base import AbstractSystem
 
 
@@ -42,8 +43,8 @@ class DoubleIntegrator(AbstractSystem):
     state_units: ClassVar = ("m", "m/s")
     control_units: ClassVar = ("N",)
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         return jnp.stack([x[1], u[0] / self.mass])
 
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         return jnp.zeros(2), jnp.zeros(1)

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import parameter, positive
-from ..math import cos, sin, wrap
+from .._typing import Control, Disturbance, State, Time
+from ..math import cos, sin
 from ._base import AbstractSystem
 
 
@@ -62,11 +63,12 @@ class DynamicBicycle(AbstractSystem):
     standstill: Array = parameter(1.0, constraint=positive)
 
     state_names: ClassVar = ("x", "y", "heading", "vx", "vy", "rate")
+    angle_names: ClassVar = ("heading",)
     control_names: ClassVar = ("acceleration", "steering")
     state_units: ClassVar = ("m", "m", "rad", "m/s", "m/s", "rad/s")
     control_units: ClassVar = ("m/s^2", "rad")
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         heading, vx, vy, rate = x[2], x[3], x[4], x[5]
         speed = (vx * vx + self.standstill**2) ** 0.5
         slip_front = jnp.arctan2(vy + self.front * rate, speed) - u[1]
@@ -86,11 +88,7 @@ class DynamicBicycle(AbstractSystem):
             ]
         )
 
-    def difference(self, x, x_ref):
-        d = x - x_ref
-        return jnp.stack([d[0], d[1], wrap(d[2]), d[3], d[4], d[5]])
-
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         """Standing at the origin.
 
         **Returns:** the zero state and control.

@@ -1,11 +1,14 @@
 """A system from a plain function."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY
+from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array
 
 from .._module import function_field, names_of
+from .._typing import Control, Disturbance, State, Time
 from ._base import AbstractSystem
 
 
@@ -30,26 +33,10 @@ class FunctionSystem(AbstractSystem):
     function: Callable[..., Array] = function_field()
     state_names: tuple[str, ...] = eqx.field(static=True)
     control_names: tuple[str, ...] = eqx.field(static=True)
-    _disturbance_names: tuple[str, ...] = eqx.field(static=True)
+    _: KW_ONLY
+    disturbance_names: tuple[str, ...] = eqx.field(static=True, default=())
 
-    def __init__(
-        self,
-        function: Callable[..., Array],
-        state_names: tuple[str, ...],
-        control_names: tuple[str, ...],
-        disturbance_names: tuple[str, ...] = (),
-    ):
-        self.function = function
-        self.state_names = state_names
-        self.control_names = control_names
-        self._disturbance_names = disturbance_names
-
-    @property
-    def disturbance_names(self) -> tuple[str, ...]:
-        """Names of the disturbances."""
-        return self._disturbance_names
-
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> Any:
         return self.function(t, x, u, w)
 
 
@@ -92,5 +79,5 @@ def system(
         f,
         names_of(states, "x", "states", "system"),
         names_of(controls, "u", "controls", "system"),
-        names_of(disturbances, "w", "disturbances", "system"),
+        disturbance_names=names_of(disturbances, "w", "disturbances", "system"),
     )

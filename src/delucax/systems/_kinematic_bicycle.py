@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import parameter, positive
-from ..math import cos, sin, wrap
+from .._typing import Control, Disturbance, State, Time
+from ..math import cos, sin
 from ._base import AbstractSystem
 
 
@@ -46,11 +47,12 @@ class KinematicBicycle(AbstractSystem):
     rear: Array = parameter(1.738, constraint=positive)
 
     state_names: ClassVar = ("x", "y", "heading", "speed")
+    angle_names: ClassVar = ("heading",)
     control_names: ClassVar = ("acceleration", "steering")
     state_units: ClassVar = ("m", "m", "rad", "m/s")
     control_units: ClassVar = ("m/s^2", "rad")
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         share = self.rear / (self.front + self.rear)
         tangent = share * sin(u[1]) / cos(u[1])
         # Cosine and sine of the slip angle, from its tangent.
@@ -66,11 +68,7 @@ class KinematicBicycle(AbstractSystem):
             ]
         )
 
-    def difference(self, x, x_ref):
-        d = x - x_ref
-        return jnp.stack([d[0], d[1], wrap(d[2]), d[3]])
-
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         """Standing at the origin; a standing car is not controllable.
 
         **Returns:** the zero state and control.

@@ -1,12 +1,13 @@
 """The continuous-time linear system."""
 
+from dataclasses import KW_ONLY
+
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
 
-from .._check import as_matrix, as_vector
+from .._check import as_vector, check_matrices, checked_names
 from .._module import indexed_names, parameter
-from .._typing import Matrix
+from .._typing import Control, Disturbance, Matrix, Observation, State, Time, Vector
 from ..math import matvec
 from ._base import AbstractSystem
 
@@ -43,37 +44,32 @@ class LinearSystem(AbstractSystem):
 
     A: Matrix = parameter()
     B: Matrix = parameter()
-    C: Matrix | None = parameter()
-    E: Matrix | None = parameter()
-    x_ref: Array = parameter()
-    u_ref: Array = parameter()
-    dx_ref: Array = parameter()
-    state_names: tuple[str, ...] = eqx.field(static=True)
-    control_names: tuple[str, ...] = eqx.field(static=True)
+    C: Matrix | None = parameter(None)
+    E: Matrix | None = parameter(None)
+    _: KW_ONLY
+    x_ref: Vector = parameter(None)
+    u_ref: Vector = parameter(None)
+    dx_ref: Vector = parameter(None)
+    # Converters let None through to `__post_init__`.
+    state_names: tuple[str, ...] = eqx.field(
+        static=True, default=None, converter=lambda names: names
+    )
+    control_names: tuple[str, ...] = eqx.field(
+        static=True, default=None, converter=lambda names: names
+    )
 
-    def __init__(
-        self,
-        A,
-        B,
-        C=None,
-        E=None,
-        *,
-        x_ref=None,
-        u_ref=None,
-        dx_ref=None,
-        state_names=None,
-        control_names=None,
-    ):
+    def __post_init__(self):
         where = "LinearSystem"
-        self.A, self.B, self.C, self.E = check_matrices(A, B, C, E, where)
+        self.A, self.B, self.C, self.E = check_matrices(
+            self.A, self.B, self.C, self.E, where
+        )
         n, m = self.B.shape
-        zeros = jnp.zeros(n, self.A.dtype)
-        self.x_ref = zeros if x_ref is None else x_ref
-        self.u_ref = jnp.zeros(m, self.A.dtype) if u_ref is None else u_ref
-        self.dx_ref = zeros if dx_ref is None else dx_ref
-        self.state_names = checked_names(state_names, "x", n, "state_names", where)
+        for name, size in (("x_ref", n), ("u_ref", m), ("dx_ref", n)):
+            if getattr(self, name) is None:
+                setattr(self, name, jnp.zeros(size, self.A.dtype))
+        self.state_names = checked_names(self.state_names, "x", n, "state_names", where)
         self.control_names = checked_names(
-            control_names, "u", m, "control_names", where
+            self.control_names, "u", m, "control_names", where
         )
 
     def __check_init__(self):
@@ -90,47 +86,15 @@ class LinearSystem(AbstractSystem):
         """Names of the disturbances, one a column of `E`."""
         return () if self.E is None else indexed_names("w", self.E.shape[1])
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         dx = self.dx_ref + matvec(self.A, x - self.x_ref)
         dx = dx + matvec(self.B, u - self.u_ref)
         if self.E is not None and w is not None:
             dx = dx + matvec(self.E, w)
         return dx
 
-    def observe(self, t, x):
+    def observe(self, t: Time, x: State) -> Observation:
         return x if self.C is None else matvec(self.C, x)
 
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         return self.x_ref, self.u_ref
-
-
-def checked_names(names, letter: str, size: int, argument: str, where: str):
-    """`names` as a tuple of `size`, indexed if there are none, or an error."""
-    if names is None:
-        return indexed_names(letter, size)
-    if isinstance(names, str) or len(names) != size:
-        raise ValueError(f"{where}: {argument} must have {size} names, got {names!r}.")
-    return tuple(names)
-
-
-def check_matrices(A, B, C, E, where: str):
-    """`A`, `B`, `C`, `E` as matrices of fitting shapes, or an error that names one."""
-    A = as_matrix(A, "A", where)
-    n = A.shape[0]
-    if A.shape != (n, n) or n == 0:
-        raise ValueError(f"{where}: A must be square, got shape {A.shape}.")
-    B = _as_part(B, "B", n, "rows", where)
-    C = None if C is None else _as_part(C, "C", n, "columns", where)
-    E = None if E is None else _as_part(E, "E", n, "rows", where)
-    return A, B, C, E
-
-
-def _as_part(value, name: str, n: int, side: str, where: str) -> Matrix:
-    """`value` as a matrix with as many rows or columns as there are states."""
-    matrix = as_matrix(value, name, where)
-    if matrix.shape[side == "columns"] != n:
-        raise ValueError(
-            f"{where}: {name} must have as many {side} as A ({n}), got shape "
-            f"{matrix.shape}."
-        )
-    return matrix

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import parameter
+from .._typing import Control, Disturbance, State, Time
 from ._base import AbstractSystem
 
 
@@ -45,7 +46,7 @@ class Lorenz(AbstractSystem):
     state_names: ClassVar = ("x", "y", "z")
     control_names: ClassVar = ("u",)
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         return jnp.stack(
             [
                 self.sigma * (x[1] - x[0]) + u[0],
@@ -54,7 +55,7 @@ class Lorenz(AbstractSystem):
             ]
         )
 
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         """The centre of the right wing, `x = y = sqrt(beta (rho - 1))`, `z = rho - 1`;
         the origin where there are no wings (`rho <= 1`).
 

@@ -1,5 +1,6 @@
 """Masses on a line, joined by springs and dampers."""
 
+from dataclasses import KW_ONLY
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -8,7 +9,12 @@ from jaxtyping import Array
 
 from .._check import check_count
 from .._module import parameter, positive
+from .._typing import Control, Disturbance, State, Time
 from ._base import AbstractSystem
+
+
+def _as_count(masses: Any) -> int:
+    return check_count(masses, "masses", "MassSpringDamper")
 
 
 class MassSpringDamper(AbstractSystem):
@@ -43,26 +49,14 @@ class MassSpringDamper(AbstractSystem):
         ```
     """
 
-    mass: Array = parameter(constraint=positive)
-    stiffness: Array = parameter()
-    damping: Array = parameter()
-    masses: int = eqx.field(static=True)
+    mass: Array = parameter(1.0, constraint=positive)
+    stiffness: Array = parameter(1.0)
+    damping: Array = parameter(0.1)
+    _: KW_ONLY
+    masses: int = eqx.field(static=True, default=1, converter=_as_count)
 
     control_names: ClassVar = ("force",)
     control_units: ClassVar = ("N",)
-
-    def __init__(
-        self,
-        mass: Any = 1.0,
-        stiffness: Any = 1.0,
-        damping: Any = 0.1,
-        *,
-        masses: int = 1,
-    ):
-        self.mass = mass
-        self.stiffness = stiffness
-        self.damping = damping
-        self.masses = check_count(masses, "masses", "MassSpringDamper")
 
     def __check_init__(self):
         for name in ("mass", "stiffness", "damping"):
@@ -86,7 +80,7 @@ class MassSpringDamper(AbstractSystem):
         """Metres, then metres per second."""
         return ("m",) * self.masses + ("m/s",) * self.masses
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         n = self.masses
         m, k, c = (
             jnp.broadcast_to(a, (n,)).astype(x.dtype)
@@ -102,5 +96,5 @@ class MassSpringDamper(AbstractSystem):
         pulls = [(tension[i + 1] - tension[i]) * lightness[i] for i in range(n)]
         return jnp.stack([*(x[n + i] for i in range(n)), *pulls])
 
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         return jnp.zeros(2 * self.masses), jnp.zeros(1)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import parameter, positive
+from .._typing import Control, Disturbance, Scalar, State, Time
 from ._base import AbstractSystem
 
 
@@ -61,7 +62,7 @@ class PermanentMagnetMotor(AbstractSystem):
     state_units: ClassVar = ("A", "A", "rad/s")
     control_units: ClassVar = ("V", "V")
 
-    def torque(self, x: Array) -> Array:
+    def torque(self, x: State) -> Scalar:
         """What the currents do to the shaft.
 
         **Arguments:** `x`: state.
@@ -71,7 +72,7 @@ class PermanentMagnetMotor(AbstractSystem):
         saliency = self.d_inductance - self.q_inductance
         return 1.5 * self.pole_pairs * (self.flux * x[1] + saliency * x[0] * x[1])
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         electrical = self.pole_pairs * x[2]
         d_flux = self.d_inductance * x[0] + self.flux
         q_flux = self.q_inductance * x[1]
@@ -89,7 +90,7 @@ class PermanentMagnetMotor(AbstractSystem):
             ]
         )
 
-    def equilibrium(self, speed: Any = 0.0):
+    def equilibrium(self, speed: Any = 0.0) -> tuple[State, Control]:
         """Turning at a speed without load, with no current along the magnets.
 
         **Arguments:** `speed`: [rad/s], 0 by default.

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from .._module import parameter
+from .._typing import Control, Disturbance, State, Time
 from ..math import cos, sin
 from ._base import AbstractSystem
 
@@ -71,8 +72,8 @@ class MountainCar(AbstractSystem):
         """
         return 0.45 * sin(3 * jnp.asarray(position)) + 0.55
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         return jnp.stack([x[1], self.acceleration(x[0], u[0])])
 
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         return jnp.array([-np.pi / 6, 0.0]), jnp.zeros(1)

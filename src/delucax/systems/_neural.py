@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from .._check import check_count, check_key
 from .._module import as_module, names_of, weight
-from .._typing import PRNGKey
+from .._typing import Control, Disturbance, PRNGKey, State, Time
 from ._base import AbstractSystem
 
 
@@ -79,5 +79,5 @@ class NeuralSystem(AbstractSystem):
             key=key,
         )
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         return self.network(jnp.concatenate([x, u])).astype(x.dtype)

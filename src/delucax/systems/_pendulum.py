@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import parameter, positive
-from ..math import sin, wrap
+from .._typing import Control, Disturbance, State, Time
+from ..math import sin
 from ._base import AbstractSystem
 
 
@@ -47,6 +48,7 @@ class Pendulum(AbstractSystem):
     damping: Array = parameter(0.0)
 
     state_names: ClassVar = ("angle", "velocity")
+    angle_names: ClassVar = ("angle",)
     control_names: ClassVar = ("torque",)
     state_units: ClassVar = ("rad", "rad/s")
     control_units: ClassVar = ("N m",)
@@ -62,11 +64,8 @@ class Pendulum(AbstractSystem):
         drive = 3 / (self.mass * self.length**2) * torque
         return weight + drive - self.damping * velocity
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         return jnp.stack([x[1], self.acceleration(x[0], x[1], u[0])])
 
-    def difference(self, x, x_ref):
-        return jnp.stack([wrap(x[0] - x_ref[0]), x[1] - x_ref[1]])
-
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         return jnp.zeros(2), jnp.zeros(1)

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import function_field, parameter, positive
-from ..math import cos, sin, wrap
+from .._typing import Control, Disturbance, State, Time
+from ..math import cos, sin
 from ._base import AbstractSystem
 
 
@@ -56,6 +57,7 @@ class PlanarQuadrotor(AbstractSystem):
     wind: Callable[..., Array] | None = function_field(None)
 
     state_names: ClassVar = ("x", "y", "angle", "vx", "vy", "rate")
+    angle_names: ClassVar = ("angle",)
     control_names: ClassVar = ("left", "right")
     disturbance_names: ClassVar = ("force_x", "force_y")
     state_units: ClassVar = ("m", "m", "rad", "m/s", "m/s", "rad/s")
@@ -68,7 +70,7 @@ class PlanarQuadrotor(AbstractSystem):
                 f"{self.wind!r}."
             )
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         thrust, lean = (u[0] + u[1]) / self.mass, x[2]
         ax, ay = -thrust * sin(lean), thrust * cos(lean) - self.gravity
         if self.wind is not None:
@@ -84,11 +86,7 @@ class PlanarQuadrotor(AbstractSystem):
         turn = (u[1] - u[0]) / (self.mass * self.length)
         return jnp.stack([x[3], x[4], x[5], ax, ay, turn])
 
-    def difference(self, x, x_ref):
-        d = x - x_ref
-        return jnp.stack([d[0], d[1], wrap(d[2]), d[3], d[4], d[5]])
-
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         """Hovering at the origin, leaning against the wind that blows there at time 0.
 
         An equilibrium for as long as the wind depends on nothing but the place.

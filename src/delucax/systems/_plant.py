@@ -5,10 +5,10 @@ from typing import Any, ClassVar, Literal, TYPE_CHECKING
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
 
-from .._check import as_vector, output_of
-from .._typing import Control, Observation, RealScalar, State
+from .._check import output_of
+from .._typing import Control, Observation, State, Time
+from ..math import wrap
 
 
 Noise = Literal["additive", "brownian"] | None
@@ -19,6 +19,18 @@ class AbstractPlant(eqx.Module):
 
     [`delucax.AbstractSystem`][] adds a vector field to it, and
     [`delucax.AbstractDynamics`][] a step.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        plant = dlx.systems.Pendulum()
+        assert isinstance(plant, dlx.systems.AbstractPlant)
+        x, u = plant.equilibrium()
+        plant.difference(jnp.array([6.3, 0.0]), x)
+        ```
     """
 
     if TYPE_CHECKING:  # a static checker would ask for abstract fields as arguments
@@ -27,6 +39,7 @@ class AbstractPlant(eqx.Module):
     else:
         state_names: eqx.AbstractVar[tuple[str, ...]]
         control_names: eqx.AbstractVar[tuple[str, ...]]
+    angle_names: ClassVar[Any] = ()
     disturbance_names: ClassVar[Any] = ()
     state_units: ClassVar[Any] = ()
     control_units: ClassVar[Any] = ()
@@ -59,22 +72,23 @@ class AbstractPlant(eqx.Module):
     def observation_size(self) -> int:
         """The size of what `observe` returns."""
         y = output_of(self.observe, (), (self.state_size,))
-        shape = getattr(y, "shape", None)
-        if shape is None or len(shape) != 1:
-            got = type(y).__name__ if shape is None else f"an array of shape {shape}"
+        is_array = isinstance(y, jax.ShapeDtypeStruct)
+        if not is_array or len(y.shape) != 1:
+            got = f"an array of shape {y.shape}" if is_array else type(y).__name__
             raise ValueError(
                 f"{type(self).__name__}: observe must return a vector, got {got}."
             )
-        return shape[0]
+        return y.shape[0]
 
     @property
     def observes_state(self) -> bool:
         """Whether what `observe` returns is the state itself, as its program shows."""
-        x = jnp.zeros(self.state_size)
-        traced = jax.make_jaxpr(self.observe)(jnp.zeros(()), x).jaxpr
+        shapes = (), (self.state_size,)
+        t, x = (jax.ShapeDtypeStruct(s, jnp.result_type(float)) for s in shapes)
+        traced = jax.make_jaxpr(self.observe)(t, x).jaxpr
         return list(traced.outvars) == [traced.invars[1]]
 
-    def observe(self, t: RealScalar, x: State) -> Observation:
+    def observe(self, t: Time, x: State) -> Observation:
         """What the plant's sensor reads; the state by default.
 
         **Arguments:** `t`: time. `x`: state.
@@ -85,13 +99,18 @@ class AbstractPlant(eqx.Module):
         return x
 
     def difference(self, x: State, x_ref: State) -> State:
-        """The deviation of `x` from `x_ref`; `x - x_ref` by default. Angles wrap here.
+        """The deviation of `x` from `x_ref`; by default `x - x_ref`, in which the
+        states that `angle_names` lists are wrapped to +-pi.
 
         **Arguments:** `x`: state. `x_ref`: the state to measure from.
 
         **Returns:** the deviation, a vector.
         """
-        return x - x_ref
+        d = x - x_ref
+        if not self.angle_names:
+            return d
+        angles = [name in self.angle_names for name in self.state_names]
+        return jnp.stack([wrap(d[i]) if a else d[i] for i, a in enumerate(angles)])
 
     def equilibrium(self) -> tuple[State, Control]:
         """A state and a control at which the plant rests.
@@ -104,20 +123,3 @@ class AbstractPlant(eqx.Module):
             f"{type(self).__name__} names no equilibrium: override `equilibrium`, or "
             "give the state and control yourself."
         )
-
-
-def validate_io(
-    plant: AbstractPlant, x: Any, u: Any, w: Any
-) -> tuple[Array, Array, Any]:
-    """State, control and disturbance with the sizes that `plant` names, or an error."""
-    where = type(plant).__name__
-    x = as_vector(x, plant.state_size, "x (the state)", where)
-    u = as_vector(u, plant.control_size, "u (the control)", where)
-    if w is not None:
-        w = as_vector(w, plant.disturbance_size, "w (the disturbance)", where)
-    return x, u, w
-
-
-def zeros_if_none(w: Array | None, size: int, like: Array) -> Array:
-    """A zero disturbance where none is given."""
-    return jnp.zeros(size, like.dtype) if w is None else w

@@ -8,6 +8,7 @@ from jaxtyping import Array
 
 from .._check import check_choice
 from .._module import parameter, positive
+from .._typing import Control, Disturbance, State, Time
 from ._base import AbstractSystem
 
 
@@ -100,7 +101,7 @@ class Quadrotor(AbstractSystem):
         """Newtons, and newton metres."""
         return ("N",) * 4 if self.inputs == "rotors" else ("N", "N m", "N m", "N m")
 
-    def wrench(self, u: Array) -> Array:
+    def wrench(self, u: Control) -> Control:
         """What the rotors do to the body.
 
         **Arguments:** `u`: control.
@@ -119,7 +120,7 @@ class Quadrotor(AbstractSystem):
             ]
         )
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         qw, qx, qy, qz = x[3], x[4], x[5], x[6]
         a, b, c = x[10], x[11], x[12]
         wrench = self.wrench(u)
@@ -131,31 +132,26 @@ class Quadrotor(AbstractSystem):
             push = 1 / self.mass
             ax, ay, az = ax + push * w[0], ay + push * w[1], az + push * w[2]
         jx, jy, jz = self.inertia_x, self.inertia_y, self.inertia_z
-        return jnp.stack(
-            [
-                x[7],
-                x[8],
-                x[9],
-                -0.5 * (qx * a + qy * b + qz * c),
-                0.5 * (qw * a + qy * c - qz * b),
-                0.5 * (qw * b + qz * a - qx * c),
-                0.5 * (qw * c + qx * b - qy * a),
-                ax,
-                ay,
-                az,
-                (wrench[1] - (jz - jy) * b * c) / jx,
-                (wrench[2] - (jx - jz) * c * a) / jy,
-                (wrench[3] - (jy - jx) * a * b) / jz,
-            ]
-        )
+        turning = [
+            -0.5 * (qx * a + qy * b + qz * c),
+            0.5 * (qw * a + qy * c - qz * b),
+            0.5 * (qw * b + qz * a - qx * c),
+            0.5 * (qw * c + qx * b - qy * a),
+        ]
+        spin = [
+            (wrench[1] - (jz - jy) * b * c) / jx,
+            (wrench[2] - (jx - jz) * c * a) / jy,
+            (wrench[3] - (jy - jx) * a * b) / jz,
+        ]
+        return jnp.stack([x[7], x[8], x[9], *turning, ax, ay, az, *spin])
 
-    def project(self, x):
+    def project(self, x: State) -> State:
         return unit_attitude(x)
 
-    def difference(self, x, x_ref):
+    def difference(self, x: State, x_ref: State) -> State:
         return attitude_difference(x, x_ref)
 
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         """Hovering at the origin.
 
         **Returns:** the state, level and at rest, and a quarter of the weight for each
@@ -168,7 +164,7 @@ class Quadrotor(AbstractSystem):
         return x, jnp.stack([weight, *[jnp.zeros_like(weight)] * 3])
 
 
-def attitude_difference(x: Array, x_ref: Array) -> Array:
+def attitude_difference(x: State, x_ref: State) -> State:
     """`x - x_ref` with the quaternion, entries 3 to 6, of the sign closer to that of
     `x_ref`; both turn alike."""
     along = sum(x[i] * x_ref[i] for i in range(3, 7))
@@ -178,7 +174,7 @@ def attitude_difference(x: Array, x_ref: Array) -> Array:
     return jnp.stack([d[0], d[1], d[2], *q, *(d[i] for i in range(7, 13))])
 
 
-def unit_attitude(x: Array) -> Array:
+def unit_attitude(x: State) -> State:
     """`x` with the quaternion, entries 3 to 6, of length 1."""
     square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5] + x[6] * x[6]
     # A quaternion of zeros has no direction; it is left, not turned into NaN.

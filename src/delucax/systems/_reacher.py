@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import parameter, positive
-from ..math import cos, sin, wrap
+from .._typing import Control, Disturbance, State, Time, Vector
+from ..math import cos, sin
 from ._base import AbstractSystem
 
 
@@ -59,11 +60,12 @@ class Reacher(AbstractSystem):
     gravity: Array = parameter(0.0)
 
     state_names: ClassVar = ("shoulder", "elbow", "shoulder_rate", "elbow_rate")
+    angle_names: ClassVar = ("shoulder", "elbow")
     control_names: ClassVar = ("shoulder_torque", "elbow_torque")
     state_units: ClassVar = ("rad", "rad", "rad/s", "rad/s")
     control_units: ClassVar = ("N m", "N m")
 
-    def tip(self, x: Array) -> Array:
+    def tip(self, x: State) -> Vector:
         """Where the hand is.
 
         **Arguments:** `x`: state.
@@ -78,7 +80,7 @@ class Reacher(AbstractSystem):
             ]
         )
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         m2, l1, l2 = self.mass_2, self.length_1, self.length_2
         total = self.mass_1 + m2
         d1, d2 = x[2], x[3]
@@ -97,11 +99,7 @@ class Reacher(AbstractSystem):
         a2 = (m11 * b2 - m12 * b1) / determinant
         return jnp.stack([d1, d2, a1, a2])
 
-    def difference(self, x, x_ref):
-        d = x - x_ref
-        return jnp.stack([wrap(d[0]), wrap(d[1]), d[2], d[3]])
-
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         """The arm stretched along the x axis, at rest.
 
         **Returns:** the zero state and control.

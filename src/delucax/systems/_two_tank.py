@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import parameter, positive
+from .._typing import Control, Disturbance, State, Time
 from ._base import AbstractSystem
 
 
@@ -62,13 +63,13 @@ class TwoTank(AbstractSystem):
         root = level * (level * level + self.smoothing**2) ** -0.25
         return outlet * (2 * self.gravity) ** 0.5 * root
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         upper = self._outflow(self.upper_outlet, x[0])
         lower = self._outflow(self.lower_outlet, x[1])
         filling = (u[0] - upper) / self.upper_area
         return jnp.stack([filling, (upper - lower) / self.lower_area])
 
-    def equilibrium(self, level: Any = 10.0):
+    def equilibrium(self, level: Any = 10.0) -> tuple[State, Control]:
         """Where the pump holds the lower tank at a level.
 
         **Arguments:** `level`: of the lower tank, not negative [cm]; 10 by default.

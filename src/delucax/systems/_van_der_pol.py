@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import parameter
+from .._typing import Control, Disturbance, State, Time
 from ._base import AbstractSystem
 
 
@@ -41,9 +42,9 @@ class VanDerPol(AbstractSystem):
     state_names: ClassVar = ("x", "v")
     control_names: ClassVar = ("u",)
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         damping = self.mu * (1 - x[0] * x[0])
         return jnp.stack([x[1], damping * x[1] - x[0] + u[0]])
 
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         return jnp.zeros(2), jnp.zeros(1)

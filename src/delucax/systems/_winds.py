@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._module import check_parameters, parameter, positive
-from .._typing import RealScalar
+from .._typing import State, Time, Vector
 
 
 class DissipativeWind(eqx.Module):
@@ -39,7 +39,7 @@ class DissipativeWind(eqx.Module):
     def __check_init__(self):
         check_parameters(self)
 
-    def __call__(self, t: RealScalar, x: Array) -> Array:
+    def __call__(self, t: Time, x: State) -> Vector:
         """The force.
 
         **Arguments:** `t`: time. `x`: a state whose first two entries are the position.
@@ -78,7 +78,7 @@ class ConstantWind(eqx.Module):
     def __check_init__(self):
         check_parameters(self)
 
-    def __call__(self, t: RealScalar, x: Array) -> Array:
+    def __call__(self, t: Time, x: State) -> Vector:
         """The force.
 
         **Arguments:** `t`: time. `x`: a state, which plays no part.
@@ -130,7 +130,7 @@ class VortexWind(eqx.Module):
                 f"VortexWind: centres must have shape (n, 2), got {self.centres.shape}."
             )
 
-    def __call__(self, t: RealScalar, x: Array) -> Array:
+    def __call__(self, t: Time, x: State) -> Vector:
         """The force.
 
         **Arguments:** `t`: time. `x`: a state whose first two entries are the position.

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_instance, check_key
+from .._check import check_choice, check_instance, check_key
 from .._controller import AbstractController, check_controller
 from .._module import parameter
 from .._typing import PRNGKey, RealScalar
-from ..controllers import Categorical, Deep, MLP, Standardise
+from ..controllers import Categorical, MLP, mlp_policy, Standardise
 from ..environments import Environment
 
 
@@ -40,7 +40,7 @@ class ActorCritic(eqx.Module):
 
         env = dlx.make("pendulum")
         policy_key, critic_key = jax.random.split(jax.random.key(0))
-        policy = dlx.controllers.Deep(env, head="gaussian", key=policy_key)
+        policy = dlx.controllers.mlp_policy(env, head="gaussian", key=policy_key)
         critic = dlx.controllers.MLP(3, 1, features=env.encode, key=critic_key)
         model = dlx.training.ActorCritic(policy, critic)
         model.value(0.0, env.reset(critic_key))
@@ -98,8 +98,8 @@ def actor_critic(
 
     Both are given `environment.encode(y)`, standardised by what training sees. The last
     layers begin a hundred times smaller than usual: that of the policy near the middle
-    of the bounds, and that of the critic flat, for the slope of an estimate that has
-    seen nothing would lead a policy that follows it astray.
+    of the bounds, and that of the critic flat, because the slope of an
+    estimate that has learned nothing would lead a policy that follows it astray.
 
     **Arguments:**
 
@@ -132,11 +132,7 @@ def actor_critic(
     """
     where = "actor_critic"
     check_instance(environment, Environment, "environment", where)
-    if head not in ("deterministic", "gaussian", "categorical"):
-        raise ValueError(
-            f"{where}: head must be 'deterministic', 'gaussian' or 'categorical', got "
-            f"{head!r}."
-        )
+    check_choice(head, ("deterministic", "gaussian", "categorical"), "head", where)
     policy_key, critic_key = jr.split(check_key(key, where))
     size = environment.feature_size
     features = Standardise(jnp.zeros(size), features=environment.encode)
@@ -151,7 +147,7 @@ def actor_critic(
         base = MLP(size, len(table), **sizes, features=features, key=policy_key)
         policy: Any = Categorical(base, table)
     else:
-        policy = Deep(environment, **sizes, head=head, key=policy_key)
+        policy = mlp_policy(environment, **sizes, head=head, key=policy_key)
         policy = eqx.tree_at(lambda p: network_of(p).features, policy, features)
     critic = MLP(size, 1, **sizes, features=features, key=critic_key)
 

@@ -7,13 +7,14 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
 from .._check import check_bool, check_count, check_instance, check_range
 from .._typing import PRNGKey, RealScalar
 from ..environments import Environment
 from ..simulation import rollout
 from ._actor_critic import ActorCritic
+from ._costs import nan_if_failed
 from ._surrogate import AbstractSurrogate
 
 
@@ -30,11 +31,9 @@ class Episodes(NamedTuple):
     """Whether something follows each step."""
     following: Any
     """The cost to go after each step: V there, or the final cost of its episode."""
-    values: Any
-    """V at each observation."""
     advantages: Float[Array, "*batch steps"]
     total_cost: Any
-    targets: Any = None
+    targets: Float[Array, "*batch steps"]
     """What V should be at each observation."""
     log_prob: Any = None
 
@@ -51,9 +50,7 @@ class AbstractActorCriticLoss(AbstractSurrogate):
     bootstrap: eqx.AbstractVar[bool]
 
     def __post_init__(self):
-        where = type(self).__name__
-        check_instance(self.environment, Environment, "environment", where)
-        if self.horizon is None:
+        if self.horizon is None and isinstance(self.environment, Environment):
             self.horizon = self.environment.horizon  # pyright: ignore
 
     def __check_init__(self):
@@ -69,10 +66,6 @@ class AbstractActorCriticLoss(AbstractSurrogate):
     def finished(self, model: ActorCritic, memory: Any) -> ActorCritic:
         return memory.statistics.applied_to(model)
 
-    def _check_model(self, model: PyTree) -> None:
-        """Raise unless `model` is an actor and a critic."""
-        check_instance(model, ActorCritic, "model", type(self).__name__)
-
     def _episodes(
         self, model: ActorCritic, key: PRNGKey, truncate: int | None = None
     ) -> Episodes:
@@ -81,16 +74,21 @@ class AbstractActorCriticLoss(AbstractSurrogate):
         The gradient is cut before every `truncate`-th step.
         """
         one = lambda key: self._episode(model, key, truncate)
-        runs = jax.vmap(one)(jr.split(key, self.batch))
-        return runs._replace(targets=runs.advantages + runs.values)
+        return jax.vmap(one)(jr.split(key, self.batch))
+
+    def _value_errors(
+        self, model: ActorCritic, runs: Episodes
+    ) -> Float[Array, "*batch steps"]:
+        """How far the critic's output is from what it should be, in its own scale."""
+        raw = jax.vmap(jax.vmap(model.raw))(runs.times, runs.observations)
+        return raw - (runs.targets - model.shift) / model.scale
 
     def _episode(self, model, key, truncate) -> Episodes:
         env, horizon = self.environment, self.horizon
         keep = ("states", "observations", "controls", "costs", "terminated")
         options: Any = dict(horizon=horizon, truncate=truncate, keep=keep, throw=False)
         run: Any = rollout(env, model.policy, key=key, **options)
-        ok = ~run.failed
-        costs = jnp.where(ok | ~jnp.isfinite(run.total_cost), run.costs, jnp.nan)
+        costs = nan_if_failed(run, run.costs)
         # The observations recorded by a truncated rollout have lost their derivatives
         # at the cuts, where V is asked for. So the states are observed again, with the
         # noise that they had.
@@ -116,8 +114,8 @@ class AbstractActorCriticLoss(AbstractSurrogate):
             valid=valid,
             continues=continues,
             following=following,
-            values=values,
             advantages=advantages,
+            targets=advantages + values,
             total_cost=run.total_cost,
         )
 

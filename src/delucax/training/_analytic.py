@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .._check import check_key
 from .._typing import PRNGKey
@@ -53,11 +53,19 @@ def analytic(
         ```
     """
     check_key(key, "analytic")
-    weights, rest = weights_of(model)
 
-    def of(weights):
-        value = loss(eqx.combine(weights, rest), key)
+    def of(model):
+        value = loss(model, key)
         return cost_and_metrics(value, "analytic")[0], value
 
+    return gradient_of_weights(of, model)
+
+
+def gradient_of_weights(
+    loss: Callable[[PyTree], tuple[Array, Any]], model: PyTree
+) -> tuple[Any, PyTree]:
+    """What `loss(model)` returns beside its scalar, and the gradient of that."""
+    weights, rest = weights_of(model)
+    of = lambda weights: loss(eqx.combine(weights, rest))
     (_, value), gradient = eqx.filter_value_and_grad(of, has_aux=True)(weights)
     return value, gradient

@@ -17,7 +17,7 @@ _FORMAT = "delucax.training.fit 2"
 
 
 class Checkpoint(NamedTuple):
-    """Where a run is saved, and the description that tells it from other runs."""
+    """Where a run is saved, and the description that distinguishes it from others."""
 
     path: Path
     run: dict[str, Any]
@@ -108,15 +108,15 @@ def checkpoint_path(path: Any) -> Path:
 
 def describe_run(
     model: PyTree,
-    values: dict[str, Any],
     constraints: dict[str, Any],
+    values: dict[str, Any],
     state: PyTree,
     memory: PyTree,
     **options: Any,
 ) -> dict[str, Any]:
-    """What tells a run from another, by its name in an error message.
+    """What distinguishes a run from another, by its name in an error message.
 
-    The arrays that the run starts from are told by their fingerprints.
+    The arrays that the run starts from are compared by their fingerprints.
     """
     for path, value in values.items():
         options[f"trainable {path}"] = f"{_kind(value)} {constraints.get(path, '')}"

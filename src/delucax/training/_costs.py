@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import as_number, check_count, check_instance, check_key
+from .._check import as_number, check_choice, check_count, check_instance, check_key
 from .._controller import (
-    AbstractController,
     AbstractStochasticPolicy,
     check_stochastic,
     initial_state,
@@ -27,7 +26,7 @@ class _ExpectedCost(eqx.Module):
     """A loss; a module rather than a closure, so that the plant is not a constant."""
 
     environment: Environment
-    gradient_decay: Array | None
+    gradient_decay: float | Array
     batch: int = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
     checkpoint: Checkpoint = eqx.field(static=True)
@@ -44,13 +43,11 @@ class _ExpectedCost(eqx.Module):
                 horizon=self.horizon,
                 keep=(),
                 checkpoint=self.checkpoint,
-                gradient_decay=(
-                    1.0 if self.gradient_decay is None else self.gradient_decay
-                ),
+                gradient_decay=self.gradient_decay,
                 truncate=self.truncate,
                 throw=False,
             )
-            return _cost_or_nan(trajectory)
+            return nan_if_failed(trajectory, trajectory.total_cost)
 
         if self.batch == 1:
             return total(key)
@@ -112,39 +109,19 @@ def expected_cost(
     """
     where = "expected_cost"
     check_instance(environment, Environment, "environment", where)
-    if checkpoint not in ("step", "sqrt", None):
-        raise ValueError(
-            f"{where}: checkpoint must be 'step', 'sqrt' or None, got {checkpoint!r}."
-        )
+    check_choice(checkpoint, ("step", "sqrt", None), "checkpoint", where)
     decay = as_float_array(as_number(gradient_decay, "gradient_decay", where))
+    # A decay of 1 is known to leave the gradient alone, and compiles nothing.
     is_one = isinstance(gradient_decay, int | float) and gradient_decay == 1
+    horizon = environment.horizon if horizon is None else horizon
     return _ExpectedCost(
         environment=environment,
-        gradient_decay=None if is_one else decay,
+        gradient_decay=1.0 if is_one else decay,
         batch=check_count(batch, "batch", where),
-        horizon=check_count(
-            environment.horizon if horizon is None else horizon, "horizon", where
-        ),
+        horizon=check_count(horizon, "horizon", where),
         checkpoint=checkpoint,
         truncate=None if truncate is None else check_count(truncate, "truncate", where),
     )
-
-
-class _WithKey(AbstractController):
-    """A controller whose episode begins with a known key, for its replay."""
-
-    base: AbstractController
-    key: PRNGKey
-
-    def init(self, *, key=None):
-        del key
-        return self.base.init(key=self.key)
-
-    def __call__(self, t, y, state):
-        return self.base(t, y, state)
-
-    def applied(self, u, cost, state):
-        return self.base.applied(u, cost, state)
 
 
 class _ScoredCost(eqx.Module):
@@ -156,15 +133,9 @@ class _ScoredCost(eqx.Module):
     ) -> tuple[Array, dict[str, Array]]:
         check_key(key, "scored_cost")
         check_stochastic(controller, "controller", "scored_cost")
-        run_key, controller_key = jr.split(key)
-        run: Any = rollout(
-            self.environment,
-            _WithKey(controller, controller_key),
-            key=run_key,
-            horizon=self.horizon,
-            keep=("observations", "controls", "costs"),
-            throw=False,
-        )
+        keep = ("observations", "controls", "costs")
+        options: Any = dict(horizon=self.horizon, keep=keep, throw=False)
+        run: Any = rollout(self.environment, controller, key=key, **options)
 
         # What was drawn depends on the weights, but the score is that of the weights
         # for a draw held fixed. So the controller is run again on what it was given:
@@ -178,9 +149,11 @@ class _ScoredCost(eqx.Module):
 
         record = (run.times[:-1], run.observations, run.controls, run.costs)
         valid = jnp.arange(self.horizon) < run.length
+        *_, controller_key = self.environment.split_key(key)
         state = initial_state(controller, controller_key)
         scores = replay(controller, state, lax.stop_gradient((*record, valid)), act)
-        return _cost_or_nan(run), {"log_prob": jnp.sum(scores)}
+        cost = nan_if_failed(run, run.total_cost)
+        return cost, {"log_prob": jnp.sum(scores)}
 
 
 def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
@@ -234,8 +207,7 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
     return _ScoredCost(environment, check_count(horizon, "horizon", where))
 
 
-def _cost_or_nan(trajectory: Trajectory) -> Array:
-    """The total cost, NaN where the run failed: a failed solve may look finite."""
-    ok = ~trajectory.failed
-    cost = trajectory.total_cost
-    return jnp.where(ok | ~jnp.isfinite(cost), cost, jnp.nan)
+def nan_if_failed(trajectory: Trajectory, costs: Array) -> Array:
+    """Costs of a run, NaN where it failed: those of a failed solve may look finite."""
+    kept = ~trajectory.failed | ~jnp.isfinite(trajectory.total_cost)
+    return jnp.where(kept, costs, jnp.nan)

@@ -10,7 +10,7 @@ import optax
 from jaxtyping import Array, PyTree
 
 from .._check import check_count, check_key
-from .._module import as_float_array, check_parameters, parameter, positive
+from .._module import check_parameters, parameter, positive
 from .._typing import PRNGKey
 from ._loss import cost_and_metrics
 from ._trainable import weights_of
@@ -68,20 +68,16 @@ class EvolutionStrategies(eqx.Module):
 
     sigma: Array = parameter(constraint=positive)
     samples: int = eqx.field(static=True)
-    antithetic: bool = eqx.field(static=True)
-
-    def __init__(self, sigma: Any, samples: int, antithetic: bool = True):
-        where = "EvolutionStrategies"
-        self.sigma = as_float_array(sigma)
-        self.samples = check_count(samples, "samples", where)
-        if antithetic and samples % 2:
-            raise ValueError(
-                f"{where}: samples must be even when antithetic, got {samples}."
-            )
-        self.antithetic = bool(antithetic)
+    antithetic: bool = eqx.field(static=True, default=True)
 
     def __check_init__(self):
+        where = "EvolutionStrategies"
         check_parameters(self)
+        check_count(self.samples, "samples", where)
+        if self.antithetic and self.samples % 2:
+            raise ValueError(
+                f"{where}: samples must be even when antithetic, got {self.samples}."
+            )
 
     def __call__(self, loss, model, key: PRNGKey) -> tuple[Any, PyTree]:
         check_key(key, "EvolutionStrategies")

@@ -14,22 +14,15 @@ import numpy as np
 import optax
 from jaxtyping import PyTree
 
-from .._check import check_count, check_key, is_concrete
+from .._check import check_at_most, check_count, check_key, is_concrete
 from .._results import choose, Result, RESULTS
 from .._typing import PRNGKey
 from ._analytic import analytic
 from ._checkpoint import Checkpoint, checkpoint_path, describe_run
-from ._compiled_steps import (
-    CAPACITY,
-    FAULTS,
-    finished_model,
-    first_memory,
-    first_state,
-    run_block,
-)
 from ._history import History, history_of
+from ._steps import CAPACITY, FAULTS, State, Steps
 from ._surrogate import AbstractSurrogate
-from ._trainable import strong, take_apart
+from ._trainable import partition_trainable
 
 
 with warnings.catch_warnings():
@@ -194,12 +187,10 @@ def fit(
         )
     steps = check_count(steps, "steps", _WHERE)
     block = check_count(block, "block", _WHERE)
-    if block > CAPACITY:
-        raise ValueError(f"{_WHERE}: block must be at most {CAPACITY}, got {block}.")
+    check_at_most(block, CAPACITY, "block", _WHERE)
     seeds = _checked_seeds(key)
     data, data_size, batch_size = _checked_data(data, batch_size)
-    has_memory = isinstance(loss, AbstractSurrogate)
-    if has_memory and data is not None:
+    if isinstance(loss, AbstractSurrogate) and data is not None:
         raise ValueError(
             f"{_WHERE}: data must be None where the loss is a surrogate, which makes "
             "its own."
@@ -222,52 +213,34 @@ def fit(
             "keys."
         )
     _check_batched(model, seeds)
-    assembly, values = take_apart(model, trainable, _WHERE)
-    state, static = eqx.partition(first_state(optimiser, values, seeds), eqx.is_array)
-    state = jax.tree.map(strong, state)
-    memory = first_memory(loss, model, key, seeds) if has_memory else None
-    shape = () if seeds is None else (seeds,)
-    order = None
-    if batch_size is not None:
-        order = (
-            jnp.zeros((*shape, data_size), jnp.int32),
-            jnp.full(shape, -1, jnp.int32),
-        )
-    fault = jnp.zeros(shape, jnp.int32)
-    carry: Any = (values, state, memory, order, fault)
-    functions = (loss, gradient, optimiser, static, assembly)
-
-    def advanced(carry, first, stop):
-        span = jnp.asarray([first, stop], jnp.int32)
-        inputs = ((key, data), span, batch_size, seeds)
-        carry, outcome = run_block(functions, carry, *inputs)
-        rows, count = jax.device_get(outcome)
-        return carry, {name: column[:count] for name, column in rows.items()}
+    assembly, values = partition_trainable(model, trainable, _WHERE)
+    run = Steps(loss, gradient, optimiser, assembly, key, data, batch_size, seeds)
+    state = run.start(model, values)
 
     saved, blocks, seconds = None, [], 0.0
     if checkpoint is not None:
-        options = dict(steps=steps, key=np.asarray(jr.key_data(key)).tolist())
-        options |= dict(batch_size=batch_size, data_size=data_size)
-        arrays = (values, state, memory)
-        run = describe_run(model, values, assembly.constraints, *arrays[1:], **options)
-        saved = Checkpoint(checkpoint_path(checkpoint), run)
-        if resumed := saved.resume(arrays):
+        options: Any = dict(steps=steps, batch_size=batch_size, data_size=data_size)
+        options |= dict(key=np.asarray(jr.key_data(key)).tolist())
+        described = describe_run(model, assembly.constraints, *state[:3], **options)
+        saved = Checkpoint(checkpoint_path(checkpoint), described)
+        if resumed := saved.resume(state[:3]):
             arrays, history, seconds = resumed
-            _, rows = advanced(carry, 0, min(2, len(history["step"])))
+            _, rows = run.block(state, 0, min(2, len(history["step"])))
             saved.check_replay(history, rows)
-            carry, blocks = (*arrays, order, fault), [history]
+            state = State(*arrays, order=state.order, fault=state.fault)
+            blocks = [history]
     elif checkpoint_every is not None:
         raise ValueError(f"{_WHERE}: checkpoint_every needs checkpoint, a path.")
     every = 10 * block if checkpoint_every is None else checkpoint_every
     every = check_count(every, "checkpoint_every", _WHERE)
 
     done = written = len(blocks[0]["step"]) if blocks else 0
-    faults = np.zeros(shape, int)
+    faults = np.asarray(state.fault)
     began = time.perf_counter() - seconds
     with tqdm(total=steps, initial=done, disable=not progress, desc="fit") as bar:
         while done < steps and not np.all(faults):
-            carry, rows = advanced(carry, done, min(done + block, steps))
-            faults = np.asarray(jax.device_get(carry[4]))
+            state, rows = run.block(state, done, min(done + block, steps))
+            faults = np.asarray(state.fault)
             seconds = time.perf_counter() - began
             count = len(rows["loss"])
             rows["step"] = np.arange(done, done + count)
@@ -280,22 +253,16 @@ def fit(
             is_due = done == steps or done - written >= every
             if saved is not None and is_due and not np.any(faults):
                 blocks = [_joined(blocks)]
-                saved.write(carry[:3], blocks[0], seconds)
+                saved.write(state[:3], blocks[0], seconds)
                 written = done
             for callback in callbacks:
                 callback(done, last)
 
     if np.any(faults) and throw:
         raise RuntimeError(_failure(faults, blocks[-1], done))
-    model = assembly(carry[0])
-    if has_memory:
-        model = finished_model(loss, model, carry[2], seeds)
-    result = RESULTS.diverged if np.any(faults) else RESULTS.successful
-    if seeds is not None:
-        result = jax.vmap(lambda d: choose(d, RESULTS.diverged, RESULTS.successful))(
-            faults > 0
-        )
-    return Fitted(model=model, history=history_of(_joined(blocks)), result=result)
+    outcome = lambda fault: choose(fault > 0, RESULTS.diverged, RESULTS.successful)
+    each = outcome if seeds is None else jax.vmap(outcome)
+    return Fitted(run.finished(state), history_of(_joined(blocks)), each(state.fault))
 
 
 def _failure(faults: np.ndarray, rows: dict[str, np.ndarray], done: int) -> str:
@@ -327,10 +294,8 @@ def _checked_seeds(key: Any) -> int | None:
 
 def _check_batched(model: PyTree, seeds: int | None) -> None:
     """Raise unless each array of a model has the axis of a batch of keys in front."""
-    if seeds is None:
-        return
     for leaf in jax.tree.leaves(eqx.filter(model, eqx.is_array)):
-        if leaf.shape[:1] != (seeds,):
+        if seeds is not None and leaf.shape[:1] != (seeds,):
             raise ValueError(
                 f"{_WHERE}: each array of model must have the axis of the {seeds} keys "
                 "in front, as equinox.filter_vmap(make)(keys) gives it, got one of "
@@ -358,11 +323,7 @@ def _checked_data(
     size = shapes[0][0]
     if batch_size is not None:
         batch_size = check_count(batch_size, "batch_size", _WHERE)
-        if batch_size > size:
-            raise ValueError(
-                f"{_WHERE}: batch_size must be at most the {size} rows of data, got "
-                f"{batch_size}."
-            )
+        check_at_most(batch_size, size, "batch_size", _WHERE, "rows of data")
     return data, size, batch_size
 
 

@@ -59,7 +59,7 @@ class History(eqx.Module):
     def __getitem__(self, name: str) -> np.ndarray:
         """The column or metric of that name.
 
-        **Raises:** `KeyError` if there is none.
+        **Raises:** `KeyError` if there is no such column.
         """
         if name in COLUMNS:
             return getattr(self, name)

@@ -11,8 +11,8 @@ from jaxtyping import PyTree
 
 from .._check import check_count, check_key
 from .._typing import PRNGKey
+from ._analytic import gradient_of_weights
 from ._loss import cost_and_metrics
-from ._trainable import weights_of
 
 
 class LikelihoodRatio(eqx.Module):
@@ -64,26 +64,23 @@ class LikelihoodRatio(eqx.Module):
     """
 
     samples: int = eqx.field(static=True)
-    baseline: bool = eqx.field(static=True)
+    baseline: bool = eqx.field(static=True, default=True)
 
-    def __init__(self, samples: int, baseline: bool = True):
+    def __check_init__(self):
         where = "LikelihoodRatio"
-        self.samples = check_count(samples, "samples", where)
-        self.baseline = bool(baseline)
-        if self.baseline and samples < 2:
+        check_count(self.samples, "samples", where)
+        if self.baseline and self.samples < 2:
             raise ValueError(
                 f"{where}: samples must be at least 2 with a baseline, the mean of the "
-                f"others, got {samples}."
+                f"others, got {self.samples}."
             )
 
     def __call__(self, loss, model, key: PRNGKey) -> tuple[Any, PyTree]:
         check_key(key, "LikelihoodRatio")
-        weights, rest = weights_of(model)
 
-        def surrogate(weights):
+        def surrogate(model):
             def draw(key):
-                value = loss(eqx.combine(weights, rest), key)
-                return cost_and_metrics(value, "LikelihoodRatio")
+                return cost_and_metrics(loss(model, key), "LikelihoodRatio")
 
             costs, metrics = jax.vmap(draw)(jr.split(key, self.samples))
             if "log_prob" not in metrics:
@@ -101,7 +98,4 @@ class LikelihoodRatio(eqx.Module):
             value = (jnp.mean(costs), lax.stop_gradient(means))
             return jnp.mean(excess * metrics["log_prob"]), value
 
-        (_, value), gradient = eqx.filter_value_and_grad(surrogate, has_aux=True)(
-            weights
-        )
-        return value, gradient
+        return gradient_of_weights(surrogate, model)

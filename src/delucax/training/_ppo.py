@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_count, check_positive, check_range
+from .._check import (
+    check_at_most,
+    check_count,
+    check_instance,
+    check_positive,
+    check_range,
+)
 from .._controller import (
     AbstractStochasticPolicy,
     check_stochastic,
@@ -54,7 +60,7 @@ class PPO(AbstractActorCriticLoss):
     An episode that its horizon cuts off is no end: the estimated cost to go stands for
     what would follow. On termination nothing follows but the final cost. Each
     [`delucax.controllers.Standardise`][] of the model, and the scale of the critic, are
-    set by what was seen before the batch, so that the ratio begins at 1; one batch is
+    set by the batches before, so that the ratio begins at 1; one batch is
     run before the first step for them. A policy with a memory is trained on whole
     episodes, through its memory; one without on single steps in random order.
 
@@ -123,7 +129,7 @@ class PPO(AbstractActorCriticLoss):
         check_range(self.entropy_weight, "entropy_weight", "PPO")
 
     def init(self, model: ActorCritic, key: PRNGKey) -> _Memory:
-        self._check_model(model)
+        check_instance(model, ActorCritic, "model", "PPO")
         policy = _policy_of(model)
         unbounded = isinstance(policy, Gaussian) and policy.bounds is None
         if unbounded and self.environment.control_bounds is not None:
@@ -134,13 +140,9 @@ class PPO(AbstractActorCriticLoss):
             )
         rows, total_cost = self._rows(model, key)
         count = rows.times.shape[0]
-        if count < self.minibatches:
-            raise ValueError(
-                f"PPO: minibatches must be at most the {count} rows of a batch, got "
-                f"{self.minibatches}."
-            )
+        check_at_most(self.minibatches, count, "minibatches", "PPO", "rows of a batch")
         none = Statistics.empty(model, rows.costs.dtype)
-        statistics = _updated(none, model, rows)
+        statistics = none.updated(model, rows)
         zero = jnp.zeros((), int)
         return _Memory(rows, jnp.arange(count), zero, statistics, total_cost)
 
@@ -160,7 +162,7 @@ class PPO(AbstractActorCriticLoss):
         again = (part == 0) & (step > 0)
         old = memory.statistics
         statistics = lax.cond(
-            again, lambda: _updated(old, model, memory.rows), lambda: old
+            again, lambda: old.updated(model, memory.rows), lambda: old
         )
         memory = memory._replace(statistics=statistics)
         memory = lax.cond(part == 0, fresh, lambda: memory)
@@ -181,7 +183,6 @@ class PPO(AbstractActorCriticLoss):
         chosen = lax.dynamic_slice(memory.order, (start,), (size,))
         rows = jax.tree.map(lambda leaf: leaf[chosen], memory.rows)
         log_prob, entropy = _scores(model, rows)
-        raw = jax.vmap(jax.vmap(model.raw))(rows.times, rows.observations)
         weights = rows.valid / jnp.maximum(jnp.sum(rows.valid), 1)
 
         def mean(values):
@@ -193,8 +194,7 @@ class PPO(AbstractActorCriticLoss):
         surrogate = mean(
             jnp.maximum(ratio * rows.advantages, clipped * rows.advantages)
         )
-        target = (rows.targets - model.shift) / model.scale
-        value_loss = mean((raw - target) ** 2)
+        value_loss = mean(self._value_errors(model, rows) ** 2)
         bonus = mean(entropy)
         loss = surrogate + self.value_weight * value_loss - self.entropy_weight * bonus
         metrics = {
@@ -219,7 +219,6 @@ class PPO(AbstractActorCriticLoss):
             log_prob=log_prob,
             continues=None,
             following=None,
-            values=None,
             total_cost=None,
         )
         if not _policy_of(model).has_memory:
@@ -230,10 +229,6 @@ class PPO(AbstractActorCriticLoss):
 def _policy_of(model: ActorCritic) -> AbstractStochasticPolicy:
     """The policy of a model, which must know the probability of what it draws."""
     return check_stochastic(model.policy, "policy", "PPO")
-
-
-def _updated(old: Statistics, model: ActorCritic, rows: Episodes) -> Statistics:
-    return old.updated(model, rows.observations, rows.targets, rows.valid)
 
 
 def _scores(model: ActorCritic, rows: Episodes) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, PyTree
 
-from .._check import check_count, check_range
+from .._check import check_count, check_instance, check_range
 from .._module import parameter
 from .._typing import PRNGKey, RealScalar
 from ..environments import Environment
@@ -107,7 +107,7 @@ class SHAC(AbstractActorCriticLoss):
         check_count(self.refresh, "refresh", "SHAC")
 
     def init(self, model: ActorCritic, key: PRNGKey) -> _Memory:
-        self._check_model(model)
+        check_instance(model, ActorCritic, "model", "SHAC")
         none = Statistics.empty(model, self.environment.dt.dtype)
         statistics = none
         # Twice: what the targets are depends on the scale of the critic.
@@ -141,9 +141,7 @@ class SHAC(AbstractActorCriticLoss):
         ends = (within == self.window - 1) | (steps == self.horizon - 1)
         bonus = jnp.where(ends | ~runs.continues, runs.following, 0)
         costs = jnp.where(runs.valid, runs.costs + self.discount * bonus, 0)
-        targets, observations = lax.stop_gradient((runs.targets, runs.observations))
-        raw = jax.vmap(jax.vmap(model.raw))(runs.times, observations)
-        error = raw - (targets - model.shift) / model.scale
+        error = self._value_errors(model, lax.stop_gradient(runs))
         # Over each episode first.
         actor = jnp.sum(self.discount**within * costs, axis=1)
         critic = jnp.sum(jnp.where(runs.valid, error**2, 0), axis=1)
@@ -154,9 +152,7 @@ class SHAC(AbstractActorCriticLoss):
         return actor + self.value_weight * value_loss, lax.stop_gradient(metrics)
 
     def _updated(self, old: Statistics, model: ActorCritic, key: PRNGKey) -> Statistics:
-        runs = self._episodes(model, key)
-        new = old.updated(model, runs.observations, runs.targets, runs.valid)
-        return lax.stop_gradient(new)
+        return lax.stop_gradient(old.updated(model, self._episodes(model, key)))
 
 
 def _with_target(model: ActorCritic, memory: _Memory) -> ActorCritic:

@@ -6,10 +6,12 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
+from .._module import parts_of
 from ..controllers import Standardise
 from ._actor_critic import ActorCritic
+from ._actor_critic_loss import Episodes
 
 
 class Moments(NamedTuple):
@@ -56,38 +58,25 @@ class Statistics(NamedTuple):
     @staticmethod
     def empty(model: ActorCritic, dtype: Any) -> "Statistics":
         """Of no observations yet."""
-        features = [Moments.empty(one.mean) for one in _standardisers(model)]
+        features = [Moments.empty(one.mean) for one in parts_of(model, Standardise)]
         return Statistics(features, Moments.empty(jnp.zeros((), dtype)))
 
-    def updated(
-        self,
-        model: ActorCritic,
-        observations: Float[Array, "batch steps p"],
-        targets: Float[Array, "batch steps"],
-        valid: Bool[Array, "batch steps"],
-    ) -> "Statistics":
+    def updated(self, model: ActorCritic, runs: Episodes) -> "Statistics":
         """With the valid ones of more observations and targets."""
-        rows = observations.reshape(-1, observations.shape[-1])
-        valid = valid.reshape(-1)
-        features = [
-            old.joined(jax.vmap(one.of)(rows), valid)
-            for one, old in zip(_standardisers(model), self.features, strict=True)
-        ]
-        return Statistics(features, self.targets.joined(targets.reshape(-1), valid))
+        rows = runs.observations.reshape(-1, runs.observations.shape[-1])
+        valid, targets = runs.valid.reshape(-1), runs.targets.reshape(-1)
+        parts = zip(parts_of(model, Standardise), self.features, strict=True)
+        features = [old.joined(jax.vmap(one.of)(rows), valid) for one, old in parts]
+        return Statistics(features, self.targets.joined(targets, valid))
 
     def applied_to(self, model: ActorCritic) -> ActorCritic:
         """The model, standardised by these moments."""
 
         def places(model):
-            each = [leaf for s in _standardisers(model) for leaf in (s.mean, s.std)]
+            parts = parts_of(model, Standardise)
+            each = [leaf for part in parts for leaf in (part.mean, part.std)]
             return (*each, model.shift, model.scale)
 
         new = [v for m in (*self.features, self.targets) for v in (m.mean, m.std)]
         new = [n.astype(o.dtype) for n, o in zip(new, places(model), strict=True)]
         return eqx.tree_at(places, model, tuple(lax.stop_gradient(new)))
-
-
-def _standardisers(model: ActorCritic) -> list[Standardise]:
-    """Each `Standardise` in a model, in the order of its leaves."""
-    is_one = lambda node: isinstance(node, Standardise)
-    return [node for node in jax.tree.leaves(model, is_leaf=is_one) if is_one(node)]

@@ -41,7 +41,7 @@ class Assembly(eqx.Module):
         }
 
 
-def take_apart(
+def partition_trainable(
     model: PyTree, trainable: Any, where: str
 ) -> tuple[Assembly, dict[str, Array]]:
     """`model` as its unconstrained trainable values, by path, and all the rest."""
@@ -59,11 +59,11 @@ def take_apart(
         chosen = _chosen_by_filter(model, entries, trainable, where)
     if not any(chosen):
         floats = [path for path, leaf, _, _ in entries if is_float(leaf)]
-        said = "no field is marked weight()"
+        reason = "no field is marked weight()"
         if trainable is not None:
-            said = f"trainable={shortened(trainable)} picks no leaf"
+            reason = f"trainable={shortened(trainable)} picks no leaf"
         raise ValueError(
-            f"{where}: nothing in {type(model).__name__} is trainable: {said}. The "
+            f"{where}: nothing in {type(model).__name__} is trainable: {reason}. The "
             f"floating-point arrays that could be are {_listed(floats)}."
         )
     leaves, holes, constraints, values = [], [], {}, {}
@@ -183,12 +183,9 @@ def _chosen_by_filter(model, entries, trainable, where) -> list[bool]:
         chosen = [trainable(leaf) for _, leaf, _, _ in entries]
     else:
         try:
-            spread = jax.tree.map(
-                lambda mask, part: jax.tree.map(lambda _: mask, part), trainable, model
-            )
+            chosen = jax.tree.leaves(jax.tree.broadcast(trainable, model))
         except (ValueError, TypeError):
-            spread = None
-        chosen = jax.tree.leaves(spread)
+            chosen = []
         if len(chosen) != len(entries):
             raise ValueError(
                 f"{where}: trainable must be a path, paths, a function of a leaf, or "

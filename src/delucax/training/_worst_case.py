@@ -19,7 +19,7 @@ from ..simulation import rollout
 
 
 class Attack(NamedTuple):
-    """The worst disturbances that were found.
+    """The worst disturbances of a search.
 
     - `w`: shape `(horizon, k)`, for `rollout(..., w=w)`.
     - `total_cost`: what they cost.
@@ -37,8 +37,9 @@ class Attack(NamedTuple):
         env = dlx.make("pendulum")
         feedback = dlx.controllers.Linear([[20.0, 5.0]])
         options = dict(bound=0.01, x0=[0.1, 0.0], horizon=30, iterations=5)
-        found = dlx.training.worst_case(env, feedback, key=jax.random.key(0), **options)
-        found.w.shape, found.costs
+        search = dlx.training.worst_case
+        attack = search(env, feedback, key=jax.random.key(0), **options)
+        attack.w.shape, attack.costs
         ```
     """
 
@@ -98,10 +99,10 @@ def worst_case(
 
         A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
         env = dlx.make("lds", A=A, B=B, horizon=100)
-        learner = dlx.controllers.GPC(env.dynamics, env.cost)
-        found = dlx.training.worst_case(env, learner, key=jax.random.key(0), bound=1.0)
-        again = dlx.rollout(env, learner, key=jax.random.key(1), w=found.w)
-        found.total_cost
+        learner = dlx.controllers.gpc(env.dynamics, env.cost)
+        attack = dlx.training.worst_case(env, learner, key=jax.random.key(0), bound=1.0)
+        again = dlx.rollout(env, learner, key=jax.random.key(1), w=attack.w)
+        attack.total_cost
         ```
     """
     where = "worst_case"
@@ -156,6 +157,6 @@ def _attack(environment, controller, key, bound, x0, horizon, iterations, starts
     noise = jr.normal(start, (starts, *shape), like.dtype)
     steady = (jnp.arange(starts) % 2 == 0)[:, None, None]
     first = jnp.where(steady, noise[:, :1], noise)
-    found = search(on_sphere(first, first).astype(like.dtype))
-    worst = jnp.argmax(found.total_cost)
-    return jax.tree.map(lambda leaf: leaf[worst], found)
+    attacks = search(on_sphere(first, first).astype(like.dtype))
+    worst = jnp.argmax(attacks.total_cost)
+    return jax.tree.map(lambda leaf: leaf[worst], attacks)

@@ -1,16 +1,25 @@
 """Learners that start anew, each followed for as long as it does well."""
 
-from typing import Any, Literal, NamedTuple
+from dataclasses import KW_ONLY
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
-from ..._check import check_count, check_instance, check_key, check_range, check_step
+from ..._check import (
+    check_choice,
+    check_count,
+    check_instance,
+    check_key,
+    check_range,
+    check_step,
+)
 from ..._controller import AbstractController, AbstractLearner
 from ..._module import parameter
+from ..._typing import PRNGKey
 
 
 class AdaptiveState(NamedTuple):
@@ -25,15 +34,15 @@ class AdaptiveState(NamedTuple):
       all are mixed.
     """
 
-    experts: Any
-    weights: Array
-    ends: Array
-    step: Array
-    t: Array
-    mean: Array
-    variance: Array
-    chosen: Any
-    key: Any
+    experts: PyTree
+    weights: Float[Array, " slots"]
+    ends: Int[Array, " slots"]
+    step: Int[Array, ""]
+    t: Float[Array, ""]
+    mean: Float[Array, ""]
+    variance: Float[Array, ""]
+    chosen: Int[Array, ""] | None
+    key: PRNGKey | None
 
 
 class Adaptive(AbstractController):
@@ -52,12 +61,12 @@ class Adaptive(AbstractController):
 
     What is played is the mixture `u = sum_i p_i u_i`; or the control of one expert,
     chosen anew only with the probability by which its weight has fallen, so that it is
-    seldom exchanged. With [`delucax.controllers.GPC`][] as base it is AdaGPC.
+    seldom exchanged. With [`delucax.controllers.gpc`][] as base it is AdaGPC.
 
     **Arguments:**
 
     - `base`: an [`delucax.AbstractLearner`][], such as one of
-        [`delucax.controllers.GPC`][].
+        [`delucax.controllers.gpc`][].
     - `slots`: the number of experts alive at once, 8 by default.
     - `every`: steps between births, 64 by default.
     - `rate`: of the weights, 0.5 by default.
@@ -77,56 +86,40 @@ class Adaptive(AbstractController):
         import jax
 
         env = dlx.make("lds", key=jax.random.key(0))
-        learner = dlx.controllers.GPC(env.dynamics, env.cost)
+        learner = dlx.controllers.gpc(env.dynamics, env.cost)
         adaptive = dlx.controllers.Adaptive(learner)
         dlx.rollout(env, adaptive, key=jax.random.key(0)).total_cost
         ```
     """
 
     base: AbstractLearner
-    rate: Array = parameter()
-    share: Array = parameter()
-    slots: int = eqx.field(static=True)
-    every: int = eqx.field(static=True)
-    play: Literal["mix", "switch"] = eqx.field(static=True)
-
-    def __init__(
-        self,
-        base: AbstractLearner,
-        *,
-        slots: int = 8,
-        every: int = 64,
-        rate: Any = 0.5,
-        share: Any = 0.02,
-        play: Literal["mix", "switch"] = "mix",
-    ):
-        where = "Adaptive"
-        if play not in ("mix", "switch"):
-            raise ValueError(f"{where}: play must be 'mix' or 'switch', got {play!r}.")
-        self.base, self.play = base, play
-        self.slots = check_count(slots, "slots", where, least=2)
-        self.every = check_count(every, "every", where)
-        self.rate, self.share = rate, share
+    _: KW_ONLY
+    slots: int = eqx.field(default=8, static=True)
+    every: int = eqx.field(default=64, static=True)
+    rate: Array = parameter(0.5)
+    share: Array = parameter(0.02)
+    play: Literal["mix", "switch"] = eqx.field(default="mix", static=True)
 
     def __check_init__(self):
         where = "Adaptive"
-        check_instance(self.base, AbstractLearner, "base", where, " such as GPC makes")
+        check_instance(self.base, AbstractLearner, "base", where, " such as gpc makes")
+        check_count(self.slots, "slots", where, least=2)
+        check_count(self.every, "every", where)
         check_step(self.rate, where, "rate")
         check_step(self.share, where, "share")
         check_range(self.share, "share", where, 0, 1)
+        check_choice(self.play, ("mix", "switch"), "play", where)
 
     def init(self, *, key=None):
-        switches = self.play == "switch"
-        if switches:
-            key, base_key = jr.split(check_key(key, "Adaptive.init"))
-        else:
-            base_key = key
-        one = self.base.init(key=base_key)
+        chosen, own, base_key = None, None, key
+        if self.play == "switch":
+            own, base_key = jr.split(check_key(key, "Adaptive.init"))
+            chosen = jnp.zeros((), jnp.int32)
         experts = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (self.slots, *leaf.shape)), one
+            lambda leaf: jnp.broadcast_to(leaf, (self.slots, *leaf.shape)),
+            self.base.init(key=base_key),
         )
-        first = jnp.arange(self.slots) == 0
-        zero = jnp.zeros(())
+        first, zero = jnp.arange(self.slots) == 0, jnp.zeros(())
         return AdaptiveState(
             experts,
             weights=jnp.where(first, jnp.ones(()), 0),
@@ -135,30 +128,27 @@ class Adaptive(AbstractController):
             t=zero,
             mean=zero,
             variance=zero,
-            chosen=jnp.zeros((), jnp.int32) if switches else None,
-            key=key if switches else None,
+            chosen=chosen,
+            key=own,
         )
 
     def __call__(self, t, y, state):
         act = jax.vmap(self.base, in_axes=(None, None, 0))
         controls, experts = act(t, y, state.experts)
-        if state.chosen is None:
-            u = state.weights.astype(y.dtype) @ controls
-        else:
-            u = controls[state.chosen]
-        t = jnp.asarray(t, state.t.dtype)
-        return u, state._replace(experts=experts, t=t)
+        weights = state.weights.astype(y.dtype)
+        u = weights @ controls if state.chosen is None else controls[state.chosen]
+        return u, state._replace(experts=experts, t=jnp.asarray(t, state.t.dtype))
 
     def applied(self, u, cost, state):
         losses = jax.vmap(self.base.loss, in_axes=(None, 0))(state.t, state.experts)
-        state = self._judge(losses.astype(state.weights.dtype), state)
-        told = jax.vmap(self.base.applied, in_axes=(None, None, 0))
-        state = state._replace(
-            experts=told(u, cost, state.experts), step=state.step + 1
-        )
-        return self._renew(state)
+        state = self._reweighted(losses.astype(state.weights.dtype), state)
+        applied = jax.vmap(self.base.applied, in_axes=(None, None, 0))
+        experts = applied(u, cost, state.experts)
+        return self._renewed(state._replace(experts=experts, step=state.step + 1))
 
-    def _judge(self, losses: Array, state: AdaptiveState) -> AdaptiveState:
+    def _reweighted(
+        self, losses: Float[Array, " slots"], state: AdaptiveState
+    ) -> AdaptiveState:
         """New weights, up to a factor, and perhaps another choice, after a step."""
         old, alive = state.weights, state.weights > 0
         losses = jnp.where(alive, losses, 0)
@@ -175,45 +165,46 @@ class Adaptive(AbstractController):
             # Normalised so that no weight rises, as costs of at least 0 would have it.
             best = jnp.min(jnp.where(alive, excess, jnp.inf))
             kept = jnp.exp(-self.rate * (excess[state.chosen] - best))
-            state = self._choose(new, kept, state)
+            state = self._rechosen(new, kept, state)
         return state._replace(weights=new)
 
-    def _choose(self, weights: Array, kept: Array, state: AdaptiveState) -> Any:
+    def _rechosen(
+        self, weights: Array, kept: ArrayLike, state: AdaptiveState
+    ) -> AdaptiveState:
         """Keep the expert that is followed with probability `kept`."""
+        assert state.key is not None and state.chosen is not None
         key, toss, draw = jr.split(state.key, 3)
         stays = jr.uniform(toss) < kept
         other = jr.categorical(draw, jnp.log(weights)).astype(state.chosen.dtype)
         return state._replace(chosen=jnp.where(stays, state.chosen, other), key=key)
 
-    def _renew(self, state: AdaptiveState) -> AdaptiveState:
-        """Births and deaths."""
+    def _renewed(self, state: AdaptiveState) -> AdaptiveState:
+        """After births and deaths."""
         step, ends = state.step, state.ends
-        born, birth = step % self.every == 0, jnp.maximum(step // self.every, 1)
-        divisor = birth & -birth
+        is_birth, births = step % self.every == 0, jnp.maximum(step // self.every, 1)
         slot = jnp.argmin(ends)
-        life = self.every * (4 * divisor + 1)
-        newborn = born & (jnp.arange(self.slots) == slot)
+        life = self.every * (4 * (births & -births) + 1)
+        newborn = is_birth & (jnp.arange(self.slots) == slot)
         ends = jnp.where(newborn, step + life, ends)
         old = jax.tree.map(lambda leaf: leaf[slot], state.experts)
-        new = self.base.fresh(old, None)
 
-        def replaced(leaf, before, after):
+        def renewed(leaf, before, after):
             # What a birth leaves as it is is not written: most of the state.
             if after is before:
                 return leaf
             mask = newborn.reshape((-1,) + (1,) * (leaf.ndim - 1))
             return jnp.where(mask, after, leaf)
 
-        experts = jax.tree.map(replaced, state.experts, old, new)
+        new = self.base.fresh(old, None)
+        experts = jax.tree.map(renewed, state.experts, old, new)
         alive = ends > step
         kept = alive & ~newborn
         weights = jnp.where(kept, state.weights, 0)
         weights = weights / jnp.sum(weights)
-        dealt = alive / jnp.sum(alive)
-        weights = (1 - self.share) * weights + self.share * dealt
-        state = state._replace(experts=experts, ends=ends)
-        state = state._replace(weights=weights.astype(state.weights.dtype))
+        weights = (1 - self.share) * weights + self.share * (alive / jnp.sum(alive))
+        state = state._replace(
+            experts=experts, ends=ends, weights=weights.astype(state.weights.dtype)
+        )
         if state.chosen is None:
             return state
-        gone = ~kept[state.chosen]
-        return self._choose(weights, jnp.where(gone, 0, 1), state)
+        return self._rechosen(weights, jnp.where(kept[state.chosen], 1, 0), state)

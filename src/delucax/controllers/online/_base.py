@@ -1,60 +1,30 @@
-"""What a learner is given, and the base controller that it gets if it is given none."""
+"""What a learner is given, and the base controller of one that is given none."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
-from ..._check import check_count, check_instance, check_positive, is_concrete
+from ..._check import check_instance, is_concrete, output_of
+from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics, LinearDynamics, linearize
 from .._lqg import LQG
 from .._lqr import LQR
 from .._scheduled import Scheduled
-from ._features import Features
-from ._learner import check_scalar_cost, OnlineLearner
-from ._loop import Loop
-from ._newton import online_newton
-from ._policy import LinearPolicy
-from ._step_size import adagrad_norm
 
 
-STEP = 0.15
-"""The step of a learner, in units of the control that undoes what it has observed."""
-RADIUS = 50.0
-"""The largest policy, in the same units."""
-OF_OUTPUTS = 4.0
-"""The prior of what is learned from nature's outputs, in steps."""
-
-
-def loop_of(
-    dynamics: Any,
-    cost: Any,
-    base: Any,
-    horizon: int | None,
+def base_for(
+    dynamics: AbstractDynamics,
+    cost: Callable[..., Array],
+    base: AbstractController | None,
     where: str,
-    *,
-    echoes: bool | None = None,
-) -> Loop:
-    """The loop of a learner, with the default base if none is given; it echoes by
-    default if the state is not observed."""
-    _check_cost(dynamics, cost, where)
-    if base is None:
-        base = _default_base(dynamics, cost, where)
-    if echoes is None:
-        echoes = not dynamics.observes_state
-    return Loop(dynamics, base, horizon, where, echoes=echoes)
-
-
-def memory_of(loop: Loop, memory: int | None, where: str) -> int:
-    """How many values of its signal a learner keeps: as given, or for as long as they
-    matter."""
-    return loop.memory() if memory is None else check_count(memory, "memory", where)
-
-
-def _check_cost(dynamics: Any, cost: Any, where: str) -> None:
-    """Raise unless the cost gives a scalar."""
+) -> AbstractController:
+    """The base of a learner with this model and cost, which are checked: as given, or
+    the default one."""
     hint = (
         ", the model that it learns with (`delucax.controllers.Explore` identifies one)"
     )
@@ -65,16 +35,34 @@ def _check_cost(dynamics: Any, cost: Any, where: str) -> None:
             f"delucax.costs, got {type(cost).__name__}."
         )
     check_scalar_cost(cost, dynamics, where)
+    return _default_base(dynamics, cost, where) if base is None else base
 
 
-def _default_base(dynamics: AbstractDynamics, cost: Any, where: str) -> Any:
+def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None:
+    """Raise unless a cost of what `dynamics` show is a scalar."""
+    y, u = (dynamics.observation_size,), (dynamics.control_size,)
+    try:
+        value = output_of(cost, (), y, u)
+    except ValueError as error:
+        raise ValueError(
+            f"{where}: cost must take the observation, of shape {y}, where a state is "
+            f"asked for, and a control of shape {u}: {error}"
+        ) from error
+    got = getattr(value, "shape", None)
+    if got != ():
+        got = type(value).__name__ if got is None else f"an array of shape {got}"
+        raise ValueError(f"{where}: cost must give a scalar, got {got}.")
+
+
+def _default_base(
+    dynamics: AbstractDynamics, cost: Callable[..., Array], where: str
+) -> AbstractController:
     """The regulator for the curvature of the cost at the operating point.
 
     For each time of time-varying dynamics it is the one that would be best if they
     stayed as they are; where not the state but `C x` is observed, it acts on what a
     Kalman filter for disturbances and sensor noise of unit covariance makes of it.
     """
-    linear = isinstance(dynamics, LinearDynamics)
     try:
         x, u = dynamics.equilibrium()
     except ValueError as error:
@@ -84,7 +72,7 @@ def _default_base(dynamics: AbstractDynamics, cost: Any, where: str) -> Any:
         ) from error
     t = jnp.zeros((), x.dtype)
     Q, R, S = _curvature(dynamics, cost, t, x, u, where)
-    if not linear:
+    if not isinstance(dynamics, LinearDynamics):
         model = linearize(dynamics, t, x, u)
         return LQR(model, Q, R, S, difference=dynamics.difference)
     if not dynamics.is_time_varying:
@@ -118,49 +106,3 @@ def _curvature(dynamics, cost, t, x, u, where):
                 "strictly so in u, at the operating point."
             )
     return Q, R, S
-
-
-def linear_learner(
-    loop: Loop,
-    cost: Any,
-    features: Features,
-    learning_rate: Any,
-    optimiser: Any,
-    radius: Any,
-    where: str,
-) -> OnlineLearner:
-    """A learner of a linear map from features to control."""
-    start = jnp.zeros((loop.dynamics.control_size, features.size), loop.dtype)
-    return OnlineLearner(
-        loop,
-        cost,
-        features,
-        LinearPolicy(start, scale(loop, radius, "radius", RADIUS, where)),
-        scale(loop, learning_rate, "learning_rate", STEP, where),
-        _optimiser(loop, features) if optimiser is None else optimiser,
-    )
-
-
-def _optimiser(loop: Loop, features: Features) -> Any:
-    """Newton's step where gradients alone are slow: nature's outputs are much alike
-    from step to step, and a response that changes points elsewhere each time."""
-    if features.nature:
-        return online_newton(OF_OUTPUTS)
-    return online_newton() if loop.response is None else adagrad_norm()
-
-
-def scale(loop: Loop, given: Any, name: str, units: float, where: str) -> Any:
-    """A step size or radius: as given, or in units of `1 / reach`."""
-    if given is not None:
-        check_positive(given, name, where)
-        if np.ndim(given):
-            raise ValueError(
-                f"{where}: {name} must be a number, got shape {np.shape(given)}."
-            )
-        return given
-    if loop.reach is None:
-        raise ValueError(
-            f"{where}: {name} must be given, for dynamics that name no equilibrium."
-        )
-    reached = loop.reach > 0
-    return jnp.where(reached, units / jnp.where(reached, loop.reach, 1), units)

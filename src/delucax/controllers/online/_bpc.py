@@ -1,30 +1,29 @@
 """Learning from the cost alone."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ..._check import check_count, check_instance, check_key, check_step
 from ..._controller import AbstractController, Tally
-from ..._module import parameter, weight
+from ..._module import parameter
+from ..._typing import PRNGKey
 from ...dynamics import AbstractDynamics
-from ...math._norms import safe_norm, within_ball
-from ._base import RADIUS, scale
-from ._features import Features
-from ._learner import accepted
-from ._loop import Loop, LoopState, shift
-from ._step_size import adagrad_norm
+from ...math._norms import safe_norm
+from ._closed_loop import ClosedLoop, ClosedLoopState, in_first_responses, shift
+from ._learner import RADIUS
+from ._optimisers import adagrad_norm, projected_step
+from ._policy import LinearPolicy
 
 
 class BPCState(NamedTuple):
     """What it remembers.
 
     - `loop`: of the plant and the base controller.
-    - `signal`: its last values, newest first.
     - `theta`: what has been learned, and `optimiser`, the state of the optimiser.
     - `tried`: the unit directions that theta was moved in, newest first.
     - `level`: the running mean of the cost, and `steps`, how many it is of.
@@ -32,14 +31,13 @@ class BPCState(NamedTuple):
     - `refused`: how many updates were not finite, and so were not made.
     """
 
-    loop: LoopState
-    signal: Array
-    theta: Array
-    optimiser: Any
-    tried: Array
-    level: Array
-    steps: Array
-    key: Array
+    loop: ClosedLoopState
+    theta: Float[Array, "m f"]
+    optimiser: PyTree
+    tried: Float[Array, "window m f"]
+    level: Float[Array, ""]
+    steps: Float[Array, ""]
+    key: PRNGKey
     refused: Tally
 
 
@@ -74,7 +72,7 @@ class BPC(AbstractController):
     - `radius`: theta is kept inside this ball in the Frobenius norm, by default 50 over
         the same size.
 
-    **Attributes:** `start`, the first theta, trainable, zero.
+    **Attributes:** `policy.start`, the first theta, trainable, zero.
 
     **Raises:** `ValueError` if the base does not stabilise the dynamics or does not fit
     them, or a number is out of its range; when it is run, if there is no key.
@@ -97,10 +95,8 @@ class BPC(AbstractController):
         ```
     """
 
-    loop: Loop
-    features: Features
-    start: Float[Array, "m f"] = weight()
-    radius: Array = parameter()
+    loop: ClosedLoop
+    policy: LinearPolicy
     delta: Array = parameter()
     learning_rate: Array = parameter()
     optimiser: optax.GradientTransformation = eqx.field(static=True)
@@ -113,40 +109,39 @@ class BPC(AbstractController):
         *,
         memory: int = 5,
         horizon: int = 5,
-        delta: Any = None,
-        learning_rate: Any = None,
+        delta: ArrayLike | None = None,
+        learning_rate: ArrayLike | None = None,
         optimiser: optax.GradientTransformation | None = None,
-        radius: Any = None,
+        radius: ArrayLike | None = None,
     ):
         where = "BPC"
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
-        echoes = not dynamics.observes_state
-        # A roll-out as long as it takes a control to be seen.
-        loop = Loop(dynamics, base, dynamics.state_size, where, echoes=echoes)
         memory = check_count(memory, "memory", where)
-        size = dynamics.observation_size
-        self.features = Features(None, memory, size, nature=echoes)
-        self.start = jnp.zeros((dynamics.control_size, memory * size), loop.dtype)
-        self.radius = scale(loop, radius, "radius", RADIUS, where)
-        self.delta = scale(loop, delta, "delta", 0.2, where)
-        self.learning_rate = scale(loop, learning_rate, "learning_rate", 0.05, where)
+        # A roll-out as long as it takes a control to be seen.
+        loop = ClosedLoop(dynamics, base, dynamics.state_size, where, memory=memory)
+        scale = lambda given, name, units: in_first_responses(
+            loop, given, name, units, where
+        )
+        start = jnp.zeros((dynamics.control_size, loop.feature_size), loop.dtype)
         self.loop = loop
+        self.policy = LinearPolicy(start, scale(radius, "radius", RADIUS))
+        self.delta = scale(delta, "delta", 0.2)
+        self.learning_rate = scale(learning_rate, "learning_rate", 0.05)
         self.optimiser = adagrad_norm() if optimiser is None else optimiser
         self.window = check_count(horizon, "horizon", where)
 
     def __check_init__(self):
-        for name in ("radius", "delta", "learning_rate"):
-            check_step(getattr(self, name), "BPC", name)
+        check_step(self.delta, "BPC", "delta")
+        check_step(self.learning_rate, "BPC", "learning_rate")
 
     def init(self, *, key=None):
         own, base_key = jr.split(check_key(key, "BPC.init"))
-        dtype = self.loop.dtype
+        theta, dtype = self.policy.init(), self.loop.dtype
         return BPCState(
             self.loop.init(base_key, 0),
-            signal=self.features.init(dtype),
-            theta=self.start,
-            optimiser=self.optimiser.init(self.start),
-            tried=jnp.zeros((self.window, *self.start.shape), dtype),
+            theta=theta,
+            optimiser=self.optimiser.init(theta),
+            tried=jnp.zeros((self.window, *theta.shape), dtype),
             level=jnp.zeros((), dtype),
             steps=jnp.zeros((), dtype),
             key=own,
@@ -154,34 +149,32 @@ class BPC(AbstractController):
         )
 
     def __call__(self, t, y, state):
-        loop, before = self.loop, state.loop.base
-        moved = loop.act(self, t, y, state.loop)
-        signal = self.features.observe(loop, moved, state.signal)
         key, now = jr.split(state.key)
-        direction = jr.normal(now, self.start.shape, loop.dtype)
+        direction = jr.normal(now, state.theta.shape, self.loop.dtype)
         direction = direction / safe_norm(direction, axis=None)
-        v = (state.theta + self.delta * direction) @ self.features(signal)
-        state = state._replace(
-            loop=loop.linearised(v, before, moved),
-            signal=signal,
-            tried=shift(direction, state.tried),
-            key=key,
-        )
-        return (moved.u_base + v).astype(y.dtype), state
+        theta = state.theta + self.delta * direction
+        policy = lambda features: self.policy(theta, features)
+        _, v, loop = self.loop.act(self, t, y, state.loop, policy)
+        tried = shift(direction, state.tried)
+        state = state._replace(loop=loop, tried=tried, key=key)
+        return (loop.u_base + v).astype(y.dtype), state
 
     def applied(self, u, cost, state):
         cost = cost.astype(state.level.dtype)
         steps = state.steps + 1
         # The first cost has nothing to be compared with.
         off = jnp.where(state.steps > 0, cost - state.level, 0)
-        size = self.start.size
+        size = state.theta.size
         gradient = size / self.delta * off * jnp.sum(state.tried, axis=0)
-        step: Any = gradient.astype(state.theta.dtype)
-        step, optimiser = self.optimiser.update(step, state.optimiser, state.theta)
-        theta = state.theta + self.learning_rate * step
-        theta = within_ball(theta, self.radius).astype(state.theta.dtype)
-        old = state.theta, state.optimiser
-        (theta, optimiser), refused = accepted((theta, optimiser), old, state.refused)
+        theta, optimiser, refused = projected_step(
+            self.optimiser,
+            self.learning_rate,
+            self.policy.project,
+            gradient.astype(state.theta.dtype),
+            state.theta,
+            state.optimiser,
+            state.refused,
+        )
         return state._replace(
             loop=self.loop.applied(u, cost, state.loop),
             theta=theta,

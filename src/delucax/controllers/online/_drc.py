@@ -9,12 +9,12 @@ from jaxtyping import Array
 from ..._check import check_count
 from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics
-from ._base import linear_learner, loop_of
-from ._features import Features
-from ._learner import OnlineLearner
+from ._base import base_for
+from ._closed_loop import ClosedLoop
+from ._learner import linear_learner, OnlineLearner
 
 
-def DRC(
+def drc(
     dynamics: AbstractDynamics,
     cost: Callable[..., Array],
     *,
@@ -60,8 +60,9 @@ def DRC(
     - `radius`: M is kept inside this ball in the Frobenius norm; by default 50 over the
         same size.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state, `signal` has
-    nature's outputs and `theta`, shape `(m, memory p)`, the matrices M side by side.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
+    has nature's outputs and `theta`, shape `(m, memory p)`, the matrices M side by
+    side.
 
     **Raises:** `ValueError` if the base does not stabilise the dynamics, does not fit
     them or cannot be designed, the cost is not a scalar, or a number is out of its
@@ -82,12 +83,11 @@ def DRC(
         cost = dlx.costs.Quadratic(C.T @ C, jnp.eye(1))
         env = dlx.make("lds", A=A, B=B, C=C, cost=cost, disturbance=push)
         cost = dlx.costs.Quadratic(jnp.eye(1), jnp.eye(1))  # of what is seen
-        learner = dlx.controllers.DRC(env.dynamics, cost)
+        learner = dlx.controllers.drc(env.dynamics, cost)
         dlx.rollout(env, learner, key=jax.random.key(0), horizon=1000).total_cost
         ```
     """
-    where = "DRC"
-    loop = loop_of(dynamics, cost, base, horizon, where, echoes=True)
-    memory = check_count(memory, "memory", where)
-    features = Features(None, memory, dynamics.observation_size, nature=True)
-    return linear_learner(loop, cost, features, learning_rate, optimiser, radius, where)
+    memory = check_count(memory, "memory", "drc")
+    base = base_for(dynamics, cost, base, "drc")
+    loop = ClosedLoop(dynamics, base, horizon, "drc", memory=memory, nature=True)
+    return linear_learner(loop, cost, learning_rate, optimiser, radius, "drc")

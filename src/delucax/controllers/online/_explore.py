@@ -8,21 +8,22 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int, PyTree
 
 from ..._check import as_matrix, check_count, check_key, check_step
 from ..._controller import AbstractController, wrong_observation
 from ..._module import function_field, parameter
+from ..._typing import PRNGKey
 from ...dynamics import LinearDynamics
 from ...math._linear_solve import solve
-from ._loop import shift
+from ._closed_loop import shift
 
 
 class ExploreState(NamedTuple):
     """What is remembered.
 
     - `step`: how many steps were made.
-    - `pushes`: the last random controls, newest first.
+    - `excitations`: the last random controls, newest first.
     - `moments`: of the state with the random control j + 1 steps before, summed up,
       shape `(order + 1, n, m)`.
     - `model`: the dynamics that were identified, and `arrays`, the controller made for
@@ -30,13 +31,13 @@ class ExploreState(NamedTuple):
     - `key`: of the next random control.
     """
 
-    step: Array
-    pushes: Array
-    moments: Array
+    step: Int[Array, ""]
+    excitations: Float[Array, "order+1 m"]
+    moments: Float[Array, "order+1 n m"]
     model: LinearDynamics
-    arrays: Any
-    inner: Any
-    key: Array
+    arrays: PyTree
+    inner: PyTree
+    key: PRNGKey
 
 
 class Explore(AbstractController):
@@ -51,7 +52,7 @@ class Explore(AbstractController):
     `B = N_0`, and `A - BK` is the least-squares solution of
     `(A - BK) [N_0 ... N_{order-1}] = [N_1 ... N_order]`. From then on the controller
     that `build` makes for `x_next = A x + B u` is in charge. With
-    [`delucax.controllers.GPC`][] and `steps` near `T^(2/3)`, its regret over T steps
+    [`delucax.controllers.gpc`][] and `steps` near `T^(2/3)`, its regret over T steps
     grows as `T^(2/3)`.
 
     **Arguments:**
@@ -82,7 +83,7 @@ class Explore(AbstractController):
         env = dlx.make("lds", A=jnp.array([[0.9, 0.3], [0.0, 0.8]]), B=jnp.eye(2))
 
         def build(model):
-            return dlx.controllers.GPC(model, env.cost, horizon=20)
+            return dlx.controllers.gpc(model, env.cost, horizon=20)
 
         learner = dlx.controllers.Explore(build, jnp.zeros((2, 2)), steps=200)
         dlx.rollout(env, learner, key=jax.random.key(0), horizon=1000).total_cost
@@ -125,14 +126,13 @@ class Explore(AbstractController):
 
     def init(self, *, key=None):
         key = check_key(key, "Explore.init")
-        m, n = self.K.shape
-        dtype = self.K.dtype
+        (m, n), dtype = self.K.shape, self.K.dtype
         # Any plant that every design has an answer for.
         model = self._model(jnp.eye(n, dtype=dtype) / 2, jnp.eye(n, m, dtype=dtype))
-        arrays, inner = self._made(model)
+        arrays, inner = self._designed(model)
         return ExploreState(
             step=jnp.zeros((), jnp.int32),
-            pushes=jnp.zeros((self.order + 1, m), dtype),
+            excitations=jnp.zeros((self.order + 1, m), dtype),
             moments=jnp.zeros((self.order + 1, n, m), dtype),
             model=model,
             arrays=arrays,
@@ -144,58 +144,52 @@ class Explore(AbstractController):
         if y.shape != self.K.shape[1:]:
             raise wrong_observation(self, self.K.shape[1], y)
         dtype, y = y.dtype, y.astype(self.K.dtype)
-        # Row j of the pushes is that of j + 1 steps ago.
-        seen = y[:, None] * state.pushes[:, None, :] / self.scale**2
+        # Row j of the excitations is that of j + 1 steps ago.
+        moments = y[:, None] * state.excitations[:, None, :] / self.scale**2
         exploring = state.step < self.steps
-        moments = jnp.where(exploring, state.moments + seen, state.moments)
+        moments = jnp.where(exploring, state.moments + moments, state.moments)
         state = state._replace(moments=moments)
-        identify = lambda s: self._identify(s)  # noqa: E731
+        identify = lambda s: self._identified(s)  # noqa: E731
         state = lax.cond(state.step == self.steps, identify, lambda s: s, state)
         key, now = jr.split(state.key)
-        push = self.scale * jr.rademacher(now, (self.K.shape[0],), y.dtype)
-        controller = eqx.combine(state.arrays, self._structure())
-        acted, inner = controller(t, y, state.inner)
-        u = jnp.where(exploring, -self.K @ y + push, acted.astype(y.dtype))
-        inner = jax.tree.map(
-            lambda old, new: jnp.where(exploring, old, new), state.inner, inner
+        excitation = self.scale * jr.rademacher(now, (self.K.shape[0],), y.dtype)
+        acted, inner = self._controller(state)(t, y, state.inner)
+        u = jnp.where(exploring, -self.K @ y + excitation, acted.astype(y.dtype))
+        state = state._replace(
+            inner=_where(exploring, state.inner, inner),
+            excitations=shift(excitation, state.excitations),
+            key=key,
         )
-        pushes = shift(push, state.pushes)
-        state = state._replace(inner=inner, pushes=pushes, key=key)
         return u.astype(dtype), state
 
     def applied(self, u, cost, state):
-        controller = eqx.combine(state.arrays, self._structure())
-        inner = controller.applied(u, cost, state.inner)
-        exploring = state.step < self.steps
-        inner = jax.tree.map(
-            lambda old, new: jnp.where(exploring, old, new), state.inner, inner
-        )
+        inner = self._controller(state).applied(u, cost, state.inner)
+        inner = _where(state.step < self.steps, state.inner, inner)
         return state._replace(inner=inner, step=state.step + 1)
 
-    def _identify(self, state: ExploreState) -> ExploreState:
-        # Lag j has been seen j steps fewer.
+    def _identified(self, state: ExploreState) -> ExploreState:
+        # Lag j was observed j steps fewer.
         counts = self.steps - 1 - jnp.arange(self.order + 1)
         N = state.moments / counts[:, None, None].astype(state.moments.dtype)
         before = jnp.concatenate(list(N[:-1]), axis=1)
         after = jnp.concatenate(list(N[1:]), axis=1)
         gram = before @ before.T
-        # A direction that was not moved is left as it is.
+        # A direction that was not excited is left as it is.
         least = jnp.finfo(gram.dtype).eps * jnp.trace(gram)
-        loop = solve(
-            gram + least * jnp.eye(len(gram), dtype=gram.dtype), before @ after.T
-        )
-        model = self._model(loop.T + N[0] @ self.K, N[0])
-        arrays, inner = self._made(model)
+        gram = gram + least * jnp.eye(len(gram), dtype=gram.dtype)
+        closed_loop = solve(gram, before @ after.T).T
+        model = self._model(closed_loop + N[0] @ self.K, N[0])
+        arrays, inner = self._designed(model)
         return state._replace(model=model, arrays=arrays, inner=inner)
 
     def _model(self, A: Array, B: Array) -> LinearDynamics:
         return LinearDynamics(A, B, dt=self.dt)
 
-    def _made(self, model: LinearDynamics) -> tuple[Any, Any]:
+    def _designed(self, model: LinearDynamics) -> tuple[PyTree, PyTree]:
         """The arrays of the controller for a model, and its state."""
 
         @eqx.filter_jit
-        def made(model):
+        def design(model):
             controller = self.build(model)
             if not isinstance(controller, AbstractController):
                 raise ValueError(
@@ -205,16 +199,14 @@ class Explore(AbstractController):
             return eqx.filter(controller, eqx.is_array), controller.init(key=None)
 
         strong = lambda x: lax.convert_element_type(x, x.dtype)  # noqa: E731
-        return jax.tree.map(strong, made(model))
+        return jax.tree.map(strong, design(model))
 
-    def _structure(self) -> Any:
-        """All of the controller but its arrays."""
-        m, n = self.K.shape
-        shapes = eqx.filter_eval_shape(
-            lambda A, B: eqx.filter(
-                self.build(self._model(A, B)), eqx.is_array, inverse=True
-            ),
-            jax.ShapeDtypeStruct((n, n), self.K.dtype),
-            jax.ShapeDtypeStruct((n, m), self.K.dtype),
-        )
-        return shapes
+    def _controller(self, state: ExploreState) -> AbstractController:
+        """The controller of the arrays in the state. All else that it consists of is
+        the same for every model."""
+        build = lambda model: eqx.filter(self.build(model), eqx.is_array, inverse=True)
+        return eqx.combine(state.arrays, eqx.filter_eval_shape(build, state.model))
+
+
+def _where(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -8,12 +8,12 @@ from jaxtyping import Array
 
 from ..._controller import AbstractController
 from ...dynamics import AbstractDynamics
-from ._base import linear_learner, loop_of, memory_of
-from ._features import Features
-from ._learner import OnlineLearner
+from ._base import base_for
+from ._closed_loop import ClosedLoop
+from ._learner import linear_learner, OnlineLearner
 
 
-def GPC(
+def gpc(
     dynamics: AbstractDynamics,
     cost: Callable[..., Array],
     *,
@@ -64,8 +64,9 @@ def GPC(
     - `radius`: E is kept inside this ball in the Frobenius norm, `50 / |B|_F` by
         default.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state, `signal` has
-    the disturbances and `theta`, shape `(m, memory n)`, the matrices E side by side.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
+    has the disturbances and `theta`, shape `(m, memory n)`, the matrices E side by
+    side.
 
     **Raises:** `ValueError` if the base does not stabilise the dynamics, does not fit
     them or cannot be designed, the cost is not a scalar, the state is not observed, or
@@ -87,19 +88,16 @@ def GPC(
         env = dlx.Environment(dynamics, cost, disturbance=push)
 
         run = lambda c: dlx.rollout(env, c, key=jax.random.key(0), horizon=1000)
-        learner = dlx.controllers.GPC(dynamics, cost)
+        learner = dlx.controllers.gpc(dynamics, cost)
         regulator = dlx.controllers.LQR(dynamics, jnp.eye(2), jnp.eye(1))
         run(learner).total_cost / run(regulator).total_cost
         ```
     """
-    where = "GPC"
-    loop = loop_of(dynamics, cost, base, horizon, where, echoes=False)
+    base = base_for(dynamics, cost, base, "gpc")
+    loop = ClosedLoop(dynamics, base, horizon, "gpc", memory=memory, nature=False)
     if not loop.observed:
         raise ValueError(
-            f"{where}: dynamics must observe their state (DRC learns from outputs), "
-            f"got {loop.dynamics.observation_size} outputs of {dynamics.state_size} "
-            "states."
+            "gpc: dynamics must observe their state (drc learns from outputs), got "
+            f"{dynamics.observation_size} outputs of {dynamics.state_size} states."
         )
-    memory = memory_of(loop, memory, where)
-    features = Features(None, memory, dynamics.state_size, nature=False)
-    return linear_learner(loop, cost, features, learning_rate, optimiser, radius, where)
+    return linear_learner(loop, cost, learning_rate, optimiser, radius, "gpc")

@@ -7,7 +7,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int, PyTree
 
 from ..._check import check_count
 from ..._controller import AbstractController
@@ -41,15 +41,15 @@ class Hindsight(NamedTuple):
         env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
         gain = dlx.controllers.Linear(jnp.zeros((1, 2)))
         run = dlx.rollout(env, gain, key=jax.random.key(0))
-        found = dlx.controllers.best_in_hindsight(env, gain, run)
-        found.controller.K, found.decrement, found.result
+        best = dlx.controllers.best_in_hindsight(env, gain, run)
+        best.controller.K, best.decrement, best.result
         ```
     """
 
     controller: AbstractController
     trajectory: Trajectory
-    decrement: Array
-    iterations: Array
+    decrement: Float[Array, ""]
+    iterations: Int[Array, ""]
     result: Result
 
 
@@ -72,10 +72,10 @@ def best_in_hindsight(
     minimum where the cost is convex in theta: of a disturbance-action policy on a
     linear plant with a convex cost it is, of a linear gain in general not.
 
-    - `GPC(...).fixed()`: the best disturbance-action policy.
-    - `DRC(...).fixed()`: the best disturbance-response policy.
+    - `gpc(...).fixed()`: the best disturbance-action policy.
+    - `drc(...).fixed()`: the best disturbance-response policy.
     - `Linear(K)` or `LQR(...)`: the best gain, from that one on.
-    - `Sequence(controls)`: the best open loop, for short horizons.
+    - `OpenLoop(controls)`: the best open loop, for short horizons.
 
     **Arguments:**
 
@@ -101,7 +101,7 @@ def best_in_hindsight(
 
         push = dlx.disturbances.Constant(0.1 * jnp.ones(2))
         env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
-        learner = dlx.controllers.GPC(env.dynamics, env.cost)
+        learner = dlx.controllers.gpc(env.dynamics, env.cost)
         run = dlx.rollout(env, learner, key=jax.random.key(0))
         best = dlx.controllers.best_in_hindsight(env, learner.fixed(), run)
         run.total_cost / best.trajectory.total_cost
@@ -121,25 +121,23 @@ def best_in_hindsight(
             f"{type(controller).__name__}."
         )
     iterations = check_count(iterations, "iterations", where)
-    if tolerance is None:
-        tolerance = float(jnp.finfo(states.dtype).eps ** 0.5)
+    rounding = float(jnp.finfo(states.dtype).eps ** 0.5)
+    tolerance = rounding if tolerance is None else tolerance
     if environment.sensor_noise is not None:
         if trajectory.observations is None:
             raise ValueError(
                 f"{where}: trajectory must have its observations, in an environment "
                 "with sensor noise."
             )
-        seen = jax.vmap(environment.dynamics.observe)(
-            trajectory.times[:-1], states[:-1]
-        )
-        noise = FromArray(trajectory.observations - seen)
+        observe = jax.vmap(environment.dynamics.observe)
+        exact = observe(trajectory.times[:-1], states[:-1])
+        noise = FromArray(trajectory.observations - exact)
         environment = eqx.tree_at(lambda e: e.sensor_noise, environment, noise)
-    return _search(
-        environment, controller, states[0], w, trajectory.steps, iterations, tolerance
-    )
+    given = states[0], w, trajectory.steps, iterations, tolerance
+    return _search(environment, controller, *given)
 
 
-def regret(trajectory: Trajectory, comparator: Trajectory) -> Array:
+def regret(trajectory: Trajectory, comparator: Trajectory) -> Float[Array, "... T"]:
     """By how much a run has cost more than another, up to each step,
 
     `regret_k = sum_{t <= k} (cost_t - comparator's cost_t)`.
@@ -164,7 +162,7 @@ def regret(trajectory: Trajectory, comparator: Trajectory) -> Array:
 
         noise = dlx.disturbances.Gaussian(0.1, size=2)
         env = dlx.make("lds", key=jax.random.key(0), disturbance=noise)
-        learner = dlx.controllers.GPC(env.dynamics, env.cost)
+        learner = dlx.controllers.gpc(env.dynamics, env.cost)
         run = dlx.rollout(env, learner, key=jax.random.key(0))
         best = dlx.controllers.best_in_hindsight(env, learner.fixed(), run)
         dlx.controllers.regret(run, best.trajectory)[-1]
@@ -180,7 +178,7 @@ def regret(trajectory: Trajectory, comparator: Trajectory) -> Array:
     return jnp.cumsum(costs - others, axis=-1)
 
 
-def _split(controller: AbstractController) -> tuple[Any, Any]:
+def _split(controller: AbstractController) -> tuple[PyTree, PyTree]:
     """The weights that the search moves, and the rest."""
     # A policy is judged on top of the base that it was given.
     inside = "policy" if isinstance(controller, FixedPolicy) else ""
@@ -200,48 +198,46 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
     start, unravel = ravel_pytree(weights)
 
     def run(theta, keep=(), checkpoint="step"):
-        found = eqx.combine(unravel(theta), rest)
-        options: Any = dict(key=jax.random.key(0), horizon=horizon, throw=False)
-        options |= dict(keep=keep, checkpoint=checkpoint)
-        return found, rollout(environment, found, x0=x0, w=w, **options)
+        policy = eqx.combine(unravel(theta), rest)
+        options: Any = dict(horizon=horizon, keep=keep, checkpoint=checkpoint)
+        options |= dict(key=jax.random.key(0), throw=False)
+        return policy, rollout(environment, policy, x0=x0, w=w, **options)
 
     def derivatives(theta):
         total = lambda theta: run(theta, checkpoint="sqrt")[1].total_cost  # noqa: E731
-        both = jax.value_and_grad(total)
-        (cost, gradient), along = jax.linearize(both, theta)
-        _, hessian = jax.vmap(along)(eye)
+        (cost, gradient), jvp = jax.linearize(jax.value_and_grad(total), theta)
+        _, hessian = jax.vmap(jvp)(eye)
         return cost, gradient, (hessian + hessian.T) / 2
 
     def step(carry):
-        best, found, damping, _, k = carry
-        cost, gradient, hessian = found
+        best, local, damping, _, k = carry
+        cost, gradient, hessian = local
         size = jnp.trace(jnp.abs(hessian)) / len(start)
         damped = hessian + damping * jnp.where(size > 0, size, 1) * eye
-        move = solve(damped, -gradient[:, None])[:, 0]
-        move = jnp.where(k > 0, move, 0)
-        promised = -(gradient @ move + move @ hessian @ move / 2)
-        tried = derivatives(best + move)
-        better = tried[0] < cost
-        pick = lambda new, old: jnp.where(better, new, old)  # noqa: E731
+        change = solve(damped, -gradient[:, None])[:, 0]
+        change = jnp.where(k > 0, change, 0)
+        promised = -(gradient @ change + change @ hessian @ change / 2)
+        tried = derivatives(best + change)
+        pick = lambda new, old: jnp.where(tried[0] < cost, new, old)  # noqa: E731
         left = promised / (jnp.abs(cost) + jnp.finfo(start.dtype).tiny)
         # What is promised below rounding is not to be had.
         left = jnp.where((k > 0) & (promised >= 0), left, jnp.inf)
-        # Never so little damping that rounding moves what the cost does not see.
+        # With less damping, rounding would move what the cost does not depend on.
         damping = pick(jnp.maximum(damping / 10, least), damping * 10)
-        found = jax.tree.map(pick, tried, found)
-        return pick(best + move, best), found, damping, left, k + 1
+        local = jax.tree.map(pick, tried, local)
+        return pick(best + change, best), local, damping, left, k + 1
 
-    def going(carry):
+    def unfinished(carry):
         *_, left, k = carry
         return (k <= iterations) & ~(left <= tolerance)
 
     eye = jnp.eye(len(start), dtype=start.dtype)
     least = jnp.finfo(start.dtype).eps ** 0.75
     # The first step stays where it is, and is better than this.
-    unknown = jnp.asarray(jnp.inf, start.dtype), jnp.zeros_like(start), 0 * eye
-    carry = start, unknown, 100 * least, jnp.asarray(jnp.inf, start.dtype), 0
-    theta, _, _, left, k = lax.while_loop(going, step, carry)
-    found, trajectory = run(theta, ("states", "controls", "costs", "disturbances"))
-    converged = left <= tolerance
-    result = choose(converged, RESULTS.successful, RESULTS.not_converged)
-    return Hindsight(found, trajectory, left, jnp.asarray(k - 1), result)
+    infinite = jnp.asarray(jnp.inf, start.dtype)
+    unknown = infinite, jnp.zeros_like(start), 0 * eye
+    carry = start, unknown, 100 * least, infinite, 0
+    theta, _, _, left, k = lax.while_loop(unfinished, step, carry)
+    best, trajectory = run(theta, ("states", "controls", "costs", "disturbances"))
+    result = choose(left <= tolerance, RESULTS.successful, RESULTS.not_converged)
+    return Hindsight(best, trajectory, left, jnp.asarray(k - 1), result)

@@ -1,4 +1,4 @@
-"""The engine of online control: learning what to add to a base controller's control."""
+"""Online control: learning what to add to a base controller's control."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -8,47 +8,44 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.interpreters import partial_eval
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ..._check import check_step, output_of
+from ..._check import check_step
 from ..._controller import AbstractLearner, Tally
 from ..._module import function_field, parameter
-from ...dynamics import AbstractDynamics
-from ._features import Features
+from ._base import check_scalar_cost
+from ._closed_loop import ClosedLoop, ClosedLoopState, in_first_responses, shift
 from ._fixed import FixedPolicy
-from ._loop import Loop, LoopState, shift
-from ._newton import positive_root
-from ._policy import AbstractPolicy
+from ._optimisers import adagrad_norm, online_newton, positive_root, projected_step
+from ._policy import AbstractPolicy, LinearPolicy
+
+
+STEP = 0.15
+"""The step of a learner, in units of the control that undoes what it has observed."""
+RADIUS = 50.0
+"""The largest policy, in the same units."""
+_PRIOR_OF_OUTPUTS = 4.0
+"""The prior of what is learned from nature's outputs, in steps."""
 
 
 class LearnerState(NamedTuple):
     """What an online learner remembers.
 
     - `loop`: of the plant and the base controller.
-    - `signal`: its last values, newest first.
     - `features`: of this step and those of the roll-out before it, newest first.
     - `theta`: what has been learned.
     - `optimiser`: the state of the optimiser.
     - `weighted`: the response weighted by the root of the curvature of the cost, where
-        it is the same at all times.
+      it is the same at all times.
     - `refused`: how many updates were not finite, and so were not made.
     """
 
-    loop: LoopState
-    signal: Array
-    features: Array
-    theta: Any
-    optimiser: Any
-    weighted: Any
+    loop: ClosedLoopState
+    features: Float[Array, "h+1 f"]
+    theta: PyTree
+    optimiser: PyTree
+    weighted: Float[Array, "h+1 o m"] | None
     refused: Tally
-
-
-def accepted(new: Any, old: Any, refused: Tally) -> tuple[Any, Tally]:
-    """What was learned, or what was known before if that is not finite."""
-    floats = jax.tree.leaves(eqx.filter(new, eqx.is_inexact_array))
-    fine = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in floats]))
-    kept = jax.tree.map(lambda a, b: jnp.where(fine, a, b), new, old)
-    return kept, refused.add(~fine)
 
 
 class OnlineLearner(AbstractLearner):
@@ -68,16 +65,16 @@ class OnlineLearner(AbstractLearner):
     likewise for the control. The responses are those of linear dynamics, or of any
     dynamics linearised along the way.
 
-    [`delucax.controllers.GPC`][], [`delucax.controllers.DRC`][],
-    [`delucax.controllers.SFC`][], [`delucax.controllers.DSC`][] and
-    [`delucax.controllers.NeuralGPC`][] make it.
+    [`delucax.controllers.gpc`][], [`delucax.controllers.drc`][],
+    [`delucax.controllers.sfc`][], [`delucax.controllers.dsc`][] and
+    [`delucax.controllers.neural_gpc`][] make it.
 
     **Attributes:**
 
     - `loop`: the model with its base controller: `loop.base`; `loop.horizon`, the
-        length of the roll-out; `loop.response`, the G_j, if they are always the same.
+        length of the roll-out; `loop.response`, the G_j, if they are always the same;
+        `loop.memory` and `loop.filters`, what the features are.
     - `cost`: the stage cost.
-    - `features`: the filters, and which signal they are of.
     - `policy`: the family of policies; `policy.start`, the first theta, is trainable.
     - `learning_rate`: an array that scales the optimiser's step; it can be
         differentiated.
@@ -85,7 +82,7 @@ class OnlineLearner(AbstractLearner):
         `learning_rate` and a function that returns the `curvature` of the loss.
 
     The state that `init` makes and a run carries along has `theta`, what has been
-    learned, and `signal`, the last values of the signal, newest first.
+    learned, and `loop.signal`, the last values of the signal, newest first.
 
     !!! example
 
@@ -94,14 +91,13 @@ class OnlineLearner(AbstractLearner):
         import jax
 
         env = dlx.make("lds", key=jax.random.key(0))
-        learner = dlx.controllers.GPC(env.dynamics, env.cost)
+        learner = dlx.controllers.gpc(env.dynamics, env.cost)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```
     """
 
-    loop: Loop
+    loop: ClosedLoop
     cost: Callable[..., Array] = function_field()
-    features: Features
     policy: AbstractPolicy
     learning_rate: Array = parameter()
     optimiser: optax.GradientTransformation = eqx.field(static=True)
@@ -110,47 +106,54 @@ class OnlineLearner(AbstractLearner):
         where, dynamics, policy = "OnlineLearner", self.loop.dynamics, self.policy
         check_step(self.learning_rate, where, "learning_rate")
         check_scalar_cost(self.cost, dynamics, where)
-        features, m = jnp.zeros(self.features.size), dynamics.control_size
-        added = lambda policy: policy(policy.init(), features)
+        size, m = self.loop.feature_size, dynamics.control_size
+        added = lambda policy: policy(policy.init(), jnp.zeros(size))
         try:
             got = eqx.filter_eval_shape(added, policy).shape
         except TypeError:  # matrices that do not fit
             got = None
         if got != (m,):
             raise ValueError(
-                f"{where}: policy must take {self.features.size} features and give "
-                f"{m} controls, got {type(policy).__name__} that does not."
+                f"{where}: policy must take {size} features and give {m} controls, got "
+                f"{type(policy).__name__} that does not."
             )
 
     def init(self, *, key=None):
-        loop, features = self.loop, self.features
-        theta, dtype = self.policy.init(), loop.dtype
-        asks = isinstance(self.optimiser, optax.GradientTransformationExtraArgs)
-        known = asks and loop.response is not None
-        same = self._constant_root() if known else None
-        inner = loop.init(key, loop.horizon)
+        loop, theta = self.loop, self.policy.init()
+        inner, h = loop.init(key, loop.horizon), loop.horizon
+        weighted = None
+        uses_curvature = isinstance(
+            self.optimiser, optax.GradientTransformationExtraArgs
+        )
+        if uses_curvature and loop.response is not None:
+            root = self._constant_root()
+            weighted = None if root is None else self._weighted(root, inner)
         return LearnerState(
             inner,
-            signal=features.init(dtype),
-            features=jnp.zeros((loop.horizon + 1, features.size), dtype),
+            features=jnp.zeros((h + 1, loop.feature_size), loop.dtype),
             theta=theta,
             optimiser=self.optimiser.init(theta),
-            weighted=None if same is None else self._weighted(same, inner),
+            weighted=weighted,
             refused=Tally("refused_update"),
         )
 
     def __call__(self, t, y, state):
-        loop, before = self.loop, state.loop.base
-        moved = loop.act(self, t, y, state.loop)
-        signal = self.features.observe(loop, moved, state.signal)
-        features = shift(self.features(signal), state.features)
-        moved = loop.linearised(self.policy(state.theta, features[0]), before, moved)
-        state = state._replace(loop=moved, signal=signal, features=features)
-        old = state.theta, state.optimiser
-        (theta, optimiser), refused = accepted(self._learn(state), old, state.refused)
-        v = self.policy(theta, features[0])
+        before = lambda features: self.policy(state.theta, features)
+        features, _, loop = self.loop.act(self, t, y, state.loop, before)
+        state = state._replace(loop=loop, features=shift(features, state.features))
+        theta, optimiser, refused = projected_step(
+            self.optimiser,
+            self.learning_rate,
+            self.policy.project,
+            jax.grad(self._loss)(state.theta, state),
+            state.theta,
+            state.optimiser,
+            state.refused,
+            curvature=lambda: self._curvature(state),
+        )
+        v = self.policy(theta, features)
         state = state._replace(theta=theta, optimiser=optimiser, refused=refused)
-        return (moved.u_base + v).astype(y.dtype), state
+        return (loop.u_base + v).astype(y.dtype), state
 
     def applied(self, u, cost, state):
         return state._replace(loop=self.loop.applied(u, cost, state.loop))
@@ -164,7 +167,7 @@ class OnlineLearner(AbstractLearner):
         theta = self.policy.init()
         return state._replace(theta=theta, optimiser=self.optimiser.init(theta))
 
-    def fixed(self, theta: Any = None) -> "FixedPolicy":
+    def fixed(self, theta: Any = None) -> FixedPolicy:
         """The same controller, no longer learning.
 
         **Arguments:** `theta`: what it has learned, from its state; by default what it
@@ -173,26 +176,7 @@ class OnlineLearner(AbstractLearner):
         **Returns:** a controller whose `policy.start` is trainable.
         """
         policy = self.policy if theta is None else self.policy.at(theta)
-        return FixedPolicy(self.loop, self.features, policy)
-
-    def _learn(self, state):
-        rate = self.learning_rate
-        gradient = jax.grad(self._loss)(state.theta, state)
-        optimiser = optax.with_extra_args_support(self.optimiser)
-        direction, optimiser = optimiser.update(
-            gradient,
-            state.optimiser,
-            state.theta,
-            # For those that ask.
-            curvature=lambda: self._curvature(state),
-            learning_rate=rate,
-        )
-        theta = jax.tree.map(
-            lambda old, step: old + (rate * step).astype(old.dtype),
-            state.theta,
-            direction,
-        )
-        return self.policy.project(theta), optimiser
+        return FixedPolicy(self.loop, policy)
 
     def _outcome(self, theta, state):
         v = jax.vmap(self.policy, in_axes=(None, 0))(theta, state.features)
@@ -234,17 +218,23 @@ class OnlineLearner(AbstractLearner):
         return None if any(used) else self._root(*here)
 
 
-def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None:
-    """Raise unless a cost of what `dynamics` show is a scalar."""
-    y, u = (dynamics.observation_size,), (dynamics.control_size,)
-    try:
-        value = output_of(cost, (), y, u)
-    except ValueError as error:
-        raise ValueError(
-            f"{where}: cost must take the observation, of shape {y}, where a state is "
-            f"asked for, and a control of shape {u}: {error}"
-        ) from error
-    if getattr(value, "shape", None) != ():
-        got = getattr(value, "shape", None)
-        got = type(value).__name__ if got is None else f"an array of shape {got}"
-        raise ValueError(f"{where}: cost must give a scalar, got {got}.")
+def linear_learner(
+    loop: ClosedLoop,
+    cost: Callable[..., Array],
+    learning_rate: ArrayLike | None,
+    optimiser: optax.GradientTransformation | None,
+    radius: ArrayLike | None,
+    where: str,
+) -> OnlineLearner:
+    """A learner of a linear map from features to control."""
+    start = jnp.zeros((loop.dynamics.control_size, loop.feature_size), loop.dtype)
+    ball = in_first_responses(loop, radius, "radius", RADIUS, where)
+    rate = in_first_responses(loop, learning_rate, "learning_rate", STEP, where)
+    if optimiser is None:
+        # Newton's step where gradients alone are slow: nature's outputs are much alike
+        # from step to step, and a response that changes points elsewhere each time.
+        if loop.nature:
+            optimiser = online_newton(_PRIOR_OF_OUTPUTS)
+        else:
+            optimiser = online_newton() if loop.response is None else adagrad_norm()
+    return OnlineLearner(loop, cost, LinearPolicy(start, ball), rate, optimiser)

@@ -14,14 +14,14 @@ from ..._controller import AbstractController
 from ..._module import as_module
 from ..._typing import PRNGKey
 from ...dynamics import AbstractDynamics
-from ._base import loop_of, memory_of
-from ._features import Features
+from ._base import base_for
+from ._closed_loop import ClosedLoop
 from ._learner import OnlineLearner
+from ._optimisers import adagrad_norm
 from ._policy import NetworkPolicy
-from ._step_size import adagrad_norm
 
 
-def NeuralGPC(
+def neural_gpc(
     dynamics: AbstractDynamics,
     cost: Callable[..., Array],
     *,
@@ -34,7 +34,7 @@ def NeuralGPC(
     optimiser: optax.GradientTransformation | None = None,
     key: PRNGKey,
 ) -> OnlineLearner:
-    """A network in place of the matrices of [`delucax.controllers.GPC`][],
+    """A network in place of the matrices of [`delucax.controllers.gpc`][],
 
     `u_t = base(y_t) + network(s_t, ..., s_{t-memory+1})`,
 
@@ -45,17 +45,17 @@ def NeuralGPC(
     **Arguments:**
 
     - `dynamics`, `cost`, `base`, `memory`, `horizon`: as for
-        [`delucax.controllers.GPC`][] and [`delucax.controllers.DRC`][].
+        [`delucax.controllers.gpc`][] and [`delucax.controllers.drc`][].
     - `width`, `depth`: of the hidden layers, 32 units in 1 layer by default.
     - `learning_rate`: scales the optimiser's step, 1e-3 by default.
-    - `optimiser`: an Optax transformation; by default Adam, with the norm of the
-        gradient clipped at 1.
+    - `optimiser`: an Optax transformation; [`delucax.controllers.adagrad_norm`][] by
+        default.
     - `key`: a random key, for the first weights.
 
     **Returns:** a [`delucax.controllers.OnlineLearner`][], whose `theta` are the
     network's weights.
 
-    **Raises:** `ValueError` as [`delucax.controllers.GPC`][].
+    **Raises:** `ValueError` as [`delucax.controllers.gpc`][].
 
     Source: Chen, Minasyan, Lee and Hazan, 2022.
 
@@ -67,18 +67,17 @@ def NeuralGPC(
 
         env = dlx.make("lds", key=jax.random.key(0))
         key, run_key = jax.random.split(jax.random.key(0))
-        learner = dlx.controllers.NeuralGPC(env.dynamics, env.cost, key=key)
+        learner = dlx.controllers.neural_gpc(env.dynamics, env.cost, key=key)
         dlx.rollout(env, learner, key=run_key).total_cost
         ```
     """
-    where = "NeuralGPC"
-    loop = loop_of(dynamics, cost, base, horizon, where)
+    where = "neural_gpc"
+    base = base_for(dynamics, cost, base, where)
+    loop = ClosedLoop(dynamics, base, horizon, where, memory=memory)
     check_key(key, where)
     check_positive(learning_rate, "learning_rate", where)
-    memory = memory_of(loop, memory, where)
-    features = Features(None, memory, dynamics.observation_size, nature=loop.echoes)
     network = eqx.nn.MLP(
-        features.size,
+        loop.feature_size,
         dynamics.control_size,
         check_count(width, "width", where),
         check_count(depth, "depth", where),
@@ -87,13 +86,7 @@ def NeuralGPC(
         dtype=loop.dtype,
         key=key,
     )
-    last = lambda net: [net.layers[-1].weight, net.layers[-1].bias]  # noqa: E731
+    last = lambda net: [net.layers[-1].weight, net.layers[-1].bias]
     network = eqx.tree_at(last, network, [0 * leaf for leaf in last(network)])
-    return OnlineLearner(
-        loop,
-        cost,
-        features,
-        NetworkPolicy(network),
-        learning_rate,
-        adagrad_norm() if optimiser is None else optimiser,
-    )
+    optimiser = adagrad_norm() if optimiser is None else optimiser
+    return OnlineLearner(loop, cost, NetworkPolicy(network), learning_rate, optimiser)

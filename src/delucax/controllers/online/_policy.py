@@ -1,13 +1,12 @@
 """What is learned: a map from features to what is added to the base's control."""
 
 import abc
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ..._check import check_step
 from ..._module import parameter, weight
@@ -22,24 +21,31 @@ class AbstractPolicy(eqx.Module):
     """A family of maps `v = policy(theta, features)` and the set that `theta` is in."""
 
     @abc.abstractmethod
-    def init(self) -> Any:
+    def init(self) -> PyTree:
         """The first `theta`."""
 
     @abc.abstractmethod
-    def at(self, theta: Any) -> "AbstractPolicy":
+    def at(self, theta: PyTree) -> "AbstractPolicy":
         """The same family, starting with `theta`."""
 
     @abc.abstractmethod
-    def __call__(self, theta: Any, features: Array) -> Array:
+    def __call__(
+        self, theta: PyTree, features: Float[Array, " f"]
+    ) -> Float[Array, " m"]:
         """What is added to the base's control."""
 
     @abc.abstractmethod
-    def project(self, theta: Any) -> Any:
+    def project(self, theta: PyTree) -> PyTree:
         """The nearest point of the set."""
 
-    def pull_back(self, theta: Any, response: Array, features: Array) -> Array:
+    def pull_back(
+        self,
+        theta: PyTree,
+        response: Float[Array, "h o m"],
+        features: Float[Array, "h f"],
+    ) -> Float[Array, "o weights"]:
         """The derivative by theta, in one row, of `sum_h response_h v_h`, with `v_h`
-        the control for the features of step h; shape (outcomes, weights)."""
+        the control for the features of step h."""
         flat, unravel = ravel_pytree(theta)
 
         def outcome(flat):

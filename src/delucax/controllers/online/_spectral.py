@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array
@@ -14,12 +13,12 @@ from ..._check import check_count
 from ..._controller import AbstractController
 from ..._message import shortened
 from ...dynamics import AbstractDynamics
-from ._base import linear_learner, loop_of
-from ._features import Features
-from ._learner import OnlineLearner
+from ._base import base_for
+from ._closed_loop import ClosedLoop
+from ._learner import linear_learner, OnlineLearner
 
 
-def SFC(
+def sfc(
     dynamics: AbstractDynamics,
     cost: Callable[..., Array],
     *,
@@ -41,24 +40,24 @@ def SFC(
     `(sigma_i, phi_i)` the largest eigenvalues and eigenvectors of the matrix
     `H_jk = (1 - margin)^(j + k - 1) / (j + k - 1)`.
 
-    A few such filters do for a long memory what [`delucax.controllers.GPC`][] and
-    [`delucax.controllers.DRC`][] need a matrix a step for: there is less to learn where
+    A few such filters do for a long memory what [`delucax.controllers.gpc`][] and
+    [`delucax.controllers.drc`][] need a matrix a step for: there is less to learn where
     the closed loop is slow. They depend on the memory and the margin alone, not on the
     plant.
 
     **Arguments:**
 
     - `dynamics`, `cost`, `base`, `horizon`, `learning_rate`, `optimiser`, `radius`: as
-        for [`delucax.controllers.DRC`][].
+        for [`delucax.controllers.drc`][].
     - `filters`: how many, 5 by default.
     - `memory`: the number of past values that are filtered, 30 by default.
     - `margin`: the stability margin, between 0 and 1: memories that fade as
         `(1 - margin)^k` or faster are well represented. 0.2 by default.
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state, `signal` has
-    the last `memory + 1` values and `theta` the matrices M side by side.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
+    has the last `memory + 1` values and `theta` the matrices M side by side.
 
-    **Raises:** `ValueError` as [`delucax.controllers.DRC`][]; and if there are more
+    **Raises:** `ValueError` as [`delucax.controllers.drc`][]; and if there are more
     filters than the memory has room for, or the margin is not between 0 and 1.
 
     Source: Brahmbhatt, Buzaglo, Druchyna and Hazan, 2025 (spectral control).
@@ -70,18 +69,18 @@ def SFC(
         import jax
 
         env = dlx.make("lds", key=jax.random.key(0))
-        learner = dlx.controllers.SFC(env.dynamics, env.cost)
+        learner = dlx.controllers.sfc(env.dynamics, env.cost)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```
     """
-    where = "SFC"
-    bank = _bank(filters, memory, margin, where)
-    past = np.pad(bank, ((0, 0), (1, 0)))
-    parts = dynamics, cost, base, horizon, learning_rate, optimiser, radius
-    return _learner(np.concatenate([np.eye(1, memory + 1), past]), *parts, where)
+    bank = _bank(filters, memory, margin, "sfc")
+    rows = np.concatenate([np.eye(1, memory + 1), np.pad(bank, ((0, 0), (1, 0)))])
+    base = base_for(dynamics, cost, base, "sfc")
+    loop = ClosedLoop(dynamics, base, horizon, "sfc", filters=rows)
+    return linear_learner(loop, cost, learning_rate, optimiser, radius, "sfc")
 
 
-def DSC(
+def dsc(
     dynamics: AbstractDynamics,
     cost: Callable[..., Array],
     *,
@@ -99,17 +98,17 @@ def DSC(
     `u_t = base(y_t) + M_0 s_t + sum_i M_i f_i(s_{t-1}, ...)`
     `    + sum_i M'_i f_i(s_t, ...) + sum_{i <= j} M''_ij (f_i * f_j)(s_t, ...)`,
 
-    with the signal s and the filters f of [`delucax.controllers.SFC`][]; `f_i * f_j` is
+    with the signal s and the filters f of [`delucax.controllers.sfc`][]; `f_i * f_j` is
     one filter after the other, which represents what an observer, itself a filter,
     makes of the past.
 
     **Arguments:** `dynamics`, `cost`, `base`, `filters`, `memory`, `margin`, `horizon`,
-    `learning_rate`, `optimiser`, `radius`: as for [`delucax.controllers.SFC`][].
+    `learning_rate`, `optimiser`, `radius`: as for [`delucax.controllers.sfc`][].
 
-    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state, `signal` has
-    the last `2 memory` values and `theta` the matrices M side by side.
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
+    has the last `2 memory` values and `theta` the matrices M side by side.
 
-    **Raises:** `ValueError` as [`delucax.controllers.SFC`][].
+    **Raises:** `ValueError` as [`delucax.controllers.sfc`][].
 
     Source: Brahmbhatt, Buzaglo, Druchyna and Hazan, 2025 (double spectral control).
 
@@ -120,33 +119,24 @@ def DSC(
         import jax
 
         env = dlx.make("lds", key=jax.random.key(0))
-        learner = dlx.controllers.DSC(env.dynamics, env.cost)
+        learner = dlx.controllers.dsc(env.dynamics, env.cost)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```
     """
-    where = "DSC"
-    bank = _bank(filters, memory, margin, where)
+    bank = _bank(filters, memory, margin, "dsc")
     length = 2 * memory
-    wide = lambda rows, first: np.pad(  # noqa: E731
-        rows, ((0, 0), (first, length - first - rows.shape[1]))
-    )
+
+    def padded(rows, first):
+        return np.pad(rows, ((0, 0), (first, length - first - rows.shape[1])))
+
     # f_i * f_j is f_j * f_i: a matrix for each pair.
     pairs = [(i, j) for i in range(filters) for j in range(i, filters)]
     twice = np.stack([np.convolve(bank[i], bank[j]) for i, j in pairs])
-    rows = [np.eye(1, length), wide(bank, 1), wide(bank, 0), wide(twice, 0)]
-    parts = dynamics, cost, base, horizon, learning_rate, optimiser, radius
-    return _learner(np.concatenate(rows), *parts, where)
-
-
-def _learner(
-    rows, dynamics, cost, base, horizon, learning_rate, optimiser, radius, where
-):
-    loop = loop_of(dynamics, cost, base, horizon, where)
-    size = dynamics.observation_size
-    features = Features(
-        jnp.asarray(rows, loop.dtype), rows.shape[1], size, nature=loop.echoes
-    )
-    return linear_learner(loop, cost, features, learning_rate, optimiser, radius, where)
+    rows = [np.eye(1, length), padded(bank, 1), padded(bank, 0), padded(twice, 0)]
+    rows = np.concatenate(rows)
+    base = base_for(dynamics, cost, base, "dsc")
+    loop = ClosedLoop(dynamics, base, horizon, "dsc", filters=rows)
+    return linear_learner(loop, cost, learning_rate, optimiser, radius, "dsc")
 
 
 def _bank(filters: int, memory: int, margin: float, where: str) -> np.ndarray:

@@ -9,8 +9,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from ..._check import check_count
 from ...costs import AbstractCost
-from ...environments import Environment, make as make_task
-from ...environments._registry import horizon_of
+from ...environments import default_horizon, Environment, make as make_task
 from .._episode import has_signals
 from .._reads_argument import reads_first_argument
 from ._single_env import GymnasiumEnv
@@ -189,7 +188,7 @@ def register_ids() -> tuple[str, ...]:
             id=f"delucax/{name}",
             entry_point=f"{__name__}:make_registered",
             vector_entry_point=f"{__package__}:make_vector",
-            max_episode_steps=horizon_of(task),
+            max_episode_steps=default_horizon(task),
             reward_threshold=_THRESHOLDS.get(name),
             # Orders are checked by the environment itself.
             order_enforce=False,

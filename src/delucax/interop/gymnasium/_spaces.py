@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
+from ..._check import LARGEST
 from ...environments import Environment
-from .._spaces import finite_ends, LARGEST, LARGEST_ACTION
+from .._spaces import finite_ends, LARGEST_ACTION
 
 
 def read_options(options: Any, names: tuple[str, ...], where: str) -> list[Any]:

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..._check import check_bool, check_instance, check_key, is_concrete
+from ..._check import check_bool, check_instance, check_key, is_concrete, LARGEST
 from ..._message import shortened
 from ..._module import as_float_array
 from ..._typing import PRNGKey
 from ...environments import Environment
 from .._by_value import ByValue
 from .._episode import begin, EpisodeState, observe, step as episode_step, time_of
-from .._spaces import has_discrete_actions, LARGEST, LARGEST_ACTION
+from .._spaces import has_discrete_actions, LARGEST_ACTION
 from ._params import GymnaxParams
 from ._spaces import box_space, discrete_space, separates_ends
 

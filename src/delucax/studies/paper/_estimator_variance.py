@@ -9,16 +9,10 @@ import jax.random as jr
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ...controllers import Deep, Gaussian, MLP
+from ... import training
+from ...controllers import Gaussian, MLP, mlp_policy
 from ...environments import pendulum
 from ...simulation import rollout
-from ...training import (
-    analytic,
-    EvolutionStrategies,
-    expected_cost,
-    LikelihoodRatio,
-    scored_cost,
-)
 from .._swing_up import spread_starts
 from ._finding import Claim, draw_panels, Finding
 
@@ -38,25 +32,25 @@ def estimator_variance(small: bool = False) -> Finding:
     widths = (4, 64) if small else (4, 8, 16, 32, 64, 128, 256)
     draws = 64 if small else 256
     env = pendulum(initial_state=np.array([1.0, 0.0]), horizon=HORIZON)
-    score = scored_cost(env)
+    score = training.scored_cost(env)
 
     def loss(controller, key):
         return rollout(env, controller, key=key, keep=(), throw=False).total_cost
 
-    ratios: dict[str, list[float]] = {}
-    rows, sizes = [], []
+    rows: list[dict[str, Any]] = []
     for width in widths:
         policy = MLP(2, 1, width, 1, key=jr.key(0))
         noisy = Gaussian(policy, float(np.log(ON_CONTROLS)))
+        antithetic = training.EvolutionStrategies(ON_WEIGHTS, BUDGET)
         estimators: dict[str, Any] = {
-            "analytic": (analytic, loss, policy),
-            "ES, antithetic": (EvolutionStrategies(ON_WEIGHTS, BUDGET), loss, policy),
-            "REINFORCE": (LikelihoodRatio(BUDGET), score, noisy),
+            "analytic": (training.analytic, loss, policy),
+            "ES, antithetic": (antithetic, loss, policy),
+            "REINFORCE": (training.LikelihoodRatio(BUDGET), score, noisy),
         }
         if not small:
-            by_one = EvolutionStrategies(ON_WEIGHTS, BUDGET, False)
+            by_one = training.EvolutionStrategies(ON_WEIGHTS, BUDGET, False)
             estimators["ES, one-sided"] = by_one, loss, policy
-            plain = LikelihoodRatio(BUDGET, baseline=False)
+            plain = training.LikelihoodRatio(BUDGET, baseline=False)
             estimators["REINFORCE, no baseline"] = plain, score, noisy
         samples = {}
         for name, (estimator, objective, model) in estimators.items():
@@ -65,12 +59,15 @@ def estimator_variance(small: bool = False) -> Finding:
             )
             samples[name] = jax.lax.map(estimate, jr.split(jr.key(1), draws))
         exact = samples["analytic"][0]
-        sizes.append(len(exact))
-        row: dict[str, Any] = {"parameters": len(exact)}
-        for name, drawn in samples.items():
-            row[name] = float(jnp.sum(jnp.var(drawn, axis=0)) / (exact @ exact))
-            ratios.setdefault(name, []).append(row[name])
-        rows.append(row)
+        scale = exact @ exact
+        variances = {
+            name: float(jnp.sum(jnp.var(drawn, axis=0)) / scale)
+            for name, drawn in samples.items()
+        }
+        rows.append({"parameters": len(exact), **variances})
+    sizes = [row["parameters"] for row in rows]
+    _, *names = rows[0]
+    ratios = {name: [row[name] for row in rows] for name in names}
     slope = {
         name: float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
         for name, values in ratios.items()
@@ -129,25 +126,21 @@ def estimator_variance(small: bool = False) -> Finding:
         f"width 32, starts at any angle and speed, {DRAWN} rollouts an estimate; the "
         "norms are those of single rollouts."
     )
-    return Finding(
-        "Variance of gradient estimators",
-        claims,
-        {"Variance / squared gradient": rows, "Against the horizon": over},
-        {"estimator_variance": ax.figure},
-        notes,
-    )
+    title = "Variance of gradient estimators"
+    tables = {"Variance / squared gradient": rows, "Against the horizon": over}
+    return Finding(title, claims, tables, {"estimator_variance": ax.figure}, notes)
 
 
 def _at_horizon(horizon: int, draws: int) -> dict[str, Any]:
     """Variances over a horizon, the start drawn, and how large the gradient is."""
     env = spread_starts(pendulum())
-    policy = Deep(env, width=32, depth=1, key=jr.key(0))
+    policy = mlp_policy(env, width=32, depth=1, key=jr.key(0))
     noisy = Gaussian(policy, -1.0, bounds=env.control_bounds)
-    one = expected_cost(env, batch=1, horizon=horizon)
-    score = scored_cost(env, horizon=horizon)
+    one = training.expected_cost(env, batch=1, horizon=horizon)
+    score = training.scored_cost(env, horizon=horizon)
     keys = jr.split(jr.key(1), draws)
-    exact = jax.jit(lambda key: _flat(analytic(one, policy, key)[1]))
-    drawn = LikelihoodRatio(DRAWN)
+    exact = jax.jit(lambda key: _flat(training.analytic(one, policy, key)[1]))
+    drawn = training.LikelihoodRatio(DRAWN)
     guess = jax.jit(lambda key: _flat(drawn(score, noisy, key)[1]))
     # Of single rollouts, so that norms are those of one, and the variance an eighth.
     each, guesses = (np.asarray(jax.lax.map(f, keys)) for f in (exact, guess))

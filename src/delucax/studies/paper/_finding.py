@@ -1,4 +1,4 @@
-"""What a study of the paper found."""
+"""The findings of a study of the paper."""
 
 from dataclasses import dataclass, field
 from typing import Any

@@ -28,7 +28,7 @@ def lq_perturbations(small: bool = False) -> Finding:
     contenders = {
         "LQR": controllers.LQR(dynamics, jnp.eye(2), jnp.eye(1)),
         "H-infinity": controllers.HInfinity(dynamics, jnp.eye(2), jnp.eye(1)),
-        "GPC": controllers.GPC(dynamics, cost),
+        "GPC": controllers.gpc(dynamics, cost),
     }
     t = np.arange(steps)[:, None]
     phases = np.random.default_rng(0).uniform(0, 2 * np.pi, (seeds, 1, 1))
@@ -92,10 +92,6 @@ def lq_perturbations(small: bool = False) -> Finding:
         "with the same perturbations for all; all at their defaults. The paper gives "
         "neither matrices nor horizon. Intervals are 95%."
     )
-    return Finding(
-        "Linear-quadratic control with adversarial perturbations",
-        claims,
-        {"Average cost": rows},
-        {"lq_perturbations": axes[0].figure},
-        notes,
-    )
+    title = "Linear-quadratic control with adversarial perturbations"
+    tables = {"Average cost": rows}
+    return Finding(title, claims, tables, {"lq_perturbations": axes[0].figure}, notes)

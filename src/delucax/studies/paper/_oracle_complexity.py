@@ -24,12 +24,8 @@ def oracle_complexity(small: bool = False) -> Finding:
     """Plan a flight of the planar quadrotor with three kinds of derivatives."""
     dynamics = planar_quadrotor().dynamics
     _, hover = dynamics.equilibrium()
-    cost = Quadratic(
-        0.1 * jnp.eye(6),
-        0.1 * jnp.eye(2),
-        final=10 * jnp.eye(6),
-        control_target=hover,
-    )
+    weights = 0.1 * jnp.eye(6), 0.1 * jnp.eye(2)
+    cost = Quadratic(*weights, final=10 * jnp.eye(6), control_target=hover)
     x0 = jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     start = jnp.tile(hover, (STEPS, 1))
     iterations = 20 if small else 60
@@ -106,13 +102,9 @@ def oracle_complexity(small: bool = False) -> Finding:
         f"drawn anew at each point; at most {iterations} iterations. "
         "Calls are those of the whole solve, line search included."
     )
-    return Finding(
-        "Dynamics calls of model-based planning",
-        claims,
-        {"One plan": rows},
-        {"oracle_complexity": ax.figure},
-        notes,
-    )
+    title = "Dynamics calls of model-based planning"
+    tables = {"One plan": rows}
+    return Finding(title, claims, tables, {"oracle_complexity": ax.figure}, notes)
 
 
 def _calls_of_a_knot(dynamics: Any, x: Any, u: Any, spacing: Any) -> int:

@@ -10,15 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from ... import training
 from ...controllers import Linear
 from ...environments import pendulum
-from ...training import (
-    analytic,
-    EvolutionStrategies,
-    expected_cost,
-    fit,
-    Fitted,
-)
 from ._finding import Claim, draw_panels, Finding
 
 
@@ -35,36 +29,23 @@ def policy_gradient(small: bool = False) -> Finding:
         options: Any = dict(gradient=estimator, progress=False)
         return np.asarray(train_linear(steps, seed, rate, **options).history.loss)
 
-    exact = train(analytic, 0)
-    first, faster = _first(exact), _first(train(analytic, 0, TWICE))
-    rows = [
-        {
-            "gradient": "through the rollout",
-            "runs": 1,
-            "reach 2.0": int(first is not None),
-            "rollouts, median": first,
-            "cost at the end, median": exact[-1],
-        }
-    ]
+    exact = train(training.analytic, 0)
+    first, faster = _first(exact), _first(train(training.analytic, 0, TWICE))
+    rows = [_row("through the rollout", 1, int(first is not None), first, exact[-1])]
     curves, reached, total, fewest = {}, 0, 0, []
     for scale in scales:
         for count in pairs:
-            estimator = EvolutionStrategies(scale, 2 * count)
+            estimator = training.EvolutionStrategies(scale, 2 * count)
             runs = [train(estimator, seed) for seed in range(seeds)]
             when = [_first(run) for run in runs]
             # The loss itself, which is one more rollout a step, is not charged.
             cost = [2 * count * w for w in when if w is not None]
             reached, total, fewest = reached + len(cost), total + seeds, fewest + cost
             curves[scale, count] = runs
-            rows.append(
-                {
-                    "gradient": f"evolution strategies, sigma {scale}, {count} pairs",
-                    "runs": seeds,
-                    "reach 2.0": len(cost),
-                    "rollouts, median": float(np.median(cost)) if cost else None,
-                    "cost at the end, median": float(np.median([r[-1] for r in runs])),
-                }
-            )
+            name = f"evolution strategies, sigma {scale}, {count} pairs"
+            median = float(np.median(cost)) if cost else None
+            at_end = float(np.median([run[-1] for run in runs]))
+            rows.append(_row(name, seeds, len(cost), median, at_end))
     least = min(fewest) if fewest else None
     claims = [
         descent_claim(first, faster),
@@ -80,14 +61,9 @@ def policy_gradient(small: bool = False) -> Finding:
     for (scale, count), runs in curves.items():
         x = 2 * count * np.arange(1, steps + 1)
         label = f"ES, sigma {scale}, {count} pairs"
-        ax.plot(
-            x,
-            np.median(runs, axis=0),
-            lw=1,
-            color=f"C{scales.index(scale)}",
-            alpha=1 - 0.2 * pairs.index(count),
-            label=label,
-        )
+        color, alpha = f"C{scales.index(scale)}", 1 - 0.2 * pairs.index(count)
+        median = np.median(runs, axis=0)
+        ax.plot(x, median, lw=1, color=color, alpha=alpha, label=label)
     ax.axhline(GOAL, color="0.5", lw=0.8, ls=":")
     ax.set(xscale="log", xlabel="rollouts", ylabel="mean cost of a step")
     ax.figure.legend(frameon=False, fontsize=7, loc="outside right center")
@@ -97,30 +73,37 @@ def policy_gradient(small: bool = False) -> Finding:
         "mean cost of Gym (with the sum it sticks at once). Evolution strategies are "
         f"antithetic, {seeds} seeds a setting, {steps} updates; lines are medians."
     )
-    return Finding(
-        "Policy gradient of the pendulum",
-        claims,
-        {"Rollouts to cost 2.0": rows},
-        {"policy_gradient": ax.figure},
-        notes,
-    )
+    tables, figures = {"Rollouts to cost 2.0": rows}, {"policy_gradient": ax.figure}
+    return Finding("Policy gradient of the pendulum", claims, tables, figures, notes)
+
+
+def _row(
+    gradient: str, runs: int, reached: int, rollouts: float | None, cost: float
+) -> dict[str, Any]:
+    return {
+        "gradient": gradient,
+        "runs": runs,
+        "reach 2.0": reached,
+        "rollouts, median": rollouts,
+        "cost at the end, median": cost,
+    }
 
 
 @functools.cache
 def _mean_cost() -> Callable[..., Any]:
     """Of a step from hanging. One object, so that a second seed does not compile."""
     env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
-    total = expected_cost(env, batch=1, horizon=HORIZON)
+    total = training.expected_cost(env, batch=1, horizon=HORIZON)
     return lambda controller, key: total(controller, key) / HORIZON
 
 
 def train_linear(
     steps: int, seed: int = 0, rate: float = RATE, **options: Any
-) -> Fitted:
+) -> training.Fitted:
     """Descend with a linear policy from zero; with the options of `fit`."""
     options["key"] = jax.random.key(seed)
     start = Linear(jnp.zeros((1, 2)))
-    return fit(_mean_cost(), start, optax.sgd(rate), steps, **options)
+    return training.fit(_mean_cost(), start, optax.sgd(rate), steps, **options)
 
 
 def descent_claim(first: int | None, faster: int | None) -> Claim:

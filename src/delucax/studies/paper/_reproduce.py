@@ -41,7 +41,7 @@ def reproduce(
     """Regenerate figures and tables of the Deluca paper, each claim with its number.
 
     A claim holds or it does not: the report says which, with what was measured. A study
-    that fails is a claim that does not hold, and harms no other.
+    that raises an error is a claim that does not hold, and the others run on.
 
     **Arguments:**
 
@@ -94,14 +94,8 @@ def reproduce(
         for claim in finding.claims:
             say(f"  {'holds' if claim.holds else 'DOES NOT HOLD'}: {claim.statement}")
             say(f"    {claim.measured}")
-            rows.append(
-                {
-                    "study": name,
-                    "claim": claim.statement,
-                    "measured": claim.measured,
-                    "holds": claim.holds,
-                }
-            )
+            words = {"claim": claim.statement, "measured": claim.measured}
+            rows.append({"study": name, **words, "holds": claim.holds})
         for title, figure in finding.figures.items():
             if not isinstance(figure, Path):
                 figure.savefig(out / f"{title}.png", dpi=150)
@@ -141,7 +135,7 @@ def _page(sections: list[str], rows: list[dict[str, Any]]) -> Page:
 
 
 def _section(finding: Finding) -> list[str]:
-    """The parts of a page that show what a study found."""
+    """The parts of a page that show the findings of a study."""
     section = Page(finding.title)
     section.heading(finding.title)
     for claim in finding.claims:

@@ -62,10 +62,5 @@ def ventilator(small: bool, out: Path, say: Callable[[str], Any]) -> Finding:
         f"and the controllers are in {out}/, as `python -m delucax lung` writes them."
     )
     images = ("simulators.png", "controllers.png", "breath.gif")
-    return Finding(
-        "Ventilator control and simulator",
-        claims,
-        {"Lungs": rows},
-        {name: out / name for name in images},
-        notes,
-    )
+    tables, figures = {"Lungs": rows}, {name: out / name for name in images}
+    return Finding("Ventilator control and simulator", claims, tables, figures, notes)

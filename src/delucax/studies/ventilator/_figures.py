@@ -12,7 +12,7 @@ from ...environments import Environment
 from ...plotting import animate
 from ...plotting.figures import color_of, NEUTRAL, NotebookFigure, style_axes
 from ._report import mean_error, PID_ROWS
-from ._size import SHOWN
+from ._settings import SHOWN
 
 
 _SIZE = 9.0

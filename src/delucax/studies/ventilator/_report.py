@@ -15,8 +15,7 @@ from ..._typing import PRNGKey
 from ...environments import Environment
 from ...simulation import rollout
 from ._contenders import Contender
-from ._size import ABORT, BREATH, INSPIRATION, SEEN, SHOWN, UNSEEN
-from ._stacks import repeated, taken
+from ._settings import ABORT, BREATH, INSPIRATION, SEEN, SHOWN, UNSEEN
 
 
 Rows = list[dict[str, Any]]
@@ -73,13 +72,15 @@ def error_rows(
     """
     rows: Rows = []
     runs: dict[str, Any] = {}
-    pips = jnp.asarray(SEEN + UNSEEN)
+    pips, count = jnp.asarray(SEEN + UNSEEN), len(names)
+    waveforms = lung.stack([waveform] * count)
     place = (SEEN + UNSEEN).index(SHOWN)
     for label, seed, controllers, shared in contenders:
-        waveforms = repeated(waveform, len(names))
-        whole = eqx.filter_vmap(lung.Breathing)(controllers, waveforms)
+        each = lung.stack([controllers] * count) if shared else controllers
+        whole = eqx.filter_vmap(lung.Breathing)(each, waveforms)
         mae, highest, breaths = _evaluated(envs, whole, pips, keys)
-        runs.setdefault(label, taken(breaths, (slice(None), 0, place)))
+        shown = jax.tree.map(lambda a: a[:, 0, place], breaths)
+        runs.setdefault(label, shown)
         for split, at in SPLITS.items():
             rows += _rows(names, label, seed, split, mae[..., at], highest[..., at])
         if shared and between is not None:
@@ -132,10 +133,8 @@ def save_controllers(
         stem = label.lower().replace(" + ", "_").replace(" ", "_").replace("-", "_")
         runs = [r for r in rows if (r["controller"], r["seed"]) == (label, seed)]
         # One that is shared is saved once, and judged by its runs in all lungs.
-        every = zip(
-            [None] if shared else names, lung.unstack(controllers), strict=False
-        )
-        for name, controller in every:
+        each = [controllers] if shared else lung.unstack(controllers)
+        for name, controller in zip([None] if shared else names, each, strict=True):
             file = folder / f"{stem if name is None else f'{stem}_{name}'}_{seed}.dlx"
             reached = [r["highest"] for r in runs if name in (None, r["lung"])]
             # NaN is not below the limit.
@@ -158,18 +157,13 @@ def mean_error(rows: Rows, label: str, split: str, lung: str | None = None) -> f
     return float(np.mean(errors)) if errors else float("nan")
 
 
-def best_pid(rows: Rows) -> str:
-    """The kind of PID with the least error at pressures that were not trained on."""
-    errors = {label: mean_error(rows, label, "unseen") for label in PID_ROWS}
-    return min((e, label) for label, e in errors.items() if e > 0)[1]
-
-
-def _least_error(
+def best_of(
     rows: Rows, labels: Iterable[str], split: str, lung: str | None = None
-) -> float:
-    """That of the best of some controllers, of those that were run."""
-    errors = (mean_error(rows, label, split, lung) for label in labels)
-    return min((e for e in errors if not np.isnan(e)), default=float("nan"))
+) -> tuple[float, str]:
+    """The least error of some controllers, and whose it is; NaN if none was run."""
+    errors = {label: mean_error(rows, label, split, lung) for label in labels}
+    known = ((e, label) for label, e in errors.items() if not np.isnan(e))
+    return min(known, default=(float("nan"), ""))
 
 
 def _by_kind(table: Rows, column: str) -> dict[str, dict[str, float]]:
@@ -192,24 +186,19 @@ def summarise(
 
     `judge` says what the controllers were run in, and `unsafe` names those that were
     not saved."""
-    names = list(dict.fromkeys(row["lung"] for row in table))
     simulators = _by_kind(table, "mae")
     learned = simulators["learned"]
-    wrong = {
-        name: min(simulators[kind][name] for kind in WRONG if kind in simulators)
-        for name in names
-    }
-    ratios = {name: learned[name] / wrong[name] for name in names}
+    wrong = [simulators[kind] for kind in WRONG if kind in simulators]
+    ratios = {name: e / min(w[name] for w in wrong) for name, e in learned.items()}
     gains, bounds = {}, {}
-    for name in names:
-        pid = _least_error(rows, PID_ROWS, "unseen", name)
+    for name in learned:
+        pid, _ = best_of(rows, PID_ROWS, "unseen", name)
         gains[name] = mean_error(rows, "MLP", "unseen", name) / pid
         least = mean_error(rows, "least error", "unseen", name)
         bounds |= {name: least / pid} if least > 0 else {}
     for_all = [f"{label} for all" for label in PID_ROWS]
     shared = {
-        split: mean_error(rows, "MLP for all", split)
-        / _least_error(rows, for_all, split)
+        split: mean_error(rows, "MLP for all", split) / best_of(rows, for_all, split)[0]
         for split in ("unseen", "between")
     }
     reached = [row["highest"] for row in rows if row["controller"] in LEARNED]

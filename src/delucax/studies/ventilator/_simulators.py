@@ -14,33 +14,23 @@ from ..._module import positive
 from ..._typing import PRNGKey
 from ...environments import Environment
 from ...simulation import rollout
-from ._size import INSPIRATION, SEEN, Size
-from ._stacks import repeated
+from ._settings import INSPIRATION, SEEN, Size
 
 
 class Kind(NamedTuple):
     """A kind of lung model, and how it is fitted.
 
     - `make`: a function of a key to the model before it is fitted.
-    - `positive`, `free`: what is fitted of it, numbers above zero and all others; the
-        weights where none is named.
+    - `trainable`: what is fitted of it, each with its constraint; the weights where
+        none is named.
     - `steps`: how often the steps of the study are taken.
     - `learning_rate`: of the fit.
     """
 
     make: Callable[[PRNGKey], lung.AbstractLung]
-    positive: tuple[str, ...] = ()
-    free: tuple[str, ...] = ()
+    trainable: dict[str, Any] = {}
     steps: int = 1
     learning_rate: float = 0.05
-
-    @property
-    def trainable(self) -> dict[str, Any] | None:
-        """What is fitted, as [`delucax.training.fit`][] is told it."""
-        constraints = dict.fromkeys(self.positive, positive)
-        constraints |= dict.fromkeys(self.free)
-        system = "dynamics.dynamics.system."
-        return {f"{system}{name}": c for name, c in constraints.items()} or None
 
 
 def _double(key: PRNGKey) -> lung.DoubleCompartment:
@@ -48,17 +38,21 @@ def _double(key: PRNGKey) -> lung.DoubleCompartment:
     return lung.DoubleCompartment(**begin)
 
 
+def _positive(*names: str) -> dict[str, Any]:
+    return dict.fromkeys(names, positive)
+
+
 KINDS = {
     "single compartment": Kind(
-        lambda key: lung.SingleCompartment(), ("resistance", "compliance")
+        lambda key: lung.SingleCompartment(), _positive("resistance", "compliance")
     ),
     "balloon": Kind(
-        lambda key: lung.BalloonLung(), ("resistance", "stiffness", "rest")
+        lambda key: lung.BalloonLung(), _positive("resistance", "stiffness", "rest")
     ),
     "double compartment": Kind(
         _double,
-        ("resistance", "compliance", "imbalance"),
-        ("central", "share"),
+        _positive("resistance", "compliance", "imbalance")
+        | {"central": None, "share": None},
         steps=2,
     ),
     "neural ODE": Kind(
@@ -66,28 +60,28 @@ KINDS = {
     ),
     "grey box": Kind(
         lambda key: lung.GreyBoxLung(key=key),
-        ("single.resistance", "single.compliance"),
-        ("network", "memory"),
+        _positive("single.resistance", "single.compliance")
+        | {"network": None, "memory": None},
         steps=2,
         learning_rate=1e-2,
     ),
 }
 
 
+def task_of(resistance: float, compliance: float, sensor_delay: int) -> Environment:
+    """The task of a lung of the study."""
+    system = lung.DoubleCompartment(resistance, compliance)
+    return lung.double_compartment(system, sensor_delay=sensor_delay)
+
+
 def explored(size: Size) -> lung.Breaths:
     """Breaths of the lungs of the study, stacked over them."""
-    return stack_breaths(
-        [
-            lung.explore(
-                lung.double_compartment(R, C, sensor_delay=size.sensor_delay),
-                size.breaths,
-                key=jr.key(i),
-                resistance=R,
-                compliance=C,
-            )
-            for i, (R, C) in enumerate(size.lungs)
-        ]
-    )
+    made = []
+    for i, (R, C) in enumerate(size.lungs):
+        env = task_of(R, C, size.sensor_delay)
+        known: Any = dict(resistance=R, compliance=C)
+        made.append(lung.explore(env, size.breaths, key=jr.key(i), **known))
+    return stack_breaths(made)
 
 
 def grouped(breaths: lung.Breaths) -> Any:
@@ -106,8 +100,7 @@ def grouped(breaths: lung.Breaths) -> Any:
 
 
 def left_out(recorded: lung.Breaths, breaths: lung.Breaths) -> str:
-    """What there is to say of recorded breaths that are not among those of each lung,
-    nothing if all are."""
+    """A sentence about the recorded breaths that are left out; empty if none is."""
     lungs, each = breaths.pressure.shape[:2]
     count = len(recorded) - lungs * each
     if not count:
@@ -149,31 +142,30 @@ def fitted(
     """Models of a kind, stacked, fitted to the breaths of each lung."""
     kind = KINDS[name]
     keys = jr.split(jr.fold_in(key, 4), train.pressure.shape[0])
-    models = [
-        lung.LungModel(kind.make(k), train.dt[0], size.sensor_delay) for k in keys
-    ]
-    return lung.fit_lungs(
-        lung.stack(models),
-        train,
-        key=jr.fold_in(key, 5),
+    delay = size.sensor_delay
+    models = [lung.LungModel(kind.make(k), train.dt[0], delay) for k in keys]
+    system = "dynamics.dynamics.system."
+    options |= dict(
         steps=size.physics_steps * kind.steps,
         learning_rate=kind.learning_rate,
-        batch_size=32,
-        trainable=kind.trainable,
-        **options,
-    ).model
+        trainable={f"{system}{n}": c for n, c in kind.trainable.items()} or None,
+    )
+    key = jr.fold_in(key, 5)
+    models = lung.stack(models)
+    return lung.fit_lungs(models, train, key=key, batch_size=32, **options).model
 
 
 def open_loop_rows(
     names: list[str], test: lung.Breaths, models: dict[str, Any]
 ) -> list[dict[str, Any]]:
     """The error of each simulator on the breaths of each lung, a row each."""
-    rows = []
-    for kind, model in models.items():
-        errors = eqx.filter_jit(eqx.filter_vmap(lung.open_loop_error))(model, test)
-        for name, error in zip(names, np.asarray(errors), strict=True):
-            rows.append({"lung": name, "simulator": kind, "mae": float(error)})
-    return rows
+    error_of = eqx.filter_jit(eqx.filter_vmap(lung.open_loop_error))
+    errors = {kind: np.asarray(error_of(model, test)) for kind, model in models.items()}
+    return [
+        {"lung": name, "simulator": kind, "mae": float(error)}
+        for kind, each in errors.items()
+        for name, error in zip(names, each, strict=True)
+    ]
 
 
 @eqx.filter_jit
@@ -200,16 +192,14 @@ def closed_loop_errors(
 ) -> dict[str, Any]:
     """How far the pressures in each simulator are from those in the lung, each under
     the same controller and without noise, by kind: shape `(lungs,)`."""
-    pips = jnp.asarray(SEEN)
-    whole = eqx.filter_vmap(lung.Breathing)(
-        controllers, repeated(waveform, len(envs.dt))
-    )
+    pips, count = jnp.asarray(SEEN), len(envs.dt)
+    waveforms = lung.stack([waveform] * count)
+    whole = eqx.filter_vmap(lung.Breathing)(controllers, waveforms)
     silent = eqx.tree_at(lambda env: env.sensor_noise, envs, None)
     truth = _observed(silent, whole, pips)
     silent_task = lambda model: lung.lung_environment(model, waveform, noise=0.0)
     errors = {}
     for kind, model in models.items():
-        simulated = eqx.filter_vmap(silent_task)(model)
-        pressure = _observed(simulated, whole, pips)
+        pressure = _observed(eqx.filter_vmap(silent_task)(model), whole, pips)
         errors[kind] = np.mean(np.abs(np.asarray(pressure - truth)), axis=(1, 2))
     return errors

@@ -1,4 +1,4 @@
-"""A study in stages: each is written when it is done, and found the next time."""
+"""A study in stages: each is written when it is done, and read the next time."""
 
 import csv
 import io
@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ..._files import replaced
 from ..._module import load, save
 
 
@@ -33,7 +34,6 @@ class Stages:
         progress: bool,
     ):
         self.out, self.say, self.progress = out, say, progress
-        self.began = time.perf_counter()
         self.seconds: dict[str, float] = {}
         known = out / "settings.json"
         (out / "controllers").mkdir(parents=True, exist_ok=True)
@@ -70,10 +70,8 @@ class Stages:
 
     def write(self, name: str, text: str) -> None:
         """Write a file whole or not at all."""
-        path = self.out / name
-        beside = path.with_suffix(".tmp")
-        beside.write_text(text, newline="")
-        beside.replace(path)
+        with replaced(self.out / name) as file:
+            file.write(text.encode())
 
     def write_table(self, name: str, rows: list[dict[str, Any]]) -> None:
         """Write rows to a file of comma-separated values."""
@@ -82,11 +80,6 @@ class Stages:
         writer.writeheader()
         writer.writerows(rows)
         self.write(name, text.getvalue())
-
-    @property
-    def elapsed(self) -> float:
-        """Seconds since it began."""
-        return time.perf_counter() - self.began
 
 
 def _check_settings(known: Path, settings: dict[str, Any]) -> None:

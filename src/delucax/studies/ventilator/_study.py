@@ -4,6 +4,7 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,35 +17,12 @@ import numpy as np
 from ... import lung
 from ..._check import check_count
 from ..._typing import PRNGKey
+from ...controllers import LeakyPID
 from ...environments import Environment
-from ._contenders import (
-    Contender,
-    designed,
-    networks,
-    networks_for_all,
-    networks_on_pids,
-    online_learners,
-    pid_contenders,
-    planners,
-    searched_pids,
-    trained_pids,
-    Trainer,
-)
-from ._report import best_pid, bound_rows, error_rows, save_controllers, summarise
-from ._simulators import (
-    closed_loop_errors,
-    divided,
-    explored,
-    fitted,
-    grouped,
-    learned,
-    left_out,
-    open_loop_rows,
-)
-from ._size import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, UNSEEN
-from ._stacks import repeated
+from . import _contenders as making, _report as reporting, _simulators as fitting
+from ._contenders import Contender, pid_contenders, Trainer
+from ._settings import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, UNSEEN
 from ._stages import Stages
-from ._tuned import tuned_pids
 
 
 def lung_study(
@@ -100,6 +78,7 @@ def lung_study(
         from delucax.studies import lung_study  # then: lung_study("out", small=True)
         ```
     """
+    began = time.perf_counter()
     size = SMALL if small else FULL
     if seeds is not None:
         size = size._replace(seeds=seeds)
@@ -118,24 +97,27 @@ def lung_study(
 
     if recorded is None:
         lungs = size.lungs
-        breaths = stages.stage("breaths", "Breaths", lambda: explored(size))
+        make = lambda: fitting.explored(size)
+        breaths = stages.stage("breaths", "Breaths", make)
     else:
-        lungs, breaths = stages.stage("breaths", "Breaths", lambda: grouped(recorded))
-        if words := left_out(recorded, breaths):
+        make = lambda: fitting.grouped(recorded)
+        lungs, breaths = stages.stage("breaths", "Breaths", make)
+        if words := fitting.left_out(recorded, breaths):
             say(words)
         kinds = dict.fromkeys((*size.physics, "grey box"))
         size = size._replace(physics=tuple(kinds), between=())
     names = [_lung_name(*each) for each in lungs]
-    train, test = divided(breaths, jr.fold_in(key, 1))
+    train, test = fitting.divided(breaths, jr.fold_in(key, 1))
     models = _simulators(stages, train, size, key)
-    table = open_loop_rows(names, test, models)
+    table = fitting.open_loop_rows(names, test, models)
 
     between = None
     if recorded is None:
-        late: Any = dict(sensor_delay=sensor_delay)
-        envs = lung.stack([lung.double_compartment(*each, **late) for each in lungs])
         around = [size.between[i % len(size.between)] for i in range(len(lungs))]
-        others = lung.stack([lung.double_compartment(*each, **late) for each in around])
+        envs, others = (
+            lung.stack([fitting.task_of(*e, sensor_delay) for e in each])
+            for each in (lungs, around)
+        )
         between = others, [_lung_name(*each) for each in size.between]
         judge = "the lungs themselves"
     else:
@@ -146,39 +128,44 @@ def lung_study(
         ]
         envs = lung.stack(made)
         judge = "grey-box lungs fitted to the same breaths, for want of the lungs"
-    trainer = Trainer(models["learned"], waveform)
-    contenders = _contenders(stages, envs, train, trainer, size, key)
+    trainer = Trainer(models["learned"], waveform, size, key)
+    contenders = _contenders(stages, envs, train, trainer)
     if size.extras and recorded is None:
         pids = next(c.controllers for c in contenders if c.label == "PID")
         closed = stages.stage(
             "closed_loop",
             "Simulators and lungs under the same PIDs",
-            lambda: closed_loop_errors(envs, models, pids, waveform),
+            lambda: fitting.closed_loop_errors(envs, models, pids, waveform),
         )
         for row in table:
             errors = closed[row["simulator"]]
             row["closed_loop_mae"] = float(errors[names.index(row["lung"])])
     stages.write_table("simulators.csv", table)
     keys = jr.split(jr.fold_in(key, 99), size.noises)
-    rows, runs = error_rows(contenders, envs, names, waveform, keys, between)
+    rows, runs = reporting.error_rows(contenders, envs, names, waveform, keys, between)
     if size.bound_steps:
         bound = stages.stage(
             "bound",
             "The least error, with the lung at hand",
             lambda: _least_errors(envs, size.bound_steps),
         )
-        rows += bound_rows(names, np.asarray(bound))
+        rows += reporting.bound_rows(names, np.asarray(bound))
     stages.write_table("report.csv", rows)
     place = stages.out / "controllers"
-    unsafe = save_controllers(place, contenders, names, waveform, rows)
-    summary = summarise(rows, table, stages.seconds, judge, unsafe)
+    unsafe = reporting.save_controllers(place, contenders, names, waveform, rows)
+    summary = reporting.summarise(rows, table, stages.seconds, judge, unsafe)
     stages.write("summary.json", json.dumps(summary, indent=1) + "\n")
     for line in summary["words"]:
         say(line)
-    chosen = {"best PID": best_pid(rows), "MLP": "MLP", "MLP for all": "MLP for all"}
-    shown = {name: runs[label] for name, label in chosen.items()}
-    _draw(stages, envs, shown, names, test, models, table, rows)
-    say(f"Written to {stages.out}/ in {stages.elapsed:.0f} s.")
+    best = {"best PID": reporting.best_of(rows, reporting.PID_ROWS, "unseen")[1]}
+    shown = {n: runs[best.get(n, n)] for n in ("best PID", "MLP", "MLP for all")}
+    if importlib.util.find_spec("matplotlib") is None:
+        say("No figures: they need matplotlib (pip install 'delucax[plot]').")
+    else:
+        from ._figures import draw_study
+
+        draw_study(stages.out, envs, shown, names, test, models, table, rows)
+    say(f"Written to {stages.out}/ in {time.perf_counter() - began:.0f} s.")
     return rows
 
 
@@ -197,64 +184,57 @@ def _simulators(
 ) -> dict[str, lung.LearnedLung | lung.LungModel]:
     """Simulators of each kind, stacked over the lungs, by name."""
     count, data = f"all {train.pressure.shape[0]} at once", (train, size, key)
-    models: dict[str, Any] = {}
-    models["learned"] = stages.training(
-        "simulators", f"Learned lungs, {count}", learned, *data
-    )
+    words = f"Learned lungs, {count}"
+    learned = stages.training("simulators", words, fitting.learned, *data)
+    models: dict[str, Any] = {"learned": learned}
     for kind in size.physics:
-        models[kind] = stages.training(
-            kind.replace(" ", "_"), f"Fitted {kind}, {count}", fitted, kind, *data
-        )
+        name, words = kind.replace(" ", "_"), f"Fitted {kind}, {count}"
+        models[kind] = stages.training(name, words, fitting.fitted, kind, *data)
     return models
 
 
 def _contenders(
-    stages: Stages,
-    envs: Environment,
-    train: lung.Breaths,
-    trainer: Trainer,
-    size: Size,
-    key: PRNGKey,
+    stages: Stages, envs: Environment, train: lung.Breaths, trainer: Trainer
 ) -> list[Contender]:
     """All controllers, in the order of the report."""
-    training, study = stages.training, (trainer, size, key)
-    by_hand = designed(trainer)
-    pids = stages.stage("pids", "PID grids", lambda: searched_pids(envs, trainer, key))
-    contenders = [by_hand["zero"], *pid_contenders(pids, trainer)]
+    size, waveform, training = trainer.size, trainer.waveform, stages.training
+    pids = stages.stage(
+        "pids", "PID grids", lambda: making.searched_pids(envs, trainer)
+    )
+    # No control is a PID without gains, as which it compiles nothing of its own.
+    none = trainer.pid(LeakyPID, (0.0, 0.0, 0.0))
+    contenders = [Contender("zero", 0, none, True), *pid_contenders(pids)]
     words = f"A network for each lung, {size.seeds} seeds at once"
-    own = training("own", words, networks, "mlp", size.seeds, *study)
+    own = training("own", words, making.networks, trainer, "mlp", size.seeds)
     words = f"A network for all lungs, {size.seeds} seeds at once"
-    shared = training("shared", words, networks_for_all, *study)
+    shared = training("shared", words, making.networks_for_all, trainer)
     if size.tuned:
         words = "PIDs with feed-forward tuned on the lungs"
-        inputs = envs, trainer.waveform, size, key, stages.say
-        tuned = training("tuned_pids", words, tuned_pids, *inputs)
-        contenders += pid_contenders(tuned, trainer)
+        tuned = training(
+            "tuned_pids", words, making.tuned_pids, envs, trainer, stages.say
+        )
+        contenders += pid_contenders(tuned)
     if size.extras:
         words = "PIDs trained on"
-        more = training("trained_pids", words, trained_pids, pids, *study)
+        more = training("trained_pids", words, making.trained_pids, trainer, pids)
         words = "A convolutional network for each lung"
-        convolved = training("own_cnn", words, networks, "cnn", 1, *study)
+        convolved = training("own_cnn", words, making.networks, trainer, "cnn", 1)
         words = "A PID and a network for each lung"
-        residual = training("residual", words, networks_on_pids, pids, *study)
-        online = stages.stage(
-            "online",
-            "GPC around the best PIDs",
-            lambda: online_learners(train, pids, trainer, size.sensor_delay),
-        )
-        contenders += pid_contenders(more, trainer)
+        residual = training("residual", words, making.networks_on_pids, trainer, pids)
+        learn = lambda: making.online_learners(train, pids, waveform, size.sensor_delay)
+        online = stages.stage("online", "GPC around the best PIDs", learn)
         contenders += [
-            by_hand["bang-bang"],
-            Contender("GPC", 0, online, False),
-            planners(trainer),
-            Contender("CNN", 0, lung.unstack(convolved)[0], False),
-            Contender("PID + MLP", 0, lung.unstack(residual)[0], False),
+            *pid_contenders(more),
+            Contender("bang-bang", 0, lung.BangBang(waveform), True),
+            Contender("GPC", 0, online),
+            making.planners(trainer),
+            Contender("CNN", 0, lung.unstack(convolved)[0]),
+            Contender("PID + MLP", 0, lung.unstack(residual)[0]),
         ]
-    for seed, controllers in enumerate(lung.unstack(own)):
-        contenders.append(Contender("MLP", seed, controllers, False))
-    for seed, controller in enumerate(lung.unstack(shared)):
-        alike = repeated(controller, trainer.count)
-        contenders.append(Contender("MLP for all", seed, alike, True))
+    for label, trained in (("MLP", own), ("MLP for all", shared)):
+        alike = trained is shared
+        each = enumerate(lung.unstack(trained))
+        contenders += [Contender(label, seed, one, alike) for seed, one in each]
     return contenders
 
 
@@ -263,13 +243,3 @@ def _least_errors(envs: Environment, steps: int) -> Any:
     pips = jnp.asarray(SEEN + UNSEEN)
     of = lambda env: lung.least_error(env, pips=pips, steps=steps)  # noqa: E731
     return eqx.filter_vmap(of)(envs)
-
-
-def _draw(stages: Stages, *what: Any) -> None:
-    """The figures, where Matplotlib is there."""
-    if importlib.util.find_spec("matplotlib") is None:
-        stages.say("No figures: they need matplotlib (pip install 'delucax[plot]').")
-        return
-    from ._figures import draw_study
-
-    draw_study(stages.out, *what)

@@ -8,7 +8,7 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float
 
-from ..._check import check_range, is_concrete
+from ..._check import is_concrete
 from ..._module import as_float_array
 from ..._results import choose, first_failure, promote, Result, RESULTS
 
@@ -28,7 +28,7 @@ class Identified(eqx.Module):
     fit). Along each there is a spread, the standard deviation of the estimate; where it
     is as large as the parameter itself, or the data do not depend on it at all, the
     direction is not identifiable: the parameters can be moved along it together, and
-    nothing is seen of it.
+    the data do not change.
 
     **Attributes:**
 
@@ -37,9 +37,9 @@ class Identified(eqx.Module):
     - `estimate`: their values, shape `(p,)`; in a linear fit `(outputs, p)`.
     - `std`: their standard deviations, of the same shape; infinite for what is not
         identifiable, NaN where the fit did not converge.
-    - `low`, `high`: the ends of their confidence intervals, of the same shape; those of
-        all legal values, such as 0 and infinity, for what is not identifiable; NaN
-        where the fit did not converge.
+    - `low`, `high`: the ends of their 95% confidence intervals, of the same shape;
+        those of all legal values, such as 0 and infinity, for what is not identifiable;
+        NaN where the fit did not converge.
     - `directions`: shape `(p, p)`, a unit vector in each row, least known first.
     - `spread`: the standard deviation along each, shape `(p,)`; NaN where the fit did
         not converge.
@@ -70,8 +70,8 @@ class Identified(eqx.Module):
         controls = jax.random.normal(jax.random.key(0), (50, 1))
         true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
         states = dlx.open_loop(true, [0.0, 0.0], controls)
-        found = dlx.training.sysid.linear(states, controls)
-        print(found.report())
+        fit = dlx.training.sysid.linear(states, controls)
+        print(fit.report())
         ```
     """
 
@@ -152,7 +152,7 @@ def checked(fit: Identified, throw: bool) -> Identified:
 
 
 class Certainty(eqx.Module):
-    """What the sensitivity of the data says of an estimate."""
+    """How certain an estimate is, from the sensitivity of the data to it."""
 
     directions: Array
     spread: Array
@@ -192,7 +192,6 @@ class Certainty(eqx.Module):
         )
 
 
-def quantile(level: Any, where: str) -> Array:
-    """How many standard deviations a confidence interval reaches to either side."""
-    check_range(level, "level", where, 0, 1)
-    return ndtri((1 + as_float_array(level)) / 2)
+def reach() -> Array:
+    """How many standard deviations a 95% confidence interval reaches to either side."""
+    return ndtri((1 + as_float_array(0.95)) / 2)

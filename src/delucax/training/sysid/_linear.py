@@ -1,19 +1,20 @@
 """Linear models by least squares."""
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ..._check import check_bool, check_count, check_finite, check_step
 from ..._message import shortened
 from ..._module import as_float_array
 from ..._results import RESULTS
 from ...dynamics import LinearDynamics
-from ._identified import Certainty, checked, Identified, quantile
+from ._identified import Certainty, checked, Identified, reach
 
 
 def linear(
@@ -22,7 +23,6 @@ def linear(
     *,
     dt: Any = 1.0,
     affine: bool = False,
-    level: Any = 0.95,
     throw: bool = True,
 ) -> Identified:
     r"""Linear dynamics by least squares on the steps of a recorded run,
@@ -38,7 +38,6 @@ def linear(
     - `controls`: shape `(T, m)`, or `(runs, T, m)`.
     - `dt`: the step, 1 by default.
     - `affine`: whether to estimate a constant c too; false by default.
-    - `level`: of the confidence intervals, 0.95 by default.
     - `throw`: raise if the data do not tell all entries (default); if false, look at
         `result`.
 
@@ -58,28 +57,26 @@ def linear(
         controls = jax.random.normal(jax.random.key(0), (50, 1))
         true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
         states = dlx.open_loop(true, [0.0, 0.0], controls)
-        found = dlx.training.sysid.linear(states, controls)
-        found.model.A, found.model.B, found.std
+        fit = dlx.training.sysid.linear(states, controls)
+        fit.model.A, fit.model.B, fit.std
         ```
     """
     where = "sysid.linear"
     states, controls = runs_of(states, controls, "states", where)
     check_step(dt, where)
     affine = check_bool(affine, "affine", where)
-    reach = quantile(level, where)
     n, m = states.shape[2], controls.shape[2]
     names = [f"x{i}" for i in range(n)] + [f"u{i}" for i in range(m)]
-    names += ["1"] if affine else []
-    before = states[:, :-1]
-    parts = [before, controls]
-    parts += [jnp.ones((*before.shape[:2], 1), before.dtype)] if affine else []
-    regressors = jnp.concatenate(parts, axis=2).reshape(-1, len(names))
-    targets = states[:, 1:].reshape(-1, n)
-    fit = _least_squares(regressors, targets)
-    A, B = fit.estimate[:, :n], fit.estimate[:, n : n + m]
-    x_next = fit.estimate[:, -1] if affine else None
-    model = LinearDynamics(A, B, dt=dt, x_next=x_next)
-    return checked(_identified(model, names, fit, reach), throw)
+    regressors = [states[:, :-1], controls]
+    if affine:
+        names.append("1")
+        regressors.append(jnp.ones((*controls.shape[:2], 1), controls.dtype))
+
+    def model_of(estimate):
+        A, B = estimate[:, :n], estimate[:, n : n + m]
+        return LinearDynamics(A, B, dt=dt, x_next=estimate[:, -1] if affine else None)
+
+    return _fitted(model_of, names, regressors, states[:, 1:], throw)
 
 
 def arx(
@@ -90,7 +87,6 @@ def arx(
     controls_back: int,
     delay: int = 1,
     dt: Any = 1.0,
-    level: Any = 0.95,
     throw: bool = True,
 ) -> Identified:
     r"""An autoregressive model with inputs (ARX) by least squares,
@@ -109,7 +105,6 @@ def arx(
     - `controls_back`: b, the controls looked back on.
     - `delay`: steps from a control to its first effect, 1 by default.
     - `dt`: the step, 1 by default.
-    - `level`: of the confidence intervals, 0.95 by default.
     - `throw`: raise if the data do not tell all entries (default); if false, look at
         `result`.
 
@@ -132,8 +127,8 @@ def arx(
         true = dlx.LinearDynamics([[0.9, 0.1], [0.0, 0.8]], [[0.0], [1.0]])
         angles = dlx.open_loop(true, [0.0, 0.0], controls)[:, :1]
         back = dict(outputs_back=2, controls_back=2)
-        found = dlx.training.sysid.arx(angles, controls, **back, throw=False)
-        found.estimate
+        fit = dlx.training.sysid.arx(angles, controls, **back, throw=False)
+        fit.estimate
         ```
     """
     where = "sysid.arx"
@@ -142,7 +137,6 @@ def arx(
     b = check_count(controls_back, "controls_back", where)
     delay = check_count(delay, "delay", where)
     check_step(dt, where)
-    reach = quantile(level, where)
     p, m, steps = outputs.shape[2], controls.shape[2], controls.shape[1]
     first = max(a, b + delay - 1)
     if steps < first:
@@ -156,11 +150,8 @@ def arx(
     back += [controls[:, first - lag : steps + 1 - lag] for lag in lags]
     names = [f"y{i}(k-{lag})" for lag in range(1, a + 1) for i in range(p)]
     names += [f"u{i}(k-{lag})" for lag in lags for i in range(m)]
-    regressors = jnp.concatenate(back, axis=2).reshape(-1, len(names))
-    targets = outputs[:, first:].reshape(-1, p)
-    fit = _least_squares(regressors, targets)
-    model = _realised(fit.estimate, p, m, a, b, delay, dt)
-    return checked(_identified(model, names, fit, reach), throw)
+    model_of = lambda estimate: _realised(estimate, p, m, a, b, delay, dt)
+    return _fitted(model_of, names, back, outputs[:, first:], throw)
 
 
 def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, Array]:
@@ -186,25 +177,12 @@ def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, 
     return outputs.astype(dtype), controls.astype(dtype)
 
 
-class _Fit(NamedTuple):
-    """Least squares of each output, and what the data tell of the estimate."""
-
-    estimate: Float[Array, "outputs p"]
-    certainty: Certainty
-    """In units of `scale`, of the output with the largest relative noise."""
-    scale: Float[Array, " p"]
-    """The size of each regressor."""
-    noise: Float[Array, " outputs"]
-    typical: Float[Array, " outputs"]
-    """The size of each output."""
-    enough: Bool[Array, ""]
-    """Whether there are as many rows as regressors."""
-
-
 @jax.jit
 def _least_squares(
     regressors: Float[Array, "rows p"], targets: Float[Array, "rows outputs"]
-) -> _Fit:
+) -> tuple[Float[Array, "outputs p"], Float[Array, "outputs p"], Array, Certainty]:
+    """The estimate of each output, its standard deviation, that of what remains, and
+    what the data tell of the output with the largest relative noise."""
     rows, p = regressors.shape
     size = jnp.sqrt(jnp.mean(regressors**2, axis=0))
     scale = jnp.where(size > 0, size, 1)
@@ -221,36 +199,43 @@ def _least_squares(
     # Unknown where its spread is the size of the outputs themselves.
     typical = jnp.sqrt(jnp.mean(targets**2, axis=0))
     typical = jnp.where(typical > 0, typical, 1)
-    certainty = Certainty.of(scaled, jnp.max(noise / typical), 1.0)
-    enough = jnp.asarray(rows >= p)
-    return _Fit(estimate / scale, certainty, scale, noise, typical, enough)
-
-
-def _identified(
-    model: LinearDynamics, names: list[str], fit: _Fit, reach: Array
-) -> Identified:
-    estimate, certainty, scale, noise, typical, enough = fit
     worst = jnp.max(noise / typical)
+    certainty = Certainty.of(scaled, worst, 1.0)
     # All outputs share the regressors, and differ in their noise alone.
     unit = certainty.std / jnp.where(worst > 0, worst, 1)
     std = noise[:, None] * unit / scale
     std = jnp.where(jnp.isinf(certainty.std), jnp.inf, jnp.where(worst > 0, std, 0))
-    known = certainty.identifiable & enough
-    return Identified(
-        model=model,
+    return estimate / scale, std, noise, certainty
+
+
+def _fitted(
+    model_of: Callable[[Array], LinearDynamics],
+    names: list[str],
+    regressors: list[Array],
+    targets: Float[Array, "runs steps outputs"],
+    throw: bool,
+) -> Identified:
+    """The linear model of `targets` by `regressors`, each with a row a step."""
+    rows = jnp.concatenate(regressors, axis=2).reshape(-1, len(names))
+    targets = targets.reshape(-1, targets.shape[2])
+    estimate, std, noise, certainty = _least_squares(rows, targets)
+    interval = reach() * std
+    fit = Identified(
+        model=model_of(estimate),
         names=tuple(names),
         estimate=estimate,
         std=std,
-        low=estimate - reach * std,
-        high=estimate + reach * std,
+        low=estimate - interval,
+        high=estimate + interval,
         directions=certainty.directions,
         spread=certainty.spread,
-        identifiable=known,
+        identifiable=certainty.identifiable & (len(rows) >= len(names)),
         noise=noise,
         correlation=None,
         x0=None,
         result=RESULTS.successful,
     )
+    return checked(fit, throw)
 
 
 def _realised(estimate, p, m, a, b, delay, dt) -> LinearDynamics:

@@ -46,7 +46,6 @@ class Solution(NamedTuple):
 
     values: dict[str, Array]
     starts: Float[Array, "windows n"]
-    cost: Float[Array, ""]
     legal: Float[Array, " p"]
     certainty: Certainty
     noise: Float[Array, " y"]
@@ -59,8 +58,8 @@ def cut_into_windows(
     observations: Float[Array, "runs points y"],
     controls: Float[Array, "runs steps m"],
     window: int,
-) -> tuple[Float[Array, "windows n"], Windows, Float[Array, " y"]]:
-    """`(starts, windows, spread of each output)`."""
+) -> tuple[Float[Array, "windows n"], Windows]:
+    """`(starts, windows)`, the noise of which is the spread of each output."""
     runs, steps, _ = controls.shape
     n, size = guesses.shape[2], observations.shape[2]
     count = steps // window
@@ -78,7 +77,7 @@ def cut_into_windows(
     spread, largest = jnp.std(observed, axis=(0, 1)), jnp.max(jnp.abs(observed), (0, 1))
     moves = spread > 1e3 * float(jnp.finfo(observed.dtype).eps) * largest
     spread = jnp.where(moves, spread, jnp.where(largest > 0, largest, 1))
-    return starts, Windows(begins, inputs, observed, counts, spread), spread
+    return starts, Windows(begins, inputs, observed, counts, spread)
 
 
 @eqx.filter_jit
@@ -120,15 +119,10 @@ def solve(
         return _Point(theta, starts, *slopes, residuals=residuals, cost=cost)
 
     rows = data.observations[0].size
+    windows, n = starts.shape
     zeros = lambda *shape: jnp.zeros(shape, dtype)
-    start = _Point(
-        theta=flat,
-        starts=starts,
-        by_theta=zeros(len(starts), rows, p),
-        by_start=zeros(len(starts), rows, starts.shape[1]),
-        residuals=zeros(len(starts), rows),
-        cost=zeros() + jnp.inf,
-    )
+    slopes = zeros(windows, rows, p), zeros(windows, rows, n)
+    start = _Point(flat, starts, *slopes, zeros(windows, rows), zeros() + jnp.inf)
     best, count = _levenberg_marquardt(linearised, start, max_steps)
 
     eps = jnp.finfo(dtype).eps
@@ -145,7 +139,7 @@ def solve(
     correlation = jnp.sqrt(jnp.sum(data.counts)) * jnp.max(
         paired / jnp.where(each > 0, each, 1)
     )
-    # The correlation of rounding says nothing.
+    # The correlation of rounding errors has no meaning.
     correlation = jnp.where(sigma < 0.5, 0, correlation)
     noise = data.noise * jnp.sqrt(each * size / free)
     values = unravel(theta)
@@ -160,7 +154,7 @@ def solve(
     result = choose(jnp.isfinite(cost), result, RESULTS.diverged)
     legal = flat_legal(assembly, values)
     noise = jnp.where(jnp.isfinite(cost), noise, jnp.nan).astype(dtype)
-    return Solution(values, starts, cost, legal, certainty, noise, correlation, result)
+    return Solution(values, starts, legal, certainty, noise, correlation, result)
 
 
 def _levenberg_marquardt(

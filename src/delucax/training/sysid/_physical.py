@@ -19,8 +19,8 @@ from ..._check import (
 from ..._module import as_float_array
 from ..._results import RESULTS
 from ...dynamics import AbstractDynamics, open_loop
-from .._trainable import Assembly, take_apart
-from ._identified import checked, CORRELATED, Identified, quantile
+from .._trainable import Assembly, partition_trainable
+from ._identified import checked, CORRELATED, Identified, reach
 from ._linear import runs_of
 from ._multiple_shooting import (
     cut_into_windows,
@@ -45,7 +45,6 @@ def physical(
     x0: Any = None,
     window: int = 20,
     noise: Any = None,
-    level: Any = 0.95,
     max_steps: int = 100,
     throw: bool = True,
 ) -> Identified:
@@ -84,7 +83,6 @@ def physical(
         not fill the last is left out.
     - `noise`: the standard deviation of each observation, a number or shape `(p,)`; by
         default as in what remains of a first fit.
-    - `level`: of the confidence intervals, 0.95 by default.
     - `max_steps`: 100 by default.
     - `throw`: raise if it does not converge or the data do not tell all parameters
         (default); if false, look at `result`.
@@ -110,8 +108,8 @@ def physical(
         states = dlx.open_loop(true, [3.0, 0.0], controls)
         guess = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
         fit = dlx.training.sysid.physical
-        found = fit(guess, states, controls, "system.length", window=20)
-        found.estimate, found.low, found.high
+        fitted = fit(guess, states, controls, "system.length", window=20)
+        fitted.estimate, fitted.low, fitted.high
         ```
     """
     where = "sysid.physical"
@@ -128,7 +126,6 @@ def physical(
     runs, steps = controls.shape[:2]
     window = min(check_count(window, "window", where), steps)
     max_steps = check_count(max_steps, "max_steps", where)
-    reach = quantile(level, where)
     check_bool(throw, "throw", where)
     if noise is not None:
         check_positive(noise, "noise", where)
@@ -144,7 +141,7 @@ def physical(
             f"{where}: x0 must be given where the state (of size {n}) is not what is "
             f"observed (of size {size})."
         )
-    assembly, values = take_apart(dynamics, parameters, where)
+    assembly, values = partition_trainable(dynamics, parameters, where)
     names = [
         path + (f"[{','.join(map(str, index))}]" if index else "")
         for path, value in sorted(values.items())
@@ -152,7 +149,8 @@ def physical(
     ]
 
     def fit(values, window):
-        starts, data, spread = cut_into_windows(guesses, observations, controls, window)
+        starts, data = cut_into_windows(guesses, observations, controls, window)
+        spread = data.noise
         data = data._replace(noise=spread if noise is None else noise)
         solution = solve(assembly, values, starts, data, max_steps)
         if noise is not None:
@@ -176,7 +174,7 @@ def physical(
                 solution = again
     values, legal, certainty = solution.values, solution.legal, solution.certainty
     std = certainty.std
-    ends = [_ends(assembly, values, sign * reach * std) for sign in (-1, 1)]
+    ends = [_ends(assembly, values, sign * reach() * std) for sign in (-1, 1)]
     starts = solution.starts.reshape(runs, count, n)[:, 0]
     fitted = Identified(
         model=assembly(values),
@@ -201,7 +199,7 @@ def physical(
 def _is_doubtful(solution: Solution) -> bool:
     """Whether it is known now that the iteration did not converge, or that it ended
     where what remains is correlated from step to step, as the noise is not."""
-    if not is_concrete(solution.cost):
+    if not is_concrete(solution.correlation):
         return False
     failed = solution.result != RESULTS.successful
     return bool(failed | (solution.correlation > CORRELATED))

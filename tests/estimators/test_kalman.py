@@ -19,7 +19,7 @@ import delucax as dlx
 pytestmark = needs_x64
 
 
-c = dlx.controllers
+c = dlx.estimators
 CLOSE = dict(rtol=tolerance(2e-4, 1e-10), atol=tolerance(2e-4, 1e-11))
 
 
@@ -374,7 +374,10 @@ def test_failures():
 
 
 BAD = [
-    ({"dynamics": dlx.systems.Pendulum()}, "dynamics must be LinearDynamics.*Pendulum"),
+    (
+        {"dynamics": dlx.systems.Pendulum()},
+        "dynamics must be a Linear.*Pendulum",
+    ),
     ({"W": jnp.eye(3)}, r"W must have shape \(2, 2\), .*disturbance, got \(3, 3\)"),
     ({"W": jnp.ones(2)}, r"W must be a matrix, got shape \(2,\)"),
     ({"W": jnp.diag(jnp.array([1.0, -1.0]))}, "W must be positive semidefinite"),
@@ -415,10 +418,10 @@ def test_wrong_records():
         with user_error(match=f"{name}: estimator must be a KalmanFilter.*got LinearD"):
             run(kalman.dynamics, YS)
         with user_error(
-            match=rf"{name}: observations must have shape \(T, 1\).*\(8,\)"
+            match=rf"{name}: observations must have shape \(steps, 1\).*\(8,\)"
         ):
             run(kalman, YS[:, 0])
-        with user_error(match=r"observations must have shape.*got shape \(0, 1\)"):
+        with user_error(match=r"observations must have at least one step"):
             run(kalman, YS[:0])
         with user_error(match="observations must be finite"):
             run(kalman, YS.at[3].set(jnp.nan))

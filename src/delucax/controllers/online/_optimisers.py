@@ -1,32 +1,107 @@
-"""Newton's step for an online learner."""
+"""The steps of online learners."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float, PyTree
 
 from ..._check import check_positive
+from ..._controller import Tally
+
+
+def projected_step(
+    optimiser: optax.GradientTransformation,
+    learning_rate: Array,
+    project: Callable[[Any], Any],
+    gradient: PyTree,
+    theta: PyTree,
+    state: PyTree,
+    refused: Tally,
+    **extra: Any,
+) -> tuple[PyTree, PyTree, Tally]:
+    """`theta` and the state of the optimiser a step later; where that is not finite,
+    they stay as they are and the step is counted as refused. `extra` is for the
+    optimisers that take more than a gradient."""
+    optimiser = optax.with_extra_args_support(optimiser)
+    extra["learning_rate"] = learning_rate
+    step, after = optimiser.update(gradient, state, theta, **extra)
+    add = lambda old, step: old + (learning_rate * step).astype(old.dtype)
+    new = project(jax.tree.map(add, theta, step)), after
+    floats = jax.tree.leaves(eqx.filter(new, eqx.is_inexact_array))
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in floats]))
+    keep = lambda new, old: jnp.where(finite, new, old)
+    return *jax.tree.map(keep, new, (theta, state)), refused.add(~finite)
+
+
+def _adagrad_norm_init(params: PyTree) -> Array:
+    """The sum of the squared norms of all gradients so far."""
+    return jnp.zeros((), jax.tree.leaves(params)[0].dtype)
+
+
+def _adagrad_norm_update(
+    updates: Any, state: Any, params: Any = None
+) -> tuple[PyTree, Array]:
+    del params
+    total = state + optax.tree.norm(updates, squared=True)
+    some = total > 0
+    scale = jnp.where(some, 1 / jnp.sqrt(jnp.where(some, total, 1)), 0)
+    return jax.tree.map(lambda g: -scale.astype(g.dtype) * g, updates), total
+
+
+_ADAGRAD_NORM = optax.GradientTransformation(_adagrad_norm_init, _adagrad_norm_update)
+
+
+def adagrad_norm() -> optax.GradientTransformation:
+    r"""Gradient descent whose step does not depend on the scale of the loss,
+
+    `theta_next = theta - learning_rate g_t / sqrt(sum_{s <= t} |g_s|^2)`,
+
+    with `learning_rate` that of the learner. With convex losses and a set of diameter D
+    its regret is at most `(D^2 / (2 learning_rate) + learning_rate) sqrt(sum |g|^2)`,
+    without knowing how large gradients will be or how many there are.
+
+    **Returns:** an `optax.GradientTransformation`, the same at each call, so that two
+    learners share what was compiled.
+
+    Source: Streeter and McMahan, 2010; Ward, Wu and Bottou, 2019.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+        import optax
+
+        optimiser = dlx.controllers.adagrad_norm()
+        state = optimiser.init(jnp.zeros(2))
+        step, state = optimiser.update(jnp.array([3.0, 4.0]), state)
+        optax.apply_updates(jnp.zeros(2), step)
+        ```
+    """
+    return _ADAGRAD_NORM
 
 
 class OnlineNewtonState(NamedTuple):
     """A root of the inverse of the curvature so far with its prior; the sum of the
     traces of what was added to it, and how many times something was."""
 
-    root: Array
-    total: Array
-    count: Array
+    root: Float[Array, "d d"]
+    total: Float[Array, ""]
+    count: Float[Array, ""]
 
 
-def _init(params: Any) -> OnlineNewtonState:
+def _online_newton_init(params: PyTree) -> OnlineNewtonState:
     flat, _ = ravel_pytree(params)
     zero = jnp.zeros((), flat.dtype)
     return OnlineNewtonState(jnp.zeros((flat.size, flat.size), flat.dtype), zero, zero)
 
 
-class _Update(eqx.Module):
+class _OnlineNewtonUpdate(eqx.Module):
     """A module, so that it can be saved and two for one prior are equal."""
 
     prior: float = eqx.field(static=True)
@@ -37,10 +112,10 @@ class _Update(eqx.Module):
         state: Any,
         params: Any = None,
         *,
-        curvature: Any = None,
-        learning_rate: Any = 1.0,
+        curvature: Callable[[], Array] | None = None,
+        learning_rate: Array | float = 1.0,
         **others: Any,
-    ) -> tuple[Any, OnlineNewtonState]:
+    ) -> tuple[PyTree, OnlineNewtonState]:
         del params, others
         if curvature is None:
             raise ValueError(
@@ -51,7 +126,7 @@ class _Update(eqx.Module):
         factor = curvature()
         root, total, count = state
         size = jnp.sum(factor**2)
-        # Next to this step all that was seen before is rounding: begin anew.
+        # Next to this step all before it is rounding: start anew.
         first = size > total / jnp.sqrt(jnp.finfo(size.dtype).eps)
         total, count = jnp.where(first, 0, total), jnp.where(first, 0, count)
         new_total, new_count = total + size, count + (size > 0)
@@ -110,15 +185,17 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
 
         env = dlx.make("lds", key=jax.random.key(0))
         optimiser = dlx.controllers.online_newton(prior=20.0)
-        learner = dlx.controllers.GPC(env.dynamics, env.cost, optimiser=optimiser)
+        learner = dlx.controllers.gpc(env.dynamics, env.cost, optimiser=optimiser)
         dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
         ```
     """
     check_positive(prior, "prior", "online_newton")
-    return optax.GradientTransformationExtraArgs(_init, _Update(float(prior)))
+    return optax.GradientTransformationExtraArgs(
+        _online_newton_init, _OnlineNewtonUpdate(float(prior))
+    )
 
 
-def positive_root(H: Array) -> Array:
+def positive_root(H: Float[Array, "z z"]) -> Float[Array, "z z"]:
     """The Cholesky factor of the positive part of a symmetric matrix; columns that
     have no positive pivot are zero."""
     slack = len(H) * jnp.finfo(H.dtype).eps * jnp.max(jnp.abs(jnp.diag(H)), initial=0)

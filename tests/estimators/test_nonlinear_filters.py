@@ -20,7 +20,7 @@ import delucax as dlx
 pytestmark = needs_x64
 
 
-c = dlx.controllers
+c = dlx.estimators
 EKF, UKF = c.ExtendedKalmanFilter, c.UnscentedKalmanFilter
 CLOSE = dict(rtol=1e-10, atol=1e-11)
 both = pytest.mark.parametrize("kind", [EKF, UKF])
@@ -132,7 +132,7 @@ def test_better_than_dead_reckoning(key):
     def errors(key):
         start, run = jax.random.split(key)
         x0 = START["mean"] + 0.3 * jax.random.normal(start, (2,))
-        run = dlx.rollout(env, c.Zero(1), key=run, x0=x0)
+        run = dlx.rollout(env, dlx.controllers.Zero(1), key=run, x0=x0)
         states = run.states[:-1]
         dead = dlx.open_loop(dynamics, START["mean"], run.controls)[:-1]
         seen = jnp.arctan2(run.observations[:, 0], run.observations[:, 1])

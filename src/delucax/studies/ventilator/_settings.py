@@ -1,4 +1,4 @@
-"""How large the study is, and of which lungs and peak pressures."""
+"""Settings of the study: its size, lungs and peak pressures."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ UNSEEN = (12.5, 17.5, 22.5, 27.5, 32.5)
 SHOWN = 27.5
 """The peak pressure of the breaths in the figures, one of those."""
 INSPIRATION, BREATH = 29, 100
-"""Steps of what is learned from of an inspiration, and of a whole breath."""
+"""Steps of an inspiration that is learned from, and of a whole breath."""
 ABORT = 60.0
 """The pressure that no controller is to reach [cmH2O]."""
 LUNGS = tuple((R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0))

@@ -1,6 +1,7 @@
-"""The plant under its base controller, as a learner on top of it sees it."""
+"""The plant under its base controller, on top of which a learner acts."""
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,13 +10,13 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from ..._check import check_count, check_instance, is_concrete
+from ..._check import check_count, check_instance, check_step, is_concrete
 from ..._controller import AbstractController, wrong_observation
+from ..._jax import jacobian
 from ..._module import parameter
 from ...dynamics import AbstractDynamics, LinearDynamics
-from ...dynamics._linearize import _jacobian
 from ...math import matvec
 from .._basic import Constant, Linear, Zero
 from .._hinfinity import HInfinity
@@ -27,13 +28,11 @@ from .._lqr import LQR
 _AFFINE = (Zero, Constant, Linear, LQR, LQI, LQG, HInfinity)
 """Controllers whose control and state depend on the observation by an affine map that
 is the same at all times."""
-FORGOTTEN = 0.03
-"""What is left of an impulse at the end of a roll-out."""
-LEAST_HORIZON, MOST_HORIZON = 10, 1000
-FADED = 0.1
-"""What is left of an impulse at the end of the default memory. A longer policy reaches
-a little less, and costs more to learn: under noise it is worse."""
-LEAST_MEMORY, MOST_MEMORY = 10, 50
+_LEFT_OF_HORIZON, _HORIZONS = 0.03, (10, 1000)
+"""What is left of an impulse at the end of a roll-out, and the shortest and longest."""
+_LEFT_OF_MEMORY, _MEMORIES = 0.1, (10, 50)
+"""The same of the default memory. A longer policy gains a little, and costs more to
+learn: under noise it is worse."""
 
 
 class Tangents(NamedTuple):
@@ -44,59 +43,69 @@ class Tangents(NamedTuple):
     and the base's control are `output z`.
     """
 
-    transition: Array
-    input: Array
-    output: Array
+    transition: Float[Array, "*T q q"]
+    input: Float[Array, "*T q m"]
+    output: Float[Array, "*T o q"]
 
 
-class LoopState(NamedTuple):
+class ClosedLoopState(NamedTuple):
     """What is remembered of the closed loop.
 
     - `base`: the state of the base controller.
     - `t`, `y`, `u_base`: of the current step.
-    - `begun`: whether a step was made.
-    - `predicted`: where the plant was to be by now without a disturbance; `None` if the
-      state is not observed.
+    - `started`: whether a step was made.
+    - `signal`: its last values, newest first.
+    - `predicted`: the state to which the model went without a disturbance; `None` if
+      the state is not observed.
     - `added`: what was added to the base's control, newest first.
-    - `echo`: the state that those controls alone have brought about; `None` if it is
-      not asked for.
+    - `forced`: the forced response, the state that those controls alone have brought
+      about; `None` if the signal is not nature's output.
     - `now`: the derivatives of the current step, and `impulses`: what is left, in the
       state, of an impulse at each of the last steps. Both are `None` where they are the
       same at all times.
     """
 
     base: Any
-    t: Array
-    y: Array
-    u_base: Array
-    begun: Array
-    predicted: Any
-    added: Array
-    echo: Any
-    now: Any
-    impulses: Any
+    t: Float[Array, ""]
+    y: Float[Array, " p"]
+    u_base: Float[Array, " m"]
+    started: Array
+    signal: Float[Array, "memory p"]
+    predicted: Float[Array, " n"] | None
+    added: Float[Array, "h m"]
+    forced: Float[Array, " q"] | None
+    now: Tangents | None
+    impulses: Float[Array, "h q m"] | None
 
 
-class Loop(eqx.Module):
+class ClosedLoop(eqx.Module):
     """A plant and the base controller that a learner adds its own control to.
+
+    What a learner adds is a function of features: the last values of a signal that does
+    not depend on what was added, or filters of them, side by side in one vector.
 
     - `tangents`: the derivatives of a step, and `response`: that of the observation and
       of the base's control to an impulse; `None` where they change.
-    - `reach`: the size of the first change of the observation that a unit of added
-      control makes; `None` if the dynamics name no equilibrium.
+    - `first_response`: the size of the first change of the observation that a unit of
+      added control makes; `None` if the dynamics name no equilibrium.
+    - `filters`: shape `(f, memory)`, newest first; `None` for the values themselves.
     - `horizon`: the length of the roll-out.
+    - `memory`: how many values of the signal are kept.
     - `observed`: whether the observation is the state.
-    - `echoes`: whether nature's output is asked for.
+    - `nature`: whether the signal is nature's output, that of the closed loop without
+      what the learner adds; otherwise it is the last disturbance.
     """
 
     dynamics: AbstractDynamics
     base: AbstractController
     tangents: Tangents | None = parameter()
     response: Float[Array, "h o m"] | None = parameter()
-    reach: Float[Array, ""] | None = parameter()
+    first_response: Float[Array, ""] | None = parameter()
+    filters: Float[Array, "f memory"] | None = parameter()
     horizon: int = eqx.field(static=True)
+    memory: int = eqx.field(static=True)
     observed: bool = eqx.field(static=True)
-    echoes: bool = eqx.field(static=True)
+    nature: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -105,49 +114,55 @@ class Loop(eqx.Module):
         horizon: int | None,
         where: str,
         *,
-        echoes: bool,
+        memory: int | None = None,
+        filters: np.ndarray | None = None,
+        nature: bool | None = None,
     ):
-        check_control(dynamics, base, where)
-        linear = isinstance(dynamics, LinearDynamics)
+        _check_control(dynamics, base, where)
+        self.dynamics, self.base = dynamics, base
         self.observed = dynamics.observes_state
-        self.echoes = echoes
-        same = linear and not dynamics.is_time_varying and isinstance(base, _AFFINE)
-        if not same and not self.observed:
+        self.nature = not self.observed if nature is None else nature
+        is_linear = isinstance(dynamics, LinearDynamics)
+        is_constant = (
+            is_linear and not dynamics.is_time_varying and isinstance(base, _AFFINE)
+        )
+        if not is_constant and not self.observed:
             raise ValueError(
                 f"{where}: where the state is not observed, dynamics must be linear "
                 "and time-invariant, and base an affine controller such as LQG; got "
                 f"{type(dynamics).__name__} and {type(base).__name__}."
             )
-        self.dynamics, self.base = dynamics, base
-        at_rest = _at_rest(dynamics, base)
-        self.horizon = _roll_out(at_rest, horizon, where)
-        self.tangents = at_rest if same else None
-        self.response = self.reach = None
-        if at_rest is not None:
-            first = at_rest if same else jax.tree.map(_first_matrix, at_rest)
+        tangents = _equilibrium_tangents(dynamics, base)
+        radius = None if tangents is None else _spectral_radius(tangents)
+        self.horizon = _roll_out_length(radius, horizon, where)
+        self.tangents = tangents if is_constant else None
+        self.filters = None if filters is None else jnp.asarray(filters, self.dtype)
+        if filters is not None:
+            memory = filters.shape[1]
+        elif memory is None:
+            # Newton's step, for nature's outputs and for loops that change, pays for
+            # each number that it learns: there the memory is the shortest.
+            is_cheap = is_constant and not self.nature
+            rate = radius if is_cheap and radius is not None else 0.0
+            memory = _steps(rate, _LEFT_OF_MEMORY, *_MEMORIES)
+        self.memory = check_count(memory, "memory", where)
+        self.response = self.first_response = None
+        if tangents is not None:
+            first = jax.tree.map(lambda a: a if a.ndim == 2 else a[0], tangents)
             response = _impulse_response(first, self.horizon)
-            self.reach = _first_size(response[:, : dynamics.observation_size])
-            self.response = response if same else None
+            self.first_response = _first_size(response[:, : dynamics.observation_size])
+            self.response = response if is_constant else None
 
     def __check_init__(self):
-        check_control(self.dynamics, self.base, "Loop")
+        _check_control(self.dynamics, self.base, "ClosedLoop")
         if self.response is not None:
             m, p = self.dynamics.control_size, self.dynamics.observation_size
             if self.response.shape[1:] != (p + m, m):
                 raise ValueError(
-                    f"Loop: response must have shape (h, {p + m}, {m}), got "
+                    f"ClosedLoop: response must have shape (h, {p + m}, {m}), got "
                     f"{self.response.shape}; build the learner anew for dynamics of "
                     "another size."
                 )
-
-    def memory(self) -> int:
-        """For how many steps a disturbance matters, as far as that can be seen."""
-        # Newton's step, for nature's outputs and for loops that change, pays for each
-        # number that it learns.
-        if self.tangents is None or self.echoes:
-            return LEAST_MEMORY
-        radius = _radius(self.tangents)
-        return _steps(radius or 0.0, FADED, LEAST_MEMORY, MOST_MEMORY)
 
     @property
     def dtype(self) -> Any:
@@ -155,7 +170,13 @@ class Loop(eqx.Module):
         arrays = jax.tree.leaves(eqx.filter(self.dynamics, eqx.is_inexact_array))
         return jnp.result_type(*arrays) if arrays else jnp.zeros(()).dtype
 
-    def init(self, key: Any, horizon: int) -> LoopState:
+    @property
+    def feature_size(self) -> int:
+        """Of the vector of features."""
+        count = self.memory if self.filters is None else self.filters.shape[0]
+        return count * self.dynamics.observation_size
+
+    def init(self, key: Any, horizon: int) -> ClosedLoopState:
         """Before the first step; `horizon` is 0 without counterfactuals."""
         dynamics, dtype = self.dynamics, self.dtype
         n, m = dynamics.state_size, dynamics.control_size
@@ -163,87 +184,103 @@ class Loop(eqx.Module):
         base = self.base.init(key=key)
         q = n + _vector(base)[0].shape[0]
         zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
-        varies = self.tangents is None and (horizon > 0 or self.echoes)
+        varies = self.tangents is None and (horizon > 0 or self.nature)
         now = Tangents(zeros(q, q), zeros(q, m), zeros(p + m, q))
-        return LoopState(
+        return ClosedLoopState(
             base,
             t=zeros(),
             y=zeros(p),
             u_base=zeros(m),
-            begun=jnp.zeros((), bool),
+            started=jnp.zeros((), bool),
+            signal=zeros(self.memory, p),
             predicted=zeros(n) if self.observed else None,
             added=zeros(horizon, m),
-            echo=zeros(q) if self.echoes else None,
+            forced=zeros(q) if self.nature else None,
             now=now if varies else None,
             impulses=zeros(horizon, q, m) if varies else None,
         )
 
-    def act(self, owner: Any, t: Any, y: Array, state: LoopState) -> LoopState:
-        """The observation, and the base's control for it."""
+    def act(
+        self,
+        owner: Any,
+        t: Any,
+        y: Float[Array, " p"],
+        state: ClosedLoopState,
+        policy: Callable[[Array], Array],
+    ) -> tuple[Float[Array, " f"], Float[Array, " m"], ClosedLoopState]:
+        """The features of this step, what `policy` adds for them, and the state with
+        the base's control and the derivatives of the step."""
         if y.shape != state.y.shape:
             raise wrong_observation(owner, state.y.shape[0], y)
-        t, y = jnp.asarray(t, self.dtype), y.astype(self.dtype)
-        u, base = self.base(t, y, state.base)
-        return state._replace(t=t, y=y, u_base=u.astype(self.dtype), base=base)
+        t, y, before = jnp.asarray(t, self.dtype), y.astype(self.dtype), state.base
+        u, base = self.base(t, y, before)
+        state = state._replace(t=t, y=y, u_base=u.astype(self.dtype), base=base)
+        value = self._nature(state) if self.nature else self._disturbance(state)
+        signal = shift(value, state.signal)
+        features = (signal if self.filters is None else self.filters @ signal).ravel()
+        v, now = policy(features), state.now
+        if now is not None:
+            now = _tangents(self.dynamics, self.base, t, y, before, v)
+        return features, v, state._replace(signal=signal, now=now)
 
-    def disturbance(self, state: LoopState) -> Array:
-        """What moved the state from where it was to be: the last disturbance."""
+    def _disturbance(self, state: ClosedLoopState) -> Float[Array, " n"]:
+        """The last disturbance: the state less where the model went."""
+        assert state.predicted is not None
         off = self.dynamics.difference(state.y, state.predicted)
         size = jnp.max(jnp.abs(state.y) + jnp.abs(state.predicted))
         # Compiled twice, a step may round differently: of that nothing is learned.
-        seen = jnp.abs(off) > 4 * jnp.finfo(off.dtype).eps * size
-        return jnp.where(state.begun & seen, off, 0)
+        is_more = jnp.abs(off) > 4 * jnp.finfo(off.dtype).eps * size
+        return jnp.where(state.started & is_more, off, 0)
 
-    def nature(self, state: LoopState) -> Array:
+    def _nature(self, state: ClosedLoopState) -> Float[Array, " p"]:
         """The observation, had nothing been added to the base's control."""
         p = state.y.shape[0]
+        assert state.forced is not None
         if self.tangents is None:
-            return state.y - state.echo[:p]
-        return state.y - matvec(self.tangents.output[:p], state.echo)
+            return state.y - state.forced[:p]
+        return state.y - matvec(self.tangents.output[:p], state.forced)
 
-    def linearised(self, v: Array, before: Any, state: LoopState) -> LoopState:
-        """The state with the derivatives of a step that adds `v`; `before` is the
-        base's state before it acted."""
-        if state.now is None:
-            return state
-        now = _tangents(self.dynamics, self.base, state.t, state.y, before, v)
-        return state._replace(now=now)
-
-    def applied(self, u: Array, cost: Array, state: LoopState) -> LoopState:
+    def applied(
+        self, u: Float[Array, " m"], cost: Array, state: ClosedLoopState
+    ) -> ClosedLoopState:
         """After the step, with the control that was applied."""
         u = u.astype(self.dtype)
         tangents: Any = self.tangents if state.now is None else state.now
         v = u - state.u_base
-        predicted, impulses, echo = state.predicted, state.impulses, state.echo
+        predicted, impulses, forced = state.predicted, state.impulses, state.forced
         if predicted is not None:
             predicted, _ = self.dynamics.advance(state.t, state.y, u, None)
         if impulses is not None:
             impulses = shift(tangents.input, tangents.transition @ impulses)
-        if echo is not None:
-            echo = matvec(tangents.transition, echo) + matvec(tangents.input, v)
+        if forced is not None:
+            forced = matvec(tangents.transition, forced) + matvec(tangents.input, v)
         return state._replace(
             base=self.base.applied(u, cost, state.base),
-            begun=jnp.ones_like(state.begun),
+            started=jnp.ones_like(state.started),
             predicted=predicted,
             added=shift(v, state.added),
-            echo=echo,
+            forced=forced,
             impulses=impulses,
         )
 
     def counterfactual(
-        self, v: Array, v_past: Array, state: LoopState
-    ) -> tuple[Array, Array]:
+        self,
+        v: Float[Array, " m"],
+        v_past: Float[Array, "h m"],
+        state: ClosedLoopState,
+    ) -> tuple[Float[Array, " p"], Float[Array, " m"]]:
         """The observation and control of this step, had `v` been added at it and
         `v_past` at the steps of the roll-out before, newest first."""
         change = jnp.einsum("hom,hm->o", self.past(state), v_past - state.added)
         p = state.y.shape[0]
         return state.y + change[:p], state.u_base + change[p:] + v
 
-    def past(self, state: LoopState) -> Array:
+    def past(self, state: ClosedLoopState) -> Float[Array, "h o m"]:
         """The response of observation and base's control to what was added at each step
-        of the roll-out, newest first, shape (horizon, p + m, m)."""
+        of the roll-out, newest first."""
         if self.response is not None:
             return self.response
+        assert state.now is not None and state.impulses is not None
         return state.now.output @ state.impulses
 
 
@@ -252,7 +289,25 @@ def shift(new: Array, history: Array) -> Array:
     return jnp.concatenate([new[None], history])[: history.shape[0]]
 
 
-def check_control(
+def in_first_responses(
+    loop: ClosedLoop, given: ArrayLike | None, name: str, units: float, where: str
+) -> Any:
+    """A step size or radius as given, or so many `units / first_response`: in units of
+    the control that undoes what was observed."""
+    if given is not None:
+        check_step(given, where, name)
+        return given
+    if loop.first_response is None:
+        raise ValueError(
+            f"{where}: {name} must be given, for dynamics that name no equilibrium."
+        )
+    responds = loop.first_response > 0
+    return jnp.where(
+        responds, units / jnp.where(responds, loop.first_response, 1), units
+    )
+
+
+def _check_control(
     dynamics: AbstractDynamics, base: AbstractController, where: str
 ) -> None:
     """Raise unless a base controller gives a control that dynamics take."""
@@ -293,11 +348,13 @@ def _tangents(dynamics, base, t, x, state, v) -> Tangents:
         return z_next, jnp.concatenate([y, u.astype(y.dtype)])
 
     z = jnp.concatenate([x, vector.astype(x.dtype)])
-    (transition, input), (output, _) = _jacobian(step, (0, 1))(z, v)
+    (transition, input), (output, _) = jacobian(step, (0, 1))(z, v)
     return Tangents(transition, input, output)
 
 
-def _at_rest(dynamics: AbstractDynamics, base: AbstractController) -> Tangents | None:
+def _equilibrium_tangents(
+    dynamics: AbstractDynamics, base: AbstractController
+) -> Tangents | None:
     """The derivatives at the operating point, at each time if they depend on it;
     `None` if the dynamics name no such point."""
 
@@ -316,11 +373,11 @@ def _at_rest(dynamics: AbstractDynamics, base: AbstractController) -> Tangents |
     return at(jnp.zeros((), x.dtype), x, u)
 
 
-def _roll_out(tangents: Tangents | None, horizon: int | None, where: str) -> int:
-    """The length of the roll-out; raise unless the base stabilises the plant."""
+def _roll_out_length(radius: float | None, horizon: int | None, where: str) -> int:
+    """As given, or until an impulse has faded; raise unless the base stabilises the
+    plant."""
     if horizon is not None:
         horizon = check_count(horizon, "horizon", where)
-    radius = None if tangents is None else _radius(tangents)
     if radius is not None and not radius < 1:
         raise ValueError(
             f"{where}: base must stabilise dynamics, got a closed loop of spectral "
@@ -333,7 +390,7 @@ def _roll_out(tangents: Tangents | None, horizon: int | None, where: str) -> int
             f"{where}: horizon must be given where the closed loop cannot be seen: "
             "inside a transformation of JAX, or of dynamics that name no equilibrium."
         )
-    return _steps(radius, FORGOTTEN, LEAST_HORIZON, MOST_HORIZON)
+    return _steps(radius, _LEFT_OF_HORIZON, *_HORIZONS)
 
 
 def _steps(radius: float, left: float, least: int, most: int) -> int:
@@ -342,27 +399,23 @@ def _steps(radius: float, left: float, least: int, most: int) -> int:
     return min(max(least, math.ceil(steps)), most)
 
 
-def _radius(tangents: Tangents) -> float | None:
+def _spectral_radius(tangents: Tangents) -> float | None:
     """The largest spectral radius of what an added control can move; `None` if it is
     traced."""
     if not (is_concrete(tangents.transition) and is_concrete(tangents.input)):
         return None
     q, m = tangents.input.shape[-2:]
     transitions = np.asarray(tangents.transition, float).reshape(-1, q, q)
-    moved = np.any(np.asarray(tangents.input).reshape(-1, q, m) != 0, axis=(0, 2))
+    reached = np.any(np.asarray(tangents.input).reshape(-1, q, m) != 0, axis=(0, 2))
     for _ in range(q):
-        moved = moved | np.any(transitions[..., moved] != 0, axis=(0, 2))
+        reached = reached | np.any(transitions[..., reached] != 0, axis=(0, 2))
     # Numbers that a base only carries along, such as a covariance, do not fade.
-    parts = transitions[:, moved][:, :, moved]
+    parts = transitions[:, reached][:, :, reached]
     return max(np.max(np.abs(np.linalg.eigvals(part)), initial=0) for part in parts)
 
 
-def _first_matrix(array: Array) -> Array:
-    return array if array.ndim == 2 else array[0]
-
-
 def _first_size(moved: Array) -> Array:
-    """The size of the first response that there is."""
+    """The size of the first response that is not zero."""
     sizes = jnp.sqrt(jnp.sum(moved**2, axis=(1, 2)))
     slack = jnp.finfo(sizes.dtype).eps ** 0.5 * jnp.max(sizes)
     return sizes[jnp.argmax(sizes > slack)]

@@ -1,0 +1,140 @@
+"""The matrix logarithm, and the exponential of which it is the inverse."""
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..math._linear_solve import full_precision, solve
+
+
+_MAX_ROOTS = 40
+_MAX_ROOT_STEPS = 60
+_CLOSE = 0.25
+"""How far from the identity the quadrature is exact to rounding."""
+_SQUARINGS = 12
+_TERMS = 9
+"""Of the exponential's series: exact to rounding for norms up to 300."""
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+
+
+def logarithm(
+    A: Float[Array, "n n"],
+) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
+    """The principal logarithm, and whether there is none.
+
+    It is differentiated as the inverse of the exponential that it is: the derivative of
+    the exponential is linear, and the block logarithm below solves it.
+    """
+    constant = lax.stop_gradient(A)
+    eye = jnp.eye(A.shape[0], dtype=A.dtype)
+    value, converged = _by_roots(constant)
+    error = jnp.linalg.norm(exponential_less_one(value) + eye - constant)
+    close = error <= jnp.finfo(A.dtype).eps ** 0.5 * jnp.linalg.norm(constant)
+    failed = ~(converged & close)
+    # The identity in the place of what failed, so that its derivatives are finite.
+    constant = jnp.where(failed, eye, constant)
+    value = jnp.where(failed, 0, value)
+    return _with_derivative(jnp.where(failed, eye, A), constant, value), failed
+
+
+@jax.custom_jvp
+def _with_derivative(A, constant, value):
+    """`value`, the logarithm of `A`, with its derivative."""
+    del A, constant
+    return value
+
+
+@_with_derivative.defjvp
+@full_precision
+def _with_derivative_jvp(primals, tangents):
+    _, constant, _ = primals
+    logarithm = _with_derivative(*primals)
+
+    def inverse(M, right):
+        """The tangent of the logarithm: a block of that of a block matrix."""
+        n = M.shape[0]
+        size = jnp.linalg.norm(right)
+        size = jnp.where(size > 0, size, 1)
+        block = jnp.block([[M, right / size], [jnp.zeros_like(M), M]])
+        return _by_roots(block)[0][:n, n:] * size
+
+    tangent = lax.custom_linear_solve(
+        lambda tangent: jax.jvp(exponential_less_one, (logarithm,), (tangent,))[1],
+        tangents[0],
+        solve=lambda _, right: inverse(constant, right),
+        transpose_solve=lambda _, right: inverse(constant.T, right),
+    )
+    return logarithm, tangent
+
+
+def exponential_less_one(L: Array) -> Array:
+    """`exp(L) - I`, by a fixed number of squarings, whose derivatives stay small
+    programs. `P` becomes `(I + P)^2 - I`: nothing is lost beside the identity."""
+    X = L / 2**_SQUARINGS
+    eye = jnp.eye(L.shape[0], dtype=L.dtype)
+    P = X / _TERMS
+    for k in range(_TERMS - 1, 0, -1):
+        P = X @ (eye + P) / k
+    return lax.fori_loop(0, _SQUARINGS, lambda _, P: 2 * P + P @ P, P)
+
+
+def _by_roots(A: Array) -> tuple[Array, Array]:
+    """The logarithm of a root near the identity, times the order of the root."""
+    eye = jnp.eye(A.shape[0], dtype=A.dtype)
+
+    def proceeds(carry):
+        root, k, converged = carry
+        far = jnp.linalg.norm(root - eye) > _CLOSE
+        return far & converged & (k < _MAX_ROOTS)
+
+    def body(carry):
+        root, k, _ = carry
+        root, converged = _square_root(root)
+        return root, k + 1, converged
+
+    start = (A, jnp.asarray(0), jnp.asarray(True))
+    root, k, converged = lax.while_loop(proceeds, body, start)
+    X = root - eye
+    converged = converged & (jnp.linalg.norm(X) <= _CLOSE)
+    X = jnp.where(converged, X, 0)
+
+    # Gauss-Legendre for the integral over [0, 1] of X (I + x X)^-1.
+    def add(total, rule):
+        node, weight = rule
+        return total + weight / 2 * solve(eye + (1 + node) / 2 * X, X), None
+
+    rules = jnp.asarray(_NODES, A.dtype), jnp.asarray(_WEIGHTS, A.dtype)
+    total, _ = lax.scan(add, jnp.zeros_like(A), rules)
+    return total * 2.0**k, converged
+
+
+def _square_root(A: Array) -> tuple[Array, Array]:
+    """The principal square root, by the product form of Denman and Beavers' iteration.
+
+    `M` goes to the identity and `Y` to the root. On the negative half-line there is
+    none, and `M` goes nowhere.
+    """
+    n, eps = A.shape[0], jnp.finfo(A.dtype).eps
+    eye = jnp.eye(n, dtype=A.dtype)
+    small = 10 * n * eps
+
+    def proceeds(carry):
+        _, _, error, before, k = carry
+        # It converges quadratically: once close, what no longer shrinks is rounding.
+        going = (error > small) & ((error < before / 2) | (before > 0.1))
+        return going & jnp.isfinite(error) & (k < _MAX_ROOT_STEPS)
+
+    def body(carry):
+        M, Y, error, _, k = carry
+        inverse = solve(M, eye)
+        Y = (Y + Y @ inverse) / 2
+        M = eye / 2 + (M + inverse) / 4
+        return M, Y, jnp.linalg.norm(M - eye), error, k + 1
+
+    far = jnp.asarray(jnp.inf, A.dtype)
+    start = (A, A, jnp.asarray(jnp.finfo(A.dtype).max, A.dtype), far, jnp.asarray(0))
+    _, root, error, *_ = lax.while_loop(proceeds, body, start)
+    # A NaN compares false, and is no root.
+    return root, error < eps**0.5 * n

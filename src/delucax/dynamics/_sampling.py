@@ -1,0 +1,194 @@
+"""Between continuous linear systems and their sampled form."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+import lineax as lx
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from .._check import check_choice, check_instance, check_step, is_concrete
+from .._typing import Matrix, Scalar, Vector
+from ..math._linear_solve import full_precision, solve
+from ..systems import LinearSystem
+from ._linear import LinearDynamics
+from ._matrix_logarithm import exponential_less_one, logarithm
+
+
+_METHODS = "zoh", "tustin"
+
+
+def c2d(system: LinearSystem, dt: ArrayLike, method: str = "zoh") -> LinearDynamics:
+    """The sampled form of a continuous linear system.
+
+    `"zoh"`, exact for a control held over the step, by one matrix exponential:
+    `A_d = exp(A dt)`, `B_d = (integral over [0, dt] of exp(A s) ds) B`.
+    `"tustin"`, the trapezoidal rule under a held control:
+    `A_d = (I - A dt/2)^-1 (I + A dt/2)`, `B_d = (I - A dt/2)^-1 B dt`.
+
+    **Arguments:**
+
+    - `system`: the linear system (from [`delucax.linearize`][], for instance).
+    - `dt`: the step, a positive number.
+    - `method`: `"zoh"` (default) or `"tustin"`.
+
+    **Returns:** [`delucax.LinearDynamics`][] about the same operating point. A
+    disturbance that enters the vector field is held too.
+
+    **Raises:** `ValueError` if `system` is not a `LinearSystem`, `dt` is not positive,
+    or `method` is unknown.
+
+    Source: Van Loan, 1978 (`"zoh"`); Tustin, 1947.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        upright = dlx.linearize(dlx.systems.Pendulum())
+        dlx.c2d(upright, dt=0.05).A
+        ```
+    """
+    check_instance(system, LinearSystem, "system", "c2d")
+    check_step(dt, "c2d")
+    check_choice(method, _METHODS, "method", "c2d")
+    n, inputs = system.state_size, _inputs(system, system.dx_ref)
+    if method == "zoh":
+        k = inputs.shape[1]
+        block = jnp.zeros((n + k, n + k), inputs.dtype)
+        block = block.at[:n, :n].set(system.A).at[:n, n:].set(inputs)
+        sampled = jsl.expm(block * dt)[:n]
+    else:
+        half = system.A * (dt / 2)
+        eye = jnp.eye(n, dtype=half.dtype)
+        right = jnp.concatenate([eye + half, inputs * dt], axis=1)
+        operator = lx.MatrixLinearOperator(eye - half)
+        column = lambda b: lx.linear_solve(operator, b, lx.LU()).value
+        sampled = jax.vmap(column, in_axes=1, out_axes=1)(right)
+    B, drift, E = _parts(sampled[:, n:], system)
+    x_next = system.x_ref + drift
+    about = _operating_point(system)
+    return LinearDynamics(sampled[:, :n], B, system.C, E, dt, x_next=x_next, **about)
+
+
+def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
+    """The continuous linear system of which `dynamics` is the sampled form.
+
+    The inverse of [`delucax.c2d`][]: `"zoh"`, exact for a control held over the step,
+    by one matrix logarithm, `A = log(A_d) / dt`,
+    `B = (integral over [0, dt] of exp(A s) ds)^-1 B_d`.
+    `"tustin"`, `A = (2/dt) (A_d + I)^-1 (A_d - I)`, `B = (2/dt) (A_d + I)^-1 B_d`.
+
+    Of all systems with these samples `"zoh"` takes the one whose frequencies are below
+    `pi/dt`. Differentiable to any order, in either mode.
+
+    **Arguments:**
+
+    - `dynamics`: time-invariant linear dynamics.
+    - `method`: `"zoh"` (default) or `"tustin"`.
+
+    **Returns:** [`delucax.systems.LinearSystem`][] about the same operating point.
+
+    **Raises:** `ValueError` if `dynamics` is not `LinearDynamics`, is time-varying, or
+    `method` is unknown. If there is no such system, `RuntimeError` (an error at run
+    time under `jax.jit`): `"zoh"` cannot have eigenvalues of `A_d` that are zero or
+    negative, which no sampled real system has but in pairs, `"tustin"` none that is -1.
+
+    Source: Cheng, Higham, Kenney and Laub, 2001 (the logarithm by square roots).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        upright = dlx.linearize(dlx.make("pendulum").dynamics)
+        dlx.d2c(upright).A
+        ```
+    """
+    hint = " (see `delucax.linearize`)"
+    check_instance(dynamics, LinearDynamics, "dynamics", "d2c", hint)
+    if dynamics.is_time_varying:
+        raise ValueError(
+            "d2c: dynamics must be time-invariant, got matrices at "
+            f"{dynamics.A.shape[0]} times; `dynamics.at(t)` are those at one time."
+        )
+    check_choice(method, _METHODS, "method", "d2c")
+    convert, distance, rule = _INVERSES[method]
+    inputs = _inputs(dynamics, dynamics.x_next - dynamics.x_ref)
+    A, inputs, failed = convert(dynamics.A, inputs, dynamics.dt)
+    if not is_concrete(failed):
+        A = eqx.error_if(A, failed, f"d2c: {rule}.")
+    elif failed:
+        values = np.linalg.eigvals(np.asarray(dynamics.A, np.float64))
+        worst = values[np.argmin(distance(values))]
+        shown = worst.real if worst.imag == 0 else worst
+        raise RuntimeError(f"d2c: {rule}; got {shown:.6g}.")
+    B, drift, E = _parts(inputs, dynamics)
+    about = _operating_point(dynamics)
+    return LinearSystem(A, B, dynamics.C, E, dx_ref=drift, **about)
+
+
+def _inputs(model: LinearSystem | LinearDynamics, drift: Vector) -> Matrix:
+    """What enters beside `A`: the control, a constant and the disturbance."""
+    columns = [model.B, drift[:, None], *([] if model.E is None else [model.E])]
+    return jnp.concatenate(columns, axis=1)
+
+
+def _parts(
+    inputs: Matrix, model: LinearSystem | LinearDynamics
+) -> tuple[Matrix, Vector, Matrix | None]:
+    """The inverse of `_inputs`."""
+    m = model.control_size
+    E = None if model.E is None else inputs[:, m + 1 :]
+    return inputs[:, :m], inputs[:, m], E
+
+
+def _operating_point(model: LinearSystem | LinearDynamics) -> dict[str, Any]:
+    names = "x_ref", "u_ref", "state_names", "control_names"
+    return {name: getattr(model, name) for name in names}
+
+
+@eqx.filter_jit
+@full_precision
+def _from_hold(A: Array, inputs: Array, dt: Scalar) -> tuple[Array, Array, Array]:
+    n = A.shape[0]
+    log, failed = logarithm(A)
+    # The integral of the exponential is one block of an exponential.
+    eye, zero = jnp.eye(n, dtype=A.dtype), jnp.zeros_like(A)
+    block = jnp.block([[log, eye], [zero, zero]])
+    held = exponential_less_one(block)[:n, n:]
+    return log / dt, solve(held, inputs) / dt, failed
+
+
+@eqx.filter_jit
+@full_precision
+def _from_trapezium(A: Array, inputs: Array, dt: Scalar) -> tuple[Array, Array, Array]:
+    n = A.shape[0]
+    eye = jnp.eye(n, dtype=A.dtype)
+    sizes = jnp.linalg.svd(lax.stop_gradient(A + eye), compute_uv=False)
+    failed = ~(sizes[-1] > n * jnp.finfo(A.dtype).eps * sizes[0])
+    matrix = jnp.where(failed, eye, A + eye)
+    solved = solve(matrix, jnp.concatenate([A - eye, inputs], axis=1)) * (2 / dt)
+    return solved[:, :n], solved[:, n:], failed
+
+
+_INVERSES = {
+    "zoh": (
+        _from_hold,
+        # To the half-line of negative numbers.
+        lambda z: np.where(z.real > 0, np.abs(z), np.abs(z.imag)),
+        "A has an eigenvalue that is zero or negative (or next to it), so that no real "
+        "system has these samples under a held control",
+    ),
+    "tustin": (
+        _from_trapezium,
+        lambda z: np.abs(z + 1),
+        "A has the eigenvalue -1, which the trapezoidal rule never gives",
+    ),
+}
+"""The inverse of each method, how far eigenvalues are from those that it cannot have,
+and which these are."""

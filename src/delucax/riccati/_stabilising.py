@@ -1,0 +1,245 @@
+"""The stabilising solution of an algebraic Riccati equation, in either time."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from ..math._linear_solve import (
+    factorised,
+    full_precision,
+    is_definite,
+    no_tangent,
+    solve,
+    symmetric,
+)
+from ..math._size import one_if_zero, size
+from ._arguments import complex_form, is_complex, real_form, RiccatiData
+from ._lyapunov import lyapunov, stein
+from ._newton import polish
+from ._residual import riccati_residual, stationary
+from ._search import Attempt, Candidate, search, SearchResult, SECOND, weights
+from ._solution import RiccatiSolution
+from ._spectrum import abscissa_and_size, spectral_radius
+from ._start import continuous_start, discrete_start
+from ._units import in_units, units
+
+
+_SECOND_START = 1e4
+"""How much higher the second start of doubling is than the first."""
+
+
+def stabilising_solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
+    """The solution of an equation with checked data, complex ones in real form."""
+    if not is_complex(*data):
+        return _solution(discrete, data)
+    data = jax.tree.map(real_form, data)
+    return _as_complex(_solution(discrete, data), discrete, data)
+
+
+@eqx.filter_jit
+@full_precision
+def _as_complex(solution: RiccatiSolution, discrete: bool, data: RiccatiData):
+    """A solution in complex form, for which the residual is bounded once more: rounding
+    may have left an X that is no real form."""
+    solution = eqx.tree_at(
+        lambda s: (s.X, s.K, s.closed_loop), solution, replace_fn=complex_form
+    )
+    data, X = lax.stop_gradient((data, real_form(solution.X)))
+    bound = riccati_residual(discrete, data, X, True).bounds[0]
+    bound = jnp.where(jnp.isfinite(bound), bound, solution.residual)
+    return eqx.tree_at(lambda s: s.residual, solution, bound)
+
+
+@eqx.filter_jit
+@full_precision
+def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
+    """The solution, computed with states in units that fit."""
+    by = d, f = units(data)
+    data = in_units(by, data)
+    solution = _certified(discrete, data, by)
+    K, closed_loop = _feedback(discrete, solution.differentiable, data, solution.X)
+    residual, bound = lax.stop_gradient((solution.best.given, solution.best.bound))
+    return RiccatiSolution(
+        X=solution.X * (f[:, None] * f),
+        K=K * d,
+        residual=residual,
+        closed_loop=closed_loop / (d[:, None] / d),
+        spectral_radius=bound if discrete else None,
+        iterations=solution.iterations,
+        result=solution.result,
+        spectral_abscissa=None if discrete else bound,
+    )
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
+    """The stabilising `X` in balanced units, `by` times those given, and what is known
+    about it."""
+    A, B, Q, R, S, E = data
+    n, eps = A.shape[0], float(jnp.finfo(A.dtype).eps)
+    # The starts are those of E^-1 A and E^-1 B.
+    explicit = data
+    if E is not None:
+        solved = factorised(E)
+        explicit = RiccatiData(solved(A), solved(B), Q, R, S, None)
+    posed = (
+        is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
+    )
+    for M in explicit[:5]:
+        posed = posed & jnp.all(jnp.isfinite(M))
+    magnified = 1 if E is None else size(E) ** 2
+
+    def attempt(kind: Array, balanced: Array) -> Attempt:
+        # From the units that balance the problem to those of the attempt.
+        back = state, row = jnp.where(balanced, 1, 1 / by)
+        here, size_Q = weights(kind, in_units(back, data))
+        start = here
+        if E is not None:
+            # Their rows have the units of the states.
+            plain = in_units(jnp.stack([state, state]), explicit)
+            start = here._replace(A=plain.A, B=plain.B)
+        second = kind == SECOND
+        if discrete:
+            height = size_Q * jnp.where(second, _SECOND_START, 1)
+            X, iterations = discrete_start(start, height)
+            size_G = jnp.zeros_like(size_Q)  # not needed
+        else:
+            X, size_G, iterations = continuous_start(start, second)
+        X, left = polish(
+            lambda *at: riccati_residual(discrete, here, *at, by[0] * state, state),
+            lambda _, *at: _correction(discrete, here.E, *at),
+            _outside(here.E, X),
+            units=3,
+        )
+        loop = left.closed_loop
+        if discrete:
+            bound = spectral_radius(loop)
+            # A stable loop may belong to a stationary point of a cost without a
+            # minimum.
+            weight = here.R + here.B.T @ X @ here.B
+            gap = jnp.where(is_semidefinite(weight), 1 - bound, -jnp.inf)
+            rounding, scale = jnp.asarray(n * eps, A.dtype), 1.0
+            reach = 10 * eps**0.5
+        else:
+            bound, scale = abscissa_and_size(loop)
+            gap, rounding = -bound, n * eps * scale
+            # A change of Q by rounding moves eigenvalues on the axis off it by its
+            # root.
+            reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
+            scale = size(loop)
+        # The rest is said in balanced units.
+        balanced_X = X * (row[:, None] * row)
+        size_loop = size(loop * (state / state[:, None]))
+        gain = 1 + size_loop**2 if discrete else 2 * size_loop
+        # The residual that rounding of X may leave.
+        terms = jnp.where(left.terms[2] > 0, left.terms[2], jnp.inf)
+        return Attempt(
+            Candidate(balanced_X, left.bounds[2], left.bounds[1], bound, gap),
+            rounding=rounding,
+            near=jnp.abs(gap) < reach,
+            around=jnp.abs(gap) < 4 * eps**0.125 * scale,
+            least=8 * eps * size(balanced_X) * gain * magnified / terms,
+            modest=size(X) * eps**0.5 < size_Q,
+            iterations=iterations,
+        )
+
+    return search(attempt, jnp.full_like(Q, jnp.nan), posed, jnp.any(by != 1))
+
+
+@_certified.defjvp
+@full_precision
+def _certified_jvp(discrete, primals, tangents):
+    """By the implicit function theorem; zero in members that are not solved."""
+    data, _ = primals
+    solution = _certified(discrete, *primals)
+    ok = solution.differentiable
+    # Guarded at both ends: what is not finite in a failed member stays in it.
+    tangent = _where(ok, tangents[0], 0)
+    safe, X = _harmless(ok, data, solution.X)
+    equation = functools.partial(left_side, discrete, X)
+    _, error, loop = jax.jvp(equation, (safe,), (tangent,), has_aux=True)
+    loop = jnp.where(ok, loop, shifted(-0.5, loop))
+    change = _correction(discrete, data.E, loop, jnp.where(ok, error, 0))
+    still = no_tangent(solution)
+    best = still.best._replace(X=jnp.where(ok, change, 0))
+    return solution, still._replace(best=best)
+
+
+def left_side(discrete: bool, X: Array, data: RiccatiData) -> tuple[Array, Array]:
+    """The left side of the equation at `X`, and the closed loop; for derivatives."""
+    A, _, Q, *_, E = data
+    moved, cross, K, closed_loop = _terms(discrete, data, X)
+    linear = moved @ A
+    if discrete:
+        linear = linear - (X if E is None else E.T @ X @ E)
+    else:
+        linear = linear + linear.T
+    return symmetric(linear - cross @ K + Q), closed_loop
+
+
+def _terms(discrete, data, X):
+    A, B, *_, E = data
+    moved, cross, weight = stationary(discrete, data, X)
+    K = solve(weight, cross.T)
+    closed_loop = A - B @ K
+    return moved, cross, K, closed_loop if E is None else solve(E, closed_loop)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _feedback(discrete: bool, ok: Bool[Array, ""], data: RiccatiData, X: Array):
+    """`K` and the closed loop, with derivatives in members that are `ok` alone."""
+    *_, K, closed_loop = _terms(discrete, data, X)
+    return K, closed_loop
+
+
+@_feedback.defjvp
+@full_precision
+def _feedback_jvp(discrete, primals, tangents):
+    ok, *at = primals
+    tangent = _where(ok, tangents[1:], 0)
+    _, tangent = jax.jvp(
+        lambda *at: _terms(discrete, *at)[2:], _harmless(ok, *at), tangent
+    )
+    return _feedback(discrete, *primals), _where(ok, tangent, 0)
+
+
+def _where(ok, tree, other):
+    return jax.tree.map(lambda M: jnp.where(ok, M, other), tree)
+
+
+def _harmless(ok: Bool[Array, ""], data: RiccatiData, X: Array):
+    """The data and `X`, and in members that are not `ok` others that are finite.
+
+    So that no derivative of them meets a matrix that cannot be solved with.
+    """
+    A, B, Q, R, S, E = data
+    A, B, Q, S, X = (jnp.where(ok, M, 0) for M in (A, B, Q, S, X))
+    R = jnp.where(ok, R, shifted(1, R))
+    E = None if E is None else jnp.where(ok, E, shifted(1, E))
+    return RiccatiData(A, B, Q, R, S, E), X
+
+
+def _correction(discrete: bool, E: Array | None, loop: Array, error: Array) -> Array:
+    """The `X` that takes an error of the equation away, to first order."""
+    return _outside(E, stein(loop, error) if discrete else lyapunov(loop, error))
+
+
+def _outside(E: Array | None, Y: Array) -> Array:
+    """The `X` of `Y = E'XE`."""
+    return Y if E is None else symmetric(solve(E.T, solve(E.T, Y).T))
+
+
+def is_semidefinite(weight: Array, units: int = 100) -> Bool[Array, ""]:
+    """Whether a symmetric matrix has no negative eigenvalue, up to rounding."""
+    rounding = weight.shape[0] * jnp.finfo(weight.dtype).eps
+    slack = units * rounding * one_if_zero(size(weight))
+    return is_definite(symmetric(weight) + shifted(slack, weight))
+
+
+def shifted(c, like: Array) -> Array:
+    """`c I`."""
+    return c * jnp.eye(like.shape[0], dtype=like.dtype)

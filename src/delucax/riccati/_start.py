@@ -1,0 +1,140 @@
+"""Where Newton's iteration on an algebraic Riccati equation starts."""
+
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Bool, Float
+
+from ..math._linear_solve import solve, symmetric
+from ..math._size import one_if_zero, relative_and_total_size, size
+from ._arguments import RiccatiData
+from ._lyapunov import MAX_DOUBLINGS
+from ._recursion import Element, joined, step_element
+
+
+_SIGN_STEPS = 60
+
+
+def discrete_start(data: RiccatiData, height: Float[Array, ""]) -> tuple[Array, Array]:
+    """A solution by doubling about `X0 = height I`, and the doublings taken."""
+    # There the control weight is invertible even where R is not, and the recursion
+    # cannot rest at a solution that leaves an unstable mode unseen by Q.
+    A, B, Q, R, S, _ = data
+    X0 = height * jnp.eye(A.shape[0], dtype=A.dtype)
+    cross = height * (A.T @ B) + S
+    weight = symmetric(R + height * (B.T @ B))
+    element = step_element(A, B, weight, cross, height * (A.T @ A) - X0, Q)
+    H, doublings = double(element, X0)
+    return X0 + H, doublings
+
+
+def continuous_start(
+    data: RiccatiData, doubled: Bool[Array, ""]
+) -> tuple[Array, Array, Array]:
+    """A solution by the sign iteration, or by doubling if that is wanted; the size of
+    `B R^-1 B'`; and the steps taken."""
+    A, B, Q, R, S, _ = data
+    n = A.shape[0]
+    solved = solve(R, jnp.concatenate([B.T, S.T], axis=1))
+    G = symmetric(B @ solved[:, :n])
+    A = A - B @ solved[:, n:]
+    Q = symmetric(Q - S @ solved[:, n:])
+    by_sign, sign_steps = _by_sign(A, G, Q, ~doubled)
+    by_doubling, doublings = _by_doubling(A, G, Q, doubled)
+    X = jnp.where(doubled, by_doubling, by_sign)
+    return X, size(G), jnp.where(doubled, doublings, sign_steps)
+
+
+def _by_sign(A, G, Q, wanted):
+    """`X` from the sign of the Hamiltonian matrix `H = [[A, -G], [-Q, -A']]`.
+
+    With `J = [[0, I], [-I, 0]]`, the iteration `H <- (H + H^-1) / 2` is one of the
+    symmetric `W = JH`: `W <- (W + J W^-1 J) / 2`.
+    """
+    n, dtype = A.shape[0], A.dtype
+    eps = jnp.finfo(dtype).eps
+    eye, both = jnp.eye(n, dtype=dtype), jnp.eye(2 * n, dtype=dtype)
+
+    def J(M):
+        return jnp.concatenate([M[n:], -M[:n]])
+
+    def more(carry):
+        *_, going, k = carry
+        return going & (k < _SIGN_STEPS)
+
+    def body(carry):
+        W, before, _, k = carry
+        turned = J(solve(W, J(both)))
+        ratio = size(turned) / size(W)
+        # Scaling speeds up the way to the neighbourhood of the limit, where it would
+        # keep the iteration from settling.
+        scale = jnp.where(before < 1e-2, 1, jnp.sqrt(ratio))
+        new = symmetric(scale * W + turned / scale) / 2
+        change = size(new - W) / size(new)
+        stalled = (change < 1e-6) & (change > before / 2)
+        # A NaN compares false, so that a lane that diverges stops.
+        going = (change > 10 * eps) & ~stalled
+        return new, change, going, k + 1
+
+    W = jnp.block([[-Q, -A.T], [-A, G]])
+    start = (W, jnp.asarray(jnp.inf, dtype), jnp.asarray(wanted), jnp.asarray(0))
+    W, *_, iterations = lax.while_loop(more, body, start)
+    # I - sign(H) = [I; X] M projects onto the stable subspace; H = J'W.
+    upper = jnp.concatenate([eye + W[n:, :n], W[n:, n:]], axis=1)
+    lower = jnp.concatenate([-W[:n, :n], eye - W[:n, n:]], axis=1)
+    operator, solver = lx.MatrixLinearOperator(upper.T), lx.QR()
+    state = solver.init(operator, {})
+
+    def row(b):
+        return lx.linear_solve(operator, b, solver, state=state, throw=False).value
+
+    return symmetric(jax.vmap(row)(lower)), iterations
+
+
+def _by_doubling(A, G, Q, wanted):
+    """`X` by doubling of the Cayley transform `(H - shift)^-1 (H + shift)`."""
+    n = A.shape[0]
+    shift = 2 * one_if_zero(size(A)) * jnp.eye(n, dtype=A.dtype)
+    moved = A - shift / 2
+    left = solve(moved, G)
+    mixed = moved.T + Q @ left
+    right = solve(mixed.T, jnp.concatenate([mixed.T + shift, left.T], axis=1))
+    H = solve(mixed, solve(moved.T, Q).T)
+    H, G = symmetric(shift @ H), symmetric(shift @ right[:, n:])
+    return double((right[:, :n], G, H), jnp.zeros_like(H), wanted)
+
+
+def double(
+    element: Element, X0: Float[Array, "n n"], wanted: Bool[Array, ""] | bool = True
+) -> tuple[Array, Array]:
+    """The limit of joining an interval's element to itself, as `J`, if it is wanted;
+    and the doublings taken.
+
+    `X0` is what `J` is a correction to, for its size alone.
+    """
+    eps = jnp.finfo(X0.dtype).eps
+
+    def more(carry):
+        _, relative, k = carry
+        return (k < MAX_DOUBLINGS) & (relative > eps)
+
+    def body(carry):
+        before, _, k = carry
+        after = joined(before, before)
+        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in after]))
+        # What overflows is left at the last finite step: it has no stable loop, and
+        # the caller finds that out.
+        A, _, J = after = jax.tree.map(
+            lambda new, old: jnp.where(finite, new, old), after, before
+        )
+        changes = jnp.stack([J - before[2], J])
+        (change, whole), _ = relative_and_total_size(changes, (X0 + J)[None])
+        # The next change is at most |A|^2 |J|.
+        relative = jnp.minimum(change, size(A) ** 2 * whole)
+        return after, jnp.where(finite, relative, 0), k + 1
+
+    relative = jnp.where(wanted, jnp.asarray(jnp.inf, X0.dtype), 0)
+    start = element, relative, jnp.asarray(0)
+    (_, _, J), _, doublings = lax.while_loop(more, body, start)
+    return J, doublings

@@ -1,0 +1,83 @@
+"""The calls of a controller in a closed loop, with what it returns checked."""
+
+import types
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from .._controller import AbstractController
+from .._results import choose, first_failure, INCIDENTS, Result, RESULTS
+from .._typing import RealScalar
+
+
+def call_controller(
+    controller: AbstractController, t: RealScalar, y: Array, state: PyTree
+) -> tuple[Array, PyTree]:
+    """`(u, state)`, what the controller returns."""
+    returned: Any = controller(t, y, state)
+    if not isinstance(returned, tuple | list) or len(returned) != 2:
+        got = type(returned).__name__
+        if isinstance(returned, jax.Array):
+            got = f"an array of shape {returned.shape}"
+        raise ValueError(
+            f"{type(controller).__name__}: must return (u, state), the state as it was "
+            f"given if there is none to keep, got {got}."
+        )
+    u, after = returned
+    return u, after
+
+
+def check_control(u: Any, source: Any, size: int, taker: str) -> None:
+    """Raise unless `u`, returned by a controller or function, has the shape that
+    `taker` takes."""
+    if jnp.shape(u) != (size,):
+        is_function = isinstance(source, types.FunctionType)
+        name = source.__name__ if is_function else type(source).__name__
+        raise ValueError(
+            f"{name}: returned a control of shape {jnp.shape(u)}, but the {taker} "
+            f"takes shape ({size},)."
+        )
+
+
+def controller_result(counts: dict[str, Array], before: dict[str, Array]) -> Result:
+    """What became of a controller, by its tallies before a run and after it."""
+    result = RESULTS.successful
+    for name, kind in INCIDENTS.items():
+        if name in counts:
+            none = counts[name] == before[name]
+            result = first_failure(result, choose(none, RESULTS.successful, kind))
+    return result
+
+
+def check_state(controller: AbstractController, first: PyTree, after: PyTree) -> None:
+    """Raise unless a controller's state is made as the `first` one, that of `init`.
+
+    A loop carries arrays of fixed shapes and dtypes, and nothing else.
+    """
+    (old, structure), (new, structure_after) = (
+        jax.tree_util.tree_flatten_with_path(state) for state in (first, after)
+    )
+    pairs = [((), first, after)]
+    if structure == structure_after:
+        leaves = zip(old, new, strict=True)
+        pairs = [(path, a, b) for (path, a), (_, b) in leaves if not _same_kind(a, b)]
+    for path, before, now in pairs:
+        raise ValueError(
+            f"{type(controller).__name__}: state{jax.tree_util.keystr(path)} must keep "
+            "the structure, shape and dtype that init gives it, "
+            f"{eqx.tree_pformat(before)}, got {eqx.tree_pformat(now)}. What changes "
+            "must be a JAX array from the start."
+        )
+
+
+def _same_kind(before: Any, now: Any) -> bool:
+    if eqx.is_array(before) != eqx.is_array(now):
+        return False
+    if not eqx.is_array(before):
+        return before is now or bool(eqx.tree_equal(before, now))
+    # The dtype of a weakly typed number follows from what it meets.
+    same_dtype = before.dtype == now.dtype or before.weak_type
+    return before.shape == now.shape and same_dtype

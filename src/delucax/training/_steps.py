@@ -1,0 +1,272 @@
+"""The steps of [`delucax.training.fit`][], compiled in blocks."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optax
+from jaxtyping import Array, Int, PyTree
+
+from .._typing import PRNGKey
+from ._history import COLUMNS
+from ._loss import cost_and_metrics
+from ._surrogate import AbstractSurrogate
+from ._trainable import Assembly, strong
+
+
+Values = dict[str, Array]
+_WHERE = "fit"
+# Folded into the key for the order of the data and for the first memory of a surrogate.
+# They are larger than the number of any step.
+_ORDER = 2**32 - 1
+_MEMORY = 2**32 - 2
+CAPACITY = 1000
+"""The most steps in a block. It is the size of the buffers whatever the block, so that
+the compiled program, and with it every last bit, is the same for all."""
+FAULTS = ("nothing", "loss", "gradient", "update")
+"""What is not finite, by the number that a block returns."""
+
+
+class State(NamedTuple):
+    """What a step changes; of each seed, if there are several."""
+
+    values: Values
+    optimiser: PyTree
+    memory: PyTree
+    """That of a surrogate."""
+    order: tuple[Array, Array] | None
+    """The rows of the data in the order of a pass, and the number of the pass."""
+    fault: Int[Array, "*seeds"]
+
+
+class Steps(NamedTuple):
+    """What all steps of a run share."""
+
+    loss: Callable[..., Any]
+    gradient: Callable[..., Any]
+    optimiser: optax.GradientTransformation
+    assembly: Assembly
+    key: PRNGKey
+    data: PyTree
+    batch_size: int | None
+    seeds: int | None
+
+    def start(self, model: PyTree, values: Values) -> State:
+        """The state before the first step."""
+        state = _over_seeds(self.optimiser.init, self.seeds)(values)
+        memory = order = None
+        if isinstance(self.loss, AbstractSurrogate):
+            memory = _first_memory(self.loss, model, self.key, self.seeds)
+        shape = () if self.seeds is None else (self.seeds,)
+        if self.batch_size is not None:
+            size = jax.tree.leaves(self.data)[0].shape[0]
+            no_pass = jnp.full(shape, -1, jnp.int32)
+            order = jnp.zeros((*shape, size), jnp.int32), no_pass
+        fault = jnp.zeros(shape, jnp.int32)
+        return State(values, jax.tree.map(strong, state), memory, order, fault)
+
+    def block(
+        self, state: State, first: int, stop: int
+    ) -> tuple[State, dict[str, np.ndarray]]:
+        """The steps from `first` up to `stop`, at most `CAPACITY` of them: the state
+        after them, and of each a row of metrics."""
+        state, outcome = self._compiled(state, jnp.asarray([first, stop], jnp.int32))
+        rows, count = jax.device_get(outcome)
+        return state, {name: column[:count] for name, column in rows.items()}
+
+    def finished(self, state: State) -> PyTree:
+        """The trained model, with what a surrogate learned beside its weights."""
+        model = self.assembly(state.values)
+        if isinstance(self.loss, AbstractSurrogate):
+            model = _finished(self.loss, model, state.memory, self.seeds)
+        return model
+
+    @eqx.filter_jit
+    def _compiled(
+        self, state: State, span: Int[Array, "2"]
+    ) -> tuple[State, tuple[dict[str, Array], Array]]:
+        def step_of_all(state, k):
+            stepped = _over_seeds(self._step, self.seeds, last=None)
+            return stepped(self.assembly, self.key, state, k)
+
+        first, stop = span[0], span[1]
+        # Traced once, here: the loop needs the shapes of a row before it begins.
+        step: Any = eqx.filter_closure_convert(step_of_all, state, first)
+        row = step.out_struct[1]
+        rows = {n: jnp.zeros((CAPACITY, *s.shape), s.dtype) for n, s in row.items()}
+
+        def going(carry):
+            state, _, count = carry
+            return (first + count < stop) & jnp.any(state.fault == 0)
+
+        def body(carry):
+            state, rows, count = carry
+            state, row = step(state, first + count)
+            rows = {
+                name: lax.dynamic_update_index_in_dim(rows[name], row[name], count, 0)
+                for name in rows
+            }
+            return state, rows, count + 1
+
+        start = (state, rows, jnp.zeros((), jnp.int32))
+        state, rows, count = lax.while_loop(going, body, start)
+        return state, (rows, count)
+
+    def _step(
+        self, assembly: Assembly, key: PRNGKey, before: State, k: Array
+    ) -> tuple[State, dict[str, Array]]:
+        """One step of one seed."""
+        values, memory, order = before.values, before.memory, before.order
+        own_key = jr.fold_in(key, k)
+        arguments = () if self.data is None else (self.data,)
+        if self.batch_size is not None and order is not None:
+            order_key = jr.fold_in(key, _ORDER)
+            rows, order = _drawn_rows(order_key, order, k, self.batch_size)
+            arguments = (jax.tree.map(lambda leaf: leaf[rows], self.data),)
+        if isinstance(self.loss, AbstractSurrogate):
+            own_key, memory_key = jr.split(own_key)
+            memory = self.loss.update(assembly(values), memory, k, memory_key)
+            _check_memory(self.loss, before.memory, memory)
+            arguments = (memory,)
+
+        def of(values, key):
+            return self.loss(assembly(values), *arguments, key)
+
+        value, slope = self.gradient(of, values, own_key)
+        cost, metrics = cost_and_metrics(value, _WHERE)
+        _check_gradient(slope, values)
+        slope = jax.tree.map(lambda g, v: g.astype(v.dtype), slope, values)
+        if taken := sorted(set(metrics) & set(COLUMNS)):
+            raise ValueError(
+                f"{_WHERE}: metrics must not be called {', '.join(COLUMNS)}; got "
+                f"{taken[0]!r}."
+            )
+        updates, after = optax.with_extra_args_support(self.optimiser).update(
+            slope,
+            before.optimiser,
+            values,
+            value=cost,
+            grad=slope,
+            value_fn=lambda v: cost_and_metrics(of(v, own_key), _WHERE)[0],
+        )
+        # Kept in the precision that it began with, or the loop would not close.
+        after = jax.tree.map(
+            lambda new, old: new if new.dtype == old.dtype else new.astype(old.dtype),
+            after,
+            before.optimiser,
+        )
+        moved = optax.apply_updates(values, updates)
+        norm = _norm(slope)
+        faulty = ~jnp.stack([*map(_is_finite, (cost, norm, moved))])
+        fault = jnp.where(jnp.any(faulty), 1 + jnp.argmax(faulty), 0).astype(jnp.int32)
+        # A seed that failed stays as it was while the others go on.
+        if self.seeds is not None:
+            fault = jnp.where(before.fault == 0, fault, before.fault)
+        stepped: Any = jax.tree.map(
+            lambda new, old: jnp.where(fault == 0, new, old),
+            (moved, after, memory),
+            before[:3],
+        )
+        row = {"loss": strong(cost), "gradient_norm": norm, **metrics}
+        return State(*stepped, order=order, fault=fault), row
+
+
+@eqx.filter_jit
+def _first_memory(
+    loss: AbstractSurrogate, model: PyTree, key: PRNGKey, seeds: int | None
+) -> PyTree:
+    """The memory of a surrogate before the first step."""
+
+    def begin(model, key):
+        memory = loss.init(model, jr.fold_in(key, _MEMORY))
+        if not all(eqx.is_array(leaf) for leaf in jax.tree.leaves(memory)):
+            raise ValueError(
+                f"{_WHERE}: the memory of {type(loss).__name__} must be a pytree of "
+                f"arrays, got {memory!r}."
+            )
+        return jax.tree.map(strong, memory)
+
+    return _over_seeds(begin, seeds)(model, key)
+
+
+@eqx.filter_jit
+def _finished(
+    loss: AbstractSurrogate, model: PyTree, memory: PyTree, seeds: int | None
+) -> PyTree:
+    return _over_seeds(loss.finished, seeds)(model, memory)
+
+
+def _over_seeds(
+    function: Callable[..., Any], seeds: int | None, last: int | None = 0
+) -> Callable[..., Any]:
+    """`function` over a leading axis of every argument, or as it is for one seed.
+
+    `last` is `None` if the last argument does not have that axis.
+    """
+    if seeds is None:
+        return function
+    first = eqx.if_array(0)
+
+    def mapped(*arguments):
+        axes = [first] * (len(arguments) - 1) + [None if last is None else first]
+        return eqx.filter_vmap(function, in_axes=tuple(axes))(*arguments)
+
+    return mapped
+
+
+def _check_memory(loss: AbstractSurrogate, old: PyTree, new: PyTree) -> None:
+    """Raise unless an update keeps the structure, shapes and dtypes of a memory."""
+    shapes = [
+        jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf)), memory)
+        for memory in (old, new)
+    ]
+    if shapes[0] != shapes[1]:
+        raise ValueError(
+            f"{_WHERE}: {type(loss).__name__}.update must return a memory of the "
+            f"shapes and dtypes that it was given, {shapes[0]}, got {shapes[1]}."
+        )
+
+
+def _drawn_rows(
+    key: PRNGKey, order: tuple[Array, Array], k: Array, batch_size: int
+) -> tuple[Array, tuple[Array, Array]]:
+    """The rows of the batch of step `k`, and the order of the pass it is in."""
+    rows, last_pass = order
+    batches = rows.shape[0] // batch_size
+    this_pass = k // batches
+    rows = lax.cond(
+        this_pass == last_pass,
+        lambda: rows,
+        lambda: jr.permutation(jr.fold_in(key, this_pass), rows.shape[0]).astype(
+            jnp.int32
+        ),
+    )
+    start = (k % batches) * batch_size
+    return lax.dynamic_slice(rows, (start,), (batch_size,)), (rows, this_pass)
+
+
+def _norm(tree: PyTree) -> Array:
+    """The Euclidean norm, in float32 at least: squares of float16 overflow at 256."""
+    widen = lambda leaf: leaf.astype(jnp.promote_types(leaf.dtype, jnp.float32))
+    return optax.tree.norm(jax.tree.map(widen, tree))
+
+
+def _is_finite(tree: PyTree) -> Array:
+    return jnp.all(
+        jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)])
+    )
+
+
+def _check_gradient(gradient: PyTree, values: Values) -> None:
+    """Raise unless an estimator's gradient has the structure and shapes of `values`."""
+    expected, got = (jax.tree.map(jnp.shape, tree) for tree in (values, gradient))
+    if expected != got:
+        raise ValueError(
+            f"{_WHERE}: gradient must return (value, gradient) with a gradient like "
+            f"the values {expected}, got {got}."
+        )

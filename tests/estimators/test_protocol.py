@@ -1,0 +1,47 @@
+"""Estimators whose state is not a belief."""
+
+import jax
+import jax.numpy as jnp
+from helpers import assert_close, once
+
+import delucax as dlx
+
+
+pytestmark = once
+
+
+class Window(dlx.estimators.AbstractEstimator):
+    """The average of the last observations."""
+
+    def init(self, *, key=None):
+        return jnp.zeros((3, 2)), jnp.zeros((), int)
+
+    def update(self, t, y, state):
+        window, count = state
+        return jnp.roll(window, 1, axis=0).at[0].set(y), count
+
+    def predict(self, t, u, state):
+        window, count = state
+        return window, count + 1
+
+    def estimate(self, state):
+        window, _ = state
+        return dlx.estimators.Belief(jnp.mean(window, axis=0), jnp.eye(2))
+
+
+def test_a_window_in_a_closed_loop(key):
+    env, window = dlx.make("pendulum"), Window()
+    K = jnp.array([[20.0, 5.0]])
+    controller = dlx.controllers.OutputFeedback(dlx.controllers.Linear(K), window)
+    run = dlx.rollout(env, controller, key=key, x0=[0.01, 0.0], horizon=4)
+    y = jnp.concatenate([jnp.zeros((2, 2)), run.observations])
+    for k in range(4):
+        assert_close(run.controls[k], -K @ jnp.mean(y[k : k + 3], axis=0), rtol=1e-5)
+
+
+def test_the_default_status(key):
+    window = Window()
+    state = window.update(0.0, jnp.ones(2), window.init())
+    assert window.status(state) == dlx.RESULTS.successful
+    state = jax.jit(window.update)(0.0, jnp.full(2, jnp.nan), state)
+    assert window.status(state) == dlx.RESULTS.diverged
