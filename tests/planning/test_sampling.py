@@ -130,15 +130,3 @@ def test_bad_arguments_are_named():
     limit = dlx.planning.Constraints(lambda t, x, u: x[0])
     with user_error(match="CEM: constraints must be None"):
         CEM()(*problem, key=KEY, constraints=limit)
-
-
-@once
-def test_the_short_calls():
-    problem = *linear(), 0.0, None, (-0.2, 0.3)
-    few = dict(key=KEY, samples=40, iterations=2)
-    for short, planner in (
-        (dlx.planning.mppi, MPPI(40, 2)),
-        (dlx.planning.cem, CEM(40, 2)),
-    ):
-        plan = short(*problem, **few)
-        assert_close(plan.controls, planner(*problem, key=KEY).controls, rtol=0)

@@ -364,7 +364,7 @@ def test_bad_paths_are_refused_before_anything_is_drawn(
         (tmp_path / "missing" / "run.gif", "path must be a file in a folder"),
         (tmp_path / "folder.gif", "path must be a file in a folder"),
         (tmp_path / "run.mp4", "path ends in .mp4, which needs the program ffmpeg"),
-        (3, "path must be a path, got 3"),
+        (3, "path must be the path of a file, got 3"),
     ):
         with user_error(match=match):
             dlx.animate(env, trajectory, path=path)

@@ -1,5 +1,8 @@
 """Conversions to and from other libraries, each an optional extra."""
 
 from . import gymnax as gymnax
-from ._matrix_files import read_linear as read_linear
-from ._python_control import from_control as from_control, to_control as to_control
+from ._linear_models import (
+    from_control as from_control,
+    read_linear as read_linear,
+    to_control as to_control,
+)

@@ -107,12 +107,13 @@ def step(
     episodes are to be truncated there."""
     x, w = episode.state, episode.signals.disturbances
     w = None if w is None else w[episode.time]
-    made = env.step(time_of(env, episode), x, action, w)
-    x_next = made.state.astype(x.dtype)
+    transition = env.step(time_of(env, episode), x, action, w)
+    terminated, x_next = transition.terminated, transition.state.astype(x.dtype)
     after = EpisodeState(x_next, episode.time + 1, episode.signals)
     truncated = (after.time >= env.horizon) & truncate
-    ended = made.terminated | truncated
-    final = jnp.where(ended, env.cost.final(time_of(env, after), x_next), 0)
+    final = jnp.where(
+        terminated | truncated, env.cost.final(time_of(env, after), x_next), 0
+    )
     finite = jnp.all(jnp.isfinite(action)) & jnp.all(jnp.isfinite(x_next))
-    failed = (made.result != RESULTS.successful) | ~finite
-    return after, Outcome(-(made.cost + final), made.terminated, truncated, failed)
+    failed = (transition.result != RESULTS.successful) | ~finite
+    return after, Outcome(-(transition.cost + final), terminated, truncated, failed)

@@ -1,7 +1,5 @@
 """The cross-entropy method."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
@@ -9,10 +7,6 @@ from jaxtyping import Array
 
 from .._check import check_count, check_number, check_range
 from .._module import parameter
-from .._typing import PRNGKey
-from ..costs import AbstractCost
-from ..dynamics import AbstractDynamics
-from ._plan import Plan
 from ._sampling import AbstractSampler, average, check_sampler
 
 
@@ -31,7 +25,7 @@ class CEM(AbstractSampler):
     those of the elites that were drawn; which ones those are is held.
 
     It is called as every [`delucax.planning.AbstractPlanner`][], with a `key`, and
-    without constraints.
+    without constraints. Its result is `diverged` if the start and all means diverge.
 
     **Arguments:**
 
@@ -95,65 +89,3 @@ class CEM(AbstractSampler):
         momentum = self.momentum.astype(mean.dtype)
         blend = lambda old, new: momentum * old + (1 - momentum) * new
         return blend(mean, centre), blend(width, after)
-
-
-def cem(
-    dynamics: AbstractDynamics,
-    cost: AbstractCost,
-    x0: Any,
-    controls: Any,
-    t0: Any = 0.0,
-    w: Any = None,
-    bounds: Any = None,
-    *,
-    key: PRNGKey,
-    samples: int = 256,
-    iterations: int = 10,
-    throw: bool = True,
-) -> Plan:
-    r"""Controls by the cross-entropy method: the short call of
-    [`delucax.planning.CEM`][], which has further options.
-
-    **Arguments:**
-
-    - `dynamics`: the discrete-time dynamics.
-    - `cost`: the stage and final cost.
-    - `x0`: the first state, shape `(n,)`.
-    - `controls`: what to start from, as for [`delucax.planning.ilqr`][].
-    - `t0`: the time of the first state, 0 by default.
-    - `w`: disturbances known in advance, shape `(T, k)`; zero by default.
-    - `bounds`: `(low, high)`, each a number or of shape `(m,)`, between which every
-        control is drawn; none by default.
-    - `key`: a random key.
-    - `samples`: sequences drawn in an iteration, of which 32 are elites; 256 by
-        default.
-    - `iterations`: 10 by default.
-    - `throw`: raise if the start and all means diverge (default); if false, look at
-        `plan.result`, which is `diverged` then.
-
-    **Returns:** a [`delucax.planning.Plan`][].
-
-    **Raises:** `ValueError` on an argument of the wrong kind or shape, out of its
-    range, or not finite; an error at run time as `throw` says.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-        import jax.numpy as jnp
-
-        env = dlx.make("pendulum")
-        plan = dlx.planning.cem(
-            env.dynamics,
-            env.cost,
-            jnp.array([0.5, 0.0]),
-            jnp.zeros((20, 1)),
-            bounds=(-2.0, 2.0),
-            key=jax.random.key(0),
-        )
-        plan.cost
-        ```
-    """
-    planner = CEM(samples, iterations)
-    return planner(dynamics, cost, x0, controls, t0, w, bounds, key=key, throw=throw)

@@ -77,24 +77,12 @@ class Multipliers(NamedTuple):
     rho: Array
 
 
-def _stacked(functions: tuple[Any, Any], arguments: tuple, dtype: Any) -> Values:
+def values_of(functions: tuple[Any, Any], arguments: tuple, dtype: Any) -> Values:
     """Of an inequality and an equality, either of which may be none."""
     given = (jnp.zeros(0) if f is None else f(*arguments) for f in functions)
     inequality, equality = (jnp.ravel(jnp.asarray(c, dtype)) for c in given)
     c = jnp.concatenate([inequality, equality])
     return c, jnp.arange(c.size) >= inequality.size
-
-
-def at_stage(constraints: Constraints, t: Array, x: Array, u: Array) -> Values:
-    """Of the constraints of a step."""
-    functions = constraints.inequality, constraints.equality
-    return _stacked(functions, (t, x, u), x.dtype)
-
-
-def at_end(constraints: Constraints, t: Array, x: Array) -> Values:
-    """Of the constraints at the end."""
-    functions = constraints.final_inequality, constraints.final_equality
-    return _stacked(functions, (t, x), x.dtype)
 
 
 def augmented(c: Array, y: Array, rho: Array, equal: Array) -> Array:

@@ -139,14 +139,10 @@ def _called(x: Any, where: Any, *, tally: _Tally, kind: str, lanes: int) -> Arra
 
 
 def _batch(values, dims, *, tally, kind, lanes):
-    x, where = values
     size = next(v.shape[d] for v, d in zip(values, dims, strict=True) if d is not None)
-    if dims[0] is None:
-        x = jnp.broadcast_to(x, (size, *x.shape))
-    else:
-        x = jnp.moveaxis(x, dims[0], 0)
+    x = batching.bdim_at_front(values[0], dims[0], size)
     params = dict(tally=tally, kind=kind, lanes=lanes * size)
-    return _report.bind(x, where, **params), 0
+    return _report.bind(x, values[1], **params), 0
 
 
 def _jvp(primals, tangents, **params):

@@ -1,5 +1,6 @@
 """The iteration of iterative LQR and differential dynamic programming."""
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,6 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._results import choose, Result, RESULTS
 from ._constraints import Multipliers
 from ._line_search import Iterate, search
 from ._lq import in_parallel, in_sequence, Policy, promised, Stages
@@ -19,25 +21,20 @@ FACTOR = 2.0
 LEAST_MU = 1e-6
 MOST_MU = 1e10
 
-NOT_CONVERGED, CONVERGED, NO_DESCENT, DIVERGED, INFEASIBLE = range(5)
-
 
 class Options(eqx.Module):
-    """What is fixed when the planner is compiled."""
+    """What the planner was asked for, defaults filled in."""
 
+    tolerance: Array
+    constraint_tolerance: Array
+    states: Array | None
+    """States to start from that need not follow from the controls."""
     second_order: bool = eqx.field(static=True)
     on_state: bool = eqx.field(static=True)
     line_search: str = eqx.field(static=True)
     parallel: bool = eqx.field(static=True)
     max_iterations: int = eqx.field(static=True)
     spacing: float | None = eqx.field(static=True, default=None)
-
-
-class Tolerances(NamedTuple):
-    """How precise the solution has to be."""
-
-    gradient: Array
-    constraints: Array
 
 
 class Outcome(NamedTuple):
@@ -49,7 +46,7 @@ class Outcome(NamedTuple):
     cost: Array
     residual: Array
     trace: Array
-    status: Array
+    result: Result
     iterations: Array
     rollouts: Array
     regularisation: Array
@@ -67,31 +64,27 @@ class _Progress(NamedTuple):
     residual: Array
     trace: Array
     iteration: Array
-    status: Array
+    result: Result
     done: Array
 
 
 def optimise(
     problem: Problem,
     start: Start,
-    guess: Array | None,
-    tolerance: Array,
     options: Options,
     before: Outcome | None = None,
 ) -> Outcome:
-    """Iterate from the cheapest start, or from its controls and states that need not
-    follow from them if there is a guess of those; counting on from `before`, if that is
-    given."""
+    """Iterate from the cheapest start, or from its controls and the states of the
+    options if there are any; counting on from `before`, if that is given."""
     T, m = controls_of(start).shape
-    dtype = problem.x0.dtype
-    n = problem.x0.shape[0]
+    n, dtype = problem.x0.shape[0], problem.x0.dtype
     zero = jnp.zeros((), dtype)
     gaps = None
-    if guess is None:
+    if options.states is None:
         _, states, controls, cost = begin(problem, start)
     else:
         controls = jax.vmap(problem.clip)(controls_of(start))
-        states = guess.at[0].set(problem.x0)
+        states = options.states.at[0].set(problem.x0)
         gaps = gaps_of(problem, states, controls)
         cost = problem.total(states, controls)
         good = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gaps))
@@ -103,16 +96,9 @@ def optimise(
     if before is not None:
         earlier = jnp.arange(options.max_iterations + 1) < iteration
         trace = jnp.where(earlier, before.trace, trace)
-    now = Iterate(
-        states,
-        controls,
-        cost,
-        gaps,
-        jnp.asarray(True),
-        rollouts + (start.count if guess is None else 0),
-    )
+    rollouts = rollouts + (start.count if options.states is None else 0)
     first = _Progress(
-        now=now,
+        now=Iterate(states, controls, cost, gaps, jnp.asarray(True), rollouts),
         gains=jnp.zeros((T, m, n), dtype),
         mu=zero,
         delta=jnp.ones((), dtype),
@@ -121,13 +107,11 @@ def optimise(
         residual=jnp.full((), jnp.inf, dtype),
         trace=trace,
         iteration=iteration,
-        status=jnp.where(lost, DIVERGED, NOT_CONVERGED),
+        result=choose(lost, RESULTS.diverged, RESULTS.not_converged),
         done=lost,
     )
 
-    def body(before):
-        return _iterate(problem, before, tolerance, options)
-
+    body = functools.partial(_iterate, problem, options)
     last = lax.while_loop(lambda progress: ~progress.done, body, first)
     reached = jnp.arange(options.max_iterations + 1) <= last.iteration
     return Outcome(
@@ -137,7 +121,7 @@ def optimise(
         last.now.cost,
         last.residual,
         jnp.where(reached, last.trace, last.now.cost),
-        last.status,
+        last.result,
         last.iteration,
         last.now.rollouts,
         last.mu,
@@ -146,15 +130,12 @@ def optimise(
     )
 
 
-def _iterate(
-    problem: Problem, before: _Progress, tolerance: Array, options: Options
-) -> _Progress:
-    now, mu = before.now, before.mu
+def _iterate(problem: Problem, options: Options, before: _Progress) -> _Progress:
+    now, mu, tolerance = before.now, before.mu, options.tolerance
     about = problem, now.states, now.controls, now.gaps, options.second_order
     stages = model(*about, before.exact, options.spacing)
-    policy, residual, settled = directions(
-        problem, stages, now.controls, mu, tolerance, options
-    )
+    given = problem, stages, now.controls, mu, options
+    policy, residual, settled = directions(*given)
     penalty = _penalty(before.penalty, now, policy)
     missed = 0.0 if now.gaps is None else jnp.max(jnp.abs(now.gaps))
     precise = 1 + jnp.max(jnp.abs(now.states))
@@ -182,7 +163,8 @@ def _iterate(
     exact = jnp.where(flatten, False, before.exact | after.accepted)
     stuck = (mu > MOST_MU) & ~converged & ~out_of_time
     ended = converged | out_of_time
-    status = jnp.where(converged, CONVERGED, jnp.where(stuck, NO_DESCENT, 0))
+    result = choose(stuck, RESULTS.no_descent, RESULTS.not_converged)
+    result = choose(converged, RESULTS.successful, result)
     iteration = before.iteration + jnp.where(ended, 0, 1)
     return _Progress(
         after,
@@ -194,7 +176,7 @@ def _iterate(
         residual,
         before.trace.at[iteration].set(after.cost),
         iteration,
-        status,
+        result,
         ended | stuck,
     )
 
@@ -204,13 +186,10 @@ def directions(
     stages: Stages,
     controls: Array,
     mu: Array,
-    tolerance: Array,
     options: Options,
 ) -> tuple[Policy, Array, Array]:
     """The policy of the model, the residual, and whether that is small enough."""
-    box = None
-    if problem.low is not None and problem.high is not None:
-        box = (problem.low - controls, problem.high - controls)
+    box, tolerance = problem.room(controls), options.tolerance
     if options.parallel:
         policy = in_parallel(stages, mu)
     else:

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+from jax.tree_util import Partial
 from jaxtyping import Array
 
 from .._check import (
@@ -20,6 +20,7 @@ from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ._ilc import as_problems, learn, raise_if_diverged, Trials
+from ._lq import Policy
 from ._plan import Plan
 from ._problem import Problem
 
@@ -104,43 +105,26 @@ def igpc(
         ```
     """
     where = "igpc"
-    true, known = as_problems(plant, model, cost, plan, w, where)
+    problems = as_problems(plant, model, cost, plan, w, where)
     for name, value in (("step", step), ("learning_rate", learning_rate)):
         check_number(value, name, where)
-        if name == "step" or not _is_zero(value):
+        no_learning = name == "learning_rate" and isinstance(value, int | float)
+        if not (no_learning and value == 0):
             check_positive(value, name, where)
-    memory = check_count(memory, "memory", where)
-    sizes = memory, check_count(horizon, "horizon", where)
     check_choice(indices, ("aligned", "deluca"), "indices", where)
+    run = Partial(
+        perturbed,
+        memory=check_count(memory, "memory", where),
+        horizon=check_count(horizon, "horizon", where),
+        aligned=indices == "aligned",
+    )
     iterations = check_count(iterations, "iterations", where)
     trials = Trials(iterations)
     if check_bool(anneal, "anneal", where):
         trials = Trials(iterations, candidates=6, strict=True, slower=SLOWER)
-    numbers = as_float_array(step), as_float_array(learning_rate)
-    out = _learn(true, known, plan, *numbers, sizes, indices == "aligned", trials)
+    rates = as_float_array(step), as_float_array(learning_rate)
+    out = learn(*problems, plan, run, *rates, trials)
     return raise_if_diverged(out, where) if throw else out
-
-
-def _is_zero(value: Any) -> bool:
-    return isinstance(value, int | float) and value == 0
-
-
-@eqx.filter_jit
-def _learn(
-    plant: Problem,
-    model: Problem,
-    plan: Plan,
-    step: Array,
-    rate: Array,
-    sizes: tuple[int, int],
-    aligned: bool,
-    trials: Trials,
-) -> Plan:
-    def run(states, controls, policy, length, rate):
-        about = states, controls - length * policy.k, policy.K
-        return perturbed(plant, model, *about, rate, sizes, aligned)
-
-    return learn(plant, model, plan, run, step, rate, trials)
 
 
 def perturbed(
@@ -148,14 +132,17 @@ def perturbed(
     model: Problem,
     states: Array,
     controls: Array,
-    K: Array,
+    policy: Policy,
+    length: Array,
     rate: Array,
-    sizes: tuple[int, int],
+    *,
+    memory: int,
+    horizon: int,
     aligned: bool,
 ) -> tuple[Array, Array, Array]:
-    """A run of the plant under `controls - K (x - states)` and what is learned online;
-    its states, controls and cost, infinite if it diverged."""
-    memory, horizon = sizes
+    """A run of the plant under the policy and what is learned online; its states,
+    controls and cost, infinite if it diverged."""
+    controls, K = controls - length * policy.k, policy.K
     T, m = controls.shape
     n, dtype = plant.x0.shape[0], controls.dtype
     times = plant.times(T)

@@ -9,12 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import (
-    check_count,
-    check_instance,
-    check_number,
-    check_positive,
-)
+from .._check import check_count, check_instance, check_number, check_positive
 from .._module import as_float_array
 from .._results import choose, RESULTS
 from ..costs import AbstractCost
@@ -107,29 +102,32 @@ def ilc(
         ```
     """
     where = "ilc"
-    true, known = as_problems(plant, model, cost, plan, w, where)
+    problems = as_problems(plant, model, cost, plan, w, where)
     check_number(step, "step", where)
     check_positive(step, "step", where)
-    iterations = check_count(iterations, "iterations", where)
-    out = _learn(true, known, plan, as_float_array(step), iterations)
+    trials = Trials(check_count(iterations, "iterations", where))
+    rates = as_float_array(step), jnp.zeros(())
+    out = learn(*problems, plan, _run_feedback, *rates, trials)
     return raise_if_diverged(out, where) if throw else out
 
 
-@eqx.filter_jit
-def _learn(
-    plant: Problem, model: Problem, plan: Plan, step: Array, iterations: int
-) -> Plan:
-    def run(states, controls, policy, length, rate):
-        del rate
-        return roll_out(plant, states, controls, policy.K, policy.k, length, None)
-
-    return learn(plant, model, plan, run, step, jnp.zeros(()), Trials(iterations))
+def _run_feedback(
+    plant: Problem,
+    model: Problem,
+    states: Array,
+    controls: Array,
+    policy: Policy,
+    length: Array,
+    rate: Array,
+) -> tuple[Array, Array, Array]:
+    """A run of the plant under the policy alone."""
+    del model, rate
+    return roll_out(plant, states, controls, policy.K, policy.k, length)
 
 
 class _Progress(NamedTuple):
-    states: Array
-    controls: Array
-    cost: Array
+    last: tuple[Array, Array, Array]
+    """States, controls and cost of the run to improve."""
     step: Array
     rate: Array
     runs: Array
@@ -138,6 +136,7 @@ class _Progress(NamedTuple):
     done: Array
 
 
+@eqx.filter_jit
 def learn(
     plant: Problem,
     model: Problem,
@@ -147,88 +146,82 @@ def learn(
     rate: Array,
     trials: Trials,
 ) -> Plan:
-    """Iterate from the first run. `run(states, controls, policy, length, rate)` runs
-    the plant about the last run, and gives states, controls and cost."""
+    """Iterate from the first run. `run(plant, model, states, controls, policy, length,
+    rate)` runs the plant about the last run, and gives states, controls and cost."""
     dtype = plan.controls.dtype
     zero = jnp.zeros((), dtype)
     about = plan.states.astype(dtype), plan.controls, plan.gains.astype(dtype)
-    nothing = jnp.zeros_like(plan.controls)
-    states, controls, cost = roll_out(plant, *about, nothing, zero, None)
-    lost = ~jnp.isfinite(cost)
+    first = roll_out(plant, *about, jnp.zeros_like(plan.controls), zero)
+    lost = ~jnp.isfinite(first[2])
 
     def policy_of(states, controls) -> tuple[Array, Policy]:
         stages = local_model(model, states, controls, None, False)
-        box = None
-        if model.low is not None and model.high is not None:
-            box = model.low - controls, model.high - controls
+        box = model.room(controls)
+
+        def regularised(mu):
+            return mu, in_sequence(stages, mu, False, box)
 
         def more(tried):
-            mu = jnp.maximum(LEAST_MU, GROWTH * tried[0])
-            return mu, in_sequence(stages, mu, False, box)
+            return regularised(jnp.maximum(LEAST_MU, GROWTH * tried[0]))
 
         def concave(tried):
             return ~tried[1].ok & (tried[0] < MOST_MU)
 
-        first = zero, in_sequence(stages, zero, False, box)
-        return lax.while_loop(concave, more, first)
+        return lax.while_loop(concave, more, regularised(zero))
 
     def body(now):
-        _, policy = policy_of(now.states, now.controls)
-        last = now.states, now.controls, now.cost
+        states, controls, cost = now.last
+        _, policy = policy_of(states, controls)
 
         def trial(tried):
             length = now.step * jnp.asarray(1.1, dtype) ** (
                 1.0 - tried.astype(dtype) ** 2
             )
-            after = run(now.states, now.controls, policy, length, now.rate)
-            cost = after[2]
-            good = cost < now.cost if trials.strict else cost <= now.cost
+            after = run(plant, model, states, controls, policy, length, now.rate)
+            good = after[2] < cost if trials.strict else after[2] <= cost
             return (length, after), good
 
-        given = trial, trials.candidates, (now.step, last)
+        given = trial, trials.candidates, (now.step, now.last)
         tried, (length, after), good = first_accepted(*given)
         keep = lambda new, old: jnp.where(good, new, old)
-        states, controls, cost = jax.tree.map(keep, after, last)
+        after = jax.tree.map(keep, after, now.last)
         iteration = now.iteration + 1
         rate, ended = now.rate, iteration >= trials.iterations
         if trials.slower is None:
             ended = ended | ~good
         else:
             rate = keep(rate, trials.slower * rate)
-        trace = now.trace.at[iteration].set(cost)
+        trace = now.trace.at[iteration].set(after[2])
         step, runs = keep(length, now.step), now.runs + tried
-        return _Progress(
-            states, controls, cost, step, rate, runs, trace, iteration, ended
-        )
+        return _Progress(after, step, rate, runs, trace, iteration, ended)
 
     start = _Progress(
-        states,
-        controls,
-        cost,
-        jnp.asarray(step, dtype),
-        jnp.asarray(rate, dtype),
-        jnp.asarray(1),
-        jnp.full((trials.iterations + 1,), cost),
-        jnp.asarray(0),
-        lost,
+        last=first,
+        step=jnp.asarray(step, dtype),
+        rate=jnp.asarray(rate, dtype),
+        runs=jnp.asarray(1),
+        trace=jnp.full((trials.iterations + 1,), first[2]),
+        iteration=jnp.asarray(0),
+        done=lost,
     )
-    last = lax.while_loop(lambda now: ~now.done, body, start)
-    mu, policy = policy_of(last.states, last.controls)
-    reached = jnp.arange(trials.iterations + 1) <= last.iteration
+    end = lax.while_loop(lambda now: ~now.done, body, start)
+    states, controls, cost = end.last
+    mu, policy = policy_of(states, controls)
+    reached = jnp.arange(trials.iterations + 1) <= end.iteration
     result = choose(
-        last.iteration < trials.iterations, RESULTS.no_descent, RESULTS.successful
+        end.iteration < trials.iterations, RESULTS.no_descent, RESULTS.successful
     )
     return plan_of(
         plant,
-        last.states,
-        last.controls,
-        last.cost,
+        states,
+        controls,
+        cost,
         gains=policy.K,
-        trace=jnp.where(reached, last.trace, last.cost),
+        trace=jnp.where(reached, end.trace, cost),
         residual=jnp.max(jnp.abs(policy.gradient)),
         result=choose(lost, RESULTS.diverged, result),
-        iterations=last.iteration,
-        rollouts=last.runs,
+        iterations=end.iteration,
+        rollouts=end.runs,
         regularisation=mu,
     )
 
@@ -260,6 +253,10 @@ def as_problems(
     if w is not None:
         w = as_rows(w, T, plant.disturbance_size, "w", where)
     x0 = plan.states[0].astype(plan.controls.dtype)
-    t0, rest = plan.t0.astype(x0.dtype), (plan.low, plan.high, plan.difference, None)
-    problem = lambda dynamics, w: Problem(dynamics, cost, x0, t0, w, *rest)
+    t0, bounds = plan.t0.astype(x0.dtype), None
+    if plan.low is not None and plan.high is not None:
+        bounds = plan.low, plan.high
+    problem = lambda dynamics, w: Problem(
+        dynamics, cost, x0, t0, w, bounds, plan.difference
+    )
     return problem(plant, w), problem(model, None)

@@ -14,19 +14,11 @@ from .._check import (
     check_range,
 )
 from .._module import as_float_array, parameter
-from .._results import choose, RESULTS
 from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ._constraints import Constraints
-from ._descent import (
-    CONVERGED,
-    DIVERGED,
-    INFEASIBLE,
-    NO_DESCENT,
-    Options,
-    Tolerances,
-)
+from ._descent import Options
 from ._implicit import solution
 from ._line_search import SEARCHES
 from ._plan import Plan, plan_of
@@ -158,12 +150,12 @@ class ILQR(AbstractPlanner):
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
         del key
         where, dtype = "ILQR", start.controls.dtype
-        if self.parallel and problem.low is not None:
+        if self.parallel and problem.bounds is not None:
             raise ValueError(f"{where}: {_IN_SEQUENCE}")
-        guess = self.states
-        if guess is not None:
+        states = self.states
+        if states is not None:
             shape = start.horizon + 1, problem.dynamics.state_size
-            guess = as_rows(guess, *shape, "states", where).astype(dtype)
+            states = as_rows(states, *shape, "states", where).astype(dtype)
         eps, spacing = float(jnp.finfo(dtype).eps), self.finite_difference
         tolerance, feasible = self.tolerance, self.constraint_tolerance
         if tolerance is None:
@@ -175,6 +167,9 @@ class ILQR(AbstractPlanner):
         if second_order is None:
             second_order = problem.constraints is not None and spacing is None
         options = Options(
+            tolerance=as_float_array(tolerance).astype(dtype),
+            constraint_tolerance=as_float_array(feasible).astype(dtype),
+            states=states,
             second_order=bool(second_order),
             on_state=self.regularise == "state",
             line_search=self.line_search,
@@ -182,8 +177,7 @@ class ILQR(AbstractPlanner):
             max_iterations=self.max_iterations,
             spacing=None if spacing is None else float(spacing),
         )
-        tolerances = (as_float_array(t).astype(dtype) for t in (tolerance, feasible))
-        return _solve(problem, start, guess, Tolerances(*tolerances), options)
+        return _solve(problem, start, options)
 
 
 _IN_SEQUENCE = (
@@ -268,23 +262,7 @@ def ilqr(
 
 
 @eqx.filter_jit
-def _solve(
-    problem: Problem,
-    start: Start,
-    guess: Array | None,
-    tolerances: Tolerances,
-    options: Options,
-) -> Plan:
-    out = solution(problem, start, guess, tolerances, options=options)
-    result = RESULTS.not_converged
-    for code, kind in (
-        (CONVERGED, RESULTS.successful),
-        (NO_DESCENT, RESULTS.no_descent),
-        (DIVERGED, RESULTS.diverged),
-        (INFEASIBLE, RESULTS.infeasible),
-    ):
-        result = choose(out.status == code, kind, result)
-    rest = out._asdict()
-    for name in ("status", "multipliers"):
-        del rest[name]
-    return plan_of(problem, **rest, result=result)
+def _solve(problem: Problem, start: Start, options: Options) -> Plan:
+    fields = solution(problem, start, options)._asdict()
+    del fields["multipliers"]
+    return plan_of(problem, **fields)

@@ -4,7 +4,6 @@ At a solution the gradient of the Lagrangian is zero. So the change of the solut
 the problem solves one linear-quadratic problem, with the exact second derivatives.
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,10 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._jax import by_lanes, nan_tangent
+from .._results import RESULTS
 from ..math import matvec
+from ..math._linear_solve import full_precision
 from ._augmented import with_constraints
 from ._constraints import Multipliers
-from ._descent import CONVERGED, Options, Outcome, Tolerances
+from ._descent import Options, Outcome
 from ._lq import apply, in_parallel, in_sequence, product, solve_free, Stages
 from ._problem import costates_of, model, Problem
 from ._start import controls_of, Start
@@ -30,28 +31,16 @@ STIFFER = 10.0
 
 
 @eqx.filter_custom_jvp
-def solution(
-    problem: Problem,
-    start: Start,
-    guess: Array | None,
-    tolerances: Tolerances,
-    *,
-    options: Options,
-) -> Outcome:
+def solution(problem: Problem, start: Start, options: Options) -> Outcome:
     """What the iteration ends with; differentiable with respect to the problem."""
-    run = functools.partial(with_constraints, options=options)
-    return by_lanes(run, problem, start, guess, tolerances)
+    return by_lanes(with_constraints, problem, start, options)
 
 
 @solution.def_jvp
-def _solution_jvp(primals: Any, tangents: Any, *, options: Options) -> Any:
-    with jax.default_matmul_precision("highest"):
-        return _with_tangents(primals, tangents, options)
-
-
-def _with_tangents(primals: Any, tangents: Any, options: Options) -> Any:
-    out = solution(*primals, options=options)
-    problem, change = primals[0], tangents[0]
+@full_precision
+def _solution_jvp(primals: Any, tangents: Any) -> Any:
+    out = solution(*primals)
+    (problem, start, options), change = primals, tangents[0]
     nothing = jax.tree.map(lambda _: None, out)
     if not jax.tree.leaves(change):
         return out, nothing
@@ -59,12 +48,12 @@ def _with_tangents(primals: Any, tangents: Any, options: Options) -> Any:
     choose = lambda f: jax.tree.map(f, change, problem, is_leaf=is_none)
     varied = choose(lambda t, p: None if t is None else p)
     rest = choose(lambda t, p: p if t is None else None)
-    solved = out.status == CONVERGED
+    solved = out.result == RESULTS.successful
     # What failed is not used, but must be finite for what is to have a derivative: so
     # the problem is looked at where it began.
     x0 = jnp.where(jnp.isfinite(problem.x0), problem.x0, 0)
     X = jnp.where(solved, out.states, x0)
-    U = jnp.where(solved, out.controls, controls_of(primals[1]))
+    U = jnp.where(solved, out.controls, controls_of(start))
     y = out.multipliers
 
     def given(varied) -> Problem:
@@ -116,16 +105,17 @@ def _change(
         c = None
         if problem.constraints is not None:
             c = [c for c, _ in problem.constraints_along(X, U)]
-        return (h, after, v), problem.x0, (problem.low, problem.high), c
+        return (h, after, v), problem.x0, problem.bounds, c
 
     at, linear = jax.jvp(conditions, (varied,), (change,))
-    ((slope, *_), *_), ((h, d, v), dx0, (dlow, dhigh), dc) = at, linear
+    ((slope, *_), *_), ((h, d, v), dx0, ends, dc) = at, linear
     free, fixed = jnp.ones_like(U, bool), jnp.zeros_like(U)
-    if problem.low is not None and problem.high is not None:
-        at_low = (U <= problem.low) & (slope[:, n:] > 0)
-        at_high = (U >= problem.high) & (slope[:, n:] < 0)
+    if problem.bounds is not None:
+        low, high = problem.bounds
+        at_low = (U <= low) & (slope[:, n:] > 0)
+        at_high = (U >= high) & (slope[:, n:] < 0)
         free = ~(at_low | at_high)
-        fixed = jnp.where(at_low, dlow, jnp.where(at_high, dhigh, fixed))
+        fixed = jnp.where(at_low, ends[0], jnp.where(at_high, ends[1], fixed))
     stages = stages._replace(h=h, d=d, v=v)
     if y is None:
         factors = factorise(stages, free)

@@ -1,17 +1,11 @@
 """Model predictive path integral planning."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_number, check_positive
 from .._module import parameter
-from .._typing import PRNGKey
-from ..costs import AbstractCost
-from ..dynamics import AbstractDynamics
-from ._plan import Plan
 from ._sampling import AbstractSampler, average, check_sampler
 
 
@@ -28,7 +22,7 @@ class MPPI(AbstractSampler):
     differentiable in whatever the costs are, for the numbers that were drawn.
 
     It is called as every [`delucax.planning.AbstractPlanner`][], with a `key`, and
-    without constraints.
+    without constraints. Its result is `diverged` if the start and all means diverge.
 
     **Arguments:**
 
@@ -79,64 +73,3 @@ class MPPI(AbstractSampler):
         temperature = self.temperature.astype(mean.dtype)
         weights = jnp.where(finite, jnp.exp(-above / temperature), 0)
         return average(weights, drawn, mean), width
-
-
-def mppi(
-    dynamics: AbstractDynamics,
-    cost: AbstractCost,
-    x0: Any,
-    controls: Any,
-    t0: Any = 0.0,
-    w: Any = None,
-    bounds: Any = None,
-    *,
-    key: PRNGKey,
-    samples: int = 256,
-    iterations: int = 10,
-    throw: bool = True,
-) -> Plan:
-    r"""Controls by model predictive path integral planning: the short call of
-    [`delucax.planning.MPPI`][], which has further options.
-
-    **Arguments:**
-
-    - `dynamics`: the discrete-time dynamics.
-    - `cost`: the stage and final cost.
-    - `x0`: the first state, shape `(n,)`.
-    - `controls`: what to start from, as for [`delucax.planning.ilqr`][].
-    - `t0`: the time of the first state, 0 by default.
-    - `w`: disturbances known in advance, shape `(T, k)`; zero by default.
-    - `bounds`: `(low, high)`, each a number or of shape `(m,)`, between which every
-        control is drawn; none by default.
-    - `key`: a random key.
-    - `samples`: sequences drawn in an iteration, 256 by default.
-    - `iterations`: 10 by default.
-    - `throw`: raise if the start and all means diverge (default); if false, look at
-        `plan.result`, which is `diverged` then.
-
-    **Returns:** a [`delucax.planning.Plan`][].
-
-    **Raises:** `ValueError` on an argument of the wrong kind or shape, out of its
-    range, or not finite; an error at run time as `throw` says.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-        import jax.numpy as jnp
-
-        env = dlx.make("pendulum")
-        plan = dlx.planning.mppi(
-            env.dynamics,
-            env.cost,
-            jnp.array([0.5, 0.0]),
-            jnp.zeros((20, 1)),
-            bounds=(-2.0, 2.0),
-            key=jax.random.key(0),
-        )
-        plan.cost
-        ```
-    """
-    planner = MPPI(samples, iterations)
-    return planner(dynamics, cost, x0, controls, t0, w, bounds, key=key, throw=throw)

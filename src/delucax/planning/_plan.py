@@ -22,7 +22,7 @@ class Plan(AbstractController):
 
     between the bounds that it was planned with. Outside the horizon the control is NaN,
     which a rollout reports. [`delucax.planning.ilqr`][] makes it, and so do
-    [`delucax.planning.mppi`][] and [`delucax.planning.cem`][], without gains, and
+    [`delucax.planning.MPPI`][] and [`delucax.planning.CEM`][], without gains, and
     [`delucax.planning.ilc`][] and [`delucax.planning.igpc`][].
 
     **Arguments:**
@@ -124,14 +124,15 @@ def plan_of(
     """A plan for a problem."""
     zero = jnp.zeros((), cost.dtype)
     defaults = dict(violation=zero, regularisation=zero)
+    low, high = problem.bounds or (None, None)
     return Plan(
         states=states,
         controls=controls,
         cost=cost,
         t0=problem.t0,
         dt=problem.dynamics.dt,
-        low=problem.low,
-        high=problem.high,
+        low=low,
+        high=high,
         difference=problem.difference,
         **(defaults | rest),
     )

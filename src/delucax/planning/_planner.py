@@ -148,11 +148,11 @@ class AbstractPlanner(eqx.Module):
             check_instance(constraints, Constraints, "constraints", where, hint)
         ends = check_control_bounds(bounds, m, where)
         if ends is not None:
-            ends = (jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
-        low, high = ends or (None, None)
+            low, high = (jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
+            ends = low, high
         x0, t0, distance = x0.astype(dtype), t0.astype(dtype), as_module(difference)
-        given = dynamics, cost, x0, t0, w, low, high, distance, constraints
-        problem, start = Problem(*given), jax.tree.map(lambda a: a.astype(dtype), start)
+        problem = Problem(dynamics, cost, x0, t0, w, ends, distance, constraints)
+        start = jax.tree.map(lambda a: a.astype(dtype), start)
         if self.is_stochastic:
             check_key(key, where)
         plan = self.solve(problem, start, key)

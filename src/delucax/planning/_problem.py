@@ -14,14 +14,7 @@ from .._results import first_of, or_none, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
-from ._constraints import (
-    at_end,
-    at_stage,
-    augmented,
-    Constraints,
-    Multipliers,
-    Values,
-)
+from ._constraints import augmented, Constraints, Multipliers, Values, values_of
 from ._lq import Stages
 
 
@@ -35,11 +28,10 @@ class Problem(eqx.Module):
     cost: AbstractCost
     x0: Array
     t0: Array
-    w: Array | None
-    low: Array | None
-    high: Array | None
-    difference: Callable[[Array, Array], Array] | None
-    constraints: Constraints | None
+    w: Array | None = None
+    bounds: tuple[Array, Array] | None = None
+    difference: Callable[[Array, Array], Array] | None = None
+    constraints: Constraints | None = None
     multipliers: Multipliers | None = None
 
     def deviation(self, x: Array, x_ref: Array) -> Array:
@@ -53,9 +45,17 @@ class Problem(eqx.Module):
 
     def clip(self, u: Array) -> Array:
         """The control between the bounds."""
-        if self.low is None or self.high is None:
+        if self.bounds is None:
             return u
-        return jnp.minimum(jnp.maximum(u, self.low), self.high)
+        low, high = self.bounds
+        return jnp.minimum(jnp.maximum(u, low), high)
+
+    def room(self, controls: Array) -> tuple[Array, Array] | None:
+        """The bounds of a change of each control, if there are any."""
+        if self.bounds is None:
+            return None
+        low, high = self.bounds
+        return low - controls, high - controls
 
     def step(self, t: Array, x: Array, u: Array, w: Array | None) -> Array:
         """The next state."""
@@ -64,12 +64,14 @@ class Problem(eqx.Module):
     def stage_constraints(self, t: Array, x: Array, u: Array) -> Values:
         """The values of the constraints of a step."""
         assert self.constraints is not None
-        return at_stage(self.constraints, t, x, u)
+        functions = self.constraints.inequality, self.constraints.equality
+        return values_of(functions, (t, x, u), x.dtype)
 
     def final_constraints(self, t: Array, x: Array) -> Values:
         """The values of the constraints at the end."""
         assert self.constraints is not None
-        return at_end(self.constraints, t, x)
+        functions = self.constraints.final_inequality, self.constraints.final_equality
+        return values_of(functions, (t, x), x.dtype)
 
     def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
         """The values of the constraints of all steps, and at the end."""
@@ -119,10 +121,10 @@ def roll_out(
     problem: Problem,
     states: Array,
     controls: Array,
-    K: Array | None,
-    k: Array | None,
-    length: Array | float,
-    gaps: Array | None,
+    K: Array | None = None,
+    k: Array | None = None,
+    length: Array | float = 0.0,
+    gaps: Array | None = None,
 ) -> tuple[Array, Array, Array]:
     """The trajectory under `u - length k - K (x - x_planned)`, and its cost.
 

@@ -104,7 +104,7 @@ def _search(
     held = jnp.broadcast_to(problem.x0, (T + 1, *problem.x0.shape))
 
     def cost_of(controls):
-        return roll_out(problem, held, controls, None, None, 0.0, None)[2]
+        return roll_out(problem, held, controls)[2]
 
     def better(best, mean, cost):
         lower = cost < best[1]
@@ -129,7 +129,7 @@ def _search(
     keys = jr.split(key, planner.iterations)
     (mean, _, best, moved), trace = lax.scan(body, first, keys)
     best = better(best, mean, cost_of(mean))
-    states, planned, cost = roll_out(problem, held, best[0], None, None, 0.0, None)
+    states, planned, cost = roll_out(problem, held, best[0])
     return plan_of(
         problem,
         states,

@@ -201,7 +201,7 @@ def _point(dynamics: AbstractDynamics, cost: AbstractCost) -> tuple[Array, Array
 @eqx.filter_jit
 def _expanded(dynamics, cost, x, u, t0):
     """The linear-quadratic problem about a point, and whether it is one."""
-    problem = Problem(dynamics, cost, x, t0, None, None, None, None, None)
+    problem = Problem(dynamics, cost, x, t0)
     stages = model(problem, jnp.stack([x, x]), u[None], None, False)
     n, F, H = x.shape[0], stages.F[0], stages.H[0]
     A, B, Q, R, S = F[:, :n], F[:, n:], H[:n, :n], H[n:, n:], H[:n, n:]
@@ -249,8 +249,7 @@ def begin(problem: Problem, start: Start) -> tuple[Start, Array, Array, Array]:
         if states is None:
             T, n = start.controls.shape[0], problem.x0.shape[0]
             states = jnp.broadcast_to(problem.x0, (T + 1, n))
-        about = states, start.controls, gains, None, 0.0, None
-        states, controls, cost = roll_out(problem, *about)
+        states, controls, cost = roll_out(problem, states, start.controls, gains)
         # Of a start that diverges at least the controls are as they were given.
         given = jax.vmap(problem.clip)(start.controls)
         return states, jnp.where(jnp.isfinite(cost), controls, given), cost

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Int, Num, UInt8
 from PIL import Image
 
-from ._figure import quantised
+from .._check import as_path
+from .figures import quantised
 
 
 Pixels: TypeAlias = UInt8[np.ndarray, "... 3"]
@@ -31,9 +32,7 @@ PLAYER = string.Template(Path(__file__).with_name("_player.html").read_text("utf
 
 def check_path(path: Any, where: str) -> Path:
     """`path` as a file that can be written, or an error, before anything is drawn."""
-    if not isinstance(path, str | os.PathLike):
-        raise ValueError(f"{where}: path must be a path, got {path!r}.")
-    path = Path(path)
+    path = as_path(path, "path", where)
     if path.suffix.lower() not in _WRITERS:
         raise ValueError(
             f"{where}: path must end in {', '.join(_WRITERS)}, got {str(path)!r}."

@@ -14,7 +14,8 @@ from matplotlib.lines import Line2D
 from .._check import as_vector, check_instance
 from .._module import as_float_array
 from ..systems import AbstractSystem
-from ._figure import (
+from ._runs import as_runs, Trajectories
+from .figures import (
     line_style,
     NEUTRAL,
     NotebookFigure,
@@ -23,7 +24,6 @@ from ._figure import (
     with_unit,
     wrapped,
 )
-from ._runs import as_runs, Trajectories
 
 
 Limits: TypeAlias = Float[np.ndarray, "2 2"]

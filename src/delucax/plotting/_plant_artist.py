@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from ..environments import Environment
 from ..simulation import Trajectory
 from ._drawings import Canvas, drawing_for, Episode, States, Vector
-from ._figure import PALETTE
+from .figures import PALETTE
 
 
 class PlantArtist:

@@ -13,7 +13,8 @@ from matplotlib.lines import Line2D
 from .._check import check_instance
 from .._results import RESULTS
 from ..environments import Environment
-from ._figure import (
+from ._runs import as_runs, FEW, HELD, Panel, panels_of, Run, Trajectories
+from .figures import (
     color_of,
     line_style,
     NEUTRAL,
@@ -23,7 +24,6 @@ from ._figure import (
     with_unit,
     wrapped,
 )
-from ._runs import as_runs, FEW, HELD, Panel, panels_of, Run, Trajectories
 
 
 Bounds: TypeAlias = Float[np.ndarray, "2 controls"]
@@ -267,25 +267,26 @@ def _mark_incidents(ax: Axes, runs: Sequence[Run]) -> None:
     """Ticks above the panel, a row for each kind of incident."""
     style = {"markersize": 4, "markeredgewidth": 1.2, "clip_on": False}
     style["transform"] = ax.get_xaxis_transform()
-    for row, name in enumerate(_incident_names(runs)):
+    for row, (name, own_color) in enumerate(_incident_colors(runs).items()):
         for i, run in enumerate(runs):
             steps = run.incidents.get(name)
             if steps is not None and len(steps) <= FEW:
                 times = run.times[:, :-1][steps]
-                color = color_of(i) if len(runs) > 1 else _incident_color(name)
+                color = color_of(i) if len(runs) > 1 else own_color
                 heights = np.full(len(times), 1.04 + 0.09 * row)
                 ax.plot(times, heights, "|", color=color, **style)
 
 
-def _incident_names(runs: Sequence[Run]) -> list[str]:
-    """The kinds of incident that happened in any run. Where runs are compared, those
-    of the controllers alone: every one of them may be clipped."""
-    names = {name for run in runs for name in run.incidents}
-    return sorted(names - {"clipped_control"} if len(runs) > 1 else names)
-
-
-def _incident_color(name: str) -> str:
-    return NEUTRAL if name == "clipped_control" else color_of(3)
+def _incident_colors(runs: Sequence[Run]) -> dict[str, str]:
+    """The kinds of incident that happened in any run, and their colours. Where runs are
+    compared, those of the controllers alone: every one of them may be clipped."""
+    names = sorted({name for run in runs for name in run.incidents})
+    colors = {name: color_of(3) for name in names}
+    if "clipped_control" in colors:
+        colors["clipped_control"] = NEUTRAL
+        if len(runs) > 1:
+            del colors["clipped_control"]
+    return colors
 
 
 def _incident_label(name: str, runs: Sequence[Run]) -> str:
@@ -331,8 +332,8 @@ def _draw_head(figure: Figure, runs: Sequence[Run], kinds: set[str]) -> None:
             label = f"failed: {RESULTS[runs[0].trajectory.result]}"
         style = {"linestyle": "none", "markeredgewidth": 1.5, "color": NEUTRAL}
         entries.append((Line2D([], [], **style, **marker), label))
-    for name in _incident_names(runs) if "controls" in kinds else ():
-        color = NEUTRAL if compared else _incident_color(name)
+    for name, color in _incident_colors(runs).items() if "controls" in kinds else ():
+        color = NEUTRAL if compared else color
         handle = Line2D([], [], linestyle="none", marker="|", color=color)
         entries.append((handle, _incident_label(name, runs)))
     title = "" if compared else wrapped(runs[0].label, 80)

@@ -57,8 +57,8 @@ class Scene:
 
         if not traces and self.plant.ax.get_aspect() == 1:  # no higher than it must be
             left, right, low, high = self.plant.ax.axis()
-            seen = (high - low) / (right - left)
-            height = min(height, max(LOWEST, width * seen + HEADER))
+            aspect = (high - low) / (right - left)
+            height = min(height, max(LOWEST, width * aspect + HEADER))
             self.figure.set_size_inches(width, height)
         rect = (0, 0, 1, 1 - HEADER / height)
         self.figure.set_layout_engine(ConstrainedLayoutEngine(rect=rect, wspace=0.06))

@@ -16,35 +16,23 @@ from ._single_env import GymnasiumEnv
 from ._vector_env import GymnasiumVectorEnv
 
 
+_PLAIN = """
+    balloon_lung delay_lung double_compartment double_integrator dynamic_bicycle
+    kinematic_bicycle learned_lung lorenz mass_spring_damper neural pendulum
+    permanent_magnet_motor planar_quadrotor quadrotor reacher single_compartment
+    two_tank van_der_pol
+""".split()
 # The name of a task, and whether its actions are whole numbers.
-_IDS = {
+_IDS = {f"{name.title().replace('_', '')}-v1": (name, False) for name in _PLAIN} | {
     "Acrobot-v1": ("acrobot", True),
     "AcrobotContinuous-v1": ("acrobot", False),
-    "BalloonLung-v1": ("balloon_lung", False),
     "CartPole-v1": ("cartpole", True),
     "CartPoleContinuous-v1": ("cartpole", False),
     "CartPoleLinear-v1": ("cartpole_linear", False),
     "CSTR-v1": ("cstr", False),
-    "DelayLung-v1": ("delay_lung", False),
-    "DoubleCompartment-v1": ("double_compartment", False),
-    "DoubleIntegrator-v1": ("double_integrator", False),
-    "DynamicBicycle-v1": ("dynamic_bicycle", False),
-    "KinematicBicycle-v1": ("kinematic_bicycle", False),
     "LDS-v1": ("lds", False),
-    "LearnedLung-v1": ("learned_lung", False),
-    "Lorenz-v1": ("lorenz", False),
-    "MassSpringDamper-v1": ("mass_spring_damper", False),
     "MountainCar-v0": ("mountain_car_discrete", True),
     "MountainCarContinuous-v0": ("mountain_car", False),
-    "Neural-v1": ("neural", False),
-    "Pendulum-v1": ("pendulum", False),
-    "PermanentMagnetMotor-v1": ("permanent_magnet_motor", False),
-    "PlanarQuadrotor-v1": ("planar_quadrotor", False),
-    "Quadrotor-v1": ("quadrotor", False),
-    "Reacher-v1": ("reacher", False),
-    "SingleCompartment-v1": ("single_compartment", False),
-    "TwoTank-v1": ("two_tank", False),
-    "VanDerPol-v1": ("van_der_pol", False),
 }
 
 

@@ -155,8 +155,8 @@ class GymnasiumEnv(gymnasium.Env):
 
     def __getstate__(self):
         """What a copy is made of: all but compiled functions, and views."""
-        made = "_program _shared _packed _action _outcome _observation _advance".split()
-        state = {k: v for k, v in self.__dict__.items() if k not in made}
+        views = "_program _shared _packed _action _outcome _observation _advance"
+        state = {k: v for k, v in self.__dict__.items() if k not in views.split()}
         return state | {"_picture": None}
 
     def __setstate__(self, state):
@@ -249,7 +249,7 @@ class GymnasiumEnv(gymnasium.Env):
         if self._buffer is None:
             raise ResetNeeded("GymnasiumEnv: call reset() before render().")
         if self._picture is None:
-            from ...plotting._renderer import Renderer
+            from ...plotting.renderer import Renderer
 
             self._picture = Renderer(self.environment, self.render_mode == "human")
         control = self._action

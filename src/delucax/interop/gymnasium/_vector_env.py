@@ -233,9 +233,9 @@ class GymnasiumVectorEnv(VectorEnv):
                 f"{where}: actions must be {what} of shape {shape}, got "
                 f"{actions.dtype} of shape {actions.shape}."
             )
-        if not discrete and not np.isfinite(actions).all():
-            raise InvalidAction(f"{where}: actions must be finite.")
         if not discrete:
+            if not np.isfinite(actions).all():
+                raise InvalidAction(f"{where}: actions must be finite.")
             return actions
         if not ((actions >= 0) & (actions < space.n)).all():
             raise InvalidAction(

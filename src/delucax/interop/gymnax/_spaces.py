@@ -59,20 +59,21 @@ def separates_ends() -> bool:
     return two and "rejax" not in sys.modules
 
 
+def _spaces() -> Any:
+    """The module of `Box` and `Discrete`: gymnax's own where gymnax is in use, for its
+    clients ask for the class."""
+    return sys.modules.get("gymnax.environments.spaces", sys.modules[__name__])
+
+
 def discrete_space(n: int) -> Any:
-    """A `Discrete`; gymnax's own where gymnax is in use, for its clients ask for the
-    class.
-    """
-    theirs = sys.modules.get("gymnax.environments.spaces")
-    return Discrete(n) if theirs is None else theirs.Discrete(n)
+    """The whole numbers from 0 to `n - 1`."""
+    return _spaces().Discrete(n)
 
 
 def box_space(bounds: Any, size: int, largest: float) -> Any:
-    """A `Box`, or gymnax's own; a side without a bound ends at the largest number."""
-    theirs = sys.modules.get("gymnax.environments.spaces")
+    """The vectors within bounds; a side without a bound ends at the largest number."""
     low, high = map(_number_if_one, finite_ends(bounds, size, largest))
-    box = Box if theirs is None else theirs.Box
-    return box(low, high, (size,), jnp.zeros(()).dtype)
+    return _spaces().Box(low, high, (size,), jnp.zeros(()).dtype)
 
 
 def _number_if_one(end: Any) -> Any:

@@ -235,8 +235,7 @@ class GymnaxEnv:
         """
         env = self._params(params).environment
         if self.discrete:
-            assert env.actions is not None
-            return discrete_space(len(env.actions))
+            return discrete_space(self.num_actions)
         return box_space(env.control_bounds, env.control_size, LARGEST_ACTION)
 
     def observation_space(self, params: GymnaxParams | None = None) -> Any:

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from .._figure import NEUTRAL
+from ..figures import NEUTRAL
 from ._canvas import BODY, Canvas, GOAL, LONG_DASHES, Points, SECOND
 from ._drawing import Drawing, Episode, States, Vector
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon, Rectangle
 
-from .._figure import color_of, NEUTRAL
+from ..figures import color_of, NEUTRAL
 
 
 Number: TypeAlias = float | int

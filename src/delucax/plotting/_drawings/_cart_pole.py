@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .._figure import NEUTRAL
+from ..figures import NEUTRAL
 from ._canvas import box, Canvas, SECOND, View
 from ._drawing import Drawing, Episode, Vector
 

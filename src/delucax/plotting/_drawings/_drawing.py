@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -60,6 +60,13 @@ class Episode:
         x, _ = targets
         zero = np.zeros(self.environment.state_size)
         return zero if x is None else np.asarray(x, float)
+
+    def visited(self, columns: Sequence[int]) -> Float[np.ndarray, "_ columns"]:
+        """Some entries of the states, and last of the target, if there is one."""
+        states = self.states
+        if self.target is not None:
+            states = np.concatenate([states, self.target[None]])
+        return states[:, list(columns)]
 
     @functools.cached_property
     def largest_controls(self) -> Vector:

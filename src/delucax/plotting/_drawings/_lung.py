@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .._figure import NEUTRAL
+from ..figures import NEUTRAL
 from ._canvas import ACTION, BODY, Canvas, GOAL, SECOND, SHORT_DASHES
 from ._drawing import Drawing, Episode, Vector
 

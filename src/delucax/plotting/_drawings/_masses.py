@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from .._figure import NEUTRAL
+from ..figures import NEUTRAL
 from ._canvas import box, Canvas, DARK, GOAL, Points, View
 from ._drawing import Drawing, Episode, Vector
 

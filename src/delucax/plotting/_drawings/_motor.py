@@ -5,7 +5,7 @@ import math
 import numpy as np
 from matplotlib.patches import Wedge
 
-from .._figure import color_of, NEUTRAL
+from ..figures import color_of, NEUTRAL
 from ._canvas import BODY, Canvas, FULL_TURN, GOAL, SECOND
 from ._drawing import Drawing, Episode, Vector
 
@@ -31,10 +31,7 @@ def motor(canvas: Canvas, episode: Episode) -> Drawing:
         style = {"size": 12, "ha": "center", "va": "center", "color": "0.25"}
         ax.text(0.88 * x, 0.88 * y, name, **style)
     largest = float(np.linalg.norm(states[:, :2], axis=1).max(initial=0.0)) or 1.0
-    speeds = np.abs(states[:, 2])
-    if target is not None:
-        speeds = np.append(speeds, abs(target[2]))
-    fastest = float(speeds.max()) or 1.0
+    fastest = float(np.abs(episode.visited((2,))).max()) or 1.0
     if target is not None:
         angle = math.pi / 2 + FULL_TURN * float(target[2]) / fastest
         ray = np.array([math.cos(angle), math.sin(angle)])

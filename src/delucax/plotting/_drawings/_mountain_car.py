@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from .._figure import NEUTRAL
+from ..figures import NEUTRAL
 from ._canvas import box, Canvas, GOAL, rotation, SECOND
 from ._drawing import Drawing, Episode, Vector
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...systems import PlanarQuadrotor
-from .._figure import NEUTRAL
+from ..figures import NEUTRAL
 from ._canvas import box, Canvas, DARK, rotation, SECOND, View
 from ._drawing import Drawing, Episode, Vector
 
@@ -14,9 +14,7 @@ def planar_quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
     """A body with a rotor at each end and its thrust above it, the goal, and the wind
     where there is one."""
     system, target = episode.system, episode.target
-    visited = episode.states[:, :2]
-    if target is not None:
-        visited = np.concatenate([visited, target[None, :2]])
+    visited = episode.visited((0, 1))
     length = float(system.length)
     low, high = visited.min(axis=0), visited.max(axis=0)
     half = 0.5 * float(np.max(high - low)) + 2 * length

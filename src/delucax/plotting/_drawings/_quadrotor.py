@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.collections import LineCollection
 
-from .._figure import color_of, NEUTRAL
+from ..figures import color_of, NEUTRAL
 from ._canvas import BODY, Canvas, SECOND, View
 from ._drawing import Drawing, Episode, Vector
 
@@ -45,9 +45,7 @@ def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
     """Two crossed arms with four rotors, the front one in amber; their thrusts, or the
     thrust of all; a floor with a grid and the shadow on it, and the goal above it."""
     system, target = episode.system, episode.target
-    visited = episode.states[:, :3]
-    if target is not None:
-        visited = np.concatenate([visited, target[None, :3]])
+    visited = episode.visited((0, 1, 2))
     length = float(system.arm)
     low, high = visited.min(axis=0), visited.max(axis=0)
     middle = target[:3] if target is not None else visited[0]

@@ -1,7 +1,6 @@
 """Which drawing belongs to which plant."""
 
 import functools
-import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -112,7 +111,7 @@ def register_drawing(
         ```
     """
     kinds = (AbstractSystem, AbstractDynamics)
-    if not (inspect.isclass(system_class) and issubclass(system_class, kinds)):
+    if not (isinstance(system_class, type) and issubclass(system_class, kinds)):
         raise ValueError(
             "register_drawing: system_class must be a subclass of AbstractSystem or "
             f"AbstractDynamics, got {system_class!r}."

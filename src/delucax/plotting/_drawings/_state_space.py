@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...systems import AbstractSystem
-from .._figure import NEUTRAL, style_axes, with_unit, wrapped
+from ..figures import NEUTRAL, style_axes, with_unit, wrapped
 from ._canvas import ACTION, BODY, Canvas, GOAL, View
 from ._drawing import Drawing, Episode, Vector
 
@@ -39,9 +39,8 @@ def plane(
     names = [wrapped(with_unit(dynamics.state_names[c], units[c]), 40) for c in columns]
     ax.set_xlabel(names[0], size=SIZE)
     ax.set_ylabel(names[1], size=SIZE)
-    points = episode.states[:, columns]
+    points = episode.visited(columns)
     if target is not None:
-        points = np.concatenate([points, target[None, columns]])
         ax.plot(*target[list(columns)], "o", ms=13, mfc="none", mec=GOAL, mew=2)
     low, high = points.min(axis=0), points.max(axis=0)
     margin = np.where(high > low, 0.09 * (high - low), 1.0)

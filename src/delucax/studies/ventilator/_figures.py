@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from ... import lung
 from ...environments import Environment
 from ...plotting import animate
-from ...plotting._figure import color_of, NEUTRAL, NotebookFigure, style_axes
+from ...plotting.figures import color_of, NEUTRAL, NotebookFigure, style_axes
 from ._report import mean_error, PID_ROWS
 from ._settings import SHOWN
 

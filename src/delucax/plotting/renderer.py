@@ -21,9 +21,11 @@ class Renderer:
     """Draws the plant of an environment, state by state; in a `window` too if asked."""
 
     def __init__(self, environment: Environment, window: bool = False):
+        self.pyplot: Any = None
         if window:
             import matplotlib.pyplot as plt
 
+            self.pyplot = plt
             self.figure = plt.figure(figsize=_INCHES, dpi=_DPI, layout="constrained")
             manager: Any = self.figure.canvas.manager
             if type(manager).show is FigureManagerBase.show:
@@ -36,7 +38,6 @@ class Renderer:
         else:
             self.figure = Figure(_INCHES, _DPI, layout="constrained")
             FigureCanvasAgg(self.figure)
-        self.window = window
         # A run that says how far things move.
         idle, key = Zero(environment.control_size), jax.random.key(0)
         trajectory = rollout(environment, idle, key=key, throw=False)
@@ -50,15 +51,11 @@ class Renderer:
         self.plant.draw(np.asarray(x, float), np.asarray(u, float))
         canvas: Any = self.figure.canvas
         canvas.draw()
-        if self.window:
-            import matplotlib.pyplot as plt
-
-            plt.pause(1e-3)  # shows it, where there is a screen
+        if self.pyplot is not None:
+            self.pyplot.pause(1e-3)  # shows it, where there is a screen
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        if self.window:
-            import matplotlib.pyplot as plt
-
-            plt.close(self.figure)
+        if self.pyplot is not None:
+            self.pyplot.close(self.figure)

@@ -1,16 +1,90 @@
-"""Linear models as `control.StateSpace`, and back."""
+"""Linear models out of files and of python-control, and back."""
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._check import is_concrete
+from .._check import as_path, is_concrete
 from .._extras import extra
 from .._module import indexed_names
 from ..dynamics import LinearDynamics
 from ..systems import LinearSystem
-from ._linear_model import check_no_feed_through, linear_model
+
+
+def read_linear(
+    path: str | os.PathLike, *, dt: Any = None
+) -> LinearSystem | LinearDynamics:
+    """A linear model from a file of its matrices, `.npz` of NumPy or `.mat` of MATLAB.
+
+    The file holds `A` and `B`, and may hold `C`, `E` (how disturbances enter), `D` if
+    it is zero, and the step `dt`.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `dt`: the step, 0 for continuous time; by default the one that the file holds.
+
+    **Returns:** [`delucax.LinearDynamics`][] with a step, and
+    [`delucax.systems.LinearSystem`][] in continuous time.
+
+    **Raises:** `ValueError` if the file is of another kind, lacks `A`, `B` or a step,
+    has one that differs from `dt`, has a `D` that is not zero, or if shapes do not fit;
+    `OSError` if it cannot be read.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import numpy as np
+
+        np.savez("plant.npz", A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [1.0]], dt=0.1)
+        env = dlx.make("lds", system=dlx.interop.read_linear("plant.npz"))
+        ```
+    """
+    where = "read_linear"
+    held = _matrices(as_path(path, "path", where), where)
+    if not {"A", "B"} <= held.keys():
+        raise ValueError(
+            f"{where}: '{path}' must hold A and B, got {', '.join(held) or 'none'}."
+        )
+    _check_no_feed_through(held.get("D", np.zeros(())), where)
+    if dt is None and "dt" not in held:
+        raise ValueError(
+            f"{where}: '{path}' holds no dt; give it: 0 for continuous time, or the "
+            "step."
+        )
+    step = float(np.reshape(held.get("dt", dt), ()))
+    if dt is not None and float(dt) != step:
+        raise ValueError(
+            f"{where}: dt must be that of '{path}', {step}, or left out, got {dt}."
+        )
+    return _linear_model(held["A"], held["B"], held.get("C"), held.get("E"), step)
+
+
+def _matrices(path: Path, where: str) -> dict[str, Any]:
+    """The matrices in a file, by name."""
+    names = ("A", "B", "C", "D", "E", "dt")
+    if path.suffix in (".npz", ".mat") and not path.is_file():
+        raise FileNotFoundError(f"{where}: path must be a file, got '{path}'.")
+    if path.suffix == ".npz":
+        with np.load(path, allow_pickle=False) as archive:
+            file = {name: archive[name] for name in names if name in archive}
+    elif path.suffix == ".mat":
+        from scipy.io import loadmat
+
+        try:
+            file = loadmat(path, variable_names=names)
+        except NotImplementedError as error:
+            raise ValueError(
+                f"{where}: '{path}' is a .mat file of version 7.3; save it with "
+                "'-v7' in MATLAB."
+            ) from error
+    else:
+        raise ValueError(f"{where}: path must end in .npz or .mat, got '{path}'.")
+    return {name: np.asarray(file[name], float) for name in names if name in file}
 
 
 def to_control(
@@ -129,7 +203,7 @@ def from_control(
             f"{where}: system must be a control.StateSpace (`control.ss` makes one of "
             f"a transfer function), got {type(system).__name__}."
         )
-    check_no_feed_through(system.D, where)
+    _check_no_feed_through(system.D, where)
     if system.dt is None:
         raise ValueError(
             f"{where}: system must say its time base: dt=0 for continuous time, or its "
@@ -146,7 +220,7 @@ def from_control(
     rest = [i for i in range(len(labels)) if i not in chosen]
     n = system.nstates
     identity = system.C.shape == (n, n) and np.array_equal(system.C, np.eye(n))
-    return linear_model(
+    return _linear_model(
         system.A,
         system.B[:, rest],
         None if identity else system.C,
@@ -166,3 +240,21 @@ def _index(disturbance: Any, labels: list[str], where: str) -> int:
         f"{where}: disturbances must be among the inputs {labels}, by name or index, "
         f"got {disturbance!r}."
     )
+
+
+def _check_no_feed_through(D: Any, where: str) -> None:
+    """Raise if `D` is not zero."""
+    if np.any(D):
+        raise ValueError(
+            f"{where}: D must be zero, as the models here have no feed-through, got "
+            f"{D.tolist()}."
+        )
+
+
+def _linear_model(
+    A: Any, B: Any, C: Any, E: Any, dt: float, **names: Any
+) -> LinearSystem | LinearDynamics:
+    """A system if the step is 0, which says continuous time; else dynamics."""
+    if dt == 0:
+        return LinearSystem(A, B, C, E, **names)
+    return LinearDynamics(A, B, C, E, dt=dt, **names)
