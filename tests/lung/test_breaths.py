@@ -89,6 +89,17 @@ def test_file_comes_back(breaths, lines, tmp_path):
     assert_close(half.u_in[:, 1::2], again.u_in[:, :28], atol=1e-4)
 
 
+def test_lungs_of_other_values(lines, tmp_path):
+    path = tmp_path / "train.csv"
+    header, *rows = lines
+    path.write_text("\n".join([header, *(r.replace(",5,20,", ",7,30,") for r in rows)]))
+    again = lung.read_breaths(path, resistances=(7.0,), compliances=(30.0, 40.0))
+    assert_close(again.resistance, 7.0)
+    assert_close(again.compliance, 30.0)
+    with user_error(match="column C: must be one of 10, 20, 50, got 30"):
+        lung.read_breaths(path, resistances=(7.0,))
+
+
 def test_quoted_numbers_and_blank_lines(lines, tmp_path):
     path, plain = tmp_path / "quoted.csv", tmp_path / "plain.csv"
     plain.write_text("\n".join(lines))

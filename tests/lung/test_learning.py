@@ -125,6 +125,16 @@ def test_an_alarm_costs_more_than_an_error():
     assert_close(lower(0.5, jnp.array([0.0, 0.0, 44.0]), u), 24.0)
 
 
+def test_expiration_counts_if_it_is_told_to():
+    x, u = jnp.array([0.0, 0.0, 9.0]), jnp.zeros(2)  # 4 above PEEP
+    assert_close(lung.BreathCost(lung.BreathWaveform(), 2)(2.0, x, u), 0.0)
+    assert_close(lung.BreathCost(lung.BreathWaveform(), 2, 0.25)(2.0, x, u), 1.0)
+    env = dlx.make("lung/single_compartment", expiration=0.5)
+    assert_close(env.cost.expiration, 0.5)
+    with user_error(match="expiration must be at least 0, got -1"):
+        dlx.make("lung/single_compartment", expiration=-1.0)
+
+
 def test_stacks_come_apart():
     lungs = [lung.SingleCompartment(R) for R in (5.0, 20.0)]
     both = lung.stack(lungs)

@@ -120,3 +120,28 @@ def test_every_breath_begins_alike():
     run = dlx.rollout(ENV, held, key=KEY, horizon=100)
     times = np.arange(50, 100) * 0.03
     assert_close(run.controls[50:, 0], 5 * (1 - np.exp(5 * (1.5 - times))), atol=1e-3)
+
+
+class Counting(dlx.AbstractController):
+    """Counts the steps, and what was applied of its controls."""
+
+    def init(self, *, key=None):
+        return jnp.zeros(2)
+
+    def __call__(self, t, y, state):
+        return jnp.reshape(0.1 * state[0], (1,)), state.at[0].add(1)
+
+    def applied(self, u, cost, state):
+        return state.at[1].add(u[0])
+
+
+def test_another_controller_of_the_expiratory_valve():
+    pid = dlx.controllers.LeakyPID(0.5, 3.0, dt=ENV.dt, reference=WAVEFORM)
+    whole = lung.Breathing(pid, WAVEFORM, valve=Counting())
+    run = dlx.rollout(ENV, whole, key=KEY, horizon=6)
+    assert_close(run.controls[:, 1], 0.1 * np.arange(6), rtol=1e-6)
+    assert_close(run.controller_state.valve, [6.0, 1.5], rtol=1e-6)
+    own = dlx.rollout(ENV, breathing(0.5), key=KEY, horizon=1)
+    assert_close(run.controls[0, 0], own.controls[0, 0])
+    with user_error(match="valve must be an AbstractController"):
+        lung.Breathing(pid, WAVEFORM, valve=1.0)

@@ -151,6 +151,19 @@ def test_a_baseline_lowers_the_variance():
     assert np.all(scored.var(0) < 0.5 * plain.var(0))
 
 
+def test_the_scored_episode_is_that_of_a_rollout():
+    env, policy, key = environment(), Recalling(), jr.key(7)
+    cost, metrics = scored_cost(env)(policy, key)
+    keep = ("observations", "controls")
+    run = dlx.rollout(env, policy, key=key, horizon=HORIZON, keep=keep)
+    assert cost == run.total_cost
+    state, score = policy.init(), 0.0
+    for y, u in zip(run.observations, run.controls, strict=True):
+        score += policy.log_prob(0.0, y, state, u)
+        state = policy._mean(y, state[0])[1], None
+    assert_close(metrics["log_prob"], score)
+
+
 @thorough
 def test_saturated_controls_are_scored_as_drawn():
     # The bounds cut most draws. The gradient through the clip is unbiased too.

@@ -162,6 +162,29 @@ def test_linear_models():
     assert closed.identifiable.tolist() == [False, True, True]
 
 
+def test_level_of_the_intervals():
+    plant = dlx.LinearDynamics(A, B)
+    controls = jr.normal(jr.key(0), (60, 1))
+    w = 0.1 * jr.normal(jr.key(1), (60, 2))
+    states = dlx.open_loop(plant, jnp.zeros(2), controls, w)
+    back = dict(outputs_back=1, controls_back=1)
+    pendulum, torques, _ = recorded()
+    fits = (
+        lambda level: sysid.linear(states, controls, level=level),
+        lambda level: sysid.arx(states, controls, **back, level=level),
+        lambda level: sysid.physical(
+            GUESS, pendulum[:41], torques[:40], "system.length", level=level
+        ),
+    )
+    for fitted in fits:
+        half, most = fitted(0.5), fitted(0.95)
+        ratio = (half.high - half.low) / (most.high - most.low)
+        # The quantiles of a normal distribution; positive values have skewed ends.
+        assert_close(ratio, np.full(ratio.shape, 0.67449 / 1.95996), rtol=1e-3)
+        with user_error(match="level must be between 0 and 1, got 1.5"):
+            fitted(1.5)
+
+
 @thorough
 def test_arx_is_the_dynamics_that_it_came_from():
     true = dlx.LinearDynamics(A, B)
@@ -193,6 +216,21 @@ def test_neural_fits_predict():
     # The data's own system leaves nothing but noise.
     own = dlx.Discretized(dlx.systems.Pendulum(**TRUE), dt=0.05)
     assert float(loss(own, data, jr.key(0))) < 1e-4
+
+
+def test_neural_options():
+    states, controls = jnp.arange(22.0).reshape(11, 2), jnp.zeros((10, 1))
+    times, some, inputs = sysid.windows(states, controls, 3, dt=0.5, stride=4)
+    assert_close(times, [0.0, 2.0])
+    assert_close(some, jnp.stack([states[:4], states[4:8]]))
+    assert inputs.shape == (2, 3, 1)
+    with user_error(match="stride must be a whole number of at least 1"):
+        sysid.windows(states, controls, 3, stride=0)
+    net = sysid.NeuralDynamics(2, 1, 8, 1, activation=jax.nn.relu, key=jr.key(0))
+    hidden, last = net.network.layers
+    z = jnp.array([1.0, -2.0, 0.5])
+    step = last(jax.nn.relu(hidden(z)))
+    assert_close(net(0.0, z[:2], z[2:]), z[:2] + step)
 
 
 class Reactor(dlx.AbstractSystem):

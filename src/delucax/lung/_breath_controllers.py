@@ -19,18 +19,18 @@ from ._waveform import BreathWaveform, check_waveform
 
 class _Phases(NamedTuple):
     inner: PyTree
+    valve: PyTree
     inhaling: Array
 
 
 class Breathing(AbstractController):
     r"""A controller of the inspiratory valve, made one of whole breaths.
 
-    In the inspiratory phase `u = (clip(inspiratory(y), 0, 100), 0)`. In the expiratory
-    phase the expiratory valve is open and the inspiratory valve closed; or, with a
-    `hold`, once half a period has gone by it is opened to `hold (1 - exp(-5 s))`, `s`
-    being the time since, which keeps the airway open against a leak. The inspiratory
-    controller begins each breath as it began the first one, and observes none of the
-    expiratory phase.
+    In the inspiratory phase `u = (clip(inspiratory(y), 0, 100), valve(y))`. In the
+    expiratory phase the inspiratory valve is closed; or, with a `hold`, once half a
+    period has gone by it is opened to `hold (1 - exp(-5 s))`, `s` being the time since,
+    which keeps the airway open against a leak. The inspiratory controller begins each
+    breath as it began the first one, and observes none of the expiratory phase.
 
     **Arguments:**
 
@@ -38,6 +38,8 @@ class Breathing(AbstractController):
         [`delucax.controllers.PID`][] whose reference is the waveform.
     - `waveform`: a [`delucax.lung.BreathWaveform`][].
     - `hold`: [%], 0 by default; that of the original is 5.
+    - `valve`: a controller of the expiratory valve; by default it is 0 in the
+        inspiratory phase and 1 in the expiratory phase.
 
     **Raises:** `ValueError` if what is given is no controller, or no waveform.
 
@@ -62,13 +64,20 @@ class Breathing(AbstractController):
     inspiratory: AbstractController
     waveform: BreathWaveform
     hold: Array = parameter(0.0)
+    valve: AbstractController | None = None
 
     def __check_init__(self):
         check_waveform(self.waveform, "Breathing")
         check_controller(self.inspiratory, "inspiratory", "Breathing")
+        if self.valve is not None:
+            check_controller(self.valve, "valve", "Breathing")
 
     def init(self, *, key=None):
-        return _Phases(self.inspiratory.init(key=key), jnp.zeros((), bool))
+        valve, valve_key = None, None
+        if self.valve is not None:
+            key, valve_key = (None, None) if key is None else jr.split(key)
+            valve = self.valve.init(key=valve_key)
+        return _Phases(self.inspiratory.init(key=key), valve, jnp.zeros((), bool))
 
     def __call__(self, t, y, state):
         inhale = self.waveform.is_inspiration(t)
@@ -78,12 +87,18 @@ class Breathing(AbstractController):
         late = jnp.maximum(self.waveform.share(t) - 0.5, 0) * self.waveform.period
         held = self.hold * (1 - jnp.exp(-5 * late))
         u_in = jnp.where(inhale, clip(u_in[0], 0, 100), held)
-        u = jnp.stack([u_in, jnp.where(inhale, 0.0, 1.0)]).astype(y.dtype)
-        return u, _Phases(_where(inhale, after, inner), inhale)
+        u_out, valve = jnp.where(inhale, 0.0, 1.0), None
+        if self.valve is not None:
+            (u_out,), valve = self.valve(t, y, state.valve)
+        u = jnp.stack([u_in, u_out]).astype(y.dtype)
+        return u, _Phases(_where(inhale, after, inner), valve, inhale)
 
     def applied(self, u, cost, state):
         inner = self.inspiratory.applied(u[:1], cost, state.inner)
-        return state._replace(inner=_where(state.inhaling, inner, state.inner))
+        state = state._replace(inner=_where(state.inhaling, inner, state.inner))
+        if self.valve is None:
+            return state
+        return state._replace(valve=self.valve.applied(u[1:], cost, state.valve))
 
 
 def _where(condition: Array, yes: PyTree, no: PyTree) -> PyTree:

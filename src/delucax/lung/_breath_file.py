@@ -5,7 +5,7 @@ import csv
 import itertools
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,8 @@ from ._waveform import LENGTH
 
 
 COLUMNS = ("id", "breath_id", "R", "C", "time_step", "u_in", "u_out", "pressure")
-ALLOWED = dict(R=(5.0, 20.0, 50.0), C=(10.0, 20.0, 50.0), u_out=(0.0, 1.0))
-"""The values that a column may hold."""
+RESISTANCES = (5.0, 20.0, 50.0)
+COMPLIANCES = (10.0, 20.0, 50.0)
 _WHERE = "read_breaths"
 
 
@@ -33,6 +33,8 @@ def read_breaths(
     *,
     length: int = LENGTH,
     dt: Any = None,
+    resistances: Sequence[float] = RESISTANCES,
+    compliances: Sequence[float] = COMPLIANCES,
 ) -> Breaths:
     """The inspirations of a file with the columns of the "Ventilator Pressure
     Prediction" data set.
@@ -50,6 +52,8 @@ def read_breaths(
     - `path`: the file.
     - `length`: samples an inspiration, 29 by default.
     - `dt`: the time between samples [s]; the median of the file's by default.
+    - `resistances`, `compliances`: the values that `R` and `C` may have; 5, 20, 50 and
+        10, 20, 50 by default.
 
     **Returns:** a [`delucax.lung.Breaths`][], with the resistance and compliance of
         each.
@@ -57,8 +61,8 @@ def read_breaths(
     **Raises:** `ValueError` that names the column and the row, which is the line of the
         file as an editor counts it (the header is in row 1, and blank lines count),
         where a column is missing, a value is not a finite number, `u_in` is out of its
-        bounds, `R` is not 5, 20 or 50, `C` not 10, 20 or 50 or `u_out` not 0 or 1, `R`
-        or `C` changes within a breath, time does not go on, or a breath is too short;
+        bounds, `R`, `C` or `u_out` is none of the values that it may have, `R` or `C`
+        changes within a breath, time does not go on, or a breath is too short;
         `OSError` if the file cannot be read.
 
     Source: Google Brain, 2021 (the data set); Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu,
@@ -86,7 +90,8 @@ def read_breaths(
     if dt is not None:
         check_positive(dt, "dt", _WHERE)
     table = _table(path)
-    starts, ends = _breaths(path, table)
+    allowed = dict(R=resistances, C=compliances, u_out=(0.0, 1.0))
+    starts, ends = _breaths(path, table, allowed)
     time = table["time_step"]
     if dt is None:
         steps = np.diff(time)
@@ -121,8 +126,13 @@ def _wrong(path: Path, line: Any, column: str, words: str) -> ValueError:
     return ValueError(f"{_WHERE}: '{path}' row {line}, column {column}: {words}.")
 
 
-def _breaths(path: Path, table: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Where each breath begins and ends, if each is one breath of one lung."""
+def _breaths(
+    path: Path, table: dict[str, np.ndarray], allowed: dict[str, Sequence[float]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where each breath begins and ends, if each is one breath of one lung.
+
+    `allowed` holds the values that a column may have.
+    """
     number, u_in = table["breath_id"], table["u_in"]
     begins = np.diff(number, prepend=np.nan) != 0
     starts = np.flatnonzero(begins)
@@ -136,8 +146,12 @@ def _breaths(path: Path, table: dict[str, np.ndarray]) -> tuple[np.ndarray, np.n
         "must be the same for all of breath {breath:g}, got {now:g} after {last:g}"
     )
     checks = [
-        (name, ~np.isin(table[name], values), f"{one_of(values)}, got {{now:g}}")
-        for name, values in ALLOWED.items()
+        (
+            name,
+            ~np.isin(table[name], np.asarray(values, float)),
+            f"{one_of(values)}, got {{now:g}}",
+        )
+        for name, values in allowed.items()
     ]
     checks += [
         ("u_in", (u_in < 0) | (u_in > 100), "must be between 0 and 100, got {now:g}"),
@@ -294,7 +308,7 @@ def write_example(
         ```
     """
     check_key(key, "write_example")
-    lungs = list(itertools.product(ALLOWED["R"], ALLOWED["C"]))
+    lungs = list(itertools.product(RESISTANCES, COMPLIANCES))
     parts = [
         explore(
             double_compartment(resistance=R, compliance=C),

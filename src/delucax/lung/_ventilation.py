@@ -95,15 +95,17 @@ class PressureSensor(AbstractWrapper):
 
 
 class BreathCost(AbstractCost):
-    r"""How far the pressure is from the target, `|p - r(t)|`, in inspiration.
+    r"""How far the pressure is from the target, `weight |p - r(t)|`.
 
-    With a limit each cmH2O above it costs ten more, in expiration too, as an alarm is
-    worse than an error. Not smooth on the target, and at the limit.
+    The weight is 1 in the inspiratory phase and `expiration` in the other. With a limit
+    each cmH2O above it costs ten more, as an alarm is worse than an error. Not smooth
+    on the target, and at the limit.
 
     **Arguments:**
 
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `index`: the place of the pressure in the state.
+    - `expiration`: 0 by default.
     - `limit`: a pressure [cmH2O]; none by default.
 
     **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`, or the limit is
@@ -122,6 +124,7 @@ class BreathCost(AbstractCost):
 
     waveform: BreathWaveform
     index: int = eqx.field(static=True)
+    expiration: Array = parameter(0.0)
     limit: Array | None = parameter(None)
 
     def __check_init__(self):
@@ -132,7 +135,8 @@ class BreathCost(AbstractCost):
     def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
         pressure = x[self.index]
         error = jnp.abs(pressure - self.waveform.pressure(t))
-        cost = self.waveform.is_inspiration(t) * error
+        weight = jnp.where(self.waveform.is_inspiration(t), 1, self.expiration)
+        cost = weight * error
         if self.limit is not None:
             cost = cost + 10 * jnp.maximum(pressure - self.limit, 0)
         return cost.astype(x.dtype)
@@ -147,6 +151,7 @@ def ventilated(
     *,
     sensor_delay: int = 0,
     noise: Any = 0.0,
+    expiration: Any = 0.0,
     limit: Any = None,
     horizon: int = 100,
     **environment: Any,
@@ -156,6 +161,7 @@ def ventilated(
     `task` is the function that a user called, which errors name.
     """
     check_range(noise, "noise", "ventilation")
+    check_range(expiration, "expiration", "ventilation")
     delay = check_count(sensor_delay, "sensor_delay", "ventilation", least=0)
     waveform = BreathWaveform() if waveform is None else waveform
     rest = jnp.zeros(dynamics.state_size) if rest is None else rest
@@ -168,7 +174,7 @@ def ventilated(
     check_keywords(environment, task.__name__, task, ventilated, Environment)
     fields: dict[str, Any] = dict(
         dynamics=sensed,
-        cost=BreathCost(waveform, dynamics.state_size, limit),
+        cost=BreathCost(waveform, dynamics.state_size, expiration, limit),
         sensor_noise=None if silent else Gaussian(noise, size=1),
         initial_state=initial_state,
         control_bounds=(jnp.zeros(2), jnp.array([100.0, 1.0])),
@@ -200,7 +206,7 @@ def ventilation(
     - `rest`: the first state of the dynamics; zero by default.
     - `sensor_delay`: steps until a pressure is observed, 0 by default.
     - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
-    - `limit`: of the cost; none by default.
+    - `expiration`, `limit`: of the cost; 0 and none by default.
     - `horizon`: steps an episode, 100 by default.
     - `**options`: of the above, and other arguments of [`delucax.Environment`][], which
         hold instead.

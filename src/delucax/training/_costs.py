@@ -160,9 +160,9 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
     """The loss of a controller that draws: one episode's cost, and its log-probability.
 
     `loss(controller, key) = (J, {"log_prob": sum_k log p(u_k | t_k, y_k, s_k)})`, with
-    the observations and the drawn controls held fixed in the log-probability. It is
-    what [`delucax.training.LikelihoodRatio`][] asks for; the other estimators take it
-    too.
+    the observations and the drawn controls held fixed in the log-probability. The
+    episode is that of `delucax.rollout(environment, controller, key=key)`. It is what
+    [`delucax.training.LikelihoodRatio`][] asks for; the other estimators take it too.
 
     **Arguments:**
 

@@ -8,7 +8,7 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float
 
-from ..._check import is_concrete
+from ..._check import check_range, is_concrete
 from ..._module import as_float_array
 from ..._results import choose, first_failure, promote, Result, RESULTS
 
@@ -37,9 +37,9 @@ class Identified(eqx.Module):
     - `estimate`: their values, shape `(p,)`; in a linear fit `(outputs, p)`.
     - `std`: their standard deviations, of the same shape; infinite for what is not
         identifiable, NaN where the fit did not converge.
-    - `low`, `high`: the ends of their 95% confidence intervals, of the same shape;
-        those of all legal values, such as 0 and infinity, for what is not identifiable;
-        NaN where the fit did not converge.
+    - `low`, `high`: the ends of their confidence intervals, of the same shape; those of
+        all legal values, such as 0 and infinity, for what is not identifiable; NaN
+        where the fit did not converge.
     - `directions`: shape `(p, p)`, a unit vector in each row, least known first.
     - `spread`: the standard deviation along each, shape `(p,)`; NaN where the fit did
         not converge.
@@ -192,6 +192,7 @@ class Certainty(eqx.Module):
         )
 
 
-def reach() -> Array:
-    """How many standard deviations a 95% confidence interval reaches to either side."""
-    return ndtri((1 + as_float_array(0.95)) / 2)
+def quantile(level: Any, where: str) -> Array:
+    """How many standard deviations a confidence interval reaches to either side."""
+    check_range(level, "level", where, 0, 1)
+    return ndtri((1 + as_float_array(level)) / 2)

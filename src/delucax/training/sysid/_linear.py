@@ -14,7 +14,7 @@ from ..._message import shortened
 from ..._module import as_float_array
 from ..._results import RESULTS
 from ...dynamics import LinearDynamics
-from ._identified import Certainty, checked, Identified, reach
+from ._identified import Certainty, checked, Identified, quantile
 
 
 def linear(
@@ -23,6 +23,7 @@ def linear(
     *,
     dt: Any = 1.0,
     affine: bool = False,
+    level: Any = 0.95,
     throw: bool = True,
 ) -> Identified:
     r"""Linear dynamics by least squares on the steps of a recorded run,
@@ -38,6 +39,7 @@ def linear(
     - `controls`: shape `(T, m)`, or `(runs, T, m)`.
     - `dt`: the step, 1 by default.
     - `affine`: whether to estimate a constant c too; false by default.
+    - `level`: of the confidence intervals, 0.95 by default.
     - `throw`: raise if the data do not tell all entries (default); if false, look at
         `result`.
 
@@ -65,6 +67,7 @@ def linear(
     states, controls = runs_of(states, controls, "states", where)
     check_step(dt, where)
     affine = check_bool(affine, "affine", where)
+    reach = quantile(level, where)
     n, m = states.shape[2], controls.shape[2]
     names = [f"x{i}" for i in range(n)] + [f"u{i}" for i in range(m)]
     regressors = [states[:, :-1], controls]
@@ -76,7 +79,7 @@ def linear(
         A, B = estimate[:, :n], estimate[:, n : n + m]
         return LinearDynamics(A, B, dt=dt, x_next=estimate[:, -1] if affine else None)
 
-    return _fitted(model_of, names, regressors, states[:, 1:], throw)
+    return _fitted(model_of, names, regressors, states[:, 1:], reach, throw)
 
 
 def arx(
@@ -87,6 +90,7 @@ def arx(
     controls_back: int,
     delay: int = 1,
     dt: Any = 1.0,
+    level: Any = 0.95,
     throw: bool = True,
 ) -> Identified:
     r"""An autoregressive model with inputs (ARX) by least squares,
@@ -105,6 +109,7 @@ def arx(
     - `controls_back`: b, the controls looked back on.
     - `delay`: steps from a control to its first effect, 1 by default.
     - `dt`: the step, 1 by default.
+    - `level`: of the confidence intervals, 0.95 by default.
     - `throw`: raise if the data do not tell all entries (default); if false, look at
         `result`.
 
@@ -137,6 +142,7 @@ def arx(
     b = check_count(controls_back, "controls_back", where)
     delay = check_count(delay, "delay", where)
     check_step(dt, where)
+    reach = quantile(level, where)
     p, m, steps = outputs.shape[2], controls.shape[2], controls.shape[1]
     first = max(a, b + delay - 1)
     if steps < first:
@@ -151,7 +157,7 @@ def arx(
     names = [f"y{i}(k-{lag})" for lag in range(1, a + 1) for i in range(p)]
     names += [f"u{i}(k-{lag})" for lag in lags for i in range(m)]
     model_of = lambda estimate: _realised(estimate, p, m, a, b, delay, dt)
-    return _fitted(model_of, names, back, outputs[:, first:], throw)
+    return _fitted(model_of, names, back, outputs[:, first:], reach, throw)
 
 
 def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, Array]:
@@ -213,13 +219,14 @@ def _fitted(
     names: list[str],
     regressors: list[Array],
     targets: Float[Array, "runs steps outputs"],
+    reach: Array,
     throw: bool,
 ) -> Identified:
     """The linear model of `targets` by `regressors`, each with a row a step."""
     rows = jnp.concatenate(regressors, axis=2).reshape(-1, len(names))
     targets = targets.reshape(-1, targets.shape[2])
     estimate, std, noise, certainty = _least_squares(rows, targets)
-    interval = reach() * std
+    interval = reach * std
     fit = Identified(
         model=model_of(estimate),
         names=tuple(names),

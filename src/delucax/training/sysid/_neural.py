@@ -1,6 +1,6 @@
 """Neural models, fitted to one step or to several."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -37,11 +37,12 @@ class NeuralDynamics(AbstractDynamics):
 
     - `states`, `controls`: their names, or how many there are.
     - `width`: units in a hidden layer, 64 by default.
-    - `depth`: hidden layers, 2 by default; they are tanh.
+    - `depth`: hidden layers, 2 by default.
     - `dt`: the step, 1 by default.
     - `x_mean`, `x_scale`: shape `(n,)` or a number; 0 and 1 by default.
     - `u_scale`: shape `(m,)` or a number; 1 by default.
     - `step_scale`: the size of a step, shape `(n,)` or a number; 1 by default.
+    - `activation`: of the hidden layers, `jnp.tanh` by default.
     - `key`: a random key, for the first weights.
 
     **Attributes:** `network`, an `eqx.nn.MLP`, trainable.
@@ -83,6 +84,7 @@ class NeuralDynamics(AbstractDynamics):
         x_scale: Any = 1.0,
         u_scale: Any = 1.0,
         step_scale: Any = 1.0,
+        activation: Callable[[Array], Array] = jnp.tanh,
         key: PRNGKey,
     ):
         where = "NeuralDynamics"
@@ -95,7 +97,7 @@ class NeuralDynamics(AbstractDynamics):
             n,
             check_count(width, "width", where),
             check_count(depth, "depth", where, least=0),
-            as_module(jnp.tanh),
+            as_module(activation),
             as_module(jax.nn.identity),
             key=key,
         )
@@ -130,7 +132,7 @@ class NeuralDynamics(AbstractDynamics):
 
 
 def windows(
-    states: Any, controls: Any, steps: int, *, dt: Any = 1.0
+    states: Any, controls: Any, steps: int, *, dt: Any = 1.0, stride: int = 1
 ) -> tuple[Array, Array, Array]:
     """Stretches of recorded runs: the data of a multi-step fit.
 
@@ -140,6 +142,7 @@ def windows(
     - `controls`: shape `(T, m)`, or `(runs, T, m)`.
     - `steps`: of a stretch; 1 for a one-step fit.
     - `dt`: the step, 1 by default.
+    - `stride`: steps between the beginnings of two stretches, 1 by default.
 
     **Returns:** `(times, states, controls)` of shapes `(N,)`, `(N, steps + 1, n)` and
     `(N, steps, m)`, for `data=` of [`delucax.training.fit`][].
@@ -161,10 +164,11 @@ def windows(
     where = "sysid.windows"
     states, controls = runs_of(states, controls, "states", where)
     steps = check_count(steps, "steps", where)
+    stride = check_count(stride, "stride", where)
     check_step(dt, where)
     runs, total = controls.shape[:2]
     check_at_most(steps, total, "steps", where, "of a run")
-    begins = np.arange(total - steps + 1)
+    begins = np.arange(0, total - steps + 1, stride)
     inside = begins[:, None] + np.arange(steps + 1)
     count = runs * len(begins)
     return (

@@ -20,7 +20,7 @@ from ..._module import as_float_array
 from ..._results import RESULTS
 from ...dynamics import AbstractDynamics, open_loop
 from .._trainable import Assembly, partition_trainable
-from ._identified import checked, CORRELATED, Identified, reach
+from ._identified import checked, CORRELATED, Identified, quantile
 from ._linear import runs_of
 from ._multiple_shooting import (
     cut_into_windows,
@@ -45,6 +45,7 @@ def physical(
     x0: Any = None,
     window: int = 20,
     noise: Any = None,
+    level: Any = 0.95,
     max_steps: int = 100,
     throw: bool = True,
 ) -> Identified:
@@ -83,6 +84,7 @@ def physical(
         not fill the last is left out.
     - `noise`: the standard deviation of each observation, a number or shape `(p,)`; by
         default as in what remains of a first fit.
+    - `level`: of the confidence intervals, 0.95 by default.
     - `max_steps`: 100 by default.
     - `throw`: raise if it does not converge or the data do not tell all parameters
         (default); if false, look at `result`.
@@ -126,6 +128,7 @@ def physical(
     runs, steps = controls.shape[:2]
     window = min(check_count(window, "window", where), steps)
     max_steps = check_count(max_steps, "max_steps", where)
+    reach = quantile(level, where)
     check_bool(throw, "throw", where)
     if noise is not None:
         check_positive(noise, "noise", where)
@@ -174,7 +177,7 @@ def physical(
                 solution = again
     values, legal, certainty = solution.values, solution.legal, solution.certainty
     std = certainty.std
-    ends = [_ends(assembly, values, sign * reach() * std) for sign in (-1, 1)]
+    ends = [_ends(assembly, values, sign * reach * std) for sign in (-1, 1)]
     starts = solution.starts.reshape(runs, count, n)[:, 0]
     fitted = Identified(
         model=assembly(values),
