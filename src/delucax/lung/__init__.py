@@ -15,11 +15,18 @@ from ._breath_file import (
 from ._breaths import Breaths as Breaths, segment as segment, split as split
 from ._controller_training import (
     breath_error as breath_error,
+    pid_grid as pid_grid,
+    PIDGrid as PIDGrid,
     train_controllers as train_controllers,
 )
 from ._exploration import explore as explore, Explorer as Explorer
 from ._learned_lung import LearnedLung as LearnedLung
-from ._lung_fitting import fit_lungs as fit_lungs, open_loop_error as open_loop_error
+from ._lung_fitting import (
+    fit_lungs as fit_lungs,
+    open_loop_error as open_loop_error,
+    stack as stack,
+    unstack as unstack,
+)
 from ._lung_models import (
     GreyBoxLung as GreyBoxLung,
     LungModel as LungModel,
@@ -45,7 +52,6 @@ from ._original_lungs import (
     OriginalDelayLung as OriginalDelayLung,
     OriginalSingleCompartment as OriginalSingleCompartment,
 )
-from ._pid_grid import pid_grid as pid_grid, PIDGrid as PIDGrid
 from ._runner import (
     Recording as Recording,
     run_breaths as run_breaths,
@@ -53,7 +59,6 @@ from ._runner import (
     SimulatedRunner as SimulatedRunner,
 )
 from ._shooting import least_error as least_error, ShootingMPC as ShootingMPC
-from ._stacking import stack as stack, unstack as unstack
 from ._valves import Valves as Valves
 from ._ventilation import (
     BreathCost as BreathCost,

@@ -13,7 +13,7 @@ from .._controller import AbstractController, check_controller
 from .._module import parameter, positive, weight
 from .._typing import PRNGKey
 from ..math import clip
-from ._tanh_network import tanh_network
+from ._learned_lung import tanh_network
 from ._waveform import BreathWaveform, check_waveform
 
 

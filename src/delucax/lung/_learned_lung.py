@@ -1,6 +1,6 @@
 """A lung learned from breaths."""
 
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -9,12 +9,11 @@ import jax.random as jr
 from jaxtyping import Array, Float
 
 from .._check import check_bool, check_count, check_instance, check_key
-from .._module import parameter, positive, weight
+from .._module import as_module, parameter, positive, weight
 from .._results import RESULTS
 from .._typing import PRNGKey, RealScalar, Scalar, State
 from ..dynamics import AbstractDynamics
 from ._breaths import Breaths
-from ._tanh_network import tanh_network
 
 
 class LearnedLung(AbstractDynamics):
@@ -269,6 +268,19 @@ class LearnedLung(AbstractDynamics):
             early = jax.vmap(begin)(known[:first], inputs)
             late = jax.vmap(go_on)(known[first:], straight[first:])
         return self.p_mean + self.p_std * jnp.concatenate([start[:1], early, late])
+
+
+def tanh_network(
+    inputs: int | Literal["scalar"],
+    outputs: int | Literal["scalar"],
+    width: int,
+    depth: int,
+    *,
+    key: PRNGKey,
+) -> eqx.nn.MLP:
+    """A fully connected network whose hidden layers are tanh."""
+    tanh, identity = as_module(jnp.tanh), as_module(jax.nn.identity)
+    return eqx.nn.MLP(inputs, outputs, width, depth, tanh, identity, key=key)
 
 
 def _windows(values: Array, size: int) -> Array:

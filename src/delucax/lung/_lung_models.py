@@ -13,8 +13,8 @@ from .._check import check_count, check_instance, check_key, check_step
 from .._module import parameter, positive, weight
 from .._typing import PRNGKey, RealScalar, Scalar, State
 from ..dynamics import Delayed, Discretized
+from ._learned_lung import tanh_network
 from ._lungs import AbstractLung, SingleCompartment
-from ._tanh_network import tanh_network
 from ._valves import Valves
 
 

@@ -18,11 +18,9 @@ from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ._constraints import Constraints
-from ._descent import Options
+from ._descent import Options, SEARCHES
 from ._implicit import solution
-from ._line_search import SEARCHES
-from ._plan import Plan, plan_of
-from ._planner import AbstractPlanner, as_rows
+from ._planner import AbstractPlanner, as_rows, Plan, plan_of
 from ._problem import Problem
 from ._start import Start
 

@@ -1,4 +1,4 @@
-"""What planners that sample have in common."""
+"""Planners that draw sequences of controls: MPPI and the cross-entropy method."""
 
 import abc
 from typing import ClassVar
@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float
 
-from .._check import check_count, check_positive, check_range
+from .._check import check_count, check_number, check_positive, check_range
 from .._message import shortened
+from .._module import parameter
 from .._results import choose, RESULTS
 from .._typing import PRNGKey
-from ._plan import Plan, plan_of
-from ._planner import AbstractPlanner
+from ._planner import AbstractPlanner, Plan, plan_of
 from ._problem import Problem, roll_out
 from ._start import begin, controls_of, Start
 
@@ -150,3 +150,150 @@ def average(weights: Array, drawn: Array, otherwise: Array) -> Array:
     safe = jnp.where(total > 0, total, 1)
     mean = jnp.einsum("s,s...->...", weights / safe, drawn)
     return jnp.where(total > 0, mean, otherwise)
+
+
+class MPPI(AbstractSampler):
+    r"""Controls by sampling, for costs and dynamics that need not be smooth:
+
+    `u_k <- sum over i of v_i u_k^i`, with `v_i` proportional to
+    `exp(-cost^i / temperature)`, over sequences `u^i` drawn about the present one.
+
+    This is model predictive path integral control. The cost of a sequence is the whole
+    cost of its trajectory, without a further charge for leaving the present one. A
+    sequence that diverges has no weight. The plan is the best of the means, the start
+    among them, so it costs no more than the start. It has no gains. It is
+    differentiable in whatever the costs are, for the numbers that were drawn.
+
+    It is called as every [`delucax.planning.AbstractPlanner`][], with a `key`, and
+    without constraints. Its result is `diverged` if the start and all means diverge.
+
+    **Arguments:**
+
+    - `samples`: sequences drawn in an iteration, 256 by default.
+    - `iterations`: 10 by default.
+    - `scale`: the standard deviation of the controls drawn, a number or of shape
+        `(m,)`; 1 by default.
+    - `correlation`: of a control drawn with the one before it, from 0, white noise, by
+        default, to 1, a constant.
+    - `temperature`: in the unit of the cost, 1 by default. The lower it is, the fewer
+        of the best sequences count.
+
+    **Raises:** `ValueError` on an option out of its range.
+
+    Source: Williams, Wagener, Goldfain, Drews, Rehg, Boots and Theodorou, 2017.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        planner = dlx.planning.MPPI(temperature=0.1, correlation=0.8)
+        plan = planner(
+            env.dynamics, env.cost, jnp.array([0.5, 0.0]), 20, key=jax.random.key(0)
+        )
+        plan.cost
+        ```
+    """
+
+    samples: int = eqx.field(default=256, static=True)
+    iterations: int = eqx.field(default=10, static=True)
+    scale: Array = parameter(1.0)
+    correlation: Array = parameter(0.0)
+    temperature: Array = parameter(1.0)
+
+    def __check_init__(self):
+        check_sampler(self)
+        check_number(self.temperature, "temperature", "MPPI")
+        check_positive(self.temperature, "temperature", "MPPI")
+
+    def update(self, drawn, costs, mean, width):
+        finite, least = jnp.isfinite(costs), jnp.min(costs)
+        least = jnp.where(jnp.isfinite(least), least, 0)
+        above = jnp.where(finite, costs, least) - least
+        temperature = self.temperature.astype(mean.dtype)
+        weights = jnp.where(finite, jnp.exp(-above / temperature), 0)
+        return average(weights, drawn, mean), width
+
+
+class CEM(AbstractSampler):
+    r"""Controls by sampling, for costs and dynamics that need not be smooth: the
+    cross-entropy method.
+
+    Sequences are drawn with a mean and a standard deviation for each control of each
+    step, and both move to those of the cheapest sequences, the elites:
+
+    `mean <- momentum mean + (1 - momentum) mean of the elites`, and likewise the
+    standard deviation.
+
+    A sequence that diverges is no elite. The plan is the best of the means, the start
+    among them, so it costs no more than the start. It has no gains. Its derivatives are
+    those of the elites that were drawn; which ones those are is held.
+
+    It is called as every [`delucax.planning.AbstractPlanner`][], with a `key`, and
+    without constraints. Its result is `diverged` if the start and all means diverge.
+
+    **Arguments:**
+
+    - `samples`: sequences drawn in an iteration, 256 by default.
+    - `iterations`: 10 by default.
+    - `elites`: how many of the sequences count, 32 by default.
+    - `scale`: the standard deviation to start with, a number or of shape `(m,)`; 1 by
+        default.
+    - `correlation`: of a control drawn with the one before it, from 0, white noise, by
+        default, to 1.
+    - `momentum`: how much stays of mean and standard deviation, 0.1 by default.
+
+    **Raises:** `ValueError` on an option out of its range, or more elites than samples.
+
+    Source: Rubinstein, 1999; Chua, Calandra, McAllister and Levine, 2018 (planning).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        planner = dlx.planning.CEM(samples=64, elites=8)
+        plan = planner(
+            env.dynamics, env.cost, jnp.array([0.5, 0.0]), 20, key=jax.random.key(0)
+        )
+        plan.cost
+        ```
+    """
+
+    samples: int = eqx.field(default=256, static=True)
+    iterations: int = eqx.field(default=10, static=True)
+    elites: int = eqx.field(default=32, static=True)
+    scale: Array = parameter(1.0)
+    correlation: Array = parameter(0.0)
+    momentum: Array = parameter(0.1)
+
+    def __check_init__(self):
+        where = "CEM"
+        check_sampler(self)
+        check_count(self.elites, "elites", where)
+        if self.elites > self.samples:
+            raise ValueError(
+                f"{where}: elites must be at most samples, {self.samples}, got "
+                f"{self.elites}."
+            )
+        check_number(self.momentum, "momentum", where)
+        check_range(self.momentum, "momentum", where, 0, 1)
+
+    def update(self, drawn, costs, mean, width):
+        # Neither infinities nor what is compared need a derivative.
+        _, best = lax.top_k(-lax.stop_gradient(costs), self.elites)
+        weights = jnp.isfinite(costs[best]).astype(mean.dtype)
+        centre = average(weights, drawn[best], mean)
+        variance = average(weights, (drawn[best] - centre) ** 2, width**2)
+        # The square root has no slope at zero.
+        spreads = variance > 0
+        after = jnp.where(spreads, jnp.sqrt(jnp.where(spreads, variance, 1)), 0)
+        momentum = self.momentum.astype(mean.dtype)
+        blend = lambda old, new: momentum * old + (1 - momentum) * new
+        return blend(mean, centre), blend(width, after)

@@ -17,11 +17,10 @@ from jaxtyping import PyTree
 from .._check import check_at_most, check_count, check_key, is_concrete
 from .._results import choose, Result, RESULTS
 from .._typing import PRNGKey
-from ._analytic import analytic
-from ._checkpoint import Checkpoint, checkpoint_path, describe_run
-from ._history import History, history_of
+from ._gradient_estimators import analytic
+from ._loss import AbstractSurrogate
+from ._record import Checkpoint, checkpoint_path, describe_run, History, history_of
 from ._steps import CAPACITY, FAULTS, State, Steps
-from ._surrogate import AbstractSurrogate
 from ._trainable import partition_trainable
 
 

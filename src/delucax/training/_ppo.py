@@ -28,8 +28,7 @@ from .._typing import PRNGKey, RealScalar
 from ..controllers import Gaussian
 from ..environments import Environment
 from ._actor_critic import ActorCritic
-from ._actor_critic_loss import AbstractActorCriticLoss, Episodes
-from ._standardisation import Statistics
+from ._actor_critic_loss import AbstractActorCriticLoss, Episodes, Statistics
 
 
 class _Memory(NamedTuple):

@@ -15,8 +15,7 @@ from .._module import parameter
 from .._typing import PRNGKey, RealScalar
 from ..environments import Environment
 from ._actor_critic import ActorCritic
-from ._actor_critic_loss import AbstractActorCriticLoss
-from ._standardisation import Statistics
+from ._actor_critic_loss import AbstractActorCriticLoss, Statistics
 from ._trainable import is_float
 
 

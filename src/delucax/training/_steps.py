@@ -13,9 +13,8 @@ import optax
 from jaxtyping import Array, Int, PyTree
 
 from .._typing import PRNGKey
-from ._history import COLUMNS
-from ._loss import cost_and_metrics
-from ._surrogate import AbstractSurrogate
+from ._loss import AbstractSurrogate, cost_and_metrics
+from ._record import COLUMNS
 from ._trainable import Assembly, strong
 
 

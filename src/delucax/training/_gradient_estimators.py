@@ -1,0 +1,264 @@
+"""Estimators of the gradient of a loss."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.random as jr
+import optax
+from jaxtyping import Array, PyTree
+
+from .._check import check_count, check_key
+from .._module import check_parameters, parameter, positive
+from .._typing import PRNGKey
+from ._loss import cost_and_metrics
+from ._trainable import weights_of
+
+
+def analytic(
+    loss: Callable[..., Any], model: PyTree, key: PRNGKey
+) -> tuple[Any, PyTree]:
+    """The gradient by automatic differentiation through the loss.
+
+    `g = d loss(theta, key) / d theta`, exact for the key that is drawn; its mean over
+    keys is the gradient of the expected loss wherever the two may be exchanged.
+
+    Like every estimator it is called as `estimator(loss, model, key)`. The gradient is
+    with respect to the leaves of the model marked `weight()`; or, where none is marked,
+    to every floating-point array. [`delucax.training.fit`][] hands it the trainable
+    (unconstrained) values alone.
+
+    **Arguments:**
+
+    - `loss`: `loss(model, key)` to a scalar, or to a scalar and a dictionary of scalar
+        metrics.
+    - `model`: a pytree with weights.
+    - `key`: a random key, passed to the loss.
+
+    **Returns:** `(value, gradient)`: what the loss returned, and a pytree like the
+    model with `None` in the place of what is not a weight.
+
+    **Raises:** `ValueError` if the loss is not a floating-point scalar, or `key` is no
+    random key.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        loss = dlx.training.expected_cost(env, batch=8, horizon=50)
+        controller = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
+        value, gradient = dlx.training.analytic(loss, controller, jax.random.key(0))
+        gradient.K
+        ```
+    """
+    check_key(key, "analytic")
+
+    def of(model):
+        value = loss(model, key)
+        return cost_and_metrics(value, "analytic")[0], value
+
+    return gradient_of_weights(of, model)
+
+
+def gradient_of_weights(
+    loss: Callable[[PyTree], tuple[Array, Any]], model: PyTree
+) -> tuple[Any, PyTree]:
+    """What `loss(model)` returns beside its scalar, and the gradient of that."""
+    weights, rest = weights_of(model)
+    of = lambda weights: loss(eqx.combine(weights, rest))
+    (_, value), gradient = eqx.filter_value_and_grad(of, has_aux=True)(weights)
+    return value, gradient
+
+
+class EvolutionStrategies(eqx.Module):
+    r"""The gradient of the loss smoothed by Gaussian noise on the weights.
+
+    Antithetic, over `n = samples / 2` directions `e_i ~ N(0, I)`, a key for each:
+
+    `g = 1 / (2 n sigma) sum_i (loss(theta + sigma e_i) - loss(theta - sigma e_i)) e_i`,
+
+    or one-sided, over `n = samples` directions and one key:
+
+    `g = 1 / (n sigma) sum_i (loss(theta + sigma e_i) - loss(theta)) e_i`.
+
+    Both are unbiased for the gradient of `E[loss(theta + sigma e)]`, which is that of
+    the expected loss itself where the loss is quadratic, and differs by order
+    `sigma^2` elsewhere. Only values are taken, all at once under `jax.vmap`: the loss
+    need not be differentiable. Called as every estimator is, see
+    [`delucax.training.analytic`][].
+
+    **Arguments:**
+
+    - `sigma`: the standard deviation of the noise, positive; in the unconstrained
+        values of what has a constraint when used by [`delucax.training.fit`][].
+    - `samples`: the number of perturbed losses in one estimate; even if antithetic.
+    - `antithetic`: whether each direction is tried both ways (default), which cancels
+        the loss itself and every even term.
+
+    **Returns:** from a call, `(value, gradient)`: what the loss returned for the
+    unperturbed weights, and a pytree like the model with `None` in the place of what is
+    not a weight.
+
+    **Raises:** `ValueError` if `sigma` is not positive, or if `samples` is below 1, or
+    odd and antithetic.
+
+    Source: Salimans, Ho, Chen, Sidor and Sutskever, 2017; Nesterov and Spokoiny, 2017
+    (one-sided).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        loss = dlx.training.expected_cost(env, batch=1, horizon=50)
+        controller = dlx.controllers.Linear(jnp.array([[20.0, 5.0]]))
+        estimator = dlx.training.EvolutionStrategies(sigma=0.1, samples=16)
+        value, gradient = estimator(loss, controller, jax.random.key(0))
+        ```
+    """
+
+    sigma: Array = parameter(constraint=positive)
+    samples: int = eqx.field(static=True)
+    antithetic: bool = eqx.field(static=True, default=True)
+
+    def __check_init__(self):
+        where = "EvolutionStrategies"
+        check_parameters(self)
+        check_count(self.samples, "samples", where)
+        if self.antithetic and self.samples % 2:
+            raise ValueError(
+                f"{where}: samples must be even when antithetic, got {self.samples}."
+            )
+
+    def __call__(self, loss, model, key: PRNGKey) -> tuple[Any, PyTree]:
+        check_key(key, "EvolutionStrategies")
+        weights, rest = weights_of(model)
+        n = self.samples // 2 if self.antithetic else self.samples
+        loss_key, noise_key, pair_key = jr.split(key, 3)
+        draw = lambda key, shape, dtype: jr.normal(key, (n, *shape), dtype)
+        noise = optax.tree.random_like(noise_key, weights, draw)
+        # The unperturbed weights come first, so that the loss is traced once.
+        sides = 2 if self.antithetic else 1
+        ones, every = jnp.ones(n), jnp.arange(n)
+        signs = jnp.concatenate([jnp.zeros(1), ones, -ones][: 1 + sides])
+        directions = jnp.concatenate([jnp.zeros(1, int), *[every] * sides])
+        keys = None
+        if self.antithetic:
+            pairs = jr.split(pair_key, n)
+            keys = jnp.concatenate([loss_key[None], pairs, pairs])
+
+        def value_at(sign, direction, own_key):
+            scale = self.sigma * sign
+            perturbed = jax.tree.map(
+                lambda w, e: (w + scale * e[direction]).astype(w.dtype), weights, noise
+            )
+            one_key = loss_key if own_key is None else own_key
+            value = loss(eqx.combine(perturbed, rest), one_key)
+            return cost_and_metrics(value, "EvolutionStrategies")
+
+        costs, metrics = jax.vmap(value_at)(signs, directions, keys)
+        if self.antithetic:
+            slopes = (costs[1 : n + 1] - costs[n + 1 :]) / (2 * n * self.sigma)
+        else:
+            slopes = (costs[1:] - costs[0]) / (n * self.sigma)
+        gradient = jax.tree.map(
+            lambda w, e: jnp.tensordot(slopes, e, 1).astype(w.dtype), weights, noise
+        )
+        first = {name: metric[0] for name, metric in metrics.items()}
+        return (costs[0], first) if first else costs[0], gradient
+
+
+class LikelihoodRatio(eqx.Module):
+    r"""The gradient of an expected cost from the probability of what was drawn.
+
+    `g = 1/n sum_i (c_i - b_i) d log p(u_i; theta) / d theta`,
+
+    with `b_i` the mean of the other samples' costs, or 0. It is unbiased for the
+    gradient of `E[c]`, since `E[d log p] = 0` and `b_i` does not depend on `u_i`. Only
+    the log-probability is differentiated, never the cost or the plant.
+
+    The loss returns `(cost, {"log_prob": ...})` for one draw, and the same loss serves
+    the other estimators, which leave the log-probability alone. Two things are asked of
+    it: the log-probability is that of what was drawn with the draw itself held fixed
+    (`jax.lax.stop_gradient(u)`; a reparametrised draw `mean + std * e` left in cancels
+    the score), and the cost depends on the weights through the draw alone.
+    [`delucax.training.scored_cost`][] makes such a loss of an environment. Called as
+    every estimator is, see [`delucax.training.analytic`][].
+
+    **Arguments:**
+
+    - `samples`: the number n of draws in one estimate.
+    - `baseline`: whether to subtract the mean cost of the other draws (default), which
+        lowers the variance and leaves the mean as it is.
+
+    **Returns:** from a call, `(value, gradient)`: the mean cost and mean metrics over
+    the draws, and a pytree like the model with `None` in the place of what is not a
+    weight.
+
+    **Raises:** `ValueError` if `samples` is below 1, or below 2 with a baseline; when
+    it is called, if the loss returns no `"log_prob"`.
+
+    Source: Williams, 1992; Kool, van Hoof and Welling, 2019 (the baseline).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        def loss(mean, key):
+            u = jax.lax.stop_gradient(mean + jax.random.normal(key))
+            return (u - 1.0) ** 2, {"log_prob": -0.5 * (u - mean) ** 2}
+
+        estimator = dlx.training.LikelihoodRatio(samples=1000)
+        value, gradient = estimator(loss, jnp.asarray(0.0), jax.random.key(0))
+        ```
+    """
+
+    samples: int = eqx.field(static=True)
+    baseline: bool = eqx.field(static=True, default=True)
+
+    def __check_init__(self):
+        where = "LikelihoodRatio"
+        check_count(self.samples, "samples", where)
+        if self.baseline and self.samples < 2:
+            raise ValueError(
+                f"{where}: samples must be at least 2 with a baseline, the mean of the "
+                f"others, got {self.samples}."
+            )
+
+    def __call__(self, loss, model, key: PRNGKey) -> tuple[Any, PyTree]:
+        check_key(key, "LikelihoodRatio")
+
+        def surrogate(model):
+            def draw(key):
+                return cost_and_metrics(loss(model, key), "LikelihoodRatio")
+
+            costs, metrics = jax.vmap(draw)(jr.split(key, self.samples))
+            if "log_prob" not in metrics:
+                raise ValueError(
+                    "LikelihoodRatio: loss must return (cost, {'log_prob': ...}), got "
+                    f"the metrics {sorted(metrics)}; delucax.training.scored_cost "
+                    "makes such a loss of an environment."
+                )
+            costs = lax.stop_gradient(costs)
+            excess = costs
+            if self.baseline:
+                # The mean of the others differs from that of all by this factor.
+                excess = (costs - jnp.mean(costs)) * (self.samples / (self.samples - 1))
+            means = {name: jnp.mean(metric) for name, metric in metrics.items()}
+            value = (jnp.mean(costs), lax.stop_gradient(means))
+            return jnp.mean(excess * metrics["log_prob"]), value
+
+        return gradient_of_weights(surrogate, model)
