@@ -24,17 +24,6 @@ LEAST_SHARE = 1e-4
 """Of the improvement that the model promises, what a step must bring."""
 
 
-class Iterate(NamedTuple):
-    """The trajectory to go on with."""
-
-    states: Array
-    controls: Array
-    cost: Array
-    gaps: Array | None
-    accepted: Array
-    rollouts: Array
-
-
 def first_accepted(
     trial: Callable[[Array], tuple[Any, Array]], count: int, otherwise: Any
 ) -> tuple[Array, Any, Array]:
@@ -51,50 +40,6 @@ def first_accepted(
         return ~accepted & (tried < count)
 
     return lax.while_loop(going, body, (jnp.asarray(0), otherwise, jnp.asarray(False)))
-
-
-def search(
-    kind: str,
-    problem: Problem,
-    now: Iterate,
-    policy: Policy,
-    penalty: Array,
-    rounding: Array,
-) -> Iterate:
-    """The first step, of those from long to short, that brings enough; or none.
-
-    What counts is the cost, plus `penalty` times the sum of the gaps where there are
-    any. It is known to within `rounding`.
-    """
-    missed = 0.0 if now.gaps is None else jnp.sum(jnp.abs(now.gaps))
-    slack = rounding + 10 * jnp.finfo(now.cost.dtype).eps * jnp.abs(now.cost)
-    lengths = 0.5 ** jnp.arange(HALVINGS, dtype=now.cost.dtype)
-
-    def trial(length):
-        states, controls, cost = roll_out(
-            problem, now.states, now.controls, policy.K, policy.k, length, now.gaps
-        )
-        curvature = length * policy.curvature / 2
-        promise = length * (penalty * missed - policy.slope - curvature)
-        gain = now.cost - cost + length * penalty * missed
-        enough = gain >= LEAST_SHARE * promise - slack
-        return (states, controls, cost), enough & jnp.isfinite(cost)
-
-    last = now.states, now.controls, now.cost
-    if kind == "parallel":
-        candidates, enough = jax.vmap(trial)(lengths)
-        best = jnp.argmax(enough)
-        accepted, length, tried = enough[best], lengths[best], jnp.asarray(HALVINGS)
-        candidate = jax.tree.map(lambda a: a[best], candidates)
-    else:
-        step = lambda i: trial(lengths[i])
-        tried, candidate, accepted = first_accepted(step, HALVINGS, last)
-        length = lengths[tried - 1]
-    keep = lambda new, old: jnp.where(accepted, new, old)
-    gaps = None if now.gaps is None else keep((1 - length) * now.gaps, now.gaps)
-    rollouts = now.rollouts + tried
-    states, controls, cost = jax.tree.map(keep, candidate, last)
-    return Iterate(states, controls, cost, gaps, accepted, rollouts)
 
 
 FACTOR = 2.0
@@ -118,7 +63,7 @@ class Options(eqx.Module):
 
 
 class Outcome(NamedTuple):
-    """What the iteration ends with."""
+    """Where the iteration is; in the end, what it ends with."""
 
     states: Array
     controls: Array
@@ -130,21 +75,22 @@ class Outcome(NamedTuple):
     iterations: Array
     rollouts: Array
     regularisation: Array
-    violation: Array
-    multipliers: Multipliers | None
+    violation: Array | None = None
+    multipliers: Multipliers | None = None
 
 
 class _Progress(NamedTuple):
-    now: Iterate
-    gains: Array
-    mu: Array
+    """What goes around the loop."""
+
+    now: Outcome
+    gaps: Array | None
+    """How far each step misses the next state, where the states were given."""
     delta: Array
+    """The factor by which the regularisation last changed."""
     exact: Array
+    """Whether second derivatives of the dynamics are taken."""
     penalty: Array
-    residual: Array
-    trace: Array
-    iteration: Array
-    result: Result
+    """The weight of the gaps."""
     done: Array
 
 
@@ -177,47 +123,40 @@ def optimise(
         earlier = jnp.arange(options.max_iterations + 1) < iteration
         trace = jnp.where(earlier, before.trace, trace)
     rollouts = rollouts + (start.count if options.states is None else 0)
-    first = _Progress(
-        now=Iterate(states, controls, cost, gaps, jnp.asarray(True), rollouts),
+    now = Outcome(
+        states=states,
+        controls=controls,
         gains=jnp.zeros((T, m, n), dtype),
-        mu=zero,
-        delta=jnp.ones((), dtype),
-        exact=jnp.asarray(True),
-        penalty=zero,
+        cost=cost,
         residual=jnp.full((), jnp.inf, dtype),
         trace=trace,
-        iteration=iteration,
         result=choose(lost, RESULTS.diverged, RESULTS.not_converged),
-        done=lost,
+        iterations=iteration,
+        rollouts=rollouts,
+        regularisation=zero,
     )
-
+    first = _Progress(
+        now, gaps, jnp.ones((), dtype), jnp.asarray(True), penalty=zero, done=lost
+    )
     body = functools.partial(_iterate, problem, options)
-    last = lax.while_loop(lambda progress: ~progress.done, body, first)
-    reached = jnp.arange(options.max_iterations + 1) <= last.iteration
-    return Outcome(
-        last.now.states,
-        last.now.controls,
-        last.gains,
-        last.now.cost,
-        last.residual,
-        jnp.where(reached, last.trace, last.now.cost),
-        last.result,
-        last.iteration,
-        last.now.rollouts,
-        last.mu,
-        zero,
-        problem.multipliers,
+    now = lax.while_loop(lambda progress: ~progress.done, body, first).now
+    reached = jnp.arange(options.max_iterations + 1) <= now.iterations
+    return now._replace(
+        trace=jnp.where(reached, now.trace, now.cost),
+        violation=zero,
+        multipliers=problem.multipliers,
     )
 
 
 def _iterate(problem: Problem, options: Options, before: _Progress) -> _Progress:
-    now, mu, tolerance = before.now, before.mu, options.tolerance
-    about = problem, now.states, now.controls, now.gaps, options.second_order
+    now, gaps, tolerance = before.now, before.gaps, options.tolerance
+    mu = now.regularisation
+    about = problem, now.states, now.controls, gaps, options.second_order
     stages = model(*about, before.exact, options.spacing)
     given = problem, stages, now.controls, mu, options
     policy, residual, settled = directions(*given)
-    penalty = _penalty(before.penalty, now, policy)
-    missed = 0.0 if now.gaps is None else jnp.max(jnp.abs(now.gaps))
+    penalty = _penalty(before.penalty, gaps, policy)
+    missed = 0.0 if gaps is None else jnp.max(jnp.abs(gaps))
     precise = 1 + jnp.max(jnp.abs(now.states))
     settled = settled & (missed <= tolerance * precise)
     # What is promised may be below the rounding of the cost. Full steps still lower the
@@ -225,40 +164,87 @@ def _iterate(problem: Problem, options: Options, before: _Progress) -> _Progress
     promise = -policy.slope - policy.curvature / 2
     rounding = _rounding(stages, now)
     spent = (jnp.abs(promise) <= rounding) & (mu == 0) & (tolerance > 0)
-    spent = spent & (missed <= tolerance * precise) & (residual >= before.residual)
+    spent = spent & (missed <= tolerance * precise) & (residual >= now.residual)
     converged = policy.ok & (settled | spent)
-    out_of_time = before.iteration >= options.max_iterations
-    rest = now._replace(accepted=jnp.asarray(False))
-    after = lax.cond(
+    out_of_time = now.iterations >= options.max_iterations
+    rest = (now.states, now.controls, now.cost, gaps), jnp.asarray(False)
+    (states, controls, cost, gaps), accepted, tried = lax.cond(
         converged | out_of_time | ~policy.ok,
-        lambda: rest,
-        lambda: search(options.line_search, problem, now, policy, penalty, rounding),
+        lambda: (*rest, jnp.asarray(0)),
+        lambda: _searched(
+            options.line_search, problem, before, policy, penalty, rounding
+        ),
     )
     # Where the second derivatives make the problem concave, or mislead, it is tried
     # without them first.
-    flatten = ~after.accepted & before.exact & options.second_order
-    changed = _schedule(after.accepted, mu, before.delta)
+    flatten = ~accepted & before.exact & options.second_order
+    changed = _schedule(accepted, mu, before.delta)
     keep = lambda old, new: jnp.where(flatten, old, new)
     mu, delta = jax.tree.map(keep, (mu, before.delta), changed)
-    exact = jnp.where(flatten, False, before.exact | after.accepted)
+    exact = jnp.where(flatten, False, before.exact | accepted)
     stuck = (mu > MOST_MU) & ~converged & ~out_of_time
     ended = converged | out_of_time
     result = choose(stuck, RESULTS.no_descent, RESULTS.not_converged)
     result = choose(converged, RESULTS.successful, result)
-    iteration = before.iteration + jnp.where(ended, 0, 1)
-    return _Progress(
-        after,
-        jnp.where(policy.ok, policy.K, before.gains),
-        jnp.where(ended, before.mu, mu),
-        delta,
-        exact,
-        penalty,
-        residual,
-        before.trace.at[iteration].set(after.cost),
-        iteration,
-        result,
-        ended | stuck,
+    iteration = now.iterations + jnp.where(ended, 0, 1)
+    after = now._replace(
+        states=states,
+        controls=controls,
+        gains=jnp.where(policy.ok, policy.K, now.gains),
+        cost=cost,
+        residual=residual,
+        trace=now.trace.at[iteration].set(cost),
+        result=result,
+        iterations=iteration,
+        rollouts=now.rollouts + tried,
+        regularisation=jnp.where(ended, now.regularisation, mu),
     )
+    return _Progress(after, gaps, delta, exact, penalty, ended | stuck)
+
+
+def _searched(
+    kind: str,
+    problem: Problem,
+    before: _Progress,
+    policy: Policy,
+    penalty: Array,
+    rounding: Array,
+) -> tuple[tuple[Array, Array, Array, Array | None], Array, Array]:
+    """The first step, of those from long to short, that brings enough; or none: the
+    states, controls, cost and gaps to go on with, whether there is one, and how many
+    were tried.
+
+    What counts is the cost, plus `penalty` times the sum of the gaps where there are
+    any. It is known to within `rounding`.
+    """
+    now, gaps = before.now, before.gaps
+    missed = 0.0 if gaps is None else jnp.sum(jnp.abs(gaps))
+    slack = rounding + 10 * jnp.finfo(now.cost.dtype).eps * jnp.abs(now.cost)
+    lengths = 0.5 ** jnp.arange(HALVINGS, dtype=now.cost.dtype)
+
+    def trial(length):
+        states, controls, cost = roll_out(
+            problem, now.states, now.controls, policy.K, policy.k, length, gaps
+        )
+        curvature = length * policy.curvature / 2
+        promise = length * (penalty * missed - policy.slope - curvature)
+        gain = now.cost - cost + length * penalty * missed
+        enough = gain >= LEAST_SHARE * promise - slack
+        return (states, controls, cost), enough & jnp.isfinite(cost)
+
+    last = now.states, now.controls, now.cost
+    if kind == "parallel":
+        candidates, enough = jax.vmap(trial)(lengths)
+        best = jnp.argmax(enough)
+        accepted, length, tried = enough[best], lengths[best], jnp.asarray(HALVINGS)
+        candidate = jax.tree.map(lambda a: a[best], candidates)
+    else:
+        step = lambda i: trial(lengths[i])
+        tried, candidate, accepted = first_accepted(step, HALVINGS, last)
+        length = lengths[tried - 1]
+    keep = lambda new, old: jnp.where(accepted, new, old)
+    left = None if gaps is None else keep((1 - length) * gaps, gaps)
+    return (*jax.tree.map(keep, candidate, last), left), accepted, tried
 
 
 def directions(
@@ -290,7 +276,7 @@ def directions(
     return policy, jnp.max(jnp.abs(step)), jnp.all(small | met)
 
 
-def _rounding(stages: Stages, now: Iterate) -> Array:
+def _rounding(stages: Stages, now: Outcome) -> Array:
     """By how much rounding may change the cost: its own, and that of the states and
     controls that it is computed from, which weighs more where targets are far from
     zero."""
@@ -300,14 +286,14 @@ def _rounding(stages: Stages, now: Iterate) -> Array:
     return jnp.finfo(z.dtype).eps * (jnp.abs(now.cost) + terms)
 
 
-def _penalty(before: Array, now: Iterate, policy: Policy) -> Array:
+def _penalty(before: Array, gaps: Array | None, policy: Policy) -> Array:
     """A weight of the gaps with which the step goes downhill.
 
     Source: Nocedal and Wright, 2006, equation 18.36.
     """
-    if now.gaps is None:
+    if gaps is None:
         return before
-    missed = jnp.sum(jnp.abs(now.gaps))
+    missed = jnp.sum(jnp.abs(gaps))
     rise = policy.slope + jnp.maximum(policy.curvature, 0) / 2
     least = rise / (0.9 * jnp.where(missed > 0, missed, 1))
     return jnp.where(missed > 0, jnp.maximum(before, least), before)

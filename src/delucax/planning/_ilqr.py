@@ -20,7 +20,7 @@ from ..dynamics import AbstractDynamics
 from ._constraints import Constraints
 from ._descent import Options, SEARCHES
 from ._implicit import solution
-from ._planner import AbstractPlanner, as_rows, Plan, plan_of
+from ._planner import AbstractPlanner, finite_rows, Plan, plan_of
 from ._problem import Problem
 from ._start import Start
 
@@ -152,8 +152,8 @@ class ILQR(AbstractPlanner):
             raise ValueError(f"{where}: {_IN_SEQUENCE}")
         states = self.states
         if states is not None:
-            shape = start.horizon + 1, problem.dynamics.state_size
-            states = as_rows(states, *shape, "states", where).astype(dtype)
+            n, points = problem.dynamics.state_size, start.horizon + 1
+            states = finite_rows(states, n, "states", where, points).astype(dtype)
         eps, spacing = float(jnp.finfo(dtype).eps), self.finite_difference
         tolerance, feasible = self.tolerance, self.constraint_tolerance
         if tolerance is None:

@@ -25,7 +25,7 @@ from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ._descent import first_accepted, LEAST_MU, MOST_MU
 from ._lq import in_sequence, Policy
-from ._planner import as_rows, checked_plan, Plan, plan_of
+from ._planner import checked_plan, finite_rows, Plan, plan_of
 from ._problem import model as local_model, Problem, roll_out
 
 
@@ -258,7 +258,7 @@ def as_problems(
                 f"got {got}."
             )
     if w is not None:
-        w = as_rows(w, T, plant.disturbance_size, "w", where)
+        w = finite_rows(w, plant.disturbance_size, "w", where, T)
     x0 = plan.states[0].astype(plan.controls.dtype)
     t0, bounds = plan.t0.astype(x0.dtype), None
     if plan.low is not None and plan.high is not None:

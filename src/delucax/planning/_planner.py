@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from .._check import (
     as_bounds,
+    as_rows,
     as_vector,
     check_control_bounds,
     check_count,
@@ -22,7 +23,6 @@ from .._check import (
     check_step,
 )
 from .._controller import AbstractController, wrong_observation
-from .._message import shortened
 from .._module import as_float_array, as_module, function_field, parameter, weight
 from .._results import choose, raise_on_failure, Result, RESULTS
 from .._typing import PRNGKey
@@ -277,7 +277,8 @@ class AbstractPlanner(eqx.Module):
         known = () if isinstance(controls, numbers.Integral) else (start.controls,)
         dtype = jnp.result_type(x0, *known)
         if w is not None:
-            w = as_rows(w, start.horizon, dynamics.disturbance_size, "w", where)
+            size = dynamics.disturbance_size
+            w = finite_rows(w, size, "w", where, start.horizon)
         if difference is not None and not callable(difference):
             raise ValueError(
                 f"{where}: difference must be a function, got {difference!r}."
@@ -324,7 +325,7 @@ def _as_start(
     if isinstance(controls, numbers.Integral):
         T = check_count(controls, "controls (the horizon)", where)
         return default_start(dynamics, cost, T, t0)
-    return Start(as_rows(controls, None, m, "controls", where))
+    return Start(finite_rows(controls, m, "controls", where))
 
 
 def _at_rest(dynamics: Any, cost: Any, controls: Any, where: str) -> Any:
@@ -340,17 +341,10 @@ def _at_rest(dynamics: Any, cost: Any, controls: Any, where: str) -> Any:
     return jnp.tile(control_at_rest(dynamics, cost), (T, 1))
 
 
-def as_rows(value: Any, steps: int | None, size: int, name: str, where: str) -> Array:
-    """`value` as a finite array of `steps` rows of `size` entries, or an error."""
-    array = as_float_array(value)
-    fits = eqx.is_inexact_array(array) and array.ndim == 2 and array.shape[1] == size
-    if not fits or steps is not None and array.shape[0] != steps:
-        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
-        rows = "steps" if steps is None else steps
-        raise ValueError(
-            f"{where}: {name} must have shape ({rows}, {size}), got {got}."
-        )
-    if array.shape[0] == 0:
-        raise ValueError(f"{where}: {name} must have at least one step, got horizon 0.")
-    check_finite(array, name, where)
-    return array
+def finite_rows(
+    value: Any, size: int, name: str, where: str, steps: int | None = None
+) -> Array:
+    """`value` as finite rows of `size` entries, one for each step, or an error."""
+    rows = as_rows(value, size, name, where, steps)
+    check_finite(rows, name, where)
+    return rows
