@@ -18,39 +18,15 @@ from ._lungs import (
     DoubleCompartment,
     SingleCompartment,
 )
-from ._ventilation import ventilated
+from ._ventilation import ventilation
 from ._waveform import BreathWaveform, check_peep
 
 
 def _task(
     task: Callable[..., Environment],
     kind: type[AbstractLung],
-    system: AbstractLung | None,
-    horizon: int,
-    options: dict[str, Any],
-    delay: int = 0,
-) -> Environment:
-    """A lung, `system` or one of `kind`, that is to breathe.
-
-    `task` is the function that a user called, which errors name, and `delay` the steps
-    until a control acts.
-    """
-    where = task.__name__
-    check_keywords(options, where, task, kind, _discretised, ventilated, Environment)
-    constants = {n: options.pop(n) for n in keywords_of(kind) if n in options}
-    if system is None:
-        system = kind(**constants)
-    elif constants:
-        names = ", ".join(constants)
-        raise ValueError(f"{where}: give a system or its {names}, not both.")
-    check_instance(system, kind, "system", where)
-    return _discretised(task, system, delay, horizon=horizon, **options)
-
-
-def _discretised(
-    task: Callable[..., Environment],
-    system: AbstractLung,
     delay: int,
+    system: AbstractLung | None,
     /,
     waveform: BreathWaveform | None = None,
     *,
@@ -59,7 +35,21 @@ def _discretised(
     substeps: int = 1,
     **options: Any,
 ) -> Environment:
-    """The task of a lung that rests at the PEEP of its valves."""
+    """A lung, `system` or one of `kind`, that rests at the PEEP of its valves and is to
+    breathe.
+
+    `task` is the function that a user called, which errors name, and `delay` the steps
+    until a control acts.
+    """
+    where = task.__name__
+    check_keywords(options, where, task, kind, _task, ventilation, Environment)
+    constants = {n: options.pop(n) for n in keywords_of(kind) if n in options}
+    if system is None:
+        system = kind(**constants)
+    elif constants:
+        names = ", ".join(constants)
+        raise ValueError(f"{where}: give a system or its {names}, not both.")
+    check_instance(system, kind, "system", where)
     valves: Any = system.valves  # pyright: ignore[reportAttributeAccessIssue]
     waveform = BreathWaveform() if waveform is None else waveform
     rest = system.resting(valves.peep)
@@ -67,8 +57,8 @@ def _discretised(
     if delay:
         dynamics = Delayed(dynamics, controls=delay)
         rest = dynamics.filled(rest)
-    env = ventilated(task, dynamics, rest, waveform, **options)
-    check_peep(waveform, valves, task.__name__)
+    env = ventilation(dynamics, waveform, **(dict(rest=rest) | options))
+    check_peep(waveform, valves, where)
     return env
 
 
@@ -104,7 +94,7 @@ def balloon_lung(
         env = dlx.make("lung/balloon_lung", resistance=10.0)
         ```
     """
-    return _task(balloon_lung, BalloonLung, system, horizon, options)
+    return _task(balloon_lung, BalloonLung, 0, system, horizon=horizon, **options)
 
 
 def delay_lung(
@@ -143,8 +133,8 @@ def delay_lung(
         ```
     """
     delay = check_count(delay, "delay", "delay_lung", least=0)
-    options = dict(substeps=4) | options
-    return _task(delay_lung, DelayLung, system, horizon, options, delay)
+    options = dict(substeps=4, horizon=horizon) | options
+    return _task(delay_lung, DelayLung, delay, system, **options)
 
 
 def single_compartment(
@@ -172,7 +162,8 @@ def single_compartment(
         env = dlx.make("lung/single_compartment", resistance=50.0, compliance=10.0)
         ```
     """
-    return _task(single_compartment, SingleCompartment, system, horizon, options)
+    options |= dict(horizon=horizon)
+    return _task(single_compartment, SingleCompartment, 0, system, **options)
 
 
 def double_compartment(
@@ -203,8 +194,9 @@ def double_compartment(
         env = dlx.make("lung/double_compartment", resistance=50.0, compliance=10.0)
         ```
     """
-    options = dict(sensor_delay=2, noise=0.2, substeps=2) | options
-    return _task(double_compartment, DoubleCompartment, system, horizon, options)
+    defaults = dict(sensor_delay=2, noise=0.2, substeps=2, horizon=horizon)
+    options = defaults | options
+    return _task(double_compartment, DoubleCompartment, 0, system, **options)
 
 
 def learned_lung(
@@ -243,5 +235,6 @@ def learned_lung(
     if model is None:
         lung = load(Path(__file__).with_name("learned_lung.dlx"))
     check_instance(lung, LearnedLung, "model", "learned_lung")
-    rest = lung.resting()
-    return ventilated(learned_lung, lung, rest, horizon=horizon, **options)
+    check_keywords(options, "learned_lung", learned_lung, ventilation, Environment)
+    options = dict(rest=lung.resting(), horizon=horizon) | options
+    return ventilation(lung, **options)

@@ -1,6 +1,5 @@
 """What makes a task of a lung: a sensor, a cost, and the bounds of the valves."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -142,52 +141,17 @@ class BreathCost(AbstractCost):
         return cost.astype(x.dtype)
 
 
-def ventilated(
-    task: Callable[..., Environment],
+def ventilation(
     dynamics: AbstractDynamics,
-    rest: ArrayLike | None,
     /,
     waveform: BreathWaveform | None = None,
     *,
+    rest: ArrayLike | None = None,
     sensor_delay: int = 0,
     noise: Any = 0.0,
     expiration: Any = 0.0,
     limit: Any = None,
     horizon: int = 100,
-    **environment: Any,
-) -> Environment:
-    """The environment of a task of a lung, see `ventilation`.
-
-    `task` is the function that a user called, which errors name.
-    """
-    check_range(noise, "noise", "ventilation")
-    check_range(expiration, "expiration", "ventilation")
-    delay = check_count(sensor_delay, "sensor_delay", "ventilation", least=0)
-    waveform = BreathWaveform() if waveform is None else waveform
-    rest = jnp.zeros(dynamics.state_size) if rest is None else rest
-    sensor = sensed = PressureSensor(dynamics)
-    initial_state = sensor.filled(rest)
-    if delay:
-        sensed = Delayed(sensor, sensor=delay)
-        initial_state = sensed.filled(initial_state)
-    silent = isinstance(noise, int | float) and noise == 0
-    check_keywords(environment, task.__name__, task, ventilated, Environment)
-    fields: dict[str, Any] = dict(
-        dynamics=sensed,
-        cost=BreathCost(waveform, dynamics.state_size, expiration, limit),
-        sensor_noise=None if silent else Gaussian(noise, size=1),
-        initial_state=initial_state,
-        control_bounds=(jnp.zeros(2), jnp.array([100.0, 1.0])),
-        horizon=horizon,
-    )
-    return Environment(**(fields | environment))
-
-
-def ventilation(
-    dynamics: AbstractDynamics,
-    waveform: BreathWaveform | None = None,
-    *,
-    rest: ArrayLike | None = None,
     **options: Any,
 ) -> Environment:
     """A task in which a lung is ventilated.
@@ -208,8 +172,8 @@ def ventilation(
     - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
     - `expiration`, `limit`: of the cost; 0 and none by default.
     - `horizon`: steps an episode, 100 by default.
-    - `**options`: of the above, and other arguments of [`delucax.Environment`][], which
-        hold instead.
+    - `**options`: other arguments of [`delucax.Environment`][], which hold instead of
+        those of the task.
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -227,7 +191,28 @@ def ventilation(
         env = lung.ventilation(dynamics, rest=plant.resting(5.0), noise=0.2)
         ```
     """
-    return ventilated(ventilation, dynamics, rest, waveform, **options)
+    where = "ventilation"
+    check_keywords(options, where, ventilation, Environment)
+    check_range(noise, "noise", where)
+    check_range(expiration, "expiration", where)
+    delay = check_count(sensor_delay, "sensor_delay", where, least=0)
+    waveform = BreathWaveform() if waveform is None else waveform
+    rest = jnp.zeros(dynamics.state_size) if rest is None else rest
+    sensor = sensed = PressureSensor(dynamics)
+    initial_state = sensor.filled(rest)
+    if delay:
+        sensed = Delayed(sensor, sensor=delay)
+        initial_state = sensed.filled(initial_state)
+    silent = isinstance(noise, int | float) and noise == 0
+    fields: dict[str, Any] = dict(
+        dynamics=sensed,
+        cost=BreathCost(waveform, dynamics.state_size, expiration, limit),
+        sensor_noise=None if silent else Gaussian(noise, size=1),
+        initial_state=initial_state,
+        control_bounds=(jnp.zeros(2), jnp.array([100.0, 1.0])),
+        horizon=horizon,
+    )
+    return Environment(**(fields | options))
 
 
 def lung_environment(
@@ -262,18 +247,20 @@ def lung_environment(
         env = lung.lung_environment(lung.LungModel(lung.SingleCompartment()))
         ```
     """
-    options = dict(noise=noise, horizon=horizon) | options
+    where = "lung_environment"
+    check_keywords(options, where, lung_environment, ventilation, Environment)
+    defaults: dict[str, Any] = dict(noise=noise, horizon=horizon)
     if isinstance(model, LungModel):
+        defaults |= dict(rest=model.system.resting(model.peep))
         options |= dict(sensor_delay=model.dynamics.sensor)
-        dynamics, rest = model.dynamics.dynamics, model.system.resting(model.peep)
-    elif isinstance(model, LearnedLung):
-        dynamics, rest = model, model.resting()
-    else:
-        raise ValueError(
-            "lung_environment: model must be a LearnedLung or a LungModel, got "
-            f"{type(model).__name__}."
-        )
-    return ventilated(lung_environment, dynamics, rest, waveform, **options)
+        return ventilation(model.dynamics.dynamics, waveform, **(defaults | options))
+    if isinstance(model, LearnedLung):
+        defaults |= dict(rest=model.resting())
+        return ventilation(model, waveform, **(defaults | options))
+    raise ValueError(
+        f"{where}: model must be a LearnedLung or a LungModel, got "
+        f"{type(model).__name__}."
+    )
 
 
 def waveform_of(env: Any, where: str, *, stacked: bool = False) -> BreathWaveform:
