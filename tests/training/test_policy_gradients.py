@@ -19,7 +19,7 @@ from delucax.training import (
     PPO,
     SHAC,
 )
-from delucax.training._actor_critic_loss import Moments
+from delucax.training._actor_critic import Moments
 
 
 A = np.array([[1.0, 0.3], [-0.2, 0.9]])

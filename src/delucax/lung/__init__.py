@@ -12,14 +12,19 @@ from ._breath_file import (
     write_breaths as write_breaths,
     write_example as write_example,
 )
-from ._breaths import Breaths as Breaths, segment as segment, split as split
+from ._breaths import (
+    Breaths as Breaths,
+    explore as explore,
+    Explorer as Explorer,
+    segment as segment,
+    split as split,
+)
 from ._controller_training import (
     breath_error as breath_error,
     pid_grid as pid_grid,
     PIDGrid as PIDGrid,
     train_controllers as train_controllers,
 )
-from ._exploration import explore as explore, Explorer as Explorer
 from ._learned_lung import LearnedLung as LearnedLung
 from ._lung_fitting import (
     fit_lungs as fit_lungs,
@@ -37,6 +42,7 @@ from ._lung_tasks import (
     delay_lung as delay_lung,
     double_compartment as double_compartment,
     learned_lung as learned_lung,
+    lung_environment as lung_environment,
     single_compartment as single_compartment,
 )
 from ._lungs import (
@@ -62,7 +68,6 @@ from ._shooting import least_error as least_error, ShootingMPC as ShootingMPC
 from ._valves import Valves as Valves
 from ._ventilation import (
     BreathCost as BreathCost,
-    lung_environment as lung_environment,
     PressureSensor as PressureSensor,
     ventilation as ventilation,
 )

@@ -16,8 +16,7 @@ import numpy as np
 
 from .._check import as_path, check_count, check_key, check_positive
 from .._typing import PRNGKey
-from ._breaths import Breaths
-from ._exploration import explore
+from ._breaths import Breaths, explore
 from ._lung_tasks import double_compartment
 from ._waveform import LENGTH
 

@@ -24,7 +24,7 @@ from ..environments import Environment
 from ..simulation import rollout
 from ..training import analytic, fit, Fitted
 from ._breath_controllers import Breathing
-from ._exploration import GAINS
+from ._breaths import GAINS
 from ._lung_fitting import count_of, kept_at, stack
 from ._ventilation import waveform_of
 from ._waveform import as_pips, at_pip, LENGTH, PIPS

@@ -11,6 +11,7 @@ from .._module import load
 from ..dynamics import Delayed, Discretized
 from ..environments import Environment
 from ._learned_lung import LearnedLung
+from ._lung_models import LungModel
 from ._lungs import (
     AbstractLung,
     BalloonLung,
@@ -19,7 +20,7 @@ from ._lungs import (
     SingleCompartment,
 )
 from ._ventilation import ventilation
-from ._waveform import BreathWaveform, check_peep
+from ._waveform import BreathWaveform, check_peep, LENGTH
 
 
 def _task(
@@ -238,3 +239,51 @@ def learned_lung(
     check_keywords(options, "learned_lung", learned_lung, ventilation, Environment)
     options = dict(rest=lung.resting(), horizon=horizon) | options
     return ventilation(lung, **options)
+
+
+def lung_environment(
+    model: LearnedLung | LungModel,
+    waveform: BreathWaveform | None = None,
+    *,
+    noise: Any = 0.2,
+    horizon: int = LENGTH,
+    **options: Any,
+) -> Environment:
+    """A task in a fitted lung: where controllers are trained.
+
+    **Arguments:**
+
+    - `model`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][].
+    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]; the default one by
+        default.
+    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
+    - `horizon`: steps an episode, 29 by default.
+    - `**options`: other arguments of [`delucax.lung.ventilation`][], such as `limit`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` if it is no such model, or `waveform` is not a
+    `BreathWaveform`.
+
+    !!! example
+
+        ```python
+        from delucax import lung
+
+        env = lung.lung_environment(lung.LungModel(lung.SingleCompartment()))
+        ```
+    """
+    where = "lung_environment"
+    check_keywords(options, where, lung_environment, ventilation, Environment)
+    defaults: dict[str, Any] = dict(noise=noise, horizon=horizon)
+    if isinstance(model, LungModel):
+        defaults |= dict(rest=model.system.resting(model.peep))
+        options |= dict(sensor_delay=model.dynamics.sensor)
+        return ventilation(model.dynamics.dynamics, waveform, **(defaults | options))
+    if isinstance(model, LearnedLung):
+        defaults |= dict(rest=model.resting())
+        return ventilation(model, waveform, **(defaults | options))
+    raise ValueError(
+        f"{where}: model must be a LearnedLung or a LungModel, got "
+        f"{type(model).__name__}."
+    )

@@ -19,9 +19,7 @@ from ..costs import AbstractCost
 from ..disturbances import Gaussian
 from ..dynamics import AbstractDynamics, AbstractWrapper, Delayed
 from ..environments import Environment
-from ._learned_lung import LearnedLung
-from ._lung_models import LungModel
-from ._waveform import BreathWaveform, check_waveform, LENGTH
+from ._waveform import BreathWaveform, check_waveform
 
 
 class PressureSensor(AbstractWrapper):
@@ -213,54 +211,6 @@ def ventilation(
         horizon=horizon,
     )
     return Environment(**(fields | options))
-
-
-def lung_environment(
-    model: LearnedLung | LungModel,
-    waveform: BreathWaveform | None = None,
-    *,
-    noise: Any = 0.2,
-    horizon: int = LENGTH,
-    **options: Any,
-) -> Environment:
-    """A task in a fitted lung: where controllers are trained.
-
-    **Arguments:**
-
-    - `model`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][].
-    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]; the default one by
-        default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
-    - `horizon`: steps an episode, 29 by default.
-    - `**options`: other arguments of [`delucax.lung.ventilation`][], such as `limit`.
-
-    **Returns:** an [`delucax.Environment`][].
-
-    **Raises:** `ValueError` if it is no such model, or `waveform` is not a
-    `BreathWaveform`.
-
-    !!! example
-
-        ```python
-        from delucax import lung
-
-        env = lung.lung_environment(lung.LungModel(lung.SingleCompartment()))
-        ```
-    """
-    where = "lung_environment"
-    check_keywords(options, where, lung_environment, ventilation, Environment)
-    defaults: dict[str, Any] = dict(noise=noise, horizon=horizon)
-    if isinstance(model, LungModel):
-        defaults |= dict(rest=model.system.resting(model.peep))
-        options |= dict(sensor_delay=model.dynamics.sensor)
-        return ventilation(model.dynamics.dynamics, waveform, **(defaults | options))
-    if isinstance(model, LearnedLung):
-        defaults |= dict(rest=model.resting())
-        return ventilation(model, waveform, **(defaults | options))
-    raise ValueError(
-        f"{where}: model must be a LearnedLung or a LungModel, got "
-        f"{type(model).__name__}."
-    )
 
 
 def waveform_of(env: Any, where: str, *, stacked: bool = False) -> BreathWaveform:

@@ -104,14 +104,9 @@ class Plan(AbstractController):
 
     def __check_init__(self):
         check_step(self.dt, "Plan")
-        if self.low is None and self.high is None:
-            return
-        for end in as_bounds((self.low, self.high), "Plan") or ():
-            if end.shape not in ((), self.controls.shape[1:]):
-                raise ValueError(
-                    "Plan: low and high must be numbers or have shape "
-                    f"{self.controls.shape[1:]}, got {end.shape}."
-                )
+        if self.low is not None or self.high is not None:
+            bounds, size = (self.low, self.high), self.controls.shape[-1]
+            as_bounds(bounds, "Plan", "low and high", size)
 
     @property
     def is_usable(self) -> Array:

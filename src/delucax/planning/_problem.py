@@ -1,5 +1,6 @@
 """What is planned: dynamics, a cost, a start; its trajectories and its local model."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -83,9 +84,7 @@ class Problem(eqx.Module):
         """The problem whose cost is the augmented Lagrangian with these, if any."""
         if multipliers is None:
             return self
-        return eqx.tree_at(
-            lambda p: p.multipliers, self, multipliers, is_leaf=lambda p: p is None
-        )
+        return dataclasses.replace(self, multipliers=multipliers)
 
     def stage_cost(self, t: Array, x: Array, u: Array, y: Array | None) -> Array:
         """The cost of a step, and what the constraints add to it."""

@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float
 
-from .._check import check_count, check_number, check_positive, check_range
+from .._check import (
+    check_at_most,
+    check_count,
+    check_number,
+    check_positive,
+    check_range,
+)
 from .._message import shortened
 from .._module import parameter
 from .._results import choose, RESULTS
@@ -277,11 +283,7 @@ class CEM(AbstractSampler):
         where = "CEM"
         check_sampler(self)
         check_count(self.elites, "elites", where)
-        if self.elites > self.samples:
-            raise ValueError(
-                f"{where}: elites must be at most samples, {self.samples}, got "
-                f"{self.elites}."
-            )
+        check_at_most(self.elites, self.samples, "elites", where, "samples")
         check_number(self.momentum, "momentum", where)
         check_range(self.momentum, "momentum", where, 0, 1)
 

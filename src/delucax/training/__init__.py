@@ -2,7 +2,12 @@
 
 from . import sysid as sysid
 from ._actor_critic import actor_critic as actor_critic, ActorCritic as ActorCritic
-from ._costs import expected_cost as expected_cost, scored_cost as scored_cost
+from ._costs import (
+    Attack as Attack,
+    expected_cost as expected_cost,
+    scored_cost as scored_cost,
+    worst_case as worst_case,
+)
 from ._fit import fit as fit, Fitted as Fitted
 from ._gradient_estimators import (
     analytic as analytic,
@@ -13,4 +18,3 @@ from ._loss import AbstractSurrogate as AbstractSurrogate
 from ._ppo import PPO as PPO
 from ._record import History as History
 from ._shac import SHAC as SHAC
-from ._worst_case import Attack as Attack, worst_case as worst_case

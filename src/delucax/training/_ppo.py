@@ -27,8 +27,7 @@ from .._module import parameter
 from .._typing import PRNGKey, RealScalar
 from ..controllers import Gaussian
 from ..environments import Environment
-from ._actor_critic import ActorCritic
-from ._actor_critic_loss import AbstractActorCriticLoss, Episodes, Statistics
+from ._actor_critic import AbstractActorCriticLoss, ActorCritic, Episodes, Statistics
 
 
 class _Memory(NamedTuple):

@@ -14,8 +14,7 @@ from .._check import check_count, check_instance, check_range
 from .._module import parameter
 from .._typing import PRNGKey, RealScalar
 from ..environments import Environment
-from ._actor_critic import ActorCritic
-from ._actor_critic_loss import AbstractActorCriticLoss, Statistics
+from ._actor_critic import AbstractActorCriticLoss, ActorCritic, Statistics
 from ._trainable import is_float
 
 
