@@ -58,7 +58,8 @@ def _task(
     if delay:
         dynamics = Delayed(dynamics, controls=delay)
         rest = dynamics.filled(rest)
-    env = ventilation(dynamics, waveform, **(dict(rest=rest) | options))
+    options.setdefault("rest", rest)
+    env = ventilation(dynamics, waveform, **options)
     check_peep(waveform, valves, where)
     return env
 
@@ -237,8 +238,8 @@ def learned_lung(
         lung = load(Path(__file__).with_name("learned_lung.dlx"))
     check_instance(lung, LearnedLung, "model", "learned_lung")
     check_keywords(options, "learned_lung", learned_lung, ventilation, Environment)
-    options = dict(rest=lung.resting(), horizon=horizon) | options
-    return ventilation(lung, **options)
+    options.setdefault("rest", lung.resting())
+    return ventilation(lung, horizon=horizon, **options)
 
 
 def lung_environment(
@@ -275,15 +276,15 @@ def lung_environment(
     """
     where = "lung_environment"
     check_keywords(options, where, lung_environment, ventilation, Environment)
-    defaults: dict[str, Any] = dict(noise=noise, horizon=horizon)
     if isinstance(model, LungModel):
-        defaults |= dict(rest=model.system.resting(model.peep))
         options |= dict(sensor_delay=model.dynamics.sensor)
-        return ventilation(model.dynamics.dynamics, waveform, **(defaults | options))
-    if isinstance(model, LearnedLung):
-        defaults |= dict(rest=model.resting())
-        return ventilation(model, waveform, **(defaults | options))
-    raise ValueError(
-        f"{where}: model must be a LearnedLung or a LungModel, got "
-        f"{type(model).__name__}."
-    )
+        dynamics, rest = model.dynamics.dynamics, model.system.resting(model.peep)
+    elif isinstance(model, LearnedLung):
+        dynamics, rest = model, model.resting()
+    else:
+        raise ValueError(
+            f"{where}: model must be a LearnedLung or a LungModel, got "
+            f"{type(model).__name__}."
+        )
+    options.setdefault("rest", rest)
+    return ventilation(dynamics, waveform, noise=noise, horizon=horizon, **options)
