@@ -65,10 +65,10 @@ from ._runner import (
     SimulatedRunner as SimulatedRunner,
 )
 from ._shooting import least_error as least_error, ShootingMPC as ShootingMPC
-from ._valves import Valves as Valves
 from ._ventilation import (
     BreathCost as BreathCost,
     PressureSensor as PressureSensor,
+    Valves as Valves,
     ventilation as ventilation,
 )
 from ._waveform import at_pip as at_pip, BreathWaveform as BreathWaveform

@@ -15,7 +15,7 @@ from .._typing import PRNGKey, RealScalar, Scalar, State
 from ..dynamics import Delayed, Discretized
 from ._learned_lung import tanh_network
 from ._lungs import AbstractLung, SingleCompartment
-from ._valves import Valves
+from ._ventilation import Valves
 
 
 class LungModel(eqx.Module):

@@ -11,7 +11,7 @@ from .._check import is_concrete
 from .._module import bounded, parameter, positive
 from .._typing import RealScalar, Scalar, State
 from ..systems import AbstractSystem
-from ._valves import Valves
+from ._ventilation import Valves
 
 
 PER_ML = 1e-3
