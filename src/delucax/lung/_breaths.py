@@ -28,6 +28,10 @@ from ._ventilation import waveform_of
 from ._waveform import as_pips, at_pip, BreathWaveform, check_waveform, LENGTH, PIPS
 
 
+GAINS = (*(i / 10 for i in range(10)), *(float(i) for i in range(1, 11)))
+"""The published grid of gains: 0, 0.1, ..., 0.9, 1, 2, ..., 10."""
+
+
 class Breaths(eqx.Module):
     """Recorded breaths, `B` of them, each of `T` samples.
 
@@ -186,10 +190,6 @@ def split(
         )
     order = jr.permutation(key, len(breaths))
     return breaths[order[cut:]], breaths[order[:cut]]
-
-
-GAINS = (*(i / 10 for i in range(10)), *(float(i) for i in range(1, 11)))
-"""The published grid of gains: 0, 0.1, ..., 0.9, 1, 2, ..., 10."""
 
 
 class Explorer(AbstractController):

@@ -30,6 +30,9 @@ from ._ventilation import waveform_of
 from ._waveform import as_pips, at_pip, LENGTH, PIPS
 
 
+_KINDS: dict[str, Any] = {"leaky": LeakyPID, "true": PID}
+
+
 def breath_error(
     env: Environment,
     controller: AbstractController,
@@ -233,9 +236,6 @@ def train_controllers(
         throw=throw,
         **kept_at(checkpoint),
     )
-
-
-_KINDS: dict[str, Any] = {"leaky": LeakyPID, "true": PID}
 
 
 class PIDGrid(eqx.Module):

@@ -22,29 +22,10 @@ HALVINGS = 12
 """The shortest step tried is 2^-11 of the full one."""
 LEAST_SHARE = 1e-4
 """Of the improvement that the model promises, what a step must bring."""
-
-
-def first_accepted(
-    trial: Callable[[Array], tuple[Any, Array]], count: int, otherwise: Any
-) -> tuple[Array, Any, Array]:
-    """Of the candidates `0, ..., count - 1`, one after the other, the first that
-    `trial` accepts: how many were tried, the last of them, and whether it was accepted.
-    `otherwise` has the form of a candidate."""
-
-    def body(carry):
-        tried, *_ = carry
-        return tried + 1, *trial(tried)
-
-    def going(carry):
-        tried, _, accepted = carry
-        return ~accepted & (tried < count)
-
-    return lax.while_loop(going, body, (jnp.asarray(0), otherwise, jnp.asarray(False)))
-
-
 FACTOR = 2.0
 LEAST_MU = 1e-6
 MOST_MU = 1e10
+"""Of the regularisation: how fast it changes, and its range above zero."""
 
 
 class Options(eqx.Module):
@@ -245,6 +226,24 @@ def _searched(
     keep = lambda new, old: jnp.where(accepted, new, old)
     left = None if gaps is None else keep((1 - length) * gaps, gaps)
     return (*jax.tree.map(keep, candidate, last), left), accepted, tried
+
+
+def first_accepted(
+    trial: Callable[[Array], tuple[Any, Array]], count: int, otherwise: Any
+) -> tuple[Array, Any, Array]:
+    """Of the candidates `0, ..., count - 1`, one after the other, the first that
+    `trial` accepts: how many were tried, the last of them, and whether it was accepted.
+    `otherwise` has the form of a candidate."""
+
+    def body(carry):
+        tried, *_ = carry
+        return tried + 1, *trial(tried)
+
+    def going(carry):
+        tried, _, accepted = carry
+        return ~accepted & (tried < count)
+
+    return lax.while_loop(going, body, (jnp.asarray(0), otherwise, jnp.asarray(False)))
 
 
 def directions(

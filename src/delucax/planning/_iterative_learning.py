@@ -31,6 +31,8 @@ from ._problem import model as local_model, Problem, roll_out
 
 GROWTH = 10.0
 """Of the regularisation, from pass to pass, until the problem is convex."""
+SLOWER = 0.01
+"""What a failed search of `igpc` multiplies the learning rate by."""
 
 
 class Trials(NamedTuple):
@@ -267,9 +269,6 @@ def as_problems(
         dynamics, cost, x0, t0, w, bounds, plan.difference
     )
     return problem(plant, w), problem(model, None)
-
-
-SLOWER = 0.01
 
 
 def igpc(

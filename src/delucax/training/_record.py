@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 
 COLUMNS = ("step", "loss", "gradient_norm", "seconds")
+_FORMAT = "delucax.training.fit 2"
 
 
 class History(eqx.Module):
@@ -94,9 +95,6 @@ def history_of(columns: dict[str, Any]) -> History:
     columns = {name: np.asarray(column) for name, column in columns.items()}
     metrics = {name: c for name, c in columns.items() if name not in COLUMNS}
     return History(**{name: columns[name] for name in COLUMNS}, metrics=metrics)
-
-
-_FORMAT = "delucax.training.fit 2"
 
 
 class Checkpoint(NamedTuple):
