@@ -86,7 +86,8 @@ def balloon_lung(
     - `horizon`: steps an episode, 100 by default.
     - `**options`: arguments of the lung; the control interval `dt` (0.03 by default),
         `solver` and `substeps` of [`delucax.Discretized`][]; `waveform`,
-        `sensor_delay`, `noise` and others of [`delucax.lung.ventilation`][]; those of [`delucax.Environment`][].
+        `sensor_delay`, `noise` and others of [`delucax.lung.ventilation`][]; those of
+        [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -225,7 +226,8 @@ def learned_lung(
         is two samples late, and so is its pressure. In the repository,
         `python -m benchmarks.learned_lung` makes it.
     - `horizon`: steps an episode, 100 by default.
-    - `**options`: `waveform`, `noise` and others of [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
+    - `**options`: `waveform`, `noise` and others of [`delucax.lung.ventilation`][] and
+        [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
