@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 
 from .._check import check_count, check_key
 from .._module import check_parameters, parameter, positive
-from .._typing import PRNGKey
+from .._typing import PRNGKey, Real
 from ._loss import cost_and_metrics
 from ._trainable import weights_of
 
@@ -127,7 +127,7 @@ class EvolutionStrategies(eqx.Module):
         ```
     """
 
-    sigma: Array = parameter(constraint=positive)
+    sigma: Real = parameter(constraint=positive)
     samples: int = eqx.field(static=True)
     antithetic: bool = eqx.field(static=True, default=True)
 
