@@ -8,7 +8,7 @@ import pytest
 from helpers import once
 
 from delucax.experiments import _execute, _memory_maps, experiment
-from delucax.experiments._memory_maps import release_programs
+from delucax.experiments._execute import release_programs
 
 
 pytestmark = [

@@ -22,9 +22,8 @@ from delucax.studies.ventilator._contenders import (
     tuned_pids,
 )
 from delucax.studies.ventilator._report import save_controllers
-from delucax.studies.ventilator._settings import FULL
 from delucax.studies.ventilator._simulators import grouped, left_out
-from delucax.studies.ventilator._stages import Stages
+from delucax.studies.ventilator._stages import FULL, Stages
 
 
 pytestmark = once

@@ -10,12 +10,11 @@ from types import ModuleType
 from typing import Any
 
 from ._experiment import Experiment
-from ._page import Page
+from ._page import as_text, Page
 from ._report import diff, DIFFERENCES, report, summary
 from ._results import Results
 from ._run import run
 from ._select import selector
-from ._tables import as_text
 
 
 def list_cases(file: str, suites: Mapping[str, str], select: str, marks: str) -> int:

@@ -9,6 +9,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,8 +19,7 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from ._experiment import arguments_of, Experiment
-from ._memory_maps import release_programs
-from ._provenance import device
+from ._fingerprint import device
 from ._store import RESERVED
 
 
@@ -303,3 +303,30 @@ def _heard(event: str, duration_secs: float, **kwargs: str | int) -> None:
     if spans is not None and event.startswith("/jax/core/compile/"):
         now = time.perf_counter()
         spans.append((now - duration_secs, now))
+
+
+_IN_USE = Path("/proc/self/maps")
+_LIMIT = Path("/proc/sys/vm/max_map_count")
+
+
+def release_programs(limit: int | None = None) -> bool:
+    """Forget all compiled programs if they hold too many memory maps.
+
+    A program that XLA has compiled holds tens of the maps that Linux allows a process,
+    65,530 by default, and a compilation that finds none left ends in a
+    segmentation fault. Programs that are still needed are compiled anew. Elsewhere than
+    on Linux nothing is done.
+
+    `limit` is how many maps are too many, by default half of what is allowed. Returns
+    whether the programs were forgotten.
+    """
+    try:
+        if limit is None:
+            limit = int(_LIMIT.read_text()) // 2
+        used = _IN_USE.read_bytes().count(b"\n")
+    except (OSError, ValueError):
+        return False
+    if used <= limit:
+        return False
+    jax.clear_caches()
+    return True

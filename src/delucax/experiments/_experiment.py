@@ -12,8 +12,7 @@ import numpy as np
 
 from .._check import check_choice
 from ._axes import Axis, axis_of, Mark, Marks, Param
-from ._fingerprint import fingerprint
-from ._provenance import version
+from ._fingerprint import fingerprint, version
 from ._select import selector, words
 from ._store import RESERVED
 

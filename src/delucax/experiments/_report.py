@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ._page import Page
+from ._page import escape, Page
 from ._results import Results
 from ._statistics import Bootstrap, interquartile_mean
-from ._tables import escape
 
 
 # The panels of a figure, and the cases of a panel, at most.

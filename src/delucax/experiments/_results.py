@@ -11,8 +11,8 @@ from .._check import as_path
 from .._extras import extra
 from .._files import replaced
 from ._experiment import Case
+from ._page import as_text, FORMS
 from ._store import CASE_COLUMNS, RUN_COLUMNS, Store
-from ._tables import as_text, FORMS
 
 
 PASSED = ("passed", "passed unexpectedly")

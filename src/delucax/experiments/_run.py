@@ -12,7 +12,7 @@ from typing import Any
 from .._check import check_choice, check_count
 from ._execute import Outcome, Runner
 from ._experiment import as_experiment, as_seeds, Case, Experiment
-from ._provenance import provenance
+from ._fingerprint import provenance
 from ._results import FAILED, Results
 from ._store import Store
 from ._workers import Job, run_in_workers

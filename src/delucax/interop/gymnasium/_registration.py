@@ -10,8 +10,7 @@ from gymnasium.envs.registration import EnvSpec
 from ..._check import check_count
 from ...costs import AbstractCost
 from ...environments import default_horizon, Environment, make as make_task
-from .._episode import has_signals
-from .._reads_argument import reads_first_argument
+from .._adapter import has_signals, reads_first_argument
 from ._single_env import GymnasiumEnv
 from ._vector_env import GymnasiumVectorEnv
 

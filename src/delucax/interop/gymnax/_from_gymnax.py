@@ -31,7 +31,7 @@ from ..._typing import (
 from ...costs import AbstractCost
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
-from .._reads_argument import reads_first_argument
+from .._adapter import reads_first_argument
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,7 +19,7 @@ from ...dynamics import LinearDynamics
 from ...environments import Environment
 from ...estimators import KalmanFilter
 from ...training.sysid import arx
-from ._settings import ABORT, SEEN, Size
+from ._stages import ABORT, SEEN, Size
 
 
 TRUE_PID = dict(

@@ -14,7 +14,7 @@ from ..._module import positive
 from ..._typing import PRNGKey
 from ...environments import Environment
 from ...simulation import rollout
-from ._settings import INSPIRATION, SEEN, Size
+from ._stages import INSPIRATION, SEEN, Size
 
 
 class Kind(NamedTuple):

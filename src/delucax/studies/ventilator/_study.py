@@ -21,8 +21,7 @@ from ...controllers import LeakyPID
 from ...environments import Environment
 from . import _contenders as making, _report as reporting, _simulators as fitting
 from ._contenders import Contender, pid_contenders, Trainer
-from ._settings import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, UNSEEN
-from ._stages import Stages
+from ._stages import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, Stages, UNSEEN
 
 
 def lung_study(
@@ -162,7 +161,7 @@ def lung_study(
     if importlib.util.find_spec("matplotlib") is None:
         say("No figures: they need matplotlib (pip install 'delucax[plot]').")
     else:
-        from ._figures import draw_study
+        from ._report import draw_study
 
         draw_study(stages.out, envs, shown, names, test, models, table, rows)
     say(f"Written to {stages.out}/ in {time.perf_counter() - began:.0f} s.")

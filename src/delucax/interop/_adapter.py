@@ -1,16 +1,48 @@
-"""An episode, step by step: what every adapter of an environment does."""
+"""What every adapter of an environment needs: an episode step by step, and spaces."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from .._check import check_bool, is_concrete
 from .._results import RESULTS
 from .._typing import BoolScalar, Control, PRNGKey, Scalar, State
 from ..disturbances import AbstractDisturbance, Zero
 from ..environments import Environment
+
+
+class ByValue:
+    """An environment that equals another if all of their numbers do.
+
+    A function that was compiled with the numbers as constants is looked up by it.
+    """
+
+    def __init__(self, env: Environment):
+        self.env = env
+        arrays, static = eqx.partition(env, eqx.is_array)
+        leaves, treedef = jax.tree.flatten(arrays)
+        values = [(a.shape, str(a.dtype), _bytes(a)) for a in leaves]
+        self.value = (*values, treedef, static)
+        self._hash = hash(self.value)
+
+    def __hash__(self):
+        return self._hash
+
+    def __eq__(self, other):
+        return isinstance(other, ByValue) and self.value == other.value
+
+
+def _bytes(array):
+    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+        array = jr.key_data(array)
+    return np.asarray(array).tobytes()
 
 
 class Signals(NamedTuple):
@@ -117,3 +149,36 @@ def step(
     finite = jnp.all(jnp.isfinite(action)) & jnp.all(jnp.isfinite(x_next))
     failed = (transition.result != RESULTS.successful) | ~finite
     return after, Outcome(-(transition.cost + final), terminated, truncated, failed)
+
+
+def reads_first_argument(function: Callable[..., Any], *args: Any) -> bool:
+    """Whether anything is computed of the first of `args`, an array."""
+    jaxpr = jax.make_jaxpr(function)(*args).jaxpr
+    return any(jaxpr.invars[0] is v for e in jaxpr.eqns for v in e.invars)
+
+
+# Samples are drawn of an action space.
+LARGEST_ACTION = 1e3
+
+
+def has_discrete_actions(env: Environment, discrete: bool | None, where: str) -> bool:
+    """Whether actions are indices into the table of `actions`: by default if there is
+    one."""
+    if discrete is None:
+        return env.actions is not None
+    if check_bool(discrete, "discrete", where) and env.actions is None:
+        raise ValueError(
+            f"{where}: discrete needs a table of actions in the environment, which has "
+            "none."
+        )
+    return bool(discrete)
+
+
+def finite_ends(bounds: Any, size: int, largest: float) -> tuple[Any, Any]:
+    """`(low, high)` of a box, of NumPy where they are known. A side without a bound
+    ends at the largest number."""
+    low, high = (-np.inf, np.inf) if bounds is None else bounds
+    numpy = np if is_concrete(low) and is_concrete(high) else jnp
+    finite = lambda end: numpy.nan_to_num(end, posinf=largest, neginf=-largest)
+    low, high = (numpy.broadcast_to(finite(end), (size,)) for end in (low, high))
+    return low, high
