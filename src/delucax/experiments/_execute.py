@@ -117,9 +117,8 @@ class Runner:
             given[name] = self.shared[key]
         if self.takes_any_name:
             return given
-        return {
-            n: value for n, value in given.items() if n in self.experiment.arguments
-        }
+        known = self.experiment.arguments
+        return {name: value for name, value in given.items() if name in known}
 
     def _call(self, arguments: dict[str, Any], seeds: tuple[int, ...], mesh: Any):
         """What the function returns: a list by seed, or all seeds at once."""
@@ -164,11 +163,8 @@ class Runner:
 
     def _all_seeds(self, static: "_Static", dynamic: Any, numbers: Any) -> Any:
         arguments = eqx.combine(dynamic, static.tree)
-
-        def one(number: Any) -> Any:
-            return self.experiment.function(**arguments, key=jax.random.key(number))
-
-        return jax.vmap(one)(numbers)
+        call = lambda n: self.experiment.function(**arguments, key=jax.random.key(n))
+        return jax.vmap(call)(numbers)
 
     def _columns(self, returned: Any) -> dict[str, list]:
         """Lists with an entry for each seed, by name, of things that JSON knows."""
@@ -294,15 +290,15 @@ _local = threading.local()
 
 @functools.cache
 def _listen() -> None:
-    jax.monitoring.register_event_duration_secs_listener(_heard)
+    """Note the spans of compilations, from now on."""
 
+    def note(event: str, duration_secs: float, **_: str | int) -> None:
+        spans = getattr(_local, "spans", None)
+        if spans is not None and event.startswith("/jax/core/compile/"):
+            now = time.perf_counter()
+            spans.append((now - duration_secs, now))
 
-def _heard(event: str, duration_secs: float, **kwargs: str | int) -> None:
-    del kwargs
-    spans = getattr(_local, "spans", None)
-    if spans is not None and event.startswith("/jax/core/compile/"):
-        now = time.perf_counter()
-        spans.append((now - duration_secs, now))
+    jax.monitoring.register_event_duration_secs_listener(note)
 
 
 _IN_USE = Path("/proc/self/maps")

@@ -1,4 +1,4 @@
-"""How the controllers of the study do: its rows, words and figures."""
+"""How the controllers of the study do at the lungs: its rows, figures and words."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,14 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.axes import Axes
 
 from ... import lung
 from ..._module import save
 from ..._typing import PRNGKey
 from ...environments import Environment
-from ...plotting import animate
-from ...plotting.figures import color_of, NEUTRAL, NotebookFigure, style_axes
 from ...simulation import rollout
 from ._contenders import Contender
 from ._stages import ABORT, BREATH, INSPIRATION, SEEN, SHOWN, UNSEEN
@@ -179,7 +176,11 @@ def _by_kind(table: Rows, column: str) -> dict[str, dict[str, float]]:
 
 
 def summarise(
-    rows: Rows, table: Rows, seconds: dict[str, float], judge: str, unsafe: list[str]
+    rows: Rows,
+    table: Rows,
+    seconds: dict[str, float],
+    judge: str,
+    unsafe: list[str],
 ) -> dict[str, Any]:
     """The figures that the study is about, and sentences of them.
 
@@ -231,132 +232,3 @@ def summarise(
         seconds=seconds,
         words=words,
     )
-
-
-_SIZE = 9.0
-_ORDER = ("best PID", "MLP", "MLP for all", "MPC", "PID + MLP", "CNN")
-
-
-def tracking_figure(
-    envs: Environment,
-    shown: dict[str, Any],
-    names: list[str],
-    rows: list[dict[str, Any]],
-) -> NotebookFigure:
-    """Breaths of some lungs under several controllers, and all their errors."""
-    count = len(names)
-    lungs = sorted({0, count // 2, count - 1})
-    figure = NotebookFigure(figsize=(9.5, 6.2), layout="constrained")
-    axes = figure.subplots(2, len(lungs), squeeze=False, height_ratios=(1.15, 1))
-    cost: Any = lung.unstack(envs)[0].cost
-    index = cost.index
-    for ax, i in zip(axes[0], lungs, strict=True):
-        for k, (label, runs) in enumerate(shown.items()):
-            pressure = np.asarray(runs.states[i, :, index])
-            times = float(envs.dt[i]) * np.arange(len(pressure))
-            ax.plot(times, pressure, color=_color(label, k), lw=1.5, label=label)
-        times = np.linspace(0, 2.99, 600)
-        target = np.asarray(lung.at_pip(cost.waveform, SHOWN).pressure(times))
-        ax.plot(times, target, color="0.2", lw=1, ls=(0, (4, 2)), label="target")
-        ax.set_title(names[i], fontsize=_SIZE + 1)
-        ax.set_xlabel("time [s]", fontsize=_SIZE)
-        style_axes(ax, size=_SIZE)
-        ax.set_xlim(0, 1.6)
-    axes[0, 0].set_ylabel("pressure [cmH2O]", fontsize=_SIZE)
-    axes[0, -1].legend(fontsize=_SIZE - 1, frameon=False)
-    grid = axes[1, 0].get_gridspec()
-    for ax in axes[1]:
-        ax.remove()
-    ax = figure.add_subplot(grid[1, :])
-    error = _errors(rows, names)
-    pids = [error[label] for label in PID_ROWS if label in error]
-    bars = {"best PID": np.min(pids, axis=0)}
-    chosen = ("MLP for all", "MPC", "CNN", "PID + MLP", "MLP", "least error")
-    bars |= {label: error[label] for label in chosen if label in error}
-    colors = {label: _color(label, k) for k, label in enumerate(bars)}
-    _draw_bars(ax, bars, colors | {"least error": NEUTRAL})
-    ax.set_xticks(np.arange(count), names)
-    ax.set_ylabel("mean |error| [cmH2O]", fontsize=_SIZE)
-    ax.legend(fontsize=_SIZE - 1, frameon=False, ncols=len(bars), loc="upper center")
-    ax.set_ylim(0, 1.25 * float(np.max(list(bars.values()))))
-    return figure
-
-
-def _draw_bars(ax: Axes, bars: dict[str, Any], colors: dict[str, str]) -> None:
-    """Bars of several labels side by side, a group for each lung."""
-    width = 0.8 / len(bars)
-    for k, (label, values) in enumerate(bars.items()):
-        place = np.arange(len(values)) + (k - (len(bars) - 1) / 2) * width
-        ax.bar(place, values, width, color=colors[label], label=label)
-    style_axes(ax, size=_SIZE)
-
-
-def _color(label: str, index: int) -> str:
-    """The same for a controller in all parts of the figure."""
-    return color_of(_ORDER.index(label) if label in _ORDER else index)
-
-
-def _errors(rows: list[dict[str, Any]], names: list[str]) -> dict[str, np.ndarray]:
-    """The error at unseen peak pressures, of each controller in each lung."""
-    labels = dict.fromkeys(r["controller"] for r in rows if r["split"] == "unseen")
-    return {
-        label: np.array([mean_error(rows, label, "unseen", name) for name in names])
-        for label in labels
-    }
-
-
-def simulator_figure(
-    test: Any, models: dict[str, Any], names: list[str], table: list[dict[str, Any]]
-) -> NotebookFigure:
-    """A breath that was not learned from as simulators see it, and their errors."""
-    figure = NotebookFigure(figsize=(9.5, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1, 1.5))
-    middle = len(names) // 2
-    # One that reaches a pressure that is often asked for.
-    breath = int(np.argmin(np.abs(np.max(test.pressure[middle], axis=-1) - 30)))
-    u = test.u_in[middle, breath]
-    times = float(np.ravel(test.dt)[0]) * np.arange(u.shape[0])
-    truth = test.pressure if test.truth is None else test.truth
-    read = np.asarray(test.pressure[middle, breath])
-    left.plot(times, read, ".", color=NEUTRAL, ms=4, label="read")
-    left.plot(times, np.asarray(truth[middle, breath]), color="0.2", lw=1, label="true")
-    for k, (label, model) in enumerate(models.items()):
-        if label not in ("learned", "single compartment", "balloon"):
-            continue
-        predicted = np.asarray(eqx.filter_jit(lung.unstack(model)[middle].predict)(u))
-        left.plot(times, predicted, color=color_of(k), lw=1.5, label=label)
-    left.set_title(f"{names[middle]}, from its controls alone", fontsize=_SIZE + 1)
-    left.set_xlabel("time [s]", fontsize=_SIZE)
-    left.set_ylabel("pressure [cmH2O]", fontsize=_SIZE)
-    left.legend(fontsize=_SIZE - 1, frameon=False)
-    style_axes(left, size=_SIZE)
-    errors = {(row["simulator"], row["lung"]): row["mae"] for row in table}
-    bars = {label: [errors[label, name] for name in names] for label in models}
-    _draw_bars(right, bars, {label: color_of(k) for k, label in enumerate(models)})
-    right.set_yscale("log")
-    right.set_xticks(np.arange(len(names)), names, rotation=30)
-    right.set_ylabel("open-loop mean |error| [cmH2O]", fontsize=_SIZE)
-    right.set_ylim(top=4 * max(row["mae"] for row in table))
-    right.legend(fontsize=_SIZE - 1, frameon=False, ncols=3, loc="upper center")
-    return figure
-
-
-def draw_study(
-    out: Path,
-    envs: Environment,
-    shown: dict[str, Any],
-    names: list[str],
-    test: Any,
-    models: dict[str, Any],
-    table: list[dict[str, Any]],
-    rows: list[dict[str, Any]],
-) -> None:
-    """`controllers.png`, `simulators.png` and `breath.gif`."""
-    figure = tracking_figure(envs, shown, names, rows)
-    figure.savefig(out / "controllers.png", dpi=130)
-    figure = simulator_figure(test, models, names, table)
-    figure.savefig(out / "simulators.png", dpi=130)
-    middle = len(names) // 2
-    env = lung.at_pip(lung.unstack(envs)[middle], SHOWN)
-    run = lung.unstack(shown["MLP"])[middle]
-    animate(env, run, path=out / "breath.gif", max_frames=40)
