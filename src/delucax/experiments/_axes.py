@@ -1,4 +1,4 @@
-"""Parameters, with their ids and marks, and which cases of them an expression selects."""
+"""Parameters, with ids and marks, and which cases of them an expression selects."""
 
 import dataclasses
 import re
