@@ -8,13 +8,12 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .._check import check_bool, is_concrete
 from .._results import RESULTS
-from .._typing import BoolScalar, Control, PRNGKey, Scalar, State
-from ..disturbances import AbstractDisturbance, Zero
+from .._typing import BoolScalar, PRNGKey, Scalar, State
+from ..disturbances import Zero
 from ..environments import Environment
 
 
@@ -102,19 +101,14 @@ def begin(env: Environment, key: PRNGKey, state: State | None = None) -> Episode
     if not isinstance(env.disturbance, Zero):
         w = env.disturbance.draw(w_key, env.dt, env.horizon, x.dtype)
     if env.sensor_noise is not None:
-        noise = _draw_noise(env, env.sensor_noise, noise_key, x.dtype)
+        # The state after the last step is observed too. Where what is recorded ends
+        # there, its last row is the noise of that.
+        recorded = env.sensor_noise.recorded_steps
+        ends = recorded is not None and recorded <= env.horizon
+        steps = env.horizon + (not ends)
+        noise = env.sensor_noise.draw(noise_key, env.dt, steps, x.dtype)
+        noise = jnp.concatenate([noise, noise[-1:]]) if ends else noise
     return EpisodeState(x, jnp.zeros((), int), Signals(w, noise))
-
-
-def _draw_noise(
-    env: Environment, noise: AbstractDisturbance, key: PRNGKey, dtype: DTypeLike
-) -> Float[Array, "times observations"]:
-    # The state after the last step is observed too. Where what is recorded ends there,
-    # its last row is the noise of that.
-    recorded = noise.recorded_steps
-    ends = recorded is not None and recorded <= env.horizon
-    rows = noise.draw(key, env.dt, env.horizon + (not ends), dtype)
-    return jnp.concatenate([rows, rows[-1:]]) if ends else rows
 
 
 def time_of(env: Environment, episode: EpisodeState) -> Scalar:
@@ -130,10 +124,7 @@ def observe(env: Environment, episode: EpisodeState) -> Float[Array, " features"
 
 
 def step(
-    env: Environment,
-    episode: EpisodeState,
-    action: Control | Array,
-    truncate: bool = True,
+    env: Environment, episode: EpisodeState, action: Array, truncate: bool = True
 ) -> tuple[EpisodeState, Outcome]:
     """One step; the final cost is charged with the last, which is at the horizon if
     episodes are to be truncated there."""
@@ -143,9 +134,8 @@ def step(
     terminated, x_next = transition.terminated, transition.state.astype(x.dtype)
     after = EpisodeState(x_next, episode.time + 1, episode.signals)
     truncated = (after.time >= env.horizon) & truncate
-    final = jnp.where(
-        terminated | truncated, env.cost.final(time_of(env, after), x_next), 0
-    )
+    final = env.cost.final(time_of(env, after), x_next)
+    final = jnp.where(terminated | truncated, final, 0)
     finite = jnp.all(jnp.isfinite(action)) & jnp.all(jnp.isfinite(x_next))
     failed = (transition.result != RESULTS.successful) | ~finite
     return after, Outcome(-(transition.cost + final), terminated, truncated, failed)

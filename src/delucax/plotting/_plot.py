@@ -23,6 +23,9 @@ Values: TypeAlias = Float[np.ndarray, "batch times"]
 WIDTH = 7.0
 PANEL_HEIGHT = 1.35
 SIZE = 9.0
+# Of a legend beside a panel.
+COMPACT: dict[str, Any] = {"handlelength": 1.4, "handletextpad": 0.5}
+COMPACT |= {"labelspacing": 0.3, "borderaxespad": 0.3}
 # What a member of a run may have done in the end.
 END_MARKS: dict[str, dict[str, Any]] = {
     "failed": {"marker": "x"},
@@ -175,18 +178,9 @@ def draw_panel(
         _mark_incidents(ax, runs)
     _label(ax, panel, int(PANEL_HEIGHT * 13 * 9 / size) if columns == 1 else 16, size)
     if len(panel.names) > 1:  # beside the panel, where it covers no data
-        ax.legend(
-            handles,
-            [figures.wrapped(name, 24) for name in panel.names],
-            loc="center left",
-            bbox_to_anchor=(1.0, 0.5),
-            frameon=False,
-            fontsize=size - 1,
-            handlelength=1.4,
-            handletextpad=0.5,
-            labelspacing=0.3,
-            borderaxespad=0.3,
-        )
+        names = [figures.wrapped(name, 24) for name in panel.names]
+        place = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5), "frameon": False}
+        ax.legend(handles, names, fontsize=size - 1, **place, **COMPACT)
     return handles
 
 
@@ -338,13 +332,6 @@ def _draw_head(figure: Figure, runs: Sequence[Run], kinds: set[str]) -> None:
     lengths = [6 + max(map(len, label.split("\n"))) for _, label in entries]
     room = int(11 * figure.get_figwidth())
     columns = len(entries) if sum(lengths) <= room else room // max(lengths)
-    figures.top_legend(
-        figure,
-        entries,
-        ncols=max(1, columns),
-        title=title or None,
-        title_fontsize=SIZE + 1,
-        fontsize=SIZE,
-        handlelength=1.8,
-        columnspacing=1.6,
-    )
+    style = {"title": title or None, "title_fontsize": SIZE + 1, "fontsize": SIZE}
+    style |= {"ncols": max(1, columns), "handlelength": 1.8, "columnspacing": 1.6}
+    figures.top_legend(figure, entries, **style)

@@ -83,12 +83,12 @@ class Canvas:
         """A filled circle."""
         self.circle(at, radius, color=color, **{"lw": 0, "zorder": 2} | style)
 
-    def rectangle(
-        self, corner: Point, width: Number, height: Number, **style: Any
-    ) -> None:
-        """A rectangle from its lower left corner."""
-        x, y = corner
-        self.ax.add_artist(Rectangle((x, y), width, height, **style))
+    def bar(self, at: Point, width: Number, top: Number, **style: Any) -> None:
+        """A filled bar that stands on the point `at`, up to the height `top`."""
+        corner, height = (at[0] - width / 2, float(at[1])), top - at[1]
+        self.ax.add_artist(
+            Rectangle(corner, width, height, **{"lw": 0, "zorder": 2} | style)
+        )
 
     def polygon(
         self,

@@ -43,7 +43,7 @@ def lung(canvas: Canvas, episode: Episode) -> Drawing:
     pipe = [(0, 0.95), (0, 1.45)]
     canvas.line(pipe, color=canvas.NEUTRAL, lw=9, solid_capstyle="butt", zorder=1)
     gauge = {"fill": False, "ec": canvas.NEUTRAL, "lw": 1.5, "zorder": 3}
-    canvas.rectangle((1.25, -0.9), 0.22, 2.3, **gauge)
+    canvas.bar((1.36, -0.9), 0.22, 1.4, **gauge)
     waveform = getattr(environment.cost, "waveform", None)
     if waveform is not None:
         for level in (float(waveform.pip), float(waveform.peep)):
@@ -56,9 +56,8 @@ def lung(canvas: Canvas, episode: Episode) -> Drawing:
         full = np.clip((x[parts] - low) / span, 0, 1)
         for centre, share, color in zip(centres, full, colors, strict=False):
             canvas.disc(centre, largest * (0.6 + 0.4 * share), color)
-        height = 2.3 * float(np.clip(x[pressure] / _SCALE, 0, 1))
-        level = {"color": canvas.BODY, "lw": 0, "alpha": 0.75, "zorder": 2}
-        canvas.rectangle((1.25, -0.9), 0.22, height, **level)
+        level = 2.3 * float(np.clip(x[pressure] / _SCALE, 0, 1)) - 0.9
+        canvas.bar((1.36, -0.9), 0.22, level, color=canvas.BODY, alpha=0.75)
         inflow = 0.6 * float(np.clip(u[0] / 100, 0, 1)) if len(u) else 0.0
         out = 0.6 * float(np.clip(u[1], 0, 1)) if len(u) > 1 else 0.0
         if inflow > 0.005:
@@ -149,27 +148,14 @@ def two_tank(canvas: Canvas, episode: Episode) -> Drawing:
         share = float(episode.shares(u)[0])
         if share > 0.005:
             surface = BOTTOMS[0] + heights[0]
-            _draw_water(canvas, 0.14 * share, surface, TOP + 0.16, canvas.ACTION)
+            canvas.bar((0, surface), 0.14 * share, TOP + 0.16, color=canvas.ACTION)
         # The upper stream falls to the lower level, the lower one out of the picture.
         ends = heights[1], -0.5
         for i, bottom in enumerate(BOTTOMS):
             top = bottom + heights[i]
-            _draw_water(canvas, widths[i], bottom, top, canvas.BODY, alpha=0.75)
+            canvas.bar((0, bottom), widths[i], top, color=canvas.BODY, alpha=0.75)
             # By Torricelli's law the stream is as the root of the level.
             stream = holes[i] * float(np.sqrt(heights[i] / HEIGHT))
-            _draw_water(canvas, stream, ends[i], bottom, canvas.SECOND)
+            canvas.bar((0, ends[i]), stream, bottom, color=canvas.SECOND)
 
     return Drawing(draw)
-
-
-def _draw_water(
-    canvas: Canvas,
-    width: float,
-    low: float,
-    high: float,
-    color: str,
-    alpha: float = 1.0,
-) -> None:
-    """Water of a width about the middle."""
-    style = {"color": color, "alpha": alpha, "lw": 0, "zorder": 2}
-    canvas.rectangle((-width / 2, low), width, high - low, **style)

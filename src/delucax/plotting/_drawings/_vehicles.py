@@ -1,6 +1,7 @@
 """Vehicles that a camera follows: cars from above, and quadrotors."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -124,18 +125,10 @@ def _draw_wind(canvas: Canvas, system: PlanarQuadrotor, view: View) -> None:
     states = jnp.zeros((len(places), 6)).at[:, :2].set(places)
     forces = np.asarray(jax.vmap(lambda x: wind(jnp.zeros(()), x))(states), float)
     strongest = np.linalg.norm(forces, axis=-1).max() or 1.0
-    canvas.ax.quiver(
-        *places.T,
-        *(forces * (0.25 * view.half[0] / strongest)).T,
-        angles="xy",
-        scale_units="xy",
-        scale=1.0,
-        pivot="middle",
-        width=0.005,
-        color=canvas.NEUTRAL,
-        alpha=0.35,
-        zorder=0,
-    )
+    arrows = forces * (0.25 * view.half[0] / strongest)
+    style: dict[str, Any] = {"color": canvas.NEUTRAL, "alpha": 0.35, "zorder": 0}
+    style |= {"angles": "xy", "scale_units": "xy", "scale": 1.0, "width": 0.005}
+    canvas.ax.quiver(*places.T, *arrows.T, pivot="middle", **style)
 
 
 AZIMUTH, ELEVATION = math.radians(-62), math.radians(24)  # of the eye, far away
