@@ -20,15 +20,9 @@ from ._fingerprint import device, provenance
 FORMS = {".csv": "csv", ".parquet": "parquet", ".md": "markdown", ".tex": "latex"}
 """The forms of a table by the ending of its file."""
 
-_LATEX = str.maketrans(
-    {
-        "\\": r"\textbackslash{}",
-        **{c: "\\" + c for c in "&%$#_{}"},
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "\n": " ",
-    }
-)
+_NAMED = {"\\": "backslash", "~": "asciitilde", "^": "asciicircum"}
+_LATEX = str.maketrans({c: "\\" + c for c in "&%$#_{}"} | {"\n": " "})
+_LATEX |= str.maketrans({c: f"\\text{name}{{}}" for c, name in _NAMED.items()})
 
 
 def as_text(

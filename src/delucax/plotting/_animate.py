@@ -16,6 +16,7 @@ from PIL import Image
 from .._check import check_bool, check_count, check_instance, check_step
 from ..environments import Environment
 from ..simulation import Trajectory
+from ._drawings._canvas import Episode
 from ._export import check_path, compressed, html_player, write
 from ._plot import control_bounds, draw_panel
 from ._runs import as_runs, HELD, Panel, panels_of, Run
@@ -54,13 +55,10 @@ class Scene:
         if traces:
             stack = grid[0, 1].subgridspec(len(panels), 1)
             self.lines = self._panels(panels, stack)
-        self.plant = PlantArtist(
-            self.figure.add_subplot(grid[0, 0]),
-            environment,
-            run.trajectory,
-            map(self._moment, indices),
-            self.states[: int(run.last[0]) + 1],
-        )
+        ax = self.figure.add_subplot(grid[0, 0])
+        episode = Episode(environment, run.trajectory)
+        visited = self.states[: int(run.last[0]) + 1]
+        self.plant = PlantArtist(ax, episode, map(self._moment, indices), visited)
 
         if not traces and self.plant.ax.get_aspect() == 1:  # no higher than it must be
             left, right, low, high = self.plant.ax.axis()

@@ -1,7 +1,7 @@
 """One moment of a plant as a picture: on given axes, or by itself, or in a window."""
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -12,10 +12,13 @@ from matplotlib.figure import Figure
 
 from ..controllers import Zero
 from ..environments import Environment
-from ..simulation import rollout, Trajectory
+from ..simulation import rollout
 from ._drawings._canvas import Canvas, Episode, States, Vector
 from ._drawings._registry import drawing_for
 from .figures import PALETTE
+
+
+Moments: TypeAlias = Iterable[tuple[Vector, Vector]]
 
 
 class PlantArtist:
@@ -27,18 +30,12 @@ class PlantArtist:
     """
 
     def __init__(
-        self,
-        ax: Axes,
-        environment: Environment,
-        trajectory: Trajectory,
-        moments: Iterable[tuple[Vector, Vector]],
-        states: States | None = None,
+        self, ax: Axes, episode: Episode, moments: Moments, states: States | None = None
     ):
         self.ax = ax
         ax.set_aspect("equal")
         ax.set_axis_off()
-        set_up = drawing_for(environment)
-        self.drawing = set_up(Canvas(ax), Episode(environment, trajectory))
+        self.drawing = drawing_for(episode.environment)(Canvas(ax), episode)
         self._draw_path(states, 0.25)
         self._fixed = set(map(id, ax.get_children()))
         if self.drawing.autoscale:
@@ -94,7 +91,7 @@ class Renderer:
         states = np.asarray(trajectory.states, float)
         moments = zip(states, np.asarray(trajectory.controls, float), strict=False)
         ax = self.figure.add_subplot()
-        self.plant = PlantArtist(ax, environment, trajectory, moments)
+        self.plant = PlantArtist(ax, Episode(environment, trajectory), moments)
 
     def frame(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """The picture at a state and a control, shape `(height, width, 3)`."""

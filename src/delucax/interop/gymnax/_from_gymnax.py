@@ -136,7 +136,7 @@ class GymnaxDynamics(AbstractDynamics):
         if getattr(env, "supports_transition_gradients", False):
             env = env.with_transition_gradients()  # else gymnax cuts them
         check_step(dt, where)
-        as_array = lambda leaf: as_float_array(leaf) if isinstance(leaf, float) else leaf
+        as_array = lambda x: as_float_array(x) if isinstance(x, float) else x
         self.env, self.params, self.dt = env, jax.tree.map(as_array, params), dt
         space = env.action_space(params)
         self.discrete = hasattr(space, "n")

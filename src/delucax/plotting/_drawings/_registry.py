@@ -96,25 +96,19 @@ def register_drawing(
             raise ValueError(
                 f"register_drawing: {name} must be a function, got {given!r}."
             )
-    _BY_TYPE[system_class] = functools.partial(_user_drawing, draw, setup)
 
+    def set_up(canvas: Canvas, episode: Episode) -> Drawing:
+        if setup is None:
+            return Drawing(functools.partial(draw, canvas.ax), autoscale=True)
+        keywords = setup(canvas.ax, episode.environment, episode.trajectory)
+        if keywords is not None and not isinstance(keywords, Mapping):
+            raise ValueError(
+                "animate: the setup of a drawing must return a dictionary or None, got "
+                f"{type(keywords).__name__}."
+            )
+        return Drawing(functools.partial(draw, canvas.ax, **(keywords or {})))
 
-def _user_drawing(
-    draw: Callable[..., Any],
-    setup: Callable[..., Any] | None,
-    canvas: Canvas,
-    episode: Episode,
-) -> Drawing:
-    """A drawing of the functions that were registered for a class."""
-    if setup is None:
-        return Drawing(functools.partial(draw, canvas.ax), autoscale=True)
-    keywords = setup(canvas.ax, episode.environment, episode.trajectory)
-    if keywords is not None and not isinstance(keywords, Mapping):
-        raise ValueError(
-            "animate: the setup of a drawing must return a dictionary or None, got "
-            f"{type(keywords).__name__}."
-        )
-    return Drawing(functools.partial(draw, canvas.ax, **(keywords or {})))
+    _BY_TYPE[system_class] = set_up
 
 
 def drawing_for(environment: Environment) -> Setup:
