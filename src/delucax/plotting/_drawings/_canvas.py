@@ -86,9 +86,8 @@ class Canvas:
     def bar(self, at: Point, width: Number, top: Number, **style: Any) -> None:
         """A filled bar that stands on the point `at`, up to the height `top`."""
         corner, height = (at[0] - width / 2, float(at[1])), top - at[1]
-        self.ax.add_artist(
-            Rectangle(corner, width, height, **{"lw": 0, "zorder": 2} | style)
-        )
+        style = {"lw": 0, "zorder": 2} | style
+        self.ax.add_artist(Rectangle(corner, width, height, **style))
 
     def polygon(
         self,

@@ -52,7 +52,7 @@ def estimator_variance(small: bool = False) -> Finding:
             estimators["ES, one-sided"] = by_one, loss, policy
             plain = training.LikelihoodRatio(BUDGET, baseline=False)
             estimators["REINFORCE, no baseline"] = plain, score, noisy
-        samples = {name: _estimates(*e, draws) for name, e in estimators.items()}
+        samples = {name: _estimates(e, draws) for name, e in estimators.items()}
         exact = samples["analytic"][0]
         scale = exact @ exact
         row: dict[str, Any] = {"parameters": len(exact)}
@@ -133,9 +133,9 @@ def _at_horizon(horizon: int, draws: int) -> dict[str, Any]:
     one = training.expected_cost(env, batch=1, horizon=horizon)
     score = training.scored_cost(env, horizon=horizon)
     # Of single rollouts, so that norms are those of one, and the variance an eighth.
-    each = np.asarray(_estimates(training.analytic, one, policy, draws))
+    each = np.asarray(_estimates((training.analytic, one, policy), draws))
     drawn = training.LikelihoodRatio(DRAWN)
-    guesses = np.asarray(_estimates(drawn, score, noisy, draws))
+    guesses = np.asarray(_estimates((drawn, score, noisy), draws))
     norms = np.linalg.norm(each, axis=1)
     return {
         "horizon": horizon,
@@ -146,8 +146,10 @@ def _at_horizon(horizon: int, draws: int) -> dict[str, Any]:
     }
 
 
-def _estimates(estimator: Any, loss: Any, model: Any, draws: int) -> jax.Array:
-    """Estimates of the gradient by the policy's own weights, a row each."""
+def _estimates(given: tuple[Any, Any, Any], draws: int) -> jax.Array:
+    """Estimates of the gradient by the policy's own weights, a row each; of an
+    estimator, a loss and a model."""
+    estimator, loss, model = given
 
     def estimate(key):
         _, gradient = estimator(loss, model, key)

@@ -172,7 +172,8 @@ def _observed(envs, controllers, pips):
     def in_lung(env, controller):
         def one(pip):
             world, policy = lung.at_pip((env, controller), pip)
-            return rollout(world, policy, key=jr.key(0), **options).observations[:, 0]
+            run: Any = rollout(world, policy, key=jr.key(0), **options)
+            return run.observations[:, 0]
 
         return jax.vmap(one)(pips)
 
