@@ -10,8 +10,8 @@ import optax
 
 import delucax as dlx
 from delucax import lung
-from delucax.studies.ventilator._settings import FULL, INSPIRATION as LENGTH
 from delucax.studies.ventilator._simulators import divided, explored
+from delucax.studies.ventilator._stages import FULL, INSPIRATION as LENGTH
 
 
 EPOCHS, BATCH, SEEDS = 500, 64, 3

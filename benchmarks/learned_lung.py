@@ -16,7 +16,7 @@ import jax
 
 import delucax as dlx
 from delucax import lung
-from delucax.studies.ventilator._settings import FULL
+from delucax.studies.ventilator._stages import FULL
 
 
 BREATHS = 400

@@ -20,8 +20,7 @@ import delucax as dlx
 from benchmarks._machine import describe
 from delucax import experiments
 from delucax.experiments import interquartile_mean, Results
-from delucax.studies._methods import FAMILIES, task_of
-from delucax.studies._scoreboard import METHODS, scoreboard
+from delucax.studies._scoreboard import FAMILIES, METHODS, scoreboard, task_of
 
 
 STORE = Path(__file__).parent / "results" / "scoreboard.jsonl"

@@ -26,7 +26,7 @@ from benchmarks._machine import describe
 from benchmarks._ventilator_page import write_page
 from delucax import lung, studies
 from delucax.studies.ventilator._report import PID_ROWS
-from delucax.studies.ventilator._settings import FULL
+from delucax.studies.ventilator._stages import FULL
 
 
 RESULTS = Path(__file__).parent / "results" / "ventilator.json"

@@ -19,7 +19,7 @@ gc.set_threshold(200_000, 50, 100)
 def released_programs():
     """Thousands of programs are compiled."""
     # Not before the tests' import hook is there.
-    from delucax.experiments._memory_maps import release_programs
+    from delucax.experiments._execute import release_programs
 
     yield
     release_programs()

@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 
 
-_DEFAULT = "(default: %(default)s)"
-
 _COMMANDS: list[tuple[Callable, str, str, tuple]] = []
 """What is called with the options, its help, more of it, and what options it has; in
 the order in which they are shown."""
@@ -29,15 +27,20 @@ def _command(help: str, *options: tuple, more: str = "") -> Callable:
     return register
 
 
-def _option(*names: str, **settings: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """What `add_argument` is given."""
-    return names, settings
+def _option(name: str, help: str, **settings: Any) -> tuple[str, dict[str, Any]]:
+    """What `add_argument` is given; the help shows the default, if there is one."""
+    shown = " (default: %(default)s)" if settings.get("default") else ""
+    return name, {"help": help + shown, **settings}
 
 
-def _expression(flag: str, name: str, help: str) -> tuple:
+def _flag(name: str, help: str) -> tuple[str, dict[str, Any]]:
+    return _option(name, help, action="store_true")
+
+
+def _expression(flag: str, name: str, help: str) -> tuple[str, dict[str, Any]]:
     """The option of an expression that selects cases."""
-    help = f"{help} (default: all)"
-    return _option(flag, dest=name, default="", metavar="EXPR", help=help)
+    settings = {"dest": name, "default": "", "metavar": "EXPR"}
+    return _option(flag, f"{help} (default: all)", **settings)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -80,8 +83,8 @@ def _parser() -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         added.set_defaults(call=call)
-        for names, settings in command_options:
-            added.add_argument(*names, **settings)
+        for name, settings in command_options:
+            added.add_argument(name, **settings)
     return parser
 
 
@@ -94,8 +97,8 @@ _CASES = (
 
 @_command(
     "swing the pendulum up, then the paper in small; in about two minutes",
-    _option("--out", default="demo", help=f"folder to write to {_DEFAULT}"),
-    _option("--seeds", type=int, default=2, help=f"how many MLPs to train {_DEFAULT}"),
+    _option("--out", "folder to write to", default="demo"),
+    _option("--seeds", "how many MLPs to train", type=int, default=2),
 )
 def _demo(out: str, seeds: int) -> None:
     from .studies import demo
@@ -105,9 +108,9 @@ def _demo(out: str, seeds: int) -> None:
 
 @_command(
     "regenerate the figures and tables of the Deluca paper, claim by claim",
-    _option("name", nargs="+", metavar="NAME", help="all, or some of these"),
-    _option("--out", default="paper", help=f"folder to write to {_DEFAULT}"),
-    _option("--small", action="store_true", help="fewer seeds and steps"),
+    _option("name", "all, or some of these", nargs="+", metavar="NAME"),
+    _option("--out", "folder to write to", default="paper"),
+    _flag("--small", "fewer seeds and steps"),
     more="""
         names: all, oracle-complexity, policy-gradient, estimator-variance,
           wall-clock, ventilator, pendulum-shock, lq-perturbations
@@ -124,24 +127,21 @@ def _reproduce(name: list[str], out: str, small: bool) -> int:
 
 @_command(
     "learn lungs from breaths, and controllers of a ventilator in them",
+    _option("--out", "folder to write to, or go on in", default="lung"),
+    _flag("--small", "two lungs, in a minute"),
     _option(
-        "--out", default="lung", help=f"folder to write to, or go on in {_DEFAULT}"
-    ),
-    _option("--small", action="store_true", help="two lungs, in a minute"),
-    _option(
-        "--data",
-        help="breaths, as a CSV file of the public data set (default: simulated)",
+        "--data", "breaths, as a CSV file of the public data set (default: simulated)"
     ),
     _option(
         "--seeds",
+        "how many controllers of each kind to train (default: 3, or 1 if --small)",
         type=int,
-        help="how many controllers of each kind to train (default: 3, or 1 if --small)",
     ),
     _option(
         "--sensor-delay",
+        "how late the sensor reads, in samples; holds for DATA too",
         type=int,
         default=2,
-        help=f"how late the sensor reads, in samples; holds for DATA too {_DEFAULT}",
     ),
 )
 def _lung(out: str, **options: Any) -> None:
@@ -152,7 +152,7 @@ def _lung(out: str, **options: Any) -> None:
 
 @_command(
     "name the tasks, controllers and suites, or the cases of FILE",
-    _option("file", nargs="?", metavar="FILE", help=f"{_FILE}; its cases are listed"),
+    _option("file", f"{_FILE}; its cases are listed", nargs="?", metavar="FILE"),
     *_CASES,
 )
 def _list(file: str | None, select: str, marks: str) -> int | None:
@@ -167,24 +167,17 @@ def _list(file: str | None, select: str, marks: str) -> int | None:
 
 @_command(
     "run the experiments of FILE",
-    _option("file", metavar="FILE", help=_FILE),
+    _option("file", _FILE, metavar="FILE"),
     *_CASES,
-    _option("--slow", action="store_true", help="also cases marked slow"),
-    _option("--seeds", type=int, help="how many seeds (default: as FILE says)"),
-    _option(
-        "--workers",
-        type=int,
-        default=1,
-        help=f"processes; -1 is one for each core {_DEFAULT}",
-    ),
-    _option(
-        "--dask", metavar="ADDRESS", help="run on the Dask cluster of this scheduler"
-    ),
-    _option("--store", help="results file (default: results/FILE.jsonl)"),
-    _option("--html", metavar="PAGE", help="write a report too"),
-    _option("--fresh", action="store_true", help="run also what is stored"),
-    _option("--retry", action="store_true", help="run again what failed"),
-    _option("--quiet", dest="progress", action="store_false", help="show no progress"),
+    _flag("--slow", "also cases marked slow"),
+    _option("--seeds", "how many seeds (default: as FILE says)", type=int),
+    _option("--workers", "processes; -1 is one for each core", type=int, default=1),
+    _option("--dask", "run on the Dask cluster of this scheduler", metavar="ADDRESS"),
+    _option("--store", "results file (default: results/FILE.jsonl)"),
+    _option("--html", "write a report too", metavar="PAGE"),
+    _flag("--fresh", "run also what is stored"),
+    _flag("--retry", "run again what failed"),
+    _option("--quiet", "show no progress", dest="progress", action="store_false"),
     more="""
         examples:
           python -m delucax run sweep.py --workers 2
@@ -211,17 +204,13 @@ def _run(
 
 @_command(
     "show a results file, or what differs between two",
-    _option("results", nargs="+", metavar="RESULTS", help="results file"),
-    _option(
-        "--diff", action="store_true", help="compare two, with paired 95%% intervals"
-    ),
-    _option("--html", metavar="PAGE", help="write a page of tables, figures"),
+    _option("results", "results file", nargs="+", metavar="RESULTS"),
+    _flag("--diff", "compare two, with paired 95%% intervals"),
+    _option("--html", "write a page of tables, figures", metavar="PAGE"),
     _option(
         "--export",
-        action="append",
-        default=[],
-        metavar="TABLE",
-        help="write all rows to a .csv, .parquet, .md or .tex file",
+        "write all rows to a .csv, .parquet, .md or .tex file",
+        **{"action": "append", "default": [], "metavar": "TABLE"},
     ),
     _expression("-k", "select", "only these cases"),
     more="""
@@ -242,7 +231,7 @@ def _report(
 
 @_command(
     "measure speed against other libraries, in a checkout",
-    _option("name", nargs="?", help="one benchmark, such as pendulum (default: all)"),
+    _option("name", "one benchmark, such as pendulum (default: all)", nargs="?"),
 )
 def _bench(name: str | None) -> int:
     sys.path.insert(0, str(Path.cwd()))

@@ -30,4 +30,4 @@ def did_you_mean(name: str, names: Iterable[str], cutoff: float = 0.6) -> str:
     """The question that an error about an unknown name ends with."""
     names = list(names)
     close = difflib.get_close_matches(name, names, n=3, cutoff=cutoff) or names
-    return f"did you mean {' or '.join(map(repr, close))}?"
+    return f"did you mean {' or '.join(map(repr, close)) or 'none'}?"

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import pytest
 from helpers import once
 
-from delucax.experiments import _execute, _memory_maps, experiment
-from delucax.experiments._memory_maps import release_programs
+from delucax.experiments import _execute, experiment
+from delucax.experiments._execute import release_programs
 
 
 pytestmark = [
@@ -21,15 +21,15 @@ def test_programs_go_when_they_take_too_much():
     programs = [jax.jit(lambda x, n=n: jnp.sin(x) + n) for n in range(20)]
     for program in programs:
         program(0.0)
-    taken = len(_memory_maps._IN_USE.read_bytes().splitlines())
+    taken = len(_execute._IN_USE.read_bytes().splitlines())
     assert not release_programs() and programs[1]._cache_size() == 1
     assert release_programs(limit=1) and programs[1]._cache_size() == 0
-    assert len(_memory_maps._IN_USE.read_bytes().splitlines()) < taken
+    assert len(_execute._IN_USE.read_bytes().splitlines()) < taken
     assert programs[1](0.0) == 1.0
 
 
 def test_elsewhere_nothing_is_done(monkeypatch, tmp_path):
-    monkeypatch.setattr(_memory_maps, "_IN_USE", tmp_path / "none")
+    monkeypatch.setattr(_execute, "_IN_USE", tmp_path / "none")
     assert not release_programs(limit=1)
 
 

@@ -5,7 +5,7 @@ import subprocess
 import pytest
 from helpers import once
 
-from delucax.experiments._provenance import provenance
+from delucax.experiments._fingerprint import provenance
 
 
 pytestmark = once

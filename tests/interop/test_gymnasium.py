@@ -15,7 +15,7 @@ from helpers import assert_close, once, thorough, user_error
 
 import delucax as dlx
 import delucax.interop.gymnasium as interop
-from delucax.interop.gymnasium._same_step import dones_and_infos
+from delucax.interop.gymnasium._vector_env import dones_and_infos
 
 
 pytestmark = once

@@ -388,7 +388,7 @@ class TestFromGymnax:
             from_gymnax(Typed())
         with user_error(match="horizon must be given"):
             from_gymnax(Slope(), Params(max_steps_in_episode=None))
-        with user_error(match="no argument 'horizont'"):
+        with user_error(match="no argument is called 'horizont'"):
             from_gymnax(Slope(), horizont=3)
         with user_error(match="encode must be given"):
             from_gymnax(Blind())

@@ -10,13 +10,12 @@ from matplotlib.patches import Polygon
 from systems_catalogue import SYSTEMS
 
 import delucax as dlx
-from delucax.plotting._drawings import drawing_for
+from delucax.plotting._animate import Scene
 from delucax.plotting._drawings._arms import arm_points
-from delucax.plotting._drawings._masses import zigzag
-from delucax.plotting._drawings._quadrotor import attitude
-from delucax.plotting._drawings._registry import _BY_TYPE
+from delucax.plotting._drawings._carts import zigzag
+from delucax.plotting._drawings._registry import _BY_TYPE, drawing_for
+from delucax.plotting._drawings._vehicles import attitude
 from delucax.plotting._runs import as_runs
-from delucax.plotting._scene import Scene
 
 
 pytestmark = once

@@ -57,7 +57,7 @@ def test_an_unwritable_folder_is_an_error_before_any_work(tmp_path, capsys):
         studies.demo(tmp_path / "file", say=lambda line: pytest.fail(line))
     assert main(["demo", "--out", str(tmp_path / "file")]) == 2
     assert "error: demo: out must be" in capsys.readouterr().err
-    with user_error(match="seeds must be at least 1"):
+    with user_error(match="seeds must be a whole number of at least 1"):
         studies.demo(tmp_path, seeds=0)
 
 

@@ -22,9 +22,8 @@ from delucax.studies.ventilator._contenders import (
     tuned_pids,
 )
 from delucax.studies.ventilator._report import save_controllers
-from delucax.studies.ventilator._settings import FULL
 from delucax.studies.ventilator._simulators import grouped, left_out
-from delucax.studies.ventilator._stages import Stages
+from delucax.studies.ventilator._stages import FULL, Stages
 
 
 pytestmark = once
@@ -79,7 +78,7 @@ def test_goes_on_where_it_was_cut_off(tmp_path):
 def test_other_settings_are_refused(begun):
     with user_error(match="other settings: seeds is 1 there and 2 here"):
         studies.lung_study(begun, small=True, seeds=2)
-    with user_error(match="seeds must be at least 1, got 0"):
+    with user_error(match="seeds must be a whole number of at least 1, got 0"):
         studies.lung_study(begun, seeds=0)
     with user_error(match="other settings: sensor_delay is 2 there and 3 here"):
         studies.lung_study(begun, small=True, sensor_delay=3)

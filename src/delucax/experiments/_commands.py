@@ -9,21 +9,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from ._axes import selector
 from ._experiment import Experiment
-from ._page import Page
-from ._report import diff, DIFFERENCES, report, summary
+from ._page import as_text, Page
+from ._report import by_experiment, diff, DIFFERENCES, report, summary
 from ._results import Results
 from ._run import run
-from ._select import selector
-from ._tables import as_text
 
 
 def list_cases(file: str, suites: Mapping[str, str], select: str, marks: str) -> int:
     """Show the cases of a file."""
     experiments = load(file, suites)
-    cases = [
-        case for one in experiments for case in one.cases(select, marks, slow=True)
-    ]
+    cases = [case for one in experiments for case in one.cases(select, marks, True)]
     for case in cases:
         labels = ", ".join(mark.name for mark in case.marks)
         print(f"{case.id}  ({labels})" if labels else case.id)
@@ -96,9 +93,8 @@ def report_diff(
 
 def _show(results: Results) -> None:
     """A table of means for each experiment."""
-    for name in dict.fromkeys(row["experiment"] for row in results.rows):
-        columns, rows = summary(results.where(experiment=name))
-        print(f"\n{name}\n\n{as_text('markdown', columns, rows)}")
+    for name, part in by_experiment(results).items():
+        print(f"\n{name}\n\n{as_text('markdown', *summary(part))}")
 
 
 def _write_page(path: str | None, make: Callable[[], Page]) -> None:

@@ -9,6 +9,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,8 +19,7 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from ._experiment import arguments_of, Experiment
-from ._memory_maps import release_programs
-from ._provenance import device
+from ._fingerprint import device
 from ._store import RESERVED
 
 
@@ -117,9 +117,8 @@ class Runner:
             given[name] = self.shared[key]
         if self.takes_any_name:
             return given
-        return {
-            n: value for n, value in given.items() if n in self.experiment.arguments
-        }
+        known = self.experiment.arguments
+        return {name: value for name, value in given.items() if name in known}
 
     def _call(self, arguments: dict[str, Any], seeds: tuple[int, ...], mesh: Any):
         """What the function returns: a list by seed, or all seeds at once."""
@@ -164,11 +163,8 @@ class Runner:
 
     def _all_seeds(self, static: "_Static", dynamic: Any, numbers: Any) -> Any:
         arguments = eqx.combine(dynamic, static.tree)
-
-        def one(number: Any) -> Any:
-            return self.experiment.function(**arguments, key=jax.random.key(number))
-
-        return jax.vmap(one)(numbers)
+        call = lambda n: self.experiment.function(**arguments, key=jax.random.key(n))
+        return jax.vmap(call)(numbers)
 
     def _columns(self, returned: Any) -> dict[str, list]:
         """Lists with an entry for each seed, by name, of things that JSON knows."""
@@ -294,12 +290,39 @@ _local = threading.local()
 
 @functools.cache
 def _listen() -> None:
-    jax.monitoring.register_event_duration_secs_listener(_heard)
+    """Note the spans of compilations, from now on."""
+
+    def note(event: str, duration_secs: float, **_: str | int) -> None:
+        spans = getattr(_local, "spans", None)
+        if spans is not None and event.startswith("/jax/core/compile/"):
+            now = time.perf_counter()
+            spans.append((now - duration_secs, now))
+
+    jax.monitoring.register_event_duration_secs_listener(note)
 
 
-def _heard(event: str, duration_secs: float, **kwargs: str | int) -> None:
-    del kwargs
-    spans = getattr(_local, "spans", None)
-    if spans is not None and event.startswith("/jax/core/compile/"):
-        now = time.perf_counter()
-        spans.append((now - duration_secs, now))
+_IN_USE = Path("/proc/self/maps")
+_LIMIT = Path("/proc/sys/vm/max_map_count")
+
+
+def release_programs(limit: int | None = None) -> bool:
+    """Forget all compiled programs if they hold too many memory maps.
+
+    A program that XLA has compiled holds tens of the maps that Linux allows a process,
+    65,530 by default, and a compilation that finds none left ends in a
+    segmentation fault. Programs that are still needed are compiled anew. Elsewhere than
+    on Linux nothing is done.
+
+    `limit` is how many maps are too many, by default half of what is allowed. Returns
+    whether the programs were forgotten.
+    """
+    try:
+        if limit is None:
+            limit = int(_LIMIT.read_text()) // 2
+        used = _IN_USE.read_bytes().count(b"\n")
+    except (OSError, ValueError):
+        return False
+    if used <= limit:
+        return False
+    jax.clear_caches()
+    return True

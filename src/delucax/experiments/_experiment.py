@@ -1,7 +1,6 @@
 """Experiments, declared as pytest declares tests: a function and its arguments."""
 
 import dataclasses
-import difflib
 import inspect
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -11,10 +10,9 @@ import jax
 import numpy as np
 
 from .._check import check_choice
-from ._axes import Axis, axis_of, Mark, Marks, Param
-from ._fingerprint import fingerprint
-from ._provenance import version
-from ._select import selector, words
+from .._message import did_you_mean
+from ._axes import Axis, axis_of, Mark, Marks, Param, selector, words
+from ._fingerprint import fingerprint, version
 from ._store import RESERVED
 
 
@@ -234,10 +232,9 @@ class Experiment:
             if name in RESERVED or name == "key":
                 raise ValueError(f"{where}: no parameter can be called {name!r}.")
             if name not in taken and not any_name:
-                close = difflib.get_close_matches(name, taken, n=3) or sorted(taken)
                 raise ValueError(
-                    f"{where}: the function has no argument {name!r}; did you mean "
-                    f"{' or '.join(repr(n) for n in close) or 'none'}?"
+                    f"{where}: the function has no argument {name!r}; "
+                    f"{did_you_mean(name, sorted(taken))}"
                 )
         given = {*names, *fixtures}
         self._check_given(self.function, where, {*given, "key", "seed"})

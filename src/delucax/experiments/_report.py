@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ._page import Page
+from ._page import escape, Page
 from ._results import Results
 from ._statistics import Bootstrap, interquartile_mean
-from ._tables import escape
 
 
 # The panels of a figure, and the cases of a panel, at most.
@@ -23,8 +22,7 @@ def report(results: Results, title: str) -> Page:
     """A table of means and a figure for each experiment, what failed, and every row."""
     page = Page(title)
     page.paragraph(_made_with(results), "made")
-    for name in dict.fromkeys(row["experiment"] for row in results.rows):
-        part = results.where(experiment=name)
+    for name, part in by_experiment(results).items():
         page.heading(name)
         page.paragraph(_counts(part))
         page.table(*summary(part))
@@ -45,6 +43,12 @@ def report(results: Results, title: str) -> Page:
     page.table(columns, [[row.get(name) for name in columns] for row in rows])
     page.parts.append("</details>")
     return page
+
+
+def by_experiment(results: Results) -> dict[str, Results]:
+    """The results of each experiment, by its name."""
+    names = dict.fromkeys(row["experiment"] for row in results.rows)
+    return {name: results.where(experiment=name) for name in names}
 
 
 def summary(results: Results) -> tuple[list[str], list[list]]:
@@ -70,15 +74,13 @@ def summary(results: Results) -> tuple[list[str], list[list]]:
             if any(isinstance(row.get(name), str) for row in results.rows):
                 words.append((name, name))
             continue
+        statistics: dict[str, Any] = {name: interquartile_mean}
+        if many and any(_varies(rows, name) for rows in cases.values()):
+            for k in (25, 75):
+                statistics[f"{name} {k}%"] = lambda v, k=k: float(np.percentile(v, k))
         with np.errstate(invalid="ignore"):
-            means = [interquartile_mean(v) if v else None for v in values]
-            columns.append((name, means))
-            if many and any(_varies(rows, name) for rows in cases.values()):
-                for k in (25, 75):
-                    ends = [
-                        float(np.quantile(v, k / 100)) if v else None for v in values
-                    ]
-                    columns.append((f"{name} {k}%", ends))
+            for heading, of in statistics.items():
+                columns.append((heading, [of(v) if v else None for v in values]))
     times = ("compile s", "compile_seconds"), ("run s", "run_seconds")
     for heading, name in (*words, *times):
         columns.append((heading, [rows[0].get(name) for rows in cases.values()]))
@@ -211,9 +213,8 @@ def _add_figures(page: Page, results: Results) -> None:
                 _panel(axes, title, cases)
             for axes in grid[len(panels) :]:
                 axes.set_axis_off()
-            figure.supxlabel(
-                f"{metric} (dot: interquartile mean; bar: quartiles)", fontsize=9
-            )
+            words = f"{metric} (dot: interquartile mean; bar: quartiles)"
+            figure.supxlabel(words, fontsize=9)
             page.figure(figure)
 
 

@@ -11,8 +11,8 @@ from .._check import as_path
 from .._extras import extra
 from .._files import replaced
 from ._experiment import Case
+from ._page import as_text, FORMS
 from ._store import CASE_COLUMNS, RUN_COLUMNS, Store
-from ._tables import as_text, FORMS
 
 
 PASSED = ("passed", "passed unexpectedly")
@@ -141,12 +141,8 @@ class Results:
         **Raises:** `ValueError` if there is no such column.
         """
         self._check_columns(values, "Results.where", ("traceback", "versions"))
-        rows = [
-            row
-            for row in self.rows
-            if all(row.get(name) == value for name, value in values.items())
-        ]
-        return dataclasses.replace(self, rows=rows)
+        holds = lambda row: all(row.get(name) == v for name, v in values.items())
+        return dataclasses.replace(self, rows=[*filter(holds, self.rows)])
 
     def export(
         self,
@@ -214,12 +210,12 @@ class Results:
         self, names: Iterable[str], where: str, more: tuple[str, ...] = ()
     ) -> None:
         known = {*self.all_columns, *more}
-        unknown = [name for name in names if name not in known]
-        if unknown:
-            raise ValueError(
-                f"{where}: there is no column {unknown[0]!r}; there are "
-                f"{', '.join(self.columns)}."
-            )
+        for name in names:
+            if name not in known:
+                raise ValueError(
+                    f"{where}: there is no column {name!r}; there are "
+                    f"{', '.join(self.columns)}."
+                )
 
     @property
     def all_columns(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from typing import Any
 from .._check import check_choice, check_count
 from ._execute import Outcome, Runner
 from ._experiment import as_experiment, as_seeds, Case, Experiment
-from ._provenance import provenance
+from ._fingerprint import provenance
 from ._results import FAILED, Results
 from ._store import Store
 from ._workers import Job, run_in_workers
@@ -127,39 +127,24 @@ def run(
         for record in changed:
             opened.append(record)
         if jobs:
-            _run_jobs(jobs, opened, workers, backend, mesh, progress)
+            here = workers == 1 and backend == "loky"
+            in_workers = lambda: run_in_workers(jobs, workers, backend)
+            outcomes = _run_here(jobs, mesh) if here else in_workers()
+            bars = _progress(len(jobs), workers, progress)
+            _write_outcomes(jobs, outcomes, opened, bars)
     return Results._of(opened, asked)
 
 
-def _run_jobs(
-    jobs: list[Job],
-    opened: Store,
-    workers: int,
-    backend: str,
-    mesh: Any,
-    progress: bool,
-) -> None:
-    """Run the jobs, and write each result down as it arrives."""
+def _write_outcomes(jobs: list[Job], outcomes: Any, opened: Store, bars: Any) -> None:
+    """Write each outcome down as it arrives."""
     number = opened.begin(provenance(_folder(jobs[0].experiment)))
-    outcomes = (
-        _run_here(jobs, mesh)
-        if workers == 1 and backend == "loky"
-        else run_in_workers(jobs, workers, backend)
-    )
-    bars = _progress(len(jobs), workers, progress)
     with bars as tick, contextlib.closing(outcomes):
         for job, outcome in outcomes:
             status = _status(job.case, outcome.error)
             fields = outcome._asdict()
             worker = fields.pop("worker")
-            record = {
-                "kind": "case",
-                "run": number,
-                **job.case.described,
-                "seeds": job.seeds,
-                "status": status,
-                **fields,
-            }
+            record = {"kind": "case", "run": number, **job.case.described}
+            record |= {"seeds": job.seeds, "status": status, **fields}
             opened.append(record)
             tick(worker, job.case.id, status)
 
@@ -185,9 +170,8 @@ def _status(case: Case, error: str | None) -> str:
 
 def _folder(experiment: Experiment) -> Path:
     try:
-        return (
-            Path(inspect.getfile(inspect.unwrap(experiment.function))).resolve().parent
-        )
+        file = inspect.getfile(inspect.unwrap(experiment.function))
+        return Path(file).resolve().parent
     except (TypeError, OSError):
         return Path.cwd()
 

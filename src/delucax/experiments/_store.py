@@ -19,16 +19,10 @@ _FORMAT = "delucax-results"
 _VERSION = 1
 _HEADER = {"format": _FORMAT, "version": _VERSION}
 # What a line `case` and a line `run` tell of each row of the table.
-CASE_COLUMNS = (
-    *("error", "traceback", "compile_seconds", "run_seconds"),
-    *("device", "hash"),
-)
+CASE_COLUMNS = "error", "traceback", "compile_seconds", "run_seconds", "device", "hash"
 RUN_COLUMNS = ("date", "commit", "dirty", "dtype")
-RESERVED = (
-    *("experiment", "case", "seed", "status", "versions"),
-    *CASE_COLUMNS,
-    *RUN_COLUMNS,
-)
+_KEYS = ("experiment", "case", "seed", "status", "versions")
+RESERVED = (*_KEYS, *CASE_COLUMNS, *RUN_COLUMNS)
 """Names that neither a parameter nor a result can have."""
 
 

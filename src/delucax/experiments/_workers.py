@@ -11,7 +11,7 @@ import threading
 import traceback
 from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 
@@ -27,6 +27,10 @@ class Job(NamedTuple):
     experiment: Experiment
     case: Case
     seeds: tuple[int, ...]
+
+
+Packed: TypeAlias = dict[str, tuple[str, bytes]]
+"""Experiments by name, each as a hash and as bytes."""
 
 
 def run_in_workers(
@@ -77,24 +81,20 @@ def _close_workers(backend: str) -> None:
 
 
 def _parallel(
-    jobs: list[Job],
-    packed: dict[str, tuple[str, bytes]],
-    workers: int,
-    backend: str,
-    marks: str | None,
+    jobs: list[Job], packed: Packed, workers: int, backend: str, marks: str | None
 ) -> Iterator[Any]:
     import joblib
 
-    precise = bool(jax.config.jax_enable_x64)
-    task = joblib.delayed(work)
+    options = bool(jax.config.jax_enable_x64), marks
+    task, parallel = joblib.delayed(work), joblib.Parallel
     with joblib.parallel_config(backend=backend, n_jobs=workers):
-        yield from joblib.Parallel(return_as="generator_unordered")(
-            task(*packed[experiment.name], number, case.index, seeds, precise, marks)
+        yield from parallel(return_as="generator_unordered")(
+            task(packed[experiment.name], number, case.index, seeds, *options)
             for number, experiment, case, seeds in jobs
         )
 
 
-def _alone(job: Job, packed: dict[str, tuple[str, bytes]], backend: str) -> Outcome:
+def _alone(job: Job, packed: Packed, backend: str) -> Outcome:
     try:
         # Two workers, for joblib runs a single one in this process.
         ((_, outcome),) = _parallel([job], packed, 2, backend, None)
@@ -139,17 +139,12 @@ def _close_runners() -> None:
 
 
 def work(
-    name: str,
-    content: bytes,
-    number: int,
-    index: tuple[int, ...],
-    seeds: tuple[int, ...],
-    precise: bool,
-    marks: str | None,
+    packed: Any, number: int, index: tuple, seeds: tuple, precise: bool, marks: Any
 ) -> tuple[int, Outcome]:
     """What a worker does: one case. It keeps the runner for the next one."""
     import cloudpickle
 
+    name, content = packed
     with jax.enable_x64(precise):
         runners = _local.__dict__.setdefault("runners", {})
         if (name, precise) not in runners:

@@ -13,6 +13,6 @@ except ImportError as error:
     ) from error
 
 from ._animate import animate as animate, Animation as Animation
-from ._drawings import register_drawing as register_drawing
+from ._drawings._registry import register_drawing as register_drawing
 from ._phase import phase_portrait as phase_portrait
 from ._plot import plot as plot

@@ -14,16 +14,8 @@ from matplotlib.lines import Line2D
 from .._check import as_vector, check_instance
 from .._module import as_float_array
 from ..systems import AbstractSystem
+from . import figures
 from ._runs import as_runs, Trajectories
-from .figures import (
-    line_style,
-    NEUTRAL,
-    NotebookFigure,
-    style_axes,
-    top_legend,
-    with_unit,
-    wrapped,
-)
 
 
 Limits: TypeAlias = Float[np.ndarray, "2 2"]
@@ -90,9 +82,9 @@ def phase_portrait(
     field = np.asarray(_field(system, control, states.reshape(-1, 2), where))
     field = field.reshape(GRID, GRID, 2)
 
-    figure = NotebookFigure(figsize=(6.0, 4.8), layout="constrained")
+    figure = figures.NotebookFigure(figsize=(6.0, 4.8), layout="constrained")
     ax = figure.add_subplot()
-    style_axes(ax, size=SIZE, ticks=(8, 6))
+    figures.style_axes(ax, size=SIZE, ticks=(8, 6))
     ax.grid(False)
     # Speed as seen in the picture, so that neither axis outweighs the other.
     extent = np.array([high - low for low, high in limits])
@@ -100,12 +92,15 @@ def phase_portrait(
     top = np.nanmax(np.where(np.isfinite(speed), speed, 0.0), initial=0.0) or 1.0
     if np.any(speed > 0):
         width = 0.5 + 0.9 * np.sqrt(speed / top)
-        style: dict[str, Any] = {"color": to_rgba(NEUTRAL, 0.6), "arrowsize": 0.8}
+        style: dict[str, Any] = {
+            "color": to_rgba(figures.NEUTRAL, 0.6),
+            "arrowsize": 0.8,
+        }
         style |= {"linewidth": width, "density": 1.3, "zorder": 1}
         ax.streamplot(x, v, field[..., 0], field[..., 1], **style)
     entries = []
     for i, run in enumerate(runs):
-        style = line_style(i)
+        style = figures.line_style(i)
         members = run.series["states"]
         alpha = 1.0 if len(members) == 1 else max(0.2, 0.9 - 0.02 * len(members))
         for path in members:
@@ -114,15 +109,15 @@ def phase_portrait(
                 ax.plot(xs, vs, linewidth=1.8, alpha=alpha, zorder=2, **style)
                 ax.plot(xs[:1], vs[:1], "o", color=style["color"], ms=5, zorder=3)
         handle = Line2D([], [], linewidth=1.8, **style)
-        entries.append((handle, wrapped(run.label, 40)))
+        entries.append((handle, figures.wrapped(run.label, 40)))
     ax.set(xlim=limits[0], ylim=limits[1])
     units = system.state_units or ("", "")
-    x_label, y_label = map(with_unit, system.state_names, units)
-    ax.set_xlabel(wrapped(x_label, 60), size=SIZE)
-    ax.set_ylabel(wrapped(y_label, 45), size=SIZE)
+    x_label, y_label = map(figures.with_unit, system.state_names, units)
+    ax.set_xlabel(figures.wrapped(x_label, 60), size=SIZE)
+    ax.set_ylabel(figures.wrapped(y_label, 45), size=SIZE)
     if isinstance(trajectories, dict) and entries:
         columns = max(1, 60 // (6 + max(len(label) for _, label in entries)))
-        top_legend(figure, entries, ncols=columns, fontsize=SIZE)
+        figures.top_legend(figure, entries, ncols=columns, fontsize=SIZE)
     return figure
 
 
@@ -141,10 +136,7 @@ def _checked_limits(limits: Any, where: str) -> Limits:
 
 
 def _field(
-    system: AbstractSystem,
-    control: Any,
-    states: Float[Array, "n 2"],
-    where: str,
+    system: AbstractSystem, control: Any, states: Float[Array, "n 2"], where: str
 ) -> Float[Array, "n 2"]:
     """dx/dt at each row of `states`."""
     size = system.control_size

@@ -13,17 +13,8 @@ from matplotlib.lines import Line2D
 from .._check import check_instance
 from .._results import RESULTS
 from ..environments import Environment
+from . import figures
 from ._runs import as_runs, FEW, HELD, Panel, panels_of, Run, Trajectories
-from .figures import (
-    color_of,
-    line_style,
-    NEUTRAL,
-    NotebookFigure,
-    style_axes,
-    top_legend,
-    with_unit,
-    wrapped,
-)
 
 
 Bounds: TypeAlias = Float[np.ndarray, "2 controls"]
@@ -32,6 +23,9 @@ Values: TypeAlias = Float[np.ndarray, "batch times"]
 WIDTH = 7.0
 PANEL_HEIGHT = 1.35
 SIZE = 9.0
+# Of a legend beside a panel.
+COMPACT: dict[str, Any] = {"handlelength": 1.4, "handletextpad": 0.5}
+COMPACT |= {"labelspacing": 0.3, "borderaxespad": 0.3}
 # What a member of a run may have done in the end.
 END_MARKS: dict[str, dict[str, Any]] = {
     "failed": {"marker": "x"},
@@ -110,7 +104,7 @@ def plot(
     columns = columns if compared else 1
     rows = math.ceil(len(panels) / columns)
     size = WIDTH + 1.5 * (columns - 1), PANEL_HEIGHT * rows + 0.7
-    figure = NotebookFigure(figsize=size, layout="constrained")
+    figure = figures.NotebookFigure(figsize=size, layout="constrained")
     grid = figure.add_gridspec(rows, columns)
     axes: list[Axes] = []
     for i, panel in enumerate(panels):
@@ -165,14 +159,14 @@ def draw_panel(
 
     Returns a handle a line, which has its colour and style.
     """
-    style_axes(ax, size=size)
+    figures.style_axes(ax, size=size)
     compared = len(runs) > 1
     handles: list[Line2D] = []
     for i, run in enumerate(runs):
         for j, column in enumerate(panel.columns):
-            style = line_style(i if compared else j + (panel.kind in HELD))
+            style = figures.line_style(i if compared else j + (panel.kind in HELD))
             if panel.kind == "costs" and not compared:
-                style["color"] = NEUTRAL
+                style["color"] = figures.NEUTRAL
             values = run.series[panel.kind][..., column]
             _draw_series(ax, run, panel.kind, values, style, faint)
             handles.append(Line2D([], [], linewidth=1.6, **style))
@@ -184,27 +178,21 @@ def draw_panel(
         _mark_incidents(ax, runs)
     _label(ax, panel, int(PANEL_HEIGHT * 13 * 9 / size) if columns == 1 else 16, size)
     if len(panel.names) > 1:  # beside the panel, where it covers no data
-        ax.legend(
-            handles,
-            [wrapped(name, 24) for name in panel.names],
-            loc="center left",
-            bbox_to_anchor=(1.0, 0.5),
-            frameon=False,
-            fontsize=size - 1,
-            handlelength=1.4,
-            handletextpad=0.5,
-            labelspacing=0.3,
-            borderaxespad=0.3,
-        )
+        names = [figures.wrapped(name, 24) for name in panel.names]
+        place = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5), "frameon": False}
+        ax.legend(handles, names, fontsize=size - 1, **place, **COMPACT)
     return handles
 
 
 def _label(ax: Axes, panel: Panel, width: int, size: float) -> None:
     joined = ", ".join(panel.names)
-    if len(panel.names) > 1 and len(with_unit(joined, panel.unit)) > 2.5 * width:
+    if (
+        len(panel.names) > 1
+        and len(figures.with_unit(joined, panel.unit)) > 2.5 * width
+    ):
         # The names are in the legend; here the kind and the unit say enough.
         joined = panel.kind
-    text = wrapped(with_unit(joined, panel.unit), width)
+    text = figures.wrapped(figures.with_unit(joined, panel.unit), width)
     ax.set_ylabel(text, fontsize=size if text.count("\n") < 2 else size - 1)
 
 
@@ -272,7 +260,7 @@ def _mark_incidents(ax: Axes, runs: Sequence[Run]) -> None:
             steps = run.incidents.get(name)
             if steps is not None and len(steps) <= FEW:
                 times = run.times[:, :-1][steps]
-                color = color_of(i) if len(runs) > 1 else own_color
+                color = figures.color_of(i) if len(runs) > 1 else own_color
                 heights = np.full(len(times), 1.04 + 0.09 * row)
                 ax.plot(times, heights, "|", color=color, **style)
 
@@ -281,9 +269,9 @@ def _incident_colors(runs: Sequence[Run]) -> dict[str, str]:
     """The kinds of incident that happened in any run, and their colours. Where runs are
     compared, those of the controllers alone: every one of them may be clipped."""
     names = sorted({name for run in runs for name in run.incidents})
-    colors = {name: color_of(3) for name in names}
+    colors = {name: figures.color_of(3) for name in names}
     if "clipped_control" in colors:
-        colors["clipped_control"] = NEUTRAL
+        colors["clipped_control"] = figures.NEUTRAL
         if len(runs) > 1:
             del colors["clipped_control"]
     return colors
@@ -307,7 +295,7 @@ def _draw_bounds(ax: Axes, panel: Panel, bounds: Bounds, compared: bool) -> None
     chosen = bounds[:, list(panel.columns)]
     shared = np.all(chosen == chosen[:, :1])
     for j in range(1 if shared else chosen.shape[1]):
-        color = NEUTRAL if shared or compared else color_of(j + 1)
+        color = figures.NEUTRAL if shared or compared else figures.color_of(j + 1)
         for end in chosen[:, j][np.isfinite(chosen[:, j])]:
             ax.axhline(end, color=color, linestyle="--", linewidth=1.0, zorder=1)
 
@@ -318,8 +306,8 @@ def _draw_head(figure: Figure, runs: Sequence[Run], kinds: set[str]) -> None:
     entries: list[tuple[Line2D, str]] = []
     for i, run in enumerate(runs if compared else ()):
         cost = f" ({_total(run)})" if "costs" in kinds else ""
-        handle = Line2D([], [], linewidth=1.6, **line_style(i))
-        entries.append((handle, wrapped(run.label, 40) + cost))
+        handle = Line2D([], [], linewidth=1.6, **figures.line_style(i))
+        entries.append((handle, figures.wrapped(run.label, 40) + cost))
     members = sum(len(run.failed) for run in runs)
     for name, marker in END_MARKS.items():
         count = sum(int(getattr(run, name).sum()) for run in runs)
@@ -330,13 +318,13 @@ def _draw_head(figure: Figure, runs: Sequence[Run], kinds: set[str]) -> None:
             label = f"{name}: {count} of {members}"
         elif name == "failed" and not compared:
             label = f"failed: {RESULTS[runs[0].trajectory.result]}"
-        style = {"linestyle": "none", "markeredgewidth": 1.5, "color": NEUTRAL}
+        style = {"linestyle": "none", "markeredgewidth": 1.5, "color": figures.NEUTRAL}
         entries.append((Line2D([], [], **style, **marker), label))
     for name, color in _incident_colors(runs).items() if "controls" in kinds else ():
-        color = NEUTRAL if compared else color
+        color = figures.NEUTRAL if compared else color
         handle = Line2D([], [], linestyle="none", marker="|", color=color)
         entries.append((handle, _incident_label(name, runs)))
-    title = "" if compared else wrapped(runs[0].label, 80)
+    title = "" if compared else figures.wrapped(runs[0].label, 80)
     if not entries:
         figure.suptitle(title, fontsize=SIZE + 1)
         return
@@ -344,13 +332,6 @@ def _draw_head(figure: Figure, runs: Sequence[Run], kinds: set[str]) -> None:
     lengths = [6 + max(map(len, label.split("\n"))) for _, label in entries]
     room = int(11 * figure.get_figwidth())
     columns = len(entries) if sum(lengths) <= room else room // max(lengths)
-    top_legend(
-        figure,
-        entries,
-        ncols=max(1, columns),
-        title=title or None,
-        title_fontsize=SIZE + 1,
-        fontsize=SIZE,
-        handlelength=1.8,
-        columnspacing=1.6,
-    )
+    style = {"title": title or None, "title_fontsize": SIZE + 1, "fontsize": SIZE}
+    style |= {"ncols": max(1, columns), "handlelength": 1.8, "columnspacing": 1.6}
+    figures.top_legend(figure, entries, **style)

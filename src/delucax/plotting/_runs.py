@@ -223,8 +223,7 @@ def panels_of(run: Run, show: Any, *, grouped: bool, where: str) -> list[Panel]:
         for group in groups.values():
             count = -(-len(group) // MOST_LINES)
             for part in np.array_split(group, count):
-                of_part = tuple(names[i] for i in part)
-                panels.append(
-                    Panel(kind, tuple(part.tolist()), of_part, units[part[0]])
-                )
+                chosen_names = tuple(names[i] for i in part)
+                unit = units[part[0]]
+                panels.append(Panel(kind, tuple(part.tolist()), chosen_names, unit))
     return panels

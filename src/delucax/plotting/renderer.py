@@ -1,9 +1,11 @@
-"""One moment of a plant as a picture, or in a window."""
+"""One moment of a plant as a picture: on given axes, or by itself, or in a window."""
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backend_bases import FigureManagerBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -11,7 +13,52 @@ from matplotlib.figure import Figure
 from ..controllers import Zero
 from ..environments import Environment
 from ..simulation import rollout
-from ._plant_artist import PlantArtist
+from ._drawings._canvas import Canvas, Episode, States, Vector
+from ._drawings._registry import drawing_for
+from .figures import PALETTE
+
+
+Moments: TypeAlias = Iterable[tuple[Vector, Vector]]
+
+
+class PlantArtist:
+    """Draws the plant of an environment, moment by moment.
+
+    The limits are those that the drawing chose, or that hold all of `moments`, pairs of
+    state and control. Where the drawing leaves a path, that of all of `states` is drawn
+    faint.
+    """
+
+    def __init__(
+        self, ax: Axes, episode: Episode, moments: Moments, states: States | None = None
+    ):
+        self.ax = ax
+        ax.set_aspect("equal")
+        ax.set_axis_off()
+        self.drawing = drawing_for(episode.environment)(Canvas(ax), episode)
+        self._draw_path(states, 0.25)
+        self._fixed = set(map(id, ax.get_children()))
+        if self.drawing.autoscale:
+            for x, u in moments:
+                self.draw(x, u)
+            ax.autoscale_view()
+        # The limits stay as they are now, unless the draw function moves them.
+        ax.set(xlim=ax.get_xlim(), ylim=ax.get_ylim())
+
+    def _draw_path(self, states: States | None, alpha: float) -> None:
+        if states is not None and self.drawing.path is not None:
+            path = np.asarray(self.drawing.path(states))
+            self.ax.plot(*path.T, color=PALETTE[0], lw=1.8, alpha=alpha, zorder=1)
+
+    def draw(self, x: Vector, u: Vector, past: States | None = None) -> None:
+        """Draw one moment in the place of the one before, and the path of the `past`
+        states."""
+        for artist in self.ax.get_children():
+            if id(artist) not in self._fixed:
+                artist.remove()
+        self.ax.set_prop_cycle(color=PALETTE)
+        self._draw_path(past, 0.8)
+        self.drawing.draw(x, u)
 
 
 _INCHES, _DPI = (5.0, 5.0), 100
@@ -44,7 +91,7 @@ class Renderer:
         states = np.asarray(trajectory.states, float)
         moments = zip(states, np.asarray(trajectory.controls, float), strict=False)
         ax = self.figure.add_subplot()
-        self.plant = PlantArtist(ax, environment, trajectory, moments)
+        self.plant = PlantArtist(ax, Episode(environment, trajectory), moments)
 
     def frame(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """The picture at a state and a control, shape `(height, width, 3)`."""

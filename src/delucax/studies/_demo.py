@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import plotting
+from .._check import check_count
 from .._extras import extra
 from .._module import replace, save
 from ..controllers import Linear, LQR, Zero
@@ -22,6 +23,7 @@ from ..environments import Environment, pendulum
 from ..simulation import rollout, Trajectory
 from ._swing_up import BATCH, holds_upright, HORIZON, STEPS, train_swing_up
 from .paper import reproduce, STUDIES
+from .paper._finding import mean_and_half_width
 from .paper._policy_gradient import train_linear
 from .paper._wall_clock import gymnasium_run
 
@@ -72,20 +74,15 @@ def demo(
     """
     pd = extra("pandas", "demo")
 
-    if seeds < 1:
-        raise ValueError(f"demo: seeds must be at least 1, got {seeds}.")
+    check_count(seeds, "seeds", "demo")
     out = _writable(Path(out))
     env = pendulum()
     controllers: dict[str, Any] = {"zero": Zero(1)}
 
     say("LQR about the upright, from the linearised ODE")
     model = linearize(env.dynamics)
-    lqr = LQR(
-        model,
-        jnp.diag(jnp.array([1.0, 0.1])),
-        jnp.eye(1) * 0.001,
-        difference=env.dynamics.difference,
-    )
+    Q, R = jnp.diag(jnp.array([1.0, 0.1])), jnp.eye(1) * 0.001
+    lqr = LQR(model, Q, R, difference=env.dynamics.difference)
     controllers["LQR"] = lqr
     say(f"  K = {np.array2string(np.asarray(lqr.K), precision=3)}")
 
@@ -95,14 +92,13 @@ def demo(
     say(f"  K = {np.array2string(np.asarray(linear.K), precision=3)}")
 
     say(f"\nMLP by gradient descent through the ODE, {seeds} seeds")
-    evaluate = eqx.filter_jit(_evaluate)
     starts = jax.vmap(env.reset)(jax.random.split(jax.random.key(2**20), STARTS))
     seconds = []
     for seed in range(seeds):
         begin = time.perf_counter()
         fitted = train_swing_up(env, key=jax.random.key(seed), steps=steps)
         seconds.append(time.perf_counter() - begin)
-        held = int(jnp.sum(holds_upright(evaluate(env, fitted.model, starts))))
+        held = int(jnp.sum(holds_upright(_evaluate(env, fitted.model, starts))))
         first = "" if seed else ", compilation included"
         say(
             f"  seed {seed}: {seconds[-1]:.1f} s{first}; swings up and holds from "
@@ -114,7 +110,7 @@ def demo(
     rows, shown = [], {}
     for world, name in ((env, "none"), (disturbed, "at 10 s")):
         for label, controller in controllers.items():
-            runs = evaluate(world, controller, starts)
+            runs = _evaluate(world, controller, starts)
             rows.append(_row(label, name, runs))
             shown[label, name] = runs
     table = pd.DataFrame(rows)
@@ -192,21 +188,19 @@ def _marked(figure: Any) -> Any:
     return figure
 
 
+@eqx.filter_jit
 def _evaluate(env: Environment, controller: Any, starts: Any) -> Trajectory:
-    def one(x0):
-        key = jax.random.key(0)
-        return rollout(env, controller, key=key, x0=x0, horizon=EVALUATION_STEPS)
-
-    return jax.vmap(one)(starts)
+    options: Any = dict(key=jax.random.key(0), horizon=EVALUATION_STEPS)
+    return jax.vmap(lambda x0: rollout(env, controller, x0=x0, **options))(starts)
 
 
 def _row(label: str, shock: str, runs: Trajectory) -> dict[str, Any]:
     cost = np.asarray(runs.total_cost)
-    half = 1.96 * cost.std(ddof=1) / np.sqrt(len(cost))
+    mean, half = mean_and_half_width(cost)
     return {
         "controller": label,
         "shock": shock,
-        "mean cost": cost.mean(),
+        "mean cost": mean,
         "+- 95%": half,
         "median": np.median(cost),
         "worst": cost.max(),

@@ -1,4 +1,4 @@
-"""Every task crossed with the controllers that suit it.
+"""Every task crossed with the controllers that suit it, one recipe for each.
 
 `python -m delucax run scoreboard` runs it; `python -m benchmarks.scoreboard` makes the
 committed results and their page.
@@ -6,20 +6,229 @@ committed results and their page.
 
 import functools
 import time
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
+from jaxtyping import Array
 
-from ..controllers import OpenLoop, Zero
-from ..environments import Environment
+from .. import controllers
+from .._controller import AbstractController
+from ..controllers import mlp_policy, OpenLoop, Zero
+from ..costs import AbstractCost, Function
+from ..disturbances import Gaussian
+from ..dynamics import linearize
+from ..environments import Environment, make, UniformState
 from ..experiments import experiment
-from ..planning import ilqr
+from ..lung import Breathing
+from ..planning import AbstractPlanner, CEM, ILQR, ilqr, MPPI
 from ..simulation import rollout
+from ..training import actor_critic, expected_cost, fit, PPO, SHAC
 from ._listing import task_names
-from ._methods import agent_of, FAMILIES, Pump, task_of, Unsuitable
+
+
+# Of every training: steps of the optimiser on the gradient, episodes a step, and the
+# most steps of an episode. PPO and SHAC are given as many steps of the environment.
+TRAINING_STEPS, EPISODES, LONGEST = 200, 32, 100
+# Of a plan in MPC.
+LOOKAHEAD = 30
+
+
+class Pump(AbstractController):
+    """Push as hard as is allowed the way that it moves, as one does a swing: the least
+    cost by far that is known of the mountain cars before it is refined."""
+
+    push: Array
+
+    def __call__(self, t, y, state):
+        return jnp.where(y[1] < 0, -self.push, self.push), state
+
+
+class Unsuitable(Exception):
+    """A controller is not made for such a task."""
+
+
+@functools.cache
+def task_of(name: str) -> Environment:
+    """The task, with what it needs drawn from a fixed key."""
+    if name == "neural":
+        return make(name, width=8, key=jax.random.key(0))
+    if name != "lds":
+        return make(name)
+    options: dict[str, Any] = {
+        "initial_state": UniformState(-jnp.ones(4), jnp.ones(4)),
+        "disturbance": Gaussian(0.1, size=4),
+        "spectral_radius": 1.05,
+    }
+    return make(name, key=jax.random.key(0), states=4, controls=2, **options)
+
+
+@functools.cache
+def _local(name: str) -> tuple[Any, Any, Any]:
+    """The linear model at the equilibrium and the curvature of the cost there, with
+    what a design needs added where it is flat."""
+    env = task_of(name)
+    x, u = env.dynamics.equilibrium()
+    model = linearize(env.dynamics, jnp.zeros(()), x, u)
+    n = x.shape[0]
+
+    def charged(z: Any) -> Any:
+        return env.cost(jnp.zeros(()), x + z[:n], u + z[n:])
+
+    H = np.asarray(jax.hessian(charged)(jnp.zeros(n + u.shape[0]))) / 2
+    if not np.all(np.isfinite(H)):
+        raise Unsuitable("the cost has no curvature at the equilibrium")
+    values, vectors = np.linalg.eigh(H)
+    scale = max(values.max(), 1e-3)
+    H = vectors * np.clip(values, 1e-4 * scale, None) @ vectors.T
+    return model, jnp.asarray(H[:n, :n]), jnp.asarray(H[n:, n:])
+
+
+def _regulator(name: str, design: Callable[..., Any], **options: Any) -> Any:
+    """A design from the linear model and the curvature of the cost."""
+    difference = task_of(name).dynamics.difference
+    return design(*_local(name), difference=difference, **options)
+
+
+def _following(name: str) -> Any:
+    """A PID on the waveform that a lung is to breathe as."""
+    env = task_of(name)
+    waveform = getattr(env.cost, "waveform", None)
+    if waveform is None:
+        raise Unsuitable("the cost follows no waveform")
+    return Breathing(controllers.LeakyPID(dt=env.dt, reference=waveform), waveform)
+
+
+def _learning(name: str, learner: Callable[..., Any], **options: Any) -> Any:
+    """An online learner on top of the LQR."""
+    env = task_of(name)
+    return learner(env.dynamics, env.cost, base=agent_of(name, "LQR"), **options)
+
+
+def _receding(name: str, kind: type[AbstractPlanner], **options: Any) -> Any:
+    """MPC with the model and the cost of the task and, at the end of a plan, the cost
+    to go of the LQR where there is one."""
+    env = task_of(name)
+    if env.dynamics.observation_size != env.dynamics.state_size:
+        raise Unsuitable("the state is not observed")
+    bounds = env.control_bounds
+    if kind is not ILQR and bounds is not None:
+        low, high = (np.asarray(bound, float) for bound in bounds)
+        width = high - low
+        options["scale"] = np.where(np.isfinite(width), width / 4, 1.0)
+    how: dict[str, Any] = {"planner": kind(**options), "bounds": bounds, "throw": False}
+    return controllers.MPC(env.dynamics, _with_cost_to_go(name), LOOKAHEAD, **how)
+
+
+def _with_cost_to_go(name: str) -> AbstractCost:
+    """The cost of the task, with the LQR's cost to go for a final cost."""
+    env = task_of(name)
+    try:
+        lqr = agent_of(name, "LQR")
+    except Unsuitable:
+        return env.cost
+
+    def to_go(t: Any, x: Any) -> Any:
+        deviation = env.dynamics.difference(x, lqr.x_ref)
+        return deviation @ lqr.P @ deviation
+
+    return Function(env.cost, to_go)
+
+
+def _by_gradient(name: str, network: Callable[..., Any], **options: Any) -> Any:
+    """A network, by gradient descent through the rollout."""
+    env = task_of(name)
+    first, key = jax.random.split(jax.random.key(1))
+    horizon = min(env.horizon, LONGEST)
+    loss = expected_cost(env, batch=EPISODES, horizon=horizon, gradient_decay=0.95)
+    return _fitted(loss, network(env, key=first, **options), TRAINING_STEPS, key)
+
+
+def _gru(env: Environment, key: Any) -> Any:
+    sizes = env.feature_size, env.control_size
+    bounds = env.control_bounds
+    if bounds is not None and not np.all(np.isfinite(bounds)):
+        bounds = None
+    return controllers.GRU(*sizes, 32, features=env.encode, bounds=bounds, key=key)
+
+
+def _by_actor_critic(name: str, method: type[PPO] | type[SHAC]) -> Any:
+    """The MLP by reinforcement learning."""
+    env, head = task_of(name), "gaussian" if method is PPO else "deterministic"
+    first, key = jax.random.split(jax.random.key(1))
+    model = actor_critic(env, width=32, depth=1, head=head, key=first)
+    loss = method(env, EPISODES, min(env.horizon, LONGEST), discount=0.95)
+    steps = TRAINING_STEPS
+    if isinstance(loss, PPO):
+        steps *= loss.epochs * loss.minibatches
+    policy = _fitted(loss, model, steps, key).policy
+    return policy.base if method is PPO else policy
+
+
+def _fitted(loss: Any, model: Any, steps: int, key: Any) -> Any:
+    """The model, trained by Adam."""
+    optimiser = optax.chain(
+        optax.clip_by_global_norm(1.0),
+        optax.adam(optax.cosine_decay_schedule(0.01, steps)),
+    )
+    quiet: dict[str, Any] = {"progress": False, "throw": False}
+    return fit(loss, model, optimiser, steps, key=key, **quiet).model
+
+
+FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
+    "Feedback": {
+        "zero": lambda name: controllers.Zero(task_of(name).control_size),
+        "PID": _following,
+        "LQR": lambda name: _regulator(name, controllers.LQR),
+        "FiniteHorizonLQR": lambda name: _regulator(
+            name, controllers.FiniteHorizonLQR, horizon=task_of(name).horizon
+        ),
+        "HInfinity": lambda name: _regulator(name, controllers.HInfinity),
+    },
+    "Online learning": {
+        "GPC": lambda name: _learning(name, controllers.gpc),
+        "Adaptive": lambda name: controllers.Adaptive(agent_of(name, "GPC")),
+        "NeuralGPC": lambda name: _learning(
+            name, controllers.neural_gpc, key=jax.random.key(0)
+        ),
+        "DRC": lambda name: _learning(name, controllers.drc),
+        "SFC": lambda name: _learning(name, controllers.sfc),
+        "DSC": lambda name: _learning(name, controllers.dsc),
+        "BPC": lambda name: controllers.BPC(
+            task_of(name).dynamics, agent_of(name, "LQR")
+        ),
+    },
+    "Planning": {
+        "MPC": lambda name: _receding(name, ILQR, max_iterations=8),
+        "MPPI": lambda name: _receding(name, MPPI, samples=128, iterations=3),
+        "CEM": lambda name: _receding(name, CEM, samples=128, iterations=3),
+    },
+    "Training": {
+        "affine": lambda name: _by_gradient(name, mlp_policy, width=1, depth=0),
+        "MLP": lambda name: _by_gradient(name, mlp_policy, width=32, depth=1),
+        "GRU": lambda name: _by_gradient(name, _gru),
+        "SHAC": lambda name: _by_actor_critic(name, SHAC),
+        "PPO": lambda name: _by_actor_critic(name, PPO),
+    },
+}
+"""What is compared: how each controller is made for the task of a name."""
+
+
+@functools.cache
+def agent_of(name: str, method: str) -> Any:
+    """The controller, designed at the equilibrium or trained.
+
+    **Raises:** `Unsuitable` if it needs what the task has not got.
+    """
+    (maker,) = (family[method] for family in FAMILIES.values() if method in family)
+    try:
+        return maker(name)
+    except (ValueError, RuntimeError) as error:
+        raise Unsuitable(str(error)) from error
 
 
 METHODS = (*(name for family in FAMILIES.values() for name in family), "plan")

@@ -8,10 +8,8 @@ import jax.numpy as jnp
 from gymnasium.envs.registration import EnvSpec
 
 from ..._check import check_count
-from ...costs import AbstractCost
 from ...environments import default_horizon, Environment, make as make_task
-from .._episode import has_signals
-from .._reads_argument import reads_first_argument
+from .._adapter import has_signals, reads_first_argument
 from ._single_env import GymnasiumEnv
 from ._vector_env import GymnasiumVectorEnv
 
@@ -100,17 +98,11 @@ def make_registered(task: str, **kwargs: Any) -> GymnasiumEnv:
     """
     own = {k: kwargs.pop(k) for k in ("discrete", "render_mode") if k in kwargs}
     env = _task(task, kwargs)
-    ends = (
-        "horizon" in kwargs or has_signals(env) or _has_final(kwargs.get("cost"), env)
-    )
+    final = lambda x: kwargs["cost"].final(0.0, x)
+    given = kwargs.get("cost") is not None
+    has_final = given and reads_first_argument(final, jnp.zeros(env.state_size))
+    ends = "horizon" in kwargs or has_signals(env) or has_final
     return GymnasiumEnv(env, truncate=ends, **own)
-
-
-def _has_final(cost: AbstractCost | None, env: Environment) -> bool:
-    """Whether a cost that is given charges the last state."""
-    return cost is not None and reads_first_argument(
-        lambda x: cost.final(0.0, x), jnp.zeros(env.state_size)
-    )
 
 
 def make_vector(

@@ -12,10 +12,8 @@ from gymnasium.error import InvalidAction, ResetNeeded
 from ..._check import as_vector, check_bool, check_finite, check_instance
 from ..._message import shortened
 from ...environments import Environment
-from .._episode import has_signals
-from .._spaces import has_discrete_actions
-from ._compiled import draw_key, program, REWARD, shared, STEP
-from ._spaces import action_space, observation_space, read_options
+from .._adapter import has_discrete_actions, has_signals
+from . import _program as programs
 
 
 RENDER_MODES = ("rgb_array", "human")
@@ -87,9 +85,9 @@ class GymnasiumEnv(gymnasium.Env):
         self.render_mode = render_mode
         fps = int(np.clip(np.round(1 / float(env.dt)), 1, 60))
         self.metadata = type(self).metadata | {"render_fps": fps}
-        self.action_space = action_space(env, self.discrete)
-        self.observation_space = observation_space(env)
-        self._program = program(env, self.discrete, self.truncate)
+        self.action_space = programs.action_space(env, self.discrete)
+        self.observation_space = programs.observation_space(env)
+        self._program = programs.program(env, self.discrete, self.truncate)
         self._table = np.asarray(env.actions) if self.discrete else np.zeros((0, 1))
         self._count = len(self._table)
         self._shape = (env.control_size,)
@@ -118,12 +116,12 @@ class GymnasiumEnv(gymnasium.Env):
         """
         super().reset(seed=seed)
         where = "GymnasiumEnv"
-        (state,) = read_options(options, ("state",), where)
+        (state,) = programs.read_options(options, ("state",), where)
         if state is not None:
             state = as_vector(state, self.environment.state_size, "state", where)
             check_finite(state, "state", where)
             state = state.astype(float)
-        packed, signals = self._program.start(draw_key(self.np_random), state)
+        packed, signals = self._program.start(programs.draw_key(self.np_random), state)
         packed = np.asarray(packed)
         if self._buffer is None or self._buffer.dtype != packed.dtype:
             self._allocate(packed.dtype)
@@ -139,9 +137,9 @@ class GymnasiumEnv(gymnasium.Env):
         """Make the arrays that steps are taken in."""
         layout, actions = self._program.layout, self.action_space.shape or (1,)
         # The packed array with the action after it, and views of its parts.
-        self._buffer, self._shared = shared(layout.size + actions[0], dtype)
+        self._buffer, self._shared = programs.shared(layout.size + actions[0], dtype)
         self._packed, self._action = np.split(self._buffer, [layout.size])
-        self._outcome = self._packed[REWARD:]
+        self._outcome = self._packed[programs.REWARD :]
         view, single = self._packed[layout.observation], np.float32
         copy = functools.partial(view.astype, single)
         self._observation = view.copy if view.dtype == single else copy
@@ -161,7 +159,7 @@ class GymnasiumEnv(gymnasium.Env):
 
     def __setstate__(self, state):
         self.__dict__.update(state)
-        self._program = program(self.environment, self.discrete, self.truncate)
+        self._program = programs.program(self.environment, self.discrete, self.truncate)
         given = self._buffer
         if given is not None:
             self._allocate(given.dtype)
@@ -229,7 +227,7 @@ class GymnasiumEnv(gymnasium.Env):
         if not np.all(np.isfinite(action)):
             raise InvalidAction(f"GymnasiumEnv: action must be finite, got {action}.")
         self._ended = True
-        step = int(self._packed[STEP])
+        step = int(self._packed[programs.STEP])
         raise RuntimeError(
             f"GymnasiumEnv: the simulation failed at step {step}: the state or the "
             "reward is not finite, or the solver did not converge. Call reset()."

@@ -19,9 +19,8 @@ from ..._message import shortened
 from ..._module import as_float_array
 from ..._typing import PRNGKey
 from ...environments import Environment
-from .._spaces import has_discrete_actions
-from ._compiled import draw_key, FAILED, program, REWARD, TERMINATED, TRUNCATED
-from ._spaces import action_space, observation_space, read_options
+from .._adapter import has_discrete_actions
+from . import _program as programs
 
 
 class GymnasiumVectorEnv(VectorEnv):
@@ -85,11 +84,11 @@ class GymnasiumVectorEnv(VectorEnv):
         self.num_envs = check_count(num_envs, "num_envs", where)
         self.discrete = has_discrete_actions(env, discrete, where)
         self.metadata = {"autoreset_mode": self._mode, "render_modes": []}
-        self.single_action_space = action_space(env, self.discrete)
-        self.single_observation_space = observation_space(env)
+        self.single_action_space = programs.action_space(env, self.discrete)
+        self.single_observation_space = programs.observation_space(env)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._program = program(env, self.discrete)
+        self._program = programs.program(env, self.discrete)
         self._packed: Any = None
         self._signals: Any = None
         self._key: Any = None
@@ -120,7 +119,7 @@ class GymnasiumVectorEnv(VectorEnv):
         **Returns:** the observations, and an empty dictionary.
         """
         where = "GymnasiumVectorEnv"
-        state, mask = read_options(options, ("state", "reset_mask"), where)
+        state, mask = programs.read_options(options, ("state", "reset_mask"), where)
         state = self._as_states(state)
         keys = self._start_keys(seed)
         packed, signals = self._program.start_batch(keys, state)
@@ -171,10 +170,10 @@ class GymnasiumVectorEnv(VectorEnv):
             mixed = np.random.SeedSequence(list(own.values())).generate_state(1)[0]
             seed = int(mixed) if own else None
         super().reset(seed=seed)
-        self._key, use = jax.random.split(draw_key(self.np_random))
+        self._key, use = jax.random.split(programs.draw_key(self.np_random))
         keys = jax.random.split(use, self.num_envs)
         for i, one in own.items():
-            keys = keys.at[i].set(draw_key(np_random(one)[0]))
+            keys = keys.at[i].set(programs.draw_key(np_random(one)[0]))
         return keys
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -191,15 +190,18 @@ class GymnasiumVectorEnv(VectorEnv):
             self._mode.value, self._packed, actions, self._signals, self._key
         )
         packed, last = np.asarray(self._packed), np.asarray(last)
-        if last[:, FAILED].any() and packed[:, FAILED].any():
-            which = np.flatnonzero(packed[:, FAILED])[:5].tolist()
+        if last[:, programs.FAILED].any() and packed[:, programs.FAILED].any():
+            which = np.flatnonzero(packed[:, programs.FAILED])[:5].tolist()
             self._packed = None
             raise RuntimeError(
                 f"GymnasiumVectorEnv: the simulation of {which} failed: the state or "
                 "the reward is not finite, or the solver did not converge. Call "
                 "reset()."
             )
-        terminations, truncations = packed[:, TERMINATED] > 0, packed[:, TRUNCATED] > 0
+        terminations, truncations = (
+            packed[:, programs.TERMINATED] > 0,
+            packed[:, programs.TRUNCATED] > 0,
+        )
         info: dict[str, Any] = {}
         ended = terminations | truncations
         if self._mode is AutoresetMode.SAME_STEP and ended.any():
@@ -209,7 +211,7 @@ class GymnasiumVectorEnv(VectorEnv):
                 final[i] = observations[i]
             info = {"final_obs": final, "_final_obs": ended.copy()}
             info |= {"final_info": {}, "_final_info": ended.copy()}
-        rewards = packed[:, REWARD].astype(np.float64)
+        rewards = packed[:, programs.REWARD].astype(np.float64)
         return self._observations(packed), rewards, terminations, truncations, info
 
     def _observations(self, packed: np.ndarray) -> np.ndarray:
@@ -242,3 +244,23 @@ class GymnasiumVectorEnv(VectorEnv):
                 f"{where}: actions must be from 0 to {space.n - 1}, got {actions}."
             )
         return actions[:, None].astype(np.float32)
+
+
+def dones_and_infos(
+    step: tuple[Any, Any, Any, Any, dict[str, Any]],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    """A step of a `GymnasiumVectorEnv` that resets in the same step, as
+    `(observations, rewards, dones, infos)`.
+
+    The infos of what has ended hold the last observation of the episode and whether it
+    was cut off by its time limit, after which the value of that observation counts.
+    """
+    observations, rewards, terminations, truncations, info = step
+    dones = terminations | truncations
+    infos: list[dict[str, Any]] = [{} for _ in dones]
+    for i in np.flatnonzero(dones):
+        infos[i] = {
+            "terminal_observation": info["final_obs"][i],
+            "TimeLimit.truncated": bool(truncations[i] and not terminations[i]),
+        }
+    return observations, rewards.astype(np.float32), dones, infos

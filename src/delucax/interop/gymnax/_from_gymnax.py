@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from ..._check import check_step
+from ..._check import check_keywords, check_step
 from ..._module import as_float_array, parameter
 from ..._results import Result, RESULTS
 from ..._typing import (
@@ -31,7 +31,7 @@ from ..._typing import (
 from ...costs import AbstractCost
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
-from .._reads_argument import reads_first_argument
+from .._adapter import reads_first_argument
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,12 +86,6 @@ def _check_protocol(env: Any, where: str) -> None:
             )
 
 
-def _as_params(params: Any) -> Any:
-    return jax.tree.map(
-        lambda leaf: as_float_array(leaf) if isinstance(leaf, float) else leaf, params
-    )
-
-
 class GymnaxDynamics(AbstractDynamics):
     """A step of an environment in gymnax's protocol; see
     [`delucax.interop.gymnax.from_gymnax`][], which makes it.
@@ -142,7 +136,8 @@ class GymnaxDynamics(AbstractDynamics):
         if getattr(env, "supports_transition_gradients", False):
             env = env.with_transition_gradients()  # else gymnax cuts them
         check_step(dt, where)
-        self.env, self.params, self.dt = env, _as_params(params), dt
+        as_array = lambda x: as_float_array(x) if isinstance(x, float) else x
+        self.env, self.params, self.dt = env, jax.tree.map(as_array, params), dt
         space = env.action_space(params)
         self.discrete = hasattr(space, "n")
         if not self.discrete and not hasattr(space, "low"):
@@ -151,9 +146,8 @@ class GymnaxDynamics(AbstractDynamics):
             )
         self.action_shape = () if self.discrete else tuple(space.shape)
         size = int(np.prod(self.action_shape))
-        self.control_names = (
-            ("action",) if size == 1 else tuple(f"action[{i}]" for i in range(size))
-        )
+        several = tuple(f"action[{i}]" for i in range(size))
+        self.control_names = ("action",) if size == 1 else several
         key = jr.key(0)
         reset = jax.eval_shape(lambda key: env.reset_env(key, params)[1], key)
         leaves, structure = jax.tree_util.tree_flatten_with_path(reset)
@@ -267,9 +261,8 @@ class _Observation(eqx.Module):
 
     def __call__(self, x: State) -> Vector:
         env, state = self.dynamics.env, self.dynamics.unravel(x)
-        known = dict(
-            key=jr.key(0), state=state, action=None, params=self.dynamics.params
-        )
+        known = dict(key=jr.key(0), state=state, action=None)
+        known["params"] = self.dynamics.params
         function = _observer(env)
         assert function is not None
         takes = inspect.signature(function).parameters
@@ -339,13 +332,10 @@ def from_gymnax(
     if params is None:
         params = getattr(env, "default_params", None)
     _check_protocol(env, where)
-    for name in environment:
-        if name not in inspect.signature(Environment).parameters:
-            raise ValueError(f"{where}: Environment has no argument {name!r}.")
+    check_keywords(environment, where, Environment)
     horizon = getattr(params, "max_steps_in_episode", None)
-    if "horizon" not in environment and (
-        horizon is None or isinstance(horizon, Tracer)
-    ):
+    unknown = horizon is None or isinstance(horizon, Tracer)
+    if unknown and "horizon" not in environment:
         raise ValueError(
             f"{where}: horizon must be given, for params has no max_steps_in_episode "
             "that is known."

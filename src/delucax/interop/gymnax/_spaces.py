@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ..._check import is_concrete
 from ..._typing import PRNGKey
-from .._spaces import finite_ends
+from .._adapter import finite_ends
 
 
 class Box:

@@ -13,11 +13,44 @@ from ..._message import shortened
 from ..._module import as_float_array
 from ..._typing import PRNGKey
 from ...environments import Environment
-from .._by_value import ByValue
-from .._episode import begin, EpisodeState, observe, step as episode_step, time_of
-from .._spaces import has_discrete_actions, LARGEST_ACTION
-from ._params import GymnaxParams
+from .. import _adapter as adapter
+from .._adapter import EpisodeState
 from ._spaces import box_space, discrete_space, separates_ends
+
+
+class GymnaxParams(eqx.Module):
+    """The numbers of an environment, as the `params` of gymnax's protocol.
+
+    **Arguments:** `environment`: the environment.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        from delucax.interop.gymnax import GymnaxParams, to_gymnax
+
+        env = to_gymnax(dlx.make("pendulum"))
+        longer = GymnaxParams(dlx.make("pendulum", length=1.2))
+        env.action_space(longer)
+        ```
+    """
+
+    arrays: Any
+    static: Any = eqx.field(static=True)
+
+    def __init__(self, environment: Environment):
+        check_instance(environment, Environment, "environment", "GymnaxParams")
+        self.arrays, self.static = eqx.partition(environment, eqx.is_array)
+
+    @property
+    def environment(self) -> Environment:
+        """The environment."""
+        return eqx.combine(self.arrays, self.static)
+
+    @property
+    def max_steps_in_episode(self) -> int:
+        """The horizon."""
+        return self.environment.horizon
 
 
 class GymnaxEnv:
@@ -67,11 +100,11 @@ class GymnaxEnv:
                 "jax.jit, jax.vmap or jax.grad); give traced numbers as params, "
                 "GymnaxParams(env)."
             )
-        self.discrete = has_discrete_actions(env, discrete, where)
+        self.discrete = adapter.has_discrete_actions(env, discrete, where)
         if separate_ends is None:
             separate_ends = separates_ends()
         self.separate_ends = check_bool(separate_ends, "separate_ends", where)
-        self._made = ByValue(env)
+        self._made = adapter.ByValue(env)
         self._identity = (self._made, self.discrete, self.separate_ends)
 
     def __hash__(self):
@@ -167,7 +200,7 @@ class GymnaxEnv:
         **Returns:** as `reset` does.
         """
         check_key(key, "GymnaxEnv.reset")
-        state = begin(self._params(params).environment, key)
+        state = adapter.begin(self._params(params).environment, key)
         return self.get_obs(state, params), state
 
     def step_env(
@@ -187,7 +220,7 @@ class GymnaxEnv:
         del key
         env = self._params(params).environment
         given = self._check_action(action)
-        after, outcome = episode_step(env, state, self._action(env, given))
+        after, outcome = adapter.step(env, state, self._action(env, given))
         info = {
             "terminated": outcome.terminated,
             "truncated": outcome.truncated,
@@ -196,7 +229,7 @@ class GymnaxEnv:
         }
         ended = outcome.terminated | outcome.truncated
         done = outcome.terminated if self.separate_ends else ended
-        return observe(env, after), after, outcome.reward, done, info
+        return adapter.observe(env, after), after, outcome.reward, done, info
 
     def get_obs(
         self, state: EpisodeState, params: GymnaxParams | None = None, key: Any = None
@@ -208,7 +241,7 @@ class GymnaxEnv:
         **Returns:** the observation.
         """
         del key
-        return observe(self._params(params).environment, state)
+        return adapter.observe(self._params(params).environment, state)
 
     def is_terminal(
         self, state: EpisodeState, params: GymnaxParams | None = None
@@ -223,7 +256,7 @@ class GymnaxEnv:
         truncated = state.time >= env.horizon
         if env.terminated is None:
             return truncated
-        return env.terminated(time_of(env, state), state.state) | truncated
+        return env.terminated(adapter.time_of(env, state), state.state) | truncated
 
     def action_space(self, params: GymnaxParams | None = None) -> Any:
         """The actions.
@@ -236,7 +269,7 @@ class GymnaxEnv:
         env = self._params(params).environment
         if self.discrete:
             return discrete_space(self.num_actions)
-        return box_space(env.control_bounds, env.control_size, LARGEST_ACTION)
+        return box_space(env.control_bounds, env.control_size, adapter.LARGEST_ACTION)
 
     def observation_space(self, params: GymnaxParams | None = None) -> Any:
         """The observations.
@@ -277,10 +310,7 @@ class GymnaxEnv:
 
 
 def to_gymnax(
-    env: Environment,
-    *,
-    discrete: bool | None = None,
-    separate_ends: bool | None = None,
+    env: Environment, *, discrete: bool | None = None, separate_ends: bool | None = None
 ) -> GymnaxEnv:
     """An environment in gymnax's protocol, without gymnax.
 

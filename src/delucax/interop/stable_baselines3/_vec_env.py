@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore
 
 from ...environments import Environment
 from ..gymnasium import GymnasiumVectorEnv
-from ..gymnasium._same_step import dones_and_infos
+from ..gymnasium._vector_env import dones_and_infos
 
 
 class SB3VecEnv(VecEnv):

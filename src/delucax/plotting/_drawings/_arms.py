@@ -3,9 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from ..figures import NEUTRAL
-from ._canvas import BODY, Canvas, GOAL, LONG_DASHES, Points, SECOND
-from ._drawing import Drawing, Episode, States, Vector
+from ._canvas import Canvas, Drawing, Episode, Points, States, Vector
 
 
 def pendulum(canvas: Canvas, episode: Episode) -> Drawing:
@@ -13,7 +11,7 @@ def pendulum(canvas: Canvas, episode: Episode) -> Drawing:
     anticlockwise; the torque is an arc of up to 240 degrees about the hinge."""
     canvas.ax.set(xlim=(-1.25, 1.25), ylim=(-1.25, 1.25))
     canvas.reach(1)
-    canvas.line([(0, 1.06), (0, 1.16)], color=NEUTRAL, linewidth=2)
+    canvas.line([(0, 1.06), (0, 1.16)], color=canvas.NEUTRAL, linewidth=2)
 
     def draw(x: Vector, u: Vector) -> None:
         angle = float(x[0])
@@ -46,11 +44,11 @@ def _set_up_arm(canvas: Canvas, reach: float) -> None:
 
 def _draw_arm(canvas: Canvas, points: Points, reach: float, bob: float = 0.0) -> None:
     """Two links through three points, with bobs on the last two."""
-    canvas.link(points[1], points[2], color=SECOND)
+    canvas.link(points[1], points[2], color=canvas.SECOND)
     canvas.link(points[0], points[1])
     if bob:
-        canvas.disc(points[2], bob * reach, SECOND)
-        canvas.disc(points[1], bob * reach, BODY)
+        canvas.disc(points[2], bob * reach, canvas.SECOND)
+        canvas.disc(points[1], bob * reach, canvas.BODY)
     for point in points[:2]:
         canvas.joint(point, 0.028 * reach)
 
@@ -66,7 +64,7 @@ def acrobot(canvas: Canvas, episode: Episode) -> Drawing:
     height = getattr(episode.environment.terminated, "goal_height", None)
     if height is not None:
         ends = [(-1.2 * reach, float(height)), (1.2 * reach, float(height))]
-        canvas.line(ends, color=GOAL, lw=2, ls=LONG_DASHES)
+        canvas.line(ends, color=canvas.GOAL, lw=2, ls=canvas.LONG_DASHES)
 
     def draw(x: Vector, u: Vector) -> None:
         points = arm_points(x, lengths)

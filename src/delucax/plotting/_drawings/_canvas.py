@@ -1,8 +1,9 @@
-"""What drawings are made of: links, joints, bodies, arrows, marks, and the view."""
+"""What a drawing is made of: the episode, the canvas with its shapes, and the view."""
 
 import dataclasses
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -10,6 +11,10 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon, Rectangle
 
+from ...dynamics import AbstractDynamics
+from ...environments import Environment
+from ...simulation import Trajectory
+from ...systems import AbstractSystem
 from ..figures import color_of, NEUTRAL
 
 
@@ -17,9 +22,6 @@ Number: TypeAlias = float | int
 Point: TypeAlias = Sequence[Number] | Float[np.ndarray, "2"]
 Points: TypeAlias = Float[np.ndarray, "_ 2"]
 
-BODY, ACTION, GOAL, SECOND = color_of(0), color_of(1), color_of(2), color_of(5)
-DARK = "0.3"
-LONG_DASHES, SHORT_DASHES = (0, (5, 3)), (0, (3, 2))
 FULL_TURN = math.radians(240)  # the sweep of the arrow of the largest torque
 
 
@@ -59,9 +61,15 @@ def arc_arrow(
 
 @dataclasses.dataclass(frozen=True)
 class Canvas:
-    """Axes, and the shapes that drawings put on them. Keywords are Matplotlib's."""
+    """Axes, the colours of drawings, and the shapes that they put on the axes. Keywords
+    are Matplotlib's."""
 
     ax: Axes
+
+    BODY, ACTION, GOAL, SECOND = color_of(0), color_of(1), color_of(2), color_of(5)
+    DARK = "0.3"
+    LONG_DASHES, SHORT_DASHES = (0, (5, 3)), (0, (3, 2))
+    NEUTRAL = NEUTRAL
 
     def line(self, points: Any, **style: Any) -> None:
         """A line through points."""
@@ -75,12 +83,11 @@ class Canvas:
         """A filled circle."""
         self.circle(at, radius, color=color, **{"lw": 0, "zorder": 2} | style)
 
-    def rectangle(
-        self, corner: Point, width: Number, height: Number, **style: Any
-    ) -> None:
-        """A rectangle from its lower left corner."""
-        x, y = corner
-        self.ax.add_artist(Rectangle((x, y), width, height, **style))
+    def bar(self, at: Point, width: Number, top: Number, **style: Any) -> None:
+        """A filled bar that stands on the point `at`, up to the height `top`."""
+        corner, height = (at[0] - width / 2, float(at[1])), top - at[1]
+        style = {"lw": 0, "zorder": 2} | style
+        self.ax.add_artist(Rectangle(corner, width, height, **style))
 
     def polygon(
         self,
@@ -97,30 +104,30 @@ class Canvas:
 
     def link(self, start: Point, end: Point, width: Number = 9, **style: Any) -> None:
         """A rod with round ends, of a width in points."""
-        style = {"color": BODY, "zorder": 2} | style
+        style = {"color": self.BODY, "zorder": 2} | style
         self.line([start, end], linewidth=width, solid_capstyle="round", **style)
 
     def joint(self, at: Point, radius: Number) -> None:
         """A hinge."""
-        self.circle(at, radius, facecolor="white", edgecolor=NEUTRAL, zorder=4)
+        self.circle(at, radius, facecolor="white", edgecolor=self.NEUTRAL, zorder=4)
 
     def wheel(self, at: Point, radius: Number) -> None:
         """A wheel seen from the side."""
-        self.disc(at, radius, DARK, zorder=3)
+        self.disc(at, radius, self.DARK, zorder=3)
         self.disc(at, 0.4 * radius, "white", zorder=3)
 
     def goal(self, at: Point, radius: Number) -> None:
         """A goal in the plane: a ring around a dot."""
-        self.circle(at, radius, fill=False, edgecolor=GOAL, lw=2, zorder=1)
-        self.disc(at, 0.3 * radius, GOAL, zorder=1)
+        self.circle(at, radius, fill=False, edgecolor=self.GOAL, lw=2, zorder=1)
+        self.disc(at, 0.3 * radius, self.GOAL, zorder=1)
 
     def reach(self, radius: Number) -> None:
         """The circle about the origin that a tip goes round."""
-        self.circle((0, 0), radius, fill=False, color=NEUTRAL, alpha=0.25, lw=1)
+        self.circle((0, 0), radius, fill=False, color=self.NEUTRAL, alpha=0.25, lw=1)
 
     def ground(self) -> None:
         """The ground at height 0, across the whole view."""
-        self.ax.axhline(0, color=NEUTRAL, lw=2, zorder=0)
+        self.ax.axhline(0, color=self.NEUTRAL, lw=2, zorder=0)
 
     def torque(
         self,
@@ -176,3 +183,89 @@ class View(NamedTuple):
         inner = np.maximum(self.half - room, 0.0)
         shift = at - np.clip(at, self.centre - inner, self.centre + inner)
         View(self.centre + shift, self.half).show(ax)
+
+
+Vector: TypeAlias = Float[np.ndarray, "_"]  # noqa: F821
+States: TypeAlias = Float[np.ndarray, "times states"]
+
+
+class Drawing(NamedTuple):
+    """How the plant of one episode is drawn.
+
+    - `draw(x, u)` draws one moment.
+    - `path(states)` is where the plant has been, shape `(times, 2)`, if it leaves one.
+    - `autoscale`: whether the limits of the axes are to fit all that is drawn.
+    """
+
+    draw: Callable[[Vector, Vector], Any]
+    path: Callable[[States], Points] | None = None
+    autoscale: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """The run that is drawn, in the terms that drawings ask for."""
+
+    environment: Environment
+    trajectory: Trajectory
+
+    @functools.cached_property
+    def system(self) -> Any:
+        """The innermost system of the environment; its dynamics if they hold none."""
+        return layers(self.environment)[-1]
+
+    @functools.cached_property
+    def states(self) -> States:
+        """The states without those that are not finite; one of zeros if all are."""
+        states = np.asarray(self.trajectory.states, float)
+        finite = states[np.all(np.isfinite(states), axis=-1)]
+        return finite if len(finite) else np.zeros_like(states[:1])
+
+    @functools.cached_property
+    def target(self) -> Vector | None:
+        """The state that the cost draws to, the origin if it names none; or nothing."""
+        targets = self.environment.cost.targets
+        if targets is None:
+            return None
+        x, _ = targets
+        zero = np.zeros(self.environment.state_size)
+        return zero if x is None else np.asarray(x, float)
+
+    def visited(self, columns: Sequence[int]) -> Float[np.ndarray, "_ columns"]:
+        """Some entries of the states, and last of the target, if there is one."""
+        states = self.states
+        if self.target is not None:
+            states = np.concatenate([states, self.target[None]])
+        return states[:, list(columns)]
+
+    @functools.cached_property
+    def largest_controls(self) -> Vector:
+        """What a full arrow stands for, one a control: its bound if it has one, else
+        the largest that was applied, else 1."""
+        bounds = self.environment.control_bounds
+        largest = np.zeros(self.environment.control_size)
+        if bounds is not None:
+            low, high = (np.abs(np.asarray(end, float)) for end in bounds)
+            largest = np.broadcast_to(np.maximum(low, high), largest.shape)
+        applied = np.abs(np.asarray(self.trajectory.controls, float))
+        applied = np.where(np.isfinite(applied), applied, 0.0).max(axis=0, initial=0.0)
+        largest = np.where(np.isfinite(largest) & (largest > 0), largest, applied)
+        return np.where(largest > 0, largest, 1.0)
+
+    def shares(self, u: Vector) -> Vector:
+        """Controls as shares of the largest, between -1 and 1."""
+        return np.clip(u / self.largest_controls, -1, 1)
+
+
+Setup: TypeAlias = Callable[[Canvas, Episode], Drawing]
+"""Draws what stays, sets the limits of the axes, and returns what draws the rest."""
+
+
+def layers(environment: Environment) -> list[Any]:
+    """The dynamics and what they wrap, the innermost system last."""
+    layers: list[Any] = [environment.dynamics]
+    while True:
+        inner = getattr(layers[-1], "system", getattr(layers[-1], "dynamics", None))
+        if not isinstance(inner, AbstractSystem | AbstractDynamics):
+            return layers
+        layers.append(inner)

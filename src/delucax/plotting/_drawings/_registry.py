@@ -4,61 +4,36 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from ... import systems
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
-from ...systems import (
-    AbstractSystem,
-    Acrobot,
-    CartPole,
-    DoubleIntegrator,
-    DynamicBicycle,
-    KinematicBicycle,
-    Lorenz,
-    MassSpringDamper,
-    MountainCar,
-    Pendulum,
-    PermanentMagnetMotor,
-    PlanarQuadrotor,
-    Quadrotor,
-    Reacher,
-    TwoTank,
-)
-from ._arms import acrobot, pendulum, reacher
-from ._canvas import Canvas
-from ._cars import car
-from ._cart_pole import cart_pole, linear_cart_pole
-from ._drawing import Drawing, Episode, layers, Setup
-from ._lung import lung, STATE_NAMES as LUNG_STATES
-from ._masses import double_integrator, mass_spring_damper
-from ._motor import motor
-from ._mountain_car import mountain_car
-from ._planar_quadrotor import planar_quadrotor
-from ._quadrotor import quadrotor
-from ._state_space import butterfly, state_space
-from ._tanks import two_tank
+from ...systems import AbstractSystem
+from . import _arms, _carts, _machines, _state_space, _vehicles
+from ._canvas import Canvas, Drawing, Episode, layers, Setup
 
 
 _BY_TYPE: dict[type, Setup] = {
-    Acrobot: acrobot,
-    CartPole: cart_pole,
-    DoubleIntegrator: double_integrator,
-    DynamicBicycle: car,
-    KinematicBicycle: car,
-    Lorenz: butterfly,
-    MassSpringDamper: mass_spring_damper,
-    MountainCar: mountain_car,
-    Pendulum: pendulum,
-    PermanentMagnetMotor: motor,
-    PlanarQuadrotor: planar_quadrotor,
-    Quadrotor: quadrotor,
-    Reacher: reacher,
-    TwoTank: two_tank,
-    AbstractDynamics: state_space,  # what has no drawing of its own
+    systems.Acrobot: _arms.acrobot,
+    systems.CartPole: _carts.cart_pole,
+    systems.DoubleIntegrator: _carts.double_integrator,
+    systems.DynamicBicycle: _vehicles.car,
+    systems.KinematicBicycle: _vehicles.car,
+    systems.Lorenz: _state_space.butterfly,
+    systems.MassSpringDamper: _carts.mass_spring_damper,
+    systems.MountainCar: _carts.mountain_car,
+    systems.Pendulum: _arms.pendulum,
+    systems.PermanentMagnetMotor: _machines.motor,
+    systems.PlanarQuadrotor: _vehicles.planar_quadrotor,
+    systems.Quadrotor: _vehicles.quadrotor,
+    systems.Reacher: _arms.reacher,
+    systems.TwoTank: _machines.two_tank,
+    AbstractDynamics: _state_space.state_space,  # what has no drawing of its own
 }
+_LUNG_CONTROLS = ("u_in", "u_out")
 # A linear model keeps the names of what it was made of, and no more.
 _BY_NAMES: dict[tuple[tuple[str, ...], tuple[str, ...]], Setup] = {
-    (("position", "angle", "velocity", "spin"), ("force",)): linear_cart_pole,
-    **{(states, ("u_in", "u_out")): lung for states in LUNG_STATES},
+    (("position", "angle", "velocity", "spin"), ("force",)): _carts.linear_cart_pole,
+    **{(names, _LUNG_CONTROLS): _machines.lung for names in _machines.LUNG_STATES},
 }
 
 
@@ -121,25 +96,19 @@ def register_drawing(
             raise ValueError(
                 f"register_drawing: {name} must be a function, got {given!r}."
             )
-    _BY_TYPE[system_class] = functools.partial(_user_drawing, draw, setup)
 
+    def set_up(canvas: Canvas, episode: Episode) -> Drawing:
+        if setup is None:
+            return Drawing(functools.partial(draw, canvas.ax), autoscale=True)
+        keywords = setup(canvas.ax, episode.environment, episode.trajectory)
+        if keywords is not None and not isinstance(keywords, Mapping):
+            raise ValueError(
+                "animate: the setup of a drawing must return a dictionary or None, got "
+                f"{type(keywords).__name__}."
+            )
+        return Drawing(functools.partial(draw, canvas.ax, **(keywords or {})))
 
-def _user_drawing(
-    draw: Callable[..., Any],
-    setup: Callable[..., Any] | None,
-    canvas: Canvas,
-    episode: Episode,
-) -> Drawing:
-    """A drawing of the functions that were registered for a class."""
-    if setup is None:
-        return Drawing(functools.partial(draw, canvas.ax), autoscale=True)
-    keywords = setup(canvas.ax, episode.environment, episode.trajectory)
-    if keywords is not None and not isinstance(keywords, Mapping):
-        raise ValueError(
-            "animate: the setup of a drawing must return a dictionary or None, got "
-            f"{type(keywords).__name__}."
-        )
-    return Drawing(functools.partial(draw, canvas.ax, **(keywords or {})))
+    _BY_TYPE[system_class] = set_up
 
 
 def drawing_for(environment: Environment) -> Setup:

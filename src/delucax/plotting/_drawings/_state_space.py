@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...systems import AbstractSystem
-from ..figures import NEUTRAL, style_axes, with_unit, wrapped
-from ._canvas import ACTION, BODY, Canvas, GOAL, View
-from ._drawing import Drawing, Episode, Vector
+from ..figures import style_axes, with_unit, wrapped
+from ._canvas import Canvas, Drawing, Episode, Vector, View
 
 
 SIZE = 11.0
@@ -41,7 +40,7 @@ def plane(
     ax.set_ylabel(names[1], size=SIZE)
     points = episode.visited(columns)
     if target is not None:
-        ax.plot(*target[list(columns)], "o", ms=13, mfc="none", mec=GOAL, mew=2)
+        ax.plot(*target[list(columns)], "o", ms=13, mfc="none", mec=canvas.GOAL, mew=2)
     low, high = points.min(axis=0), points.max(axis=0)
     margin = np.where(high > low, 0.09 * (high - low), 1.0)
     view = View((low + high) / 2, (high - low) / 2 + margin)
@@ -53,7 +52,7 @@ def plane(
     def draw(x: Vector, u: Vector) -> None:
         del u
         at = x[list(columns)]
-        ax.plot(*at, "o", color=ACTION, markersize=9, zorder=4)
+        ax.plot(*at, "o", color=canvas.ACTION, markersize=9, zorder=4)
         away = np.abs(at - view.centre) / view.half
         View(view.centre, view.half * np.maximum(1.0, 1.05 * away)).show(ax)
 
@@ -78,7 +77,7 @@ def _draw_flow(canvas: Canvas, episode: Episode, view: View) -> None:
         field = lambda x: system(0.0, x, u) - x
     ways = np.asarray(jax.vmap(field)(jnp.asarray(places)), float) / view.half
     ways = ways / np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-12)
-    style = {"color": NEUTRAL, "alpha": 0.4, "zorder": 0, "width": 0.004}
+    style = {"color": canvas.NEUTRAL, "alpha": 0.4, "zorder": 0, "width": 0.004}
     canvas.ax.quiver(*places.T, *ways.T, pivot="middle", scale=1.6 * ARROWS, **style)
 
 
@@ -94,10 +93,10 @@ def bars(canvas: Canvas, episode: Episode) -> Drawing:
     scale = np.where(scale > 0, scale, 1.0)
     places = np.append(np.arange(n), n + 0.6 + np.arange(m))
     ax.set_aspect("auto")
-    ax.axhline(0, color=NEUTRAL, lw=1.5, zorder=3)
+    ax.axhline(0, color=canvas.NEUTRAL, lw=1.5, zorder=3)
     low, high = states.min(axis=0) / scale, states.max(axis=0) / scale
-    ax.bar(places[:n], high - low, 0.8, bottom=low, color=BODY, alpha=0.12)
-    ax.bar(places[n:], 2.0, 0.8, bottom=-1.0, color=ACTION, alpha=0.1)
+    ax.bar(places[:n], high - low, 0.8, bottom=low, color=canvas.BODY, alpha=0.12)
+    ax.bar(places[n:], 2.0, 0.8, bottom=-1.0, color=canvas.ACTION, alpha=0.1)
     names = [*dynamics.state_names, *dynamics.control_names]
     if len(names) <= MOST_NAMES:
         upright = max(map(len, names)) * len(names) > 36
@@ -106,7 +105,7 @@ def bars(canvas: Canvas, episode: Episode) -> Drawing:
             ax.text(float(place), -1.1, name, rotation=90 * upright, **style)
     ax.set(xlim=(-0.7, places[-1] + 0.7), ylim=(-1.35, 1.1))
     scale = np.append(scale, episode.largest_controls)
-    colors = [BODY] * n + [ACTION] * m
+    colors = [canvas.BODY] * n + [canvas.ACTION] * m
 
     def draw(x: Vector, u: Vector) -> None:
         heights = np.clip(np.append(x, u) / scale, -1, 1)

@@ -52,19 +52,13 @@ def estimator_variance(small: bool = False) -> Finding:
             estimators["ES, one-sided"] = by_one, loss, policy
             plain = training.LikelihoodRatio(BUDGET, baseline=False)
             estimators["REINFORCE, no baseline"] = plain, score, noisy
-        samples = {}
-        for name, (estimator, objective, model) in estimators.items():
-            estimate = jax.jit(
-                lambda key, e=estimator, o=objective, m=model: _flat(e(o, m, key)[1])
-            )
-            samples[name] = jax.lax.map(estimate, jr.split(jr.key(1), draws))
+        samples = {name: _estimates(e, draws) for name, e in estimators.items()}
         exact = samples["analytic"][0]
         scale = exact @ exact
-        variances = {
-            name: float(jnp.sum(jnp.var(drawn, axis=0)) / scale)
-            for name, drawn in samples.items()
-        }
-        rows.append({"parameters": len(exact), **variances})
+        row: dict[str, Any] = {"parameters": len(exact)}
+        for name, drawn in samples.items():
+            row[name] = float(jnp.sum(jnp.var(drawn, axis=0)) / scale)
+        rows.append(row)
     sizes = [row["parameters"] for row in rows]
     _, *names = rows[0]
     ratios = {name: [row[name] for row in rows] for name in names}
@@ -138,12 +132,10 @@ def _at_horizon(horizon: int, draws: int) -> dict[str, Any]:
     noisy = Gaussian(policy, -1.0, bounds=env.control_bounds)
     one = training.expected_cost(env, batch=1, horizon=horizon)
     score = training.scored_cost(env, horizon=horizon)
-    keys = jr.split(jr.key(1), draws)
-    exact = jax.jit(lambda key: _flat(training.analytic(one, policy, key)[1]))
-    drawn = training.LikelihoodRatio(DRAWN)
-    guess = jax.jit(lambda key: _flat(drawn(score, noisy, key)[1]))
     # Of single rollouts, so that norms are those of one, and the variance an eighth.
-    each, guesses = (np.asarray(jax.lax.map(f, keys)) for f in (exact, guess))
+    each = np.asarray(_estimates((training.analytic, one, policy), draws))
+    drawn = training.LikelihoodRatio(DRAWN)
+    guesses = np.asarray(_estimates((drawn, score, noisy), draws))
     norms = np.linalg.norm(each, axis=1)
     return {
         "horizon": horizon,
@@ -154,8 +146,14 @@ def _at_horizon(horizon: int, draws: int) -> dict[str, Any]:
     }
 
 
-def _flat(gradient: Any) -> Any:
-    """What is with respect to the policy's own weights."""
-    return ravel_pytree(gradient.base if isinstance(gradient, Gaussian) else gradient)[
-        0
-    ]
+def _estimates(given: tuple[Any, Any, Any], draws: int) -> jax.Array:
+    """Estimates of the gradient by the policy's own weights, a row each; of an
+    estimator, a loss and a model."""
+    estimator, loss, model = given
+
+    def estimate(key):
+        _, gradient = estimator(loss, model, key)
+        own = gradient.base if isinstance(gradient, Gaussian) else gradient
+        return ravel_pytree(own)[0]
+
+    return jax.lax.map(jax.jit(estimate), jr.split(jr.key(1), draws))

@@ -40,11 +40,9 @@ def lq_perturbations(small: bool = False) -> Finding:
 
     @jax.jit
     def costs(controller, w):
-        def one(w):
-            options: Any = dict(key=jr.key(0), x0=jnp.zeros(2), horizon=steps)
-            return rollout(env, controller, w=w, keep=("costs",), **options).costs
-
-        return jax.vmap(one)(w)
+        options: Any = dict(key=jr.key(0), x0=jnp.zeros(2), horizon=steps)
+        options["keep"] = ("costs",)
+        return jax.vmap(lambda w: rollout(env, controller, w=w, **options).costs)(w)
 
     costs_of = {
         (name, kind): np.asarray(costs(controller, jnp.asarray(w, A.dtype)))
@@ -55,12 +53,10 @@ def lq_perturbations(small: bool = False) -> Finding:
     for kind in kinds:
         for name in contenders:
             mean, half = mean_and_half_width(means[name, kind])
-            rows.append(
-                {"perturbation": kind, "controller": name, "cost": mean, "+-": half}
-            )
-    ratio = {
-        kind: paired_ratio(means["GPC", kind], means["LQR", kind]) for kind in kinds
-    }
+            row = {"perturbation": kind, "controller": name}
+            rows.append({**row, "cost": mean, "+-": half})
+    against_lqr = lambda kind: paired_ratio(means["GPC", kind], means["LQR", kind])
+    ratio = {kind: against_lqr(kind) for kind in kinds}
     claims = [
         Claim(
             "Under Gaussian noise GPC costs at most 1.05 times what LQR does, which is "

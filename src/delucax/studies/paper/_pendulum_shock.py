@@ -34,9 +34,8 @@ def pendulum_shock(small: bool = False) -> Finding:
     rng = np.random.default_rng(0)
     starts = jnp.asarray(rng.uniform(0.3, 0.6, (seeds, 2)) * [1, 0])
     middle = (np.arange(steps) >= steps // 3) & (np.arange(steps) < 2 * steps // 3)
-    wave = 0.2 * np.sin(
-        np.arange(steps) / (2 * np.pi) + rng.uniform(0, 2 * np.pi, (seeds, 1))
-    )
+    phases = rng.uniform(0, 2 * np.pi, (seeds, 1))
+    wave = 0.2 * np.sin(np.arange(steps) / (2 * np.pi) + phases)
     shock = np.stack([np.zeros_like(wave), np.where(middle, wave, 0)], axis=2)
     worlds = {"no noise": np.zeros_like(shock), "shock": shock}
 
@@ -46,6 +45,8 @@ def pendulum_shock(small: bool = False) -> Finding:
 
     plans = jax.lax.map(planned, starts)
     learner = controllers.gpc(dynamics, cost, base=lqr)
+    horizon = learner.loop.horizon
+    around = lambda x: controllers.gpc(dynamics, cost, base=x, horizon=horizon)
     # What LQR would cost from there on stands for all that lies beyond the horizon.
     ahead = Quadratic(jnp.eye(2), jnp.eye(1), final=lqr.P)
     mpc = controllers.MPC(dynamics, ahead, AHEAD, bounds=(-BOUND, BOUND))
@@ -57,21 +58,17 @@ def pendulum_shock(small: bool = False) -> Finding:
         "iLQR, open loop": lambda plan: controllers.OpenLoop(plan.controls),
         "iLQR, with gains": lambda plan: plan,
         "MPC": lambda plan: mpc,
-        "GPC around the plan": lambda plan: controllers.gpc(
-            dynamics, cost, base=plan, horizon=learner.loop.horizon
-        ),
+        "GPC around the plan": around,
     }
     costs_of = {}
+    options: Any = dict(horizon=steps, keep=("costs",), throw=False)
     for name, make in contenders.items():
 
         @jax.jit
-        def costs(plans, starts, w, make=make):
-            def one(plan, x0, w):
-                options: Any = dict(key=jr.key(0), horizon=steps, throw=False)
-                run = rollout(env, make(plan), x0=x0, w=w, keep=("costs",), **options)
-                return run.costs
-
-            return jax.vmap(one)(plans, starts, w)
+        @jax.vmap
+        def costs(plan, x0, w, make=make):
+            key = jr.key(0)
+            return rollout(env, make(plan), key=key, x0=x0, w=w, **options).costs
 
         for world, w in worlds.items():
             w = jnp.asarray(w, starts.dtype)

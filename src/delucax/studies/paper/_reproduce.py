@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from ..._check import check_choice
 from ..._extras import extra
 from ...experiments import Page
 from ._estimator_variance import estimator_variance
@@ -76,11 +77,7 @@ def reproduce(
     extra("matplotlib", "reproduce").use("agg")
     chosen = [names] if isinstance(names, str) else list(names)
     for name in chosen:
-        if name != "all" and name not in STUDIES:
-            raise ValueError(
-                f"reproduce: names must be 'all' or among {', '.join(STUDIES)}; got "
-                f"{name!r}."
-            )
+        check_choice(name, ("all", *STUDIES), "names", "reproduce")
     chosen = list(STUDIES) if "all" in chosen else chosen
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -102,14 +99,18 @@ def reproduce(
         # Drawn once: figures take as long as some studies.
         sections += _section(finding)
         pd.DataFrame(rows).to_csv(out / "claims.csv", index=False)
-        _page(sections, rows).write(out / "report.html")
+        page = Page("The Deluca paper, reproduced")
+        page.paragraph(f"{_held(rows)}.")
+        page.parts.extend(sections)
+        page.provenance(Path())
+        page.write(out / "report.html")
         say(f"  {time.perf_counter() - study_start:.0f} s")
-    held = sum(row["holds"] for row in rows)
-    say(
-        f"{held} of {len(rows)} claims hold; {out / 'report.html'}, in "
-        f"{time.perf_counter() - start:.0f} s"
-    )
+    say(f"{_held(rows)}; {out / 'report.html'}, in {time.perf_counter() - start:.0f} s")
     return rows
+
+
+def _held(rows: list[dict[str, Any]]) -> str:
+    return f"{sum(row['holds'] for row in rows)} of {len(rows)} claims hold"
 
 
 def _run(name: str, out: Path, small: bool, say: Callable[[str], Any]) -> Finding:
@@ -123,15 +124,6 @@ def _run(name: str, out: Path, small: bool, say: Callable[[str], Any]) -> Findin
         (out / f"{name}.txt").write_text(traceback.format_exc())
         failed = Claim("The study runs", f"{type(error).__name__}: {error}", False)
         return Finding(name, [failed], notes=f"The traceback is in {name}.txt.")
-
-
-def _page(sections: list[str], rows: list[dict[str, Any]]) -> Page:
-    held = sum(row["holds"] for row in rows)
-    page = Page("The Deluca paper, reproduced")
-    page.paragraph(f"{held} of {len(rows)} claims hold.")
-    page.parts.extend(sections)
-    page.provenance(Path())
-    return page
 
 
 def _section(finding: Finding) -> list[str]:

@@ -48,9 +48,8 @@ def wall_clock(small: bool = False) -> Finding:
         f"deviation over {runs} runs, and the median ratio. Gymnasium has become "
         "several times as fast since the paper's 54 us."
     )
-    return Finding(
-        "Simulation wall-clock time", claims, {"Time a step": rows}, {}, notes
-    )
+    tables = {"Time a step": rows}
+    return Finding("Simulation wall-clock time", claims, tables, notes=notes)
 
 
 def _compiled(steps: int, lanes: int | None) -> tuple[float, Callable[[], Any]]:

@@ -19,7 +19,7 @@ from ...dynamics import LinearDynamics
 from ...environments import Environment
 from ...estimators import KalmanFilter
 from ...training.sysid import arx
-from ._settings import ABORT, SEEN, Size
+from ._stages import ABORT, SEEN, Size
 
 
 TRUE_PID = dict(
@@ -71,11 +71,9 @@ class Trainer(NamedTuple):
         self, start: Any, steps: int, fold: int, *, limit: Any = None, **options: Any
     ) -> Any:
         """The trained controllers: see [`delucax.lung.train_controllers`][]."""
-        in_simulator = lambda model: lung.lung_environment(
-            model, self.waveform, limit=limit
-        )
+        task = lambda model: lung.lung_environment(model, self.waveform, limit=limit)
         # Compiled, as the trainings are: then the first states round as they do there.
-        envs = eqx.filter_jit(eqx.filter_vmap(in_simulator))(self.simulators)
+        envs = eqx.filter_jit(eqx.filter_vmap(task))(self.simulators)
         options |= dict(steps=steps, key=jr.fold_in(self.key, fold))
         return lung.train_controllers(envs, start, **options).model
 
@@ -96,11 +94,8 @@ def _stacked(make: Callable[[PRNGKey], Any], keys: PRNGKey) -> Any:
 def searched_pids(envs: Environment, trainer: Trainer) -> dict[str, LeakyPID | PID]:
     """The best PID of each kind, for each lung and for all."""
     best: dict[str, Any] = {}
-    kinds: Any = (
-        ("leaky PID", LeakyPID, {}),
-        ("PID", PID, dict(TRUE_PID, kind="true")),
-    )
-    for name, kind, options in kinds:
+    true: Any = dict(TRUE_PID, kind="true")
+    for name, kind, options in (("leaky PID", LeakyPID, {}), ("PID", PID, true)):
         grid = lung.pid_grid(envs, key=jr.fold_in(trainer.key, 6), **options)
         best[name] = lung.stack([trainer.pid(kind, gains) for gains in grid.best()])
         best[f"{name} for all"] = trainer.pid(kind, grid.best_of_all())
@@ -120,31 +115,26 @@ def trained_pids(
     trained, options = {}, dict(learning_rate=0.05, progress=progress)
     for name, start in starts.items():
         steps = trainer.size.pid_steps * (2 if "forward" in name else 1)
-        options |= dict(
-            shared=name.endswith("for all"),
-            checkpoint=f"{checkpoint}.{name.replace(' ', '_')}",
-        )
+        file = f"{checkpoint}.{name.replace(' ', '_')}"
+        options |= dict(shared=name.endswith("for all"), checkpoint=file)
         models = trainer(lung.stack([start]), steps, 6, **options)
         trained[name] = lung.unstack(models)[0]
     return trained
 
 
+def _log_uniform(key: PRNGKey, low: float, high: float) -> Array:
+    return jnp.exp(jr.uniform(key, minval=jnp.log(low), maxval=jnp.log(high)))
+
+
 @eqx.filter_jit
 def _drawn(
-    kind: type[LeakyPID | PID],
-    count: int,
-    dt: Array,
-    waveform: lung.BreathWaveform,
-    key: PRNGKey,
+    kind: type[LeakyPID | PID], count: int, dt: Array, waveform: Any, key: PRNGKey
 ) -> lung.Summed:
     """PIDs with a feed-forward, gains at random over orders of magnitude."""
 
     def one(key):
-        keys = jr.split(key, 7)
+        keys, between = jr.split(key, 7), _log_uniform
         some = jr.bernoulli(keys[0], 0.5, (3,))
-        between = lambda key, low, high: jnp.exp(  # noqa: E731
-            jr.uniform(key, minval=jnp.log(low), maxval=jnp.log(high))
-        )
         kd = between(keys[1], 0.003, 0.2) * (1.0 if kind is PID else 20.0)
         gains = between(keys[2], 0.03, 8.0), between(keys[3], 0.05, 40.0), some[0] * kd
         forward = lung.FeedForward(
@@ -163,10 +153,8 @@ def _errors(
 ) -> Float[Array, "lungs controllers"]:
     """The error of each in each lung, shape `(lungs, controllers)`; of controllers of
     shape `(controllers,)`, or `(controllers, lungs)` if each lung has its own."""
-    pips = jnp.asarray(SEEN)
-    of = lambda env, one: jnp.mean(  # noqa: E731
-        lung.breath_error(env, one, key=key, pips=pips)
-    )
+    options: Any = dict(key=key, pips=jnp.asarray(SEEN))
+    of = lambda env, one: jnp.mean(lung.breath_error(env, one, **options))
     across = eqx.filter_vmap(of, in_axes=(None, eqx.if_array(0)))
     over = eqx.if_array(1) if own else None
     errors = eqx.filter_vmap(across, in_axes=(eqx.if_array(0), over))(envs, controllers)
@@ -212,9 +200,8 @@ def tuned_pids(
             file = Path(f"{checkpoint}.{label.replace(' ', '_')}")
             options |= dict(checkpoint=file, shared=shared)
             trained = lung.train_controllers(envs, begin, key=fit_key, **options)
-            candidates = lung.stack(
-                [*lung.unstack(begin), *lung.unstack(trained.model)]
-            )
+            both = [*lung.unstack(begin), *lung.unstack(trained.model)]
+            candidates = lung.stack(both)
             judged = _errors(envs, candidates, judge_key, not shared)
             if words := divergence_note(trained.history["diverged"], judged):
                 say(f"  {label}: {words}")

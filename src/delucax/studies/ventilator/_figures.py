@@ -11,8 +11,8 @@ from ... import lung
 from ...environments import Environment
 from ...plotting import animate
 from ...plotting.figures import color_of, NEUTRAL, NotebookFigure, style_axes
-from ._report import mean_error, PID_ROWS
-from ._settings import SHOWN
+from ._report import mean_error, PID_ROWS, Rows
+from ._stages import SHOWN
 
 
 _SIZE = 9.0
@@ -20,10 +20,7 @@ _ORDER = ("best PID", "MLP", "MLP for all", "MPC", "PID + MLP", "CNN")
 
 
 def tracking_figure(
-    envs: Environment,
-    shown: dict[str, Any],
-    names: list[str],
-    rows: list[dict[str, Any]],
+    envs: Environment, shown: dict[str, Any], names: list[str], rows: Rows
 ) -> NotebookFigure:
     """Breaths of some lungs under several controllers, and all their errors."""
     count = len(names)
@@ -88,10 +85,7 @@ def _errors(rows: list[dict[str, Any]], names: list[str]) -> dict[str, np.ndarra
 
 
 def simulator_figure(
-    test: Any,
-    models: dict[str, Any],
-    names: list[str],
-    table: list[dict[str, Any]],
+    test: Any, models: dict[str, Any], names: list[str], table: list[dict[str, Any]]
 ) -> NotebookFigure:
     """A breath that was not learned from as simulators see it, and their errors."""
     figure = NotebookFigure(figsize=(9.5, 3.6), layout="constrained")
@@ -126,22 +120,8 @@ def simulator_figure(
     return figure
 
 
-def draw_study(
-    out: Path,
-    envs: Environment,
-    shown: dict[str, Any],
-    names: list[str],
-    test: Any,
-    models: dict[str, Any],
-    table: list[dict[str, Any]],
-    rows: list[dict[str, Any]],
-) -> None:
-    """`controllers.png`, `simulators.png` and `breath.gif`."""
-    figure = tracking_figure(envs, shown, names, rows)
-    figure.savefig(out / "controllers.png", dpi=130)
-    figure = simulator_figure(test, models, names, table)
-    figure.savefig(out / "simulators.png", dpi=130)
-    middle = len(names) // 2
+def draw_breath(path: Path, envs: Environment, runs: Any) -> None:
+    """A breath in the middle one of the lungs, as a moving picture."""
+    middle = len(envs.dt) // 2
     env = lung.at_pip(lung.unstack(envs)[middle], SHOWN)
-    run = lung.unstack(shown["MLP"])[middle]
-    animate(env, run, path=out / "breath.gif", max_frames=40)
+    animate(env, lung.unstack(runs)[middle], path=path, max_frames=40)

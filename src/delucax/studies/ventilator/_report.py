@@ -15,20 +15,15 @@ from ..._typing import PRNGKey
 from ...environments import Environment
 from ...simulation import rollout
 from ._contenders import Contender
-from ._settings import ABORT, BREATH, INSPIRATION, SEEN, SHOWN, UNSEEN
+from ._stages import ABORT, BREATH, INSPIRATION, SEEN, SHOWN, UNSEEN
 
 
 Rows = list[dict[str, Any]]
 WRONG = ("single compartment", "balloon")
 """Physics that the lungs of the study do not have."""
 PID_ROWS = (
-    "leaky PID",
-    "PID",
-    "trained leaky PID",
-    "trained PID",
-    "PID + feed-forward",
-    "tuned PID + feed-forward",
-    "tuned leaky PID + feed-forward",
+    *("leaky PID", "PID", "trained leaky PID", "trained PID", "PID + feed-forward"),
+    *("tuned PID + feed-forward", "tuned leaky PID + feed-forward"),
 )
 FLOORS = ("zero", "bang-bang")
 SPLITS = {"seen": slice(len(SEEN)), "unseen": slice(len(SEEN), None)}
@@ -94,11 +89,10 @@ def error_rows(
 
 def bound_rows(names: list[str], bound: Any) -> Rows:
     """Rows of the least errors, shape `(lungs, pips)`."""
-    return [
-        row
-        for split, at in SPLITS.items()
-        for row in _rows(names, "least error", 0, split, bound[:, at], None)
-    ]
+    rows: Rows = []
+    for split, at in SPLITS.items():
+        rows += _rows(names, "least error", 0, split, bound[:, at], None)
+    return rows
 
 
 def _rows(
@@ -148,12 +142,8 @@ def save_controllers(
 
 def mean_error(rows: Rows, label: str, split: str, lung: str | None = None) -> float:
     """Of a controller, over its seeds, in one lung or all; NaN if it was not run."""
-    errors = [
-        row["mae"]
-        for row in rows
-        if (row["controller"], row["split"]) == (label, split)
-        and lung in (None, row["lung"])
-    ]
+    of = lambda row: (row["controller"], row["split"]) == (label, split)
+    errors = [r["mae"] for r in rows if of(r) and lung in (None, r["lung"])]
     return float(np.mean(errors)) if errors else float("nan")
 
 
@@ -176,11 +166,7 @@ def _by_kind(table: Rows, column: str) -> dict[str, dict[str, float]]:
 
 
 def summarise(
-    rows: Rows,
-    table: Rows,
-    seconds: dict[str, float],
-    judge: str,
-    unsafe: list[str],
+    rows: Rows, table: Rows, seconds: dict[str, float], judge: str, unsafe: list[str]
 ) -> dict[str, Any]:
     """The figures that the study is about, and sentences of them.
 

@@ -14,7 +14,7 @@ from ..._module import positive
 from ..._typing import PRNGKey
 from ...environments import Environment
 from ...simulation import rollout
-from ._settings import INSPIRATION, SEEN, Size
+from ._stages import INSPIRATION, SEEN, Size
 
 
 class Kind(NamedTuple):
@@ -33,26 +33,22 @@ class Kind(NamedTuple):
     learning_rate: float = 0.05
 
 
-def _double(key: PRNGKey) -> lung.DoubleCompartment:
-    begin: Any = dict(central=0.5, share=0.4, imbalance=3.0)
-    return lung.DoubleCompartment(**begin)
+def _fitted(positives: str, *free: str) -> dict[str, Any]:
+    """What is fitted: what stays positive, its names in one string, and the rest."""
+    return dict.fromkeys(positives.split(), positive) | dict.fromkeys(free)
 
 
-def _positive(*names: str) -> dict[str, Any]:
-    return dict.fromkeys(names, positive)
-
-
+_DOUBLE: Any = dict(central=0.5, share=0.4, imbalance=3.0)
 KINDS = {
     "single compartment": Kind(
-        lambda key: lung.SingleCompartment(), _positive("resistance", "compliance")
+        lambda key: lung.SingleCompartment(), _fitted("resistance compliance")
     ),
     "balloon": Kind(
-        lambda key: lung.BalloonLung(), _positive("resistance", "stiffness", "rest")
+        lambda key: lung.BalloonLung(), _fitted("resistance stiffness rest")
     ),
     "double compartment": Kind(
-        _double,
-        _positive("resistance", "compliance", "imbalance")
-        | {"central": None, "share": None},
+        lambda key: lung.DoubleCompartment(**_DOUBLE),
+        _fitted("resistance compliance imbalance", "central", "share"),
         steps=2,
     ),
     "neural ODE": Kind(
@@ -60,8 +56,7 @@ KINDS = {
     ),
     "grey box": Kind(
         lambda key: lung.GreyBoxLung(key=key),
-        _positive("single.resistance", "single.compliance")
-        | {"network": None, "memory": None},
+        _fitted("single.resistance single.compliance", "network", "memory"),
         steps=2,
         learning_rate=1e-2,
     ),
@@ -172,11 +167,12 @@ def open_loop_rows(
 def _observed(envs, controllers, pips):
     """What the sensor reads in an inspiration, shape `(lungs, pips, steps)`."""
 
+    options: Any = dict(horizon=INSPIRATION, keep=("observations",), throw=False)
+
     def in_lung(env, controller):
         def one(pip):
             world, policy = lung.at_pip((env, controller), pip)
-            options: Any = dict(horizon=INSPIRATION, keep=("observations",))
-            run: Any = rollout(world, policy, key=jr.key(0), throw=False, **options)
+            run: Any = rollout(world, policy, key=jr.key(0), **options)
             return run.observations[:, 0]
 
         return jax.vmap(one)(pips)

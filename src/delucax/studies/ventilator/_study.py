@@ -21,8 +21,7 @@ from ...controllers import LeakyPID
 from ...environments import Environment
 from . import _contenders as making, _report as reporting, _simulators as fitting
 from ._contenders import Contender, pid_contenders, Trainer
-from ._settings import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, UNSEEN
-from ._stages import Stages
+from ._stages import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, Stages, UNSEEN
 
 
 def lung_study(
@@ -81,24 +80,19 @@ def lung_study(
     began = time.perf_counter()
     size = SMALL if small else FULL
     if seeds is not None:
-        size = size._replace(seeds=seeds)
-    if size.seeds < 1:
-        raise ValueError(f"lung: seeds must be at least 1, got {seeds}.")
+        size = size._replace(seeds=check_count(seeds, "seeds", "lung"))
     sensor_delay = check_count(sensor_delay, "sensor_delay", "lung", least=0)
     size = size._replace(sensor_delay=sensor_delay)
     recorded = None if data is None else lung.read_breaths(data)
-    settings = dict(
-        size._asdict(),
-        data=None if data is None else _named(Path(data)),
-        version=importlib.metadata.version("delucax"),
-    )
+    source = None if data is None else _named(Path(data))
+    version = importlib.metadata.version("delucax")
+    settings = dict(size._asdict(), data=source, version=version)
     stages = Stages(Path(out), settings, say, progress)
     waveform, key = lung.BreathWaveform(), jr.key(0)
 
     if recorded is None:
         lungs = size.lungs
-        make = lambda: fitting.explored(size)
-        breaths = stages.stage("breaths", "Breaths", make)
+        breaths = stages.stage("breaths", "Breaths", lambda: fitting.explored(size))
     else:
         make = lambda: fitting.grouped(recorded)
         lungs, breaths = stages.stage("breaths", "Breaths", make)
@@ -122,21 +116,16 @@ def lung_study(
         judge = "the lungs themselves"
     else:
         # What no controller was trained in stands in for the lungs.
-        made = [
-            lung.lung_environment(model, waveform, horizon=BREATH)
-            for model in lung.unstack(models["grey box"])
-        ]
-        envs = lung.stack(made)
+        task = lambda model: lung.lung_environment(model, waveform, horizon=BREATH)
+        envs = lung.stack([*map(task, lung.unstack(models["grey box"]))])
         judge = "grey-box lungs fitted to the same breaths, for want of the lungs"
     trainer = Trainer(models["learned"], waveform, size, key)
     contenders = _contenders(stages, envs, train, trainer)
     if size.extras and recorded is None:
         pids = next(c.controllers for c in contenders if c.label == "PID")
-        closed = stages.stage(
-            "closed_loop",
-            "Simulators and lungs under the same PIDs",
-            lambda: fitting.closed_loop_errors(envs, models, pids, waveform),
-        )
+        words = "Simulators and lungs under the same PIDs"
+        make = lambda: fitting.closed_loop_errors(envs, models, pids, waveform)
+        closed = stages.stage("closed_loop", words, make)
         for row in table:
             errors = closed[row["simulator"]]
             row["closed_loop_mae"] = float(errors[names.index(row["lung"])])
@@ -144,11 +133,10 @@ def lung_study(
     keys = jr.split(jr.fold_in(key, 99), size.noises)
     rows, runs = reporting.error_rows(contenders, envs, names, waveform, keys, between)
     if size.bound_steps:
-        bound = stages.stage(
-            "bound",
-            "The least error, with the lung at hand",
-            lambda: _least_errors(envs, size.bound_steps),
-        )
+        pips = jnp.asarray(SEEN + UNSEEN)
+        of = lambda env: lung.least_error(env, pips=pips, steps=size.bound_steps)
+        words, make = "The least error, with the lung at hand", eqx.filter_vmap(of)
+        bound = stages.stage("bound", words, lambda: make(envs))
         rows += reporting.bound_rows(names, np.asarray(bound))
     stages.write_table("report.csv", rows)
     place = stages.out / "controllers"
@@ -162,9 +150,13 @@ def lung_study(
     if importlib.util.find_spec("matplotlib") is None:
         say("No figures: they need matplotlib (pip install 'delucax[plot]').")
     else:
-        from ._figures import draw_study
+        from . import _figures as figures
 
-        draw_study(stages.out, envs, shown, names, test, models, table, rows)
+        figure = figures.tracking_figure(envs, shown, names, rows)
+        figure.savefig(stages.out / "controllers.png", dpi=130)
+        figure = figures.simulator_figure(test, models, names, table)
+        figure.savefig(stages.out / "simulators.png", dpi=130)
+        figures.draw_breath(stages.out / "breath.gif", envs, shown["MLP"])
     say(f"Written to {stages.out}/ in {time.perf_counter() - began:.0f} s.")
     return rows
 
@@ -198,9 +190,8 @@ def _contenders(
 ) -> list[Contender]:
     """All controllers, in the order of the report."""
     size, waveform, training = trainer.size, trainer.waveform, stages.training
-    pids = stages.stage(
-        "pids", "PID grids", lambda: making.searched_pids(envs, trainer)
-    )
+    search = lambda: making.searched_pids(envs, trainer)
+    pids = stages.stage("pids", "PID grids", search)
     # No control is a PID without gains, as which it compiles nothing of its own.
     none = trainer.pid(LeakyPID, (0.0, 0.0, 0.0))
     contenders = [Contender("zero", 0, none, True), *pid_contenders(pids)]
@@ -210,9 +201,8 @@ def _contenders(
     shared = training("shared", words, making.networks_for_all, trainer)
     if size.tuned:
         words = "PIDs with feed-forward tuned on the lungs"
-        tuned = training(
-            "tuned_pids", words, making.tuned_pids, envs, trainer, stages.say
-        )
+        given = envs, trainer, stages.say
+        tuned = training("tuned_pids", words, making.tuned_pids, *given)
         contenders += pid_contenders(tuned)
     if size.extras:
         words = "PIDs trained on"
@@ -236,10 +226,3 @@ def _contenders(
         each = enumerate(lung.unstack(trained))
         contenders += [Contender(label, seed, one, alike) for seed, one in each]
     return contenders
-
-
-def _least_errors(envs: Environment, steps: int) -> Any:
-    """About the least error there could be, shape `(lungs, pips)`."""
-    pips = jnp.asarray(SEEN + UNSEEN)
-    of = lambda env: lung.least_error(env, pips=pips, steps=steps)  # noqa: E731
-    return eqx.filter_vmap(of)(envs)

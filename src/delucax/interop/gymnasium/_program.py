@@ -1,4 +1,4 @@
-"""An environment as compiled functions of one packed array.
+"""An environment as Gymnasium sees it: its spaces, and compiled functions of one array.
 
 A call of a compiled function costs a few microseconds for each array that goes in or
 comes out, which is more than the arithmetic. So all that a step returns is one array,
@@ -8,27 +8,57 @@ environment are compiled in.
 """
 
 import functools
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from gymnasium.spaces import Box, Discrete
 from jaxtyping import Array
 
+from ..._check import LARGEST
 from ..._typing import PRNGKey, State
 from ...environments import Environment
-from .._by_value import ByValue
-from .._episode import (
-    begin,
-    EpisodeState,
-    has_signals,
-    NO_SIGNALS,
-    observe,
-    Outcome,
-    Signals,
-    step as episode_step,
-)
+from .. import _adapter as adapter
+from .._adapter import EpisodeState
+
+
+def read_options(options: Any, names: tuple[str, ...], where: str) -> list[Any]:
+    """The options of a reset, none for those that are left out."""
+    if options is not None and not isinstance(options, Mapping):
+        raise ValueError(f"{where}: options must be a dictionary, got {options!r}.")
+    options = dict(options or {})
+    values = [options.pop(name, None) for name in names]
+    if options:
+        raise ValueError(
+            f"{where}: options takes {' and '.join(map(repr, names))} alone, got "
+            f"{', '.join(map(repr, options))}."
+        )
+    return values
+
+
+def action_space(env: Environment, discrete: bool) -> Box | Discrete:
+    """Indices into the table of actions, or controls."""
+    if discrete:
+        assert env.actions is not None
+        return Discrete(len(env.actions))
+    return _box(env.control_bounds, env.control_size, adapter.LARGEST_ACTION)
+
+
+def observation_space(env: Environment) -> Box:
+    """What `encode` returns."""
+    bounds = env.observation_bounds
+    # Gymnasium's own spaces are infinite where bounds are.
+    ends = (-LARGEST, LARGEST) if bounds is None else bounds
+    return _box(ends, env.feature_size, np.inf)
+
+
+def _box(bounds: Any, size: int, largest: float) -> Box:
+    ends = adapter.finite_ends(bounds, size, largest)
+    low, high = (np.asarray(end, np.float32) for end in ends)
+    return Box(low, high, dtype=np.float32)
 
 
 class Layout(NamedTuple):
@@ -63,7 +93,7 @@ class Program(NamedTuple):
 
 def program(env: Environment, discrete: bool, truncate: bool = True) -> Program:
     """The program of an environment; one that is the same compiles no more."""
-    return _compiled(ByValue(env), discrete, truncate)
+    return _compiled(adapter.ByValue(env), discrete, truncate)
 
 
 def shared(size: int, dtype: Any) -> tuple[np.ndarray, jax.Array]:
@@ -86,7 +116,7 @@ def draw_key(generator: np.random.Generator) -> PRNGKey:
 
 
 @functools.lru_cache(maxsize=64)
-def _compiled(same: ByValue, discrete: bool, truncate: bool) -> Program:
+def _compiled(same: adapter.ByValue, discrete: bool, truncate: bool) -> Program:
     env = same.env
     layout = Layout(env.state_size, env.feature_size)
 
@@ -94,9 +124,9 @@ def _compiled(same: ByValue, discrete: bool, truncate: bool) -> Program:
         action = action[0].astype(int) if discrete else action
         x, k = packed[: layout.states], packed[STEP].astype(int)
         now = EpisodeState(x, k, signals)
-        return _packed(env, *episode_step(env, now, action, truncate))
+        return _packed(env, *adapter.step(env, now, action, truncate))
 
-    def step_in_place(given, signals=NO_SIGNALS):
+    def step_in_place(given, signals=adapter.NO_SIGNALS):
         return step(given[: layout.size], given[layout.size :], signals)
 
     start = functools.partial(_start, env)
@@ -111,25 +141,25 @@ def _compiled(same: ByValue, discrete: bool, truncate: bool) -> Program:
     )
 
 
-def _packed(env: Environment, episode: EpisodeState, outcome: Outcome) -> Array:
+def _packed(env: Environment, episode: EpisodeState, outcome: adapter.Outcome) -> Array:
     x, (reward, terminated, truncated, failed) = episode.state, outcome
     failed = failed | ~jnp.all(jnp.isfinite(x)) | ~jnp.isfinite(reward)
     rest = (reward, terminated, truncated, failed, episode.time)
     rest = jnp.stack([jnp.asarray(part, x.dtype) for part in rest])
-    return jnp.concatenate([x, observe(env, episode).astype(x.dtype), rest])
+    return jnp.concatenate([x, adapter.observe(env, episode).astype(x.dtype), rest])
 
 
 def _start(
     env: Environment, key: PRNGKey, state: State | None
-) -> tuple[Array, Signals]:
-    if has_signals(env):
-        episode = begin(env, key, state)
+) -> tuple[Array, adapter.Signals]:
+    if adapter.has_signals(env):
+        episode = adapter.begin(env, key, state)
     else:
         # A key that is not split saves a batch a third of the time of a reset.
         x = env.reset(key) if state is None else state
         episode = EpisodeState(x, jnp.zeros((), int))
     no = jnp.zeros((), bool)
-    outcome = Outcome(jnp.zeros((), episode.state.dtype), no, no, no)
+    outcome = adapter.Outcome(jnp.zeros((), episode.state.dtype), no, no, no)
     return _packed(env, episode, outcome), episode.signals
 
 

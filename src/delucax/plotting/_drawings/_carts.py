@@ -1,0 +1,222 @@
+"""Carts and masses on a track, and the car in its valley."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from ._canvas import box, Canvas, Drawing, Episode, Points, rotation, Vector, View
+
+
+# Of the cart under a pole, in lengths of the pole.
+WIDTH, HEIGHT, WHEEL = 0.56, 0.26, 0.08
+HINGE = WHEEL + HEIGHT
+
+
+def _cart_pole(
+    canvas: Canvas,
+    episode: Episode,
+    length: float,
+    lean: Callable[[Vector], float],
+    hangs: bool,
+    bob: float = 0.0,
+) -> Drawing:
+    """A cart on its track, and a pole that leans to the right by `lean(x)`, with a mass
+    at its tip if `bob` is not 0. The track ends where the task says, and the view goes
+    lower if the pole hangs at times."""
+    canvas.ground()
+    end = getattr(episode.environment.terminated, "max_position", None)
+    if end is None:
+        positions = np.abs(episode.states[:, 0]).max(initial=0.0)
+        reach = float(np.clip(positions, 1.2 * length, 2.5 * length))
+    else:
+        reach = float(end)
+        for side in (-reach, reach):
+            ends = [(side, -0.12 * length), (side, 0.12 * length)]
+            canvas.line(ends, color=canvas.NEUTRAL, lw=2)
+    low = HINGE - 1.2 if hangs else -0.3
+    low, high = low * length, (HINGE + 1.2) * length
+    half = np.array([reach + 0.5 * WIDTH * length, (high - low) / 2])
+    view = View(np.array([0.0, (high + low) / 2]), half)
+    view.show(canvas.ax)
+    width, radius = WIDTH * length, WHEEL * length
+    middle = radius + HEIGHT * length / 2
+
+    def draw(x: Vector, u: Vector) -> None:
+        position, angle = float(x[0]), lean(x)
+        hinge = np.array([position, HINGE * length])
+        cart = box(width, HEIGHT * length, 0.05 * length)
+        canvas.polygon(cart, (position, middle))
+        for side in (-0.27, 0.27):
+            canvas.wheel((position + side * width * 1.1, radius), radius)
+        tip = hinge + length * np.array([math.sin(angle), math.cos(angle)])
+        canvas.link(hinge, tip, width=7, color=canvas.SECOND, zorder=3)
+        canvas.joint(hinge, 0.045 * length)
+        share = float(episode.shares(u)[0])
+        side = position + math.copysign(width / 2 + 0.04 * length, share)
+        canvas.force((side, middle), (0.6 * length * share, 0.0), 0.6 * length)
+        view.follow(canvas.ax, (position, view.centre[1]), 0.5 * width)
+        if bob:
+            canvas.disc(tip, bob * length, canvas.SECOND, zorder=3)
+
+    return Drawing(draw)
+
+
+def cart_pole(canvas: Canvas, episode: Episode) -> Drawing:
+    """A pole that leans to the right for positive angles."""
+    length = 2 * float(episode.system.half_length)
+    hangs = np.cos(episode.states[:, 2]).min(initial=1.0) < 0.3
+    return _cart_pole(canvas, episode, length, lambda x: float(x[2]), bool(hangs))
+
+
+def linear_cart_pole(canvas: Canvas, episode: Episode) -> Drawing:
+    """A rod with a mass at its tip, which leans to the left for positive angles. Its
+    length is found in how much more a force accelerates the cart than the angle."""
+    B = np.asarray(episode.system.B, float).reshape(-1, 4, 1)
+    cart, turning = B[0, 2:, 0]
+    length = float(cart / turning) if turning * cart > 0 else 1.0
+    lean = lambda x: -float(x[1])
+    # The model is true near the upright alone, so its pole never hangs.
+    return _cart_pole(canvas, episode, length, lean, hangs=False, bob=0.09)
+
+
+COILS = 6
+
+
+def _draw_mass(canvas: Canvas, at: float, side: float) -> None:
+    """A block on two rollers."""
+    block = box(side, 0.9 * side, 0.08 * side)
+    canvas.polygon(block, (at, 0.65 * side))
+    for place in (-0.28, 0.28):
+        canvas.wheel((at + place * side, 0.1 * side), 0.1 * side)
+
+
+def _draw_force(canvas: Canvas, at: float, side: float, share: float) -> None:
+    """The force on a mass, at its side."""
+    start = at + math.copysign(0.58 * side, share)
+    canvas.force((start, 0.65 * side), (1.5 * side * share, 0.0), 1.5 * side)
+
+
+def double_integrator(canvas: Canvas, episode: Episode) -> Drawing:
+    """A mass that rolls along a line, with a mark at the origin."""
+    reach = np.abs(episode.states[:, 0]).max(initial=0.0)
+    reach = float(np.clip(reach, 0.5, 10.0))
+    side = 0.3 * reach
+    canvas.ground()
+    canvas.ax.plot([0], [-0.25 * side], marker="^", color=canvas.GOAL, markersize=11)
+    half = np.array([1.35 * reach + side, 1.2 * side])
+    view = View(np.array([0.0, 0.5 * side]), half)
+    view.show(canvas.ax)
+
+    def draw(x: Vector, u: Vector) -> None:
+        place = float(x[0])
+        _draw_mass(canvas, place, side)
+        _draw_force(canvas, place, side, float(episode.shares(u)[0]))
+        view.follow(canvas.ax, (place, view.centre[1]), side)
+
+    return Drawing(draw)
+
+
+def mass_spring_damper(canvas: Canvas, episode: Episode) -> Drawing:
+    """A chain of masses from the wall, with marks where they rest, and the force on
+    the last of them."""
+    count = int(episode.system.masses)
+    places = episode.states[:, :count]
+    stretch = np.abs(np.diff(places, axis=1, prepend=0.0)).max(initial=0.0)
+    stretch = float(stretch) if stretch > 0 else 1.0
+    side = 0.75 * stretch
+    rest = (side + 1.6 * stretch) * np.arange(1, count + 1) - side / 2
+    gap = float(rest[0]) - side / 2
+    canvas.ground()
+    canvas.line([(0, 0), (0, 1.35 * side)], color=canvas.NEUTRAL, lw=2)
+    for height in np.linspace(0.1, 1.25, 6) * side:  # the wall's hatching
+        ends = [(-0.18 * side, height - 0.18 * side), (0, height)]
+        canvas.line(ends, color=canvas.NEUTRAL, lw=1, alpha=0.6)
+    marks = np.full(count, -0.22 * side)
+    canvas.ax.plot(rest, marks, "^", color=canvas.GOAL, markersize=11)
+    right = rest[-1] + float(places[:, -1].max(initial=0.0)) + 2.3 * side
+    canvas.ax.set(xlim=(-0.4 * side, right), ylim=(-0.7 * side, 1.7 * side))
+
+    def draw(x: Vector, u: Vector) -> None:
+        left, place = 0.0, 0.0
+        for place in map(float, rest + x[:count]):
+            right = place - side / 2
+            spring = zigzag(left, right, 0.85 * side, 0.14 * side)
+            canvas.line(spring, color=canvas.DARK, lw=1.8, zorder=1)
+            _draw_damper(canvas, left, right, 0.42 * side, gap, 0.12 * side)
+            _draw_mass(canvas, place, side)
+            left = place + side / 2
+        _draw_force(canvas, place, side, float(episode.shares(u)[0]))
+
+    return Drawing(draw)
+
+
+def zigzag(start: float, end: float, height: float, swing: float) -> Points:
+    """The corners of a spring between two places on a line."""
+    lead = 0.12 * (end - start)
+    xs = np.linspace(start + lead, end - lead, 2 * COILS + 1)
+    ys = height + swing * np.array([0, *[1, -1] * COILS])[: 2 * COILS + 1]
+    ys[-1] = height
+    return np.array([[start, height], *zip(xs, ys, strict=True), [end, height]])
+
+
+def _draw_damper(
+    canvas: Canvas, start: float, end: float, height: float, rest: float, size: float
+) -> None:
+    """A cup on the left and a piston on the right, which moves in it."""
+    near, far = start + 0.12 * rest, start + 0.34 * rest
+    cup = np.array([[far, size], [near, size], [near, -size], [far, -size]])
+    share = np.clip((end - start) / rest - 0.3, 0.05, 1.3) / 1.4
+    plate = near + share * (far - near)
+    for points in (
+        cup + [0, height],
+        [[start, height], [near, height]],
+        [[plate, height + 0.7 * size], [plate, height - 0.7 * size]],
+        [[plate, height], [end, height]],
+    ):
+        canvas.line(points, color=canvas.NEUTRAL, lw=1.6, zorder=1)
+
+
+CAR_LENGTH, CAR_HEIGHT, CAR_WHEEL = 0.17, 0.06, 0.028
+
+
+def mountain_car(canvas: Canvas, episode: Episode) -> Drawing:
+    """The car on the slope, pushed along it, between hills and walls, and a flag at
+    the goal."""
+    ax, environment = canvas.ax, episode.environment
+    positions = episode.states[:, 0]
+    low = getattr(environment.dynamics, "min_position", -1.2)
+    high = getattr(environment.dynamics, "max_position", 0.6)
+    low = max(min(float(low), positions.min()), -4.0) - 0.1
+    high = min(max(float(high), positions.max()), 4.0) + 0.1
+    xs = np.linspace(low, high, 300)
+    ys = np.asarray(episode.system.height(xs), float)
+    slopes = np.gradient(ys, xs)
+    floor = ys.min() - 0.12
+    ax.fill_between(xs, ys, floor, color=canvas.NEUTRAL, alpha=0.18, lw=0)
+    ax.plot(xs, ys, color=canvas.NEUTRAL, lw=2)
+    goal = getattr(environment.terminated, "goal_position", None)
+    if goal is not None:
+        foot = np.array([float(goal), float(np.interp(float(goal), xs, ys))])
+        canvas.line([foot, foot + [0, 0.26]], color=canvas.NEUTRAL, lw=2)
+        flag = np.array([(0, 0.26), (0.13, 0.21), (0, 0.16)])
+        canvas.polygon(flag, foot, color=canvas.GOAL, zorder=1)
+    ax.set(xlim=(low, high), ylim=(floor, ys.max() + 0.3))
+
+    def draw(x: Vector, u: Vector) -> None:
+        place = float(x[0])
+        foot = np.array([place, np.interp(place, xs, ys)])
+        angle = math.atan(np.interp(place, xs, slopes))
+        turned = rotation(angle)
+        for side in (-0.28, 0.28):
+            canvas.wheel(foot + turned @ (side * CAR_LENGTH, CAR_WHEEL), CAR_WHEEL)
+        middle = foot + turned @ (0.0, 1.4 * CAR_WHEEL + CAR_HEIGHT / 2)
+        canvas.polygon(box(CAR_LENGTH, CAR_HEIGHT, 0.02), middle, angle)
+        cabin = np.array([[-0.4, 0], [0.3, 0], [0.15, 1], [-0.28, 1]])
+        roof = cabin * [CAR_LENGTH, 0.75 * CAR_HEIGHT] + [0.0, CAR_HEIGHT / 2]
+        canvas.polygon(roof, middle, angle, canvas.SECOND)
+        share = float(episode.shares(u)[0])
+        end = turned @ (math.copysign(CAR_LENGTH / 2 + 0.015, share), 0.0)
+        canvas.force(middle + end, turned @ (0.22 * share, 0.0), 0.22)
+
+    return Drawing(draw)

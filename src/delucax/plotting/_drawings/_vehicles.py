@@ -1,0 +1,221 @@
+"""Vehicles that a camera follows: cars from above, and quadrotors."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from matplotlib.collections import LineCollection
+
+from ...systems import PlanarQuadrotor
+from ..figures import color_of
+from ._canvas import box, Canvas, Drawing, Episode, rotation, Vector, View
+
+
+LANES = 3
+
+
+def car(canvas: Canvas, episode: Episode) -> Drawing:
+    """A car with its front wheels steered, and its acceleration, on a road of three
+    lanes, the middle one along `y = 0`; the view goes along with it."""
+    ax, system = canvas.ax, episode.system
+    front, rear = float(system.front), float(system.rear)
+    base = front + rear
+    lane = 1.25 * base
+    edge = LANES * lane / 2
+    ax.axhspan(-edge, edge, color=canvas.NEUTRAL, alpha=0.13, lw=0)
+    for side in (-edge, edge):
+        ax.axhline(side, color=canvas.NEUTRAL, lw=2)
+    ax.axhline(0, color=canvas.GOAL, lw=1.5, alpha=0.7, zorder=0)
+    ys = episode.states[:, 1]
+    reach = float(np.clip(np.abs(ys).max(initial=0.0) + base, 1.25 * edge, 3 * edge))
+    half = np.array([4.2 * base, reach])
+    View(np.zeros(2), half).show(ax)
+
+    width = 0.64 * base
+    hood, boot = front + 0.3 * base, -rear - 0.28 * base
+    chassis = box(hood - boot, 0.88 * width, 0.16 * base)
+    tyre = box(0.26 * base, 0.1 * base, 0.03 * base)
+
+    def draw(x: Vector, u: Vector) -> None:
+        place, heading = np.asarray(x[:2], float), float(x[2])
+        turned = rotation(heading)
+        middle = place[0] + 0.6 * base
+        View(np.array([middle, 0.0]), half).follow(ax, (middle, place[1]), base)
+        _draw_dashes(canvas, middle, float(half[0]), base)
+        axis = place + turned @ ((hood + boot) / 2, 0.0)
+        for along, steering in ((front, float(u[1])), (-rear, 0.0)):
+            for side in (-0.48, 0.48):
+                at = place + turned @ (along, side * width)
+                canvas.polygon(tyre, at, heading + steering, canvas.DARK, zorder=3)
+        canvas.polygon(chassis, axis, heading)
+        for near, far, inner in ((0.28, 0.02, 0.3), (-0.62, -0.5, 0.32)):
+            corners = [(near, -0.36), (far, -inner), (far, inner), (near, 0.36)]
+            glass = np.array(corners) * [base, width]
+            canvas.polygon(glass, axis, heading, "white", alpha=0.55, zorder=4)
+        canvas.disc(place, 0.05 * base, "white", zorder=4)
+        share = float(episode.shares(u)[0])
+        start = place + turned @ ((hood if share > 0 else boot), 0.0)
+        ahead = turned @ (math.copysign(0.12 * base, share), 0)
+        canvas.force(start + ahead, turned @ (1.2 * base * share, 0), 1.2 * base)
+
+    return Drawing(draw, lambda states: states[:, :2])
+
+
+def _draw_dashes(canvas: Canvas, middle: float, half: float, base: float) -> None:
+    """The dashes between the lanes, which stay where they are on the road."""
+    pitch = 2.4 * base
+    first = math.floor((middle - half) / pitch)
+    last = math.ceil((middle + half) / pitch)
+    starts = pitch * np.arange(first, last + 1)
+    dash = np.stack([starts, starts + 0.45 * pitch, np.full_like(starts, np.nan)], -1)
+    for k in range(1, LANES):
+        height = (k - LANES / 2) * 1.25 * base
+        heights = np.full(dash.size, height)
+        canvas.ax.plot(dash.ravel(), heights, color="white", lw=2.5)
+
+
+def planar_quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
+    """A body with a rotor at each end and its thrust above it, the goal, and the wind
+    where there is one."""
+    system, target = episode.system, episode.target
+    visited = episode.visited((0, 1))
+    length = float(system.length)
+    low, high = visited.min(axis=0), visited.max(axis=0)
+    half = 0.5 * float(np.max(high - low)) + 2 * length
+    # About all of it; of what is too large, about its end.
+    centre = (low + high) / 2 if half <= 20 * length else visited[-1]
+    half = np.full(2, min(max(half, 4 * length), 20 * length))
+    view = View(centre, half)
+    arm = max(length, 0.16 * float(half[0]))  # seen from afar it is drawn larger
+    if target is not None:
+        canvas.goal(target[:2], 0.3 * arm)
+    if system.wind is not None:
+        _draw_wind(canvas, system, view)
+    weight = float(system.mass * system.gravity)
+    largest = np.maximum(episode.largest_controls, 0.5 * weight)
+    view.show(canvas.ax)
+
+    def draw(x: Vector, u: Vector) -> None:
+        centre, angle = np.asarray(x[:2], float), float(x[2])
+        turned = rotation(angle)
+        canvas.polygon(box(2 * arm, 0.16 * arm, 0.07 * arm), centre, angle)
+        canvas.disc(centre, 0.2 * arm)
+        canvas.disc(centre, 0.09 * arm, "white", zorder=3)
+        blade, up = turned @ (0.42 * arm, 0.0), turned @ (0.0, 0.1 * arm)
+        for side, share in zip((-1, 1), np.clip(u / largest, -1, 1), strict=True):
+            foot = centre + turned @ (0.92 * side * arm, 0.0)
+            hub = centre + turned @ (0.92 * side * arm, 0.26 * arm)
+            canvas.link(foot, hub, width=2, color=canvas.DARK)
+            canvas.link(hub - blade, hub + blade, width=3.5, color=canvas.SECOND)
+            canvas.force(hub + up, turned @ (0.0, 1.5 * arm * share), 1.5 * arm)
+        view.follow(canvas.ax, centre, 1.5 * arm)
+
+    return Drawing(draw, lambda states: states[:, :2])
+
+
+def _draw_wind(canvas: Canvas, system: PlanarQuadrotor, view: View) -> None:
+    """Arrows of the force that the wind has at time 0 on what is at rest."""
+    assert system.wind is not None
+    wind = system.wind
+    side = np.linspace(-0.9, 0.9, 9) * view.half[0]
+    places = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2) + view.centre
+    states = jnp.zeros((len(places), 6)).at[:, :2].set(places)
+    forces = np.asarray(jax.vmap(lambda x: wind(jnp.zeros(()), x))(states), float)
+    strongest = np.linalg.norm(forces, axis=-1).max() or 1.0
+    arrows = forces * (0.25 * view.half[0] / strongest)
+    style: dict[str, Any] = {"color": canvas.NEUTRAL, "alpha": 0.35, "zorder": 0}
+    style |= {"angles": "xy", "scale_units": "xy", "scale": 1.0, "width": 0.005}
+    canvas.ax.quiver(*places.T, *arrows.T, pivot="middle", **style)
+
+
+AZIMUTH, ELEVATION = math.radians(-62), math.radians(24)  # of the eye, far away
+HORIZONTAL = np.array([math.cos(AZIMUTH), math.sin(AZIMUTH), 0.0])
+RIGHT = np.array([-math.sin(AZIMUTH), math.cos(AZIMUTH), 0.0])
+UP = -math.sin(ELEVATION) * HORIZONTAL + np.array([0.0, 0.0, math.cos(ELEVATION)])
+SCREEN = np.stack([RIGHT, UP])  # the axes of the picture, in space
+FRONT = color_of(4)
+# Front, left, back and right, as the thrusts are ordered.
+ARMS = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], float)
+RIM = np.array(
+    [[np.cos(a), np.sin(a), 0.0] for a in np.linspace(0, 2 * np.pi, 33)[:-1]]
+)
+
+
+def projected(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
+    """Points in space as they lie in the picture."""
+    return points @ SCREEN.T
+
+
+def attitude(x: Vector) -> Float[np.ndarray, "3 3"]:
+    """The rotation matrix from body to world of a state."""
+    w, a, b, c = x[3:7] / (np.linalg.norm(x[3:7]) or 1.0)
+    return np.array(
+        [
+            [1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b)],
+            [2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a)],
+            [2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b)],
+        ]
+    )
+
+
+def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
+    """Two crossed arms with four rotors, the front one in amber; their thrusts, or the
+    thrust of all; a floor with a grid and the shadow on it, and the goal above it."""
+    system, target = episode.system, episode.target
+    visited = episode.visited((0, 1, 2))
+    length = float(system.arm)
+    low, high = visited.min(axis=0), visited.max(axis=0)
+    middle = target[:3] if target is not None else visited[0]
+    half = np.clip(0.5 * np.max(high - low) + 2 * length, 5 * length, 15 * length)
+    centre = np.where(high - low < 2 * half, (low + high) / 2, middle)
+    floor = float(max(low[2], centre[2] - half) - 2.5 * length)
+    arm = max(length, 0.16 * float(half))  # seen from afar it is drawn larger
+
+    ends = np.array([-half, half])
+    lines = []
+    for tick in np.linspace(-half, half, 7):
+        for across in (np.full(2, tick), ends), (ends, np.full(2, tick)):
+            flat = np.stack([*across, np.zeros(2)], axis=-1)
+            lines.append(projected(flat + [*centre[:2], floor]))
+    style = {"colors": canvas.NEUTRAL, "alpha": 0.3, "linewidths": 0.8, "zorder": 0}
+    canvas.ax.add_collection(LineCollection(lines, **style), autolim=False)
+    if target is not None:
+        stem = projected(np.stack([[*target[:2], floor], target[:3]]))
+        canvas.line(stem, color=canvas.NEUTRAL, lw=1, ls=(0, (3, 3)), zorder=0)
+        canvas.goal(projected(target[:3]), 0.35 * arm)
+    near = np.clip(visited, centre - half, centre + half)
+    corners = np.concatenate([*lines, projected(near) + [0, 2.5 * arm]])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    view = View((low + high) / 2, 0.52 * (high - low))
+    view.show(canvas.ax)
+
+    def draw(x: Vector, u: Vector) -> None:
+        place, turned = np.asarray(x[:3], float), attitude(x)
+        hubs = place + arm * ARMS @ turned.T
+        discs = [hub + 0.48 * arm * (RIM + [0, 0, 0.3]) @ turned.T for hub in hubs]
+        for rotor in (*discs, place + 0.3 * arm * RIM @ turned.T):
+            shadow = projected(rotor * [1, 1, 0] + [0, 0, floor])
+            canvas.polygon(shadow, color=canvas.NEUTRAL, alpha=0.3, zorder=1)
+        # What is farther away is drawn first.
+        order = np.argsort(hubs @ np.cross(RIGHT, UP))
+        for i in order:
+            color = FRONT if i == 0 else canvas.BODY
+            canvas.link(projected(place), projected(hubs[i]), width=5, color=color)
+        canvas.disc(projected(place), 0.24 * arm)
+        for i in order:
+            color = FRONT if i == 0 else canvas.SECOND
+            canvas.polygon(projected(discs[i]), color=color, alpha=0.65)
+        up, shares = turned[:, 2], episode.shares(u)
+        if system.inputs == "rotors":
+            thrusts = [(hubs[i], 2.8 * arm * shares[i]) for i in order]
+        else:
+            thrusts = [(place, 3 * arm * shares[0])]
+        for foot, thrust in thrusts:
+            start, along = projected(foot + 0.2 * arm * up), projected(thrust * up)
+            canvas.force(start, along, 2 * arm)
+        view.follow(canvas.ax, projected(place), 1.5 * arm)
+
+    return Drawing(draw, lambda states: projected(states[:, :3]))
