@@ -13,7 +13,7 @@ from .._message import shortened
 from .._module import as_float_array
 from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision
-from ._arguments import check_definite
+from ._arguments import check_definite, check_shapes, common_dtype
 from ._game import (
     attached,
     barrier,
@@ -24,7 +24,6 @@ from ._game import (
     sanitised_game,
     solve_game,
 )
-from ._horizon_arguments import check_shapes, common_dtype
 from ._level import bisect_level, Bisection, followed
 from ._solution import checked
 from ._spectrum import spectral_abscissa, spectral_radius

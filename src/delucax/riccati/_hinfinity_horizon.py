@@ -10,10 +10,10 @@ from jaxtyping import Array
 
 from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision, solve, symmetric
+from ._arguments import checked_times, final_weight, in_time, symmetric_stack
 from ._flow import flow_values
 from ._game import inverse_margins, joint, joint_gain, players
 from ._hinfinity import checked_game, checked_level, level_of, LOOSE
-from ._horizon_arguments import checked_times, final_weight, in_time, symmetric_stack
 from ._level import bisect_level, followed, Game
 from ._recursion import gain, is_clearly_definite, sanitised, values
 from ._solution import checked
