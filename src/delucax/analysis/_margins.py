@@ -6,7 +6,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from .._message import shortened
+from .._check import check_at_most, check_count
 from .._results import first_of, raise_on_failure, Result
 from .._typing import BoolScalar, RealScalar, Scalar
 from ..math._linear_solve import lu_solve
@@ -99,12 +99,8 @@ def disk_margin(
             f"{where}: loop must have as many outputs as controls, got {p} and {m}."
         )
     if channel is not None:
-        is_index = isinstance(channel, int) and not isinstance(channel, bool)
-        if not is_index or channel not in range(m):
-            raise ValueError(
-                f"{where}: channel must be a whole number from 0 to {m - 1}, or None "
-                f"for all, got {shortened(channel)}."
-            )
+        channel = check_count(channel, "channel", where, least=0)
+        check_at_most(channel, m - 1, "channel", where)
     disk = disk_of(system, jnp.asarray(skew, system.A.dtype), channel)
     return raise_on_failure(disk, where, throw)
 

@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-import numpy as np
 from jaxtyping import Array
 
 from .._check import (
@@ -14,12 +13,12 @@ from .._check import (
     check_count,
     check_instance,
     check_key,
+    check_range,
     check_real,
     check_step,
-    is_concrete,
+    check_vector,
 )
 from .._controller import AbstractController, wrong_observation
-from .._message import shortened
 from .._module import parameter, weight
 from ..math import matvec
 from ..math._steps import row_at, step_at
@@ -74,10 +73,7 @@ class Constant(AbstractController):
     value: Array = weight()
 
     def __check_init__(self):
-        if not eqx.is_array(self.value) or self.value.ndim != 1:
-            raise ValueError(
-                f"Constant: value must be a vector, got {shortened(self.value)}."
-            )
+        check_vector(self.value, "value", "Constant")
 
     def __call__(self, t, y, state):
         return self.value.astype(y.dtype), state
@@ -110,18 +106,13 @@ class Random(AbstractController):
     mean: Array = parameter(0.0)
 
     def __check_init__(self):
-        if not eqx.is_array(self.std) or self.std.ndim != 1:
-            raise ValueError(
-                "Random: std must be a vector with an entry for each control, got "
-                f"{shortened(self.std)}."
-            )
+        check_vector(self.std, "std", "Random")
+        check_range(self.std, "std", "Random")
         if jnp.shape(self.mean) not in ((), self.std.shape):
             raise ValueError(
                 f"Random: mean must be a number or have shape {self.std.shape}, got "
                 f"{jnp.shape(self.mean)}."
             )
-        if is_concrete(self.std) and np.any(np.asarray(self.std) < 0):
-            raise ValueError(f"Random: std must not be negative, got {self.std}.")
 
     def init(self, *, key=None):
         return check_key(key, "Random.init")

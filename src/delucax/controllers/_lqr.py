@@ -5,12 +5,10 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import lineax as lx
-import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import as_matrix, check_step
+from .._check import as_matrix, check_count, check_instance, check_step
 from .._controller import AbstractController
-from .._message import shortened
 from .._module import function_field, parameter, weight
 from ..dynamics import AbstractDynamics, LinearDynamics, OperatingPoint
 from ..math import matvec
@@ -118,23 +116,23 @@ class LQR(AbstractController):
         point: OperatingPoint | None = None,
     ):
         where = "LQR"
-        if point is not None and not isinstance(dynamics, AbstractDynamics):
-            raise ValueError(
-                f"{where}: point needs AbstractDynamics, got "
-                f"{type(dynamics).__name__}; sample a system with "
-                "`delucax.Discretized`, or use `delucax.controllers.lqrd`."
+        if point is not None:
+            hint = (
+                ", where point is given (sample a system with `delucax.Discretized`, "
+                "or use `delucax.controllers.lqrd`)"
             )
+            check_instance(dynamics, AbstractDynamics, "dynamics", where, hint)
         linear, difference = linear_at(dynamics, point, difference, where)
         check_linear_state_feedback(linear, where, time_invariant=True)
         self.x_ref = operating_state(linear, difference, where)
         self.u_ref, self.difference = linear.u_ref, difference
         given = as_signals(linear, reference, control_reference, disturbance, where)
         is_known = any(signal is not None for signal in given)
-        steps = isinstance(preview, int | np.integer) and not isinstance(preview, bool)
-        if not steps or preview < 0 or (preview and not is_known):
+        preview = check_count(preview, "preview", where, least=0)
+        if preview and not is_known:
             raise ValueError(
-                f"{where}: preview must be a number of steps, from 0, at which a "
-                f"reference or disturbance is looked up, got {shortened(preview)}."
+                f"{where}: preview must be 0 without a reference or disturbance that "
+                f"is looked up ahead, got {preview}."
             )
         A, B = linear.A, linear.B
         A, B, Q, R, S, _ = riccati_arguments(where, A, B, Q, R, S, None, definite=False)
@@ -145,7 +143,7 @@ class LQR(AbstractController):
             M = solve(jnp.asarray(R, P.dtype) + B.T @ P @ B, B.T)
             signals = KnownSignals(linear, *given, difference)
             known = signals, P, M, solution.closed_loop
-            self.feed_forward = Preview(*known, int(preview))
+            self.feed_forward = Preview(*known, preview)
 
     def __check_init__(self):
         if self.feed_forward is None:

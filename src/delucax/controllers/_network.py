@@ -16,14 +16,13 @@ from .._check import (
     bounds_field,
     check_choice,
     check_count,
-    check_finite,
     check_instance,
     check_key,
     check_positive,
+    check_vector,
     is_concrete,
 )
 from .._controller import AbstractController, check_controller, wrong_observation
-from .._message import shortened
 from .._module import as_float_array, as_module, function_field, parameter, weight
 from .._typing import PRNGKey
 from ..environments import Environment
@@ -410,9 +409,7 @@ class Standardise(eqx.Module):
 
     def __check_init__(self):
         where, mean = "Standardise", self.mean
-        if not eqx.is_inexact_array(mean) or mean.ndim != 1:
-            raise ValueError(f"{where}: mean must be a vector, got {shortened(mean)}.")
-        check_finite(mean, "mean", where)
+        check_vector(mean, "mean", where)
         check_positive(self.std, "std", where)
         if self.std.shape != mean.shape:
             raise ValueError(

@@ -140,11 +140,8 @@ def lqrd(
         regulator.K
         ```
     """
-    if not isinstance(system, AbstractSystem):
-        raise ValueError(
-            f"lqrd: system must be an AbstractSystem, got {type(system).__name__}; for "
-            "dynamics in discrete time use `delucax.controllers.LQR`."
-        )
+    hint = " (for dynamics in discrete time use `delucax.controllers.LQR`)"
+    check_instance(system, AbstractSystem, "system", "lqrd", hint)
     linear, difference = linear_at(system, point, difference, "lqrd")
     if not isinstance(linear, LinearSystem):
         linear = linearize(system)

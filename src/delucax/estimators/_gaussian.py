@@ -9,10 +9,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._check import as_vector, check_finite, is_concrete, symmetric_matrix
+from .._check import (
+    as_vector,
+    check_definite,
+    check_finite,
+    symmetric_matrix,
+)
 from .._controller import wrong_observation
 from .._typing import Control, Observation, RealScalar, Scalar
 from ..dynamics import AbstractDynamics
@@ -287,15 +291,7 @@ def covariance_matrix(value: Any, size: int, name: str, of: str, where: str) -> 
             f"{where}: {name} must have shape {(size, size)}, a row for each entry of "
             f"{of}, got {matrix.shape}."
         )
-    if is_concrete(matrix):
-        array = np.asarray(matrix)
-        eigenvalues = np.linalg.eigvalsh(array)
-        slack = 100 * size * np.finfo(array.dtype).eps * np.max(np.abs(eigenvalues))
-        if eigenvalues[0] < -slack:
-            raise ValueError(
-                f"{where}: {name} must be positive semidefinite, got {array}, whose "
-                f"least eigenvalue is {eigenvalues[0]:.3g}."
-            )
+    check_definite(matrix, name, where, False)
     return matrix
 
 

@@ -15,15 +15,15 @@ from .._check import (
     check_instance,
     check_number,
     check_positive,
+    check_time_invariant,
     is_concrete,
 )
 from .._jax import jacobian
 from .._module import function_field, parameter, positive, weight
-from .._results import RESULTS
+from .._results import raise_on_failure, RESULTS
 from ..dynamics import AbstractDynamics, LinearDynamics
 from ..math._linear_solve import symmetric
 from ..riccati import filter_dare
-from ..riccati._solution import checked
 from ._gaussian import (
     AbstractGaussianFilter,
     congruence,
@@ -124,7 +124,7 @@ class KalmanFilter(AbstractGaussianFilter):
             self.y_ref = as_vector(y_ref, self.V.shape[0], "y_ref", where)
         if not steady_state:
             return
-        _check_time_invariant(dynamics)
+        check_time_invariant(dynamics, "dynamics with steady_state", where)
         if covariance is not None:
             raise ValueError(
                 f"{where}: covariance must not be given with steady_state, of which it "
@@ -133,8 +133,8 @@ class KalmanFilter(AbstractGaussianFilter):
         C, noise = self._C, self._noise(dynamics)
         solution = filter_dare(dynamics.A, C, noise, self.V, throw=False)
         what = f"{where}: there is no steady state. Of A', C' in the places of A, B"
-        covariance = symmetric(checked(solution, what, True).X)
-        self.covariance = covariance.astype(self.mean.dtype)
+        solution = raise_on_failure(solution, what, facts=solution._facts)
+        self.covariance = symmetric(solution.X).astype(self.mean.dtype)
         joint = LinearJoint(C @ self.mean, self.covariance, C, self.V)
         self.L = joint.gain()
         self.updated_covariance = joint.remainder(self.L)
@@ -142,7 +142,8 @@ class KalmanFilter(AbstractGaussianFilter):
     def __check_init__(self):
         _check_linear(self.dynamics)
         if self.L is not None:
-            _check_time_invariant(self.dynamics)
+            named = "dynamics with steady_state"
+            check_time_invariant(self.dynamics, named, "KalmanFilter")
         if self.y_ref is not None:
             size = self.dynamics.observation_size
             as_vector(self.y_ref, size, "y_ref", "KalmanFilter")
@@ -184,14 +185,6 @@ class KalmanFilter(AbstractGaussianFilter):
 def _check_linear(dynamics: Any) -> None:
     hint = " (ExtendedKalmanFilter and UnscentedKalmanFilter take any)"
     check_instance(dynamics, LinearDynamics, "dynamics", "KalmanFilter", hint)
-
-
-def _check_time_invariant(dynamics: LinearDynamics) -> None:
-    if dynamics.is_time_varying:
-        raise ValueError(
-            "KalmanFilter: steady_state needs time-invariant dynamics, got matrices at "
-            f"{dynamics.A.shape[0]} times."
-        )
 
 
 class ExtendedKalmanFilter(AbstractGaussianFilter):

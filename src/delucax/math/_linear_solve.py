@@ -48,8 +48,12 @@ def factorised(
     A small matrix is eliminated entry by entry: one member of a batch is then a lane of
     vector instructions, where LAPACK would be called for each.
     """
+    small = matrix.shape[0] <= SMALL
+    return _factorised(matrix, _Elimination() if small else lx.LU())
+
+
+def _factorised(matrix, solver):
     operator = lx.MatrixLinearOperator(matrix)
-    solver = _Elimination() if matrix.shape[0] <= SMALL else lx.LU()
     state = solver.init(operator, {})
 
     def column(b):
@@ -177,10 +181,4 @@ def lu_solve(
     matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"]
 ) -> Inexact[Array, "n k"]:
     """`solve` by LAPACK at every size, of complex matrices too."""
-    operator, solver = lx.MatrixLinearOperator(matrix), lx.LU()
-    state = solver.init(operator, {})
-
-    def column(b):
-        return lx.linear_solve(operator, b, solver, state=state, throw=False).value
-
-    return jax.vmap(column, in_axes=1, out_axes=1)(right)
+    return _factorised(matrix, lx.LU())(right)

@@ -26,9 +26,7 @@ from ._linear import (
     dlyap as dlyap,
     dsylvester as dsylvester,
     lyap as lyap,
+    MatrixSolution as MatrixSolution,
     sylvester as sylvester,
 )
-from ._solution import (
-    MatrixSolution as MatrixSolution,
-    RiccatiSolution as RiccatiSolution,
-)
+from ._stabilising import RiccatiSolution as RiccatiSolution

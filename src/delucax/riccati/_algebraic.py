@@ -6,8 +6,7 @@ import equinox as eqx
 
 from .._check import as_matrix
 from ._arguments import riccati_arguments
-from ._solution import checked, RiccatiSolution
-from ._stabilising import stabilising_solution
+from ._stabilising import RiccatiSolution, stabilising_solution
 
 
 def dare(
@@ -77,7 +76,7 @@ def dare(
         ```
     """
     data = riccati_arguments("dare", A, B, Q, R, S, E, definite=False)
-    return checked(stabilising_solution(True, data), "dare", throw)
+    return stabilising_solution(True, data, "dare", throw)
 
 
 def care(
@@ -147,7 +146,7 @@ def care(
         ```
     """
     data = riccati_arguments("care", A, B, Q, R, S, E, definite=True)
-    return checked(stabilising_solution(False, data), "care", throw)
+    return stabilising_solution(False, data, "care", throw)
 
 
 _NAMES = ("A", "C", "W", "V", "S", "E")
@@ -203,7 +202,7 @@ def filter_dare(
     """
     where = "filter_dare"
     data = _transposed(where, A, C, W, V, S, definite=False)
-    return checked(_dual(stabilising_solution(True, data)), where, throw)
+    return _dual(stabilising_solution(True, data, where, throw))
 
 
 def filter_care(
@@ -254,7 +253,7 @@ def filter_care(
     """
     where = "filter_care"
     data = _transposed(where, A, C, W, V, S, definite=True)
-    return checked(_dual(stabilising_solution(False, data)), where, throw)
+    return _dual(stabilising_solution(False, data, where, throw))
 
 
 def _transposed(where, A, C, W, V, S, definite):

@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_matrix, check_count, check_finite, is_concrete, symmetric_matrix
+from .._check import (
+    as_matrix,
+    check_count,
+    check_definite,
+    check_finite,
+    is_concrete,
+    symmetric_matrix,
+)
 from .._message import shortened
 from .._module import as_float_array
 
@@ -96,23 +103,6 @@ def riccati_arguments(
     return jax.tree.map(lambda M: M.astype(dtype), given)
 
 
-def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
-    """Raise unless `R`, as far as it can be seen, is positive definite or, if not
-    `definite`, semidefinite."""
-    if not is_concrete(R):
-        return
-    array = np.asarray(R)
-    least, *_ = eigenvalues = np.linalg.eigvalsh(array)
-    rounding = np.finfo(array.dtype).eps * np.max(np.abs(eigenvalues))
-    slack = -rounding if definite else 100 * len(array) * rounding
-    if least < -slack or definite and least <= 0:
-        kind = "definite" if definite else "semidefinite"
-        raise ValueError(
-            f"{where}: {name} must be positive {kind}, got {array}, whose least "
-            f"eigenvalue is {least:.3g}."
-        )
-
-
 def is_complex(*matrices: Array | None) -> bool:
     """Whether any of the matrices is."""
     return any(M is not None and jnp.iscomplexobj(M) for M in matrices)
@@ -130,44 +120,55 @@ def complex_form(M: Array) -> Array:
     return ((upper[:, :m] + lower[:, m:]) + 1j * (lower[:, :m] - upper[:, m:])) / 2
 
 
-def in_time(
-    where: str,
-    horizon: Any,
-    matrices: dict[str, tuple[Any, tuple[str, ...]]],
-    sizes: dict[str, int] | None = None,
-) -> tuple[dict[str, Array], int]:
-    """Each argument with a leading time axis, in one precision; and the horizon.
+_AXES = dict(A="nn", B="nm", D="nk", Q="nn", R="mm", S="nm", d="n", q="n", r="m")
+"""The axes of each argument, an axis being named by its size."""
 
-    `matrices` holds `name: (value, axes)`, an axis being named by its size (`"n"`);
-    the sizes are those of the first argument that has them. What is `None` is zero.
+
+def in_time(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
+    """Each argument with a leading time axis, in one precision. What is `None` is zero.
+
+    The sizes are those of the first argument that has them.
     """
-    sizes = {} if sizes is None else dict(sizes)
-    given, steps = {}, {}
-    for name, (value, axes) in matrices.items():
+    arrays, sizes, steps = {}, {}, {}
+    for name, value in given.items():
         if value is None:
             continue
-        array = as_float_array(value)
-        ndim = len(axes)
+        array, ndim = as_float_array(value), len(_AXES[name])
+        if name in "QR":
+            is_stack = eqx.is_array(array) and array.ndim == 3
+            array = symmetric_matrix(array, name, where, ndim=3 if is_stack else 2)
         if not eqx.is_inexact_array(array) or array.ndim not in (ndim, ndim + 1):
             got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
-            shape = ", ".join(axes) + ("," if ndim == 1 else "")
+            shape = ", ".join(_AXES[name]) + ("," if ndim == 1 else "")
             raise ValueError(
                 f"{where}: {name} must have shape ({shape}), or that with a leading "
                 f"time axis, got {got}."
             )
         check_finite(array, name, where)
-        _check_sizes(where, name, array.shape[array.ndim - ndim :], axes, sizes)
+        _check_sizes(where, name, array.shape[array.ndim - ndim :], sizes)
         if array.ndim > ndim:
             steps[name] = array.shape[0]
-        given[name] = array
-    T = _length(where, horizon, steps)
-    dtype = common_dtype(where, given)
-    whole = {}
-    for name, (_, axes) in matrices.items():
-        shape = (T, *(sizes[axis] for axis in axes))
-        array = given.get(name, jnp.zeros((), dtype))
-        whole[name] = jnp.broadcast_to(array.astype(dtype), shape)
-    return whole, T
+        arrays[name] = array
+    T, dtype = _length(where, horizon, steps), common_dtype(where, arrays)
+    zero = jnp.zeros((), dtype)
+    shape = lambda name: (T, *(sizes[axis] for axis in _AXES[name]))
+    return {
+        name: jnp.broadcast_to(arrays.get(name, zero).astype(dtype), shape(name))
+        for name in given
+    }
+
+
+def constant_matrices(where: str, **given: Any) -> dict[str, Array]:
+    """The matrices that are given, in one precision, or an error unless they fit each
+    other."""
+    arrays, sizes = {}, {}
+    for name, value in given.items():
+        if value is not None:
+            check = symmetric_matrix if name in "QR" else as_matrix
+            arrays[name] = check(value, name, where)
+            _check_sizes(where, name, arrays[name].shape, sizes)
+    dtype = common_dtype(where, arrays)
+    return {name: array.astype(dtype) for name, array in arrays.items()}
 
 
 def common_dtype(where: str, given: dict[str, Array]):
@@ -178,10 +179,10 @@ def common_dtype(where: str, given: dict[str, Array]):
     return dtype
 
 
-def _check_sizes(where, name, shape, axes, sizes):
-    for axis, size in zip(axes, shape, strict=True):
+def _check_sizes(where, name, shape, sizes):
+    for axis, size in zip(_AXES[name], shape, strict=True):
         sizes.setdefault(axis, size)
-    wanted = tuple(sizes[axis] for axis in axes)
+    wanted = tuple(sizes[axis] for axis in _AXES[name])
     if shape != wanted:
         raise ValueError(
             f"{where}: {name} must have shape {wanted} to fit the other arguments, "
@@ -215,52 +216,20 @@ def _length(where, horizon, steps):
     return T
 
 
-def symmetric_stack(value: Any, name: str, where: str) -> Array:
-    """`value` as a symmetric matrix, or a stack of them."""
-    array = as_float_array(value)
-    if not eqx.is_inexact_array(array) or array.ndim != 3:
-        return symmetric_matrix(value, name, where)
-    as_matrix(array, name, where, ndim=3)
-    if array.shape[1] != array.shape[2]:
-        raise ValueError(f"{where}: {name} must be square, got shape {array.shape}.")
-    turned = jnp.swapaxes(array, 1, 2)
-    if is_concrete(array):
-        entries = np.asarray(array)
-        scale = np.max(np.abs(entries), axis=(1, 2), initial=0.0)
-        off = np.abs(entries - np.swapaxes(entries, 1, 2))
-        slack = 100 * np.finfo(entries.dtype).eps * scale
-        if np.any(np.max(off, axis=(1, 2), initial=0.0) > slack):
-            raise ValueError(f"{where}: {name} must be symmetric at each step.")
-    return (array + turned) / 2
-
-
-def final_weight(value: Any, n: int, where: str, dtype: Any) -> Array:
+def final_weight(value: Any, A: Array, where: str) -> Array:
     """The final weight, zero if none is given, or an error."""
+    shape = A.shape[-2:]
     if value is None:
-        return jnp.zeros((n, n), dtype)
+        return jnp.zeros(shape, A.dtype)
     final = symmetric_matrix(value, "final", where)
-    if final.shape != (n, n):
+    if final.shape != shape:
         raise ValueError(
-            f"{where}: final must have shape {(n, n)} to fit A, got {final.shape}."
+            f"{where}: final must have shape {shape} to fit A, got {final.shape}."
         )
-    return final.astype(dtype)
+    return final.astype(A.dtype)
 
 
-def check_shapes(where: str, given: dict[str, Array]) -> None:
-    """Raise unless the matrices fit each other."""
-    n, m = given["A"].shape[0], given["B"].shape[1]
-    shapes = {"A": (n, n), "B": (n, m), "Q": (n, n), "R": (m, m), "S": (n, m)}
-    if "D" in given:
-        shapes["D"] = (n, given["D"].shape[1])
-    for name, matrix in given.items():
-        if matrix.shape != shapes[name] or 0 in matrix.shape:
-            raise ValueError(
-                f"{where}: {name} must have shape {shapes[name]} to fit the other "
-                f"matrices, got {matrix.shape}."
-            )
-
-
-def checked_times(times: Any, where: str) -> Array:
+def increasing_times(times: Any, where: str) -> Array:
     """`times` as an increasing vector of at least two, or an error."""
     array = as_float_array(times)
     if not eqx.is_inexact_array(array) or array.ndim != 1 or array.shape[0] < 2:

@@ -7,16 +7,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_matrix, as_vector, symmetric_matrix
-from .._results import choose, Result, RESULTS
+from .._check import as_vector
+from .._results import choose, raise_on_failure, Result, RESULTS
 from ..math._linear_solve import full_precision, solve, symmetric
 from ._arguments import (
-    check_shapes,
-    checked_times,
-    common_dtype,
+    constant_matrices,
     final_weight,
     in_time,
-    symmetric_stack,
+    increasing_times,
 )
 from ._flow import flow_values
 from ._recursion import (
@@ -27,7 +25,6 @@ from ._recursion import (
     sanitised,
     values,
 )
-from ._solution import checked
 
 
 class FiniteHorizonSolution(eqx.Module):
@@ -138,33 +135,19 @@ def dre(
         ```
     """
     where = "dre"
-    Q, R = symmetric_stack(Q, "Q", where), symmetric_stack(R, "R", where)
-    stage = {
-        "A": (A, ("n", "n")),
-        "B": (B, ("n", "m")),
-        "Q": (Q, ("n", "n")),
-        "R": (R, ("m", "m")),
-        "S": (S, ("n", "m")),
-        "d": (d, ("n",)),
-        "q": (q, ("n",)),
-        "r": (r, ("m",)),
-    }
-    stage, _ = in_time(where, horizon, stage)
-    n = stage["A"].shape[-1]
-    dtype = stage["A"].dtype
-    final = final_weight(final, n, where, dtype)
+    stage = in_time(where, horizon, A=A, B=B, Q=Q, R=R, S=S, d=d, q=q, r=r)
+    A = stage["A"]
+    final, n = final_weight(final, A, where), A.shape[-1]
     is_affine = any(v is not None for v in (d, q, r, final_q))
-    if final_q is None:
-        final_q = jnp.zeros(n, dtype)
-    final_q = as_vector(final_q, n, "final_q", where).astype(dtype)
+    final_q = jnp.zeros(n) if final_q is None else final_q
+    final_q = as_vector(final_q, n, "final_q", where).astype(A.dtype)
     solution = _discrete_solution(
         *stage.values(), final, final_q, is_affine, bool(parallel)
     )
-    return checked(solution, where, throw, _first_discrete_failure)
-
-
-def _first_discrete_failure(solution: FiniteHorizonSolution) -> str:
-    return f"R + B'XB is not positive definite at step {failed_step(solution.X)}."
+    step = lambda: (
+        f"R + B'XB is not positive definite at step {failed_step(solution.X)}."
+    )
+    return raise_on_failure(solution, where, throw, facts=step)
 
 
 @eqx.filter_jit
@@ -291,26 +274,17 @@ def cre(
         ```
     """
     where = "cre"
-    given = {"A": as_matrix(A, "A", where), "B": as_matrix(B, "B", where)}
-    given["Q"] = symmetric_matrix(Q, "Q", where)
-    given["R"] = symmetric_matrix(R, "R", where)
-    if S is not None:
-        given["S"] = as_matrix(S, "S", where)
-    check_shapes(where, given)
-    dtype = common_dtype(where, given)
-    n, m = given["B"].shape
-    final = final_weight(final, n, where, dtype)
-    given.setdefault("S", jnp.zeros((n, m)))
-    matrices = (given[name].astype(dtype) for name in "ABQRS")
-    solution = _continuous_solution(
-        *matrices, final, checked_times(times, where).astype(dtype)
+    given = constant_matrices(where, A=A, B=B, Q=Q, R=R, S=S)
+    A, B = given["A"], given["B"]
+    given.setdefault("S", jnp.zeros_like(B))
+    final = final_weight(final, A, where)
+    times = increasing_times(times, where).astype(A.dtype)
+    solution = _continuous_solution(*(given[M] for M in "ABQRS"), final, times)
+    point = lambda: (
+        "There is no solution over the time from point "
+        f"{failed_step(solution.X)} of the grid."
     )
-    return checked(solution, where, throw, _first_continuous_failure)
-
-
-def _first_continuous_failure(solution: ContinuousHorizonSolution) -> str:
-    point = failed_step(solution.X)
-    return f"There is no solution over the time from point {point} of the grid."
+    return raise_on_failure(solution, where, throw, facts=point)
 
 
 @eqx.filter_jit

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.interpreters import partial_eval
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ..._check import check_instance, check_step, is_concrete, output_of
 from ..._controller import AbstractController, AbstractLearner, Tally
+from ..._jax import is_constant
 from ..._module import function_field, parameter
 from ...dynamics import AbstractDynamics, LinearDynamics, linearize
 from .._basic import Scheduled
@@ -216,9 +216,7 @@ class OnlineLearner(AbstractLearner):
         dynamics, dtype = self.loop.dynamics, self.loop.dtype
         size = dynamics.observation_size + dynamics.control_size
         here = jnp.zeros((), dtype), jnp.zeros(size, dtype)
-        traced = jax.make_jaxpr(self._root)(*here)
-        _, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
-        return None if any(used) else self._root(*here)
+        return self._root(*here) if is_constant(self._root, *here) else None
 
 
 def linear_learner(
