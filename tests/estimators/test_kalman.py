@@ -415,7 +415,7 @@ def test_wrong_records():
     kalman = c.KalmanFilter(dlx.LinearDynamics(A, B, C), W, V)
     for run in (c.run_filter, c.smooth):
         name = run.__name__
-        with user_error(match=f"{name}: estimator must be an Abstract.*: a KalmanFilter.*got LinearD"):
+        with user_error(match=f"{name}: estimator.*: a KalmanFilter.*got LinearD"):
             run(kalman.dynamics, YS)
         with user_error(
             match=rf"{name}: observations must have shape \(steps, 1\).*\(8,\)"
