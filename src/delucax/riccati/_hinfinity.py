@@ -23,7 +23,7 @@ from ._game import (
     sanitised_game,
     solve_game,
 )
-from ._level import bisect_level, Bisection, followed
+from ._level import Bisection, game_at_level
 from ._spectrum import spectral_abscissa, spectral_radius
 
 
@@ -247,18 +247,10 @@ def at_level(
 @eqx.filter_jit
 @full_precision
 def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
-    end, level = bisect_level(
-        functools.partial(solve_game, discrete),
-        problem,
-        game_start(discrete, problem),
-        gamma,
-        tolerance,
-    )
-    if gamma is None:
-        gamma = followed(functools.partial(barrier, discrete), problem, level)
-    else:
-        level = gamma
-    game, level = end.game, jnp.where(level > 0, level, 1)
+    solve, steep = (functools.partial(f, discrete) for f in (solve_game, barrier))
+    start = game_start(discrete, problem)
+    end, level, gamma = game_at_level(solve, steep, problem, start, gamma, tolerance)
+    game = end.game
     X = attached(discrete, problem, level, game)
     safe, X = sanitised_game(game.good, problem, X)
     A, B, *_ = safe

@@ -14,7 +14,7 @@ from ._arguments import final_weight, in_time, increasing_times
 from ._flow import flow_values
 from ._game import inverse_margins, joint, joint_gain, players
 from ._hinfinity import at_level, checked_game
-from ._level import bisect_level, followed, Game
+from ._level import Game, game_at_level
 from ._recursion import gain, is_clearly_definite, sanitised, values
 from ._stabilising import shifted
 
@@ -239,18 +239,9 @@ def _barrier(discrete: bool, problem: tuple, gamma: Array) -> Array:
 def _solution(discrete: bool, problem, gamma, tolerance) -> HorizonGameSolution:
     A, B, D, Q, R, _, *times = problem
     points = times[0].shape[0] if times else A.shape[0] + 1
-    end, level = bisect_level(
-        functools.partial(_game, discrete),
-        problem,
-        jnp.zeros((points, *A.shape[-2:]), A.dtype),
-        gamma,
-        tolerance,
-    )
-    if gamma is None:
-        gamma = followed(functools.partial(_barrier, discrete), problem, level)
-    else:
-        level = gamma
-    level = jnp.where(level > 0, level, 1)
+    solve, steep = (functools.partial(f, discrete) for f in (_game, _barrier))
+    start = jnp.zeros((points, *A.shape[-2:]), A.dtype)
+    end, level, gamma = game_at_level(solve, steep, problem, start, gamma, tolerance)
     X = _values(discrete, problem, level)
     good = jnp.all(jnp.isfinite(X), axis=(1, 2))
     masked = lambda M: jnp.where(good[:, None, None], M, jnp.nan)
