@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float
@@ -21,7 +20,14 @@ from .._controller import wrong_observation
 from .._typing import Control, Observation, RealScalar, Scalar
 from ..dynamics import AbstractDynamics
 from ..math import matvec
-from ..math._linear_solve import full_precision, is_definite, SMALL, solve, symmetric
+from ..math._linear_solve import (
+    factorised,
+    full_precision,
+    is_definite,
+    SMALL,
+    solve,
+    symmetric,
+)
 from ._base import AbstractEstimator, Belief
 
 
@@ -132,14 +138,8 @@ def _gain(S, cross):
     S, _ = _regular(S)
     if S.shape[0] <= SMALL:
         return solve(S, cross.T).T
-    operator = lx.MatrixLinearOperator(S, lx.positive_semidefinite_tag)
-    solver = lx.Cholesky()
-    state = solver.init(operator, {})
-
-    def row(c):
-        return lx.linear_solve(operator, c, solver, state=state, throw=False).value
-
-    return jax.vmap(row)(cross)
+    tag = lx.positive_semidefinite_tag
+    return factorised(S, lx.Cholesky(), tag)(cross.T).T
 
 
 def _regular(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, " n"]]:

@@ -41,19 +41,19 @@ def solve(
 
 
 def factorised(
-    matrix: Float[Array, "n n"],
-) -> Callable[[Float[Array, "n k"]], Float[Array, "n k"]]:
+    matrix: Inexact[Array, "m n"],
+    solver: lx.AbstractLinearSolver | None = None,
+    tags: Any = (),
+) -> Callable[[Inexact[Array, "m k"]], Inexact[Array, "n k"]]:
     """`right -> matrix^-1 right`, for more than one right side in turn.
 
     A small matrix is eliminated entry by entry: one member of a batch is then a lane of
-    vector instructions, where LAPACK would be called for each.
+    vector instructions, where LAPACK would be called for each. A `solver` that is given
+    may need `tags` of the matrix.
     """
-    small = matrix.shape[0] <= SMALL
-    return _factorised(matrix, _Elimination() if small else lx.LU())
-
-
-def _factorised(matrix, solver):
-    operator = lx.MatrixLinearOperator(matrix)
+    if solver is None:
+        solver = _Elimination() if matrix.shape[0] <= SMALL else lx.LU()
+    operator = lx.MatrixLinearOperator(matrix, tags)
     state = solver.init(operator, {})
 
     def column(b):
@@ -181,4 +181,4 @@ def lu_solve(
     matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"]
 ) -> Inexact[Array, "n k"]:
     """`solve` by LAPACK at every size, of complex matrices too."""
-    return _factorised(matrix, lx.LU())(right)
+    return factorised(matrix, lx.LU())(right)
