@@ -247,7 +247,8 @@ def at_level(
 @eqx.filter_jit
 @full_precision
 def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
-    solve, steep = (functools.partial(f, discrete) for f in (solve_game, barrier))
+    solve = functools.partial(solve_game, discrete)
+    steep = functools.partial(barrier, discrete)
     start = game_start(discrete, problem)
     end, level, gamma = game_at_level(solve, steep, problem, start, gamma, tolerance)
     game = end.game

@@ -239,7 +239,8 @@ def _barrier(discrete: bool, problem: tuple, gamma: Array) -> Array:
 def _solution(discrete: bool, problem, gamma, tolerance) -> HorizonGameSolution:
     A, B, D, Q, R, _, *times = problem
     points = times[0].shape[0] if times else A.shape[0] + 1
-    solve, steep = (functools.partial(f, discrete) for f in (_game, _barrier))
+    solve = functools.partial(_game, discrete)
+    steep = functools.partial(_barrier, discrete)
     start = jnp.zeros((points, *A.shape[-2:]), A.dtype)
     end, level, gamma = game_at_level(solve, steep, problem, start, gamma, tolerance)
     X = _values(discrete, problem, level)

@@ -143,10 +143,10 @@ def game_at_level(
     level as it is, with its derivatives."""
     end, level = bisect_level(solve, problem, start, gamma, tolerance)
     if gamma is None:
-        gamma = followed(barrier, problem, level)
+        attained = followed(barrier, problem, level)
     else:
-        level = gamma
-    return end, jnp.where(level > 0, level, 1), gamma
+        attained = level = gamma
+    return end, jnp.where(level > 0, level, 1), attained
 
 
 def _next(now: Bisection) -> Array:

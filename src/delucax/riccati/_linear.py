@@ -236,7 +236,8 @@ def _equation(where, discrete, A, B, C, throw) -> MatrixSolution:
             f"{where}: {name} must have shape {shape}, got shape {C.shape}."
         )
     dtype = jnp.result_type(*(M for M in (A, B, C) if M is not None))
-    A, B, C = (None if M is None else M.astype(dtype) for M in (A, B, C))
+    A, C = A.astype(dtype), C.astype(dtype)
+    B = None if B is None else B.astype(dtype)
     C = -C if B is None and not discrete else C
     solution = _solution(discrete, A, B, C)
     return raise_on_failure(solution, where, throw, facts=solution._facts)
