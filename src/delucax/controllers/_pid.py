@@ -15,13 +15,14 @@ from .._check import (
     as_matrix,
     bounds_field,
     check_choice,
+    check_count,
     check_range,
     check_step,
 )
 from .._controller import AbstractController, wrong_observation
 from .._message import shortened
 from .._module import as_float_array, as_module, parameter, positive, weight
-from .._typing import Bounds, RealScalar
+from .._typing import Bounds, Real, RealScalar
 from ..math import clip, matvec
 
 
@@ -76,12 +77,12 @@ def _as(after: Any, before: Any) -> Any:
 class _AbstractPID(AbstractController):
     """Loops side by side, each of which follows an output."""
 
-    kp: eqx.AbstractVar[Array]
-    ki: eqx.AbstractVar[Array]
-    kd: eqx.AbstractVar[Array]
-    dt: eqx.AbstractVar[Array]
+    kp: eqx.AbstractVar[Real]
+    ki: eqx.AbstractVar[Real]
+    kd: eqx.AbstractVar[Real]
+    dt: eqx.AbstractVar[Real]
     reference: eqx.AbstractVar[Array | Callable[[Any], Array] | None]
-    output: eqx.AbstractVar[Callable[[Array], Array] | None]
+    output: eqx.AbstractVar[Any]
     bounds: eqx.AbstractVar[Bounds | None]
     _times: eqx.AbstractClassVar[tuple[str, ...]]
 
@@ -89,7 +90,7 @@ class _AbstractPID(AbstractController):
         where = type(self).__name__
         check_step(self.dt, where)
         as_bounds(self.bounds, where)
-        assert self.loops
+        check_count(self.loops, "loops", where)
 
     @property
     def loops(self) -> int:
@@ -215,19 +216,19 @@ class PID(_AbstractPID):
         ```
     """
 
-    kp: Array = weight()
-    ki: Array = weight(0.0)
-    kd: Array = weight(0.0)
+    kp: Real = weight()
+    ki: Real = weight(0.0)
+    kd: Real = weight(0.0)
     _: KW_ONLY
-    dt: Array = parameter(constraint=positive)
+    dt: Real = parameter(constraint=positive)
     reference: Array | Callable[[Any], Array] | None = parameter(None)
-    output: Callable[[Array], Array] | None = _output_field()
+    output: Callable[[Array], Array] | int | Sequence[int] | None = _output_field()
     bounds: tuple[Array, Array] | None = bounds_field("PID", default=None)
-    derivative_time_constant: Array | None = parameter(None)
+    derivative_time_constant: Real | None = parameter(None)
     derivative_on: Literal["measurement", "error"] = eqx.field(
         default="measurement", static=True
     )
-    anti_windup_time: Array | None = parameter(None, constraint=positive)
+    anti_windup_time: Real | None = parameter(None, constraint=positive)
 
     _times: ClassVar = ("derivative_time_constant", "anti_windup_time")
 
@@ -320,14 +321,14 @@ class LeakyPID(_AbstractPID):
         ```
     """
 
-    kp: Array = weight(3.0)
-    ki: Array = weight(4.0)
-    kd: Array = weight(0.0)
+    kp: Real = weight(3.0)
+    ki: Real = weight(4.0)
+    kd: Real = weight(0.0)
     _: KW_ONLY
-    dt: Array = parameter(constraint=positive)
-    time_constant: Array = parameter(0.5, constraint=positive)
+    dt: Real = parameter(constraint=positive)
+    time_constant: Real = parameter(0.5, constraint=positive)
     reference: Array | Callable[[Any], Array] | None = parameter(None)
-    output: Callable[[Array], Array] | None = _output_field()
+    output: Callable[[Array], Array] | int | Sequence[int] | None = _output_field()
     bounds: tuple[Array, Array] | None = bounds_field("LeakyPID", default=None)
 
     _times: ClassVar = ("time_constant",)
