@@ -120,23 +120,24 @@ def as_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
     return array
 
 
-def symmetric_matrix(value: Any, name: str, where: str) -> Array:
-    """`value` as a symmetric matrix of finite entries, or an error.
+def symmetric_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
+    """`value` as a symmetric matrix of finite entries (or with `ndim` 3 a stack of
+    them), or an error.
 
     An asymmetry of the size of rounding is averaged away.
     """
-    matrix = as_matrix(value, name, where)
-    if matrix.shape[0] != matrix.shape[1]:
+    matrix = as_matrix(value, name, where, ndim=ndim)
+    if matrix.shape[-2] != matrix.shape[-1]:
         raise ValueError(f"{where}: {name} must be square, got shape {matrix.shape}.")
     if is_concrete(matrix):
         array = np.asarray(matrix)
-        scale = np.max(np.abs(array), initial=0.0)
-        slack = 100 * np.finfo(array.dtype).eps * scale
-        if np.max(np.abs(array - array.T), initial=0.0) > slack:
+        largest = functools.partial(np.max, axis=(-2, -1), initial=0.0)
+        slack = 100 * np.finfo(array.dtype).eps * largest(np.abs(array))
+        if np.any(largest(np.abs(array - np.swapaxes(array, -2, -1))) > slack):
             raise ValueError(
                 f"{where}: {name} must be symmetric, got {shortened(array)}."
             )
-    return (matrix + matrix.T) / 2
+    return (matrix + matrix.mT) / 2
 
 
 def as_bounds(
@@ -400,3 +401,36 @@ def _as_part(value: Any, name: str, n: int, side: str, where: str) -> Array:
             f"{matrix.shape}."
         )
     return matrix
+
+
+def check_time_invariant(model: Any, name: str, where: str) -> None:
+    """Raise if the matrices of a linear model depend on time."""
+    if model.is_time_varying:
+        raise ValueError(
+            f"{where}: {name} must be time-invariant, got matrices at {len(model.A)} "
+            "times; `dynamics.at(t)` are those at one time."
+        )
+
+
+def check_vector(value: Any, name: str, where: str) -> None:
+    """Raise unless `value` is an array of one axis with finite entries."""
+    if not eqx.is_inexact_array(value) or value.ndim != 1:
+        raise ValueError(f"{where}: {name} must be a vector, got {shortened(value)}.")
+    check_finite(value, name, where)
+
+
+def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
+    """Raise unless `R`, as far as it can be seen, is positive definite or, if not
+    `definite`, semidefinite."""
+    if not is_concrete(R):
+        return
+    array = np.asarray(R)
+    least, *_ = eigenvalues = np.linalg.eigvalsh(array)
+    rounding = np.finfo(array.dtype).eps * np.max(np.abs(eigenvalues))
+    slack = -rounding if definite else 100 * len(array) * rounding
+    if least < -slack or definite and least <= 0:
+        kind = "definite" if definite else "semidefinite"
+        raise ValueError(
+            f"{where}: {name} must be positive {kind}, got {array}, whose least "
+            f"eigenvalue is {least:.3g}."
+        )

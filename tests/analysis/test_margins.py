@@ -237,7 +237,7 @@ def test_bad_loops_are_refused():
         an.margins(two)
     with user_error(match="as many outputs as controls, got 2 and 1"):
         an.disk_margin(LinearSystem(-jnp.eye(2), jnp.ones((2, 1))))
-    with user_error(match="channel must be a whole number from 0 to 1"):
+    with user_error(match="channel must be at most 1"):
         an.disk_margin(two, channel=2)
     with user_error(match="margins: model must be a LinearSystem"):
         an.margins(dlx.systems.Pendulum())

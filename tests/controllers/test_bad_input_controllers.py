@@ -20,7 +20,7 @@ DYNAMICS = dlx.LinearDynamics(0.5 * EYE, EYE[:, :1])
 @pytest.mark.parametrize(
     "call, match",
     [
-        (lambda: c.Random([-1.0]), "Random: std must not be negative"),
+        (lambda: c.Random([-1.0]), "Random: std must be at least 0"),
         (lambda: c.Random([1.0]).init(key=0), "Random.init: key must be"),
         (lambda: c.Gaussian(c.Zero(1), 0.0).init(key=0), "Gaussian.init: key must be"),
         (lambda: c.PID(1.0, dt=-1.0), "PID: dt must be positive"),

@@ -100,7 +100,7 @@ def test_no_controller():
 
 def test_wrong_arguments():
     dynamics = dlx.LinearDynamics(A, B)
-    with user_error(match="HInfinity: dynamics must be LinearDynamics"):
+    with user_error(match="HInfinity: dynamics must be a LinearDynamics"):
         HInfinity(dlx.make("pendulum").dynamics, Q, R)
     with user_error(match="HInfinity: dynamics must rest"):
         HInfinity(dlx.LinearDynamics(A, B, x_next=[1.0, 0.0]), Q, R)

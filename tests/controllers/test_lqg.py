@@ -209,7 +209,7 @@ def test_gradient_of_the_design():
 
 
 def test_wrong_arguments():
-    with user_error(match="LQR: dynamics must be LinearDynamics.*got Pendulum"):
+    with user_error(match="LQR: dynamics must be a LinearDynamics.*got Pendulum"):
         c.LQG(dlx.systems.Pendulum(), Q, R, W, V)
     with user_error(match=r"Q must have shape \(2, 2\)"):
         c.LQG(DYNAMICS, jnp.eye(3), R, W, V)

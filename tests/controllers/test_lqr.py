@@ -131,7 +131,7 @@ def test_no_stabilising_gain():
 def test_wrong_arguments():
     dynamics = dlx.LinearDynamics(A, B)
     LQR = dlx.controllers.LQR
-    with user_error(match="dynamics must be LinearDynamics.*linearize.*got LinearSys"):
+    with user_error(match="dynamics must be a LinearD.*linearize.*got LinearSys"):
         LQR(dlx.linearize(dlx.systems.Pendulum()), Q, R)
     varying = dlx.LinearDynamics(jnp.stack([A, A]), B)
     with user_error(match="must be time-invariant, got matrices at 2 times"):
@@ -216,7 +216,7 @@ def test_a_point_that_does_not_fit():
     point = dlx.dynamics.OperatingPoint(
         jnp.zeros(3), jnp.zeros(1), jnp.zeros(3), dlx.RESULTS.successful
     )
-    with user_error(match="LQR: point needs AbstractDynamics, got CSTR"):
+    with user_error(match="LQR: dynamics must be an Abs.*point.*lqrd.*got CSTR"):
         dlx.controllers.LQR(dlx.systems.CSTR(), Q, R, point=point)
     dynamics = dlx.Discretized(dlx.systems.CSTR(), dt=0.1)
     with user_error(match=r"LQR: point must have x of shape \(2,\).*got \(3,\)"):

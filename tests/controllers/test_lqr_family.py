@@ -319,21 +319,21 @@ def test_wrong_arguments():
     varying = dlx.LinearDynamics(jnp.stack([A, A]), B)
     with user_error(match="horizon must be given"):
         FiniteHorizonLQR(DYNAMICS, Q, R)
-    with user_error(match="horizon must be at most 2"):
+    with user_error(match="horizon must be at most the 2 steps of dynamics"):
         FiniteHorizonLQR(varying, Q, R, horizon=3)
     with user_error(match="reference must be a vector of size 2.*shape \\(1,\\)"):
         LQR(DYNAMICS, Q, R, reference=gust)
     with user_error(match="disturbance"):
         LQR(DYNAMICS, Q, R, disturbance=jnp.ones(2))
-    with user_error(match="preview must be a number of steps"):
+    with user_error(match="preview must be a whole number of at least 0"):
         LQR(DYNAMICS, Q, R, reference=wave, preview=-1)
-    with user_error(match="preview must be a number of steps"):
+    with user_error(match="preview must be 0 without a reference"):
         LQR(DYNAMICS, Q, R, preview=3)
     with user_error(match=r"output must have shape \(p, 2\) with p from 1 to 1"):
         LQI(DYNAMICS, jnp.eye(4), R, output=jnp.eye(2))
     with user_error(match=r"Q must have shape \(3, 3\)"):
         LQI(DYNAMICS, Q, R, output=jnp.eye(1, 2))
-    with user_error(match="LQI: dynamics must be LinearDynamics"):
+    with user_error(match="LQI: dynamics must be a LinearDynamics"):
         LQI(STIFF, Q, R, output=jnp.eye(1, 2))
     with user_error(match="lqrd: system must be an AbstractSystem.*LQR"):
         dlx.controllers.lqrd(DYNAMICS, Q, R, 0.1)

@@ -219,9 +219,9 @@ def test_wrong_arguments(kind):
 
 @once
 def test_wrong_times():
-    with user_error(match="derivative_time_constant must not be negative, got -1"):
+    with user_error(match="derivative_time_constant must be at least 0, got -1"):
         PID(1.0, dt=DT, derivative_time_constant=-1.0)
-    with user_error(match="anti_windup_time must be at least dt"):
+    with user_error(match="anti_windup_time must be at least 0.1.*, got 0.01"):
         PID(1.0, 1.0, dt=DT, anti_windup_time=0.01)
     with user_error(match="derivative_on must be .* got 'state'"):
         PID(1.0, dt=DT, derivative_on="state")

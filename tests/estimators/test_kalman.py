@@ -397,7 +397,7 @@ BAD = [
     ),
     (
         {"dynamics": dlx.LinearDynamics(jnp.stack([A, A]), B, C), "steady_state": True},
-        "steady_state needs time-invariant dynamics, got matrices at 2 times",
+        "dynamics with steady_state must be time-invariant, got matrices at 2 times",
     ),
     ({"y_ref": jnp.zeros(2)}, r"y_ref must have shape \(1,\)"),
     ({"y_ref": jnp.full(1, jnp.nan)}, "y_ref must be finite"),
@@ -415,7 +415,7 @@ def test_wrong_records():
     kalman = c.KalmanFilter(dlx.LinearDynamics(A, B, C), W, V)
     for run in (c.run_filter, c.smooth):
         name = run.__name__
-        with user_error(match=f"{name}: estimator must be a KalmanFilter.*got LinearD"):
+        with user_error(match=f"{name}: estimator.*: a KalmanFilter.*got LinearD"):
             run(kalman.dynamics, YS)
         with user_error(
             match=rf"{name}: observations must have shape \(steps, 1\).*\(8,\)"

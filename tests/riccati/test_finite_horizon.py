@@ -328,7 +328,7 @@ def test_derivatives_of_the_differential_equation():
         ({"A": np.ones((2, 3))}, r"A must have shape \(2, 2\).*got \(2, 3\)"),
         ({"B": np.ones(2)}, r"B must have shape \(n, m\).*got shape \(2,\)"),
         ({"Q": np.array([[1.0, 1.0], [0.0, 1.0]])}, "Q must be symmetric"),
-        ({"Q": np.ones((4, 2, 2)) * [[1, 1], [0, 1]]}, "symmetric at each step"),
+        ({"Q": np.ones((4, 2, 2)) * [[1, 1], [0, 1]]}, "Q must be symmetric"),
         ({"R": np.eye(2)}, r"R must have shape \(1, 1\).*got \(2, 2\)"),
         ({"d": np.array([np.nan, 0])}, "d must be finite"),
         ({"final": np.eye(3)}, r"final must have shape \(2, 2\)"),

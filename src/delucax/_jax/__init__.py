@@ -1,7 +1,11 @@
 """What leans on the insides of JAX, and on how it differentiates."""
 
 from ._components import by_components as by_components, LARGEST as COMPONENTS_UP_TO
-from ._derivatives import first_possible as first_possible, jacobian as jacobian
+from ._derivatives import (
+    first_possible as first_possible,
+    is_constant as is_constant,
+    jacobian as jacobian,
+)
 from ._fence import fence as fence
 from ._lanes import by_lanes as by_lanes
 from ._nan_tangent import nan_tangent as nan_tangent

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+from jax.interpreters import partial_eval
 
 
 def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
@@ -31,3 +32,10 @@ def jacobian(
     """The Jacobian of `f` in forward mode, or in reverse where a solver inside has only
     that."""
     return first_possible(jax.jacfwd(f, argnums), jax.jacrev(f, argnums))
+
+
+def is_constant(f: Callable[..., Any], *args: Any) -> bool:
+    """Whether the array that `f` returns depends on none of its arguments."""
+    traced = jax.make_jaxpr(f)(*args)
+    _, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
+    return not any(used)

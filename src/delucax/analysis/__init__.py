@@ -1,6 +1,12 @@
 """What linear models tell of themselves: modes, Gramians, norms, margins."""
 
-from ._disk import disk_margin as disk_margin, DiskMargin as DiskMargin
+from ._gains import (
+    dcgain as dcgain,
+    frequency_response as frequency_response,
+    h2_norm as h2_norm,
+    hinf_norm as hinf_norm,
+    PeakGain as PeakGain,
+)
 from ._gramians import (
     controllability_gramian as controllability_gramian,
     controllability_matrix as controllability_matrix,
@@ -8,6 +14,8 @@ from ._gramians import (
     observability_matrix as observability_matrix,
 )
 from ._margins import (
+    disk_margin as disk_margin,
+    DiskMargin as DiskMargin,
     Margins as Margins,
     margins as margins,
 )
@@ -20,7 +28,5 @@ from ._modes import (
     modal_observability as modal_observability,
     ModalTest as ModalTest,
     poles as poles,
+    zeros as zeros,
 )
-from ._norms import h2_norm as h2_norm, hinf_norm as hinf_norm, PeakGain as PeakGain
-from ._response import dcgain as dcgain, frequency_response as frequency_response
-from ._zeros import zeros as zeros

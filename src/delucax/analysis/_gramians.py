@@ -1,21 +1,16 @@
 """What inputs reach and outputs show, as matrices."""
 
 import equinox as eqx
-import jax.lax as lax
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
 from .._check import check_count, check_positive
 from .._results import raise_if
 from .._typing import BoolScalar, RealScalar, Scalar
+from ..math._gramian import gramian_over
 from ..math._linear_solve import full_precision, symmetric
 from ..riccati._lyapunov import lyapunov, stein
 from ._state_space import LinearModel, state_space, StateSpace
-
-
-_DOUBLINGS = 60
-"""Enough for a horizon of 2**60 times what the fastest mode takes."""
 
 
 def controllability_matrix(
@@ -209,24 +204,4 @@ def _gramian_of_steps(system: StateSpace, steps: int) -> Float[Array, "n n"]:
 @eqx.filter_jit
 @full_precision
 def _gramian_of_time(system: StateSpace, horizon: Scalar) -> Float[Array, "n n"]:
-    """Van Loan's block exponential over a short time, and then doubling."""
-    A, Q = system.A, system.B @ system.B.T
-    n = A.shape[0]
-    fastest = lax.stop_gradient(horizon * jnp.linalg.norm(A))
-    doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(fastest, 1))), 0, _DOUBLINGS)
-    short = horizon * 0.5**doublings
-    block = jnp.block([[-A, Q], [jnp.zeros_like(A), A.T]]) * short
-    exponential = jsl.expm(block)
-    power = exponential[n:, n:].T
-    W = power @ exponential[:n, n:]
-
-    def double(carry, k):
-        W, power = carry
-        more = k < doublings
-        # Zero where it is not used: what overflows there must not reach a derivative.
-        safe_power = jnp.where(more, power, 0)
-        W_next = W + safe_power @ W @ safe_power.T
-        return (W_next, jnp.where(more, safe_power @ safe_power, power)), None
-
-    (W, _), _ = lax.scan(double, (W, power), jnp.arange(_DOUBLINGS))
-    return symmetric(W)
+    return gramian_over(system.A, system.B @ system.B.T, horizon)

@@ -7,7 +7,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Inexact
 
-from .._check import check_choice
+from .._check import check_choice, check_time_invariant
 from .._typing import BoolScalar, Scalar
 from ..dynamics import LinearDynamics
 from ..math import safe_norm
@@ -86,11 +86,8 @@ def state_space(model: Any, inputs: str, where: str) -> StateSpace:
         )
     check_choice(inputs, ("controls", "disturbances"), "inputs", where)
     dt = model.dt if isinstance(model, LinearDynamics) else None
-    if isinstance(model, LinearDynamics) and model.is_time_varying:
-        raise ValueError(
-            f"{where}: model must be time-invariant, got matrices at "
-            f"{model.A.shape[0]} times; `dynamics.at(t)` are those at one time."
-        )
+    if isinstance(model, LinearDynamics):
+        check_time_invariant(model, "model", where)
     if inputs == "disturbances" and model.E is None and dt is None:
         raise ValueError(
             f"{where}: inputs='disturbances' needs a model with E, which says how "

@@ -6,20 +6,23 @@ from ._basic import (
     Linear as Linear,
     OpenLoop as OpenLoop,
     Random as Random,
+    Scheduled as Scheduled,
     Zero as Zero,
 )
 from ._finite_horizon import FiniteHorizonLQR as FiniteHorizonLQR
 from ._hinfinity import HInfinity as HInfinity
-from ._lqg import LQG as LQG
-from ._lqi import LQI as LQI
-from ._lqr import LQR as LQR
+from ._lqr import LQI as LQI, LQR as LQR
 from ._mpc import MPC as MPC, MPCState as MPCState
-from ._network import MLP as MLP, mlp_policy as mlp_policy
-from ._output_feedback import OutputFeedback as OutputFeedback
+from ._network import (
+    GRU as GRU,
+    History as History,
+    MLP as MLP,
+    mlp_policy as mlp_policy,
+    Standardise as Standardise,
+)
+from ._output_feedback import LQG as LQG, OutputFeedback as OutputFeedback
 from ._pid import LeakyPID as LeakyPID, PID as PID
-from ._recurrent import GRU as GRU, History as History, Standardise as Standardise
 from ._sampled import lqrd as lqrd, sampled_weights as sampled_weights
-from ._scheduled import Scheduled as Scheduled
 from ._stochastic import (
     Categorical as Categorical,
     Gaussian as Gaussian,

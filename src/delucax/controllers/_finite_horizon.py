@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._check import check_count, check_step
+from .._check import check_at_most, check_count, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
 from ..dynamics import LinearDynamics
@@ -101,19 +101,13 @@ class FiniteHorizonLQR(AbstractController):
         where = "FiniteHorizonLQR"
         check_linear_state_feedback(dynamics, where)
         steps = dynamics.A.shape[0] if dynamics.is_time_varying else None
-        if horizon is not None:
-            T = check_count(horizon, "horizon", where)
-        elif steps is not None:
-            T = steps
-        else:
+        if horizon is None and steps is None:
             raise ValueError(
                 f"{where}: horizon must be given, as dynamics are time-invariant."
             )
-        if steps is not None and T > steps:
-            raise ValueError(
-                f"{where}: horizon must be at most {steps}, the steps of dynamics, got "
-                f"{T}."
-            )
+        T = check_count(steps if horizon is None else horizon, "horizon", where)
+        if steps is not None:
+            check_at_most(T, steps, "horizon", where, "steps of dynamics")
         given = reference, control_reference, disturbance
         signals = as_signals(dynamics, *given, where)
 

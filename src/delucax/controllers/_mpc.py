@@ -9,6 +9,7 @@ import jax.random as jr
 from jaxtyping import Array, Float, Int
 
 from .._check import (
+    as_rows,
     bounds_field,
     check_bool,
     check_control_bounds,
@@ -19,8 +20,7 @@ from .._check import (
     check_key,
 )
 from .._controller import AbstractController, Tally
-from .._message import shortened
-from .._module import as_float_array, check_parameters, function_field
+from .._module import check_parameters, function_field
 from .._results import Result, RESULTS
 from .._typing import Control, Observation, PRNGKey
 from ..costs import AbstractCost
@@ -184,16 +184,8 @@ class MPC(AbstractController):
                 )
         else:
             if start is not None:
-                array = as_float_array(start)
-                if not eqx.is_inexact_array(array) or array.shape != (horizon, m):
-                    got = shortened(start)
-                    got = f"shape {array.shape}" if eqx.is_array(array) else got
-                    raise ValueError(
-                        f"{where}: start must have shape (horizon, controls) = "
-                        f"({horizon}, {m}), got {got}."
-                    )
-                check_finite(array, "start", where)
-                start = array
+                start = as_rows(start, m, "start", where, horizon)
+                check_finite(start, "start", where)
             start = default_start(dynamics, cost, horizon, controls=start)
         self.dynamics, self.cost = dynamics, cost
         self.start = _stacked(start, dynamics.state_size)

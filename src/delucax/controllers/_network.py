@@ -1,13 +1,15 @@
-"""Neural-network policies."""
+"""Policies that are neural networks, and what they are given."""
 
 from collections.abc import Callable
-from typing import Any, Literal
+from dataclasses import KW_ONLY
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.random as jr
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._check import (
     as_bounds,
@@ -16,10 +18,12 @@ from .._check import (
     check_count,
     check_instance,
     check_key,
+    check_positive,
+    check_vector,
     is_concrete,
 )
-from .._controller import AbstractController, wrong_observation
-from .._module import as_module, function_field, weight
+from .._controller import AbstractController, check_controller, wrong_observation
+from .._module import as_float_array, as_module, function_field, parameter, weight
 from .._typing import PRNGKey
 from ..environments import Environment
 from ._stochastic import Gaussian
@@ -197,3 +201,236 @@ def mlp_policy(
     if bounds is not None:
         std = jnp.broadcast_to((bounds[1] - bounds[0]) / 4, (size,))
     return Gaussian(network, jnp.log(std), bounds=environment.control_bounds)
+
+
+class GRU(AbstractController):
+    """A gated recurrent network of the observations so far,
+
+    `h = cell(features(y), h)`, `u = A h + b`, and with bounds
+    `u = (high + low) / 2 + (high - low) / 2 * tanh(A h + b)`.
+
+    Its memory h begins at zero with each episode.
+
+    **Arguments:**
+
+    - `in_size`: the size of the features.
+    - `out_size`: the number of controls.
+    - `width`: the size of the memory, 32 by default.
+    - `features`: what the network is given of an observation, a function such as
+        `env.encode`; the observation itself by default.
+    - `bounds`: `(low, high)`, each a finite number or vector, that the control is
+        squashed into; none by default.
+    - `key`: a random key, for the first weights.
+
+    **Attributes:** `cell`, an `eqx.nn.GRUCell`, and `readout`, an `eqx.nn.Linear`,
+    trainable.
+
+    **Raises:** `ValueError` if a size is below 1, bounds are not finite or there is no
+    key; when it is run, if the features have another size.
+
+    Source: Cho et al., 2014.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("pendulum")
+        policy = dlx.controllers.GRU(
+            3, 1, width=8, features=env.encode, bounds=(-2, 2), key=jax.random.key(0)
+        )
+        dlx.rollout(env, policy, key=jax.random.key(1), horizon=10).total_cost
+        ```
+    """
+
+    cell: eqx.nn.GRUCell = weight()
+    readout: eqx.nn.Linear = weight()
+    features: Callable[[Array], Array] | None = function_field()
+    bounds: tuple[Array, Array] | None = bounds_field("GRU")
+
+    def __init__(
+        self,
+        in_size: int,
+        out_size: int,
+        width: int = 32,
+        *,
+        features: Callable[[Array], Array] | None = None,
+        bounds: Any = None,
+        key: PRNGKey,
+    ):
+        cell_key, readout_key = jr.split(check_key(key, "GRU"))
+        in_size = check_count(in_size, "in_size", "GRU")
+        out_size = check_count(out_size, "out_size", "GRU")
+        width = check_count(width, "width", "GRU")
+        self.cell = eqx.nn.GRUCell(in_size, width, key=cell_key)
+        self.readout = eqx.nn.Linear(width, out_size, key=readout_key)
+        self.features, self.bounds = features, bounds
+
+    def __check_init__(self):
+        check_squash(self.bounds, int(self.readout.out_features), "GRU")
+
+    def init(self, *, key=None):
+        del key
+        return jnp.zeros(self.cell.hidden_size, self.readout.weight.dtype)
+
+    def __call__(self, t, y, state):
+        z = features_of(self, y, int(self.cell.input_size))
+        after = self.cell(z.astype(state.dtype), state)
+        return squash(self.readout(after), self.bounds).astype(y.dtype), after
+
+
+class _Past(NamedTuple):
+    base: PyTree
+    observations: Array
+    controls: Array
+    started: Array
+
+
+class History(AbstractController):
+    """A controller that is given a window of the past beside the observation,
+
+    `u_t = base(t, (z_t, z_{t-1}, ..., z_{t-n}, u_{t-1}, ..., u_{t-n}))`
+
+    with `z = features(y)` and u the controls that were applied. Before the beginning
+    the controls are zero and the observations the first one.
+
+    **Arguments:**
+
+    - `base`: the controller of the window, which has `size (n + 1) + controls n`
+        entries.
+    - `size`: the size of the features.
+    - `controls`: the number of controls.
+    - `length`: n, the steps of the past, 1 by default.
+    - `features`: of an observation, a function such as `env.encode`; the observation
+        itself by default.
+
+    **Raises:** `ValueError` if `base` is not a controller or a size is below 1; when it
+    is run, if the features have another size.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("pendulum")
+        angle = lambda y: env.encode(y)[:2]
+        size = 2 * (3 + 1) + 3
+        base = dlx.controllers.MLP(size, 1, width=8, depth=1, key=jax.random.key(0))
+        blind = dlx.controllers.History(base, 2, 1, length=3, features=angle)
+        dlx.rollout(env, blind, key=jax.random.key(1), horizon=10).total_cost
+        ```
+    """
+
+    base: AbstractController
+    size: int = eqx.field(static=True)
+    controls: int = eqx.field(static=True)
+    length: int = eqx.field(default=1, static=True)
+    _: KW_ONLY
+    features: Callable[[Array], Array] | None = function_field(None)
+
+    def __check_init__(self):
+        check_controller(self.base, "base", "History")
+        for name in ("size", "controls", "length"):
+            check_count(getattr(self, name), name, "History")
+
+    def init(self, *, key=None):
+        return _Past(
+            self.base.init(key=key),
+            jnp.zeros((self.length, self.size)),
+            jnp.zeros((self.length, self.controls)),
+            jnp.zeros((), bool),
+        )
+
+    def __call__(self, t, y, state):
+        z = features_of(self, y, self.size).astype(state.observations.dtype)
+        past = jnp.where(state.started, state.observations, z)
+        window = jnp.concatenate([z, past.ravel(), state.controls.ravel()])
+        u, base = self.base(t, window.astype(y.dtype), state.base)
+        observations = jnp.concatenate([z[None], past[:-1]])
+        return u, _Past(base, observations, state.controls, jnp.ones((), bool))
+
+    def applied(self, u, cost, state):
+        u = u.astype(state.controls.dtype)
+        return state._replace(
+            base=self.base.applied(u, cost, state.base),
+            controls=jnp.concatenate([u[None], state.controls[:-1]]),
+        )
+
+
+class Standardise(eqx.Module):
+    """Features shifted and scaled to mean 0 and standard deviation 1,
+
+    `clip((features(y) - mean) / std, -10, 10)`: the `features=` of a network.
+
+    [`delucax.training.PPO`][] and [`delucax.training.SHAC`][] set `mean` and `std` by
+    what they see on the way, wherever in their model there is one.
+
+    **Arguments:**
+
+    - `mean`: a vector with an entry for each feature.
+    - `std`: a vector of positive numbers, or one for all; 1 by default.
+    - `features`: of an observation, a function such as `env.encode`; the observation
+        itself by default.
+
+    **Raises:** `ValueError` if `std` is not positive, or numbers are not finite.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        env = dlx.make("pendulum")
+        features = dlx.controllers.Standardise(jnp.zeros(3), [1, 1, 4], env.encode)
+        policy = dlx.controllers.MLP(3, 1, features=features, key=jax.random.key(0))
+        dlx.rollout(env, policy, key=jax.random.key(1), horizon=10).total_cost
+        ```
+    """
+
+    mean: Array = parameter()
+    std: Array = parameter()
+    features: Callable[[Array], Array] | None = function_field()
+
+    def __init__(
+        self,
+        mean: Any,
+        std: Any = 1.0,
+        features: Callable[[Array], Array] | None = None,
+    ):
+        self.mean = as_float_array(mean)
+        std = as_float_array(std)
+        if eqx.is_inexact_array(self.mean) and jnp.ndim(std) == 0:
+            std = jnp.broadcast_to(std, self.mean.shape).astype(self.mean.dtype)
+        self.std = std
+        self.features = features
+
+    def __check_init__(self):
+        where, mean = "Standardise", self.mean
+        check_vector(mean, "mean", where)
+        check_positive(self.std, "std", where)
+        if self.std.shape != mean.shape:
+            raise ValueError(
+                f"{where}: std must be a number or have shape {mean.shape}, got shape "
+                f"{self.std.shape}."
+            )
+
+    def of(self, y: Array) -> Array:
+        """The features, as they are.
+
+        **Arguments:** `y`: an observation.
+
+        **Returns:** a vector.
+        """
+        return y if self.features is None else jnp.asarray(self.features(y))
+
+    def __call__(self, y: Array) -> Array:
+        """The features, standardised.
+
+        **Arguments:** `y`: an observation.
+
+        **Returns:** a vector.
+        """
+        return jnp.clip((self.of(y) - self.mean) / self.std, -10, 10)

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import is_concrete
+from .._check import check_instance, check_time_invariant, is_concrete
 from .._controller import AbstractController, wrong_observation
-from .._message import shortened
 from ..dynamics import LinearDynamics, linearize, OperatingPoint
 from ..math._drift import relative_drift
 from ..systems import LinearSystem
@@ -31,11 +30,8 @@ def linear_at(
     """`dynamics` linearised at a point that is given, and how their states differ."""
     if point is None:
         return dynamics, difference
-    if not isinstance(point, OperatingPoint):
-        raise ValueError(
-            f"{where}: point must be an OperatingPoint (`delucax.trim` computes one), "
-            f"got {shortened(point)}."
-        )
+    hint = " (`delucax.trim` computes one)"
+    check_instance(point, OperatingPoint, "point", where, hint)
     sizes = (dynamics.state_size,), (dynamics.control_size,)
     if (point.x.shape, point.u.shape) != sizes:
         raise ValueError(
@@ -52,17 +48,13 @@ def check_linear_state_feedback(
 ) -> None:
     """Raise unless the dynamics are linear and observe their state, and if need be are
     the same at all times."""
-    if not isinstance(dynamics, LinearDynamics):
-        raise ValueError(
-            f"{where}: dynamics must be LinearDynamics (`delucax.linearize` makes "
-            "them of any dynamics, `delucax.c2d` of a linear system), got "
-            f"{type(dynamics).__name__}."
-        )
-    if time_invariant and dynamics.is_time_varying:
-        raise ValueError(
-            f"{where}: dynamics must be time-invariant, got matrices at "
-            f"{dynamics.A.shape[0]} times; `dynamics.at(t)` are those at one time."
-        )
+    hint = (
+        " (`delucax.linearize` makes one of any dynamics, `delucax.c2d` of a linear "
+        "system)"
+    )
+    check_instance(dynamics, LinearDynamics, "dynamics", where, hint)
+    if time_invariant:
+        check_time_invariant(dynamics, "dynamics", where)
     C, n = dynamics.C, dynamics.state_size
     if C is None:
         return

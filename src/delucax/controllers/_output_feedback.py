@@ -1,14 +1,19 @@
-"""A state feedback that acts on an estimate."""
+"""State feedback that acts on an estimate."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from .._check import check_instance
 from .._controller import AbstractController, check_controller
-from ..estimators import AbstractEstimator
+from .._module import parameter
+from ..dynamics import LinearDynamics
+from ..estimators import AbstractEstimator, KalmanFilter
+from ._lqr import LQR
+from ._operating_point import Difference
 
 
 class _State(NamedTuple):
@@ -76,3 +81,139 @@ class OutputFeedback(AbstractController):
         memory = self.controller.applied(u, cost, state.controller)
         after = self.estimator.predict(state.time, u, state.estimator)
         return _State(memory, after, state.time)
+
+
+class LQG(AbstractController):
+    r"""The linear-quadratic regulator on the state that a Kalman filter estimates,
+
+    `u = u_ref - K (mean - x_ref)`,
+
+    `mean` being the estimate with the current observation in it; it is moved on with
+    the control that was really applied. Of all controllers that see
+    `y = C x + v`, `v ~ N(0, V)`, of `x_next = A x + B u + E w`, `w ~ N(0, W)`, it has
+    the least average cost `dx'Q dx + 2 dx'S du + du'R du`:
+
+    `trace(P E W E') + trace(K' (R + B'PB) K Sigma)`,
+
+    `P` being the solution of the regulator's Riccati equation and `Sigma` the
+    covariance of the estimate.
+
+    **Arguments:**
+
+    - `dynamics`: time-invariant linear dynamics whose operating point is an
+        equilibrium; of [`delucax.linearize`][], for example.
+    - `Q`: state weight, shape `(n, n)`, symmetric.
+    - `R`: control weight, shape `(m, m)`, symmetric.
+    - `W`: covariance of the disturbance that the dynamics take, shape `(k, k)`.
+    - `V`: covariance of the sensor noise, shape `(p, p)`.
+    - `S`: cross weight, shape `(n, m)`; zero by default.
+    - `mean`: of the first state, shape `(n,)`; `x_ref` by default.
+    - `covariance`: of the first state before it is observed, shape `(n, n)`; only
+        without `steady_state`, and then the identity by default.
+    - `steady_state`: use the filter's gain of the steady state at all times; true by
+        default.
+    - `y_ref`: what is observed at the operating point, shape `(p,)`; `C x_ref` by
+        default.
+    - `difference`: `(x, x_ref) -> deviation`, which wraps angles of the state;
+        subtraction by default.
+    - `observation_difference`: likewise for observations.
+
+    **Attributes:** `regulator`, a [`delucax.controllers.LQR`][], with `K` and `P`;
+    `estimator`, a [`delucax.estimators.KalmanFilter`][], with `L`; `average_cost`, a
+    scalar, of the steady state (`None` without it).
+
+    **Raises:** `ValueError` as those two do; an error at run time if there is no
+    stabilising gain or no steady state of the filter.
+
+    Source: Åström, 1970.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
+        env = dlx.make(
+            "lds",
+            A=A,
+            B=B,
+            C=jnp.array([[1.0, 0.0]]),
+            disturbance=dlx.disturbances.Gaussian(0.1, size=2),
+            sensor_noise=dlx.disturbances.Gaussian(0.5, size=1),
+        )
+        lqg = dlx.controllers.LQG(
+            env.dynamics, jnp.eye(2), jnp.eye(1), 0.01 * jnp.eye(2), 0.25 * jnp.eye(1)
+        )
+        trajectory = dlx.rollout(env, lqg, key=jax.random.key(0))
+        trajectory.total_cost / 200, lqg.average_cost
+        ```
+    """
+
+    regulator: LQR
+    estimator: KalmanFilter
+    average_cost: Float[Array, ""] | None = parameter()
+
+    def __init__(
+        self,
+        dynamics: LinearDynamics,
+        Q: Any,
+        R: Any,
+        W: Any,
+        V: Any,
+        S: Any = None,
+        *,
+        mean: Any = None,
+        covariance: Any = None,
+        steady_state: bool = True,
+        y_ref: Any = None,
+        difference: Difference | None = None,
+        observation_difference: Difference | None = None,
+    ):
+        plant: Any = dynamics
+        if isinstance(dynamics, LinearDynamics) and dynamics.C is not None:
+            plant = eqx.tree_at(lambda d: d.C, dynamics, None)
+        self.regulator = LQR(plant, Q, R, S, difference=difference)
+        self.estimator = KalmanFilter(
+            dynamics,
+            W,
+            V,
+            mean=mean,
+            covariance=covariance,
+            steady_state=steady_state,
+            y_ref=y_ref,
+            observation_difference=observation_difference,
+        )
+        self.average_cost = None
+        covariance = self.estimator.updated_covariance
+        if covariance is not None:
+            noise = self.estimator._noise(dynamics)
+            K, P, B = self.regulator.K, self.regulator.P, dynamics.B
+            # The weight of an error of the estimate.
+            weight = K.T @ (jnp.asarray(R) + B.T @ P @ B) @ K
+            self.average_cost = jnp.trace(P @ noise) + jnp.trace(weight @ covariance)
+
+    def __check_init__(self):
+        check_instance(self.regulator, LQR, "regulator", "LQG")
+        check_instance(self.estimator, KalmanFilter, "estimator", "LQG")
+        dynamics = self.estimator.dynamics
+        shape = dynamics.control_size, dynamics.state_size
+        if self.regulator.K.shape != shape:
+            raise ValueError(
+                f"LQG: regulator.K must have shape {shape}, as the dynamics of "
+                f"estimator need, got {self.regulator.K.shape}."
+            )
+
+    @property
+    def _feedback(self) -> OutputFeedback:
+        return OutputFeedback(self.regulator, self.estimator)
+
+    def init(self, *, key=None):
+        return self._feedback.init(key=key)
+
+    def __call__(self, t, y, state):
+        return self._feedback(t, y, state)
+
+    def applied(self, u, cost, state):
+        return self._feedback.applied(u, cost, state)

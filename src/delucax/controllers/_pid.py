@@ -15,13 +15,14 @@ from .._check import (
     as_matrix,
     bounds_field,
     check_choice,
+    check_count,
+    check_range,
     check_step,
-    is_concrete,
 )
 from .._controller import AbstractController, wrong_observation
 from .._message import shortened
 from .._module import as_float_array, as_module, parameter, positive, weight
-from .._typing import Real
+from .._typing import Bounds, Real, RealScalar
 from ..math import clip, matvec
 
 
@@ -68,40 +69,94 @@ def _output_field() -> Any:
     return eqx.field(default=None, converter=_as_output)
 
 
-def _count_loops(pid: Any) -> int:
-    """The number of loops: the size that all vectors have; 1 where all are numbers."""
-    where = type(pid).__name__
-    low, high = (None, None) if pid.bounds is None else pid.bounds
-    vectors = {"low bounds": low, "high bounds": high}
-    vectors |= {name: getattr(pid, name) for name in ("kp", "ki", "kd", *pid._times)}
-    if not callable(pid.reference):
-        vectors["reference"] = pid.reference
-    sizes = {}
-    for name, value in vectors.items():
-        if value is None:
-            continue
-        array = as_float_array(value)
-        if not eqx.is_inexact_array(array) or array.ndim > 1:
+def _as(after: Any, before: Any) -> Any:
+    """`after` in the types of `before`, as a loop must carry it."""
+    return jax.tree.map(lambda a, b: a.astype(b.dtype), after, before)
+
+
+class _AbstractPID(AbstractController):
+    """Loops side by side, each of which follows an output."""
+
+    kp: eqx.AbstractVar[Real]
+    ki: eqx.AbstractVar[Real]
+    kd: eqx.AbstractVar[Real]
+    dt: eqx.AbstractVar[Real]
+    reference: eqx.AbstractVar[Array | Callable[[Any], Array] | None]
+    output: eqx.AbstractVar[Any]
+    bounds: eqx.AbstractVar[Bounds | None]
+    _times: eqx.AbstractClassVar[tuple[str, ...]]
+
+    def __check_init__(self):
+        where = type(self).__name__
+        check_step(self.dt, where)
+        as_bounds(self.bounds, where)
+        check_count(self.loops, "loops", where)
+
+    @property
+    def loops(self) -> int:
+        """The number of loops: the size that all vectors have; 1 where all are
+        numbers."""
+        where = type(self).__name__
+        low, high = (None, None) if self.bounds is None else self.bounds
+        vectors = {"low bounds": low, "high bounds": high}
+        vectors |= {name: getattr(self, name) for name in ("kp", "ki", "kd")}
+        vectors |= {name: getattr(self, name) for name in self._times}
+        if not callable(self.reference):
+            vectors["reference"] = self.reference
+        sizes = {}
+        for name, value in vectors.items():
+            if value is None:
+                continue
+            array = as_float_array(value)
+            if not eqx.is_inexact_array(array) or array.ndim > 1:
+                raise ValueError(
+                    f"{where}: {name} must be a number or a vector, got "
+                    f"{shortened(value)}."
+                )
+            if array.ndim == 1:
+                sizes[name] = array.shape[0]
+        if isinstance(self.output, _Select):
+            sizes["output"] = len(self.output.indices)
+        elif isinstance(self.output, _Project):
+            sizes["output"] = self.output.C.shape[0]
+        if len(set(sizes.values())) > 1 or 0 in sizes.values():
+            got = ", ".join(f"{name} of size {size}" for name, size in sizes.items())
+            raise ValueError(f"{where}: there must be one entry a loop; got {got}.")
+        return next(iter(sizes.values()), 1)
+
+    def _zeros(self) -> Array:
+        dtype = jnp.result_type(self.kp, self.ki, self.kd, self.dt)
+        return jnp.zeros(self.loops, dtype)
+
+    def _error(self, t: RealScalar, y: Array) -> tuple[Array, Array]:
+        """`(r(t) - h(y), h(y))`, checked to have an entry for each loop."""
+        name, output, loops = type(self).__name__, self.output, self.loops
+        if isinstance(output, _Select) and max(output.indices) >= y.shape[0]:
             raise ValueError(
-                f"{where}: {name} must be a number or a vector, got {shortened(value)}."
+                f"{name}: output selects component {max(output.indices)}, but the "
+                f"observation has size {y.shape[0]}."
             )
-        if array.ndim == 1:
-            sizes[name] = array.shape[0]
-    if isinstance(pid.output, _Select):
-        sizes["output"] = len(pid.output.indices)
-    elif isinstance(pid.output, _Project):
-        sizes["output"] = pid.output.C.shape[0]
-    if len(set(sizes.values())) > 1 or 0 in sizes.values():
-        got = ", ".join(f"{name} of size {size}" for name, size in sizes.items())
-        raise ValueError(f"{where}: there must be one entry a loop; got {got}.")
-    return next(iter(sizes.values()), 1)
+        if isinstance(output, _Project) and y.shape != output.C.shape[1:]:
+            raise wrong_observation(self, output.C.shape[1], y)
+        measured = y if output is None else jnp.atleast_1d(output(y))
+        if measured.shape != (loops,):
+            what = "the observation has" if output is None else "output gives"
+            raise ValueError(
+                f"{name}: expects {loops} outputs, one a loop, but {what} shape "
+                f"{measured.shape}; choose what each loop follows, such as output=0."
+            )
+        given = self.reference
+        reference = given(t) if callable(given) else given
+        reference = jnp.asarray(0 if reference is None else reference)
+        if reference.shape not in ((), (loops,)):
+            raise ValueError(
+                f"{name}: reference must have an entry for each of {loops} loops, got "
+                f"shape {reference.shape}."
+            )
+        return reference - measured, measured
 
-
-def _check(pid: Any) -> None:
-    where = type(pid).__name__
-    check_step(pid.dt, where)
-    as_bounds(pid.bounds, where)
-    _count_loops(pid)
+    def _clip(self, u: Array, y: Array) -> Array:
+        return (u if self.bounds is None else clip(u, *self.bounds)).astype(y.dtype)
 
 
 class _Memory(NamedTuple):
@@ -112,7 +167,7 @@ class _Memory(NamedTuple):
     asked: Array
 
 
-class PID(AbstractController):
+class PID(_AbstractPID):
     """Proportional, integral and derivative action, one loop a control.
 
     With the error `e = r(t) - h(y)`, over a step of `dt`:
@@ -178,29 +233,21 @@ class PID(AbstractController):
     _times: ClassVar = ("derivative_time_constant", "anti_windup_time")
 
     def __check_init__(self):
-        _check(self)
         check_choice(
             self.derivative_on, ("measurement", "error"), "derivative_on", "PID"
         )
         lag, windup, dt = self.derivative_time_constant, self.anti_windup_time, self.dt
-        if lag is not None and is_concrete(lag) and np.any(np.asarray(lag) < 0):
-            raise ValueError(
-                f"PID: derivative_time_constant must not be negative, got {lag}."
-            )
-        if windup is not None and is_concrete(windup) and is_concrete(dt):
-            if np.any(np.asarray(windup) < np.asarray(dt)):
-                raise ValueError(
-                    f"PID: anti_windup_time must be at least dt = {dt}, got {windup}."
-                )
-
-    loops = property(_count_loops)
+        if lag is not None:
+            check_range(lag, "derivative_time_constant", "PID")
+        if windup is not None:
+            check_range(windup, "anti_windup_time", "PID", dt)
 
     def init(self, *, key=None):
-        zeros = _zeros(self)
+        zeros = self._zeros()
         return _Memory(zeros, zeros, zeros, jnp.zeros((), bool), zeros)
 
     def __call__(self, t, y, state):
-        error, measured = _error(self, t, y)
+        error, measured = self._error(t, y)
         moving = -measured if self.derivative_on == "measurement" else error
         step = jnp.where(state.started, moving - state.previous, 0)
         lag = self.derivative_time_constant
@@ -209,7 +256,7 @@ class PID(AbstractController):
         asked = self.kp * error + state.integral + self.kd * slope
         integral = state.integral + self.dt * self.ki * error
         after = _Memory(integral, slope, moving, jnp.ones((), bool), asked)
-        return _clip(self, asked, y), _as(after, state)
+        return self._clip(asked, y), _as(after, state)
 
     def applied(self, u, cost, state):
         correction = self.dt * self._windup_rate() * (u - state.asked)
@@ -233,7 +280,7 @@ class _Averages(NamedTuple):
     derivative: Array
 
 
-class LeakyPID(AbstractController):
+class LeakyPID(_AbstractPID):
     """The PID of the original Deluca, whose integral is an exponential average.
 
     With the error `e = r(t) - h(y)` and `a = dt / (dt + T)`:
@@ -286,61 +333,15 @@ class LeakyPID(AbstractController):
 
     _times: ClassVar = ("time_constant",)
 
-    def __check_init__(self):
-        _check(self)
-
-    loops = property(_count_loops)
-
     def init(self, *, key=None):
-        zeros = _zeros(self)
+        zeros = self._zeros()
         return _Averages(zeros, zeros, zeros)
 
     def __call__(self, t, y, state):
-        error, _ = _error(self, t, y)
+        error, _ = self._error(t, y)
         share = self.dt / (self.dt + self.time_constant)
         integral = state.integral + share * (error - state.integral)
         change = error - state.error
         derivative = state.derivative + share * (change - state.derivative)
         u = self.kp * error + self.ki * integral + self.kd * derivative
-        return _clip(self, u, y), _as(_Averages(error, integral, derivative), state)
-
-
-def _zeros(pid: Any) -> Array:
-    return jnp.zeros(pid.loops, jnp.result_type(pid.kp, pid.ki, pid.kd, pid.dt))
-
-
-def _error(pid: Any, t: Any, y: Array) -> tuple[Array, Array]:
-    """`(r(t) - h(y), h(y))`, checked to have an entry for each loop."""
-    name, output, loops = type(pid).__name__, pid.output, pid.loops
-    if isinstance(output, _Select) and max(output.indices) >= y.shape[0]:
-        raise ValueError(
-            f"{name}: output selects component {max(output.indices)}, but the "
-            f"observation has size {y.shape[0]}."
-        )
-    if isinstance(output, _Project) and y.shape != output.C.shape[1:]:
-        raise wrong_observation(pid, output.C.shape[1], y)
-    measured = y if output is None else jnp.atleast_1d(output(y))
-    if measured.shape != (loops,):
-        what = "the observation has" if output is None else "output gives"
-        raise ValueError(
-            f"{name}: expects {loops} outputs, one a loop, but {what} shape "
-            f"{measured.shape}; choose what each loop follows, such as output=0."
-        )
-    given: Any = pid.reference
-    reference: Any = given(t) if callable(given) else given
-    reference = 0 if reference is None else jnp.asarray(reference)
-    if jnp.shape(reference) not in ((), (loops,)):
-        raise ValueError(
-            f"{name}: reference must have an entry for each of {loops} loops, got "
-            f"shape {jnp.shape(reference)}."
-        )
-    return reference - measured, measured
-
-
-def _clip(pid: Any, u: Array, y: Array) -> Array:
-    return (u if pid.bounds is None else clip(u, *pid.bounds)).astype(y.dtype)
-
-
-def _as(after: Any, before: Any) -> Any:
-    """`after` in the types of `before`, as a loop must carry it."""
-    return jax.tree.map(lambda a, b: a.astype(b.dtype), after, before)
+        return self._clip(u, y), _as(_Averages(error, integral, derivative), state)

@@ -2,19 +2,15 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
 from jaxtyping import Array
 
 from .._check import as_matrix, check_instance, check_positive, symmetric_matrix
 from ..dynamics import c2d, linearize, OperatingPoint
+from ..math._gramian import gramian_over
 from ..systems import AbstractSystem, LinearSystem
 from ._lqr import LQR
 from ._operating_point import Difference, linear_at
-
-
-_MOST_DOUBLINGS = 20
 
 
 def sampled_weights(
@@ -69,25 +65,7 @@ def sampled_weights(
     size = n + m
     field = jnp.zeros((size, size), A.dtype).at[:n, :n].set(A).at[:n, n:].set(B)
     charge = jnp.block([[Q, S], [S.T, R]]).astype(A.dtype)
-    zero = jnp.zeros_like(field)
-    block = jnp.block([[-field.T, charge], [zero, field]])
-    # Over all of `dt` the exponential of `-A'` would overflow where `A` is stiff, so it
-    # is taken over a part in which little happens, which is then doubled.
-    step = jax.lax.stop_gradient(jnp.linalg.norm(field) * dt)
-    doublings = jnp.clip(jnp.ceil(jnp.log2(step)), 0, _MOST_DOUBLINGS)
-    exponential = jsl.expm(block * (dt * 2**-doublings))
-    flow = exponential[size:, size:]
-    total = flow.T @ exponential[:size, size:]
-
-    def double(carry, k):
-        flow, total = carry
-        doubled = flow @ flow, total + flow.T @ total @ flow
-        keep = lambda a, b: jnp.where(k < doublings, a, b)
-        return jax.tree.map(keep, doubled, carry), None
-
-    steps = jnp.arange(_MOST_DOUBLINGS)
-    (_, total), _ = jax.lax.scan(double, (flow, total), steps)
-    total = (total + total.T) / 2
+    total = gramian_over(field.T, charge, jnp.asarray(dt, A.dtype))
     return total[:n, :n], total[n:, n:], total[:n, n:]
 
 
@@ -140,11 +118,8 @@ def lqrd(
         regulator.K
         ```
     """
-    if not isinstance(system, AbstractSystem):
-        raise ValueError(
-            f"lqrd: system must be an AbstractSystem, got {type(system).__name__}; for "
-            "dynamics in discrete time use `delucax.controllers.LQR`."
-        )
+    hint = " (for dynamics in discrete time use `delucax.controllers.LQR`)"
+    check_instance(system, AbstractSystem, "system", "lqrd", hint)
     linear, difference = linear_at(system, point, difference, "lqrd")
     if not isinstance(linear, LinearSystem):
         linear = linearize(system)

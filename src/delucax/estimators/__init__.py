@@ -1,9 +1,9 @@
 """Estimates of the state from observations."""
 
 from ._base import AbstractEstimator as AbstractEstimator, Belief as Belief
-from ._kalman import KalmanFilter as KalmanFilter
-from ._nonlinear import (
+from ._kalman import (
     ExtendedKalmanFilter as ExtendedKalmanFilter,
+    KalmanFilter as KalmanFilter,
     UnscentedKalmanFilter as UnscentedKalmanFilter,
 )
 from ._smoother import (

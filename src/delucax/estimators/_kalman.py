@@ -1,19 +1,37 @@
-"""The Kalman filter."""
+"""Kalman filters: linear, extended and unscented."""
 
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import as_vector, check_bool, check_instance
-from .._module import function_field, parameter, weight
-from ..dynamics import LinearDynamics
+from .._check import (
+    as_vector,
+    check_bool,
+    check_instance,
+    check_number,
+    check_positive,
+    check_time_invariant,
+    is_concrete,
+)
+from .._jax import jacobian
+from .._module import function_field, parameter, positive, weight
+from .._results import raise_on_failure, RESULTS
+from ..dynamics import AbstractDynamics, LinearDynamics
 from ..math._linear_solve import symmetric
 from ..riccati import filter_dare
-from ..riccati._solution import checked
-from ._gaussian import AbstractGaussianFilter, gaussian_model
-from ._moments import congruence, LinearJoint
+from ._gaussian import (
+    AbstractGaussianFilter,
+    congruence,
+    gaussian_model,
+    LinearJoint,
+    SampledJoint,
+    square_root,
+)
 
 
 class KalmanFilter(AbstractGaussianFilter):
@@ -106,7 +124,7 @@ class KalmanFilter(AbstractGaussianFilter):
             self.y_ref = as_vector(y_ref, self.V.shape[0], "y_ref", where)
         if not steady_state:
             return
-        _check_time_invariant(dynamics)
+        check_time_invariant(dynamics, "dynamics with steady_state", where)
         if covariance is not None:
             raise ValueError(
                 f"{where}: covariance must not be given with steady_state, of which it "
@@ -115,8 +133,8 @@ class KalmanFilter(AbstractGaussianFilter):
         C, noise = self._C, self._noise(dynamics)
         solution = filter_dare(dynamics.A, C, noise, self.V, throw=False)
         what = f"{where}: there is no steady state. Of A', C' in the places of A, B"
-        covariance = symmetric(checked(solution, what, True).X)
-        self.covariance = covariance.astype(self.mean.dtype)
+        solution = raise_on_failure(solution, what, facts=solution._facts)
+        self.covariance = symmetric(solution.X).astype(self.mean.dtype)
         joint = LinearJoint(C @ self.mean, self.covariance, C, self.V)
         self.L = joint.gain()
         self.updated_covariance = joint.remainder(self.L)
@@ -124,7 +142,8 @@ class KalmanFilter(AbstractGaussianFilter):
     def __check_init__(self):
         _check_linear(self.dynamics)
         if self.L is not None:
-            _check_time_invariant(self.dynamics)
+            named = "dynamics with steady_state"
+            check_time_invariant(self.dynamics, named, "KalmanFilter")
         if self.y_ref is not None:
             size = self.dynamics.observation_size
             as_vector(self.y_ref, size, "y_ref", "KalmanFilter")
@@ -168,9 +187,247 @@ def _check_linear(dynamics: Any) -> None:
     check_instance(dynamics, LinearDynamics, "dynamics", "KalmanFilter", hint)
 
 
-def _check_time_invariant(dynamics: LinearDynamics) -> None:
-    if dynamics.is_time_varying:
-        raise ValueError(
-            "KalmanFilter: steady_state needs time-invariant dynamics, got matrices at "
-            f"{dynamics.A.shape[0]} times."
+class ExtendedKalmanFilter(AbstractGaussianFilter):
+    r"""The Kalman filter of the dynamics linearised about the estimate, at each step,
+    by automatic differentiation:
+
+    `x_next = F(t, x, u, w)`, `w ~ N(0, W)`, `y = h(t, x) + v`, `v ~ N(0, V)`,
+
+    with `A = dF/dx`, `E = dF/dw` and `C = dh/dx` in the places of the matrices of
+    [`delucax.estimators.KalmanFilter`][]. On linear dynamics it is that filter.
+
+    **Arguments:**
+
+    - `dynamics`: any dynamics; their `observe` is the sensor h, and their `difference`
+        counts in a smoother.
+    - `W`: covariance of the disturbance that the dynamics take, shape `(k, k)`,
+        symmetric, semidefinite. Of a system with a diffusion that of the Brownian
+        increments.
+    - `V`: covariance of the sensor noise, shape `(p, p)`, symmetric, semidefinite.
+    - `mean`: of the first state, shape `(n,)`; zero by default.
+    - `covariance`: of the first state before it is observed, shape `(n, n)`, symmetric,
+        semidefinite; the identity by default.
+    - `observation_difference`: `(y, y_predicted) -> deviation`, which wraps angles
+        among the observations: `dynamics.difference` where the state is observed, for
+        example. Subtraction by default.
+
+    **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not one, or
+    sizes do not fit.
+
+    Source: Schmidt, 1966; Jazwinski, 1970.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        W, V = 1e-4 * jnp.eye(2), 1e-2 * jnp.eye(2)
+        ekf = dlx.estimators.ExtendedKalmanFilter(
+            pendulum, W, V, observation_difference=pendulum.difference
         )
+        belief = ekf.update(0.0, jnp.array([0.1, 0.0]), ekf.init())
+        belief = ekf.predict(0.0, jnp.zeros(1), belief)
+        ```
+    """
+
+    dynamics: AbstractDynamics
+    W: Float[Array, "k k"] = parameter()
+    V: Float[Array, "p p"] = parameter()
+    mean: Float[Array, " n"] = parameter()
+    covariance: Float[Array, "n n"] = parameter()
+    observation_difference: Callable[[Array, Array], Array] | None = function_field()
+
+    def __init__(
+        self,
+        dynamics: AbstractDynamics,
+        W: Any,
+        V: Any,
+        *,
+        mean: Any = None,
+        covariance: Any = None,
+        observation_difference: Callable[[Array, Array], Array] | None = None,
+    ):
+        where = "ExtendedKalmanFilter"
+        _check_dynamics(dynamics, where)
+        self.dynamics = dynamics
+        self.W, self.V, self.mean, self.covariance = gaussian_model(
+            dynamics, W, V, mean, covariance, None, where
+        )
+        self.observation_difference = observation_difference
+
+    def __check_init__(self):
+        _check_dynamics(self.dynamics, "ExtendedKalmanFilter")
+
+    def _observation(self, t, belief):
+        observe = lambda x: self.dynamics.observe(t, x)
+        C = jacobian(observe)(belief.mean)
+        return LinearJoint(observe(belief.mean), belief.covariance, C, self.V)
+
+    def _transition(self, t, u, belief):
+        A = jacobian(lambda x: _advanced(self.dynamics, t, x, u))(belief.mean)
+        mean = _advanced(self.dynamics, t, belief.mean, u)
+        noise = _added_covariance(self, t, u, belief.mean)
+        return LinearJoint(mean, belief.covariance, A, noise)
+
+
+class UnscentedKalmanFilter(AbstractGaussianFilter):
+    r"""The Kalman filter whose moments are those of `2 n + 1` points, each passed
+    through the dynamics and the sensor:
+
+    `x_next = F(t, x, u, w)`, `w ~ N(0, W)`, `y = h(t, x) + v`, `v ~ N(0, V)`.
+
+    The points are the mean, and the mean plus and minus the columns of
+    `sqrt(c) chol(covariance)`, with `c = alpha^2 (n + kappa)`; the outer ones weigh
+    `1 / (2 c)`, the middle one `1 - n / c` in the mean and
+    `2 - n / c - alpha^2 + beta` in the covariance. They are drawn anew for each update.
+    The disturbance counts to first order, by `E W E'` with `E = dF/dw` at the mean,
+    which is exact where it is added to the state. On linear dynamics this is the
+    [`delucax.estimators.KalmanFilter`][].
+
+    With the default weights no weight is negative, so that covariances stay
+    semidefinite. A small `alpha`, such as the common 1e-3, has weights of `1 / alpha^2`
+    that cancel, at the cost of as many digits. A state of zero variance is taken to be
+    known; there is no derivative with respect to that variance.
+
+    **Arguments:**
+
+    - `dynamics`: any dynamics; their `observe` is the sensor h, and their `difference`,
+        which wraps angles, measures the spread of the moved points.
+    - `W`: covariance of the disturbance that the dynamics take, shape `(k, k)`,
+        symmetric, semidefinite. Of a system with a diffusion that of the Brownian
+        increments.
+    - `V`: covariance of the sensor noise, shape `(p, p)`, symmetric, semidefinite.
+    - `mean`: of the first state, shape `(n,)`; zero by default.
+    - `covariance`: of the first state before it is observed, shape `(n, n)`, symmetric,
+        semidefinite; the identity by default.
+    - `alpha`: spread of the points, a positive number; 1 by default.
+    - `beta`: what is added to the weight of the middle point in covariances, a number;
+        2 by default, which suits normal states.
+    - `kappa`: more spread, a number above `-n`; 0 by default.
+    - `observation_difference`: `(y, y_predicted) -> deviation`, which wraps angles
+        among the observations: `dynamics.difference` where the state is observed, for
+        example. Subtraction by default.
+
+    **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not one, a
+    number is out of its range, or sizes do not fit.
+
+    Source: Julier and Uhlmann, 1997; Wan and van der Merwe, 2000.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        W, V = 1e-4 * jnp.eye(2), 1e-2 * jnp.eye(2)
+        ukf = dlx.estimators.UnscentedKalmanFilter(
+            pendulum, W, V, observation_difference=pendulum.difference
+        )
+        belief = ukf.update(0.0, jnp.array([0.1, 0.0]), ukf.init())
+        belief = ukf.predict(0.0, jnp.zeros(1), belief)
+        ```
+    """
+
+    dynamics: AbstractDynamics
+    W: Float[Array, "k k"] = parameter()
+    V: Float[Array, "p p"] = parameter()
+    mean: Float[Array, " n"] = parameter()
+    covariance: Float[Array, "n n"] = parameter()
+    alpha: Float[Array, ""] = parameter(constraint=positive)
+    beta: Float[Array, ""] = parameter()
+    kappa: Float[Array, ""] = parameter()
+    observation_difference: Callable[[Array, Array], Array] | None = function_field()
+
+    def __init__(
+        self,
+        dynamics: AbstractDynamics,
+        W: Any,
+        V: Any,
+        *,
+        mean: Any = None,
+        covariance: Any = None,
+        alpha: Any = 1.0,
+        beta: Any = 2.0,
+        kappa: Any = 0.0,
+        observation_difference: Callable[[Array, Array], Array] | None = None,
+    ):
+        where = "UnscentedKalmanFilter"
+        _check_dynamics(dynamics, where)
+        self.dynamics = dynamics
+        self.W, self.V, self.mean, self.covariance = gaussian_model(
+            dynamics, W, V, mean, covariance, None, where
+        )
+        self.alpha, self.beta, self.kappa = alpha, beta, kappa
+        self.observation_difference = observation_difference
+
+    def __check_init__(self):
+        where = "UnscentedKalmanFilter"
+        _check_dynamics(self.dynamics, where)
+        for name in ("alpha", "beta", "kappa"):
+            check_number(getattr(self, name), name, where)
+        check_positive(self.alpha, "alpha", where)
+        n, kappa = self.dynamics.state_size, self.kappa
+        if is_concrete(kappa) and not np.asarray(kappa) > -n:
+            raise ValueError(
+                f"{where}: kappa must be above -n = {-n}, n being the size of the "
+                f"state, got {kappa}."
+            )
+
+    def _observation(self, t, belief):
+        observe = lambda x: self.dynamics.observe(t, x)
+        return self._sampled(observe, self.observation_difference, belief, self.V)
+
+    def _transition(self, t, u, belief):
+        advance = lambda x: _advanced(self.dynamics, t, x, u)
+        noise = _added_covariance(self, t, u, belief.mean)
+        return self._sampled(advance, self.dynamics.difference, belief, noise)
+
+    def _sampled(self, function, difference, belief, noise):
+        mean, (n,) = belief.mean, belief.mean.shape
+        spread = self.alpha**2 * (n + self.kappa)
+        columns = jnp.sqrt(spread) * square_root(belief.covariance)
+        dx = jnp.concatenate([jnp.zeros((1, n)), columns.T, -columns.T])
+        dx = dx.astype(mean.dtype)
+        z = jax.vmap(function)(mean + dx)
+        # About the middle point, so that angles are averaged as they should be.
+        middle = z[0]
+        if difference is None:
+            dz = z - middle
+        else:
+            dz = jax.vmap(difference, in_axes=(0, None))(z, middle)
+        outer = jnp.full(2 * n, 1 / (2 * spread), mean.dtype)
+        shift = outer @ dz[1:]
+        inner = 2 - n / spread - self.alpha**2 + self.beta
+        weights = jnp.concatenate([jnp.reshape(inner, 1).astype(mean.dtype), outer])
+        return SampledJoint(middle + shift, dx, dz - shift, weights, noise)
+
+
+def _check_dynamics(dynamics: Any, where: str) -> None:
+    check_instance(dynamics, AbstractDynamics, "dynamics", where)
+    n = dynamics.state_size
+    x = jnp.zeros(n)
+    shape = eqx.filter_eval_shape(dynamics.difference, x, x).shape
+    if shape != (n,):
+        raise ValueError(
+            f"{where}: dynamics must have a difference of the size of the state, "
+            f"{(n,)}, got shape {shape}."
+        )
+
+
+def _advanced(dynamics: AbstractDynamics, t: Any, x: Array, u: Array, w: Any = None):
+    """The next state; NaN if the solver fails, which the loop around it reports."""
+    x_next, result = dynamics.advance(t, x, u, w)
+    if result is RESULTS.successful:
+        return x_next
+    return jnp.where(result == RESULTS.successful, x_next, jnp.nan)
+
+
+def _added_covariance(estimator: Any, t: Any, u: Array, x: Array) -> Array:
+    """`E W E'`, what the disturbance adds to the covariance of the next state."""
+    dynamics, W = estimator.dynamics, estimator.W
+    w = jnp.zeros(W.shape[0], x.dtype)
+    E = jacobian(lambda w: _advanced(dynamics, t, x, u, w))(w)
+    return congruence(E, W)

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_rows, check_finite, check_number, is_concrete
+from .._check import as_rows, check_finite, check_instance, check_number
 from .._module import as_float_array
-from .._results import choose, Result, RESULTS
+from .._results import choose, raise_on_failure, Result, RESULTS
 from ..math._linear_solve import full_precision
 from ._base import Belief
 from ._gaussian import AbstractGaussianFilter
@@ -142,10 +142,10 @@ def run_filter(
         ```
     """
     where = "run_filter"
-    filtered = _filter(
-        estimator, *_record(estimator, observations, controls, t0, where)
-    )
-    return _checked(filtered, where) if throw else filtered
+    record = _record(estimator, observations, controls, t0, where)
+    filtered = _filter(estimator, *record)
+    place = lambda: _first_failure(filtered)
+    return raise_on_failure(filtered, where, throw, "the beliefs", place)
 
 
 def smooth(
@@ -204,19 +204,16 @@ def smooth(
         ```
     """
     where = "smooth"
-    smoothed = _smooth(
-        estimator, *_record(estimator, observations, controls, t0, where)
-    )
-    return _checked(smoothed, where) if throw else smoothed
+    record = _record(estimator, observations, controls, t0, where)
+    smoothed = _smooth(estimator, *record)
+    place = lambda: _first_failure(smoothed.filtered)
+    return raise_on_failure(smoothed, where, throw, "the beliefs", place)
 
 
 def _record(estimator, observations, controls, t0, where):
     """The observations, controls and times, checked."""
-    if not isinstance(estimator, AbstractGaussianFilter):
-        raise ValueError(
-            f"{where}: estimator must be a KalmanFilter, ExtendedKalmanFilter or "
-            f"UnscentedKalmanFilter, got {type(estimator).__name__}."
-        )
+    hint = ": a KalmanFilter, ExtendedKalmanFilter or UnscentedKalmanFilter"
+    check_instance(estimator, AbstractGaussianFilter, "estimator", where, hint)
     m = estimator.dynamics.control_size
     y = as_rows(observations, estimator.V.shape[0], "observations", where)
     check_finite(y, "observations", where)
@@ -289,17 +286,6 @@ def _masked(ok: Array, values: Array, otherwise: Any = jnp.nan) -> Array:
     return jnp.where(ok.reshape(-1, *(1,) * (values.ndim - 1)), values, otherwise)
 
 
-def _checked(solution, where):
-    """Raise if the run failed: now if its values are known, else at run time."""
-    failed = solution.result != RESULTS.successful
-    if not is_concrete(failed):
-        return solution.result.error_if(solution, failed)
-    if failed:
-        filtered = solution if isinstance(solution, Filtered) else solution.filtered
-        finite = np.isfinite(filtered.log_likelihoods)
-        place = "" if finite.all() else f" At observation {finite.argmin()}."
-        raise RuntimeError(
-            f"{where}: {RESULTS[solution.result]}{place} Pass throw=False to look at "
-            "the beliefs."
-        )
-    return solution
+def _first_failure(filtered: Filtered) -> str:
+    finite = np.isfinite(filtered.log_likelihoods)
+    return "" if finite.all() else f"At observation {finite.argmin()}."

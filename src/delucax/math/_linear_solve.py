@@ -41,15 +41,19 @@ def solve(
 
 
 def factorised(
-    matrix: Float[Array, "n n"],
-) -> Callable[[Float[Array, "n k"]], Float[Array, "n k"]]:
+    matrix: Inexact[Array, "m n"],
+    solver: lx.AbstractLinearSolver | None = None,
+    tags: Any = (),
+) -> Callable[[Inexact[Array, "m k"]], Inexact[Array, "n k"]]:
     """`right -> matrix^-1 right`, for more than one right side in turn.
 
     A small matrix is eliminated entry by entry: one member of a batch is then a lane of
-    vector instructions, where LAPACK would be called for each.
+    vector instructions, where LAPACK would be called for each. A `solver` that is given
+    may need `tags` of the matrix.
     """
-    operator = lx.MatrixLinearOperator(matrix)
-    solver = _Elimination() if matrix.shape[0] <= SMALL else lx.LU()
+    if solver is None:
+        solver = _Elimination() if matrix.shape[0] <= SMALL else lx.LU()
+    operator = lx.MatrixLinearOperator(matrix, tags)
     state = solver.init(operator, {})
 
     def column(b):
@@ -177,10 +181,4 @@ def lu_solve(
     matrix: Inexact[Array, "n n"], right: Inexact[Array, "n k"]
 ) -> Inexact[Array, "n k"]:
     """`solve` by LAPACK at every size, of complex matrices too."""
-    operator, solver = lx.MatrixLinearOperator(matrix), lx.LU()
-    state = solver.init(operator, {})
-
-    def column(b):
-        return lx.linear_solve(operator, b, solver, state=state, throw=False).value
-
-    return jax.vmap(column, in_axes=1, out_axes=1)(right)
+    return factorised(matrix, lx.LU())(right)

@@ -1,13 +1,17 @@
 """Matrix equations of control, by solves and products alone."""
 
-from ._care import care as care
-from ._continuous_horizon import (
+from ._algebraic import (
+    care as care,
+    dare as dare,
+    filter_care as filter_care,
+    filter_dare as filter_dare,
+)
+from ._finite_horizon import (
     ContinuousHorizonSolution as ContinuousHorizonSolution,
     cre as cre,
+    dre as dre,
+    FiniteHorizonSolution as FiniteHorizonSolution,
 )
-from ._dare import dare as dare
-from ._filter import filter_care as filter_care, filter_dare as filter_dare
-from ._finite_horizon import dre as dre, FiniteHorizonSolution as FiniteHorizonSolution
 from ._hinfinity import (
     GameSolution as GameSolution,
     hinf_care as hinf_care,
@@ -22,9 +26,7 @@ from ._linear import (
     dlyap as dlyap,
     dsylvester as dsylvester,
     lyap as lyap,
+    MatrixSolution as MatrixSolution,
     sylvester as sylvester,
 )
-from ._solution import (
-    MatrixSolution as MatrixSolution,
-    RiccatiSolution as RiccatiSolution,
-)
+from ._stabilising import RiccatiSolution as RiccatiSolution

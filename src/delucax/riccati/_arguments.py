@@ -2,12 +2,22 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_matrix, is_concrete
+from .._check import (
+    as_matrix,
+    check_count,
+    check_definite,
+    check_finite,
+    is_concrete,
+    symmetric_matrix,
+)
+from .._message import shortened
+from .._module import as_float_array
 
 
 class RiccatiData(NamedTuple):
@@ -93,23 +103,6 @@ def riccati_arguments(
     return jax.tree.map(lambda M: M.astype(dtype), given)
 
 
-def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
-    """Raise unless `R`, as far as it can be seen, is positive definite or, if not
-    `definite`, semidefinite."""
-    if not is_concrete(R):
-        return
-    array = np.asarray(R)
-    least, *_ = eigenvalues = np.linalg.eigvalsh(array)
-    rounding = np.finfo(array.dtype).eps * np.max(np.abs(eigenvalues))
-    slack = -rounding if definite else 100 * len(array) * rounding
-    if least < -slack or definite and least <= 0:
-        kind = "definite" if definite else "semidefinite"
-        raise ValueError(
-            f"{where}: {name} must be positive {kind}, got {array}, whose least "
-            f"eigenvalue is {least:.3g}."
-        )
-
-
 def is_complex(*matrices: Array | None) -> bool:
     """Whether any of the matrices is."""
     return any(M is not None and jnp.iscomplexobj(M) for M in matrices)
@@ -125,3 +118,124 @@ def complex_form(M: Array) -> Array:
     n, m = M.shape[0] // 2, M.shape[1] // 2
     upper, lower = M[:n], M[n:]
     return ((upper[:, :m] + lower[:, m:]) + 1j * (lower[:, :m] - upper[:, m:])) / 2
+
+
+_AXES = dict(A="nn", B="nm", D="nk", Q="nn", R="mm", S="nm", d="n", q="n", r="m")
+"""The axes of each argument, an axis being named by its size."""
+
+
+def in_time(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
+    """Each argument with a leading time axis, in one precision. What is `None` is zero.
+
+    The sizes are those of the first argument that has them.
+    """
+    arrays, sizes, steps = {}, {}, {}
+    for name, value in given.items():
+        if value is None:
+            continue
+        array, ndim = as_float_array(value), len(_AXES[name])
+        if name in "QR":
+            is_stack = eqx.is_array(array) and array.ndim == 3
+            array = symmetric_matrix(array, name, where, ndim=3 if is_stack else 2)
+        if not eqx.is_inexact_array(array) or array.ndim not in (ndim, ndim + 1):
+            got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
+            shape = ", ".join(_AXES[name]) + ("," if ndim == 1 else "")
+            raise ValueError(
+                f"{where}: {name} must have shape ({shape}), or that with a leading "
+                f"time axis, got {got}."
+            )
+        check_finite(array, name, where)
+        _check_sizes(where, name, array.shape[array.ndim - ndim :], sizes)
+        if array.ndim > ndim:
+            steps[name] = array.shape[0]
+        arrays[name] = array
+    T, dtype = _length(where, horizon, steps), common_dtype(where, arrays)
+    zero = jnp.zeros((), dtype)
+    shape = lambda name: (T, *(sizes[axis] for axis in _AXES[name]))
+    return {
+        name: jnp.broadcast_to(arrays.get(name, zero).astype(dtype), shape(name))
+        for name in given
+    }
+
+
+def constant_matrices(where: str, **given: Any) -> dict[str, Array]:
+    """The matrices that are given, in one precision, or an error unless they fit each
+    other."""
+    arrays, sizes = {}, {}
+    for name, value in given.items():
+        if value is not None:
+            check = symmetric_matrix if name in "QR" else as_matrix
+            arrays[name] = check(value, name, where)
+            _check_sizes(where, name, arrays[name].shape, sizes)
+    dtype = common_dtype(where, arrays)
+    return {name: array.astype(dtype) for name, array in arrays.items()}
+
+
+def common_dtype(where: str, given: dict[str, Array]):
+    """The real precision that all can be held in."""
+    dtype = jnp.result_type(*given.values())
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise ValueError(f"{where}: {', '.join(given)} must be real, got {dtype}.")
+    return dtype
+
+
+def _check_sizes(where, name, shape, sizes):
+    for axis, size in zip(_AXES[name], shape, strict=True):
+        sizes.setdefault(axis, size)
+    wanted = tuple(sizes[axis] for axis in _AXES[name])
+    if shape != wanted:
+        raise ValueError(
+            f"{where}: {name} must have shape {wanted} to fit the other arguments, "
+            f"got {shape}."
+        )
+    if 0 in shape:
+        raise ValueError(f"{where}: {name} must not be empty, got shape {shape}.")
+
+
+def _length(where, horizon, steps):
+    """The number of steps, on which all that have a time axis must agree."""
+    if horizon is not None:
+        horizon = check_count(horizon, "horizon", where)
+    if len(set(steps.values())) > 1 or 0 in steps.values():
+        raise ValueError(
+            f"{where}: leading time axes must have one length of at least 1, got "
+            f"{steps}."
+        )
+    if not steps:
+        if horizon is None:
+            raise ValueError(
+                f"{where}: horizon must be given where no argument has a time axis."
+            )
+        return horizon
+    name, T = next(iter(steps.items()))
+    if horizon not in (None, T):
+        raise ValueError(
+            f"{where}: horizon must be the length of the time axis of {name} ({T}), "
+            f"got {horizon}."
+        )
+    return T
+
+
+def final_weight(value: Any, A: Array, where: str) -> Array:
+    """The final weight, zero if none is given, or an error."""
+    shape = A.shape[-2:]
+    if value is None:
+        return jnp.zeros(shape, A.dtype)
+    final = symmetric_matrix(value, "final", where)
+    if final.shape != shape:
+        raise ValueError(
+            f"{where}: final must have shape {shape} to fit A, got {final.shape}."
+        )
+    return final.astype(A.dtype)
+
+
+def increasing_times(times: Any, where: str) -> Array:
+    """`times` as an increasing vector of at least two, or an error."""
+    array = as_float_array(times)
+    if not eqx.is_inexact_array(array) or array.ndim != 1 or array.shape[0] < 2:
+        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(times)
+        raise ValueError(f"{where}: times must be at least two numbers, got {got}.")
+    check_finite(array, "times", where)
+    if is_concrete(array) and not np.all(np.diff(np.asarray(array)) > 0):
+        raise ValueError(f"{where}: times must increase, got {array}.")
+    return array

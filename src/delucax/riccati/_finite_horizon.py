@@ -1,4 +1,4 @@
-"""Linear-quadratic control over a finite horizon in discrete time."""
+"""Linear-quadratic control over a finite horizon."""
 
 from typing import Any
 
@@ -8,11 +8,23 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_vector
-from .._results import choose, Result, RESULTS
-from ..math._linear_solve import full_precision, solve
-from ._horizon_arguments import final_weight, in_time, symmetric_stack
-from ._recursion import failed_step, gain, linear_recursion, sanitised, values
-from ._solution import checked
+from .._results import choose, raise_on_failure, Result, RESULTS
+from ..math._linear_solve import full_precision, solve, symmetric
+from ._arguments import (
+    constant_matrices,
+    final_weight,
+    in_time,
+    increasing_times,
+)
+from ._flow import flow_values
+from ._recursion import (
+    failed_step,
+    gain,
+    is_clearly_definite,
+    linear_recursion,
+    sanitised,
+    values,
+)
 
 
 class FiniteHorizonSolution(eqx.Module):
@@ -123,36 +135,24 @@ def dre(
         ```
     """
     where = "dre"
-    Q, R = symmetric_stack(Q, "Q", where), symmetric_stack(R, "R", where)
-    stage = {
-        "A": (A, ("n", "n")),
-        "B": (B, ("n", "m")),
-        "Q": (Q, ("n", "n")),
-        "R": (R, ("m", "m")),
-        "S": (S, ("n", "m")),
-        "d": (d, ("n",)),
-        "q": (q, ("n",)),
-        "r": (r, ("m",)),
-    }
-    stage, _ = in_time(where, horizon, stage)
-    n = stage["A"].shape[-1]
-    dtype = stage["A"].dtype
-    final = final_weight(final, n, where, dtype)
+    stage = in_time(where, horizon, A=A, B=B, Q=Q, R=R, S=S, d=d, q=q, r=r)
+    A = stage["A"]
+    final, n = final_weight(final, A, where), A.shape[-1]
     is_affine = any(v is not None for v in (d, q, r, final_q))
-    if final_q is None:
-        final_q = jnp.zeros(n, dtype)
-    final_q = as_vector(final_q, n, "final_q", where).astype(dtype)
-    solution = _solution(*stage.values(), final, final_q, is_affine, bool(parallel))
-    return checked(solution, where, throw, _first_failure)
-
-
-def _first_failure(solution: FiniteHorizonSolution) -> str:
-    return f"R + B'XB is not positive definite at step {failed_step(solution.X)}."
+    final_q = jnp.zeros(n) if final_q is None else final_q
+    final_q = as_vector(final_q, n, "final_q", where).astype(A.dtype)
+    solution = _discrete_solution(
+        *stage.values(), final, final_q, is_affine, bool(parallel)
+    )
+    step = lambda: (
+        f"R + B'XB is not positive definite at step {failed_step(solution.X)}."
+    )
+    return raise_on_failure(solution, where, throw, facts=step)
 
 
 @eqx.filter_jit
 @full_precision
-def _solution(A, B, Q, R, S, d, q, r, final, final_q, is_affine, parallel):
+def _discrete_solution(A, B, Q, R, S, d, q, r, final, final_q, is_affine, parallel):
     X = values(A, B, Q, R, S, final, 0, parallel)
     good = jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
     A, B, Q, R, S, after = sanitised(good, A, B, Q, R, S, X[1:])
@@ -181,3 +181,127 @@ def _affine(loop, K, B, R, after, d, q, r, final_q, parallel):
     gained = jnp.sum(d * (p[1:] + ahead), axis=1) - jnp.sum(k * push, axis=1)
     s = jnp.cumsum(gained[::-1])[::-1]
     return p, jnp.concatenate([s, jnp.zeros(1, s.dtype)]), k
+
+
+class ContinuousHorizonSolution(eqx.Module):
+    """The optimal control over a finite horizon of continuous time.
+
+    The least cost from state `x` at time `times[i]` is `x'X[i]x`, and the control there
+    is `u = -K[i] x`.
+
+    **Attributes:**
+
+    - `times`: the grid, shape `(N,)`.
+    - `X`: shape `(N, n, n)`, symmetric.
+    - `K`: the gains, shape `(N, m, n)`.
+    - `closed_loop`: the matrices `A - B K`, shape `(N, n, n)`.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
+        B = jnp.array([[0.0], [1.0]])
+        times = jnp.linspace(0.0, 2.0, 21)
+        solution = dlx.riccati.cre(A, B, jnp.eye(2), jnp.eye(1), times=times)
+        solution.X[0], solution.K[0]
+        ```
+    """
+
+    times: Array
+    X: Array
+    K: Array
+    closed_loop: Array
+    result: Result
+
+
+def cre(
+    A: Any,
+    B: Any,
+    Q: Any,
+    R: Any,
+    S: Any = None,
+    *,
+    times: Any,
+    final: Any = None,
+    throw: bool = True,
+) -> ContinuousHorizonSolution:
+    r"""The Riccati differential equation, back from `X(t_1) = final`:
+
+    `-dX/dt = A'X + XA - (XB + S) R^-1 (B'X + S') + Q`.
+
+    The control `u = -K(t) x`, `K = R^-1 (B'X + S')`, minimises the integral of
+    `x'Qx + 2 x'Su + u'Ru` along `dx/dt = A x + B u` up to `t_1`, the last of `times`,
+    plus `x(t_1)' final x(t_1)`.
+
+    It is exact but for rounding, however stiff the equation and coarse the grid: the
+    flow is linear in `[I; X]`, so that it is known over a short time, and intervals are
+    joined, doubling their length each time, in a form that does not grow. It is
+    differentiable to any order, in either mode.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`.
+    - `B`: shape `(n, m)`.
+    - `Q`: state weight, shape `(n, n)`, symmetric.
+    - `R`: control weight, shape `(m, m)`, symmetric, positive definite.
+    - `S`: cross weight, shape `(n, m)`; zero by default.
+    - `times`: where `X` is wanted, increasing, at least two, shape `(N,)`.
+    - `final`: final weight, shape `(n, n)`, symmetric; zero by default.
+    - `throw`: raise if there is no minimum (default); if false, look at `result`.
+
+    **Returns:** a [`delucax.riccati.ContinuousHorizonSolution`][]. It is NaN at the
+    times from which there is no minimum.
+
+    **Raises:** `ValueError` on an argument of the wrong shape, that is not finite or
+    not symmetric, or times that do not increase; an error at run time as `throw` says.
+
+    Source: Davison and Maki, 1973 (the linear flow).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
+        B = jnp.array([[0.0], [1.0]])
+        times = jnp.array([0.0, 100.0])
+        K = dlx.riccati.cre(A, B, jnp.eye(2), jnp.eye(1), times=times).K[0]
+        ```
+    """
+    where = "cre"
+    given = constant_matrices(where, A=A, B=B, Q=Q, R=R, S=S)
+    A, B = given["A"], given["B"]
+    given.setdefault("S", jnp.zeros_like(B))
+    final = final_weight(final, A, where)
+    times = increasing_times(times, where).astype(A.dtype)
+    solution = _continuous_solution(*(given[M] for M in "ABQRS"), final, times)
+    point = lambda: (
+        "There is no solution over the time from point "
+        f"{failed_step(solution.X)} of the grid."
+    )
+    return raise_on_failure(solution, where, throw, facts=point)
+
+
+@eqx.filter_jit
+@full_precision
+def _continuous_solution(A, B, Q, R, S, final, times):
+    definite = is_clearly_definite(R)
+    safe = jnp.where(definite, R, jnp.eye(R.shape[0], dtype=R.dtype))
+    removed = solve(safe, jnp.concatenate([S.T, B.T], axis=1))
+    n = A.shape[0]
+    plain_A, G = A - B @ removed[:, :n], symmetric(B @ removed[:, n:])
+    plain_Q = symmetric(Q - S @ removed[:, :n])
+    X = flow_values(plain_A, G, plain_Q, final, times, False)
+    good = definite & jnp.all(jnp.isfinite(X), axis=(1, 2))
+    known = jnp.where(good[:, None, None], X, 0)
+    K = jax.vmap(lambda X: solve(safe, B.T @ X + S.T))(known)
+    masked = lambda M: jnp.where(good[:, None, None], M, jnp.nan)
+    result = choose(jnp.all(good), RESULTS.successful, RESULTS.infeasible)
+    return ContinuousHorizonSolution(
+        times, masked(known), masked(K), masked(A - B @ K), result
+    )

@@ -29,13 +29,6 @@ def hamiltonian(A, G, Q) -> Array:
     return jnp.block([[A, -G], [-Q, -A.T]])
 
 
-def halvings(H: Array, time: Array) -> Array:
-    """How often to halve `time` until the flow over what is left is near the identity;
-    a whole number."""
-    size = jnp.maximum(2 * jnp.linalg.norm(H) * time, 1)
-    return lax.stop_gradient(jnp.ceil(jnp.log2(size))).astype(jnp.int32)
-
-
 def short_element(H: Float[Array, "_ _"], time: Array) -> tuple[Array, Array, Array]:
     """What `joined` joins, over a time that is short against `H`."""
     n = H.shape[0] // 2
@@ -87,7 +80,9 @@ def elements_to_differentiate(H: Float[Array, "_ _"], times: Float[Array, " N"])
 
 
 def _short_elements(H, times):
-    count = jnp.max(jax.vmap(lambda time: halvings(H, time))(times))
+    # Halved so often, the longest flow is near the identity.
+    sizes = jnp.maximum(2 * jnp.linalg.norm(H) * times, 1)
+    count = jnp.max(lax.stop_gradient(jnp.ceil(jnp.log2(sizes))).astype(jnp.int32))
     count = jnp.minimum(count, _MAX_HALVINGS)
     return count, jax.vmap(lambda time: short_element(H, time))(times * 0.5**count)
 

@@ -1,6 +1,7 @@
 """The stationary H-infinity games."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -8,12 +9,10 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_matrix, check_positive, symmetric_matrix
-from .._message import shortened
-from .._module import as_float_array
-from .._results import choose, Result, RESULTS
+from .._check import check_definite, check_step
+from .._results import choose, raise_on_failure, Result, RESULTS
 from ..math._linear_solve import full_precision
-from ._arguments import check_definite
+from ._arguments import constant_matrices
 from ._game import (
     attached,
     barrier,
@@ -24,9 +23,7 @@ from ._game import (
     sanitised_game,
     solve_game,
 )
-from ._horizon_arguments import check_shapes, common_dtype
-from ._level import bisect_level, Bisection, followed
-from ._solution import checked
+from ._level import Bisection, game_at_level
 from ._spectrum import spectral_abscissa, spectral_radius
 
 
@@ -144,10 +141,8 @@ def hinf_dare(
         ```
     """
     where = "hinf_dare"
-    arguments = checked_game(where, A, B, D, Q, R)
-    gamma, tolerance = checked_level(where, gamma, tolerance, arguments[0].dtype)
-    solution = _solution(True, arguments, gamma, tolerance)
-    return checked(solution, where, throw, level_of)
+    problem = checked_game(where, A, B, D, Q, R)
+    return at_level(_solution, where, True, problem, gamma, tolerance, throw)
 
 
 def hinf_care(
@@ -211,75 +206,52 @@ def hinf_care(
         ```
     """
     where = "hinf_care"
-    arguments = checked_game(where, A, B, D, Q, R)
-    dtype = arguments[0].dtype
-    loose = LOOSE[dtype.itemsize]
-    gamma, tolerance = checked_level(where, gamma, tolerance, dtype, loose)
-    solution = _solution(False, arguments, gamma, tolerance)
-    return checked(solution, where, throw, level_of)
+    problem = checked_game(where, A, B, D, Q, R)
+    return at_level(_solution, where, False, problem, gamma, tolerance, throw)
 
 
-LOOSE = {4: 1e-3, 8: 1e-6}
+_LOOSE = {4: 1e-3, 8: 1e-6}
 """Default tolerance of a level by the bytes of a number, where `X` has a pole at it."""
 
 
-def checked_game(where, A, B, D, Q, R):
+def checked_game(where: str, A: Any, B: Any, D: Any, Q: Any, R: Any) -> tuple:
     """The matrices of a stationary game, in one precision, that fit each other."""
-    given = {name: as_matrix(M, name, where) for name, M in (("A", A), ("B", B))}
-    n = given["A"].shape[0]
-    given["D"] = as_matrix(jnp.eye(n) if D is None else D, "D", where)
-    given["Q"] = symmetric_matrix(Q, "Q", where)
-    given["R"] = symmetric_matrix(R, "R", where)
+    given = constant_matrices(where, A=A, B=B, D=D, Q=Q, R=R)
     check_definite(given["Q"], "Q", where, False)
-    check_shapes(where, given)
-    if D is None:
-        del given["D"]
-    dtype = common_dtype(where, given)
-    given.setdefault("D", jnp.eye(n))
-    return tuple(given[name].astype(dtype) for name in "ABDQR")
+    given.setdefault("D", jnp.eye(len(given["A"]), dtype=given["A"].dtype))
+    return tuple(given[name] for name in "ABDQR")
 
 
-def checked_level(where, gamma, tolerance, dtype, default=None):
-    """The level, or `None`; and the tolerance of the search for it."""
-    values = []
-    for value, name in ((gamma, "gamma"), (tolerance, "tolerance")):
-        if value is None:
-            values.append(None)
-            continue
-        value = as_float_array(value)
-        if not eqx.is_inexact_array(value) or value.ndim != 0:
-            raise ValueError(
-                f"{where}: {name} must be a number, got {shortened(value)}."
-            )
-        check_positive(value, name, where)
-        values.append(value.astype(dtype))
-    gamma, tolerance = values
+def at_level(
+    solution_of: Callable[..., Any],
+    where: str,
+    discrete: bool,
+    problem: tuple,
+    gamma: Any,
+    tolerance: Any,
+    throw: bool,
+) -> Any:
+    """A game at the level that is given, or at the least one to within a tolerance."""
+    dtype = problem[0].dtype
     if tolerance is None:
-        default = 16 * jnp.finfo(dtype).eps if default is None else default
-        tolerance = jnp.asarray(default, dtype)
-    return gamma, tolerance
-
-
-def level_of(solution: Any) -> str:
-    """What to say of a game that is not solved."""
-    return f"Level gamma {float(solution.gamma):.6g}."
+        tolerance = 16 * jnp.finfo(dtype).eps if discrete else _LOOSE[dtype.itemsize]
+    check_step(tolerance, where, "tolerance")
+    if gamma is not None:
+        check_step(gamma, where, "gamma")
+        gamma = jnp.asarray(gamma, dtype)
+    solution = solution_of(discrete, problem, gamma, jnp.asarray(tolerance, dtype))
+    facts = lambda: f"Level gamma {float(solution.gamma):.6g}."
+    return raise_on_failure(solution, where, throw, facts=facts)
 
 
 @eqx.filter_jit
 @full_precision
 def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
-    end, level = bisect_level(
-        functools.partial(solve_game, discrete),
-        problem,
-        game_start(discrete, problem),
-        gamma,
-        tolerance,
-    )
-    if gamma is None:
-        gamma = followed(functools.partial(barrier, discrete), problem, level)
-    else:
-        level = gamma
-    game, level = end.game, jnp.where(level > 0, level, 1)
+    solve = functools.partial(solve_game, discrete)
+    steep = functools.partial(barrier, discrete)
+    start = game_start(discrete, problem)
+    end, level, gamma = game_at_level(solve, steep, problem, start, gamma, tolerance)
+    game = end.game
     X = attached(discrete, problem, level, game)
     safe, X = sanitised_game(game.good, problem, X)
     A, B, *_ = safe

@@ -10,13 +10,12 @@ from jaxtyping import Array
 
 from .._results import choose, Result, RESULTS
 from ..math._linear_solve import full_precision, solve, symmetric
+from ._arguments import final_weight, in_time, increasing_times
 from ._flow import flow_values
 from ._game import inverse_margins, joint, joint_gain, players
-from ._hinfinity import checked_game, checked_level, level_of, LOOSE
-from ._horizon_arguments import checked_times, final_weight, in_time, symmetric_stack
-from ._level import bisect_level, followed, Game
+from ._hinfinity import at_level, checked_game
+from ._level import Game, game_at_level
 from ._recursion import gain, is_clearly_definite, sanitised, values
-from ._solution import checked
 from ._stabilising import shifted
 
 
@@ -125,19 +124,10 @@ def hinf_dre(
     A = jnp.asarray(A) if isinstance(A, list | tuple) else A
     if D is None and eqx.is_array_like(A) and jnp.ndim(A) in (2, 3):
         D = jnp.eye(jnp.shape(A)[-1], dtype=jnp.result_type(A, jnp.float32))
-    stage = {
-        "A": (A, ("n", "n")),
-        "B": (B, ("n", "m")),
-        "D": (D, ("n", "k")),
-        "Q": (symmetric_stack(Q, "Q", where), ("n", "n")),
-        "R": (symmetric_stack(R, "R", where), ("m", "m")),
-    }
-    stage, _ = in_time(where, horizon, stage)
-    n, dtype = stage["A"].shape[-1], stage["A"].dtype
-    final = final_weight(final, n, where, dtype)
-    gamma, tolerance = checked_level(where, gamma, tolerance, dtype)
-    solution = _solution(True, (*stage.values(), final), gamma, tolerance)
-    return checked(solution, where, throw, level_of)
+    stage = in_time(where, horizon, A=A, B=B, D=D, Q=Q, R=R)
+    final = final_weight(final, stage["A"], where)
+    problem = (*stage.values(), final)
+    return at_level(_solution, where, True, problem, gamma, tolerance, throw)
 
 
 def hinf_cre(
@@ -205,14 +195,11 @@ def hinf_cre(
         ```
     """
     where = "hinf_cre"
-    problem = checked_game(where, A, B, D, Q, R)
-    n, dtype = problem[0].shape[0], problem[0].dtype
-    final = final_weight(final, n, where, dtype)
-    times = checked_times(times, where).astype(dtype)
-    loose = LOOSE[dtype.itemsize]
-    gamma, tolerance = checked_level(where, gamma, tolerance, dtype, loose)
-    solution = _solution(False, (*problem, final, times), gamma, tolerance)
-    return checked(solution, where, throw, level_of)
+    A, *others = checked_game(where, A, B, D, Q, R)
+    final = final_weight(final, A, where)
+    times = increasing_times(times, where).astype(A.dtype)
+    problem = (A, *others, final, times)
+    return at_level(_solution, where, False, problem, gamma, tolerance, throw)
 
 
 def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
@@ -252,18 +239,10 @@ def _barrier(discrete: bool, problem: tuple, gamma: Array) -> Array:
 def _solution(discrete: bool, problem, gamma, tolerance) -> HorizonGameSolution:
     A, B, D, Q, R, _, *times = problem
     points = times[0].shape[0] if times else A.shape[0] + 1
-    end, level = bisect_level(
-        functools.partial(_game, discrete),
-        problem,
-        jnp.zeros((points, *A.shape[-2:]), A.dtype),
-        gamma,
-        tolerance,
-    )
-    if gamma is None:
-        gamma = followed(functools.partial(_barrier, discrete), problem, level)
-    else:
-        level = gamma
-    level = jnp.where(level > 0, level, 1)
+    solve = functools.partial(_game, discrete)
+    steep = functools.partial(_barrier, discrete)
+    start = jnp.zeros((points, *A.shape[-2:]), A.dtype)
+    end, level, gamma = game_at_level(solve, steep, problem, start, gamma, tolerance)
     X = _values(discrete, problem, level)
     good = jnp.all(jnp.isfinite(X), axis=(1, 2))
     masked = lambda M: jnp.where(good[:, None, None], M, jnp.nan)

@@ -131,6 +131,24 @@ def bisect_level(
     return end, jnp.where(end.solvable & ~end.affected, 0, level)
 
 
+def game_at_level(
+    solve: Solve,
+    barrier: Callable[[tuple, Array], Array],
+    problem: tuple,
+    start: Array,
+    gamma: Array | None,
+    tolerance: Array,
+) -> tuple[Bisection, Array, Array]:
+    """The game at `gamma`, or at the least level; that level, or 1 if it is 0; and the
+    level as it is, with its derivatives."""
+    end, level = bisect_level(solve, problem, start, gamma, tolerance)
+    if gamma is None:
+        attained = followed(barrier, problem, level)
+    else:
+        attained = level = gamma
+    return end, jnp.where(level > 0, level, 1), attained
+
+
 def _next(now: Bisection) -> Array:
     """Up by factors until feasible, down until not, and then into the middle."""
     known = jnp.where(jnp.isinf(now.high), 1, now.high)

@@ -10,19 +10,54 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_matrix
-from .._results import choose, RESULTS
+from .._results import choose, raise_on_failure, Result, RESULTS
 from ..math._linear_solve import full_precision, no_tangent, solve
 from ._arguments import complex_form, is_complex, real_form, square_matrix
 from ._lyapunov import smith, stable_sylvester
 from ._residual import linear_residual
 from ._search import tolerance
-from ._solution import checked, MatrixSolution
 from ._spectrum import spectral_abscissa
 
 
 _DENSE = 256
 """Up to as many unknowns the equation may be solved as one linear system."""
 _PLAIN, _SHIFTED, _DENSELY, _DONE = range(4)
+
+
+class MatrixSolution(eqx.Module):
+    """What a solver of a linear matrix equation found.
+
+    **Attributes:**
+
+    - `X`: the solution.
+    - `residual`: the norm of the equation's residual over `(|A| + |B|) |X| + |C|`, in
+        discrete time over `(|A| |B| + 1) |X| + |C|`: the relative change of the data
+        that would make `X` exact.
+    - `iterations`: doublings taken.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+
+    `X` is differentiable; where the solve failed, its derivatives are zero.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[-1.0, 1.0], [0.0, -2.0]])
+        solution = dlx.riccati.lyap(A, jnp.eye(2))
+        solution.X, solution.residual
+        ```
+    """
+
+    X: Array
+    residual: Array
+    iterations: Array
+    result: Result
+
+    def _facts(self) -> str:
+        """What an error says of a failure."""
+        return f"Relative residual {float(self.residual):.1e}."
 
 
 def lyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
@@ -64,8 +99,7 @@ def lyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
         covariance = dlx.riccati.lyap(A, jnp.eye(2)).X
         ```
     """
-    A, _, Q = _checked("lyap", A, None, Q, "Q")
-    return checked(_solution(False, A, None, -Q), "lyap", throw)
+    return _equation("lyap", False, A, None, Q, throw)
 
 
 def dlyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
@@ -107,8 +141,7 @@ def dlyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
         covariance = dlx.riccati.dlyap(A, jnp.eye(2)).X
         ```
     """
-    A, _, Q = _checked("dlyap", A, None, Q, "Q")
-    return checked(_solution(True, A, None, Q), "dlyap", throw)
+    return _equation("dlyap", True, A, None, Q, throw)
 
 
 def sylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
@@ -148,8 +181,7 @@ def sylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
         X = dlx.riccati.sylvester(A, B, jnp.ones((2, 1))).X
         ```
     """
-    A, B, C = _checked("sylvester", A, B, C, "C")
-    return checked(_solution(False, A, B, C), "sylvester", throw)
+    return _equation("sylvester", False, A, B, C, throw)
 
 
 def dsylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
@@ -189,12 +221,13 @@ def dsylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
         X = dlx.riccati.dsylvester(A, B, jnp.ones((2, 1))).X
         ```
     """
-    A, B, C = _checked("dsylvester", A, B, C, "C")
-    return checked(_solution(True, A, B, C), "dsylvester", throw)
+    return _equation("dsylvester", True, A, B, C, throw)
 
 
-def _checked(where, A, B, C, name):
-    """The arguments as matrices of one precision that fit each other."""
+def _equation(where, discrete, A, B, C, throw) -> MatrixSolution:
+    """The solution for arguments as a user gives them; without `B` they are those of
+    the Lyapunov equation."""
+    name = "Q" if B is None else "C"
     A, C = square_matrix(A, "A", where), as_matrix(C, name, where)
     B = None if B is None else square_matrix(B, "B", where)
     shape = (A.shape[0], A.shape[0] if B is None else B.shape[0])
@@ -203,7 +236,11 @@ def _checked(where, A, B, C, name):
             f"{where}: {name} must have shape {shape}, got shape {C.shape}."
         )
     dtype = jnp.result_type(*(M for M in (A, B, C) if M is not None))
-    return tuple(None if M is None else M.astype(dtype) for M in (A, B, C))
+    A, C = A.astype(dtype), C.astype(dtype)
+    B = None if B is None else B.astype(dtype)
+    C = -C if B is None and not discrete else C
+    solution = _solution(discrete, A, B, C)
+    return raise_on_failure(solution, where, throw, facts=solution._facts)
 
 
 @eqx.filter_jit

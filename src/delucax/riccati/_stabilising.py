@@ -8,6 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from .._results import raise_on_failure, Result
 from ..math._linear_solve import (
     factorised,
     full_precision,
@@ -22,7 +23,6 @@ from ._lyapunov import lyapunov, stein
 from ._newton import polish
 from ._residual import riccati_residual, stationary
 from ._search import Attempt, Candidate, search, SearchResult, SECOND, weights
-from ._solution import RiccatiSolution
 from ._spectrum import abscissa_and_size, spectral_radius
 from ._start import continuous_start, discrete_start
 from ._units import in_units, units
@@ -32,12 +32,73 @@ _SECOND_START = 1e4
 """How much higher the second start of doubling is than the first."""
 
 
-def stabilising_solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
+class RiccatiSolution(eqx.Module):
+    """What a Riccati solver found, with the facts to judge it by.
+
+    **Attributes:**
+
+    - `X`: the solution, shape `(n, n)`, symmetric.
+    - `K`: the gain of `u = -K x`, shape `(m, n)`; of a filter that of
+        `K (y - C x)`, shape `(n, p)`.
+    - `residual`: the norm of the equation's residual over the sum of the norms of its
+        terms: an upper bound, with rounding of its own evaluation counted.
+    - `closed_loop`: the matrix of `x_next = closed_loop x` (of
+        `dx/dt = closed_loop x`), shape `(n, n)`.
+    - `spectral_radius`: in discrete time, that of `closed_loop`, to about eight digits
+        and from above: the loop is stable if it is below 1. `None` in continuous time.
+    - `iterations`: doublings or steps of the sign iteration taken.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+    - `spectral_abscissa`: in continuous time, the largest real part of an eigenvalue of
+        `closed_loop`, likewise: the loop is stable if it is below 0. `None` in discrete
+        time.
+
+    `X`, `K` and `closed_loop` are differentiable. `residual`, `spectral_radius` and
+    `spectral_abscissa` are measurements and have no gradient. Where the solve failed
+    and the loop is not stable there is nothing to differentiate, and the derivatives
+    are zero, so that they do not spoil a batch.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+        B = jnp.array([[0.0], [1.0]])
+        solution = dlx.riccati.dare(A, B, jnp.eye(2), jnp.eye(1))
+        solution.K, solution.spectral_radius
+        ```
+    """
+
+    X: Array
+    K: Array
+    residual: Array
+    closed_loop: Array
+    spectral_radius: Array | None
+    iterations: Array
+    result: Result
+    spectral_abscissa: Array | None = None
+
+    def _facts(self) -> str:
+        """What an error says of a failure."""
+        radius, abscissa = self.spectral_radius, self.spectral_abscissa
+        name, bound = ("abscissa", abscissa) if radius is None else ("radius", radius)
+        return (
+            f"Relative residual {float(self.residual):.1e}, spectral {name} of the "
+            f"closed loop {float(jnp.asarray(bound)):.6g}."
+        )
+
+
+def stabilising_solution(
+    discrete: bool, data: RiccatiData, where: str, throw: bool
+) -> RiccatiSolution:
     """The solution of an equation with checked data, complex ones in real form."""
-    if not is_complex(*data):
-        return _solution(discrete, data)
-    data = jax.tree.map(real_form, data)
-    return _as_complex(_solution(discrete, data), discrete, data)
+    if is_complex(*data):
+        data = jax.tree.map(real_form, data)
+        solution = _as_complex(_solution(discrete, data), discrete, data)
+    else:
+        solution = _solution(discrete, data)
+    return raise_on_failure(solution, where, throw, facts=solution._facts)
 
 
 @eqx.filter_jit

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float
 
-from ..math._linear_solve import solve, symmetric
+from ..math._linear_solve import factorised, solve, symmetric
 from ..math._size import one_if_zero, relative_and_total_size, size
 from ._arguments import RiccatiData
 from ._lyapunov import MAX_DOUBLINGS
@@ -83,13 +83,7 @@ def _by_sign(A, G, Q, wanted):
     # I - sign(H) = [I; X] M projects onto the stable subspace; H = J'W.
     upper = jnp.concatenate([eye + W[n:, :n], W[n:, n:]], axis=1)
     lower = jnp.concatenate([-W[:n, :n], eye - W[:n, n:]], axis=1)
-    operator, solver = lx.MatrixLinearOperator(upper.T), lx.QR()
-    state = solver.init(operator, {})
-
-    def row(b):
-        return lx.linear_solve(operator, b, solver, state=state, throw=False).value
-
-    return symmetric(jax.vmap(row)(lower)), iterations
+    return symmetric(factorised(upper.T, lx.QR())(lower.T).T), iterations
 
 
 def _by_doubling(A, G, Q, wanted):

@@ -20,9 +20,8 @@ from ...dynamics import AbstractDynamics, LinearDynamics
 from ...math import matvec
 from .._basic import Constant, Linear, Zero
 from .._hinfinity import HInfinity
-from .._lqg import LQG
-from .._lqi import LQI
-from .._lqr import LQR
+from .._lqr import LQI, LQR
+from .._output_feedback import LQG
 
 
 _AFFINE = (Zero, Constant, Linear, LQR, LQI, LQG, HInfinity)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float, Int, PyTree
 
-from ..._check import as_matrix, check_count, check_key, check_step
+from ..._check import as_matrix, check_count, check_instance, check_key, check_step
 from ..._controller import AbstractController, wrong_observation
 from ..._module import function_field, parameter
 from ..._typing import PRNGKey
@@ -108,11 +108,6 @@ class Explore(AbstractController):
         dt: Any = 1.0,
     ):
         where = "Explore"
-        if not callable(build):
-            raise ValueError(
-                f"{where}: build must be a function that makes a controller for linear "
-                f"dynamics, got {type(build).__name__}."
-            )
         self.K = as_matrix(K, "K", where)
         order = self.K.shape[1] if order is None else order
         self.order = check_count(order, "order", where)
@@ -191,11 +186,8 @@ class Explore(AbstractController):
         @eqx.filter_jit
         def design(model):
             controller = self.build(model)
-            if not isinstance(controller, AbstractController):
-                raise ValueError(
-                    "Explore: build must make an AbstractController, got "
-                    f"{type(controller).__name__}."
-                )
+            made = "what build makes"
+            check_instance(controller, AbstractController, made, "Explore")
             return eqx.filter(controller, eqx.is_array), controller.init(key=None)
 
         strong = lambda x: lax.convert_element_type(x, x.dtype)  # noqa: E731

@@ -1,16 +1,23 @@
-"""The gradient perturbation controller."""
+"""Learners whose features are the last values of the signal."""
 
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
+from ..._check import check_count, check_key, check_positive
 from ..._controller import AbstractController
+from ..._module import as_module
+from ..._typing import PRNGKey
 from ...dynamics import AbstractDynamics
-from ._base import base_for
 from ._closed_loop import ClosedLoop
-from ._learner import linear_learner, OnlineLearner
+from ._learner import base_for, linear_learner, OnlineLearner
+from ._optimisers import adagrad_norm
+from ._policy import NetworkPolicy
 
 
 def gpc(
@@ -101,3 +108,153 @@ def gpc(
             f"{dynamics.observation_size} outputs of {dynamics.state_size} states."
         )
     return linear_learner(loop, cost, learning_rate, optimiser, radius, "gpc")
+
+
+def drc(
+    dynamics: AbstractDynamics,
+    cost: Callable[..., Array],
+    *,
+    base: AbstractController | None = None,
+    memory: int = 10,
+    horizon: int | None = None,
+    learning_rate: Any = None,
+    optimiser: optax.GradientTransformation | None = None,
+    radius: Any = None,
+) -> OnlineLearner:
+    """The disturbance response controller, for a state that is not observed,
+
+    `u_t = base(y_t) + sum_{j=0..memory-1} M_j nature_{t-j}`,
+
+    where nature's output, `nature_t = y_t - G(v)_t`, is what the closed loop would have
+    shown had nothing been added to the base's control; `G(v)` is the loop's response to
+    all that was added, saturation included. M follows the gradient of what each step
+    would have cost under it, in the past too: see
+    [`delucax.controllers.OnlineLearner`][]. Its regret against the best fixed M in
+    hindsight grows as `sqrt(T)`.
+
+    With `base` zero it is the gradient response controller; a base such as
+    [`delucax.controllers.LQG`][] makes it as good as that from the start, and right for
+    plants that are not stable by themselves.
+
+    **Arguments:**
+
+    - `dynamics`: the model; linear and time-invariant where the state is not observed.
+    - `cost`: the stage cost, a differentiable function of `(t, y, u)`: of the
+        observation, which is all that is seen.
+    - `base`: a controller that stabilises the dynamics; by default the
+        [`delucax.controllers.LQG`][] for the curvature of the cost and for disturbances
+        and sensor noise of unit covariance ([`delucax.controllers.LQR`][] where the
+        state is observed).
+    - `memory`: the number of outputs, 10 by default.
+    - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
+        1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
+        loop.
+    - `learning_rate`: scales the optimiser's step, of Newton's the longest; by default
+        0.15 over the size of the first response of the output to a unit of control.
+    - `optimiser`: an Optax transformation; [`delucax.controllers.online_newton`][] with
+        a prior of 4 steps by default.
+    - `radius`: M is kept inside this ball in the Frobenius norm; by default 50 over the
+        same size.
+
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
+    has nature's outputs and `theta`, shape `(m, memory p)`, the matrices M side by
+    side.
+
+    **Raises:** `ValueError` if the base does not stabilise the dynamics, does not fit
+    them or cannot be designed, the cost is not a scalar, or a number is out of its
+    range.
+
+    Source: Simchowitz, Singh and Hazan, 2020.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        A, B = jnp.array([[0.9, 0.5], [0.0, 0.9]]), jnp.array([[0.0], [1.0]])
+        C = jnp.array([[1.0, 0.0]])
+        push = dlx.disturbances.Constant(0.3 * jnp.ones(2))
+        cost = dlx.costs.Quadratic(C.T @ C, jnp.eye(1))
+        env = dlx.make("lds", A=A, B=B, C=C, cost=cost, disturbance=push)
+        cost = dlx.costs.Quadratic(jnp.eye(1), jnp.eye(1))  # of what is seen
+        learner = dlx.controllers.drc(env.dynamics, cost)
+        dlx.rollout(env, learner, key=jax.random.key(0), horizon=1000).total_cost
+        ```
+    """
+    memory = check_count(memory, "memory", "drc")
+    base = base_for(dynamics, cost, base, "drc")
+    loop = ClosedLoop(dynamics, base, horizon, "drc", memory=memory, nature=True)
+    return linear_learner(loop, cost, learning_rate, optimiser, radius, "drc")
+
+
+def neural_gpc(
+    dynamics: AbstractDynamics,
+    cost: Callable[..., Array],
+    *,
+    base: AbstractController | None = None,
+    memory: int | None = None,
+    width: int = 32,
+    depth: int = 1,
+    horizon: int | None = None,
+    learning_rate: Any = 1e-3,
+    optimiser: optax.GradientTransformation | None = None,
+    key: PRNGKey,
+) -> OnlineLearner:
+    """A network in place of the matrices of [`delucax.controllers.gpc`][],
+
+    `u_t = base(y_t) + network(s_t, ..., s_{t-memory+1})`,
+
+    where the signal s is the last disturbance if the state is observed, nature's output
+    otherwise. The network starts by adding nothing. There is no bound on its regret;
+    it is for costs and plants that a linear map of the past does not suit.
+
+    **Arguments:**
+
+    - `dynamics`, `cost`, `base`, `memory`, `horizon`: as for
+        [`delucax.controllers.gpc`][] and [`delucax.controllers.drc`][].
+    - `width`, `depth`: of the hidden layers, 32 units in 1 layer by default.
+    - `learning_rate`: scales the optimiser's step, 1e-3 by default.
+    - `optimiser`: an Optax transformation; [`delucax.controllers.adagrad_norm`][] by
+        default.
+    - `key`: a random key, for the first weights.
+
+    **Returns:** a [`delucax.controllers.OnlineLearner`][], whose `theta` are the
+    network's weights.
+
+    **Raises:** `ValueError` as [`delucax.controllers.gpc`][].
+
+    Source: Chen, Minasyan, Lee and Hazan, 2022.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("lds", key=jax.random.key(0))
+        key, run_key = jax.random.split(jax.random.key(0))
+        learner = dlx.controllers.neural_gpc(env.dynamics, env.cost, key=key)
+        dlx.rollout(env, learner, key=run_key).total_cost
+        ```
+    """
+    where = "neural_gpc"
+    base = base_for(dynamics, cost, base, where)
+    loop = ClosedLoop(dynamics, base, horizon, where, memory=memory)
+    check_key(key, where)
+    check_positive(learning_rate, "learning_rate", where)
+    network = eqx.nn.MLP(
+        loop.feature_size,
+        dynamics.control_size,
+        check_count(width, "width", where),
+        check_count(depth, "depth", where),
+        as_module(jnp.tanh),
+        as_module(jax.nn.identity),
+        dtype=loop.dtype,
+        key=key,
+    )
+    last = lambda net: [net.layers[-1].weight, net.layers[-1].bias]
+    network = eqx.tree_at(last, network, [0 * leaf for leaf in last(network)])
+    optimiser = adagrad_norm() if optimiser is None else optimiser
+    return OnlineLearner(loop, cost, NetworkPolicy(network), learning_rate, optimiser)

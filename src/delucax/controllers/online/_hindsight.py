@@ -17,7 +17,7 @@ from ...disturbances import FromArray
 from ...environments import Environment
 from ...math._linear_solve import solve
 from ...simulation import rollout, Trajectory
-from ._fixed import FixedPolicy
+from ._policy import FixedPolicy
 
 
 class Hindsight(NamedTuple):

@@ -13,9 +13,8 @@ from ..._check import check_count
 from ..._controller import AbstractController
 from ..._message import shortened
 from ...dynamics import AbstractDynamics
-from ._base import base_for
 from ._closed_loop import ClosedLoop
-from ._learner import linear_learner, OnlineLearner
+from ._learner import base_for, linear_learner, OnlineLearner
 
 
 def sfc(

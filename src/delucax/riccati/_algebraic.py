@@ -1,0 +1,278 @@
+"""The algebraic Riccati equations of control and of the stationary filter."""
+
+from typing import Any
+
+import equinox as eqx
+
+from .._check import as_matrix
+from ._arguments import riccati_arguments
+from ._stabilising import RiccatiSolution, stabilising_solution
+
+
+def dare(
+    A: Any,
+    B: Any,
+    Q: Any,
+    R: Any,
+    S: Any = None,
+    E: Any = None,
+    *,
+    throw: bool = True,
+) -> RiccatiSolution:
+    r"""The stabilising solution of the discrete-time algebraic Riccati equation,
+
+    `A'XA - E'XE - (A'XB + S) (R + B'XB)^-1 (B'XA + S') + Q = 0`,
+
+    whose gain `K = (R + B'XB)^-1 (B'XA + S')` minimises the sum of
+    `x'Qx + 2 x'Su + u'Ru` over all time along `E x_next = A x + B u`, at cost
+    `(Ex)' X (Ex)` from `x`.
+
+    Structure-preserving doubling, started at a multiple of the identity: the Riccati
+    recursion from a positive final cost, 2, 4, 8, ... steps back. Then Newton steps on
+    the equation itself, if its residual asks for them. It takes products and solves
+    alone, no eigenvalues, which suits accelerators and `jax.vmap`; in a batch, a member
+    that fails harms no other. It is differentiable to any order, in either mode, by the
+    implicit function theorem.
+
+    Where the cost does not see an unstable mode, the stabilising solution is not the
+    cheapest: no control at all would cost less, and the state would grow.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`. Real, or complex, as all others; then `'` is the conjugate
+        transpose.
+    - `B`: shape `(n, m)`.
+    - `Q`: state weight, shape `(n, n)`, symmetric. An indefinite one is accepted.
+    - `R`: control weight, shape `(m, m)`, symmetric, positive semidefinite. May be
+        singular, and zero.
+    - `S`: cross weight, shape `(n, m)`; zero by default.
+    - `E`: descriptor matrix, shape `(n, n)`, invertible; the identity by default.
+    - `throw`: raise unless the solution is found and stabilising (default); if false,
+        look at `result`.
+
+    **Returns:** a [`delucax.riccati.RiccatiSolution`][]. It is successful if the
+    residual, in units of the states that balance the equation, is at most 1e-12 (1e-5
+    in single precision), or up to a hundred times that if rounding of `X` alone may
+    leave it; and if the closed loop is stable: a small residual alone is no
+    certificate. Else `result` is one of `RESULTS.not_stabilisable`, `not_stabilising`
+    (no such solution), `on_boundary` (eigenvalues on the unit circle, or so close that
+    data changed by rounding have no stabilising solution), `not_converged` and
+    `ill_posed`.
+
+    **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
+    symmetric or (`R`) not semidefinite; an error at run time as `throw` says.
+
+    Source: Chu, Fan, Lin and Wang, 2004 (doubling); Benner, 2001 (balancing).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+        B = jnp.array([[0.0], [1.0]])
+        K = dlx.riccati.dare(A, B, jnp.eye(2), jnp.eye(1)).K  # [[0.4221, 1.2439]]
+        ```
+    """
+    data = riccati_arguments("dare", A, B, Q, R, S, E, definite=False)
+    return stabilising_solution(True, data, "dare", throw)
+
+
+def care(
+    A: Any,
+    B: Any,
+    Q: Any,
+    R: Any,
+    S: Any = None,
+    E: Any = None,
+    *,
+    throw: bool = True,
+) -> RiccatiSolution:
+    r"""The stabilising solution of the continuous-time algebraic Riccati equation,
+
+    `A'XE + E'XA - (E'XB + S) R^-1 (B'XE + S') + Q = 0`,
+
+    whose gain `K = R^-1 (B'XE + S')` minimises the integral of
+    `x'Qx + 2 x'Su + u'Ru` over all time along `E dx/dt = A x + B u`, at cost
+    `(Ex)' X (Ex)` from `x`.
+
+    The scaled sign iteration of the Hamiltonian matrix; if that fails, doubling of its
+    Cayley transform. Then Newton steps on the equation itself, if its residual asks for
+    them. It takes products and solves alone, no eigenvalues, which suits accelerators
+    and `jax.vmap`; in a batch, a member that fails harms no other. It is differentiable
+    to any order, in either mode, by the implicit function theorem.
+
+    Where the cost does not see an unstable mode, the stabilising solution is not the
+    cheapest: no control at all would cost less, and the state would grow.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`. Real, or complex, as all others; then `'` is the conjugate
+        transpose.
+    - `B`: shape `(n, m)`.
+    - `Q`: state weight, shape `(n, n)`, symmetric. An indefinite one is accepted.
+    - `R`: control weight, shape `(m, m)`, symmetric, positive definite: with a singular
+        one the control may be an impulse, and there is no such gain.
+    - `S`: cross weight, shape `(n, m)`; zero by default.
+    - `E`: descriptor matrix, shape `(n, n)`, invertible; the identity by default.
+    - `throw`: raise unless the solution is found and stabilising (default); if false,
+        look at `result`.
+
+    **Returns:** a [`delucax.riccati.RiccatiSolution`][] with a `spectral_abscissa`. It
+    is successful if the residual, in units of the states that balance the equation, is
+    at most 1e-12 (1e-5 in single precision), or up to a hundred times that if rounding
+    of `X` alone may leave it; and if the closed loop is stable: a small residual alone
+    is no certificate. Else `result` is one of `RESULTS.not_stabilisable`,
+    `not_stabilising` (no such solution), `on_boundary` (eigenvalues on the imaginary
+    axis, or so close that data changed by rounding have no stabilising solution),
+    `not_converged` and `ill_posed`.
+
+    **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
+    symmetric or (`R`) not definite; an error at run time as `throw` says.
+
+    Source: Roberts, 1971 (sign); Byers, 1987 (scaling); Chu, Fan and Lin, 2005
+    (doubling); Kleinman, 1968 (Newton); Benner, 2001 (balancing).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
+        B = jnp.array([[0.0], [1.0]])
+        K = dlx.riccati.care(A, B, jnp.eye(2), jnp.eye(1)).K  # [[1.0, 1.7321]]
+        ```
+    """
+    data = riccati_arguments("care", A, B, Q, R, S, E, definite=True)
+    return stabilising_solution(False, data, "care", throw)
+
+
+_NAMES = ("A", "C", "W", "V", "S", "E")
+
+
+def filter_dare(
+    A: Any, C: Any, W: Any, V: Any, S: Any = None, *, throw: bool = True
+) -> RiccatiSolution:
+    r"""The stationary covariance of a one-step prediction, in discrete time,
+
+    `A X A' - X - (A X C' + S) (V + C X C')^-1 (C X A' + S') + W = 0`,
+
+    and the gain `K = (A X C' + S) (V + C X C')^-1` of the predictor
+    `x_next = A x + K (y - C x)` of `x_next = A x + w`, `y = C x + v`, where `w` and `v`
+    are white with covariances `W`, `V` and `S = E[w v']`.
+
+    `X` is the covariance of the state given all measurements before it; the gain of the
+    measurement update is `X C' (V + C X C')^-1`. This is the equation of
+    [`delucax.riccati.dare`][] for the transposed system.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`.
+    - `C`: what is measured, shape `(p, n)`.
+    - `W`: covariance of the process noise, shape `(n, n)`, symmetric.
+    - `V`: covariance of the measurement noise, shape `(p, p)`, symmetric, positive
+        semidefinite.
+    - `S`: their cross-covariance, shape `(n, p)`; zero by default.
+    - `throw`: raise unless the solution is found and stabilising (default); if false,
+        look at `result`.
+
+    **Returns:** a [`delucax.riccati.RiccatiSolution`][], with `K` of shape `(n, p)` and
+    `closed_loop = A - K C`, the matrix of the prediction error. Its `result` speaks of
+    the transposed system: `RESULTS.not_stabilisable` means that `(A, C)` is not
+    detectable.
+
+    **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
+    symmetric or (`V`) not semidefinite; an error at run time as `throw` says.
+
+    Source: Kalman, 1960.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.0, 0.1], [0.0, 1.0]])
+        C = jnp.array([[1.0, 0.0]])
+        prediction = dlx.riccati.filter_dare(A, C, 0.01 * jnp.eye(2), jnp.eye(1))
+        prediction.X, prediction.K
+        ```
+    """
+    where = "filter_dare"
+    data = _transposed(where, A, C, W, V, S, definite=False)
+    return _dual(stabilising_solution(True, data, where, throw))
+
+
+def filter_care(
+    A: Any, C: Any, W: Any, V: Any, S: Any = None, *, throw: bool = True
+) -> RiccatiSolution:
+    r"""The stationary covariance of the estimate of the Kalman-Bucy filter,
+
+    `A X + X A' - (X C' + S) V^-1 (C X + S') + W = 0`,
+
+    and the gain `K = (X C' + S) V^-1` of `dx/dt = A x + K (y - C x)`, for
+    `dx/dt = A x + w`, `y = C x + v`, where `w` and `v` are white with intensities `W`,
+    `V` and cross-intensity `S`.
+
+    This is the equation of [`delucax.riccati.care`][] for the transposed system.
+
+    **Arguments:**
+
+    - `A`: shape `(n, n)`.
+    - `C`: what is measured, shape `(p, n)`.
+    - `W`: intensity of the process noise, shape `(n, n)`, symmetric.
+    - `V`: intensity of the measurement noise, shape `(p, p)`, symmetric, positive
+        definite.
+    - `S`: their cross-intensity, shape `(n, p)`; zero by default.
+    - `throw`: raise unless the solution is found and stabilising (default); if false,
+        look at `result`.
+
+    **Returns:** a [`delucax.riccati.RiccatiSolution`][], with `K` of shape `(n, p)` and
+    `closed_loop = A - K C`, the matrix of the estimation error. Its `result` speaks of
+    the transposed system: `RESULTS.not_stabilisable` means that `(A, C)` is not
+    detectable.
+
+    **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
+    symmetric or (`V`) not definite; an error at run time as `throw` says.
+
+    Source: Kalman and Bucy, 1961.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
+        C = jnp.array([[1.0, 0.0]])
+        estimate = dlx.riccati.filter_care(A, C, 0.01 * jnp.eye(2), jnp.eye(1))
+        estimate.X, estimate.K
+        ```
+    """
+    where = "filter_care"
+    data = _transposed(where, A, C, W, V, S, definite=True)
+    return _dual(stabilising_solution(False, data, where, throw))
+
+
+def _transposed(where, A, C, W, V, S, definite):
+    A, C = as_matrix(A, "A", where), as_matrix(C, "C", where)
+    return riccati_arguments(
+        where,
+        A.conj().T,
+        C.conj().T,
+        W,
+        V,
+        S,
+        None,
+        definite=definite,
+        names=_NAMES,
+        dual=True,
+    )
+
+
+def _dual(solution: RiccatiSolution) -> RiccatiSolution:
+    return eqx.tree_at(
+        lambda s: (s.K, s.closed_loop), solution, replace_fn=lambda M: M.conj().T
+    )
