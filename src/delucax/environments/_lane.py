@@ -10,8 +10,7 @@ from .._typing import State, Vector
 from ..costs import Quadratic
 from ..math import cos, sin, wrap
 from ..systems import DynamicBicycle, KinematicBicycle
-from ._task import task
-from ._uniform_state import UniformState
+from ._task import task, UniformState
 
 
 def bicycle_features(x: State) -> Vector:

@@ -1,4 +1,4 @@
-"""What the tasks of a system share: its arguments, its dynamics and their solver."""
+"""What the tasks share: their arguments, dynamics and solver, and where they start."""
 
 import functools
 import inspect
@@ -6,12 +6,61 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import diffrax
+import equinox as eqx
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array
 
-from .._check import check_instance, check_keywords, keywords_of
+from .._check import (
+    as_bounds,
+    check_instance,
+    check_key,
+    check_keywords,
+    check_step,
+    keywords_of,
+)
+from .._module import parameter
+from .._typing import PRNGKey
 from ..dynamics import AbstractDynamics, Discretized
 from ..systems import AbstractSystem
 from ._environment import Environment
-from ._gym import gym_or_solver
+
+
+class UniformState(eqx.Module):
+    """A first state drawn uniformly from a box.
+
+    **Arguments:** `low`, `high`: vectors, the corners of the box.
+
+    **Raises:** `ValueError` if the corners differ in size or `low` is above `high`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        start = dlx.environments.UniformState(-jnp.ones(2), jnp.ones(2))
+        start(jax.random.key(0))
+        ```
+    """
+
+    low: Array = parameter()
+    high: Array = parameter()
+
+    def __init__(self, low: Any, high: Any):
+        self.low = low
+        self.high = high
+
+    def __check_init__(self):
+        size = np.size(self.low)
+        as_bounds((self.low, self.high), "UniformState", "low and high", size)
+
+    def __call__(self, key: PRNGKey) -> Array:
+        """A state drawn with `key`."""
+        check_key(key, "UniformState")
+        unit = jr.uniform(key, self.low.shape, self.low.dtype)
+        return self.low + (self.high - self.low) * unit
 
 
 # What a task observes has its bounds for the task as it is. They are left out where
@@ -111,3 +160,24 @@ def task(
 def _taken(arguments: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
     """Those of `arguments` that are called so, which they no longer hold then."""
     return {name: arguments.pop(name) for name in names if name in arguments}
+
+
+def gym_or_solver(
+    step: functools.partial[AbstractDynamics],
+    solver: diffrax.AbstractSolver | None,
+    substeps: int,
+    where: str,
+) -> AbstractDynamics:
+    """What `step` makes of a system, `dt` and limits, or a solver in its place."""
+    system, dt = step.args
+    check_step(dt, where)
+    if solver is None:
+        if substeps != 1:
+            raise ValueError(f"{where}: substeps needs a solver, such as RK4().")
+        return step()
+    for name in step.keywords:
+        raise ValueError(
+            f"{where}: {name} is of Gym's arithmetic, and no solver has the like; give "
+            f"one of {name} and solver."
+        )
+    return Discretized(system, dt, solver, substeps)
