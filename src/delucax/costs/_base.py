@@ -7,8 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._module import check_parameters, parts_of
+from .._module import as_float_array, check_parameters, parts_of
 from .._typing import Control, RealScalar, State
+from ..systems import AbstractPlant
 
 
 class AbstractCost(eqx.Module):
@@ -52,6 +53,32 @@ class AbstractCost(eqx.Module):
             return None
         first = lambda values: next((a for a in values if a is not None), None)
         return first(x for x, _ in pairs), first(u for _, u in pairs)
+
+    def set_point(self, plant: AbstractPlant) -> tuple[State, Control] | None:
+        """The state and the control to regulate a plant about: the `targets` where they
+        name both, else the equilibrium of the plant, else the one that is named and
+        zeros.
+
+        **Arguments:** `plant`: a system or dynamics.
+
+        **Returns:** `(x, u)`; `None` if neither names one, or they do not fit.
+        """
+        x, u = targets = self.targets or (None, None)
+        if x is None or u is None:
+            try:
+                x, u = plant.equilibrium()
+            except ValueError:
+                if self.targets is None:
+                    return None
+                sizes = plant.state_size, plant.control_size
+                x, u = (
+                    jnp.zeros(size) if at is None else at
+                    for at, size in zip(targets, sizes, strict=True)
+                )
+        x, u = jnp.asarray(as_float_array(x)), jnp.asarray(as_float_array(u))
+        # What does not fit the plant is an error of what uses the point.
+        fits = x.shape == (plant.state_size,) and u.shape == (plant.control_size,)
+        return (x, u) if fits else None
 
     # So that a NumPy number times a cost is left to `__rmul__`.
     __array_ufunc__: ClassVar = None

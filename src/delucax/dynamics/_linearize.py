@@ -6,12 +6,12 @@ from typing import Any, overload
 import jax.numpy as jnp
 
 from .._check import as_vector
+from .._integration import evaluate_field
 from .._jax import jacobian
 from .._message import shortened
 from .._typing import Control, RealScalar, State
 from ..systems import AbstractSystem, LinearSystem
 from ._base import AbstractDynamics
-from ._discretized import evaluate_field
 from ._linear import LinearDynamics
 from ._operating_point import OperatingPoint
 

@@ -6,10 +6,7 @@ from jaxtyping import Array, Float
 
 from .._check import is_concrete
 from .._message import shortened
-from .._module import as_float_array
 from .._results import Result, RESULTS
-from ..costs import AbstractCost
-from ._base import AbstractDynamics
 
 
 class OperatingPoint(eqx.Module):
@@ -56,23 +53,3 @@ class OperatingPoint(eqx.Module):
         if jnp.ndim(good):
             return f"successful: {int(jnp.sum(good))} of {good.size}"
         return "successful" if good else RESULTS[self.result]
-
-
-def operating_point(
-    dynamics: AbstractDynamics, cost: AbstractCost
-) -> tuple[Array, Array] | None:
-    """The state and control to regulate about, if cost or dynamics name them."""
-    n, m = dynamics.state_size, dynamics.control_size
-    targets = cost.targets
-    x, u = (None, None) if targets is None else targets
-    if x is None or u is None:
-        try:
-            x, u = dynamics.equilibrium()
-        except ValueError:
-            if targets is None:
-                return None
-            x = jnp.zeros(n) if x is None else x
-            u = jnp.zeros(m) if u is None else u
-    x, u = jnp.asarray(as_float_array(x)), jnp.asarray(as_float_array(u))
-    # What does not fit the dynamics is an error of the planner, not of its start.
-    return (x, u) if x.shape == (n,) and u.shape == (m,) else None

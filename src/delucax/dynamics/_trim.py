@@ -11,13 +11,14 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_bool, check_finite, check_number, is_concrete
+from .._integration import evaluate_field
 from .._message import shortened
 from .._results import choose, RESULTS
 from .._typing import RealScalar
 from ..math._drift import relative_drift, ULPS, units_of
 from ..systems import AbstractSystem
 from ._base import AbstractDynamics
-from ._discretized import Discretized, evaluate_field
+from ._discretized import Discretized
 from ._linearize import at_point
 from ._operating_point import OperatingPoint
 

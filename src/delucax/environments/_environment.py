@@ -35,9 +35,8 @@ from .._typing import Control, Disturbance, Observation, PRNGKey, State, Time, V
 from ..costs import AbstractCost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics, OperatingPoint, trim
-from ..dynamics._noise import check_noise
-from ..dynamics._operating_point import operating_point
 from ..math import clip
+from ._noise import check_noise
 
 
 class Step(NamedTuple):
@@ -248,7 +247,7 @@ class Environment(eqx.Module):
             dlx.controllers.LQR(env.dynamics, Q, R, point=env.trim(fix="concentration"))
             ```
         """
-        point = operating_point(self.dynamics, self.cost)
+        point = self.cost.set_point(self.dynamics)
         if point is None:
             raise ValueError(
                 "Environment: trim needs a cost with targets or dynamics that name an "

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import check_bool, check_range
+from .._integration import runge_kutta_step
 from .._jax import fence
 from .._module import parameter, positive
 from .._results import Result, RESULTS
 from .._typing import Control, Disturbance, State, Time
 from ..dynamics import AbstractDiscretization, RK4
-from ..dynamics._runge_kutta import runge_kutta_step
 from ..math import clip, wrap
 from ..systems import Acrobot, CartPole, MountainCar, Pendulum
 

@@ -12,6 +12,7 @@ from .._check import check_range, LARGEST
 from .._module import as_float_array
 from .._typing import PRNGKey, State, Vector
 from ..costs import Quadratic
+from ..math._attitude import attitude_difference, unit_attitude
 from ..systems import (
     ConstantWind,
     DissipativeWind,
@@ -19,7 +20,6 @@ from ..systems import (
     Quadrotor,
     VortexWind,
 )
-from ..systems._quadrotors import attitude_difference, unit_attitude
 from ._task import task, UniformState
 
 

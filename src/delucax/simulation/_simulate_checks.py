@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import check_instance, check_positive, is_concrete
+from .._integration import check_adaptive, check_kind
 from .._message import shortened
 from .._module import as_float_array
-from ..dynamics._solvers import check_adaptive, check_kind
 from ..systems import AbstractSystem
 
 

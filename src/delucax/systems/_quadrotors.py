@@ -11,6 +11,7 @@ from .._check import check_choice
 from .._module import function_field, parameter, positive
 from .._typing import Control, Disturbance, State, Time
 from ..math import cos, sin
+from ..math._attitude import attitude_difference, unit_attitude
 from ._base import AbstractSystem
 
 
@@ -255,22 +256,3 @@ class Quadrotor(AbstractSystem):
         if self.inputs == "rotors":
             return x, jnp.stack([weight / 4] * 4)
         return x, jnp.stack([weight, *[jnp.zeros_like(weight)] * 3])
-
-
-def attitude_difference(x: State, x_ref: State) -> State:
-    """`x - x_ref` with the quaternion, entries 3 to 6, of the sign closer to that of
-    `x_ref`; both turn alike."""
-    along = sum(x[i] * x_ref[i] for i in range(3, 7))
-    sign = jnp.where(along < 0, -1.0, 1.0).astype(x.dtype)
-    q = [sign * x[i] - x_ref[i] for i in range(3, 7)]
-    d = x - x_ref
-    return jnp.stack([d[0], d[1], d[2], *q, *(d[i] for i in range(7, 13))])
-
-
-def unit_attitude(x: State) -> State:
-    """`x` with the quaternion, entries 3 to 6, of length 1."""
-    square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5] + x[6] * x[6]
-    # A quaternion of zeros has no direction; it is left, not turned into NaN.
-    scale = jnp.where(square > 0, square, 1.0) ** -0.5
-    q = [scale * x[i] for i in range(3, 7)]
-    return jnp.stack([x[0], x[1], x[2], *q, *(x[i] for i in range(7, 13))])

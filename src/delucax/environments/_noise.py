@@ -2,8 +2,8 @@
 
 import jax
 
+from ..dynamics import AbstractDynamics
 from ..systems import AbstractPlant, AbstractSystem
-from ._base import AbstractDynamics
 
 
 def check_noise(plant: AbstractPlant, where: str) -> None:
