@@ -60,6 +60,10 @@ def _as_start(value: Any) -> Any:
     return as_module(value) if callable(value) else as_float_array(value)
 
 
+def _as_horizon(value: Any) -> int:
+    return check_count(value, "horizon", "Environment")
+
+
 class Environment(eqx.Module):
     """Dynamics, a cost, and what else makes a task of them.
 
@@ -105,50 +109,29 @@ class Environment(eqx.Module):
 
     dynamics: AbstractDynamics
     cost: AbstractCost
-    disturbance: AbstractDisturbance
-    sensor_noise: AbstractDisturbance | None
-    initial_state: Any = eqx.field(converter=_as_start)
-    control_bounds: tuple[Array, Array] | None = bounds_field(
-        "Environment", "control_bounds"
+    # What is None by default follows from the dynamics, in `__post_init__`.
+    disturbance: AbstractDisturbance = eqx.field(default=None)
+    sensor_noise: AbstractDisturbance | None = None
+    initial_state: Any = eqx.field(default=None, converter=_as_start)
+    control_bounds: tuple[Any, Any] | None = bounds_field(
+        "Environment", "control_bounds", default=None
     )
-    horizon: int = eqx.field(static=True)
-    terminated: Callable[[Time, State], Array] | None = function_field()
-    actions: Array | None = parameter()
-    encode: Callable[[Observation], Vector] = function_field()
-    observation_bounds: tuple[Array, Array] | None = bounds_field(
-        "Environment", "observation_bounds"
+    horizon: int = eqx.field(static=True, default=200, converter=_as_horizon)
+    terminated: Callable[[Time, State], Array] | None = function_field(None)
+    actions: Any = parameter(None)
+    encode: Callable[[Observation], Vector] = function_field(None)
+    observation_bounds: tuple[Any, Any] | None = bounds_field(
+        "Environment", "observation_bounds", default=None
     )
 
-    def __init__(
-        self,
-        dynamics: AbstractDynamics,
-        cost: AbstractCost,
-        disturbance: AbstractDisturbance | None = None,
-        sensor_noise: AbstractDisturbance | None = None,
-        initial_state: Any = None,
-        control_bounds: tuple[Any, Any] | None = None,
-        horizon: int = 200,
-        terminated: Callable[[Time, State], Array] | None = None,
-        actions: Any = None,
-        encode: Callable[[Observation], Vector] | None = None,
-        observation_bounds: tuple[Any, Any] | None = None,
-    ):
-        check_instance(dynamics, AbstractDynamics, "dynamics", "Environment")
-        if disturbance is None:
-            disturbance = _default_disturbance(dynamics)
-        if initial_state is None:
-            initial_state = jnp.zeros(dynamics.state_size)
-        self.dynamics = dynamics
-        self.cost = cost
-        self.disturbance = disturbance
-        self.sensor_noise = sensor_noise
-        self.initial_state = initial_state
-        self.control_bounds = control_bounds
-        self.horizon = check_count(horizon, "horizon", "Environment")
-        self.terminated = terminated
-        self.actions = actions
-        self.encode = _identity if encode is None else encode
-        self.observation_bounds = observation_bounds
+    def __post_init__(self):
+        check_instance(self.dynamics, AbstractDynamics, "dynamics", "Environment")
+        if self.disturbance is None:
+            self.disturbance = _default_disturbance(self.dynamics)
+        if self.initial_state is None:
+            self.initial_state = jnp.zeros(self.dynamics.state_size)
+        if self.encode is None:
+            self.encode = _identity
 
     def __check_init__(self):
         where, dynamics = "Environment", self.dynamics

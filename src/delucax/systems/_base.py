@@ -71,6 +71,11 @@ class AbstractPlant(eqx.Module):
         """
         return None if self.disturbance_names else "additive"
 
+    @classmethod
+    def declares_noise(cls) -> bool:
+        """Whether the class itself says how `w` acts, by a `noise` of its own."""
+        return cls.noise is not AbstractPlant.noise
+
     @property
     def observation_size(self) -> int:
         """The size of what `observe` returns."""
@@ -188,17 +193,23 @@ class AbstractSystem(AbstractPlant):
             )
         check_parameters(self)
 
+    @classmethod
+    def declares_noise(cls) -> bool:
+        """Whether the class has a `noise` or a `diffusion` of its own."""
+        own_diffusion = cls.diffusion is not AbstractSystem.diffusion
+        return own_diffusion or cls.noise is not AbstractSystem.noise
+
     @property
     def noise(self) -> Noise:
         """`"brownian"` with a `diffusion`; else `None` with `disturbance_names`, and
         `"additive"` without."""
-        return super().noise if brownian_size(self) is None else "brownian"
+        return super().noise if _brownian_size(self) is None else "brownian"
 
     @property
     def disturbance_size(self) -> int:
         """The size of `w`: that of its Brownian motions or of its names, or of the
         state if there are neither."""
-        motions = brownian_size(self)
+        motions = _brownian_size(self)
         return super().disturbance_size if motions is None else motions
 
     @abc.abstractmethod
@@ -241,9 +252,9 @@ class AbstractSystem(AbstractPlant):
         return None
 
 
-def brownian_size(system: AbstractSystem) -> int | None:
+def _brownian_size(system: AbstractSystem) -> int | None:
     """The number of Brownian motions of `system`; `None` if it has no noise inside."""
-    if type(system).diffusion is AbstractSystem.diffusion:
+    if not system.declares_noise():
         return None
     name, n, names = type(system).__name__, system.state_size, system.disturbance_names
     g = output_of(system.diffusion, (), (n,), (system.control_size,))

@@ -66,13 +66,6 @@ class PlanarQuadrotor(AbstractSystem):
     state_units: ClassVar = ("m", "m", "rad", "m/s", "m/s", "rad/s")
     control_units: ClassVar = ("N", "N")
 
-    def __check_init__(self):
-        if self.wind is not None and not callable(self.wind):
-            raise ValueError(
-                "PlanarQuadrotor: wind must be a function (t, x) -> force, got "
-                f"{self.wind!r}."
-            )
-
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         thrust, lean = (u[0] + u[1]) / self.mass, x[2]
         ax, ay = -thrust * sin(lean), thrust * cos(lean) - self.gravity
