@@ -63,16 +63,11 @@ class UniformState(eqx.Module):
         return self.low + (self.high - self.low) * unit
 
 
-# What a task observes has its bounds for the task as it is. They are left out where
-# one of these is given.
-_CHANGES_OBSERVATIONS = {
-    "disturbance",
-    "dynamics",
-    "encode",
-    "initial_state",
-    "sensor_noise",
-    "terminated",
-}
+_CHANGES_OBSERVATIONS = frozenset(
+    "disturbance dynamics encode initial_state sensor_noise terminated".split()
+)
+"""Arguments of `Environment` with which the task's bounds of observations may not
+hold."""
 
 
 def task(
@@ -108,6 +103,8 @@ def task(
 
     def decorate(added: Callable[..., dict[str, Any]]) -> Callable[..., Environment]:
         where = added.__name__
+        # The first parameter is the system or the dynamics, the others are options.
+        _, *options = inspect.signature(added).parameters.values()
 
         def make(
             system: Any = None,
@@ -119,39 +116,48 @@ def task(
             **others: Any,
         ) -> Environment:
             check_keywords(others, where, make, kind, *arithmetic, Environment)
-            chosen = _taken(others, [p.name for p in options])
+            check_step(dt, where)
+            # Each takes its own of the other arguments; those of Environment are left.
+            chosen = _taken(others, [option.name for option in options])
             special = _taken(others, derived)
             special = {n: v for n, v in special.items() if v is not None}
             constants = _taken(others, keywords_of(kind))
+            limits = {} if gym is None else _taken(others, keywords_of(gym))
+
             if system is None:
                 system = kind(**(constants | arguments(**special)))
             elif special or constants:
                 names = ", ".join([*special, *constants])
                 raise ValueError(f"{where}: give a system or its {names}, not both.")
             check_instance(system, accepts, "system", where)
-            if gym is None:
-                subject = system
-                dynamics = Discretized(system, dt, solver or default_solver, substeps)
-            else:
-                limits = _taken(others, keywords_of(gym))
-                step = functools.partial(gym, system, dt, **limits)
-                subject = dynamics = gym_or_solver(step, solver, substeps, where)
-            fields: dict[str, Any] = dict(dynamics=dynamics, horizon=horizon)
-            fields = fields | added(subject, **chosen) | others
-            if "observation_bounds" not in others:
-                if not _CHANGES_OBSERVATIONS.isdisjoint(others):
-                    fields["observation_bounds"] = None
-            return Environment(**fields)
 
-        # Documentation and the check of keywords read the arguments off the signature.
+            if gym is None or solver is not None:
+                for name in limits:
+                    raise ValueError(
+                        f"{where}: {name} is of Gym's arithmetic, and no solver has "
+                        f"the like; give one of {name} and solver."
+                    )
+                dynamics = Discretized(system, dt, solver or default_solver, substeps)
+            elif substeps != 1:
+                raise ValueError(f"{where}: substeps needs a solver, such as RK4().")
+            else:
+                dynamics = gym(system, dt, **limits)
+
+            fields: dict[str, Any] = dict(dynamics=dynamics, horizon=horizon)
+            fields |= added(system if gym is None else dynamics, **chosen)
+            # Bounds of observations are those of the task as it is.
+            if not _CHANGES_OBSERVATIONS.isdisjoint(others):
+                fields["observation_bounds"] = None
+            return Environment(**(fields | others))
+
+        # Documentation and the check of keywords read the arguments off the signature:
+        # those of `make`, with the options after the system.
         signature = inspect.signature(make)
         system, *rest = signature.parameters.values()
         system = system.replace(annotation=accepts | None)
-        _, *options = inspect.signature(added).parameters.values()
         parameters = [system, *options, *derived.values(), *rest]
-        signature = signature.replace(parameters=parameters)
         functools.update_wrapper(make, added)
-        vars(make)["__signature__"] = signature
+        vars(make)["__signature__"] = signature.replace(parameters=parameters)
         return make
 
     return decorate
@@ -160,24 +166,3 @@ def task(
 def _taken(arguments: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
     """Those of `arguments` that are called so, which they no longer hold then."""
     return {name: arguments.pop(name) for name in names if name in arguments}
-
-
-def gym_or_solver(
-    step: functools.partial[AbstractDynamics],
-    solver: diffrax.AbstractSolver | None,
-    substeps: int,
-    where: str,
-) -> AbstractDynamics:
-    """What `step` makes of a system, `dt` and limits, or a solver in its place."""
-    system, dt = step.args
-    check_step(dt, where)
-    if solver is None:
-        if substeps != 1:
-            raise ValueError(f"{where}: substeps needs a solver, such as RK4().")
-        return step()
-    for name in step.keywords:
-        raise ValueError(
-            f"{where}: {name} is of Gym's arithmetic, and no solver has the like; give "
-            f"one of {name} and solver."
-        )
-    return Discretized(system, dt, solver, substeps)
