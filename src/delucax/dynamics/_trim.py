@@ -19,8 +19,7 @@ from ..math._drift import relative_drift, ULPS, units_of
 from ..systems import AbstractSystem
 from ._base import AbstractDynamics
 from ._discretized import Discretized
-from ._linearize import at_point
-from ._operating_point import OperatingPoint
+from ._linearize import at_point, OperatingPoint
 
 
 _MAX_STEPS = 256
