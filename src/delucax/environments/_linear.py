@@ -4,16 +4,16 @@ from typing import Any
 
 import jax.numpy as jnp
 import jax.random as jr
-import numpy as np
 
 from .._check import (
     check_count,
     check_instance,
     check_key,
     check_keywords,
+    check_number,
     check_positive,
+    check_range,
     check_step,
-    is_concrete,
 )
 from .._module import as_float_array
 from .._typing import PRNGKey
@@ -170,8 +170,7 @@ def lds(
         dynamics = _sampled(system, dt)
     else:
         if (A is None) != (B is None):
-            missing = "A" if A is None else "B"
-            other = "B" if A is None else "A"
+            missing, other = ("A", "B") if A is None else ("B", "A")
             raise ValueError(
                 f"lds: {missing} must be given with {other}, or neither of them."
             )
@@ -223,10 +222,8 @@ def _random(
     check_key(key, "lds")
     n = check_count(states, "states", "lds")
     m = check_count(controls, "controls", "lds")
-    if is_concrete(radius) and not 0 <= radius < np.inf:
-        raise ValueError(
-            f"lds: spectral_radius must be finite and not negative, got {radius}."
-        )
+    check_number(radius, "spectral_radius", "lds")
+    check_range(radius, "spectral_radius", "lds")
     a, b, c = jr.split(key, 3)
     A = jr.normal(a, (n, n))
     A = A * (radius / jnp.max(jnp.abs(jnp.linalg.eigvals(A))))
