@@ -17,7 +17,7 @@ from ..dynamics import Discretized
 from ..math import cos, sin
 from ..systems import Acrobot, Reacher
 from ._gym import GymAcrobot
-from ._task import task, UniformState
+from ._task import Fields, task, UniformState
 
 
 def acrobot_features(x: State) -> Vector:
@@ -57,7 +57,7 @@ def acrobot(
     torque_noise: Any = None,
     goal_height: Any = 1.0,
     disturbance: AbstractDisturbance | None = None,
-) -> dict[str, Any]:
+) -> Fields:
     """Swing the tip of two hanging links above a line, by a torque at the elbow.
 
     State (angle_1, angle_2, velocity_1, velocity_2), hanging at 0; control (torque);
@@ -199,7 +199,7 @@ class _Features(eqx.Module):
 
 
 @task(Reacher, dt=0.01, horizon=200, solver=diffrax.Euler())
-def reacher(system: Reacher, *, goal: Any = (0.0, 1.8)) -> dict[str, Any]:
+def reacher(system: Reacher, *, goal: Any = (0.0, 1.8)) -> Fields:
     """Bring the tip of an arm of two links to a goal.
 
     State (shoulder, elbow, shoulder_rate, elbow_rate); control (shoulder_torque,

@@ -15,7 +15,7 @@ from ..dynamics import Discretized
 from ..math import cos, sin
 from ..systems import CartPole, MountainCar, Pendulum
 from ._gym import GymCartPole, GymMountainCar, GymPendulum
-from ._task import task, UniformState
+from ._task import Fields, task, UniformState
 
 
 def pendulum_features(x: State) -> Vector:
@@ -38,9 +38,7 @@ def pendulum_features(x: State) -> Vector:
 
 
 @task(Pendulum, gym=GymPendulum, dt=0.05, horizon=200)
-def pendulum(
-    dynamics: GymPendulum | Discretized, *, max_torque: Any = 2.0
-) -> dict[str, Any]:
+def pendulum(dynamics: GymPendulum | Discretized, *, max_torque: Any = 2.0) -> Fields:
     """Swing up a pendulum and hold it upright with a torque too weak to lift it at
     once.
 
@@ -109,7 +107,7 @@ def cartpole(
     max_force: Any = 10.0,
     max_position: Any = 2.4,
     max_angle: Any = 12 * 2 * np.pi / 360,
-) -> dict[str, Any]:
+) -> Fields:
     """Keep a pole upright on a cart that a force pushes to and fro.
 
     State (position, velocity, angle, spin), upright at 0; control (force), continuous
@@ -186,7 +184,7 @@ def mountain_car(
     *,
     goal_position: Any = 0.45,
     goal_velocity: Any = 0.0,
-) -> dict[str, Any]:
+) -> Fields:
     """Drive a car out of a valley by rocking it: Gym's MountainCarContinuous-v0.
 
     State (position, velocity); control (push), in +-1. Starts at rest with the position
@@ -250,7 +248,7 @@ def mountain_car_discrete(
     *,
     goal_position: Any = 0.5,
     goal_velocity: Any = 0.0,
-) -> dict[str, Any]:
+) -> Fields:
     """Drive a car out of a valley in the fewest steps: Gym's MountainCar-v0.
 
     As [`delucax.environments.mountain_car`][] with a weaker motor and a farther goal;

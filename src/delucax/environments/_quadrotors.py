@@ -20,7 +20,7 @@ from ..systems import (
     Quadrotor,
     VortexWind,
 )
-from ._task import task, UniformState
+from ._task import Fields, task, UniformState
 
 
 _WINDS: dict[str, Callable[..., Any]] = {
@@ -51,7 +51,7 @@ def _wind(
 
 
 @task(PlanarQuadrotor, dt=0.05, horizon=100, solver=diffrax.Euler(), arguments=_wind)
-def planar_quadrotor(system: PlanarQuadrotor) -> dict[str, Any]:
+def planar_quadrotor(system: PlanarQuadrotor) -> Fields:
     """Fly a planar quadrotor to the origin and hover there.
 
     State (x, y, angle, vx, vy, rate); control (left, right), the thrusts, without
@@ -145,7 +145,7 @@ def quadrotor_features(x: State) -> Vector:
 
 
 @task(Quadrotor, dt=0.02, horizon=250)
-def quadrotor(system: Quadrotor, *, max_thrust: Any = 6.0) -> dict[str, Any]:
+def quadrotor(system: Quadrotor, *, max_thrust: Any = 6.0) -> Fields:
     """Fly a quadrotor to the origin and hover there.
 
     State (position, quaternion, velocity, body rates), 13 entries; control (front,

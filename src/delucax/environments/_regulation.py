@@ -18,13 +18,11 @@ from ..systems import (
     TwoTank,
     VanDerPol,
 )
-from ._task import task, UniformState
+from ._task import Fields, task, UniformState
 
 
 @task(DoubleIntegrator, dt=0.1, horizon=100)
-def double_integrator(
-    system: DoubleIntegrator, *, max_force: Any = 1.0
-) -> dict[str, Any]:
+def double_integrator(system: DoubleIntegrator, *, max_force: Any = 1.0) -> Fields:
     """Bring a mass on a line to rest at the origin.
 
     State (position, velocity); control (force). Starts with the position uniform in
@@ -64,9 +62,7 @@ def double_integrator(
 
 
 @task(MassSpringDamper, dt=0.1, horizon=200)
-def mass_spring_damper(
-    system: MassSpringDamper, *, max_force: Any = 1.0
-) -> dict[str, Any]:
+def mass_spring_damper(system: MassSpringDamper, *, max_force: Any = 1.0) -> Fields:
     """Bring a mass on a spring, or a chain of them, to rest by a force on the last.
 
     State (positions, velocities); control (force). Starts with each state uniform in
@@ -107,7 +103,7 @@ def mass_spring_damper(
 
 
 @task(VanDerPol, dt=0.05, horizon=200)
-def van_der_pol(system: VanDerPol, *, max_control: Any = 3.0) -> dict[str, Any]:
+def van_der_pol(system: VanDerPol, *, max_control: Any = 3.0) -> Fields:
     """Bring van der Pol's oscillator from its limit cycle to rest.
 
     State (x, v); control (u). Starts with each state uniform in +-2. Cost
@@ -147,7 +143,7 @@ def van_der_pol(system: VanDerPol, *, max_control: Any = 3.0) -> dict[str, Any]:
 
 
 @task(Lorenz, dt=0.01, horizon=500)
-def lorenz(system: Lorenz, *, max_control: Any = 50.0) -> dict[str, Any]:
+def lorenz(system: Lorenz, *, max_control: Any = 50.0) -> Fields:
     """Hold Lorenz's chaotic system at the centre of its right wing.
 
     State (x, y, z); control (u). Starts with x and y uniform in +-20 and z in [10, 40].
@@ -188,9 +184,7 @@ def lorenz(system: Lorenz, *, max_control: Any = 50.0) -> dict[str, Any]:
 
 
 @task(TwoTank, dt=2.0, horizon=200)
-def two_tank(
-    system: TwoTank, *, level: Any = 10.0, max_flow: Any = 30.0
-) -> dict[str, Any]:
+def two_tank(system: TwoTank, *, level: Any = 10.0, max_flow: Any = 30.0) -> Fields:
     """Hold the lower of two tanks at a level.
 
     State (upper, lower) [cm]; control (flow) [cm^3/s], not negative. Starts with the
@@ -240,7 +234,7 @@ def cstr(
     concentration: Any = 0.5,
     min_coolant: Any = 280.0,
     max_coolant: Any = 320.0,
-) -> dict[str, Any]:
+) -> Fields:
     """Hold a stirred-tank reactor at its unstable equilibrium.
 
     State (concentration [mol/l], temperature [K]); control (coolant [K]). Starts within
@@ -290,7 +284,7 @@ def cstr(
 @task(PermanentMagnetMotor, dt=0.0005, horizon=200)
 def permanent_magnet_motor(
     system: PermanentMagnetMotor, *, speed: Any = 100.0, max_voltage: Any = 150.0
-) -> dict[str, Any]:
+) -> Fields:
     """Bring a synchronous motor to a speed and hold it.
 
     State (i_d, i_q, speed); control (v_d, v_q), each within +-max_voltage; disturbance
@@ -351,7 +345,7 @@ def _drawn(
 
 
 @task(NeuralSystem, dt=0.05, horizon=100, arguments=_drawn, accepts=AbstractSystem)
-def neural(system: AbstractSystem, *, max_control: Any = 1.0) -> dict[str, Any]:
+def neural(system: AbstractSystem, *, max_control: Any = 1.0) -> Fields:
     """Bring the state of a learned vector field to the origin.
 
     Starts with each state uniform in +-1. Cost `|x|^2 + 0.1 |u|^2` a step. Never

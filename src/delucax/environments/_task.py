@@ -3,7 +3,7 @@
 import functools
 import inspect
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -70,6 +70,10 @@ _CHANGES_OBSERVATIONS = frozenset(
 hold."""
 
 
+Fields: TypeAlias = dict[str, Any]
+"""Arguments of `Environment`, by name."""
+
+
 def task(
     kind: type[AbstractSystem],
     *,
@@ -80,7 +84,7 @@ def task(
     gym: Callable[..., AbstractDynamics] | None = None,
     arguments: Callable[..., dict[str, Any]] = lambda: {},
     accepts: type[AbstractSystem] | None = None,
-) -> Callable[[Callable[..., dict[str, Any]]], Callable[..., Environment]]:
+) -> Callable[[Callable[..., Fields]], Callable[..., Environment]]:
     """A decorator that makes a task of what the task adds to a system.
 
     It decorates a function of the system (with `gym`, of the dynamics) and of options
@@ -101,7 +105,7 @@ def task(
     arithmetic = () if gym is None else (gym,)
     derived = inspect.signature(arguments).parameters
 
-    def decorate(added: Callable[..., dict[str, Any]]) -> Callable[..., Environment]:
+    def decorate(added: Callable[..., Fields]) -> Callable[..., Environment]:
         where = added.__name__
         # The first parameter is the system or the dynamics, the others are options.
         _, *options = inspect.signature(added).parameters.values()
@@ -143,7 +147,7 @@ def task(
             else:
                 dynamics = gym(system, dt, **limits)
 
-            fields: dict[str, Any] = dict(dynamics=dynamics, horizon=horizon)
+            fields: Fields = dict(dynamics=dynamics, horizon=horizon)
             fields |= added(system if gym is None else dynamics, **chosen)
             # Bounds of observations are those of the task as it is.
             if not _CHANGES_OBSERVATIONS.isdisjoint(others):
