@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_finite, symmetric_matrix
+from .._check import as_vector, check_finite, symmetric_matrix
 from .._message import shortened
 from .._module import function_field, parameter
 from .._typing import Control, Matrix, RealScalar, Scalar, State, Vector
@@ -113,12 +113,8 @@ class Quadratic(_AbstractQuadratic):
     def __check_init__(self):
         for name, weight in (("state_target", self.Q), ("control_target", self.R)):
             target = getattr(self, name)
-            size = jnp.shape(weight)[:1]
-            if target is not None and jnp.shape(target) != size:
-                raise ValueError(
-                    f"Quadratic: {name} must have shape {size}, got "
-                    f"{jnp.shape(target)}."
-                )
+            if target is not None and jnp.ndim(weight) > 0:
+                as_vector(target, len(weight), name, "Quadratic")
 
     @property
     def targets(self) -> tuple[Array | None, Array | None]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_finite, check_number, check_range, LARGEST
+from .._check import as_vector, check_finite, check_number, check_range, LARGEST
 from .._module import parameter
 from .._typing import BoolScalar, State, Time, Vector
 from ..costs import AbstractCost, Arrival
@@ -166,10 +166,7 @@ class ReacherCost(AbstractCost):
     torque_weight: Array = parameter(0.1)
 
     def __check_init__(self):
-        if jnp.shape(self.goal) != (2,):
-            raise ValueError(
-                f"ReacherCost: goal must have shape (2,), got {jnp.shape(self.goal)}."
-            )
+        as_vector(self.goal, 2, "goal", "ReacherCost")
         check_finite(self.goal, "goal", "ReacherCost")
 
     def offset(self, x: Array) -> Array:
