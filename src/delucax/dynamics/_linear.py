@@ -59,7 +59,7 @@ class LinearDynamics(AbstractDynamics):
     B: Float[Array, "*T n m"] = parameter()
     C: Float[Array, "p n"] | None = parameter(None)
     E: Float[Array, "*T n k"] | None = parameter(None)
-    dt: Array = parameter(1.0)
+    dt: Any = parameter(1.0)
     x_ref: Float[Array, "*T n"] = parameter(None)
     u_ref: Float[Array, "*T m"] = parameter(None)
     x_next: Float[Array, "*T n"] = parameter(None)

@@ -273,31 +273,30 @@ class Environment(eqx.Module):
 
         **Returns:** shape `(m,)`.
         """
-        given = u
         try:
-            u = jnp.asarray(u)
+            control = jnp.asarray(u)
         except (TypeError, ValueError):  # no number, or ragged
             raise ValueError(
                 "Environment: u (the control) must have shape "
-                f"({self.control_size},), got {shortened(given)}."
+                f"({self.control_size},), got {shortened(u)}."
             ) from None
-        check_real(u, "u (the control)", "Environment")
-        if self.actions is not None and jnp.issubdtype(jnp.result_type(u), jnp.integer):
-            if jnp.ndim(u) != 0:
+        check_real(control, "u (the control)", "Environment")
+        if self.actions is not None and jnp.issubdtype(control.dtype, jnp.integer):
+            if control.ndim != 0:
                 raise ValueError(
                     "Environment: u must be one integer action (a scalar) or a control "
-                    f"of shape ({self.control_size},), got shape {jnp.shape(u)}."
+                    f"of shape ({self.control_size},), got shape {control.shape}."
                 )
             count = len(self.actions)
-            if is_concrete(u) and not 0 <= int(u) < count:
+            if is_concrete(control) and not 0 <= int(control) < count:
                 raise ValueError(
                     f"Environment: u must be an action from 0 to {count - 1}, got {u}."
                 )
-            u = self.actions[u]
+            control = self.actions[control]
         if self.control_bounds is None:
-            return u
+            return control
         low, high = self.control_bounds
-        return clip(u, low, high).astype(u.dtype)
+        return clip(control, low, high).astype(control.dtype)
 
     def step(
         self, t: Time, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None
