@@ -158,6 +158,8 @@ class _Chord(diffrax.VeryChord):
     shorter step. Fixed steps have none, so this one goes on while it contracts.
     """
 
+    atol: Any  # one for each entry, where Diffrax has a number for all
+
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
         size = state.diffsize  # of the last change, in units of the tolerance
