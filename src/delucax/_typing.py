@@ -1,8 +1,8 @@
 """Array aliases shared by every signature."""
 
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TYPE_CHECKING, TypeAlias
 
-from jaxtyping import Array, Bool, Float, Key, Num, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, Key, Num, UInt32
 
 
 RealScalar: TypeAlias = Num[Array, ""] | int | float
@@ -24,3 +24,18 @@ PRNGKey: TypeAlias = Key[Array, "..."] | UInt32[Array, "... 2"]
 """A key from `jax.random.key` (or the older `jax.random.PRNGKey`)."""
 Checkpoint: TypeAlias = Literal["step", "sqrt"] | None
 """What the gradient of a rollout stores."""
+
+
+if TYPE_CHECKING:
+
+    class Real:
+        """A field that is set to a number or an array, and is an array to its readers.
+
+        A static checker reads off `__set__` what the constructor takes.
+        """
+
+        def __get__(self, instance: Any, owner: Any = None) -> Array: ...
+        def __set__(self, instance: Any, value: ArrayLike) -> None: ...
+
+else:
+    Real = Array

@@ -163,12 +163,14 @@ def test_saturated_controls_are_scored_as_drawn():
 
 
 def test_a_score_stops_where_the_episode_does():
-    loss = scored_cost(environment(terminated=lambda t, x: t > 1.5))  # two steps
+    env = environment(terminated=lambda t, x: t > 1.5)  # two steps
+    loss = scored_cost(env)
     slope = eqx.filter_jit(
         jax.grad(lambda model: loss(model, jr.key(0))[1]["log_prob"])
     )(Recalling()).log_std
     # Each step adds e^2 - 1 to the slope in log_std; drawn again here from the key.
-    _, key = Recalling().init(key=jr.split(jr.key(0))[1])
+    *_, key = env.split_key(jr.key(0))
+    _, key = Recalling().init(key=key)
     total = 0.0
     for _ in range(2):
         key, now = jr.split(key)

@@ -17,7 +17,8 @@ def by_lanes(function: Callable[..., Any], *args: Any) -> Any:
     worst, and a sixth at best. Accelerators run the batch as one.
     """
     # What a cost or a constraint of the user's closes over is batched with the rest.
-    closed = eqx.filter_closure_convert(function, *args)
+    # Equinox looks into functions with a closure alone, such as this lambda.
+    closed = eqx.filter_closure_convert(lambda *args: function(*args), *args)
     arrays, static = eqx.partition((closed, args), eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
 

@@ -21,6 +21,7 @@ from .._check import (
 from .._controller import AbstractController, wrong_observation
 from .._message import shortened
 from .._module import as_float_array, as_module, parameter, positive, weight
+from .._typing import Real
 from ..math import clip, matvec
 
 
@@ -160,19 +161,19 @@ class PID(AbstractController):
         ```
     """
 
-    kp: Array = weight()
-    ki: Array = weight(0.0)
-    kd: Array = weight(0.0)
+    kp: Real = weight()
+    ki: Real = weight(0.0)
+    kd: Real = weight(0.0)
     _: KW_ONLY
-    dt: Array = parameter(constraint=positive)
+    dt: Real = parameter(constraint=positive)
     reference: Array | Callable[[Any], Array] | None = parameter(None)
-    output: Callable[[Array], Array] | None = _output_field()
+    output: Callable[[Array], Array] | int | Sequence[int] | None = _output_field()
     bounds: tuple[Array, Array] | None = bounds_field("PID", default=None)
-    derivative_time_constant: Array | None = parameter(None)
+    derivative_time_constant: Real | None = parameter(None)
     derivative_on: Literal["measurement", "error"] = eqx.field(
         default="measurement", static=True
     )
-    anti_windup_time: Array | None = parameter(None, constraint=positive)
+    anti_windup_time: Real | None = parameter(None, constraint=positive)
 
     _times: ClassVar = ("derivative_time_constant", "anti_windup_time")
 
@@ -273,14 +274,14 @@ class LeakyPID(AbstractController):
         ```
     """
 
-    kp: Array = weight(3.0)
-    ki: Array = weight(4.0)
-    kd: Array = weight(0.0)
+    kp: Real = weight(3.0)
+    ki: Real = weight(4.0)
+    kd: Real = weight(0.0)
     _: KW_ONLY
-    dt: Array = parameter(constraint=positive)
-    time_constant: Array = parameter(0.5, constraint=positive)
+    dt: Real = parameter(constraint=positive)
+    time_constant: Real = parameter(0.5, constraint=positive)
     reference: Array | Callable[[Any], Array] | None = parameter(None)
-    output: Callable[[Array], Array] | None = _output_field()
+    output: Callable[[Array], Array] | int | Sequence[int] | None = _output_field()
     bounds: tuple[Array, Array] | None = bounds_field("LeakyPID", default=None)
 
     _times: ClassVar = ("time_constant",)

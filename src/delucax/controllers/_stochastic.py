@@ -21,7 +21,7 @@ from .._controller import (
 )
 from .._message import shortened
 from .._module import parameter, weight
-from .._typing import PRNGKey, RealScalar
+from .._typing import PRNGKey, Real, RealScalar
 from ..math import clip
 from ..simulation import Trajectory
 
@@ -93,7 +93,7 @@ class Gaussian(_AroundBase):
     """
 
     base: AbstractController
-    log_std: Float[Array, "..."] = weight()
+    log_std: Real = weight()
     _: KW_ONLY
     bounds: tuple[Array, Array] | None = bounds_field("Gaussian", default=None)
 

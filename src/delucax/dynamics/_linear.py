@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from .._check import as_matrix, check_matrices, check_real, checked_names, is_concrete
 from .._module import as_float_array, parameter
 from .._results import RESULTS
+from .._typing import Real
 from ..math import matvec
 from ..math._steps import row_at, step_at
 from ._base import AbstractDynamics
@@ -59,7 +60,7 @@ class LinearDynamics(AbstractDynamics):
     B: Float[Array, "*T n m"] = parameter()
     C: Float[Array, "p n"] | None = parameter(None)
     E: Float[Array, "*T n k"] | None = parameter(None)
-    dt: Any = parameter(1.0)
+    dt: Real = parameter(1.0)
     x_ref: Float[Array, "*T n"] = parameter(None)
     u_ref: Float[Array, "*T m"] = parameter(None)
     x_next: Float[Array, "*T n"] = parameter(None)

@@ -83,10 +83,11 @@ def balloon_lung(
     **Arguments:**
 
     - `system`: a [`delucax.lung.BalloonLung`][]; made of `options` by default.
+    - `horizon`: steps an episode, 100 by default.
     - `**options`: arguments of the lung; the control interval `dt` (0.03 by default),
         `solver` and `substeps` of [`delucax.Discretized`][]; `waveform`,
-        `sensor_delay`, `noise`, `horizon` and others of
-        [`delucax.lung.ventilation`][]; those of [`delucax.Environment`][].
+        `sensor_delay`, `noise` and others of [`delucax.lung.ventilation`][]; those of
+        [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -123,6 +124,7 @@ def delay_lung(
 
     - `system`: a [`delucax.lung.DelayLung`][]; made of `options` by default.
     - `delay`: steps until a control acts, 5 by default.
+    - `horizon`: steps an episode, 100 by default.
     - `**options`: as of `lung/balloon_lung`; `substeps` is 4 by default, because air
         rushes out of the pipe in some 25 ms.
 
@@ -157,6 +159,7 @@ def single_compartment(
     **Arguments:**
 
     - `system`: a [`delucax.lung.SingleCompartment`][]; made of `options` by default.
+    - `horizon`: steps an episode, 100 by default.
     - `**options`: as of `lung/balloon_lung`.
 
     **Returns:** an [`delucax.Environment`][].
@@ -186,6 +189,7 @@ def double_compartment(
     **Arguments:**
 
     - `system`: a [`delucax.lung.DoubleCompartment`][]; made of `options` by default.
+    - `horizon`: steps an episode, 100 by default.
     - `**options`: as of `lung/balloon_lung`; `sensor_delay` is 2 steps and `noise`
         0.2 cmH2O by default, and `substeps` is 2, because with the expiratory valve
         open the fast compartment of a narrow lung is empty within some 10 ms.
@@ -221,8 +225,9 @@ def learned_lung(
         library, learned from breaths of the task `lung/double_compartment`; its sensor
         is two samples late, and so is its pressure. In the repository,
         `python -m benchmarks.learned_lung` makes it.
-    - `**options`: `waveform`, `noise`, `horizon` and others of
-        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
+    - `horizon`: steps an episode, 100 by default.
+    - `**options`: `waveform`, `noise` and others of [`delucax.lung.ventilation`][] and
+        [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from .._check import is_concrete
 from .._module import bounded, parameter, positive
-from .._typing import RealScalar, Scalar, State
+from .._typing import Real, RealScalar, Scalar, State
 from ..systems import AbstractSystem
 from ._valves import Valves
 
@@ -148,8 +148,8 @@ class SingleCompartment(_AbstractCompartment):
         ```
     """
 
-    resistance: Array = parameter(20.0, constraint=positive)
-    compliance: Array = parameter(20.0, constraint=positive)
+    resistance: Real = parameter(20.0, constraint=positive)
+    compliance: Real = parameter(20.0, constraint=positive)
     valves: Valves = Valves()
 
     def elastic_pressure(self, volume: Array) -> Array:
@@ -199,11 +199,11 @@ class DoubleCompartment(AbstractLung):
         ```
     """
 
-    resistance: Array = parameter(20.0, constraint=positive)
-    compliance: Array = parameter(20.0, constraint=positive)
-    central: Array = parameter(0.3, constraint=bounded(0, 1))
-    share: Array = parameter(0.1, constraint=bounded(0, 1))
-    imbalance: Array = parameter(10.0, constraint=positive)
+    resistance: Real = parameter(20.0, constraint=positive)
+    compliance: Real = parameter(20.0, constraint=positive)
+    central: Real = parameter(0.3, constraint=bounded(0, 1))
+    share: Real = parameter(0.1, constraint=bounded(0, 1))
+    imbalance: Real = parameter(10.0, constraint=positive)
     valves: Valves = Valves()
 
     state_names: ClassVar = ("inflow", "opening", "fast", "slow")
@@ -285,9 +285,9 @@ class BalloonLung(_AbstractCompartment):
         ```
     """
 
-    resistance: Array = parameter(20.0, constraint=positive)
-    stiffness: Array = parameter(40.0, constraint=positive)
-    rest: Array = parameter(1.5, constraint=positive)
+    resistance: Real = parameter(20.0, constraint=positive)
+    stiffness: Real = parameter(40.0, constraint=positive)
+    rest: Real = parameter(1.5, constraint=positive)
     valves: Valves = Valves()
 
     def elastic_pressure(self, volume: Array) -> Array:
@@ -331,10 +331,10 @@ class DelayLung(AbstractLung):
         ```
     """
 
-    resistance: Array = parameter(20.0, constraint=positive)
-    stiffness: Array = parameter(40.0, constraint=positive)
-    rest: Array = parameter(1.5, constraint=positive)
-    pipe: Array = parameter(5.0, constraint=positive)
+    resistance: Real = parameter(20.0, constraint=positive)
+    stiffness: Real = parameter(40.0, constraint=positive)
+    rest: Real = parameter(1.5, constraint=positive)
+    pipe: Real = parameter(5.0, constraint=positive)
     valves: Valves = Valves()
 
     state_names: ClassVar = ("inflow", "opening", "pipe", "volume")

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from .._check import check_count
 from .._module import parameter, positive
-from .._typing import Control, Disturbance, State, Time
+from .._typing import Control, Disturbance, Real, State, Time
 from ._base import AbstractSystem
 
 
@@ -89,9 +89,9 @@ class MassSpringDamper(AbstractSystem):
         ```
     """
 
-    mass: Array = parameter(1.0, constraint=positive)
-    stiffness: Array = parameter(1.0)
-    damping: Array = parameter(0.1)
+    mass: Real = parameter(1.0, constraint=positive)
+    stiffness: Real = parameter(1.0)
+    damping: Real = parameter(0.1)
     _: KW_ONLY
     masses: int = eqx.field(static=True, default=1, converter=_as_count)
 

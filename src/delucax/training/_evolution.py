@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import optax
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .._check import check_count, check_key
 from .._module import check_parameters, parameter, positive
-from .._typing import PRNGKey
+from .._typing import PRNGKey, Real
 from ._loss import cost_and_metrics
 from ._trainable import weights_of
 
@@ -66,7 +66,7 @@ class EvolutionStrategies(eqx.Module):
         ```
     """
 
-    sigma: Array = parameter(constraint=positive)
+    sigma: Real = parameter(constraint=positive)
     samples: int = eqx.field(static=True)
     antithetic: bool = eqx.field(static=True, default=True)
 

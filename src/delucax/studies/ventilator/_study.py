@@ -115,7 +115,7 @@ def lung_study(
     if recorded is None:
         around = [size.between[i % len(size.between)] for i in range(len(lungs))]
         envs, others = (
-            lung.stack([fitting.task_of(*e, sensor_delay) for e in each])
+            lung.stack([fitting.task_of(R, C, sensor_delay) for R, C in each])
             for each in (lungs, around)
         )
         between = others, [_lung_name(*each) for each in size.between]
