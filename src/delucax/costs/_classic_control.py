@@ -1,13 +1,12 @@
 """Costs of Gym's classic control, and smooth ones in their place."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._module import function_field, parameter
-from .._typing import Control, RealScalar, Scalar, State
+from .._typing import Control, Real, RealScalar, Scalar, State
 from ..math import cos, wrap
 from ._base import AbstractCost
 
@@ -40,22 +39,10 @@ class Arrival(AbstractCost):
         ```
     """
 
-    reached: Callable[[RealScalar, Array], Array] | None = function_field()
-    step_cost: Array = parameter()
-    control_weight: Array = parameter()
-    arrival_cost: Array = parameter()
-
-    def __init__(
-        self,
-        reached: Callable[[RealScalar, Array], Array] | None = None,
-        step_cost: Any = 1.0,
-        control_weight: Any = 0.0,
-        arrival_cost: Any = 0.0,
-    ):
-        self.reached = reached
-        self.step_cost = step_cost
-        self.control_weight = control_weight
-        self.arrival_cost = arrival_cost
+    reached: Callable[[RealScalar, Array], Array] | None = function_field(None)
+    step_cost: Real = parameter(1.0)
+    control_weight: Real = parameter(0.0)
+    arrival_cost: Real = parameter(0.0)
 
     def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
         effort = self.control_weight * sum(part * part for part in tuple(u))
