@@ -20,7 +20,7 @@ from .._check import (
     keywords_of,
 )
 from .._module import parameter
-from .._typing import PRNGKey, Real
+from .._typing import PRNGKey
 from ..dynamics import AbstractDynamics, Discretized
 from ..systems import AbstractSystem
 from ._environment import Environment
@@ -45,8 +45,12 @@ class UniformState(eqx.Module):
         ```
     """
 
-    low: Real = parameter()
-    high: Real = parameter()
+    low: Array = parameter()
+    high: Array = parameter()
+
+    def __init__(self, low: Any, high: Any):
+        self.low = low
+        self.high = high
 
     def __check_init__(self):
         size = np.size(self.low)
