@@ -34,7 +34,7 @@ from benchmarks._machine import describe, limit_cores
 from benchmarks._plans import TO_GO
 from benchmarks._results import updated
 from benchmarks.planning import PEERS, Worker
-from delucax.dynamics._wrapper import AbstractWrapper
+from delucax.dynamics import AbstractWrapper
 
 
 RESULTS = Path(__file__).parent / "results" / "reactor.json"

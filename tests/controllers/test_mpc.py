@@ -11,7 +11,7 @@ from helpers import assert_close, needs_x64, once, thorough, user_error
 from hypothesis import settings, strategies as st
 
 import delucax as dlx
-from delucax.dynamics._wrapper import AbstractWrapper
+from delucax.dynamics import AbstractWrapper
 
 
 MPC = dlx.controllers.MPC

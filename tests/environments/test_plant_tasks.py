@@ -303,7 +303,7 @@ FLOW = dlx.systems.LinearSystem(jnp.eye(1), jnp.eye(1))
         ),
         ("planar_quadrotor", dict(wind_strength=1.0), "needs a wind that is named"),
         ("planar_quadrotor", dict(mass=0.0), "mass must be positive"),
-        ("reacher", dict(goal=[1.0]), r"goal must have shape \(2,\), got \(1,\)"),
+        ("reacher", dict(goal=[1.0]), r"goal must have shape \(2,\), got shape \(1,\)"),
         ("reacher", dict(goal=[1.0, np.nan]), "goal must be finite"),
         ("two_tank", dict(level=-1.0), "level must be at least 0"),
         ("cstr", dict(concentration=-0.1), "concentration must be positive"),

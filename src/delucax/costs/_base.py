@@ -1,14 +1,25 @@
-"""Stage and final costs."""
+"""Stage and final costs, and costs made of functions and of other costs."""
 
 import abc
+import functools
+import operator
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._module import check_parameters, parts_of
+from .._check import check_instance, check_number, check_step
+from .._module import (
+    as_float_array,
+    check_parameters,
+    function_field,
+    parameter,
+    parts_of,
+)
 from .._typing import Control, RealScalar, State
+from ..systems import AbstractPlant
 
 
 class AbstractCost(eqx.Module):
@@ -53,11 +64,37 @@ class AbstractCost(eqx.Module):
         first = lambda values: next((a for a in values if a is not None), None)
         return first(x for x, _ in pairs), first(u for _, u in pairs)
 
+    def set_point(self, plant: AbstractPlant) -> tuple[State, Control] | None:
+        """The state and the control to regulate a plant about: the `targets` where they
+        name both, else the equilibrium of the plant, else the one that is named and
+        zeros.
+
+        **Arguments:** `plant`: a system or dynamics.
+
+        **Returns:** `(x, u)`; `None` if neither names one, or they do not fit.
+        """
+        x, u = targets = self.targets or (None, None)
+        if x is None or u is None:
+            try:
+                x, u = plant.equilibrium()
+            except ValueError:
+                if self.targets is None:
+                    return None
+                sizes = plant.state_size, plant.control_size
+                x, u = (
+                    jnp.zeros(size) if at is None else at
+                    for at, size in zip(targets, sizes, strict=True)
+                )
+        x, u = jnp.asarray(as_float_array(x)), jnp.asarray(as_float_array(u))
+        # What does not fit the plant is an error of what uses the point.
+        fits = x.shape == (plant.state_size,) and u.shape == (plant.control_size,)
+        return (x, u) if fits else None
+
     # So that a NumPy number times a cost is left to `__rmul__`.
     __array_ufunc__: ClassVar = None
 
     def __add__(self, other: "AbstractCost") -> "AbstractCost":
-        from ._compose import Sum
+        from ._base import Sum
 
         if not isinstance(other, AbstractCost):
             return NotImplemented
@@ -68,7 +105,7 @@ class AbstractCost(eqx.Module):
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
     def __mul__(self, factor: Any) -> "AbstractCost":
-        from ._compose import Scaled
+        from ._base import Scaled
 
         if isinstance(factor, AbstractCost):
             return NotImplemented
@@ -94,3 +131,141 @@ class AbstractCost(eqx.Module):
         """
         del t
         return jnp.zeros((), x.dtype)
+
+
+class Function(AbstractCost):
+    """A cost from functions.
+
+    **Arguments:**
+
+    - `stage`: `(t, x, u) -> scalar`.
+    - `final_cost`: `(t, x) -> scalar`; zero by default.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        cost = dlx.costs.Function(lambda t, x, u: jnp.sum(x**2) + jnp.sum(u**2))
+        cost(0.0, jnp.ones(2), jnp.zeros(1))
+        ```
+    """
+
+    stage: Callable[[RealScalar, Array, Array], Array] = function_field()
+    final_cost: Callable[[RealScalar, Array], Array] | None = function_field(None)
+
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
+        return self.stage(t, x, u)
+
+    def final(self, t: RealScalar, x: State) -> Array:
+        if self.final_cost is None:
+            return super().final(t, x)
+        return self.final_cost(t, x)
+
+
+class Sum(AbstractCost):
+    """The sum of several costs, `c_1(t, x, u) + ... + c_n(t, x, u)`, and of their final
+    costs. `cost + other` makes it.
+
+    **Arguments:** `*terms`: the costs, at least one.
+
+    **Raises:** `ValueError` if there are none, or if one is no cost.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        effort = dlx.costs.Function(lambda t, x, u: jnp.sum(jnp.abs(u)))
+        cost = dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1)) + 0.1 * effort
+        cost(0.0, jnp.ones(2), jnp.ones(1))
+        ```
+    """
+
+    terms: tuple[AbstractCost, ...]
+
+    def __init__(self, *terms: AbstractCost):
+        self.terms = terms
+
+    def __check_init__(self):
+        if not self.terms:
+            raise ValueError("Sum: at least one cost must be given.")
+        for term in self.terms:
+            check_instance(term, AbstractCost, "every term", "Sum")
+
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
+        return functools.reduce(operator.add, (c(t, x, u) for c in self.terms))
+
+    def final(self, t: RealScalar, x: State) -> Array:
+        return functools.reduce(operator.add, (c.final(t, x) for c in self.terms))
+
+
+class Scaled(AbstractCost):
+    """A cost times a number, `factor c(t, x, u)`, and so its final cost.
+    `factor * cost` makes it.
+
+    **Arguments:**
+
+    - `cost`: the cost.
+    - `factor`: a number; it can be differentiated.
+
+    **Raises:** `ValueError` if `cost` is not one, or `factor` is not a finite number.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        doubled = 2 * dlx.costs.PendulumCost()
+        ```
+    """
+
+    cost: AbstractCost
+    factor: Array = parameter()
+
+    def __check_init__(self):
+        check_instance(self.cost, AbstractCost, "cost", "Scaled")
+        check_number(self.factor, "factor", "Scaled")
+
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
+        return self.factor * self.cost(t, x, u)
+
+    def final(self, t: RealScalar, x: State) -> Array:
+        return self.factor * self.cost.final(t, x)
+
+
+class Rate(AbstractCost):
+    """A cost a second, charged for a step of `dt`: `c(t, x, u) dt`.
+
+    The problem then stays the same when `dt` changes. The final cost is unchanged.
+
+    **Arguments:**
+
+    - `cost`: the cost a second.
+    - `dt`: the step.
+
+    **Raises:** `ValueError` if `dt` is not positive.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        cost = dlx.costs.Rate(dlx.costs.PendulumCost(), dt=0.05)
+        ```
+    """
+
+    cost: AbstractCost
+    dt: Array = parameter()
+
+    def __check_init__(self):
+        check_instance(self.cost, AbstractCost, "cost", "Rate")
+        check_step(self.dt, "Rate")
+
+    def __call__(self, t: RealScalar, x: State, u: Control) -> Array:
+        return self.cost(t, x, u) * self.dt
+
+    def final(self, t: RealScalar, x: State) -> Array:
+        return self.cost.final(t, x)

@@ -8,9 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_finite, symmetric_matrix
+from .._check import as_vector, check_finite, symmetric_matrix
 from .._message import shortened
-from .._module import as_float_array, function_field, parameter
+from .._module import function_field, parameter
 from .._typing import Control, Matrix, RealScalar, Scalar, State, Vector
 from ..math import quadratic_form
 from ..math._small import dot
@@ -25,7 +25,16 @@ class _AbstractQuadratic(AbstractCost):
     Qf: eqx.AbstractVar[Matrix | Vector | None]
 
     def __check_init__(self):
-        _weights(self.Q, self.R, self.Qf, type(self).__name__)
+        where = type(self).__name__
+        _check_weight(self.Q, "Q", where)
+        _check_weight(self.R, "R", where)
+        if self.Qf is not None:
+            _check_weight(self.Qf, "final", where)
+            if len(self.Qf) != len(self.Q):
+                raise ValueError(
+                    f"{where}: final must fit Q of shape {self.Q.shape}, got shape "
+                    f"{self.Qf.shape}."
+                )
 
     @abc.abstractmethod
     def _state_error(self, t: RealScalar, x: State) -> Vector:
@@ -96,7 +105,7 @@ class Quadratic(_AbstractQuadratic):
         *,
         difference: Callable[[Array, Array], Array] | None = None,
     ):
-        self.Q, self.R, self.Qf = _weights(Q, R, final, "Quadratic")
+        self.Q, self.R, self.Qf = Q, R, final
         self.state_target = state_target
         self.control_target = control_target
         self.difference = difference
@@ -104,11 +113,8 @@ class Quadratic(_AbstractQuadratic):
     def __check_init__(self):
         for name, weight in (("state_target", self.Q), ("control_target", self.R)):
             target = getattr(self, name)
-            if target is not None and jnp.shape(target) != weight.shape[:1]:
-                raise ValueError(
-                    f"Quadratic: {name} must have shape {weight.shape[:1]}, got "
-                    f"{jnp.shape(target)}."
-                )
+            if target is not None and jnp.ndim(weight) > 0:
+                as_vector(target, len(weight), name, "Quadratic")
 
     @property
     def targets(self) -> tuple[Array | None, Array | None]:
@@ -173,7 +179,7 @@ class Tracking(_AbstractQuadratic):
         final: Any = None,
         output: Callable[[Array], Array] | None = None,
     ):
-        self.Q, self.R, self.Qf = _weights(Q, R, final, "Tracking")
+        self.Q, self.R, self.Qf = Q, R, final
         self.reference = reference
         self.output = output
 
@@ -202,29 +208,15 @@ def _form(weight: Matrix | Vector, d: Vector) -> Scalar:
     return dot(weight * d, d)
 
 
-def _weights(Q: Any, R: Any, final: Any, where: str) -> tuple[Array, Array, Any]:
-    """The weights as symmetric matrices, or their diagonals, that fit each other, or an
-    error."""
-    Q, R = _weight(Q, "Q", where), _weight(R, "R", where)
-    if final is None:
-        return Q, R, None
-    final = _weight(final, "final", where)
-    if len(final) != len(Q):
-        raise ValueError(
-            f"{where}: final must fit Q of shape {Q.shape}, got shape {final.shape}."
-        )
-    return Q, R, final
-
-
-def _weight(value: Any, name: str, where: str) -> Array:
-    """A symmetric matrix or the diagonal of one, or an error."""
-    array = as_float_array(value)
-    if eqx.is_inexact_array(array) and array.ndim == 1:
-        check_finite(array, name, where)
-        return array
-    if not eqx.is_inexact_array(array) or array.ndim != 2:
-        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
+def _check_weight(weight: Any, name: str, where: str) -> None:
+    """Raise unless `weight` is a symmetric matrix or the diagonal of one."""
+    ndim = weight.ndim if eqx.is_inexact_array(weight) else None
+    if ndim == 1:
+        check_finite(weight, name, where)
+    elif ndim == 2:
+        symmetric_matrix(weight, name, where)
+    else:
+        got = f"shape {weight.shape}" if eqx.is_array(weight) else shortened(weight)
         raise ValueError(
             f"{where}: {name} must be a matrix or its diagonal, got {got}."
         )
-    return symmetric_matrix(value, name, where)

@@ -1,7 +1,6 @@
 """Sequences of disturbances, drawn for a whole horizon at once."""
 
-from ._base import AbstractDisturbance as AbstractDisturbance
-from ._compose import shock as shock, Sum as Sum, Window as Window
+from ._base import AbstractDisturbance as AbstractDisturbance, Sum as Sum
 from ._deterministic import (
     Constant as Constant,
     FromArray as FromArray,
@@ -15,3 +14,4 @@ from ._random import (
     RandomWalk as RandomWalk,
     Uniform as Uniform,
 )
+from ._window import shock as shock, Window as Window

@@ -2,13 +2,16 @@
 
 import abc
 import dataclasses
+import functools
+import operator
 from typing import Any, ClassVar, TYPE_CHECKING, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.random as jr
 from jaxtyping import Array, Float
 
-from .._check import check_count
+from .._check import check_count, check_instance, check_key
 from .._message import shortened
 from .._module import as_float_array, check_parameters, parts_of
 from .._typing import PRNGKey, RealScalar, Vector
@@ -97,8 +100,6 @@ class AbstractDisturbance(eqx.Module):
         return w[:steps]
 
     def __add__(self, other: "AbstractDisturbance") -> "AbstractDisturbance":
-        from ._compose import Sum
-
         if not isinstance(other, AbstractDisturbance):
             return NotImplemented
         return Sum(self, other)
@@ -106,6 +107,52 @@ class AbstractDisturbance(eqx.Module):
     def __radd__(self, other: Any) -> "AbstractDisturbance":
         # The built-in `sum` starts at 0.
         return self if isinstance(other, int) and other == 0 else NotImplemented
+
+
+class Sum(AbstractDisturbance):
+    """The sum of several disturbances, each drawn with a key of its own.
+
+    **Arguments:** `*terms`: disturbances of one size.
+
+    **Raises:** `ValueError` if there are none, if one is no disturbance, or if sizes
+    differ.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        both = dlx.disturbances.Sum(
+            dlx.disturbances.Gaussian(0.1, size=2),
+            dlx.disturbances.Constant(0.5, size=2),
+        )
+        ```
+    """
+
+    terms: tuple[AbstractDisturbance, ...]
+
+    def __init__(self, *terms: AbstractDisturbance):
+        self.terms = terms
+
+    def __check_init__(self):
+        for term in self.terms:
+            check_instance(term, AbstractDisturbance, "every term", "Sum")
+        sizes = [term.size for term in self.terms]
+        if len(set(sizes)) != 1:
+            raise ValueError(f"Sum: terms must be of one size, got sizes {sizes}.")
+
+    @property
+    def size(self) -> int:
+        """The size that the terms share."""
+        return self.terms[0].size
+
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
+        n = len(self.terms)
+        if key is not None:
+            check_key(key, "Sum")
+        keys = [None] * n if key is None else list(jr.split(key, n))
+        drawn = (w.sequence(k, times) for w, k in zip(self.terms, keys, strict=True))
+        return functools.reduce(operator.add, drawn)
 
 
 class AbstractEntrywise(AbstractDisturbance):

@@ -1,18 +1,16 @@
 """Discrete maps `x_next = F(t, x, u, w)`: discretised, linear and linearised
 systems."""
 
-from ._base import AbstractDynamics as AbstractDynamics
-from ._delayed import Delayed as Delayed
-from ._discretized import Discretized as Discretized
-from ._linear import LinearDynamics as LinearDynamics
-from ._linearize import linearize as linearize
-from ._open_loop import open_loop as open_loop
-from ._operating_point import OperatingPoint as OperatingPoint
-from ._runge_kutta import RK4 as RK4
-from ._sampling import c2d as c2d, d2c as d2c
-from ._trim import trim as trim
-from ._worst_case import WorstCase as WorstCase
-from ._wrapper import (
+from .._integration import RK4 as RK4
+from ._base import (
     AbstractDiscretization as AbstractDiscretization,
+    AbstractDynamics as AbstractDynamics,
     AbstractWrapper as AbstractWrapper,
 )
+from ._discretized import Discretized as Discretized
+from ._linear import LinearDynamics as LinearDynamics
+from ._linearize import linearize as linearize, OperatingPoint as OperatingPoint
+from ._open_loop import open_loop as open_loop
+from ._sampling import c2d as c2d, d2c as d2c
+from ._trim import trim as trim
+from ._wrappers import Delayed as Delayed, WorstCase as WorstCase

@@ -9,21 +9,24 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_count, check_instance
+from .._integration import (
+    check_kind,
+    check_method,
+    check_returned,
+    evaluate_field,
+    for_fixed_steps,
+    raise_on_failure,
+    RK4,
+    runge_kutta_step,
+    solve_result,
+    Start,
+    tableau_of,
+)
 from .._jax import by_components, join_state, split_state
 from .._module import parameter
 from .._results import choose, first_of, or_none, promote, RESULTS
 from ..systems import AbstractSystem
-from ._base import zeros_if_none
-from ._runge_kutta import RK4, runge_kutta_step, tableau_of
-from ._solvers import (
-    check_kind,
-    check_method,
-    for_fixed_steps,
-    raise_on_failure,
-    solve_result,
-)
-from ._start import Start
-from ._wrapper import AbstractDiscretization
+from ._base import AbstractDiscretization, zeros_if_none
 
 
 _SDE_SOLVERS = (
@@ -307,27 +310,6 @@ def _field(s, x, args):
     """
     system, start, u, held = args
     return start.after(s, lambda t: evaluate_field(system, t, x, u, held))
-
-
-def evaluate_field(system: AbstractSystem, t: Any, x: Array, u: Array, w: Any) -> Array:
-    """The vector field of `system`, with its shape checked."""
-    dx = system.vector_field(t, x, u, w)
-    check_returned(dx, x, system, "vector_field")
-    return dx
-
-
-def check_returned(value: Any, x: Array, system: AbstractSystem, method: str) -> None:
-    """Raise unless what a method of `system` returned has the shape of the state."""
-    shape = getattr(value, "shape", None)
-    if shape == x.shape:
-        return
-    got = f"a {type(value).__name__}" if shape is None else shape
-    listed = isinstance(value, tuple | list)
-    hint = " (jnp.stack makes an array of a list)" if listed else ""
-    raise ValueError(
-        f"{type(system).__name__}: {method} must return an array of shape {x.shape}, "
-        f"as the state has, got {got}{hint}."
-    )
 
 
 def _solver_step(solver, term, s, x, h, args):

@@ -1,5 +1,6 @@
 """Linear dynamics in discrete time, about their operating point."""
 
+from dataclasses import KW_ONLY
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +11,7 @@ from jaxtyping import Array, Float
 from .._check import as_matrix, check_matrices, check_real, checked_names, is_concrete
 from .._module import as_float_array, parameter
 from .._results import RESULTS
+from .._typing import Real
 from ..math import matvec
 from ..math._steps import row_at, step_at
 from ._base import AbstractDynamics
@@ -56,41 +58,29 @@ class LinearDynamics(AbstractDynamics):
 
     A: Float[Array, "*T n n"] = parameter()
     B: Float[Array, "*T n m"] = parameter()
-    C: Float[Array, "p n"] | None = parameter()
-    E: Float[Array, "*T n k"] | None = parameter()
-    dt: Array = parameter()
-    x_ref: Float[Array, "*T n"] = parameter()
-    u_ref: Float[Array, "*T m"] = parameter()
-    x_next: Float[Array, "*T n"] = parameter()
-    state_names: tuple[str, ...] = eqx.field(static=True)
-    control_names: tuple[str, ...] = eqx.field(static=True)
+    C: Float[Array, "p n"] | None = parameter(None)
+    E: Float[Array, "*T n k"] | None = parameter(None)
+    dt: Real = parameter(1.0)
+    x_ref: Float[Array, "*T n"] = parameter(None)
+    u_ref: Float[Array, "*T m"] = parameter(None)
+    x_next: Float[Array, "*T n"] = parameter(None)
+    _: KW_ONLY
+    state_names: tuple[str, ...] = eqx.field(static=True, default=None)
+    control_names: tuple[str, ...] = eqx.field(static=True, default=None)
 
-    def __init__(
-        self,
-        A: Any,
-        B: Any,
-        C: Any = None,
-        E: Any = None,
-        dt: Any = 1.0,
-        x_ref: Any = None,
-        u_ref: Any = None,
-        x_next: Any = None,
-        *,
-        state_names: tuple[str, ...] | None = None,
-        control_names: tuple[str, ...] | None = None,
-    ):
+    def __post_init__(self):
         where = "LinearDynamics"
-        A, B, C, E = _checked_matrices(A, B, C, E)
-        self.A, self.B, self.C, self.E, self.dt = A, B, C, E, dt
+        A, B, *_ = parts = _checked_matrices(self.A, self.B, self.C, self.E)
+        self.A, self.B, self.C, self.E = parts
         n, m = B.shape[-2:]
-        x_ref = jnp.zeros(n, A.dtype) if x_ref is None else x_ref
-        u_ref = jnp.zeros(m, A.dtype) if u_ref is None else u_ref
-        x_next = x_ref if x_next is None else x_next
+        x_ref = jnp.zeros(n, A.dtype) if self.x_ref is None else self.x_ref
+        u_ref = jnp.zeros(m, A.dtype) if self.u_ref is None else self.u_ref
+        x_next = x_ref if self.x_next is None else self.x_next
         points = (as_float_array(point) for point in (x_ref, u_ref, x_next))
         self.x_ref, self.u_ref, self.x_next = (_over_time(p, 1, A) for p in points)
-        self.state_names = checked_names(state_names, "x", n, "state_names", where)
+        self.state_names = checked_names(self.state_names, "x", n, "state_names", where)
         self.control_names = checked_names(
-            control_names, "u", m, "control_names", where
+            self.control_names, "u", m, "control_names", where
         )
 
     def __check_init__(self):

@@ -10,16 +10,16 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_bool, check_finite, check_number, is_concrete
+from .._check import check_bool, check_finite, check_number
+from .._integration import evaluate_field
 from .._message import shortened
-from .._results import choose, RESULTS
+from .._results import choose, raise_on_failure, RESULTS
 from .._typing import RealScalar
 from ..math._drift import relative_drift, ULPS, units_of
 from ..systems import AbstractSystem
 from ._base import AbstractDynamics
-from ._discretized import Discretized, evaluate_field
-from ._linearize import at_point
-from ._operating_point import OperatingPoint
+from ._discretized import Discretized
+from ._linearize import at_point, OperatingPoint
 
 
 _MAX_STEPS = 256
@@ -108,20 +108,8 @@ def trim(
         # Where the field is zero the state stays, by any method that integrates it.
         model = model.system
     point = _solve(model, jnp.asarray(t, guess.dtype), guess, free)
-    failed = point.result != RESULTS.successful
-    if not throw:
-        return point
-    if not is_concrete(failed):
-        ends = (RESULTS.no_equilibrium, RESULTS.not_converged, RESULTS.diverged)
-        which = jnp.argmax(jnp.stack([point.result == end for end in ends]))
-        words = [f"{where}: {RESULTS[end]}" for end in ends]
-        return eqx.branched_error_if(point, failed, which, words)
-    if failed:
-        raise RuntimeError(
-            f"{where}: {RESULTS[point.result]} The residual is {point.residual} at x "
-            f"{point.x}, u {point.u}. Pass throw=False to look at the point."
-        )
-    return point
+    facts = lambda: f"The residual is {point.residual} at x {point.x}, u {point.u}."
+    return raise_on_failure(point, where, throw, "the point", facts)
 
 
 def _fixed(model: Any, fix: Any, where: str) -> dict[int, Any]:

@@ -1,40 +1,37 @@
 """Environments, and the named tasks."""
 
-from ._acrobot import (
+from ._arms import (
     acrobot as acrobot,
     acrobot_features as acrobot_features,
-    GymAcrobot as GymAcrobot,
+    reacher as reacher,
+    ReacherCost as ReacherCost,
 )
-from ._cartpole import (
+from ._classic_control import (
     cartpole as cartpole,
-    cartpole_linear as cartpole_linear,
-    GymCartPole as GymCartPole,
+    mountain_car as mountain_car,
+    mountain_car_discrete as mountain_car_discrete,
+    pendulum as pendulum,
+    pendulum_features as pendulum_features,
 )
 from ._environment import Environment as Environment, Step as Step
+from ._gym import (
+    GymAcrobot as GymAcrobot,
+    GymCartPole as GymCartPole,
+    GymMountainCar as GymMountainCar,
+    GymPendulum as GymPendulum,
+)
 from ._lane import (
     bicycle_features as bicycle_features,
     dynamic_bicycle as dynamic_bicycle,
     kinematic_bicycle as kinematic_bicycle,
 )
-from ._lds import lds as lds
-from ._mountain_car import (
-    GymMountainCar as GymMountainCar,
-    mountain_car as mountain_car,
-    mountain_car_discrete as mountain_car_discrete,
-)
-from ._neural import neural as neural
-from ._pendulum import (
-    GymPendulum as GymPendulum,
-    pendulum as pendulum,
-    pendulum_features as pendulum_features,
-)
-from ._planar_quadrotor import planar_quadrotor as planar_quadrotor
-from ._quadrotor import (
+from ._linear import cartpole_linear as cartpole_linear, lds as lds
+from ._quadrotors import (
+    planar_quadrotor as planar_quadrotor,
     quadrotor as quadrotor,
     quadrotor_features as quadrotor_features,
 )
 from ._randomise import randomise as randomise
-from ._reacher import reacher as reacher, ReacherCost as ReacherCost
 from ._registry import (
     default_horizon as default_horizon,
     make as make,
@@ -46,8 +43,9 @@ from ._regulation import (
     double_integrator as double_integrator,
     lorenz as lorenz,
     mass_spring_damper as mass_spring_damper,
+    neural as neural,
     permanent_magnet_motor as permanent_magnet_motor,
     two_tank as two_tank,
     van_der_pol as van_der_pol,
 )
-from ._uniform_state import UniformState as UniformState
+from ._task import UniformState as UniformState

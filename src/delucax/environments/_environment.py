@@ -35,9 +35,8 @@ from .._typing import Control, Disturbance, Observation, PRNGKey, State, Time, V
 from ..costs import AbstractCost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics, OperatingPoint, trim
-from ..dynamics._noise import check_noise
-from ..dynamics._operating_point import operating_point
 from ..math import clip
+from ._noise import check_noise
 
 
 class Step(NamedTuple):
@@ -59,6 +58,10 @@ class Step(NamedTuple):
 
 def _as_start(value: Any) -> Any:
     return as_module(value) if callable(value) else as_float_array(value)
+
+
+def _as_horizon(value: Any) -> int:
+    return check_count(value, "horizon", "Environment")
 
 
 class Environment(eqx.Module):
@@ -106,50 +109,29 @@ class Environment(eqx.Module):
 
     dynamics: AbstractDynamics
     cost: AbstractCost
-    disturbance: AbstractDisturbance
-    sensor_noise: AbstractDisturbance | None
-    initial_state: Any = eqx.field(converter=_as_start)
-    control_bounds: tuple[Array, Array] | None = bounds_field(
-        "Environment", "control_bounds"
+    # What is None by default follows from the dynamics, in `__post_init__`.
+    disturbance: AbstractDisturbance = eqx.field(default=None)
+    sensor_noise: AbstractDisturbance | None = None
+    initial_state: Any = eqx.field(default=None, converter=_as_start)
+    control_bounds: tuple[Any, Any] | None = bounds_field(
+        "Environment", "control_bounds", default=None
     )
-    horizon: int = eqx.field(static=True)
-    terminated: Callable[[Time, State], Array] | None = function_field()
-    actions: Array | None = parameter()
-    encode: Callable[[Observation], Vector] = function_field()
-    observation_bounds: tuple[Array, Array] | None = bounds_field(
-        "Environment", "observation_bounds"
+    horizon: int = eqx.field(static=True, default=200, converter=_as_horizon)
+    terminated: Callable[[Time, State], Array] | None = function_field(None)
+    actions: Any = parameter(None)
+    encode: Callable[[Observation], Vector] = function_field(None)
+    observation_bounds: tuple[Any, Any] | None = bounds_field(
+        "Environment", "observation_bounds", default=None
     )
 
-    def __init__(
-        self,
-        dynamics: AbstractDynamics,
-        cost: AbstractCost,
-        disturbance: AbstractDisturbance | None = None,
-        sensor_noise: AbstractDisturbance | None = None,
-        initial_state: Any = None,
-        control_bounds: tuple[Any, Any] | None = None,
-        horizon: int = 200,
-        terminated: Callable[[Time, State], Array] | None = None,
-        actions: Any = None,
-        encode: Callable[[Observation], Vector] | None = None,
-        observation_bounds: tuple[Any, Any] | None = None,
-    ):
-        check_instance(dynamics, AbstractDynamics, "dynamics", "Environment")
-        if disturbance is None:
-            disturbance = _default_disturbance(dynamics)
-        if initial_state is None:
-            initial_state = jnp.zeros(dynamics.state_size)
-        self.dynamics = dynamics
-        self.cost = cost
-        self.disturbance = disturbance
-        self.sensor_noise = sensor_noise
-        self.initial_state = initial_state
-        self.control_bounds = control_bounds
-        self.horizon = check_count(horizon, "horizon", "Environment")
-        self.terminated = terminated
-        self.actions = actions
-        self.encode = _identity if encode is None else encode
-        self.observation_bounds = observation_bounds
+    def __post_init__(self):
+        check_instance(self.dynamics, AbstractDynamics, "dynamics", "Environment")
+        if self.disturbance is None:
+            self.disturbance = _default_disturbance(self.dynamics)
+        if self.initial_state is None:
+            self.initial_state = jnp.zeros(self.dynamics.state_size)
+        if self.encode is None:
+            self.encode = _identity
 
     def __check_init__(self):
         where, dynamics = "Environment", self.dynamics
@@ -248,7 +230,7 @@ class Environment(eqx.Module):
             dlx.controllers.LQR(env.dynamics, Q, R, point=env.trim(fix="concentration"))
             ```
         """
-        point = operating_point(self.dynamics, self.cost)
+        point = self.cost.set_point(self.dynamics)
         if point is None:
             raise ValueError(
                 "Environment: trim needs a cost with targets or dynamics that name an "
@@ -291,31 +273,30 @@ class Environment(eqx.Module):
 
         **Returns:** shape `(m,)`.
         """
-        given = u
         try:
-            u = jnp.asarray(u)
+            control = jnp.asarray(u)
         except (TypeError, ValueError):  # no number, or ragged
             raise ValueError(
                 "Environment: u (the control) must have shape "
-                f"({self.control_size},), got {shortened(given)}."
+                f"({self.control_size},), got {shortened(u)}."
             ) from None
-        check_real(u, "u (the control)", "Environment")
-        if self.actions is not None and jnp.issubdtype(jnp.result_type(u), jnp.integer):
-            if jnp.ndim(u) != 0:
+        check_real(control, "u (the control)", "Environment")
+        if self.actions is not None and jnp.issubdtype(control.dtype, jnp.integer):
+            if control.ndim != 0:
                 raise ValueError(
                     "Environment: u must be one integer action (a scalar) or a control "
-                    f"of shape ({self.control_size},), got shape {jnp.shape(u)}."
+                    f"of shape ({self.control_size},), got shape {control.shape}."
                 )
             count = len(self.actions)
-            if is_concrete(u) and not 0 <= int(u) < count:
+            if is_concrete(control) and not 0 <= int(control) < count:
                 raise ValueError(
                     f"Environment: u must be an action from 0 to {count - 1}, got {u}."
                 )
-            u = self.actions[u]
+            control = self.actions[control]
         if self.control_bounds is None:
-            return u
+            return control
         low, high = self.control_bounds
-        return clip(u, low, high).astype(u.dtype)
+        return clip(control, low, high).astype(control.dtype)
 
     def step(
         self, t: Time, x: ArrayLike, u: ArrayLike, w: ArrayLike | None = None

@@ -10,8 +10,7 @@ from .._typing import State, Vector
 from ..costs import Quadratic
 from ..math import cos, sin, wrap
 from ..systems import DynamicBicycle, KinematicBicycle
-from ._task import task
-from ._uniform_state import UniformState
+from ._task import Fields, task, UniformState
 
 
 def bicycle_features(x: State) -> Vector:
@@ -41,7 +40,7 @@ def _lane_keeping(
     speed: Any,
     max_acceleration: Any,
     max_steering: Any,
-) -> dict[str, Any]:
+) -> Fields:
     """What the task `where` of a bicycle adds, which starts within `spread` of driving
     along the lane.
 
@@ -85,7 +84,7 @@ def kinematic_bicycle(
     speed: Any = 10.0,
     max_acceleration: Any = 3.0,
     max_steering: Any = 0.5,
-) -> dict[str, Any]:
+) -> Fields:
     """Bring a car that rolls without slip to the lane y = 0, and to a speed.
 
     State (x, y, heading, speed); control (acceleration, steering). Starts at x = 0 with
@@ -132,7 +131,7 @@ def dynamic_bicycle(
     speed: Any = 20.0,
     max_acceleration: Any = 5.0,
     max_steering: Any = 0.2,
-) -> dict[str, Any]:
+) -> Fields:
     """Bring a fast car on tyres to the lane y = 0, and to a speed.
 
     State (x, y, heading, vx, vy, rate); control (acceleration, steering). Starts at

@@ -5,24 +5,24 @@ from typing import Any
 import jax.numpy as jnp
 
 from .._check import check_number, check_positive, check_range
+from .._typing import PRNGKey
 from ..costs import Quadratic
 from ..systems import (
+    AbstractSystem,
     CSTR,
     DoubleIntegrator,
     Lorenz,
     MassSpringDamper,
+    NeuralSystem,
     PermanentMagnetMotor,
     TwoTank,
     VanDerPol,
 )
-from ._task import task
-from ._uniform_state import UniformState
+from ._task import Fields, task, UniformState
 
 
 @task(DoubleIntegrator, dt=0.1, horizon=100)
-def double_integrator(
-    system: DoubleIntegrator, *, max_force: Any = 1.0
-) -> dict[str, Any]:
+def double_integrator(system: DoubleIntegrator, *, max_force: Any = 1.0) -> Fields:
     """Bring a mass on a line to rest at the origin.
 
     State (position, velocity); control (force). Starts with the position uniform in
@@ -62,9 +62,7 @@ def double_integrator(
 
 
 @task(MassSpringDamper, dt=0.1, horizon=200)
-def mass_spring_damper(
-    system: MassSpringDamper, *, max_force: Any = 1.0
-) -> dict[str, Any]:
+def mass_spring_damper(system: MassSpringDamper, *, max_force: Any = 1.0) -> Fields:
     """Bring a mass on a spring, or a chain of them, to rest by a force on the last.
 
     State (positions, velocities); control (force). Starts with each state uniform in
@@ -105,7 +103,7 @@ def mass_spring_damper(
 
 
 @task(VanDerPol, dt=0.05, horizon=200)
-def van_der_pol(system: VanDerPol, *, max_control: Any = 3.0) -> dict[str, Any]:
+def van_der_pol(system: VanDerPol, *, max_control: Any = 3.0) -> Fields:
     """Bring van der Pol's oscillator from its limit cycle to rest.
 
     State (x, v); control (u). Starts with each state uniform in +-2. Cost
@@ -145,7 +143,7 @@ def van_der_pol(system: VanDerPol, *, max_control: Any = 3.0) -> dict[str, Any]:
 
 
 @task(Lorenz, dt=0.01, horizon=500)
-def lorenz(system: Lorenz, *, max_control: Any = 50.0) -> dict[str, Any]:
+def lorenz(system: Lorenz, *, max_control: Any = 50.0) -> Fields:
     """Hold Lorenz's chaotic system at the centre of its right wing.
 
     State (x, y, z); control (u). Starts with x and y uniform in +-20 and z in [10, 40].
@@ -186,9 +184,7 @@ def lorenz(system: Lorenz, *, max_control: Any = 50.0) -> dict[str, Any]:
 
 
 @task(TwoTank, dt=2.0, horizon=200)
-def two_tank(
-    system: TwoTank, *, level: Any = 10.0, max_flow: Any = 30.0
-) -> dict[str, Any]:
+def two_tank(system: TwoTank, *, level: Any = 10.0, max_flow: Any = 30.0) -> Fields:
     """Hold the lower of two tanks at a level.
 
     State (upper, lower) [cm]; control (flow) [cm^3/s], not negative. Starts with the
@@ -238,7 +234,7 @@ def cstr(
     concentration: Any = 0.5,
     min_coolant: Any = 280.0,
     max_coolant: Any = 320.0,
-) -> dict[str, Any]:
+) -> Fields:
     """Hold a stirred-tank reactor at its unstable equilibrium.
 
     State (concentration [mol/l], temperature [K]); control (coolant [K]). Starts within
@@ -288,7 +284,7 @@ def cstr(
 @task(PermanentMagnetMotor, dt=0.0005, horizon=200)
 def permanent_magnet_motor(
     system: PermanentMagnetMotor, *, speed: Any = 100.0, max_voltage: Any = 150.0
-) -> dict[str, Any]:
+) -> Fields:
     """Bring a synchronous motor to a speed and hold it.
 
     State (i_d, i_q, speed); control (v_d, v_q), each within +-max_voltage; disturbance
@@ -333,4 +329,64 @@ def permanent_magnet_motor(
         cost=Quadratic(Q, R, state_target=x, control_target=u),
         initial_state=UniformState([-1.0, -1.0, -50.0], [1.0, 1.0, 50.0]),
         control_bounds=(-max_voltage, max_voltage),
+    )
+
+
+def _drawn(
+    *, key: PRNGKey | None = None, states: Any = 2, controls: Any = 1, width: int = 32
+) -> dict[str, Any]:
+    """The arguments of a network with random weights."""
+    if key is None:
+        raise ValueError(
+            "neural: give a system, or a key to draw the weights of one, such as "
+            "key=jax.random.key(0), got neither."
+        )
+    return dict(key=key, states=states, controls=controls, width=width)
+
+
+@task(NeuralSystem, dt=0.05, horizon=100, arguments=_drawn, accepts=AbstractSystem)
+def neural(system: AbstractSystem, *, max_control: Any = 1.0) -> Fields:
+    """Bring the state of a learned vector field to the origin.
+
+    Starts with each state uniform in +-1. Cost `|x|^2 + 0.1 |u|^2` a step. Never
+    terminates.
+
+    **Arguments:**
+
+    - `system`: a [`delucax.systems.NeuralSystem`][], such as one that was fitted to
+        data, or any other system. One with random weights by default.
+    - `key`: a random key, for random weights.
+    - `states`, `controls`, `width`: of a network with random weights, 2, 1 and 32 by
+        default; see [`delucax.systems.NeuralSystem`][].
+    - `max_control`: of each control, to either side; 1 by default.
+    - `dt`: the control interval, 0.05 by default.
+    - `horizon`: steps an episode, 100 by default.
+    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
+    - `substeps`: solver steps an interval, 1 by default.
+    - `**others`: arguments of [`delucax.Environment`][], such as `disturbance`, or,
+        without a `system`, of [`delucax.systems.NeuralSystem`][].
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, without a system and a key, or with a
+        system and arguments of another.
+
+    Source: Chen, Rubanova, Bettencourt and Duvenaud, 2018.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("neural", key=jax.random.key(0), states=3)
+        again = dlx.make("neural", system=env.dynamics.system)
+        ```
+    """
+    check_range(max_control, "max_control", "neural")
+    corner = jnp.ones(system.state_size)
+    return dict(
+        cost=Quadratic(corner, 0.1 * jnp.ones(system.control_size)),
+        initial_state=UniformState(-corner, corner),
+        control_bounds=(-max_control, max_control),
     )

@@ -1,29 +1,77 @@
-"""What the tasks of a system share: its arguments, its dynamics and their solver."""
+"""What the tasks share: their arguments, dynamics and solver, and where they start."""
 
 import functools
 import inspect
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, TypeAlias
 
 import diffrax
+import equinox as eqx
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array
 
-from .._check import check_instance, check_keywords, keywords_of
+from .._check import (
+    as_bounds,
+    check_instance,
+    check_key,
+    check_keywords,
+    check_step,
+    keywords_of,
+)
+from .._module import parameter
+from .._typing import PRNGKey
 from ..dynamics import AbstractDynamics, Discretized
 from ..systems import AbstractSystem
 from ._environment import Environment
-from ._gym import gym_or_solver
 
 
-# What a task observes has its bounds for the task as it is. They are left out where
-# one of these is given.
-_CHANGES_OBSERVATIONS = {
-    "disturbance",
-    "dynamics",
-    "encode",
-    "initial_state",
-    "sensor_noise",
-    "terminated",
-}
+class UniformState(eqx.Module):
+    """A first state drawn uniformly from a box.
+
+    **Arguments:** `low`, `high`: vectors, the corners of the box.
+
+    **Raises:** `ValueError` if the corners differ in size or `low` is above `high`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        start = dlx.environments.UniformState(-jnp.ones(2), jnp.ones(2))
+        start(jax.random.key(0))
+        ```
+    """
+
+    low: Array = parameter()
+    high: Array = parameter()
+
+    def __init__(self, low: Any, high: Any):
+        self.low = low
+        self.high = high
+
+    def __check_init__(self):
+        size = np.size(self.low)
+        as_bounds((self.low, self.high), "UniformState", "low and high", size)
+
+    def __call__(self, key: PRNGKey) -> Array:
+        """A state drawn with `key`."""
+        check_key(key, "UniformState")
+        unit = jr.uniform(key, self.low.shape, self.low.dtype)
+        return self.low + (self.high - self.low) * unit
+
+
+_CHANGES_OBSERVATIONS = frozenset(
+    "disturbance dynamics encode initial_state sensor_noise terminated".split()
+)
+"""Arguments of `Environment` with which the task's bounds of observations may not
+hold."""
+
+
+Fields: TypeAlias = dict[str, Any]
+"""Arguments of `Environment`, by name."""
 
 
 def task(
@@ -36,7 +84,7 @@ def task(
     gym: Callable[..., AbstractDynamics] | None = None,
     arguments: Callable[..., dict[str, Any]] = lambda: {},
     accepts: type[AbstractSystem] | None = None,
-) -> Callable[[Callable[..., dict[str, Any]]], Callable[..., Environment]]:
+) -> Callable[[Callable[..., Fields]], Callable[..., Environment]]:
     """A decorator that makes a task of what the task adds to a system.
 
     It decorates a function of the system (with `gym`, of the dynamics) and of options
@@ -57,8 +105,10 @@ def task(
     arithmetic = () if gym is None else (gym,)
     derived = inspect.signature(arguments).parameters
 
-    def decorate(added: Callable[..., dict[str, Any]]) -> Callable[..., Environment]:
+    def decorate(added: Callable[..., Fields]) -> Callable[..., Environment]:
         where = added.__name__
+        # The first parameter is the system or the dynamics, the others are options.
+        _, *options = inspect.signature(added).parameters.values()
 
         def make(
             system: Any = None,
@@ -70,39 +120,48 @@ def task(
             **others: Any,
         ) -> Environment:
             check_keywords(others, where, make, kind, *arithmetic, Environment)
-            chosen = _taken(others, [p.name for p in options])
+            check_step(dt, where)
+            # Each takes its own of the other arguments; those of Environment are left.
+            chosen = _taken(others, [option.name for option in options])
             special = _taken(others, derived)
             special = {n: v for n, v in special.items() if v is not None}
             constants = _taken(others, keywords_of(kind))
+            limits = {} if gym is None else _taken(others, keywords_of(gym))
+
             if system is None:
                 system = kind(**(constants | arguments(**special)))
             elif special or constants:
                 names = ", ".join([*special, *constants])
                 raise ValueError(f"{where}: give a system or its {names}, not both.")
             check_instance(system, accepts, "system", where)
-            if gym is None:
-                subject = system
-                dynamics = Discretized(system, dt, solver or default_solver, substeps)
-            else:
-                limits = _taken(others, keywords_of(gym))
-                step = functools.partial(gym, system, dt, **limits)
-                subject = dynamics = gym_or_solver(step, solver, substeps, where)
-            fields: dict[str, Any] = dict(dynamics=dynamics, horizon=horizon)
-            fields = fields | added(subject, **chosen) | others
-            if "observation_bounds" not in others:
-                if not _CHANGES_OBSERVATIONS.isdisjoint(others):
-                    fields["observation_bounds"] = None
-            return Environment(**fields)
 
-        # Documentation and the check of keywords read the arguments off the signature.
+            if gym is None or solver is not None:
+                for name in limits:
+                    raise ValueError(
+                        f"{where}: {name} is of Gym's arithmetic, and no solver has "
+                        f"the like; give one of {name} and solver."
+                    )
+                dynamics = Discretized(system, dt, solver or default_solver, substeps)
+            elif substeps != 1:
+                raise ValueError(f"{where}: substeps needs a solver, such as RK4().")
+            else:
+                dynamics = gym(system, dt, **limits)
+
+            fields: Fields = dict(dynamics=dynamics, horizon=horizon)
+            fields |= added(system if gym is None else dynamics, **chosen)
+            # Bounds of observations are those of the task as it is.
+            if not _CHANGES_OBSERVATIONS.isdisjoint(others):
+                fields["observation_bounds"] = None
+            return Environment(**(fields | others))
+
+        # Documentation and the check of keywords read the arguments off the signature:
+        # those of `make`, with the options after the system.
         signature = inspect.signature(make)
         system, *rest = signature.parameters.values()
         system = system.replace(annotation=accepts | None)
-        _, *options = inspect.signature(added).parameters.values()
         parameters = [system, *options, *derived.values(), *rest]
-        signature = signature.replace(parameters=parameters)
         functools.update_wrapper(make, added)
-        vars(make)["__signature__"] = signature
+        vars(make)["__signature__"] = signature.replace(parameters=parameters)
         return make
 
     return decorate

@@ -14,8 +14,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 from .._check import check_instance
-from ..dynamics import AbstractDynamics
-from ..dynamics._wrapper import AbstractWrapper
+from ..dynamics import AbstractDynamics, AbstractWrapper
 
 
 class Evaluations(NamedTuple):

@@ -14,7 +14,6 @@ from .._module import as_float_array, parameter
 from .._typing import RealScalar
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ..dynamics._operating_point import operating_point
 from ..math._linear_solve import is_definite
 from ..riccati import dare
 from ._problem import model, Problem, roll_out
@@ -195,7 +194,7 @@ def control_at_rest(dynamics: AbstractDynamics, cost: AbstractCost) -> Array:
 def _point(dynamics: AbstractDynamics, cost: AbstractCost) -> tuple[Array, Array]:
     """The operating point, or zeros where neither names one."""
     n, m = dynamics.state_size, dynamics.control_size
-    return operating_point(dynamics, cost) or (jnp.zeros(n), jnp.zeros(m))
+    return cost.set_point(dynamics) or (jnp.zeros(n), jnp.zeros(m))
 
 
 @eqx.filter_jit

@@ -10,9 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._controller import AbstractController, tallies
-from ..dynamics._discretized import evaluate_field
-from ..dynamics._solvers import AbstractTransparentSolver
-from ..dynamics._start import Start
+from .._integration import AbstractTransparentSolver, evaluate_field, Start
 from ..systems import AbstractSystem
 from ._controller_calls import call_controller, check_control, check_state
 

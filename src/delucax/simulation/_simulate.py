@@ -20,15 +20,15 @@ from .._check import (
     is_concrete,
 )
 from .._controller import AbstractController, tallies
-from .._results import choose, first_failure, RESULTS
-from .._typing import PRNGKey
-from ..dynamics._solvers import (
+from .._integration import (
     check_method,
     for_fixed_steps,
     raise_on_failure,
     solve_result,
+    Start,
 )
-from ..dynamics._start import Start
+from .._results import choose, first_failure, RESULTS
+from .._typing import PRNGKey
 from ..math._steps import check_steps
 from ..systems import AbstractSystem
 from ._controller_calls import check_control, controller_result

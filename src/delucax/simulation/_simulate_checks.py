@@ -8,31 +8,29 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import check_instance, check_positive, is_concrete
+from .._integration import check_adaptive, check_kind
 from .._message import shortened
 from .._module import as_float_array
-from ..dynamics._solvers import check_adaptive, check_kind
 from ..systems import AbstractSystem
 
 
 def check_system(system: Any, w: Any, where: str) -> None:
     """Raise unless one solve can integrate `system`."""
     check_instance(system, AbstractSystem, "system", where)
-    name, other = type(system).__name__, "use `delucax.open_loop` or `delucax.rollout`"
+    name, reason = type(system).__name__, None
     if type(system).project is not AbstractSystem.project:
-        raise ValueError(
-            f"{where}: system {name} projects its state after each interval, which one "
-            f"solve cannot do; {other} with delucax.Discretized(system, dt)."
+        reason = f"system {name} projects its state after each interval"
+    elif system.noise == "brownian":
+        reason = f"system {name} has a diffusion, whose increments are of fixed steps"
+    elif w is not None and not system.disturbance_names:
+        reason = (
+            f"w cannot be given, as {name} names no disturbances: w would be added to "
+            "the state after each interval"
         )
-    if system.noise == "brownian":
+    if reason is not None:
         raise ValueError(
-            f"{where}: system {name} has a diffusion; {other} with "
-            "delucax.Discretized(system, dt), which takes its Brownian increments."
-        )
-    if w is not None and not system.disturbance_names:
-        raise ValueError(
-            f"{where}: w cannot be given, as {name} names no disturbances: w would be "
-            "added to the state after each interval, which one solve cannot do; "
-            f"{other} with delucax.Discretized(system, dt)."
+            f"{where}: {reason}, which one solve cannot do; use `delucax.open_loop` or "
+            "`delucax.rollout` with delucax.Discretized(system, dt)."
         )
 
 

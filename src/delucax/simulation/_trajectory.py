@@ -376,7 +376,4 @@ def checked(trajectory: Trajectory, where: str) -> Trajectory:
 
 
 def _message(code: Any) -> str:
-    item = jax.tree.unflatten(
-        jax.tree.structure(RESULTS.successful), [np.asarray(code)]
-    )
-    return RESULTS[item]
+    return RESULTS[jax.tree.map(lambda _: np.asarray(code), RESULTS.successful)]

@@ -1,14 +1,17 @@
-"""A system from a plain function."""
+"""Systems whose vector field is a function, or a neural network."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._module import function_field, names_of
-from .._typing import Control, Disturbance, State, Time
+from .._check import check_count, check_key
+from .._module import as_module, function_field, names_of, weight
+from .._typing import Control, Disturbance, PRNGKey, State, Time
 from ._base import AbstractSystem
 
 
@@ -81,3 +84,73 @@ def system(
         names_of(controls, "u", "controls", "system"),
         disturbance_names=names_of(disturbances, "w", "disturbances", "system"),
     )
+
+
+class NeuralSystem(AbstractSystem):
+    """A fully connected network of the state and the control,
+
+    `dx/dt = network((x, u))`.
+
+    As smooth as its activation. The network is trainable: `delucax.training.fit` moves
+    it and nothing else.
+
+    **Arguments:**
+
+    - `states`, `controls`: their names, or how many there are.
+    - `width`: units in a hidden layer, 64 by default.
+    - `depth`: hidden layers, 2 by default; 0 for a linear field.
+    - `activation`: of the hidden layers, `jnp.tanh` by default.
+    - `key`: a random key, for the first weights.
+
+    **Attributes:** `network`, an `eqx.nn.MLP`, trainable; `state_names` and
+    `control_names`.
+
+    **Raises:** `ValueError` if a size is below 1, names are neither a number nor
+    strings, or there is no key.
+
+    Source: Chen, Rubanova, Bettencourt and Duvenaud, 2018.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        field = dlx.systems.NeuralSystem(2, 1, width=32, key=jax.random.key(0))
+        dynamics = dlx.Discretized(field, dt=0.05)
+        dynamics(0.0, jnp.ones(2), jnp.zeros(1))
+        ```
+    """
+
+    network: eqx.nn.MLP = weight()
+    state_names: tuple[str, ...] = eqx.field(static=True)
+    control_names: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        states: int | Sequence[str],
+        controls: int | Sequence[str],
+        width: int = 64,
+        depth: int = 2,
+        *,
+        activation: Callable[[Array], Array] = jnp.tanh,
+        key: PRNGKey,
+    ):
+        where = "NeuralSystem"
+        check_key(key, where)
+        self.state_names = names_of(states, "x", "states", where)
+        self.control_names = names_of(controls, "u", "controls", where)
+        n = len(self.state_names)
+        self.network = eqx.nn.MLP(
+            n + len(self.control_names),
+            n,
+            check_count(width, "width", where),
+            check_count(depth, "depth", where, least=0),
+            as_module(activation),
+            as_module(jax.nn.identity),
+            key=key,
+        )
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        return self.network(jnp.concatenate([x, u])).astype(x.dtype)

@@ -9,8 +9,7 @@ import jax.random as jr
 import numpy as np
 
 from ...costs import Quadratic
-from ...dynamics import AbstractDynamics
-from ...dynamics._wrapper import AbstractWrapper
+from ...dynamics import AbstractDynamics, AbstractWrapper
 from ...environments import planar_quadrotor
 from ...planning import count_evaluations, ILQR
 from ._finding import Claim, draw_panels, Finding

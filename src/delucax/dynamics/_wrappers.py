@@ -1,14 +1,16 @@
-"""A plant behind dead times."""
+"""Dynamics around others: dead times, and an adversary that acts on the state."""
 
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from .._check import as_vector, check_count
-from ._base import AbstractDynamics
-from ._wrapper import AbstractWrapper
+from .._check import as_matrix, as_vector, check_count, check_instance, check_positive
+from .._module import parameter
+from ..math import matvec
+from ..math._norms import within_ball
+from ._base import AbstractDynamics, AbstractWrapper
 
 
 class Delayed(AbstractWrapper):
@@ -134,3 +136,80 @@ class Delayed(AbstractWrapper):
     def equilibrium(self):
         x, u = self.dynamics.equilibrium()
         return self.filled(x, u), u
+
+
+class WorstCase(AbstractWrapper):
+    """Dynamics with an adversary that measures the state and adds to the disturbance,
+
+    `x_next = F(t, x, u, w + L difference(x, x_ref))`,
+
+    about the operating point that the dynamics name. With the `L` of
+    [`delucax.controllers.HInfinity`][] or of [`delucax.riccati.hinf_dare`][] it is the
+    worst disturbance of the H-infinity game; a `bound` keeps it within what a
+    disturbance can be.
+
+    **Arguments:**
+
+    - `dynamics`: the plant, which names an equilibrium.
+    - `L`: the adversary's gain, shape `(k, n)`.
+    - `bound`: what it adds is scaled back to this Euclidean norm; none by default.
+
+    **Raises:** `ValueError` if `dynamics` are none or name no equilibrium, `L` does not
+    fit them, or `bound` is not positive.
+
+    Source: Basar and Bernhard, 1995.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+
+        A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
+        dynamics = dlx.LinearDynamics(A, B)
+        robust = dlx.controllers.HInfinity(dynamics, jnp.eye(2), jnp.eye(1))
+        attacked = dlx.dynamics.WorstCase(dynamics, 0.9 * robust.L, bound=1.0)
+        env = dlx.Environment(attacked, dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1)))
+        x0 = jnp.ones(2)
+        dlx.rollout(env, robust, key=jax.random.key(0), x0=x0, horizon=50).total_cost
+        ```
+    """
+
+    dynamics: AbstractDynamics
+    L: Float[Array, "k n"] = parameter()
+    bound: Array | None = parameter()
+
+    def __init__(self, dynamics: AbstractDynamics, L: Any, *, bound: Any = None):
+        self.dynamics, self.L, self.bound = dynamics, L, bound
+
+    def __check_init__(self):
+        where, dynamics = "WorstCase", self.dynamics
+        check_instance(dynamics, AbstractDynamics, "dynamics", where)
+        dynamics.equilibrium()
+        as_matrix(self.L, "L", where)
+        shape = dynamics.disturbance_size, dynamics.state_size
+        if self.L.shape != shape:
+            raise ValueError(
+                f"{where}: L must have shape {shape}, a row for each disturbance and a "
+                f"column for each state, got shape {self.L.shape}."
+            )
+        if self.bound is not None:
+            check_positive(self.bound, "bound", where)
+
+    def attack(self, x: Array) -> Array:
+        """What the adversary adds to the disturbance.
+
+        **Arguments:** `x`: the state.
+
+        **Returns:** shape `(k,)`.
+        """
+        x_ref, _ = self.dynamics.equilibrium()
+        added = matvec(self.L, self.dynamics.difference(x, x_ref)).astype(x.dtype)
+        if self.bound is None:
+            return added
+        return within_ball(added, self.bound)
+
+    def advance(self, t, x, u, w):
+        added = self.attack(x)
+        return self.dynamics.advance(t, x, u, added if w is None else w + added)

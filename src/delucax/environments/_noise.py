@@ -2,8 +2,8 @@
 
 import jax
 
-from ..systems import AbstractPlant, AbstractSystem
-from ._base import AbstractDynamics
+from ..dynamics import AbstractDynamics
+from ..systems import AbstractPlant
 
 
 def check_noise(plant: AbstractPlant, where: str) -> None:
@@ -20,21 +20,13 @@ def check_noise(plant: AbstractPlant, where: str) -> None:
             )
     for part in _inside(plant):
         check_noise(part, where)
-        if _is_noisy(part) and not _says(plant):
+        if _is_noisy(part) and not plant.declares_noise():
             raise ValueError(
                 f"{where}: {name} hides the Brownian noise of the "
                 f"{type(part).__name__} that it holds. Derive it from "
                 f"delucax.dynamics.AbstractWrapper, or give {name} `noise` of its own: "
                 "that of what it holds, or `noise = None` where w is not Brownian."
             )
-
-
-def _says(plant: AbstractPlant) -> bool:
-    kind = type(plant)
-    if issubclass(kind, AbstractSystem):
-        own = kind.diffusion is not AbstractSystem.diffusion
-        return own or kind.noise is not AbstractSystem.noise
-    return kind.noise is not AbstractPlant.noise
 
 
 def _inside(plant: AbstractPlant) -> list[AbstractPlant]:

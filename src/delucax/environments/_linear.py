@@ -1,17 +1,111 @@
-"""Linear dynamical systems."""
+"""Linear dynamical systems: given, drawn at random, and the cart-pole of the paper."""
 
 from typing import Any
 
 import jax.numpy as jnp
 import jax.random as jr
-import numpy as np
 
-from .._check import check_count, check_instance, check_key, check_keywords, is_concrete
+from .._check import (
+    check_count,
+    check_instance,
+    check_key,
+    check_keywords,
+    check_number,
+    check_positive,
+    check_range,
+    check_step,
+)
+from .._module import as_float_array
 from .._typing import PRNGKey
 from ..costs import Quadratic
 from ..dynamics import c2d, LinearDynamics
 from ..systems import LinearSystem
 from ._environment import Environment
+from ._task import UniformState
+
+
+def cartpole_linear(
+    cart_mass: Any = 1.0,
+    pole_mass: Any = 0.1,
+    length: Any = 1.0,
+    gravity: Any = 9.81,
+    *,
+    dt: Any = 0.02,
+    horizon: int = 200,
+    **others: Any,
+) -> Environment:
+    """The linear cart-pole of the Deluca paper: a point mass on a rod near the upright,
+    by an Euler step, at quadratic cost `x'x + u'u`.
+
+    ```
+    d(velocity)/dt = (force + m g angle) / M
+    d(spin)/dt = (force + (M + m) g angle) / (M l)
+    ```
+
+    State (position, angle, velocity, spin), in this order; control (force), without
+    bounds. The angle grows against the direction of positive positions. Starts with
+    each state uniform in +-0.05. Never terminates.
+
+    **Arguments:**
+
+    - `cart_mass`: M [kg], 1 by default.
+    - `pole_mass`: m [kg], 0.1 by default.
+    - `length`: l, of the rod [m], 1 by default.
+    - `gravity`: g [m/s^2], 9.81 by default.
+    - `dt`: the step, 0.02 by default.
+    - `horizon`: steps an episode, 200 by default: 4 s, where the paper's code stops
+        after 10 steps.
+    - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
+        `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][] whose dynamics are
+        [`delucax.LinearDynamics`][].
+
+    **Raises:** `ValueError` if a mass, the length or `dt` is not positive, or `gravity`
+        is not finite.
+
+    Source: Gradu et al., 2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        env = dlx.make("cartpole_linear")
+        lqr = dlx.controllers.LQR(env.dynamics, jnp.eye(4), jnp.eye(1))
+        ```
+    """
+    where = "cartpole_linear"
+    check_keywords(others, where, cartpole_linear, Environment)
+    check_positive(cart_mass, "cart_mass", where)
+    check_positive(pole_mass, "pole_mass", where)
+    check_positive(length, "length", where)
+    check_step(dt, where)
+    M, m, l, g = (as_float_array(v) for v in (cart_mass, pole_mass, length, gravity))
+    zero, one = jnp.zeros_like(M), jnp.ones_like(M)
+    rate = [
+        [zero, zero, one, zero],
+        [zero, zero, zero, one],
+        [zero, m * g / M, zero, zero],
+        [zero, (m + M) * g / (M * l), zero, zero],
+    ]
+    A = jnp.eye(4) + dt * jnp.array(rate)
+    B = dt * jnp.array([[zero], [zero], [1 / M], [1 / (M * l)]])
+    dynamics = LinearDynamics(
+        A,
+        B,
+        dt=dt,
+        state_names=("position", "angle", "velocity", "spin"),
+        control_names=("force",),
+    )
+    fields: dict[str, Any] = dict(
+        dynamics=dynamics,
+        cost=Quadratic(jnp.ones(4), jnp.ones(1)),
+        initial_state=UniformState([-0.05] * 4, [0.05] * 4),
+        horizon=horizon,
+    )
+    return Environment(**(fields | others))
 
 
 def lds(
@@ -76,8 +170,7 @@ def lds(
         dynamics = _sampled(system, dt)
     else:
         if (A is None) != (B is None):
-            missing = "A" if A is None else "B"
-            other = "B" if A is None else "A"
+            missing, other = ("A", "B") if A is None else ("B", "A")
             raise ValueError(
                 f"lds: {missing} must be given with {other}, or neither of them."
             )
@@ -129,10 +222,8 @@ def _random(
     check_key(key, "lds")
     n = check_count(states, "states", "lds")
     m = check_count(controls, "controls", "lds")
-    if is_concrete(radius) and not 0 <= radius < np.inf:
-        raise ValueError(
-            f"lds: spectral_radius must be finite and not negative, got {radius}."
-        )
+    check_number(radius, "spectral_radius", "lds")
+    check_range(radius, "spectral_radius", "lds")
     a, b, c = jr.split(key, 3)
     A = jr.normal(a, (n, n))
     A = A * (radius / jnp.max(jnp.abs(jnp.linalg.eigvals(A))))

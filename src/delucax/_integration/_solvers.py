@@ -1,16 +1,13 @@
 """Diffrax solvers: which of them fit, and implicit ones at fixed steps."""
 
 import operator
-from collections.abc import Callable
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
-import lineax as lx
 import optimistix as optx
-from jaxtyping import PyTree, Scalar
 
 from .._results import choose, promote, Result, RESULTS
 from ._runge_kutta import tableau_of
@@ -154,29 +151,14 @@ class AbstractTransparentSolver(diffrax.AbstractWrappedSolver):
         return self.solver.func(terms, t0, y0, args)
 
 
-class _Chord(optx.AbstractRootFinder):
+class _Chord(diffrax.VeryChord):
     """Diffrax's chord method, which iterates until it has converged.
 
     Diffrax's own gives up after two iterations, for a step-size controller to take a
     shorter step. Fixed steps have none, so this one goes on while it contracts.
     """
 
-    rtol: Any
-    atol: Any
-    linear_solver: lx.AbstractLinearSolver
-    norm: Callable[[PyTree], Scalar] = optx.rms_norm
-
-    @property
-    def _chord(self):
-        return diffrax.VeryChord(
-            self.rtol, self.atol, self.norm, linear_solver=self.linear_solver
-        )
-
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        return self._chord.init(fn, y, args, options, f_struct, aux_struct, tags)
-
-    def step(self, fn, y, args, options, state, tags):
-        return self._chord.step(fn, y, args, options, state, tags)
+    atol: Any  # one for each entry, where Diffrax has a number for all
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
@@ -193,9 +175,6 @@ class _Chord(optx.AbstractRootFinder):
         failed = state.result != optx.RESULTS.successful
         result = optx.RESULTS.where(failed, state.result, result)
         return failed | converged | diverged, result
-
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        return y, aux, {}
 
 
 class _FixedStep(AbstractTransparentSolver):
@@ -227,7 +206,9 @@ class _FixedStep(AbstractTransparentSolver):
     def _with_tolerances(self, rtol: float, atol: Any) -> Any:
         finder = self.solver.root_finder  # pyright: ignore
         if isinstance(finder, diffrax.VeryChord | optx.Chord):
-            finder = _Chord(rtol=rtol, atol=atol, linear_solver=finder.linear_solver)
+            finder = _Chord(
+                rtol, atol, optx.rms_norm, linear_solver=finder.linear_solver
+            )
         values = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
         for name in _unset(finder):
             get = operator.attrgetter(name)

@@ -1,79 +1,23 @@
-"""Swing the tip of a two-link arm above a line: Gym's Acrobot-v1."""
+"""Tasks of arms of two links: Gym's Acrobot-v1, and the paper's reacher."""
 
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_number, check_range
-from .._module import parameter, positive
-from .._results import Result, RESULTS
-from .._typing import BoolScalar, Control, Disturbance, State, Time, Vector
-from ..costs import Arrival
+from .._check import as_vector, check_finite, check_number, check_range, LARGEST
+from .._module import parameter
+from .._typing import BoolScalar, State, Time, Vector
+from ..costs import AbstractCost, Arrival
 from ..disturbances import AbstractDisturbance, Uniform
-from ..dynamics import AbstractDiscretization, Discretized, RK4
-from ..dynamics._runge_kutta import runge_kutta_step
-from ..math import clip, cos, sin, wrap
-from ..systems import Acrobot
-from ._task import task
-from ._uniform_state import UniformState
-
-
-class GymAcrobot(AbstractDiscretization):
-    """Gym's arithmetic for the acrobot: one Runge-Kutta step of order 4, the torque
-    held with `w` added to it; then the angles are wrapped to +-pi and the velocities
-    clipped.
-
-    Not smooth where a velocity meets its limit: the gradient through it is 0 beyond.
-    The state jumps where an angle wraps, the gradient does not. The smooth variant is
-    [`delucax.Discretized`][] of the same system.
-
-    A step is Gym's to rounding. The acrobot is chaotic, so that of 100 episodes under
-    random actions about 5 end more than 1e-6 from Gym's in double precision, as Gym's
-    own do when they start at the next number that there is.
-
-    **Arguments:**
-
-    - `system`: the acrobot.
-    - `dt`: the step, 0.2 by default.
-    - `max_velocity_1`, `max_velocity_2`: 4 pi and 9 pi by default.
-
-    **Raises:** `ValueError` if `dt` or a limit is not positive.
-
-    Source: Gymnasium (Towers et al., 2023), `Acrobot-v1`.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        dynamics = dlx.environments.GymAcrobot(dlx.systems.Acrobot())
-        dynamics(0.0, jnp.array([0.1, 0.0, 0.0, 0.0]), jnp.ones(1))
-        ```
-    """
-
-    system: Acrobot
-    dt: Array = parameter(0.2, constraint=positive)
-    max_velocity_1: Array = parameter(4 * np.pi, constraint=positive)
-    max_velocity_2: Array = parameter(9 * np.pi, constraint=positive)
-
-    def advance(
-        self, t: Time, x: State, u: Control, w: Disturbance
-    ) -> tuple[State, Result]:
-        field = lambda t, x: self.system.vector_field(t, x, u, w)
-        free = runge_kutta_step(RK4.tableau, field, t, x, self.dt)
-        x_next = jnp.stack(
-            [
-                wrap(free[0]),
-                wrap(free[1]),
-                clip(free[2], -self.max_velocity_1, self.max_velocity_1),
-                clip(free[3], -self.max_velocity_2, self.max_velocity_2),
-            ]
-        )
-        return x_next.astype(x.dtype), RESULTS.successful
+from ..dynamics import Discretized
+from ..math import cos, sin
+from ..systems import Acrobot, Reacher
+from ._gym import GymAcrobot
+from ._task import Fields, task, UniformState
 
 
 def acrobot_features(x: State) -> Vector:
@@ -113,7 +57,7 @@ def acrobot(
     torque_noise: Any = None,
     goal_height: Any = 1.0,
     disturbance: AbstractDisturbance | None = None,
-) -> dict[str, Any]:
+) -> Fields:
     """Swing the tip of two hanging links above a line, by a torque at the elbow.
 
     State (angle_1, angle_2, velocity_1, velocity_2), hanging at 0; control (torque);
@@ -189,4 +133,117 @@ def acrobot(
         actions=max_torque * jnp.array([[-1.0], [0.0], [1.0]]),
         encode=acrobot_features,
         observation_bounds=(-feature_bound, feature_bound) if bounded else None,
+    )
+
+
+class ReacherCost(AbstractCost):
+    """`|tip - goal|^2 + torque_weight |torques|^2`.
+
+    **Arguments:**
+
+    - `system`: the arm, for where its tip is.
+    - `goal`: shape `(2,)` [m]; (0, 1.8) by default.
+    - `torque_weight`: 0.1 by default.
+
+    **Raises:** `ValueError` if the goal is not a finite vector of two.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        cost = dlx.environments.ReacherCost(dlx.systems.Reacher())
+        cost(0.0, jnp.zeros(4), jnp.zeros(2))
+        ```
+    """
+
+    system: Reacher
+    goal: Array = parameter((0.0, 1.8))
+    torque_weight: Array = parameter(0.1)
+
+    def __check_init__(self):
+        as_vector(self.goal, 2, "goal", "ReacherCost")
+        check_finite(self.goal, "goal", "ReacherCost")
+
+    def offset(self, x: Array) -> Array:
+        """Where the tip is, seen from the goal.
+
+        **Arguments:** `x`: state.
+
+        **Returns:** `tip - goal`, shape `(2,)` [m].
+        """
+        return self.system.tip(x) - self.goal.astype(x.dtype)
+
+    def __call__(self, t, x, u):
+        offset = self.offset(x)
+        effort = self.torque_weight * (u[0] * u[0] + u[1] * u[1])
+        return offset[0] * offset[0] + offset[1] * offset[1] + effort
+
+
+class _Features(eqx.Module):
+    """Cosines and sines of the angles, the rates, and the offset of the tip."""
+
+    cost: ReacherCost
+
+    def __call__(self, x: Array) -> Array:
+        offset = self.cost.offset(x)
+        angles = [cos(x[0]), sin(x[0]), cos(x[1]), sin(x[1])]
+        return jnp.stack([*angles, x[2], x[3], offset[0], offset[1]])
+
+
+@task(Reacher, dt=0.01, horizon=200, solver=diffrax.Euler())
+def reacher(system: Reacher, *, goal: Any = (0.0, 1.8)) -> Fields:
+    """Bring the tip of an arm of two links to a goal.
+
+    State (shoulder, elbow, shoulder_rate, elbow_rate); control (shoulder_torque,
+    elbow_torque), without bounds. Starts at rest at the angles (pi/4, pi/2). Cost
+    `|tip - goal|^2 + 0.1 |torques|^2` a step. `encode` gives cosines and sines of the
+    angles, the rates and `tip - goal`. Explicit Euler, as in the paper. Never
+    terminates.
+
+    The cost and `encode` hold the arm too: for arms of other lengths call this again,
+    under `jax.vmap` for many, where `delucax.replace` would change one of the three.
+
+    **Arguments:**
+
+    - `system`: a [`delucax.systems.Reacher`][]; made of `others` by default.
+    - `goal`: shape `(2,)` [m]; (0, 1.8) by default.
+    - `dt`: the control interval, 0.01 by default.
+    - `horizon`: steps an episode, 200 by default.
+    - `solver`: a Diffrax solver, `diffrax.Euler()` by default.
+    - `substeps`: solver steps an interval, 1 by default.
+    - `**others`: arguments of [`delucax.systems.Reacher`][] or
+        [`delucax.Environment`][], such as `control_bounds`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, or a goal that is not a vector of two.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        model = dlx.make("reacher")
+        plant = dlx.make("reacher", gravity=-10.0)
+        ```
+    """
+    cost = ReacherCost(system, goal)
+    reach = system.length_1 + system.length_2
+    low, high = (
+        jnp.array([sign] * 4 + [sign * LARGEST] * 2 + [*(sign * reach - cost.goal)])
+        for sign in (-1.0, 1.0)
+    )
+    return dict(
+        cost=cost,
+        initial_state=jnp.array([np.pi / 4, np.pi / 2, 0.0, 0.0]),
+        encode=_Features(cost),
+        observation_bounds=(low, high),
     )

@@ -1,65 +1,16 @@
-"""Disturbances made of others."""
+"""Disturbances inside a window of time."""
 
-import functools
-import operator
 from typing import Any
 
 import jax.numpy as jnp
-import jax.random as jr
 from jaxtyping import Array
 
-from .._check import check_instance, check_key, check_range
+from .._check import check_instance, check_range
 from .._module import parameter
 from .._typing import PRNGKey, Vector
 from ..math._steps import reached, step_between
 from ._base import AbstractDisturbance, Rows
 from ._deterministic import Constant
-
-
-class Sum(AbstractDisturbance):
-    """The sum of several disturbances, each drawn with a key of its own.
-
-    **Arguments:** `*terms`: disturbances of one size.
-
-    **Raises:** `ValueError` if there are none, if one is no disturbance, or if sizes
-    differ.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-
-        both = dlx.disturbances.Sum(
-            dlx.disturbances.Gaussian(0.1, size=2),
-            dlx.disturbances.Constant(0.5, size=2),
-        )
-        ```
-    """
-
-    terms: tuple[AbstractDisturbance, ...]
-
-    def __init__(self, *terms: AbstractDisturbance):
-        self.terms = terms
-
-    def __check_init__(self):
-        for term in self.terms:
-            check_instance(term, AbstractDisturbance, "every term", "Sum")
-        sizes = [term.size for term in self.terms]
-        if len(set(sizes)) != 1:
-            raise ValueError(f"Sum: terms must be of one size, got sizes {sizes}.")
-
-    @property
-    def size(self) -> int:
-        """The size that the terms share."""
-        return self.terms[0].size
-
-    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
-        n = len(self.terms)
-        if key is not None:
-            check_key(key, "Sum")
-        keys = [None] * n if key is None else list(jr.split(key, n))
-        drawn = (w.sequence(k, times) for w, k in zip(self.terms, keys, strict=True))
-        return functools.reduce(operator.add, drawn)
 
 
 class Window(AbstractDisturbance):

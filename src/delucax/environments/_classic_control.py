@@ -1,0 +1,317 @@
+"""Gym's Pendulum-v1, CartPole-v1, MountainCarContinuous-v0 and MountainCar-v0."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._check import check_number, check_positive, check_range
+from .._module import parameter
+from .._typing import BoolScalar, State, Time, Vector
+from ..costs import Arrival, PendulumCost
+from ..dynamics import Discretized
+from ..math import cos, sin
+from ..systems import CartPole, MountainCar, Pendulum
+from ._gym import GymCartPole, GymMountainCar, GymPendulum
+from ._task import Fields, task, UniformState
+
+
+def pendulum_features(x: State) -> Vector:
+    """Cosine and sine of the angle, and the velocity: what Gymnasium users see.
+
+    **Arguments:** `x`: (angle, velocity).
+
+    **Returns:** (cos(angle), sin(angle), velocity).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.environments.pendulum_features(jnp.array([0.1, 0.0]))
+        ```
+    """
+    return jnp.stack([cos(x[0]), sin(x[0]), x[1]])
+
+
+@task(Pendulum, gym=GymPendulum, dt=0.05, horizon=200)
+def pendulum(dynamics: GymPendulum | Discretized, *, max_torque: Any = 2.0) -> Fields:
+    """Swing up a pendulum and hold it upright with a torque too weak to lift it at
+    once.
+
+    State (angle, velocity) with angle 0 upright; control (torque). Starts with the
+    angle uniform over the circle and the velocity in +-1. Cost
+    `wrap(angle)^2 + 0.1 velocity^2 + 0.001 torque^2` a step. Never terminates.
+
+    Not smooth where the speed meets the limit of Gym's arithmetic; a `solver` gives the
+    smooth variant. The slope of the cost jumps where the pendulum hangs straight down.
+
+    **Arguments:**
+
+    - `system`: a [`delucax.systems.Pendulum`][]; made of `others` by default.
+    - `dt`: the control interval, 0.05 by default.
+    - `horizon`: steps an episode, 200 by default.
+    - `max_torque`: 2 by default.
+    - `solver`: a Diffrax solver in place of Gym's arithmetic; there is no speed limit
+        then.
+    - `substeps`: solver steps an interval, with `solver`.
+    - `**others`: arguments of [`delucax.systems.Pendulum`][], of
+        [`delucax.environments.GymPendulum`][], such as `max_speed`, without a `solver`,
+        or of [`delucax.Environment`][], such as `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, `substeps` without `solver`, or
+        `max_speed` with it.
+
+    Source: Gymnasium (Towers et al., 2023), `Pendulum-v1`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.environments.pendulum(length=1.2, dt=0.02)
+        ```
+    """
+    check_range(max_torque, "max_torque", "pendulum")
+    fastest = dynamics.max_speed if isinstance(dynamics, GymPendulum) else np.inf
+    feature_bound = jnp.array([1.0, 1.0, fastest])
+    corner = jnp.array([np.pi, 1.0])
+    return dict(
+        cost=PendulumCost(),
+        initial_state=UniformState(-corner, corner),
+        control_bounds=(-max_torque, max_torque),
+        encode=pendulum_features,
+        observation_bounds=(-feature_bound, feature_bound),
+    )
+
+
+class _Fallen(eqx.Module):
+    """Whether the cart has left the track or the pole has fallen."""
+
+    max_position: Array = parameter()
+    max_angle: Array = parameter()
+
+    def __call__(self, t: Time, x: State) -> BoolScalar:
+        return (abs(x[0]) > self.max_position) | (abs(x[2]) > self.max_angle)
+
+
+@task(CartPole, gym=GymCartPole, dt=0.02, horizon=500)
+def cartpole(
+    dynamics: GymCartPole | Discretized,
+    *,
+    max_force: Any = 10.0,
+    max_position: Any = 2.4,
+    max_angle: Any = 12 * 2 * np.pi / 360,
+) -> Fields:
+    """Keep a pole upright on a cart that a force pushes to and fro.
+
+    State (position, velocity, angle, spin), upright at 0; control (force), continuous
+    within its bounds; the integer actions 0 and 1 are Gym's forces -10 and 10. Starts
+    with each state uniform in +-0.05. A step costs -1; the episode ends when the
+    position or the angle leaves its bounds.
+
+    The dynamics are smooth as they are. That cost has no gradient: for planning and
+    policy gradients give a [`delucax.costs.Quadratic`][] as `cost`. The linear model
+    about the upright pole is `dlx.linearize(env.dynamics)`.
+
+    **Arguments:**
+
+    - `system`: a [`delucax.systems.CartPole`][]; made of `others` by default.
+    - `dt`: the control interval, 0.02 by default.
+    - `horizon`: steps an episode, 500 by default.
+    - `max_force`: 10 by default.
+    - `max_position`: where the track ends, 2.4 by default.
+    - `max_angle`: beyond which the pole has fallen, 12 degrees by default.
+    - `solver`: a Diffrax solver in place of Gym's arithmetic.
+    - `substeps`: solver steps an interval, with `solver`.
+    - `**others`: arguments of [`delucax.systems.CartPole`][], of
+        [`delucax.environments.GymCartPole`][], such as `semi_implicit`, without a
+        `solver`, or of [`delucax.Environment`][], such as `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, `substeps` without `solver`, or
+        `semi_implicit` with it.
+
+    Source: Gymnasium (Towers et al., 2023), `CartPole-v1`; Barto, Sutton and Anderson,
+    1983.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        env = dlx.environments.cartpole(half_length=0.6)
+        env.step(0.0, jnp.zeros(4), 1)
+        smooth = dlx.make("cartpole", cost=dlx.costs.Quadratic(jnp.eye(4), jnp.eye(1)))
+        lqr = dlx.controllers.LQR(dlx.linearize(env.dynamics), jnp.eye(4), jnp.eye(1))
+        ```
+    """
+    check_range(max_force, "max_force", "cartpole")
+    check_positive(max_position, "max_position", "cartpole")
+    check_positive(max_angle, "max_angle", "cartpole")
+    # Gym's own: twice where the episode ends, which no state of an episode reaches.
+    feature_bound = jnp.array([2 * max_position, np.inf, 2 * max_angle, np.inf])
+    return dict(
+        cost=Arrival(step_cost=-1.0),
+        initial_state=UniformState([-0.05] * 4, [0.05] * 4),
+        control_bounds=(-max_force, max_force),
+        terminated=_Fallen(max_position, max_angle),
+        actions=max_force * jnp.array([[-1.0], [1.0]]),
+        observation_bounds=(-feature_bound, feature_bound),
+    )
+
+
+class _AtGoal(eqx.Module):
+    """Whether the car is at the goal or beyond it, and fast enough."""
+
+    goal_position: Array = parameter()
+    goal_velocity: Array = parameter()
+
+    def __call__(self, t: Time, x: State) -> BoolScalar:
+        return (x[0] >= self.goal_position) & (x[1] >= self.goal_velocity)
+
+
+@task(MountainCar, gym=GymMountainCar, dt=1.0, horizon=999)
+def mountain_car(
+    dynamics: GymMountainCar | Discretized,
+    *,
+    goal_position: Any = 0.45,
+    goal_velocity: Any = 0.0,
+) -> Fields:
+    """Drive a car out of a valley by rocking it: Gym's MountainCarContinuous-v0.
+
+    State (position, velocity); control (push), in +-1. Starts at rest with the position
+    uniform in [-0.6, -0.4]. A step costs `0.1 push^2`, and the arrival at the goal
+    -100, where the episode ends. Gym charges the push that was asked for; here it is
+    the one that was applied, within the bounds.
+
+    The arrival has no gradient. For planning and policy gradients give as `cost` a
+    [`delucax.costs.Quadratic`][] with the goal as `state_target`, `terminated=None`,
+    and a `solver` for dynamics without walls and limits.
+
+    **Arguments:**
+
+    - `system`: a [`delucax.systems.MountainCar`][]; made of `others` by default.
+    - `dt`: the control interval in Gym's steps, 1 by default.
+    - `horizon`: steps an episode, 999 by default.
+    - `goal_position`: 0.45 by default.
+    - `goal_velocity`: the least velocity at the goal, 0 by default.
+    - `solver`: a Diffrax solver in place of Gym's arithmetic; there are no limits then.
+    - `substeps`: solver steps an interval, with `solver`.
+    - `**others`: arguments of [`delucax.systems.MountainCar`][], of
+        [`delucax.environments.GymMountainCar`][], such as `max_speed`, without a
+        `solver`, or of [`delucax.Environment`][], such as `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, `substeps` without `solver`, or a limit
+        with it.
+
+    Source: Gymnasium (Towers et al., 2023), `MountainCarContinuous-v0`; Moore, 1990.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        env = dlx.environments.mountain_car(power=0.002)
+        cost = dlx.costs.Quadratic(
+            jnp.diag(jnp.array([1.0, 0.0])), 0.1 * jnp.eye(1), state_target=[0.45, 0.0]
+        )
+        smooth = dlx.make(
+            "mountain_car", solver=dlx.dynamics.RK4(), cost=cost, terminated=None
+        )
+        ```
+    """
+    goal, valley = _valley("mountain_car", dynamics, goal_position, goal_velocity)
+    cost = Arrival(goal, step_cost=0.0, control_weight=0.1, arrival_cost=-100.0)
+    return dict(cost=cost, **valley)
+
+
+@task(
+    MountainCar,
+    gym=GymMountainCar,
+    dt=1.0,
+    horizon=200,
+    arguments=lambda *, power=0.001: dict(power=power),
+)
+def mountain_car_discrete(
+    dynamics: GymMountainCar | Discretized,
+    *,
+    goal_position: Any = 0.5,
+    goal_velocity: Any = 0.0,
+) -> Fields:
+    """Drive a car out of a valley in the fewest steps: Gym's MountainCar-v0.
+
+    As [`delucax.environments.mountain_car`][] with a weaker motor and a farther goal;
+    the integer actions 0, 1, 2 are the pushes -1, 0, 1, and a push between them is
+    taken too. A step costs 1, the arrival nothing.
+
+    That cost has no gradient; what has is named there.
+
+    **Arguments:**
+
+    - `system`: a [`delucax.systems.MountainCar`][]; made of `others` by default.
+    - `power`: of its motor, 0.001 by default.
+    - `dt`: the control interval in Gym's steps, 1 by default.
+    - `horizon`: steps an episode, 200 by default.
+    - `goal_position`: 0.5 by default.
+    - `goal_velocity`: the least velocity at the goal, 0 by default.
+    - `solver`: a Diffrax solver in place of Gym's arithmetic; there are no limits then.
+    - `substeps`: solver steps an interval, with `solver`.
+    - `**others`: arguments of [`delucax.systems.MountainCar`][], of
+        [`delucax.environments.GymMountainCar`][], such as `max_speed`, without a
+        `solver`, or of [`delucax.Environment`][], such as `disturbance`.
+
+    **Returns:** an [`delucax.Environment`][].
+
+    **Raises:** `ValueError` on illegal numbers, `substeps` without `solver`, or a limit
+        with it.
+
+    Source: Gymnasium (Towers et al., 2023), `MountainCar-v0`; Moore, 1990.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        env = dlx.environments.mountain_car_discrete()
+        env.step(0.0, jnp.array([-0.5, 0.0]), 2)
+        ```
+    """
+    where = "mountain_car_discrete"
+    goal, valley = _valley(where, dynamics, goal_position, goal_velocity)
+    return dict(cost=Arrival(goal), actions=[[-1.0], [0.0], [1.0]], **valley)
+
+
+def _valley(
+    where: str,
+    dynamics: GymMountainCar | Discretized,
+    goal_position: Any,
+    goal_velocity: Any,
+) -> tuple[_AtGoal, dict[str, Any]]:
+    """The goal, and what both tasks have: where a car starts, and between what it
+    stays."""
+    check_number(goal_position, "goal_position", where)
+    check_number(goal_velocity, "goal_velocity", where)
+    goal, bounds = _AtGoal(goal_position, goal_velocity), None
+    if isinstance(dynamics, GymMountainCar):
+        bounds = (
+            jnp.stack([dynamics.min_position, -dynamics.max_speed]),
+            jnp.stack([dynamics.max_position, dynamics.max_speed]),
+        )
+    return goal, dict(
+        initial_state=UniformState([-0.6, 0.0], [-0.4, 0.0]),
+        control_bounds=(-1.0, 1.0),
+        terminated=goal,
+        observation_bounds=bounds,
+    )

@@ -1,0 +1,24 @@
+"""States whose entries 3 to 6 are a quaternion, the attitude of a body."""
+
+import jax.numpy as jnp
+
+from .._typing import State
+
+
+def attitude_difference(x: State, x_ref: State) -> State:
+    """`x - x_ref` with the quaternion, entries 3 to 6, of the sign closer to that of
+    `x_ref`; both turn alike."""
+    along = sum(x[i] * x_ref[i] for i in range(3, 7))
+    sign = jnp.where(along < 0, -1.0, 1.0).astype(x.dtype)
+    q = [sign * x[i] - x_ref[i] for i in range(3, 7)]
+    d = x - x_ref
+    return jnp.stack([d[0], d[1], d[2], *q, *(d[i] for i in range(7, 13))])
+
+
+def unit_attitude(x: State) -> State:
+    """`x` with the quaternion, entries 3 to 6, of length 1."""
+    square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5] + x[6] * x[6]
+    # A quaternion of zeros has no direction; it is left, not turned into NaN.
+    scale = jnp.where(square > 0, square, 1.0) ** -0.5
+    q = [scale * x[i] for i in range(3, 7)]
+    return jnp.stack([x[0], x[1], x[2], *q, *(x[i] for i in range(7, 13))])

@@ -1,0 +1,273 @@
+"""Plants of industry: a reactor, a pair of tanks and a motor."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._check import is_concrete
+from .._message import shortened
+from .._module import parameter, positive
+from .._typing import Control, Disturbance, Scalar, State, Time
+from ._base import AbstractSystem
+
+
+class CSTR(AbstractSystem):
+    r"""The continuous stirred-tank reactor: a reactant flows in, reacts in a tank that
+    is stirred, and gives off heat, which a jacket takes away,
+
+    `dc/dt = flow (c_feed - c) - r`,
+    `dT/dt = flow (T_feed - T) + heat r + cooling (T_coolant - T)`,
+
+    with `r = rate exp(-activation / T) c`. Time is in minutes.
+
+    The state is (concentration [mol/l], temperature [K]), the control is (coolant [K]),
+    the temperature of the jacket.
+
+    With the numbers below it can rest at half the feed's concentration, but not by
+    itself: a little warmer, it reacts faster and gets warmer still. There the poles are
+    2.83 and -0.45 a minute.
+
+    **Arguments:**
+
+    - `flow`: of the feed over the volume, q/V [1/min], 1 by default.
+    - `feed_concentration`: of the reactant in the feed [mol/l], 1 by default.
+    - `feed_temperature`: [K], 350 by default.
+    - `rate`: k0, of the reaction at infinite temperature [1/min], 7.2e10 by default.
+    - `activation`: the activation energy over the gas constant, E/R [K], 8750 by
+        default.
+    - `heat`: by how much the tank warms a mole that reacts in a litre [K l/mol], 209.2
+        by default.
+    - `cooling`: heat conducted to the jacket, over the capacity of the tank [1/min],
+        2.092 by default.
+
+    **Raises:** `ValueError` if a number is not positive.
+
+    Source: Hicks and Ray, 1971; Henson and Seborg, 1997 (these numbers).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        reactor = dlx.systems.CSTR()
+        x, u = reactor.equilibrium(concentration=0.5)
+        reactor.vector_field(0.0, x, u, None)
+        ```
+    """
+
+    flow: Array = parameter(1.0, constraint=positive)
+    feed_concentration: Array = parameter(1.0, constraint=positive)
+    feed_temperature: Array = parameter(350.0, constraint=positive)
+    rate: Array = parameter(7.2e10, constraint=positive)
+    activation: Array = parameter(8750.0, constraint=positive)
+    heat: Array = parameter(209.2, constraint=positive)
+    cooling: Array = parameter(2.092, constraint=positive)
+
+    state_names: ClassVar = ("concentration", "temperature")
+    control_names: ClassVar = ("coolant",)
+    state_units: ClassVar = ("mol/l", "K")
+    time_unit: ClassVar = "min"
+    control_units: ClassVar = ("K",)
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        c, T = x[0], x[1]
+        # Nothing reacts near absolute zero, below which a solver's stage may be.
+        reaction = self.rate * jnp.exp(-self.activation / jnp.maximum(T, 1.0)) * c
+        dc = self.flow * (self.feed_concentration - c) - reaction
+        warming = self.flow * (self.feed_temperature - T) + self.heat * reaction
+        return jnp.stack([dc, warming + self.cooling * (u[0] - T)])
+
+    def equilibrium(self, concentration: Any = 0.5) -> tuple[State, Control]:
+        """Where the coolant holds the tank at a concentration.
+
+        **Arguments:** `concentration`: of the reactant, between 0 and that of the feed
+        [mol/l]; 0.5 by default.
+
+        **Returns:** `(x, u)`.
+
+        **Raises:** `ValueError` if `concentration` is not between these.
+        """
+        c, feed = jnp.asarray(concentration, float), self.feed_concentration
+        if is_concrete(c) and is_concrete(feed):
+            at, most = np.asarray(c), np.asarray(feed)
+            if not np.all((at > 0) & (at < most)):
+                raise ValueError(
+                    "CSTR: concentration must be above 0 and below feed_concentration, "
+                    f"{shortened(most)}, got {shortened(at)}."
+                )
+        reaction = self.flow * (feed - c)
+        T = self.activation / jnp.log(self.rate * c / reaction)
+        warming = self.flow * (self.feed_temperature - T) + self.heat * reaction
+        return jnp.stack([c, T]), jnp.stack([T - warming / self.cooling])
+
+
+class TwoTank(AbstractSystem):
+    r"""A pump fills the upper of two tanks, which drains into the lower one, which
+    drains away:
+
+    `A1 d(upper)/dt = flow - a1 sqrt(2 g) root(upper)`,
+    `A2 d(lower)/dt = a1 sqrt(2 g) root(upper) - a2 sqrt(2 g) root(lower)`.
+
+    The state is the levels (upper [cm], lower [cm]), the control is (flow [cm^3/s]).
+
+    Torricelli's law has `root(h) = sqrt(h)`, whose slope is infinite at an empty tank,
+    and which has no value below. Here it is `root(h) = h / (h^2 + smoothing^2)^(1/4)`,
+    odd and smooth everywhere, and off by `(smoothing / h)^2 / 4` relatively: 2.5e-5 at
+    a level of 1 cm, by default. With a smaller `smoothing` an empty tank is stiffer.
+
+    **Arguments:**
+
+    - `upper_area`, `lower_area`: A1 and A2, of the tanks [cm^2], 28 by default.
+    - `upper_outlet`, `lower_outlet`: a1 and a2, of the holes [cm^2], 0.071 by default.
+    - `gravity`: g [cm/s^2], 981 by default.
+    - `smoothing`: a level [cm], 0.01 by default.
+
+    **Raises:** `ValueError` if a number is not positive.
+
+    Source: Johansson, 2000 (one branch of the quadruple tank).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        tanks = dlx.systems.TwoTank()
+        x, u = tanks.equilibrium(level=12.0)
+        tanks.vector_field(0.0, x, u, None)
+        ```
+    """
+
+    upper_area: Array = parameter(28.0, constraint=positive)
+    lower_area: Array = parameter(28.0, constraint=positive)
+    upper_outlet: Array = parameter(0.071, constraint=positive)
+    lower_outlet: Array = parameter(0.071, constraint=positive)
+    gravity: Array = parameter(981.0, constraint=positive)
+    smoothing: Array = parameter(0.01, constraint=positive)
+
+    state_names: ClassVar = ("upper", "lower")
+    control_names: ClassVar = ("flow",)
+    state_units: ClassVar = ("cm", "cm")
+    control_units: ClassVar = ("cm^3/s",)
+
+    def _outflow(self, outlet: Array, level: Array) -> Array:
+        root = level * (level * level + self.smoothing**2) ** -0.25
+        return outlet * (2 * self.gravity) ** 0.5 * root
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        upper = self._outflow(self.upper_outlet, x[0])
+        lower = self._outflow(self.lower_outlet, x[1])
+        filling = (u[0] - upper) / self.upper_area
+        return jnp.stack([filling, (upper - lower) / self.lower_area])
+
+    def equilibrium(self, level: Any = 10.0) -> tuple[State, Control]:
+        """Where the pump holds the lower tank at a level.
+
+        **Arguments:** `level`: of the lower tank, not negative [cm]; 10 by default.
+
+        **Returns:** `(x, u)`.
+        """
+        level = jnp.asarray(level, float)
+        flow = self._outflow(self.lower_outlet, level)
+        # The level with that outflow: root(h)^2 = r solves for h^2 by a quadratic.
+        r = (flow / self.upper_outlet) ** 2 / (2 * self.gravity)
+        square = r * (r + (r * r + 4 * self.smoothing**2) ** 0.5) / 2
+        return jnp.stack([square**0.5, level]), jnp.stack([flow])
+
+
+class PermanentMagnetMotor(AbstractSystem):
+    r"""A synchronous motor with permanent magnets, in the coordinates d (along the
+    magnets) and q (across them) that turn with the rotor:
+
+    `L_d d(i_d)/dt = v_d - R i_d + p speed L_q i_q`,
+    `L_q d(i_q)/dt = v_q - R i_q - p speed (L_d i_d + flux)`,
+    `J d(speed)/dt = 3/2 p (flux i_q + (L_d - L_q) i_d i_q) - b speed - load`.
+
+    The state is (i_d [A], i_q [A], speed [rad/s]), the speed being that of the shaft;
+    the control is (v_d [V], v_q [V]); the disturbance is (load [N m]). Smooth.
+
+    **Arguments:**
+
+    - `resistance`: R [ohm], 2.875 by default.
+    - `d_inductance`, `q_inductance`: L_d and L_q [H], 0.0085 by default.
+    - `flux`: of the magnets [Wb], 0.175 by default.
+    - `inertia`: J [kg m^2], 0.0008 by default.
+    - `friction`: b [N m s], 0.001 by default.
+    - `pole_pairs`: p, 4 by default.
+
+    **Raises:** `ValueError` if an inductance, the flux, the inertia or the number of
+    poles is not positive, or a number is not finite.
+
+    Source: Krause, Wasynczuk and Sudhoff, 2002. The constants are those of a small
+    servo motor.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        motor = dlx.systems.PermanentMagnetMotor()
+        x, u = motor.equilibrium(speed=100.0)
+        motor.vector_field(0.0, x, u, None)
+        ```
+    """
+
+    resistance: Array = parameter(2.875)
+    d_inductance: Array = parameter(0.0085, constraint=positive)
+    q_inductance: Array = parameter(0.0085, constraint=positive)
+    flux: Array = parameter(0.175, constraint=positive)
+    inertia: Array = parameter(0.0008, constraint=positive)
+    friction: Array = parameter(0.001)
+    pole_pairs: Array = parameter(4.0, constraint=positive)
+
+    state_names: ClassVar = ("i_d", "i_q", "speed")
+    control_names: ClassVar = ("v_d", "v_q")
+    disturbance_names: ClassVar = ("load",)
+    state_units: ClassVar = ("A", "A", "rad/s")
+    control_units: ClassVar = ("V", "V")
+
+    def torque(self, x: State) -> Scalar:
+        """What the currents do to the shaft.
+
+        **Arguments:** `x`: state.
+
+        **Returns:** the torque [N m], a scalar.
+        """
+        saliency = self.d_inductance - self.q_inductance
+        return 1.5 * self.pole_pairs * (self.flux * x[1] + saliency * x[0] * x[1])
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        electrical = self.pole_pairs * x[2]
+        d_flux = self.d_inductance * x[0] + self.flux
+        q_flux = self.q_inductance * x[1]
+        d_voltage = u[0] - self.resistance * x[0] + electrical * q_flux
+        q_voltage = u[1] - self.resistance * x[1] - electrical * d_flux
+        torque = self.torque(x) - self.friction * x[2]
+        if w is not None:
+            torque = torque - w[0]
+        # Loops compute the reciprocals once.
+        return jnp.stack(
+            [
+                d_voltage * (1 / self.d_inductance),
+                q_voltage * (1 / self.q_inductance),
+                torque * (1 / self.inertia),
+            ]
+        )
+
+    def equilibrium(self, speed: Any = 0.0) -> tuple[State, Control]:
+        """Turning at a speed without load, with no current along the magnets.
+
+        **Arguments:** `speed`: [rad/s], 0 by default.
+
+        **Returns:** `(x, u)`.
+        """
+        speed = jnp.asarray(speed, float)
+        current = self.friction * speed / (1.5 * self.pole_pairs * self.flux)
+        electrical = self.pole_pairs * speed
+        d_voltage = -electrical * self.q_inductance * current
+        q_voltage = self.resistance * current + electrical * self.flux
+        x = jnp.stack([jnp.zeros_like(current), current, speed])
+        return x, jnp.stack([d_voltage, q_voltage])
