@@ -159,7 +159,9 @@ def raise_on_failure(
     result = solution.result
     failed = result != RESULTS.successful
     if isinstance(failed, Tracer):
-        return result.error_if(solution, failed)
+        # As `result.error_if` does, with the name before each message.
+        words = [f"{where}: {m}" for m in result._enumeration._index_to_message]
+        return eqx.branched_error_if(solution, failed, result._value, words)
     if failed:
         words = (
             f"{where}: {RESULTS[result]}",

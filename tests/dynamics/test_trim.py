@@ -120,7 +120,7 @@ def test_what_is_no_equilibrium_says_so():
     def found(x):
         return dlx.trim(Reactor(), x=x, u=[300.0], fix=("T", "Tc")).x
 
-    with pytest.raises(eqx.EquinoxRuntimeError, match="There is no equilibrium"):
+    with pytest.raises(eqx.EquinoxRuntimeError, match="trim: There is no equilibrium"):
         eqx.filter_jit(found)(jnp.array(case["x"]))
     cold = dlx.trim(Reactor(), x=[0.5, 0.0], u=[300.0], fix="Tc", throw=False)
     assert cold.result == dlx.RESULTS.diverged

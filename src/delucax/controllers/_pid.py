@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -84,7 +84,10 @@ class _AbstractPID(AbstractController):
     reference: eqx.AbstractVar[Array | Callable[[Any], Array] | None]
     output: eqx.AbstractVar[Any]
     bounds: eqx.AbstractVar[Bounds | None]
-    _times: eqx.AbstractClassVar[tuple[str, ...]]
+    if TYPE_CHECKING:  # a static checker would ask for it as an argument
+        _times: ClassVar[tuple[str, ...]]
+    else:
+        _times: eqx.AbstractClassVar[tuple[str, ...]]
 
     def __check_init__(self):
         where = type(self).__name__
