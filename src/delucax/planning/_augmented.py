@@ -54,6 +54,7 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
     def body(carry):
         before, tolerance, _ = carry
         after = minimise(before, tolerance)
+        assert after.violation is not None
         precise = tolerance <= options.tolerance
         holds = after.violation <= options.constraint_tolerance
         settled = (after.result == RESULTS.successful) & precise & holds

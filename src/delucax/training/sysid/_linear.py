@@ -77,7 +77,8 @@ def linear(
 
     def model_of(estimate):
         A, B = estimate[:, :n], estimate[:, n : n + m]
-        return LinearDynamics(A, B, dt=dt, x_next=estimate[:, -1] if affine else None)
+        x_next: Any = estimate[:, -1] if affine else None
+        return LinearDynamics(A, B, dt=dt, x_next=x_next)
 
     return _fitted(model_of, names, regressors, states[:, 1:], reach, throw)
 
