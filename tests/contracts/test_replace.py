@@ -216,7 +216,7 @@ def part(name):
         ("KalmanFilter", {"dynamics": dynamics(3)}, r"W must have shape \(3, 3\)"),
         ("KalmanFilter",
             {"dynamics": dlx.LinearDynamics(np.stack([A, A]), np.stack([B, B]))},
-            "steady_state needs time-invariant dynamics"),
+            "dynamics with steady_state must be time-invariant"),
         ("Plan", {"states": np.ones((7, 2))}, "Plan: shapes do not fit each other"),
         ("Plan", {"dt": -1.0}, "Plan: dt must be positive"),
         ("Plan", {"low": [1.0], "high": [-1.0]}, "low <= high"),

@@ -110,7 +110,7 @@ class Environment(eqx.Module):
     dynamics: AbstractDynamics
     cost: AbstractCost
     # What is None by default follows from the dynamics, in `__post_init__`.
-    disturbance: AbstractDisturbance = eqx.field(default=None)
+    disturbance: AbstractDisturbance | None = eqx.field(default=None)
     sensor_noise: AbstractDisturbance | None = None
     initial_state: Any = eqx.field(default=None, converter=_as_start)
     control_bounds: tuple[Any, Any] | None = bounds_field(

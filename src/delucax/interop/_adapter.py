@@ -98,7 +98,7 @@ def begin(env: Environment, key: PRNGKey, state: State | None = None) -> Episode
     start_key, w_key, noise_key, _ = env.split_key(key)
     x = env.reset(start_key) if state is None else state
     w = noise = None
-    if not isinstance(env.disturbance, Zero):
+    if env.disturbance is not None and not isinstance(env.disturbance, Zero):
         w = env.disturbance.draw(w_key, env.dt, env.horizon, x.dtype)
     if env.sensor_noise is not None:
         # The state after the last step is observed too. Where what is recorded ends
