@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import diffrax
 import equinox as eqx
 import jax
@@ -464,3 +466,34 @@ def test_statistics_of_a_batch(key):
     assert_close(batch[:4].statistics()["terminated"], 0.25)
     alone = go(starts[1]).statistics()
     assert alone["5%"] == alone["95%"] == total[1] and alone["finite"] == 1
+
+
+class Faulty(dlx.AbstractSystem):
+    """Fails in a loop, where its state is traced."""
+
+    state_names = ("x",)
+    control_names = ("u",)
+    fails: bool = eqx.field(static=True, default=False)
+
+    def vector_field(self, t, x, u, w):
+        if self.fails:
+            raise ZeroDivisionError
+        return u - x
+
+
+def test_few_frames_lie_between_the_scan_and_the_vector_field():
+    """Of this library's, in the traceback that a wrong field of a user's gives."""
+    cost = dlx.costs.Quadratic(jnp.ones(1), jnp.ones(1))
+    env = dlx.Environment(dlx.Discretized(Faulty(), 0.1), cost)
+    env = eqx.tree_at(lambda e: e.dynamics.system, env, Faulty(True))
+    inside, filtering = Path(dlx.__file__).parent, jax.config.jax_traceback_filtering
+    jax.config.update("jax_traceback_filtering", "off")
+    try:
+        with pytest.raises(ZeroDivisionError) as caught:
+            dlx.rollout(env, dlx.controllers.Zero(1), key=jax.random.key(0))
+    finally:
+        jax.config.update("jax_traceback_filtering", filtering)
+    entries = list(caught.traceback)
+    scan = max(k for k, entry in enumerate(entries) if entry.name == "scan")
+    paths = [Path(str(entry.path)) for entry in entries[scan:]]
+    assert 0 < sum(path.is_relative_to(inside) for path in paths) <= 7
