@@ -199,8 +199,8 @@ def check_finite(array: Any, name: str, where: str) -> None:
 def _check_entries(
     value: Any, name: str, where: str, rule: str, holds: Callable[[Any], Any]
 ) -> None:
-    """Raise unless all entries of a number or an array are as they must be, as far as
-    can be seen."""
+    """Raise unless all entries of a number or an array are as they must be, where
+    they are concrete."""
     array = as_float_array(value)
     if eqx.is_inexact_array(array):
         if not is_concrete(array) or np.all(holds(np.asarray(array))):
@@ -210,7 +210,7 @@ def _check_entries(
 
 
 def check_positive(value: Any, name: str, where: str) -> None:
-    """Raise unless numbers are finite and above zero, as far as can be seen."""
+    """Raise unless numbers are finite and above zero, where they are concrete."""
     holds = lambda at: np.isfinite(at) & (at > 0)
     _check_entries(value, name, where, "positive and finite", holds)
 
@@ -223,7 +223,7 @@ def check_step(dt: Any, where: str, name: str = "dt") -> None:
 
 
 def check_number(value: Any, name: str, where: str) -> None:
-    """Raise unless `value` is one finite real number, as far as can be seen."""
+    """Raise unless `value` is one finite real number, where they are concrete."""
     array = _as_array(value, name, where, "be a number", lambda shape: shape == ())
     check_real(array, name, where)
     check_finite(array, name, where)
@@ -251,7 +251,7 @@ def as_number(value: Any, name: str, where: str) -> Any:
 def check_range(
     value: Any, name: str, where: str, low: Any = 0, high: float | int = np.inf
 ) -> None:
-    """Raise unless numbers lie between `low` and `high`, as far as can be seen."""
+    """Raise unless numbers lie between `low` and `high`, where they are concrete."""
     least = as_float_array(low)
 
     def holds(at):
@@ -420,7 +420,7 @@ def check_vector(value: Any, name: str, where: str) -> None:
 
 
 def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
-    """Raise unless `R`, as far as it can be seen, is positive definite or, if not
+    """Raise unless `R`, where it is concrete, is positive definite or, if not
     `definite`, semidefinite."""
     if not is_concrete(R):
         return

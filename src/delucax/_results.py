@@ -134,7 +134,7 @@ _T = TypeVar("_T")
 
 
 def raise_if(failed: Bool[Array, ""], value: _T, message: str) -> _T:
-    """`value`, or an error: now if it can be seen, else at run time."""
+    """`value`, or an error: now if it is concrete, else at run time."""
     if isinstance(failed, Tracer):
         return eqx.error_if(value, failed, message)
     if failed:
@@ -150,9 +150,9 @@ def raise_on_failure(
     facts: Callable[[], str] = lambda: "",
 ) -> Any:
     """`solution`, or an error if its `result` is a failure and `throw` holds: now if
-    that can be seen, else at run time.
+    it is concrete, else at run time.
 
-    `it` names the solution in the error; `facts` says more of a failure that is seen.
+    `it` names the solution in the error; `facts` says more of a concrete failure.
     """
     if not throw:
         return solution

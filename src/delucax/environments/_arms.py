@@ -170,7 +170,7 @@ class ReacherCost(AbstractCost):
         check_finite(self.goal, "goal", "ReacherCost")
 
     def offset(self, x: Array) -> Array:
-        """Where the tip is, seen from the goal.
+        """Where the tip is, relative to the goal.
 
         **Arguments:** `x`: state.
 

@@ -114,7 +114,7 @@ _DEATHS = ("TerminatedWorkerError", "BrokenProcessPool", "KilledWorker")
 def _packed(experiment: Experiment) -> tuple[str, bytes]:
     """The experiment as bytes that any process can read, and their hash."""
     cloudpickle = extra("cloudpickle", "experiments")
-    # Its fixtures are found here: in another process it has no module's globals.
+    # Its fixtures are looked up here: in another process it has no module's globals.
     experiment = dataclasses.replace(experiment, fixtures=experiment.used_fixtures())
     try:
         content = cloudpickle.dumps(experiment)

@@ -47,7 +47,7 @@ def dare(
         singular, and zero.
     - `S`: cross weight, shape `(n, m)`; zero by default.
     - `E`: descriptor matrix, shape `(n, n)`, invertible; the identity by default.
-    - `throw`: raise unless the solution is found and stabilising (default); if false,
+    - `throw`: raise unless there is a stabilising solution (default); if false,
         look at `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][]. It is successful if the
@@ -116,7 +116,7 @@ def care(
         one the control may be an impulse, and there is no such gain.
     - `S`: cross weight, shape `(n, m)`; zero by default.
     - `E`: descriptor matrix, shape `(n, n)`, invertible; the identity by default.
-    - `throw`: raise unless the solution is found and stabilising (default); if false,
+    - `throw`: raise unless there is a stabilising solution (default); if false,
         look at `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][] with a `spectral_abscissa`. It
@@ -175,7 +175,7 @@ def filter_dare(
     - `V`: covariance of the measurement noise, shape `(p, p)`, symmetric, positive
         semidefinite.
     - `S`: their cross-covariance, shape `(n, p)`; zero by default.
-    - `throw`: raise unless the solution is found and stabilising (default); if false,
+    - `throw`: raise unless there is a stabilising solution (default); if false,
         look at `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][], with `K` of shape `(n, p)` and
@@ -226,7 +226,7 @@ def filter_care(
     - `V`: intensity of the measurement noise, shape `(p, p)`, symmetric, positive
         definite.
     - `S`: their cross-intensity, shape `(n, p)`; zero by default.
-    - `throw`: raise unless the solution is found and stabilising (default); if false,
+    - `throw`: raise unless there is a stabilising solution (default); if false,
         look at `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][], with `K` of shape `(n, p)` and

@@ -25,7 +25,7 @@ _PLAIN, _SHIFTED, _DENSELY, _DONE = range(4)
 
 
 class MatrixSolution(eqx.Module):
-    """What a solver of a linear matrix equation found.
+    """The solution of a linear matrix equation.
 
     **Attributes:**
 

@@ -33,7 +33,7 @@ _SECOND_START = 1e4
 
 
 class RiccatiSolution(eqx.Module):
-    """What a Riccati solver found, with the facts to judge it by.
+    """The solution of a Riccati equation, with the facts to judge it by.
 
     **Attributes:**
 

@@ -117,7 +117,7 @@ class BPC(AbstractController):
         where = "BPC"
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         memory = check_count(memory, "memory", where)
-        # A roll-out as long as it takes a control to be seen.
+        # A roll-out as long as it takes a control to show.
         loop = ClosedLoop(dynamics, base, dynamics.state_size, where, memory=memory)
         scale = lambda given, name, units: in_first_responses(
             loop, given, name, units, where

@@ -140,7 +140,7 @@ def drc(
 
     - `dynamics`: the model; linear and time-invariant where the state is not observed.
     - `cost`: the stage cost, a differentiable function of `(t, y, u)`: of the
-        observation, which is all that is seen.
+        observation, which is all that it is given.
     - `base`: a controller that stabilises the dynamics; by default the
         [`delucax.controllers.LQG`][] for the curvature of the cost and for disturbances
         and sensor noise of unit covariance ([`delucax.controllers.LQR`][] where the
@@ -178,7 +178,7 @@ def drc(
         push = dlx.disturbances.Constant(0.3 * jnp.ones(2))
         cost = dlx.costs.Quadratic(C.T @ C, jnp.eye(1))
         env = dlx.make("lds", A=A, B=B, C=C, cost=cost, disturbance=push)
-        cost = dlx.costs.Quadratic(jnp.eye(1), jnp.eye(1))  # of what is seen
+        cost = dlx.costs.Quadratic(jnp.eye(1), jnp.eye(1))  # of the observation
         learner = dlx.controllers.drc(env.dynamics, cost)
         dlx.rollout(env, learner, key=jax.random.key(0), horizon=1000).total_cost
         ```

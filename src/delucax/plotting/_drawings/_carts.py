@@ -71,7 +71,7 @@ def cart_pole(canvas: Canvas, episode: Episode) -> Drawing:
 
 def linear_cart_pole(canvas: Canvas, episode: Episode) -> Drawing:
     """A rod with a mass at its tip, which leans to the left for positive angles. Its
-    length is found in how much more a force accelerates the cart than the angle."""
+    length shows in how much more a force accelerates the cart than the angle."""
     B = np.asarray(episode.system.B, float).reshape(-1, 4, 1)
     cart, turning = B[0, 2:, 0]
     length = float(cart / turning) if turning * cart > 0 else 1.0

@@ -89,7 +89,7 @@ def planar_quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
     centre = (low + high) / 2 if half <= 20 * length else visited[-1]
     half = np.full(2, min(max(half, 4 * length), 20 * length))
     view = View(centre, half)
-    arm = max(length, 0.16 * float(half[0]))  # seen from afar it is drawn larger
+    arm = max(length, 0.16 * float(half[0]))  # in a wide view it is drawn larger
     if target is not None:
         canvas.goal(target[:2], 0.3 * arm)
     if system.wind is not None:
@@ -172,7 +172,7 @@ def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
     half = np.clip(0.5 * np.max(high - low) + 2 * length, 5 * length, 15 * length)
     centre = np.where(high - low < 2 * half, (low + high) / 2, middle)
     floor = float(max(low[2], centre[2] - half) - 2.5 * length)
-    arm = max(length, 0.16 * float(half))  # seen from afar it is drawn larger
+    arm = max(length, 0.16 * float(half))  # in a wide view it is drawn larger
 
     ends = np.array([-half, half])
     lines = []
