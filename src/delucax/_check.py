@@ -115,9 +115,7 @@ def check_real(array: Array, name: str, where: str) -> None:
 def as_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
     """`value` as a floating-point array of `ndim` axes with finite entries."""
     fits = lambda shape: len(shape) == ndim
-    array = _as_array(value, name, where, "be a matrix", fits)
-    check_finite(array, name, where)
-    return array
+    return as_finite(value, name, where, "be a matrix", fits)
 
 
 def symmetric_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
@@ -434,3 +432,13 @@ def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
             f"{where}: {name} must be positive {kind}, got {array}, whose least "
             f"eigenvalue is {least:.3g}."
         )
+
+
+def as_finite(
+    value: Any, name: str, where: str, rule: str, fits: Callable[[Shape], bool]
+) -> Array:
+    """`value` as a floating-point array of finite entries whose shape fits, as the
+    `rule` says, or an error."""
+    array = _as_array(value, name, where, rule, fits)
+    check_finite(array, name, where)
+    return array

@@ -12,6 +12,8 @@ Vector: TypeAlias = Float[Array, "_"]  # noqa: F821
 """A rank-1 floating-point array."""
 Matrix: TypeAlias = Float[Array, "_ _"]
 """A rank-2 floating-point array."""
+Square: TypeAlias = Float[Array, "n n"]
+"""A square matrix; all in one signature have the same size."""
 State: TypeAlias = Float[Array, "states"]  # noqa: F821
 Control: TypeAlias = Float[Array, "controls"]  # noqa: F821
 Disturbance: TypeAlias = Float[Array, "disturbances"] | None  # noqa: F821

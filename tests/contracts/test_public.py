@@ -129,7 +129,7 @@ LONG = {
     lung.least_error lung.pid_grid lung.ShootingMPC lung.train_controllers
     lung.write_example planning.Constraints planning.ilqr planning.Plan
     plotting.phase_portrait randomise
-    riccati.ContinuousHorizonSolution riccati.dre riccati.hinf_care riccati.hinf_cre
+    riccati.dre riccati.hinf_care riccati.hinf_cre
     riccati.hinf_dre simulate training.analytic training.EvolutionStrategies
     training.expected_cost training.fit training.PPO training.scored_cost
     training.SHAC training.sysid.arx training.sysid.Identified

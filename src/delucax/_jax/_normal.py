@@ -17,7 +17,7 @@ from jax.extend.random import threefry_2x32
 from jaxtyping import Array
 
 from .._typing import PRNGKey
-from ..math._trig import cos, sin
+from ..math._angles import cos, sin
 
 
 _PAIRS = 16

@@ -254,7 +254,15 @@ def peak_gain(system: StateSpace) -> PeakGain:
     safe = system.stable_or_harmless(stable)
     frozen = lax.stop_gradient(safe)
     start, ended = _search(frozen)
-    gain, frequency = _at_top(safe, *_climb(frozen, start))
+    top, curvature, moves = _climb(frozen, start)
+    finite = jnp.isfinite(top)
+    gain, slope = _with_slope(safe, jnp.where(finite, top, 1))
+    rise = jnp.where(moves, slope - lax.stop_gradient(slope), 0)
+    # Zero, but not its derivatives: the step that Newton's method would take next, by
+    # which the top and its frequency move with the plant.
+    step = -rise / curvature
+    gain = gain + step * slope + step**2 * curvature / 2
+    gain, frequency = jnp.where(finite, gain, largest_gain(safe.D)), top + step
     least = poles[jnp.argmax(growth)]
     if system.dt is None:
         at_pole = jnp.abs(jnp.imag(least))
@@ -311,24 +319,10 @@ def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScala
     return top, curvature, moves
 
 
-def _at_top(
-    system: StateSpace, omega: Scalar, curvature: Scalar, moves: BoolScalar
-) -> tuple[Scalar, Scalar]:
-    """The gain at the top, and its frequency, which move with the plant as they do."""
-    finite = jnp.isfinite(omega)
-    gain, slope = _with_slope(system, jnp.where(finite, omega, 1))
-    rise = jnp.where(moves, slope - lax.stop_gradient(slope), 0)
-    # Zero, but not its derivatives: the step that Newton's method would take next.
-    step = -rise / curvature
-    gain = gain + step * slope + step**2 * curvature / 2
-    at_infinity = largest_gain(system.D)
-    return jnp.where(finite, gain, at_infinity), omega + step
-
-
 def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
     """The frequency of the largest gain, and whether the search came to its end."""
     axis = system.on_the_axis() if system.is_discrete else system
-    A, B, C, D = axis.A, axis.B, axis.C, axis.D
+    A, B, C, D, _ = axis
     n = A.shape[0]
     gain = lambda w: largest_gain(axis.response(w))
     eps = jnp.finfo(A.dtype).eps

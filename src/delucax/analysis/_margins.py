@@ -108,7 +108,7 @@ def disk_margin(
 @eqx.filter_jit
 def disk_of(loop: StateSpace, skew: Scalar, channel: int | None) -> DiskMargin:
     """The disk margin of a loop, or of one of its channels."""
-    A, B, C = loop.A, loop.B, loop.C
+    A, B, C, *_ = loop
     if channel is not None:
         others = [i for i in range(B.shape[1]) if i != channel]
         A = A - B[:, jnp.array(others)] @ C[jnp.array(others)] if others else A
@@ -251,7 +251,7 @@ def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
 
 @eqx.filter_jit
 def _margins(loop: StateSpace) -> Margins:
-    stable = loop.with_A(loop.A - loop.B @ loop.C).is_stable()
+    stable = loop._replace(A=loop.A - loop.B @ loop.C).is_stable()
     skews = jnp.array([0, 1, -1], loop.A.dtype)
     disks = jax.vmap(lambda skew: disk_of(loop, skew, None))(skews)
     frozen = lax.stop_gradient(loop)
@@ -344,16 +344,16 @@ def _crossings(
 
     **Returns:** two rows of frequencies, and which of them are crossings.
     """
-    A, B, C = loop.A, loop.B, loop.C
+    A, B, C, D, _ = loop
     eps = jnp.finfo(A.dtype).eps
     if loop.is_discrete:
         scale = jnp.ones((), A.dtype)
         # A pole at -1, on the circle, would go to infinity; now it goes far.
-        axis = loop.with_A(loop.A * (1 - 10 * eps)).on_the_axis()
+        axis = loop._replace(A=loop.A * (1 - 10 * eps)).on_the_axis()
     else:
         sizes = jnp.abs(jnp.linalg.eigvals(A - B @ C))
         scale = jnp.exp(jnp.mean(jnp.log(jnp.where(sizes > 0, sizes, 1))))
-        axis = StateSpace(A / scale, B / scale, C, loop.D, None)
+        axis = StateSpace(A / scale, B / scale, C, D, None)
 
     def omega(phi):
         """The frequency of an angle in `[0, pi/2]`, one for each frequency there is."""
@@ -399,7 +399,9 @@ def _crossings(
 
 def _real_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
     """Zeros of `L(s) - L(-s)`: eigenvalues, seen from two points of the real axis."""
-    A, B, C = loop.A, loop.B, loop.C
+    A, B, C, *_ = loop
+    # Where g(s) = L(s) - L(-s) is zero, 1 / g has a pole: an eigenvalue of the inverse
+    # system, which exists in a variable 1 / (point - s), as g(point) is not zero.
     zero = jnp.zeros_like(A)
     both_A = jnp.block([[A, zero], [zero, -A]])
     both_B, both_C = jnp.concatenate([B, B]), jnp.concatenate([C, C], axis=1)
@@ -417,7 +419,7 @@ def _real_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
 
 def _unit_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
     """Zeros of `1 - L(-s) L(s)`: eigenvalues of a Hamiltonian."""
-    A, B, C, D = loop.A, loop.B, loop.C, loop.D
+    A, B, C, D, _ = loop
     remainder = 1 - D[0, 0] ** 2
     remainder = jnp.where(remainder == 0, jnp.finfo(A.dtype).eps, remainder)
     F = A + B @ C * D[0, 0] / remainder

@@ -1,14 +1,13 @@
 """The matrices that every analysis is about."""
 
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
-import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Inexact
 
 from .._check import check_choice, check_time_invariant
-from .._typing import BoolScalar, Scalar
+from .._typing import BoolScalar, Scalar, Square
 from ..dynamics import LinearDynamics
 from ..math import safe_norm
 from ..math._linear_solve import lu_solve
@@ -18,10 +17,10 @@ from ..systems import LinearSystem
 LinearModel: TypeAlias = LinearSystem | LinearDynamics
 
 
-class StateSpace(eqx.Module):
+class StateSpace(NamedTuple):
     """`y = (C (s I - A)^-1 B + D) u`, with `s = z` if it has a step `dt`."""
 
-    A: Float[Array, "n n"]
+    A: Square
     B: Float[Array, "n m"]
     C: Float[Array, "p n"]
     D: Float[Array, "p m"]
@@ -32,17 +31,13 @@ class StateSpace(eqx.Module):
         return self.dt is not None
 
     @property
-    def eye(self) -> Float[Array, "n n"]:
+    def eye(self) -> Square:
         return jnp.eye(self.A.shape[0], dtype=self.A.dtype)
 
     @property
     def dual(self) -> "StateSpace":
         """The transposed system, whose inputs are what this one's outputs are."""
         return StateSpace(self.A.T, self.C.T, self.B.T, self.D.T, self.dt)
-
-    def with_A(self, A: Float[Array, "n n"]) -> "StateSpace":
-        """The same system with other dynamics."""
-        return eqx.tree_at(lambda system: system.A, self, A)
 
     def growth(self, poles: Complex[Array, "*poles"]) -> Float[Array, "*poles"]:
         """Below zero for what decays: the real part, or the modulus less 1."""
@@ -56,7 +51,7 @@ class StateSpace(eqx.Module):
     def stable_or_harmless(self, stable: BoolScalar) -> "StateSpace":
         """This system, or a stable one in the place of one that is not, so that what is
         computed of it and then not taken has finite derivatives."""
-        return self.with_A(jnp.where(stable, self.A, -self.eye / 2))
+        return self._replace(A=jnp.where(stable, self.A, -self.eye / 2))
 
     def response(self, omega: Scalar) -> Complex[Array, "p m"]:
         """The complex gain at one finite frequency: at the point `j omega`, or
@@ -68,11 +63,11 @@ class StateSpace(eqx.Module):
     def on_the_axis(self) -> "StateSpace":
         """The system in continuous time with the gains of this one in discrete time:
         with `z = (1 + s) / (1 - s)` the circle becomes the axis."""
-        n, eye = self.A.shape[0], self.eye
-        right = jnp.concatenate([self.A - eye, self.B], axis=1)
-        both = lu_solve(eye + self.A, right)
-        D = self.D - self.C @ both[:, n:]
-        C = 2**0.5 * lu_solve((eye + self.A).T, self.C.T).T
+        A, B, C, D, _ = self
+        n = A.shape[0]
+        both = lu_solve(self.eye + A, jnp.concatenate([A - self.eye, B], axis=1))
+        D = D - C @ both[:, n:]
+        C = 2**0.5 * lu_solve((self.eye + A).T, C.T).T
         return StateSpace(both[:, :n], 2**0.5 * both[:, n:], C, D, None)
 
 
@@ -120,6 +115,7 @@ def largest_gain(G: Inexact[Array, "p m"]) -> Scalar:
     if 1 in G.shape:
         return frobenius_norm(G)
     frozen = lax.stop_gradient(G)
+    # The first-order change of the top singular vector, as perturbation theory has it.
     squares, vectors = jnp.linalg.eigh(frozen.conj().T @ frozen)
     gaps = squares[-1] - squares
     open_gaps = gaps > jnp.finfo(gaps.dtype).eps ** 0.5 * squares[-1]

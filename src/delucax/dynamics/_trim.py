@@ -15,7 +15,7 @@ from .._integration import evaluate_field
 from .._message import shortened
 from .._results import choose, raise_on_failure, RESULTS
 from .._typing import RealScalar
-from ..math._drift import relative_drift, ULPS, units_of
+from ..math._norms import relative_drift, ULPS, units_of
 from ..systems import AbstractSystem
 from ._base import AbstractDynamics
 from ._discretized import Discretized

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._size import power_of_two
+from ._norms import power_of_two
 
 
 _SMALL = 2**15

@@ -3,8 +3,8 @@
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
-from jaxtyping import Array, Float
 
+from .._typing import Scalar, Square
 from ._linear_solve import full_precision, symmetric
 
 
@@ -13,9 +13,7 @@ _DOUBLINGS = 60
 
 
 @full_precision
-def gramian_over(
-    A: Float[Array, "n n"], Q: Float[Array, "n n"], time: Float[Array, ""]
-) -> Float[Array, "n n"]:
+def gramian_over(A: Square, Q: Square, time: Scalar) -> Square:
     """The integral of `exp(A s) Q exp(A' s)` over `s` from 0 to `time`.
 
     Over all of the time the exponential of `-A` would overflow where `A` is stiff. So

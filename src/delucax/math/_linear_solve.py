@@ -8,7 +8,9 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float, Inexact
+from jaxtyping import Array, Float, Inexact
+
+from .._typing import BoolScalar, Square
 
 
 SMALL = 5
@@ -33,9 +35,7 @@ def full_precision(function: Callable) -> Callable:
     return wrapped
 
 
-def solve(
-    matrix: Float[Array, "n n"], right: Float[Array, "n k"]
-) -> Float[Array, "n k"]:
+def solve(matrix: Square, right: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """`matrix^-1 right`; not finite where `matrix` is singular."""
     return factorised(matrix)(right)
 
@@ -145,7 +145,7 @@ def _factor(matrix):
     return _apart(rows), pivots
 
 
-def is_definite(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
+def is_definite(matrix: Square) -> BoolScalar:
     """Whether all pivots of a symmetric matrix are positive."""
     n = matrix.shape[0]
     if n > SMALL:

@@ -7,7 +7,6 @@ from ._algebraic import (
     filter_dare as filter_dare,
 )
 from ._finite_horizon import (
-    ContinuousHorizonSolution as ContinuousHorizonSolution,
     cre as cre,
     dre as dre,
     FiniteHorizonSolution as FiniteHorizonSolution,
@@ -17,11 +16,7 @@ from ._hinfinity import (
     hinf_care as hinf_care,
     hinf_dare as hinf_dare,
 )
-from ._hinfinity_horizon import (
-    hinf_cre as hinf_cre,
-    hinf_dre as hinf_dre,
-    HorizonGameSolution as HorizonGameSolution,
-)
+from ._hinfinity_horizon import hinf_cre as hinf_cre, hinf_dre as hinf_dre
 from ._linear import (
     dlyap as dlyap,
     dsylvester as dsylvester,

@@ -1,17 +1,24 @@
-"""A game at its least level, by bisection, and the derivative of the level."""
+"""A game at a level, or at its least one by bisection, and the level's derivative."""
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from ..math._linear_solve import full_precision
+from .._check import check_step
+from .._results import raise_on_failure
+from .._typing import Scalar, Square
+from ..math._linear_solve import full_precision, solve
+from ._arguments import RiccatiData
+from ._residual import stationary
 
 
+_LOOSE = {4: 1e-3, 8: 1e-6}
+"""Default tolerance of a level by the bytes of a number, where `X` has a pole at it."""
 _WIDEST = 1e18
 """The search gives up this factor away from where it starts."""
 _FACTOR = 4.0
@@ -19,6 +26,50 @@ _MAX_TRIALS = 200
 _AWAY = (1.0, 4.0, 16.0, 64.0)
 _WEIGHTS = (64 / 21, -8 / 3, 2 / 3, -1 / 21)
 """Of the polynomial through values at the roots of the above, at 0."""
+
+
+def players(B, D, R, gamma) -> tuple[Array, Array]:
+    """`[B D]`, and the weight of the joint control `[u; w]`."""
+    m, k = B.shape[-1], D.shape[-1]
+    weight = jnp.zeros((*R.shape[:-2], m + k, m + k), R.dtype)
+    worth = -(gamma**2) * jnp.eye(k, dtype=R.dtype)
+    weight = weight.at[..., :m, :m].set(R).at[..., m:, m:].set(worth)
+    return jnp.concatenate([B, D], axis=-1), weight
+
+
+def joint(problem: tuple, gamma: Scalar) -> RiccatiData:
+    """The equation of the game `(A, B, D, Q, R)`."""
+    A, B, D, Q, R = problem
+    both, weight = players(B, D, R, gamma)
+    return RiccatiData(A, both, Q, weight, jnp.zeros_like(both), None)
+
+
+def joint_gain(discrete: bool, data: RiccatiData, X: Square) -> Array:
+    """The gains `K` of the joint control `[u; w] = -K x`."""
+    _, cross, weight = stationary(discrete, data, X)
+    return solve(weight, cross.T)
+
+
+def at_level(
+    solution_of: Callable[..., Any],
+    where: str,
+    discrete: bool,
+    problem: tuple,
+    gamma: Any,
+    tolerance: Any,
+    throw: bool,
+) -> Any:
+    """A game at the level that is given, or at the least one to within a tolerance."""
+    dtype = problem[0].dtype
+    if tolerance is None:
+        tolerance = 16 * jnp.finfo(dtype).eps if discrete else _LOOSE[dtype.itemsize]
+    check_step(tolerance, where, "tolerance")
+    if gamma is not None:
+        check_step(gamma, where, "gamma")
+        gamma = jnp.asarray(gamma, dtype)
+    solution = solution_of(discrete, problem, gamma, jnp.asarray(tolerance, dtype))
+    facts = lambda: f"Level gamma {float(solution.gamma):.6g}."
+    return raise_on_failure(solution, where, throw, facts=facts)
 
 
 class Game(NamedTuple):
@@ -54,7 +105,7 @@ below the solution, from which the iteration rises to it."""
 
 
 def bisect_level(
-    solve: Solve,
+    solve_game: Solve,
     problem: tuple,
     start: Array,
     gamma: Array | None = None,
@@ -82,27 +133,33 @@ def bisect_level(
 
     def body(now):
         first = now.trials == 0
-        trial = _next(now) if gamma is None else gamma
+        if gamma is None:
+            # Up by factors until feasible, down until not, and then into the middle, of
+            # the logarithms: the level may have any size.
+            known = jnp.where(jnp.isinf(now.high), 1, now.high)
+            up = jnp.where(now.low == 0, now.start, _FACTOR * now.low)
+            down = jnp.where(now.low == 0, known / _FACTOR, jnp.sqrt(now.low * known))
+            trial = jnp.where(jnp.isinf(now.high), up, down)
+        else:
+            trial = gamma
         trial = jnp.where(first, one, trial)
         tried = (A, B, jnp.where(first, 0, D), *others)
-        game = solve(tried, trial, now.base)
+        game = solve_game(tried, trial, now.base)
         good = game.good
-        # What a disturbance does to the cost when it is not resisted at all.
+        # What a disturbance does to the cost when nothing resists it: D'XD, whose
+        # root has the size of a level, and the search starts there.
         X = game.X[1:] if D.ndim == 3 else game.X
         effect = jnp.einsum("...ik,...ij,...jk->", D, X, D)
         size = jnp.linalg.norm(X) * jnp.sum(D**2)
         slack = 10 * A.shape[-1] * jnp.finfo(A.dtype).eps * size
-        at_first = Bisection(
-            low=now.low,
-            high=now.high,
+        at_first = now._replace(
             start=jnp.sqrt(jnp.maximum(effect, jnp.finfo(A.dtype).tiny)),
             solvable=good,
             affected=effect > slack,
             base=game.X,
             game=game,
-            trials=now.trials,
         )
-        # Between neighbouring numbers there is nothing left to try.
+        # Between neighbouring numbers there is nothing left to try: the bracket closes.
         stuck = (trial <= now.low) | (trial >= now.high)
         better = good & ~stuck
         keep = better if gamma is None else jnp.ones((), bool)
@@ -113,7 +170,7 @@ def bisect_level(
         )
         return _where(first, at_first, later)._replace(trials=now.trials + 1)
 
-    unknown = jax.eval_shape(solve, problem, one, start)
+    unknown = jax.eval_shape(solve_game, problem, one, start)
     begin = Bisection(
         low=0 * one,
         high=jnp.inf * one,
@@ -132,7 +189,7 @@ def bisect_level(
 
 
 def game_at_level(
-    solve: Solve,
+    solve_game: Solve,
     barrier: Callable[[tuple, Array], Array],
     problem: tuple,
     start: Array,
@@ -141,20 +198,12 @@ def game_at_level(
 ) -> tuple[Bisection, Array, Array]:
     """The game at `gamma`, or at the least level; that level, or 1 if it is 0; and the
     level as it is, with its derivatives."""
-    end, level = bisect_level(solve, problem, start, gamma, tolerance)
+    end, level = bisect_level(solve_game, problem, start, gamma, tolerance)
     if gamma is None:
         attained = followed(barrier, problem, level)
     else:
         attained = level = gamma
     return end, jnp.where(level > 0, level, 1), attained
-
-
-def _next(now: Bisection) -> Array:
-    """Up by factors until feasible, down until not, and then into the middle."""
-    known = jnp.where(jnp.isinf(now.high), 1, now.high)
-    up = jnp.where(now.low == 0, now.start, _FACTOR * now.low)
-    down = jnp.where(now.low == 0, known / _FACTOR, jnp.sqrt(now.low * known))
-    return jnp.where(jnp.isinf(now.high), up, down)
 
 
 def _where(condition, first, second):
@@ -175,6 +224,8 @@ def followed(barrier: Callable[[tuple, Array], Array], problem: tuple, level: Ar
 @followed.defjvp
 @full_precision
 def _followed_jvp(barrier, primals, tangents):
+    # By implicit differentiation of barrier(problem, gamma) = constant a little above
+    # the level: at it both slopes are infinite, and their quotient has a limit.
     problem, level = primals
     level = once(level)
     problem = jax.tree.map(once, problem)
@@ -211,3 +262,13 @@ def _once_jvp(primals, tangents):
         "The least attainable gamma has first derivatives only. Give gamma as an "
         "argument for higher ones."
     )
+
+
+def inverse_margins(
+    D: Float[Array, "T n k"], X: Float[Array, "T n n"], gamma: Scalar
+) -> Scalar:
+    """The traces of `(gamma^2 I - D'XD)^-1`, summed, in a unit that fits."""
+    eye = jnp.eye(D.shape[-1], dtype=D.dtype)
+    margins = gamma**2 * eye - jnp.swapaxes(D, 1, 2) @ X @ D
+    inverses = jax.vmap(lambda M: jnp.trace(solve(M, eye)))(margins)
+    return lax.stop_gradient(gamma**2 * jnp.linalg.norm(X)) * jnp.sum(inverses)

@@ -1,20 +1,31 @@
-"""What is left of a matrix equation, bounded from above with all rounding counted."""
+"""What is left of a matrix equation, bounded from above with all rounding counted, and
+Newton steps on it."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from .._typing import BoolScalar, Scalar, Square
 from ..math._accurate import in_parts, product
 from ..math._linear_solve import solve, symmetric
-from ..math._size import relative_and_total_size
+from ..math._norms import relative_and_total_size
 from ._arguments import RiccatiData
 
 
 _MARGIN = 1.01
 """Covers the rounding of the norms that a residual is the quotient of."""
+_NEWTON_STEPS = 8
+_FINE = 64
+"""Units of rounding in the relative residual that need no correction."""
+
+
+def tolerance(dtype: Any) -> float:
+    """The relative residual up to which an equation counts as solved."""
+    return 1e-12 if jnp.finfo(dtype).bits == 64 else 1e-5
 
 
 class Residual(NamedTuple):
@@ -28,24 +39,18 @@ class Residual(NamedTuple):
     - `terms`: the sum of the norms of the terms, in each of these units.
     """
 
-    error: Float[Array, "n n"]
-    relative: Float[Array, ""]
+    error: Square
+    relative: Scalar
     bounds: Float[Array, " units"]
-    closed_loop: Float[Array, "n n"]
+    closed_loop: Square
     terms: Float[Array, " units"]
-
-
-def no_residual(X: Float[Array, "n n"], units: int) -> Residual:
-    """A residual of nothing, of the shapes of that at `X`."""
-    matrix, number, vector = (jnp.zeros(s, X.dtype) for s in (X.shape, (), units))
-    return Residual(matrix, number, vector, matrix, vector)
 
 
 def riccati_residual(
     discrete: bool,
     data: RiccatiData,
-    X: Float[Array, "n n"],
-    accurately: Bool[Array, ""] | bool,
+    X: Square,
+    accurately: BoolScalar | bool,
     *others: Float[Array, " n"],
     players: int = 0,
 ) -> Residual:
@@ -69,8 +74,12 @@ def riccati_residual(
     (n, m), dtype = B.shape, A.dtype
     moved, cross, weight = stationary(discrete, data, X)
     weighted = X if E is None else E.T @ X
+    # One factorisation for the gain and for the inverse, whose absolute value bounds
+    # the last term: G is small, so that its own rounding matters little.
     solved = solve(weight, jnp.concatenate([cross.T, jnp.eye(m, dtype=dtype)], axis=1))
     K, inverse = solved[:, :n], jnp.abs(solved[:, n:])
+    # The terms of the equation, for their norms. A game's two quadratic terms have
+    # opposite signs: their sum would hide how large they are.
     first = m - players
     moved = moved @ A
     if discrete and E is not None:
@@ -95,6 +104,7 @@ def riccati_residual(
         *_, left = lax.while_loop(lambda carry: carry[0], more_accurate, start)
     error, lost, gap, gap_lost = left
     gap = jnp.abs(gap) + gap_lost
+    # |G'W^-1 G| <= |G|' |W^-1| |G| entry by entry; 2 covers the rounding of W^-1.
     bound = jnp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
 
     both, terms = jnp.stack([error, bound]), jnp.stack(terms)
@@ -112,7 +122,7 @@ def riccati_residual(
 
 
 def stationary(
-    discrete: bool, data: RiccatiData, X: Float[Array, "n n"]
+    discrete: bool, data: RiccatiData, X: Square
 ) -> tuple[Array, Array, Array]:
     """`E'X`, `E'XB + S` and `R`, or `A'X`, `A'XB + S` and `R + B'XB` in discrete time:
     of the last two follows the best gain."""
@@ -136,6 +146,9 @@ class _Left(NamedTuple):
 def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
     """N, L, T, Y = XL (XE in continuous time) and Z = XE, and what is left."""
     n, m = B.shape
+    # Higham's model: fl(a op b) = (a op b) (1 + d) with |d| <= unit, and a product of k
+    # terms is off by k units of the product of absolute values. `lost_M` is that bound
+    # for M, `from_L` is what an error of L does to XL.
     unit = jnp.finfo(A.dtype).eps / 2
     size_B, size_S, size_X, size_N = (jnp.abs(M) for M in (B, S, X, K))
     N = -K
@@ -168,6 +181,7 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
     else:
         square, lost = _twice(square), _twice(lost + both)
     lost += m * unit * (size_S @ size_N) + size_N.T @ (m * unit * size_T + lost_T)
+    # Four additions, each of a sum no larger than that of the sizes, and a margin.
     lost += 5 * unit * sum(jnp.abs(M) for M in (square, subtracted, Q, SN, NT))
     gap_lost = size_B.T @ ((n + 2) * unit * size_Y + lost_Y + from_L)
     gap_lost += lost_T + 2 * unit * size_T
@@ -195,6 +209,7 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
     else:
         terms, added = [(L, Z), (Z, L), (S.T, N), (N, T)], [Q]
         of_X = [] if E is None else [(E, Z, 2 * L)]
+    # S and R stand under A and B, so that one product has the rests of L and of T.
     # Pairs of what is left out and a bound on what this leaves out again.
     pair = product(stacked([B, R]), N, stacked([A, S.T]), -stacked([L, T]))
     rests = list(zip(*(jnp.split(M, [n]) for M in pair), strict=True))
@@ -240,7 +255,8 @@ def linear_residual(discrete, A, B, C, X) -> Array:
     """What is left of `A X + X B = C`, or of `X - A X B = C`, at `X`, over
     `(|A| + |B|) |X| + |C|`, or over `(|A| |B| + 1) |X| + |C|`.
 
-    Relative to these norms, rounding counts for little, and its bound is added.
+    Relative to these norms, rounding counts for little, and its bound is added. So it
+    is the backward error: how far, relatively, the data are from some that `X` solves.
     """
     eps = jnp.finfo(X.dtype).eps
     size_A, size_B = jnp.linalg.norm(A), jnp.linalg.norm(B)
@@ -254,3 +270,64 @@ def linear_residual(discrete, A, B, C, X) -> Array:
     relative = jnp.linalg.norm(error) / jnp.where(terms == 0, 1, terms)
     relative = _MARGIN * (relative + rounding)
     return jnp.where(jnp.isfinite(relative), relative, jnp.inf)
+
+
+def polish(
+    residual: Callable[[Array, Array], Residual],
+    correction: Callable[[Array, Array, Array], Array],
+    X: Square,
+    *,
+    units: int,
+    to_working_precision: bool = False,
+) -> tuple[Array, Residual]:
+    """Newton steps on the equation itself, if it asks for them, while they help.
+
+    `residual(X, accurately)` is what is left of it, in so many `units`, and
+    `correction(X, closed_loop, error)` solves it to first order. Where rounding may
+    hide more than there is to be left, the steps go on with accurate residuals, unless
+    they are to end in working precision. Returns the best `X`, and what is left there.
+
+    Source: Kleinman, 1968; each step solves the Lyapunov equation of the last loop.
+    """
+    fine, wide = _FINE * float(jnp.finfo(X.dtype).eps), tolerance(X.dtype)
+
+    def body(carry):
+        X, last, best, accurately, going, patient, k = carry
+        # The first round measures, those after it step: so there is one residual in
+        # the compiled program, which is most of its size.
+        first = k == 0
+        X = symmetric(X + step((X, *last), going & ~first))
+        new = residual(X, going & accurately)
+        better = first | (new.relative < best[1].relative)
+        # Where steps stop to help much, rounding is all that is left. But far from the
+        # solution the first may not help and yet be one towards it.
+        helped = first | (new.relative < best[1].relative / 4)
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), (X, new), best)
+        rest = best[1].relative
+        again = helped | patient & (rest > wide)
+        again &= (rest > fine) & (k < _NEWTON_STEPS)
+        # The bound is too wide for a certificate: once more, accurately, from the best.
+        hidden = ~again & ~accurately & (jnp.max(best[1].bounds) > wide)
+        X = jnp.where(hidden, best[0], X)
+        k = jnp.where(hidden, 0, k + 1)
+        last = new.closed_loop, new.error
+        return X, last, best, accurately | hidden, again | hidden, helped, k
+
+    def step(at, needed):
+        """The correction. A loop of one round is not run for a batch in which no member
+        needs it, as in the first round, which only measures."""
+
+        def once(carry):
+            # What is carried changes, so that no work on it is moved ahead of the loop.
+            nothing = jax.tree.map(jnp.zeros_like, at)
+            return jnp.zeros_like(needed), correction(*carry[2]), nothing
+
+        start = needed, jnp.zeros_like(X), at
+        return lax.while_loop(lambda carry: carry[0], once, start)[1]
+
+    yes = jnp.asarray(True)
+    matrix, number, vector = (jnp.zeros(s, X.dtype) for s in (X.shape, (), units))
+    unknown = Residual(matrix, number, vector, matrix, vector)
+    accurately = jnp.asarray(to_working_precision)
+    start = X, (matrix, matrix), (X, unknown), accurately, yes, yes, jnp.asarray(0)
+    return lax.while_loop(lambda carry: carry[4], body, start)[2]

@@ -6,9 +6,10 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from .._results import raise_on_failure, Result
+from .._typing import BoolScalar
 from ..math._linear_solve import (
     factorised,
     full_precision,
@@ -17,19 +18,33 @@ from ..math._linear_solve import (
     solve,
     symmetric,
 )
-from ..math._size import one_if_zero, size
-from ._arguments import complex_form, is_complex, real_form, RiccatiData
-from ._lyapunov import lyapunov, stein
-from ._newton import polish
-from ._residual import riccati_residual, stationary
-from ._search import Attempt, Candidate, search, SearchResult, SECOND, weights
+from ..math._lyapunov import lyapunov
+from ..math._norms import one_if_zero, size
+from ._arguments import (
+    complex_form,
+    is_complex,
+    real_form,
+    RiccatiData,
+    where_solved,
+)
+from ._doubling import continuous_start, discrete_start
+from ._residual import polish, riccati_residual, stationary
+from ._search import (
+    Attempt,
+    Candidate,
+    in_units,
+    search,
+    SearchResult,
+    SECOND,
+    units,
+    weights,
+)
 from ._spectrum import abscissa_and_size, spectral_radius
-from ._start import continuous_start, discrete_start
-from ._units import in_units, units
 
 
 _SECOND_START = 1e4
-"""How much higher the second start of doubling is than the first."""
+"""How much higher the second start of doubling is than the first: `X` may be far larger
+than `Q`, as where a control is weak."""
 
 
 class RiccatiSolution(eqx.Module):
@@ -122,6 +137,7 @@ def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
     by = d, f = units(data)
     data = in_units(by, data)
     solution = _certified(discrete, data, by)
+    # The gain is a formula in X and the data, whose derivatives are then its own.
     K, closed_loop = _feedback(discrete, solution.differentiable, data, solution.X)
     residual, bound = lax.stop_gradient((solution.best.given, solution.best.bound))
     return RiccatiSolution(
@@ -147,6 +163,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
     if E is not None:
         solved = factorised(E)
         explicit = RiccatiData(solved(A), solved(B), Q, R, S, None)
+    # In discrete time R + B'XB is inverted, in continuous time R alone.
     posed = (
         is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
     )
@@ -167,7 +184,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
         if discrete:
             height = size_Q * jnp.where(second, _SECOND_START, 1)
             X, iterations = discrete_start(start, height)
-            size_G = jnp.zeros_like(size_Q)  # not needed
+            size_G = jnp.zeros_like(size_Q)  # needed in continuous time alone
         else:
             X, size_G, iterations = continuous_start(start, second)
         X, left = polish(
@@ -184,6 +201,8 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             weight = here.R + here.B.T @ X @ here.B
             gap = jnp.where(is_semidefinite(weight), 1 - bound, -jnp.inf)
             rounding, scale = jnp.asarray(n * eps, A.dtype), 1.0
+            # Eigenvalues come in pairs z, 1/z. Where two meet on the circle, data that
+            # change by rounding move them apart by its root.
             reach = 10 * eps**0.5
         else:
             bound, scale = abscissa_and_size(loop)
@@ -196,7 +215,8 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
         balanced_X = X * (row[:, None] * row)
         size_loop = size(loop * (state / state[:, None]))
         gain = 1 + size_loop**2 if discrete else 2 * size_loop
-        # The residual that rounding of X may leave.
+        # A change dX leaves L'dX L - E'dX E, or E'dX L + L'dX E: the residual that
+        # rounding of X may leave.
         terms = jnp.where(left.terms[2] > 0, left.terms[2], jnp.inf)
         return Attempt(
             Candidate(balanced_X, left.bounds[2], left.bounds[1], bound, gap),
@@ -219,8 +239,10 @@ def _certified_jvp(discrete, primals, tangents):
     solution = _certified(discrete, *primals)
     ok = solution.differentiable
     # Guarded at both ends: what is not finite in a failed member stays in it.
-    tangent = _where(ok, tangents[0], 0)
+    tangent = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents[0])
     safe, X = _harmless(ok, data, solution.X)
+    # The derivative of the equation in X is the Lyapunov operator of the closed loop:
+    # dX solves it for what the change of the data leaves at a fixed X.
     equation = functools.partial(left_side, discrete, X)
     _, error, loop = jax.jvp(equation, (safe,), (tangent,), has_aux=True)
     loop = jnp.where(ok, loop, shifted(-0.5, loop))
@@ -251,7 +273,7 @@ def _terms(discrete, data, X):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _feedback(discrete: bool, ok: Bool[Array, ""], data: RiccatiData, X: Array):
+def _feedback(discrete: bool, ok: BoolScalar, data: RiccatiData, X: Array):
     """`K` and the closed loop, with derivatives in members that are `ok` alone."""
     *_, K, closed_loop = _terms(discrete, data, X)
     return K, closed_loop
@@ -261,32 +283,22 @@ def _feedback(discrete: bool, ok: Bool[Array, ""], data: RiccatiData, X: Array):
 @full_precision
 def _feedback_jvp(discrete, primals, tangents):
     ok, *at = primals
-    tangent = _where(ok, tangents[1:], 0)
-    _, tangent = jax.jvp(
-        lambda *at: _terms(discrete, *at)[2:], _harmless(ok, *at), tangent
-    )
-    return _feedback(discrete, *primals), _where(ok, tangent, 0)
+    if_ok = lambda tree: jax.tree.map(lambda M: jnp.where(ok, M, 0), tree)
+    terms = lambda *at: _terms(discrete, *at)[2:]
+    _, tangent = jax.jvp(terms, _harmless(ok, *at), if_ok(tangents[1:]))
+    return _feedback(discrete, *primals), if_ok(tangent)
 
 
-def _where(ok, tree, other):
-    return jax.tree.map(lambda M: jnp.where(ok, M, other), tree)
-
-
-def _harmless(ok: Bool[Array, ""], data: RiccatiData, X: Array):
-    """The data and `X`, and in members that are not `ok` others that are finite.
-
-    So that no derivative of them meets a matrix that cannot be solved with.
-    """
+def _harmless(ok: BoolScalar, data: RiccatiData, X: Array):
+    """The data and `X`, and in members that are not `ok` others that are finite."""
     A, B, Q, R, S, E = data
-    A, B, Q, S, X = (jnp.where(ok, M, 0) for M in (A, B, Q, S, X))
-    R = jnp.where(ok, R, shifted(1, R))
-    E = None if E is None else jnp.where(ok, E, shifted(1, E))
+    (A, B, Q, S, X), (R, E) = where_solved(ok, (A, B, Q, S, X), (R, E))
     return RiccatiData(A, B, Q, R, S, E), X
 
 
 def _correction(discrete: bool, E: Array | None, loop: Array, error: Array) -> Array:
     """The `X` that takes an error of the equation away, to first order."""
-    return _outside(E, stein(loop, error) if discrete else lyapunov(loop, error))
+    return _outside(E, lyapunov(discrete, loop, error))
 
 
 def _outside(E: Array | None, Y: Array) -> Array:
@@ -294,9 +306,11 @@ def _outside(E: Array | None, Y: Array) -> Array:
     return Y if E is None else symmetric(solve(E.T, solve(E.T, Y).T))
 
 
-def is_semidefinite(weight: Array, units: int = 100) -> Bool[Array, ""]:
+def is_semidefinite(weight: Array, units: int = 100) -> BoolScalar:
     """Whether a symmetric matrix has no negative eigenvalue, up to rounding."""
     rounding = weight.shape[0] * jnp.finfo(weight.dtype).eps
+    # The shift makes a zero eigenvalue positive, as Cholesky's factorisation needs, and
+    # leaves a negative one that is more than rounding.
     slack = units * rounding * one_if_zero(size(weight))
     return is_definite(symmetric(weight) + shifted(slack, weight))
 

@@ -1,11 +1,12 @@
-"""The Stein, Lyapunov and Sylvester equations of stable matrices, by doubling."""
+"""The Lyapunov, Stein and Sylvester equations of stable matrices, by doubling."""
 
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..math._linear_solve import factorised
-from ..math._size import relative_size
+from .._typing import Square
+from ._linear_solve import factorised
+from ._norms import relative_size
 
 
 _REFINEMENTS = 3
@@ -13,22 +14,26 @@ MAX_DOUBLINGS = 60
 """Beyond it the spectral radius cannot be told from 1: 2**60 > 1 / eps in float64."""
 
 
-def stein(A: Float[Array, "n n"], Q: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The solution of `X = A' X A + Q` for a stable `A`, by doubling.
+def lyapunov(discrete: bool, A: Square, Q: Square) -> Square:
+    """The solution of `A'X + XA + Q = 0`, or in discrete time of `X = A'XA + Q`, for a
+    stable `A`.
 
     It is differentiated as the linear solve that it is, to any order and in either
     mode.
     """
+    equation = smith if discrete else stable_sylvester
+    solved = lambda A: lambda _, right: equation(A, None, right)[0]
+    # The transposed equation is that of A'. The doubling is never differentiated.
     return lax.custom_linear_solve(
-        lambda X: X - A.T @ X @ A,
-        Q,
-        solve=lambda _, right: smith(A.T, None, right)[0],
-        transpose_solve=lambda _, right: smith(A, None, right)[0],
+        lambda X: X - A.T @ X @ A if discrete else A.T @ X + X @ A,
+        Q if discrete else -Q,
+        solve=solved(A.T),
+        transpose_solve=solved(A),
     )
 
 
 def smith(
-    A: Float[Array, "n n"], B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
+    A: Square, B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
 ) -> tuple[Float[Array, "n m"], Array]:
     """`X = A X B + C` for stable `A` and `B` (default `A'`), and the doublings taken.
 
@@ -57,22 +62,8 @@ def smith(
     return X, iterations
 
 
-def lyapunov(F: Float[Array, "n n"], Q: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The solution of `F'X + XF + Q = 0` for a stable `F`.
-
-    It is differentiated as the linear solve that it is, to any order and in either
-    mode.
-    """
-    return lax.custom_linear_solve(
-        lambda X: F.T @ X + X @ F,
-        -Q,
-        solve=lambda _, right: stable_sylvester(F.T, None, right)[0],
-        transpose_solve=lambda _, right: stable_sylvester(F, None, right)[0],
-    )
-
-
 def stable_sylvester(
-    A: Float[Array, "n n"], B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
+    A: Square, B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
 ) -> tuple[Float[Array, "n m"], Array]:
     """`A X + X B = C` for stable `A` and `B` (default `A'`), and the doublings taken.
 
@@ -84,7 +75,8 @@ def stable_sylvester(
     eps = jnp.finfo(C.dtype).eps
     other = A.T if B is None else B
     # The geometric mean of the eigenvalues' sizes: the transform maps what is far above
-    # it and far below it towards the circle alike.
+    # it and far below it towards the circle alike. The determinant gives it without
+    # eigenvalues.
     logs = jnp.linalg.slogdet(A)[1]
     logs = 2 * logs if B is None else logs + jnp.linalg.slogdet(B)[1]
     c = jnp.exp(logs / (2 * n if B is None else n + m))
@@ -112,8 +104,7 @@ def stable_sylvester(
         going = better & (residual > 10 * eps)
         return X, left_over, residual, iterations + doublings, going, k + 1
 
-    unknown = jnp.asarray(jnp.inf, C.dtype)
-    zero = jnp.asarray(0)
+    unknown, zero = jnp.asarray(jnp.inf, C.dtype), jnp.asarray(0)
     start = jnp.zeros_like(C), C, unknown, zero, jnp.asarray(True), zero
     X, _, _, iterations, *_ = lax.while_loop(more, body, start)
     return X, iterations
