@@ -1,4 +1,4 @@
-"""What inputs reach and outputs show, as matrices."""
+"""Controllability and observability: Krylov matrices and Gramians."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,8 +18,8 @@ def controllability_matrix(
 ) -> Float[Array, "n nm"]:
     """The Krylov matrix `[B, A B, ..., A^(n-1) B]`.
 
-    Its rank is that of what the inputs reach, but is hard to tell beyond a few states:
-    [`delucax.analysis.is_controllable`][] asks mode by mode instead.
+    Its rank is the dimension of the controllable subspace, but ill-conditioned beyond a
+    few states: [`delucax.analysis.is_controllable`][] tests mode by mode instead.
 
     **Arguments:**
 
@@ -177,7 +177,7 @@ def _krylov(system: StateSpace) -> Float[Array, "n nm"]:
 @eqx.filter_jit
 def _gramian_of_all_time(system: StateSpace) -> tuple[Float[Array, "n n"], BoolScalar]:
     stable = system.is_stable()
-    W = stable_gramian(system.stable_or_harmless(stable))
+    W = stable_gramian(system.stable_or_placeholder(stable))
     return jnp.where(stable, W, jnp.inf), stable
 
 

@@ -16,8 +16,8 @@ _DOUBLINGS = 60
 def gramian_over(A: Square, Q: Square, time: Scalar) -> Square:
     """The integral of `exp(A s) Q exp(A' s)` over `s` from 0 to `time`.
 
-    Over all of the time the exponential of `-A` would overflow where `A` is stiff. So
-    it is taken over a part in which little happens, which is then doubled.
+    Over the whole time the exponential of `-A` would overflow where `A` is stiff. It is
+    taken over a short part, with `|A| t < 1`, which is then doubled.
 
     Source: Van Loan, 1978.
     """

@@ -1,4 +1,4 @@
-"""Linear solves: one door, with eliminations written out for small matrices."""
+"""Linear solves, with unrolled elimination for small matrices."""
 
 import functools
 from collections.abc import Callable
@@ -65,8 +65,8 @@ def factorised(
 class _Elimination(lx.AbstractLinearSolver):
     """Gaussian elimination with partial pivoting, unrolled, for a matrix and a vector.
 
-    Rows are exchanged by selects, not by indexing, so that each member of a batch has
-    its own pivots at no cost in gathers.
+    Rows are exchanged by selects instead of gathers, which vectorise under `jax.vmap`
+    although each member of a batch has its own pivots.
     """
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
@@ -110,8 +110,8 @@ class _Elimination(lx.AbstractLinearSolver):
 
 
 def _apart(tree):
-    """The same values, made before they are used: compilers that fuse all that follows
-    into one loop make them again for each use, and their number doubles with each
+    """The same values, materialised before use: a compiler that fuses the whole
+    elimination recomputes them for each use, and their number doubles with each
     pivot."""
     return lax.optimization_barrier(tree)
 
@@ -167,7 +167,7 @@ def symmetric(X: Float[Array, "*T n n"]) -> Float[Array, "*T n n"]:
 
 
 def no_tangent(tree: Any) -> Any:
-    """The zero tangent of measurements: of whole numbers and flags too."""
+    """The zero tangent of a tree, integers and flags included."""
 
     def zero(x):
         if jnp.issubdtype(x.dtype, jnp.inexact):

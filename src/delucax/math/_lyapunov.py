@@ -68,8 +68,8 @@ def stable_sylvester(
     """`A X + X B = C` for stable `A` and `B` (default `A'`), and the doublings taken.
 
     With `P = (A - c)^-1 (A + c)` and likewise of `B` it is the Stein equation
-    `X = P X P_B - 2c (A - c)^-1 C (B - c)^-1`. What the transform rounds away of a wide
-    spectrum is won back by iterative refinement.
+    `X = P X P_B - 2c (A - c)^-1 C (B - c)^-1`. Iterative refinement recovers what
+    the transform loses of a wide spectrum.
     """
     n, m = C.shape
     eps = jnp.finfo(C.dtype).eps

@@ -1,4 +1,4 @@
-"""Norms and limits, safe at zero, at infinity and where squares would overflow."""
+"""Norms, projections onto balls and boxes, and the residual of an equilibrium."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from jaxtyping import Array, ArrayLike
 
 
 ULPS = 4
-"""What rounding leaves of a drift, in units of the last place."""
+"""The rounding error of a residual `F(x) - x`, in units of the last place of `x`."""
 
 
 def safe_norm(x: ArrayLike, axis: int | None = -1, keepdims: bool = False) -> Array:
@@ -51,7 +51,7 @@ def clip(x: ArrayLike, low: Any, high: Any) -> Array:
 
     `jnp.clip` by comparisons: its own minimum and maximum must pass on a NaN of the
     limits, which costs a batch on CPU as much as all the rest of a pendulum's step. A
-    NaN in `x` stays; one in the limits is no limit. The gradient goes to `x` within the
+    NaN in `x` is kept; NaN limits are ignored. The gradient goes to `x` within the
     limits and on them, and to the limit outside.
 
     **Arguments:**
@@ -76,18 +76,19 @@ def clip(x: ArrayLike, low: Any, high: Any) -> Array:
 
 def size(matrix: Array) -> Array:
     """The Frobenius norm."""
+    # Scaled by the largest entry, whose square may overflow or underflow.
     scale = _divisor(jnp.max(jnp.abs(matrix)))
     return scale * _norm(matrix / scale)
 
 
 def relative_size(error: Array, *terms: Array) -> Array:
-    """The norm of what is left of an equation, over the sum of those of its terms."""
+    """The norm of an equation's residual over the sum of the norms of its terms."""
     return relative_and_total_size(error, jnp.stack(terms))[0]
 
 
 def relative_and_total_size(error: Array, terms: Array) -> tuple[Array, Array]:
-    """The norm of what is left of an equation, or of a stack of such, over the sum of
-    those of its terms, which are stacked; and this sum."""
+    """The norm of an equation's residual, or of a stack of residuals, over the sum of
+    the norms of its stacked terms; and this sum."""
     scale = _divisor(jnp.max(jnp.abs(terms)))
     total = jnp.sum(_norm(terms / scale))
     return _norm(error / scale) / _divisor(total), scale * total
@@ -99,7 +100,7 @@ def one_if_zero(x: Array) -> Array:
 
 
 def _divisor(x):
-    # A NaN stays one.
+    # `lax.max` propagates NaN, as a comparison would not.
     return lax.max(x, jnp.finfo(x.dtype).tiny)
 
 
@@ -116,11 +117,11 @@ def power_of_two(x: Array) -> Array:
 def relative_drift(
     drift: Array, jacobian: Array, x: Array, u: Array, *, is_map: bool
 ) -> Array:
-    """How far from rest a point is: the largest share of `drift` among its terms,
+    """The scaled residual of an equilibrium, the largest entry of
 
-    `|drift_i| / (|drift_i| + sum_j |jacobian_ij| unit_j)`, row by row. Of a map the
-    drift is `F(x) - x`, and what the rounding of `x_i` may leave is taken off. Axes in
-    front are times, along which a unit is that of the largest value.
+    `|drift_i| / (|drift_i| + sum_j |jacobian_ij| unit_j)`. The drift of a map is
+    `F(x) - x`, less the rounding of `x_i`. Leading axes are times, along which the unit
+    is that of the largest value.
     """
     largest = lambda z: jnp.max(jnp.abs(z).reshape(-1, z.shape[-1]), axis=0)
     terms = jnp.abs(jacobian) @ jnp.concatenate(
@@ -134,8 +135,8 @@ def relative_drift(
 
 
 def units_of(z: Array) -> Array:
-    """The size of each entry, or where it is zero up to rounding 1, or that of the
-    largest entry if this is less and not zero."""
+    """The size of each entry; for one that is zero up to rounding that of the largest
+    entry, at most 1, and 1 if all are zero."""
     size = jnp.abs(z)
     largest = jnp.max(size, initial=0)
     floor = jnp.where(largest > 0, jnp.minimum(largest, 1), 1)

@@ -20,15 +20,14 @@ def dare(
     `x'Qx + 2 x'Su + u'Ru` over all time along `E x_next = A x + B u`, at cost
     `(Ex)' X (Ex)` from `x`.
 
-    Structure-preserving doubling, started at a multiple of the identity: the Riccati
-    recursion from a positive final cost, 2, 4, 8, ... steps back. Then Newton steps on
-    the equation itself, if its residual asks for them. It takes products and solves
+    Structure-preserving doubling of the Riccati recursion from a positive final cost,
+    followed by Newton steps while the residual is large. It takes products and solves
     alone, no eigenvalues, which suits accelerators and `jax.vmap`; in a batch, a member
-    that fails harms no other. It is differentiable to any order, in either mode, by the
-    implicit function theorem.
+    that fails does not affect the others. It is differentiable to any order, in either
+    mode, by the implicit function theorem.
 
-    Where the cost does not see an unstable mode, the stabilising solution is not the
-    cheapest: no control at all would cost less, and the state would grow.
+    If `(A, Q)` is not detectable, the stabilising solution is not the minimal one: no
+    control at all would cost less, and the state would grow.
 
     **Arguments:**
 
@@ -41,16 +40,15 @@ def dare(
     - `S`: cross weight, shape `(n, m)`; zero by default.
     - `E`: descriptor matrix, shape `(n, n)`, invertible; the identity by default.
     - `throw`: raise unless there is a stabilising solution (default); if false,
-        look at `result`.
+        check `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][]. It is successful if the
-    residual, in units of the states that balance the equation, is at most 1e-12 (1e-5
-    in single precision), or up to a hundred times that if rounding of `X` alone may
-    leave it; and if the closed loop is stable: a small residual alone is no
-    certificate. Else `result` is one of `RESULTS.not_stabilisable`, `not_stabilising`
-    (no such solution), `on_boundary` (eigenvalues on the unit circle, or so close that
-    data changed by rounding have no stabilising solution), `not_converged` and
-    `ill_posed`.
+    closed loop is stable, and the residual after diagonal balancing of the states is at
+    most 1e-12 (1e-5 in single precision), or up to a hundred times that if rounding of
+    `X` alone may cause it. Else `result` is one of `RESULTS.not_stabilisable`,
+    `not_stabilising` (no such solution), `on_boundary` (eigenvalues on the unit circle,
+    or so close that rounding of the data removes the stabilising solution),
+    `not_converged` and `ill_posed`.
 
     **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
     symmetric or (`R`) not semidefinite; an error at run time as `throw` says.
@@ -84,13 +82,8 @@ def care(
     `(Ex)' X (Ex)` from `x`.
 
     The scaled sign iteration of the Hamiltonian matrix; if that fails, doubling of its
-    Cayley transform. Then Newton steps on the equation itself, if its residual asks for
-    them. It takes products and solves alone, no eigenvalues, which suits accelerators
-    and `jax.vmap`; in a batch, a member that fails harms no other. It is differentiable
-    to any order, in either mode, by the implicit function theorem.
-
-    Where the cost does not see an unstable mode, the stabilising solution is not the
-    cheapest: no control at all would cost less, and the state would grow.
+    Cayley transform. Newton steps, accelerators, batches, derivatives and undetectable
+    modes: as of [`delucax.riccati.dare`][].
 
     **Arguments:** `A`, `B`, `Q`, `S`, `E` and `throw`: as of
     [`delucax.riccati.dare`][];
@@ -139,16 +132,16 @@ def filter_dare(
     **Arguments:**
 
     - `A`: shape `(n, n)`.
-    - `C`: what is measured, shape `(p, n)`.
+    - `C`: output matrix, shape `(p, n)`.
     - `W`: covariance of the process noise, shape `(n, n)`, symmetric.
     - `V`: covariance of the measurement noise, shape `(p, p)`, symmetric, positive
         semidefinite.
     - `S`: their cross-covariance, shape `(n, p)`; zero by default.
     - `throw`: raise unless there is a stabilising solution (default); if false,
-        look at `result`.
+        check `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][], with `K` of shape `(n, p)` and
-    `closed_loop = A - K C`, the matrix of the prediction error. Its `result` speaks of
+    `closed_loop = A - K C`, the matrix of the prediction error. Its `result` is that of
     the transposed system: `RESULTS.not_stabilisable` means that `(A, C)` is not
     detectable.
 

@@ -1,4 +1,4 @@
-"""What the Riccati and Lyapunov solvers accept."""
+"""Checks and conversions of the arguments of matrix equations."""
 
 from typing import Any, NamedTuple
 
@@ -52,7 +52,7 @@ def hermitian_matrix(value: Any, name: str, where: str) -> Array:
         kind = "Hermitian" if jnp.iscomplexobj(matrix) else "symmetric"
         raise ValueError(f"{where}: {name} must be {kind}, got {matrix}.")
     average = (matrix + transposed) / 2
-    # Of data that cannot be looked at yet, the result will say that they are ill-posed.
+    # Traced data cannot be checked yet: NaN makes the result `ill_posed`.
     return average if is_concrete(wrong) else jnp.where(wrong, jnp.nan, average)
 
 

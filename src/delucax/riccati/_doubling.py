@@ -19,8 +19,8 @@ _SIGN_STEPS = 60
 
 def discrete_start(data: RiccatiData, height: Scalar) -> tuple[Array, Array]:
     """A solution by doubling about `X0 = height I`, and the doublings taken."""
-    # There the control weight is invertible even where R is not, and the recursion
-    # cannot rest at a solution that leaves an unstable mode unseen by Q.
+    # X0 > 0 makes R + B'X0 B invertible, and excludes the fixed points that leave an
+    # undetectable unstable mode unstable.
     A, B, Q, R, S, _ = data
     X0 = height * jnp.eye(A.shape[0], dtype=A.dtype)
     # The data of the equation of H = X - X0.
@@ -37,7 +37,7 @@ def continuous_start(
     """A solution by the sign iteration, or by doubling if that is wanted; the size of
     `B R^-1 B'`; and the steps taken."""
     A, G, Q = without_cross_weight(*data[:5])
-    # Under vmap both run for all members: what is not wanted ends after no step.
+    # Under vmap both run for all members: the unwanted one ends before its first step.
     by_sign, sign_steps = _by_sign(A, G, Q, ~doubled)
     by_doubling, doublings = _by_doubling(A, G, Q, doubled)
     X = jnp.where(doubled, by_doubling, by_sign)
@@ -124,8 +124,8 @@ def double(
         before, _, k = carry
         after = joined(before, before)
         finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in after]))
-        # What overflows is left at the last finite step: it has no stable loop, and
-        # the caller finds that out.
+        # An overflow ends the iteration at the last finite step, whose closed loop is
+        # not stable, which the caller checks.
         A, _, J = after = jax.tree.map(
             lambda new, old: jnp.where(finite, new, old), after, before
         )

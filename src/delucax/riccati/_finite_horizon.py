@@ -114,7 +114,7 @@ def dre(
     - `final_q`: linear cost of the final state, shape `(n,)`; zero by default.
     - `parallel`: if true, in parallel over time, by associative scans of logarithmic
         depth, which pays on accelerators; in sequence by default.
-    - `throw`: raise if a step has no minimum (default); if false, look at `result`.
+    - `throw`: raise if a step has no minimum (default); if false, check `result`.
 
     **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. It is NaN at a step
     where `R + B'XB` is not positive definite, and at all before it, as there is no
@@ -224,7 +224,7 @@ def cre(
     - `S`: cross weight, shape `(n, m)`; zero by default.
     - `times`: where `X` is wanted, increasing, at least two, shape `(N,)`.
     - `final`: final weight, shape `(n, n)`, symmetric; zero by default.
-    - `throw`: raise if there is no minimum (default); if false, look at `result`.
+    - `throw`: raise if there is no minimum (default); if false, check `result`.
 
     **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. It is NaN at the
     times from which there is no minimum.

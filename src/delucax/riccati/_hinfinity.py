@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import check_definite
-from .._results import choose, Result, RESULTS
+from .._results import choose, RESULTS
 from .._typing import Scalar, Square
 from ..math._linear_solve import full_precision, solve, symmetric
 from ..math._lyapunov import lyapunov
@@ -26,6 +26,7 @@ from ._level import (
     bisect_level,
     Game,
     game_at_level,
+    GameSolution,
     inverse_margins,
     joint,
     joint_gain,
@@ -41,64 +42,6 @@ from ._recursion import (
 from ._residual import polish, riccati_residual, stationary
 from ._spectrum import spectral_abscissa, spectral_radius
 from ._stabilising import is_semidefinite, left_side, shifted
-
-
-class GameSolution(eqx.Module):
-    """The saddle point of a game, stationary or over a finite horizon.
-
-    Over a horizon the matrices have a leading axis for the steps `t` (or the points of
-    the grid), and from state `x` at step `t` the worst cost is `x'X[t]x`, less
-    `gamma^2` times that of the disturbance.
-
-    **Attributes:**
-
-    - `X`: the solution of the game equation, shape `(n, n)`, symmetric; over a horizon
-        at each step and at the end, shape `(T+1, n, n)`, or in continuous time at each
-        point of the grid, shape `(N, n, n)`.
-    - `K`: the gain of the control `u = -K x`, shape `(m, n)`; over a horizon
-        `(T, m, n)`, or `(N, m, n)`.
-    - `L`: the gain of the worst disturbance `w = L x`, shape `(k, n)`; over a horizon
-        `(T, k, n)`, or `(N, k, n)`.
-    - `gamma`: the level that is attained.
-    - `closed_loop`: the matrix `A - B K`, shape `(n, n)`; over a horizon `(T, n, n)`,
-        or `(N, n, n)`.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
-    - `residual`: the norm of the equation's residual over the sum of the norms of its
-        terms: an upper bound, with rounding of its own evaluation counted. `None` over
-        a horizon, as are those below.
-    - `iterations`: doublings taken at `gamma`.
-    - `spectral_radius`: in discrete time, an upper bound on that of `closed_loop`,
-        close to it. `None` in continuous time.
-    - `spectral_abscissa`: in continuous time, the largest real part of an eigenvalue of
-        `closed_loop`, up to rounding. `None` in discrete time.
-
-    `residual`, `spectral_radius` and `spectral_abscissa` are measurements and have no
-    gradient.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
-        B = jnp.array([[0.0], [1.0]])
-        Q, R = jnp.eye(2), jnp.eye(1)
-        solution = dlx.riccati.hinf_dare(A, B, None, Q, R, gamma=5.0)
-        solution.K, solution.L, solution.spectral_radius
-        ```
-    """
-
-    X: Array
-    K: Array
-    L: Array
-    gamma: Array
-    closed_loop: Array
-    result: Result
-    residual: Array | None = None
-    iterations: Array | None = None
-    spectral_radius: Array | None = None
-    spectral_abscissa: Array | None = None
 
 
 def hinf_dare(
@@ -144,7 +87,7 @@ def hinf_dare(
     - `gamma`: the level, a positive number; by default the least that is attainable.
     - `tolerance`: how close to the least level, relatively; by default 16 rounding
         units.
-    - `throw`: raise unless the game is solved (default); if false, look at `result`.
+    - `throw`: raise unless the game is solved (default); if false, check `result`.
 
     **Returns:** a [`delucax.riccati.GameSolution`][]. Its matrices are NaN if there is
     no solution, as when `gamma` is below the least attainable level.
@@ -182,7 +125,7 @@ def hinf_care(
     tolerance: Any = None,
     throw: bool = True,
 ) -> GameSolution:
-    r"""The stationary H-infinity game in continuous time,
+    """The stationary H-infinity game in continuous time,
 
     `A'X + XA - X (B R^-1 B' - gamma^-2 D D') X + Q = 0`,
 
@@ -249,8 +192,8 @@ def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
         tolerance,
     )
     game = end.game
-    X = _attached(discrete, problem, level, game)
-    # A game that was not solved is one at rest for the derivatives.
+    X = _with_implicit_derivative(discrete, problem, level, game)
+    # An unsolved game is replaced by a trivial one, which keeps NaN out of derivatives.
     (A, B, D, Q, X), R = where_solved(game.good, (*problem[:4], X), problem[4])
     K = joint_gain(discrete, joint((A, B, D, Q, R), level), X)
     m = B.shape[1]
@@ -281,15 +224,15 @@ def _rounding(n: int, dtype) -> float:
 
 
 def _game_start(discrete: bool, problem: tuple) -> Square:
-    """Where to start without a disturbance: not at 0, where an iteration rests that has
-    an unstable mode unseen by the cost."""
+    """The starting point without a disturbance: not 0, which is a fixed point if
+    `(A, Q)` is not detectable."""
     A, B, _, Q, R = problem
     if discrete:
         scale = jnp.linalg.norm(Q)
         scale = one_if_zero(jnp.where(scale > 0, scale, jnp.linalg.norm(R)))
     else:
         control = symmetric(B @ solve(R, B.T))
-        # Without a cost of the state it is the unstable modes that set the size.
+        # With Q = 0 the unstable modes alone set the size of X, |A|^2 / |B R^-1 B'|.
         tiny = jnp.finfo(A.dtype).tiny ** 0.5
         unseen = jnp.linalg.norm(A) ** 2 / jnp.maximum(jnp.linalg.norm(control), tiny)
         Q = jnp.where(jnp.linalg.norm(Q) > 0, Q, shifted(unseen, Q))
@@ -298,7 +241,8 @@ def _game_start(discrete: bool, problem: tuple) -> Square:
 
 
 def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Game:
-    """The stabilising solution of the game equation, and whether it is of the game."""
+    """The stabilising solution of the game equation, with the conditions under which it
+    is a saddle point."""
     A, B, D, _, R = problem
     (n, m), eps = B.shape, jnp.finfo(A.dtype).eps
     data = joint(problem, gamma)
@@ -331,7 +275,7 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
 
 
 def _element(discrete, data, problem, gamma, X0):
-    """The equation of the correction to X0 over a step, and the unit of its parts."""
+    """The element of a step of the equation of `X - X0`, and the unit of `X`."""
     A, B, D, Q, R = problem
     if discrete:
         moved, cross, weight = stationary(True, data, X0)
@@ -347,10 +291,10 @@ def _element(discrete, data, problem, gamma, X0):
 
 
 def _correction(discrete, X, loop, error):
-    """The change of `X` that takes an error of the equation away, to first order.
+    """The Newton step for an `error` of the equation.
 
-    In continuous time in the coordinates in which `X` is the identity: near the least
-    level `X` is large in some directions, and the loop far from normal.
+    In continuous time it is solved in coordinates in which `X` is the identity: near
+    the least level `X` is large in some directions, and the loop far from normal.
     """
     if discrete:
         return lyapunov(True, loop, error)
@@ -364,20 +308,22 @@ def _correction(discrete, X, loop, error):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _attached(discrete: bool, problem: tuple, gamma: Scalar, game: Game) -> Square:
-    """`X` of a game that was solved, with its derivatives; zero if it was not."""
+def _with_implicit_derivative(
+    discrete: bool, problem: tuple, gamma: Scalar, game: Game
+) -> Square:
+    """`X` of a solved game with its implicit derivatives; zero of an unsolved one."""
     del discrete, problem, gamma
     return jnp.where(game.good, game.X, 0)
 
 
-@_attached.defjvp
+@_with_implicit_derivative.defjvp
 @full_precision
-def _attached_jvp(discrete, primals, tangents):
-    X = _attached(discrete, *primals)
+def _implicit_derivative_jvp(discrete, primals, tangents):
+    X = _with_implicit_derivative(discrete, *primals)
     problem, gamma, game = primals
     (A, *others), R = where_solved(game.good, problem[:4], problem[4])
     if not discrete:
-        # At rest a loop is not stable: it is given one that is.
+        # The trivial game has A = 0, which is not stable: it is given A = -I.
         A = A - shifted(jnp.where(game.good, 0, 1), A)
     gamma = jnp.where(game.good, gamma, 1)
     # By the implicit function theorem, as for the equation of control.
@@ -391,12 +337,12 @@ def _attached_jvp(discrete, primals, tangents):
 
 
 def _barrier(discrete: bool, problem: tuple, gamma: Scalar) -> Array:
-    """What becomes steep at the least level."""
+    """A barrier function, whose slope diverges at the least level."""
     start = _game_start(discrete, problem)
     end, _ = bisect_level(
         functools.partial(_solve_game, discrete), problem, start, gamma
     )
-    X = _attached(discrete, problem, gamma, end.game)
+    X = _with_implicit_derivative(discrete, problem, gamma, end.game)
     total = jnp.trace(X)
     if discrete:
         total += inverse_margins(problem[2][None], X[None], gamma)

@@ -10,11 +10,12 @@ from jaxtyping import Array
 from .._results import choose, RESULTS
 from ..math._linear_solve import full_precision, solve, symmetric
 from ._arguments import final_weight, in_time, increasing_times, where_solved
-from ._hinfinity import checked_game, GameSolution
+from ._hinfinity import checked_game
 from ._level import (
     at_level,
     Game,
     game_at_level,
+    GameSolution,
     inverse_margins,
     joint,
     joint_gain,
@@ -22,6 +23,20 @@ from ._level import (
 )
 from ._recursion import flow_values, gain, is_clearly_definite, values
 from ._stabilising import shifted
+
+
+def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
+    """`X` at the steps or times of the game `(A, B, D, Q, R, final, *times)`."""
+    A, B, D, Q, R, final, *times = problem
+    if discrete:
+        both, weight = players(B, D, R, gamma)
+        S = jnp.zeros_like(both)
+        return values(A, both, Q, weight, S, final, D.shape[-1], False)
+    definite = is_clearly_definite(R)
+    safe = jnp.where(definite, R, shifted(1, R))
+    G = symmetric(B @ solve(safe, B.T) - D @ D.T / gamma**2)
+    X = flow_values(A, G, Q, final, *times, True)
+    return jnp.where(definite, X, jnp.nan)
 
 
 def hinf_dre(
@@ -63,7 +78,7 @@ def hinf_dre(
     - `gamma`: the level, a positive number; by default the least that is attainable.
     - `tolerance`: how close to the least level, relatively; by default 16 rounding
         units.
-    - `throw`: raise unless the game is solved (default); if false, look at `result`.
+    - `throw`: raise unless the game is solved (default); if false, check `result`.
 
     **Returns:** a [`delucax.riccati.GameSolution`][]. It is NaN at a step that
     has no saddle point, as where `gamma` is too low, and at all before it.
@@ -156,20 +171,6 @@ def hinf_cre(
     times = increasing_times(times, where).astype(A.dtype)
     problem = (A, *others, final, times)
     return at_level(_solution, where, False, problem, gamma, tolerance, throw)
-
-
-def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
-    """`X` at the steps or times of the game `(A, B, D, Q, R, final, *times)`."""
-    A, B, D, Q, R, final, *times = problem
-    if discrete:
-        both, weight = players(B, D, R, gamma)
-        S = jnp.zeros_like(both)
-        return values(A, both, Q, weight, S, final, D.shape[-1], False)
-    definite = is_clearly_definite(R)
-    safe = jnp.where(definite, R, shifted(1, R))
-    G = symmetric(B @ solve(safe, B.T) - D @ D.T / gamma**2)
-    X = flow_values(A, G, Q, final, *times, True)
-    return jnp.where(definite, X, jnp.nan)
 
 
 @eqx.filter_jit

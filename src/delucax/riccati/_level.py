@@ -4,13 +4,14 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._check import check_step
-from .._results import raise_on_failure
+from .._results import raise_on_failure, Result
 from .._typing import Scalar, Square
 from ..math._linear_solve import full_precision, solve
 from ._arguments import RiccatiData
@@ -26,6 +27,64 @@ _MAX_TRIALS = 200
 _AWAY = (1.0, 4.0, 16.0, 64.0)
 _WEIGHTS = (64 / 21, -8 / 3, 2 / 3, -1 / 21)
 """Of the polynomial through values at the roots of the above, at 0."""
+
+
+class GameSolution(eqx.Module):
+    """The saddle point of a game, stationary or over a finite horizon.
+
+    Over a horizon the matrices have a leading axis for the steps `t` (or the points of
+    the grid), and from state `x` at step `t` the worst cost is `x'X[t]x`, less
+    `gamma^2` times that of the disturbance.
+
+    **Attributes:**
+
+    - `X`: the solution of the game equation, shape `(n, n)`, symmetric; over a horizon
+        at each step and at the end, shape `(T+1, n, n)`, or in continuous time at each
+        point of the grid, shape `(N, n, n)`.
+    - `K`: the gain of the control `u = -K x`, shape `(m, n)`; over a horizon
+        `(T, m, n)`, or `(N, m, n)`.
+    - `L`: the gain of the worst disturbance `w = L x`, shape `(k, n)`; over a horizon
+        `(T, k, n)`, or `(N, k, n)`.
+    - `gamma`: the level that is attained.
+    - `closed_loop`: the matrix `A - B K`, shape `(n, n)`; over a horizon `(T, n, n)`,
+        or `(N, n, n)`.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+    - `residual`: the norm of the equation's residual over the sum of the norms of its
+        terms: an upper bound, with rounding of its own evaluation counted. `None` over
+        a horizon, as are those below.
+    - `iterations`: doublings taken at `gamma`.
+    - `spectral_radius`: in discrete time, an upper bound on that of `closed_loop`,
+        close to it. `None` in continuous time.
+    - `spectral_abscissa`: in continuous time, the largest real part of an eigenvalue of
+        `closed_loop`, up to rounding. `None` in discrete time.
+
+    `residual`, `spectral_radius` and `spectral_abscissa` are measurements and have no
+    gradient.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+        B = jnp.array([[0.0], [1.0]])
+        Q, R = jnp.eye(2), jnp.eye(1)
+        solution = dlx.riccati.hinf_dare(A, B, None, Q, R, gamma=5.0)
+        solution.K, solution.L, solution.spectral_radius
+        ```
+    """
+
+    X: Array
+    K: Array
+    L: Array
+    gamma: Array
+    closed_loop: Array
+    result: Result
+    residual: Array | None = None
+    iterations: Array | None = None
+    spectral_radius: Array | None = None
+    spectral_abscissa: Array | None = None
 
 
 def players(B, D, R, gamma) -> tuple[Array, Array]:
@@ -73,12 +132,12 @@ def at_level(
 
 
 class Game(NamedTuple):
-    """A solution of the equation of a game, and what it is worth."""
+    """A solution of the equation of a game, and the conditions of a saddle point."""
 
     X: Array
     residual: Array
-    holds: Array  # whether all conditions of a solution but the equation are met
-    solved: Array  # whether the equation is
+    holds: Array  # whether all conditions but the equation hold
+    solved: Array  # whether the equation is solved
     iterations: Array
 
     @property
@@ -87,7 +146,7 @@ class Game(NamedTuple):
 
 
 class Bisection(NamedTuple):
-    """Where a search for the least level has come to."""
+    """The state of the bisection of the least level."""
 
     low: Array
     high: Array
@@ -113,10 +172,10 @@ def bisect_level(
 ) -> tuple[Bisection, Array]:
     """The game at `gamma`, or at the least level; and the level. No derivatives.
 
-    The first trial is without a disturbance, from `start`. It tells whether there is
-    any level, and about where; and the others start at its solution. The level is the
-    upper, feasible end of a bracket that is narrower than `tolerance`, relatively. It
-    is 0 where no disturbance has any effect.
+    The first trial is without a disturbance, from `start`. It tells whether any level
+    is feasible and gives the scale of the bracket; the other trials start at its
+    solution. The level is the upper, feasible end of a bracket of relative width
+    `tolerance`, and 0 where no disturbance has any effect.
     """
     problem, start, gamma = lax.stop_gradient((problem, start, gamma))
     A, B, D, *others = problem
@@ -146,8 +205,8 @@ def bisect_level(
         tried = (A, B, jnp.where(first, 0, D), *others)
         game = solve_game(tried, trial, now.base)
         good = game.good
-        # What a disturbance does to the cost when nothing resists it: D'XD, whose
-        # root has the size of a level, and the search starts there.
+        # The cost of a unit disturbance, trace D'XD: the square of a typical level, at
+        # which the bracket starts.
         X = game.X[1:] if D.ndim == 3 else game.X
         effect = jnp.einsum("...ik,...ij,...jk->", D, X, D)
         size = jnp.linalg.norm(X) * jnp.sum(D**2)
@@ -159,7 +218,7 @@ def bisect_level(
             base=game.X,
             game=game,
         )
-        # Between neighbouring numbers there is nothing left to try: the bracket closes.
+        # Between neighbouring floating-point numbers the bracket closes.
         stuck = (trial <= now.low) | (trial >= now.high)
         better = good & ~stuck
         keep = better if gamma is None else jnp.ones((), bool)
@@ -200,7 +259,7 @@ def game_at_level(
     level as it is, with its derivatives."""
     end, level = bisect_level(solve_game, problem, start, gamma, tolerance)
     if gamma is None:
-        attained = followed(barrier, problem, level)
+        attained = with_derivative(barrier, problem, level)
     else:
         attained = level = gamma
     return end, jnp.where(level > 0, level, 1), attained
@@ -211,19 +270,21 @@ def _where(condition, first, second):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def followed(barrier: Callable[[tuple, Array], Array], problem: tuple, level: Array):
-    """The least level, differentiated as the problem changes.
+def with_derivative(
+    barrier: Callable[[tuple, Array], Array], problem: tuple, level: Array
+):
+    """The least level, with its derivative in the problem.
 
-    `barrier(problem, gamma)` is any function whose value or slope becomes infinite at
-    the least level: where it is constant, `gamma` moves as the level does.
+    `barrier(problem, gamma)` is any function whose value or slope diverges at the least
+    level: its level sets move with the problem as the least level does.
     """
     del barrier, problem
     return level
 
 
-@followed.defjvp
+@with_derivative.defjvp
 @full_precision
-def _followed_jvp(barrier, primals, tangents):
+def _with_derivative_jvp(barrier, primals, tangents):
     # By implicit differentiation of barrier(problem, gamma) = constant a little above
     # the level: at it both slopes are infinite, and their quotient has a limit.
     problem, level = primals
@@ -233,25 +294,25 @@ def _followed_jvp(barrier, primals, tangents):
     attained = level > 0
     safe = jnp.where(attained, level, 1)
 
-    def following(away):
+    def at_distance(away):
         along = functools.partial(jax.jvp, barrier, (problem, safe * (1 + away)))
         _, slope = along((still, jnp.ones_like(safe)))
         _, change = along((tangents[0], jnp.zeros_like(safe)))
         return -change / jnp.where(slope != 0, slope, 1)
 
-    # Its error is a series in the root of the distance: two eigenvalues may meet on the
-    # boundary. From four distances follows the limit without the first terms.
+    # The error is a series in the root of the distance, as two eigenvalues may meet on
+    # the boundary. Extrapolation from four distances removes its first terms.
     away = jnp.finfo(level.dtype).eps ** (3 / 8) * jnp.asarray(_AWAY, level.dtype)
-    tangent = jax.vmap(following)(away) @ jnp.asarray(_WEIGHTS, level.dtype)
+    tangent = jax.vmap(at_distance)(away) @ jnp.asarray(_WEIGHTS, level.dtype)
     return primals[1], jnp.where(attained, tangent, 0)
 
 
 @jax.custom_jvp
 def once(x: Array) -> Array:
-    """`x`, which can not be differentiated again.
+    """`x`, which cannot be differentiated twice.
 
-    The slope of the barrier is infinite in the limit: its own derivative would be
-    rounding alone.
+    The slope of the barrier diverges in the limit: its own derivative would be rounding
+    alone.
     """
     return x
 

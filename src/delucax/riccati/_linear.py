@@ -55,7 +55,7 @@ class MatrixSolution(eqx.Module):
     result: Result
 
     def _facts(self) -> str:
-        """What an error says of a failure."""
+        """The diagnostics of an error."""
         return f"Relative residual {float(self.residual):.1e}."
 
 
@@ -76,7 +76,7 @@ def lyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
     - `A`: shape `(n, n)`. Real, or complex, as `Q`; then `'` is the conjugate
         transpose.
     - `Q`: shape `(n, n)`, not necessarily symmetric.
-    - `throw`: raise unless the solution is found (default); if false, look at `result`.
+    - `throw`: raise unless the solution is found (default); if false, check `result`.
 
     **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
     `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
@@ -150,7 +150,7 @@ def sylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
     - `A`: shape `(n, n)`. Real, or complex, as `B` and `C`.
     - `B`: shape `(m, m)`.
     - `C`: shape `(n, m)`.
-    - `throw`: raise unless the solution is found (default); if false, look at `result`.
+    - `throw`: raise unless the solution is found (default); if false, check `result`.
 
     **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
     `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
@@ -181,7 +181,7 @@ def dsylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
     `A X B - X + C = 0`.
 
     Solved by doubling if the spectral radii of `A` and `B` have a product below one; by
-    a Cayley transform if the circle about 0 is crossed outwards by both spectra.
+    a Cayley transform if both spectra lie outside the unit circle.
     Otherwise a unique solution is still found, in one dense solve, up to 256 unknowns;
     beyond it `result` is `RESULTS.not_separated`.
 
@@ -208,8 +208,7 @@ def dsylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
 
 
 def _equation(where, discrete, A, B, C, throw) -> MatrixSolution:
-    """The solution for arguments as a user gives them; without `B` they are those of
-    the Lyapunov equation."""
+    """The checked and solved equation; without `B` the Lyapunov equation."""
     name = "Q" if B is None else "C"
     A, C = square_matrix(A, "A", where), as_matrix(C, name, where)
     B = None if B is None else square_matrix(B, "B", where)
@@ -268,7 +267,7 @@ def _solved(discrete, A, B, C) -> _Candidate:
         if last == _DENSELY:
             X = _densely(discrete, A, B, C, X, kind == _DENSELY)
         residual = linear_residual(discrete, A, A.T if B is None else B, C, X)
-        # The equation is linear: if its residual is small, it is solved.
+        # For a linear equation a small residual is a small backward error: enough.
         better = (residual < before.residual) | plain
         after = before._replace(
             X=jnp.where(better, X, before.X),
@@ -287,7 +286,7 @@ def _solved(discrete, A, B, C) -> _Candidate:
 def _separated(discrete, A, B, C, plain, shifted):
     """The solution if the spectra are separated, as they are or by a shift."""
     if discrete:
-        # What is not wanted is given a problem that takes one step.
+        # An inactive kind gets a trivial problem, which takes one step.
         X, steps = smith(*_wanted(plain, A, B, C))
         # Where both spectra are outside the circle, the Cayley transform puts them to
         # the right of the axis.
@@ -326,7 +325,7 @@ def _one_side(A, B, C, sign, shift, wanted):
 
 
 def _wanted(wanted, A, B, C, scale=0):
-    """The problem if it is wanted; else one that is done at once."""
+    """The problem if it is wanted; else a trivial one."""
     A = jnp.where(wanted, A, scale * jnp.eye(A.shape[0], dtype=A.dtype))
     if B is not None:
         B = jnp.where(wanted, B, scale * jnp.eye(B.shape[0], dtype=B.dtype))
@@ -359,7 +358,7 @@ def _solved_jvp(discrete, primals, tangents):
     A, B, _ = primals
     solution = _solved(discrete, *primals)
     ok = solution.solved
-    # Guarded at both ends: what is not finite in a failed member stays in it.
+    # Masked at input and output, so that a failed member's NaN does not spread.
     dA, dB, dC = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents)
     X = jnp.where(ok, solution.X, 0)
     half = functools.partial(jnp.where, ok)

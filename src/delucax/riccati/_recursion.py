@@ -27,8 +27,8 @@ its start."""
 def is_clearly_definite(M: Square) -> BoolScalar:
     """Whether a symmetric matrix is positive definite, by more than rounding."""
     L = jnp.linalg.cholesky(lax.stop_gradient(M))
-    # A pivot L_ii^2 is what is left of M_ii once the directions before it are known.
-    # Relative to the diagonal, so that units do not matter. NaN compares false.
+    # The pivot L_ii^2 is the Schur complement of M_ii, and is compared with it, so that
+    # units do not matter. NaN fails the comparison.
     least = M.shape[0] * jnp.finfo(M.dtype).eps * jnp.abs(jnp.diagonal(M))
     return jnp.all(jnp.diagonal(L) ** 2 > least)
 
@@ -95,7 +95,8 @@ def values(A, B, Q, R, S, final, players: int, parallel: bool):
 
 
 def backwards(step: Callable[[Array, Any], Array], final: Array, steps: Any) -> Array:
-    """What `step(X, here)` makes of `final`, and so on back through `steps`."""
+    """The values of the recursion `X = step(X, here)` from `final`, back through
+    `steps`."""
 
     def back(X, here):
         X = step(X, here)
@@ -105,8 +106,8 @@ def backwards(step: Callable[[Array, Any], Array], final: Array, steps: Any) -> 
 
 
 def _in_parallel(A, B, Q, R, S, final):
-    # Adding x_next' P x_next - x' P x to each step changes no decision, and makes the
-    # control weight definite even where R is not.
+    # Adding x_next' P x_next - x' P x to each step, a telescoping sum, does not change
+    # the optimal control, and makes the control weight definite even where R is not.
     n = A.shape[-1]
     size = jnp.linalg.norm(Q, axis=(1, 2)).mean() + jnp.linalg.norm(final)
     size = jnp.where(size > 0, size, jnp.linalg.norm(R, axis=(1, 2)).mean())
@@ -127,7 +128,7 @@ def _in_parallel(A, B, Q, R, S, final):
     elements = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), steps, last)
     _, _, J = lax.associative_scan(combine, elements, reverse=True)
     X = (J + P).at[-1].set(final)
-    # One step from each X to the one before takes the scan's rounding away.
+    # One exact step from each X to the one before removes the scan's rounding.
     K, _ = jax.vmap(gain)(A, B, R, S, X[1:])
     return X.at[:-1].set(jax.vmap(one_step)(A, B, Q, R, S, K, X[1:]))
 
@@ -141,10 +142,11 @@ def without_cross_weight(A, B, Q, R, S, added=None) -> Element:
     """
     n = A.shape[0]
     solved = solve(R, jnp.concatenate([S.T, B.T], axis=1))
-    K, G = solved[:, :n], symmetric(B @ solved[:, n:])
+    K = solved[:, :n]
+    closed_loop, G = A - B @ K, symmetric(B @ solved[:, n:])
     # The difference of like terms first: rounding of `added` would hide it.
     Q = Q - S @ K
-    return A - B @ K, G, symmetric(Q if added is None else Q + added)
+    return closed_loop, G, symmetric(Q if added is None else Q + added)
 
 
 def joined(first: Element, second: Element) -> Element:
@@ -194,7 +196,7 @@ def _values_jvp(players, parallel, primals, tangents):
     (A, B, Q, S, after), R = where_solved(good, (A, B, Q, S, X[1:]), R)
     K, loop = jax.vmap(gain)(A, B, R, S, after)
 
-    # At the best gain the cost-to-go is stationary in it: its change is not needed.
+    # By the envelope theorem a change of the optimal gain does not contribute.
     def cost(A, B, Q, R, S):
         return jax.vmap(one_step)(A, B, Q, R, S, K, after)
 
@@ -219,7 +221,7 @@ def hamiltonian(A, G, Q) -> Array:
 
 
 def short_element(H: Float[Array, "_ _"], time: Array) -> tuple[Array, Array, Array]:
-    """What `joined` joins, over a time that is short against `H`."""
+    """The element of an interval that is short relative to `1 / |H|`."""
     n = H.shape[0] // 2
     Z = -H * time
     power = jnp.eye(2 * n, dtype=H.dtype)
@@ -239,12 +241,12 @@ def short_element(H: Float[Array, "_ _"], time: Array) -> tuple[Array, Array, Ar
 
 
 def _short_elements(A, G, Q, times):
-    """The elements of intervals so short that a doubling or more leads to each of those
-    between `times`; how many; and the unit of `X` in which they are."""
-    # In it the quadratic and the constant part of the flow are alike.
+    """The elements of the intervals between `times`, halved as often as needed; the
+    number of halvings; and the unit of `X`."""
+    # In this unit the quadratic and the constant part of the flow have equal norms.
     unit, lengths = scale_of(G, Q), jnp.diff(times)
     H = hamiltonian(A, unit * G, Q / unit)
-    # Halved so often, the longest flow is near the identity.
+    # After that many halvings |H| times the longest interval is at most 1/2.
     sizes = jnp.maximum(2 * jnp.linalg.norm(H) * lengths, 1)
     count = jnp.max(lax.stop_gradient(jnp.ceil(jnp.log2(sizes))).astype(jnp.int32))
     count = jnp.minimum(count, _MAX_HALVINGS)
@@ -261,7 +263,7 @@ def is_within_reach(C: Array, X: Array, is_game: bool) -> Array:
     that no eigenvalue of `I + C X` has become negative.
     """
     C, X = lax.stop_gradient((C, X))
-    # Of a game C is indefinite and X is not; of control alone it is the other way.
+    # In a game C is indefinite and X is not; without a disturbance it is the reverse.
     inner, outer = (X, C) if is_game else (C, X)
     n = X.shape[0]
     eye = jnp.eye(n, dtype=X.dtype)
@@ -284,7 +286,7 @@ def flow_values(A, G, Q, final, times, is_game: bool):
 
     def twice(_, carry):
         element, good = carry
-        # The equation from 0 may have a solution over each half and none over both.
+        # The equation from X = 0 may have a solution over each half and none over both.
         good &= jax.vmap(reach)(element[1], element[2])
         return jax.vmap(joined)(element, element), good
 
@@ -310,7 +312,7 @@ def _to_differentiate(A, G, Q, final, times):
     unit, count, short = _short_elements(A, G, Q, times)
 
     def twice(element, k):
-        # Beyond the last doubling nothing is joined to nothing, which is harmless.
+        # After the last doubling zero elements are joined, which is harmless.
         going = k < count
         tried = jax.tree.map(lambda M: jnp.where(going, M, 0), element)
         after = jax.vmap(joined)(tried, tried)
@@ -328,7 +330,7 @@ def _flow_values_jvp(is_game, primals, tangents):
     X = flow_values(*primals, is_game)  # pyright: ignore[reportCallIssue]
     good = jnp.all(jnp.isfinite(X))
     *matrices, times = primals
-    # What fails is replaced, so that no NaN of it is in a derivative.
+    # A failed problem is replaced, which keeps its NaN out of the derivatives.
     safe = (*(jnp.where(good, M, 0) for M in matrices), times)
     _, tangent = jax.jvp(_to_differentiate, safe, tangents)
     return X, jnp.where(good, tangent, 0)

@@ -1,5 +1,5 @@
-"""What is left of a matrix equation, bounded from above with all rounding counted, and
-Newton steps on it."""
+"""Residuals of matrix equations with rigorous rounding-error bounds, and Newton
+steps."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -29,12 +29,12 @@ def tolerance(dtype: Any) -> float:
 
 
 class Residual(NamedTuple):
-    """What is left of a Riccati equation.
+    """The residual of a Riccati equation.
 
-    - `error`: the left side, with the gain in place of the best one.
-    - `relative`: its norm over the sum of those of the terms.
-    - `bounds`: an upper bound on what this is at the best gain and without rounding, in
-      each of the units that were asked for.
+    - `error`: the left side, evaluated at a rounded gain.
+    - `relative`: its norm over the sum of the norms of the terms.
+    - `bounds`: upper bounds on the exact relative residual, at the exact gain and
+      without rounding, in each of the requested units.
     - `closed_loop`: `A - B K`, or `E^-1 (A - B K)`.
     - `terms`: the sum of the norms of the terms, in each of these units.
     """
@@ -54,21 +54,21 @@ def riccati_residual(
     *others: Float[Array, " n"],
     players: int = 0,
 ) -> Residual:
-    r"""What is left of the Riccati equation at `X`.
+    r"""The residual of the Riccati equation at `X`.
 
-    The left side is stationary in the gain, so that one in working precision will do.
+    The left side is stationary in the gain, so that one in working precision is enough.
     With `N = -K`, `L = A + B N` and `T = S' + R N` it is
 
     `L'XE + E'XL + Q + S N + N'T - G'W^-1 G`, `W = R`, `G = B'XE + T`, or
     `L'XL - E'XE + Q + S N + N'T - G'W^-1 G`, `W = R + B'XB`, `G = B'XL + T`,
 
     in continuous and in discrete time. G is rounding alone, and the last term its
-    square. The rounding of each product is bounded by that of the absolute values of
-    its factors. Where that is too wide they are evaluated `accurately`.
+    square. The rounding of each product is bounded by the product of the absolute
+    values of its factors. Where this bound is too wide they are evaluated `accurately`.
 
-    The last `players` controls are a second player's, whose terms count apart. In other
-    units of the states the equation is this one, with rows and columns times those of
-    `others`.
+    The last `players` controls are those of a maximising player, whose terms are
+    counted separately. `others` are other units of the states, in which rows and
+    columns of the equation are multiplied by these.
     """
     A, B, Q, _, _, E = data
     (n, m), dtype = B.shape, A.dtype
@@ -98,8 +98,8 @@ def riccati_residual(
             left = _sharper(discrete, *data, X, working, left)
             return jnp.zeros_like(needed), jax.tree.map(jnp.zeros_like, working), left
 
-        # A loop of one round is not run for a batch in which no member needs it. What
-        # it works on is carried and changes: else compilers move work ahead of it.
+        # A loop of one round is not run for a batch in which no member needs it. Its
+        # operands are carried and changed, or compilers would hoist the work out of it.
         start = needed, working, left
         *_, left = lax.while_loop(lambda carry: carry[0], more_accurate, start)
     error, lost, gap, gap_lost = left
@@ -135,7 +135,7 @@ def stationary(
 
 
 class _Left(NamedTuple):
-    """The left side and G, and by how much rounding may have changed each entry."""
+    """The left side and G, with bounds on the rounding error of each entry."""
 
     error: Array
     lost: Array
@@ -144,7 +144,7 @@ class _Left(NamedTuple):
 
 
 def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
-    """N, L, T, Y = XL (XE in continuous time) and Z = XE, and what is left."""
+    """N, L, T, Y = XL (XE in continuous time), Z = XE, and the residual."""
     n, m = B.shape
     # Higham's model: fl(a op b) = (a op b) (1 + d) with |d| <= unit, and a product of k
     # terms is off by k units of the product of absolute values. `lost_M` is that bound
@@ -172,7 +172,7 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
     square, units = in_parts(L.T, Y)
     SN, NT = S @ N, N.T @ T
     lost = most_L.T @ (units * unit * size_Y + lost_Y)
-    # What is wrong with L is in both factors where the second is XL.
+    # In discrete time an error of L is in both factors, as the second one is XL.
     both = lost_L.T @ (size_Y + from_L / 2)
     if discrete:
         lost += _twice(both)
@@ -190,10 +190,10 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
 
 
 def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
-    """What is left in more digits, and entry by entry the sharper bound.
+    """The residual in more digits, and entry by entry the sharper bound.
 
-    The rests are what rounding left out of L, T, Y and Z. They are summed with the rest
-    of the equation, each as often as it is there.
+    The rests are the rounding errors of L, T, Y and Z. They enter the sum once for each
+    place at which their matrix stands in the equation.
     """
     N, L, T, Y, Z = working
     n, m = B.shape
@@ -209,8 +209,8 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
     else:
         terms, added = [(L, Z), (Z, L), (S.T, N), (N, T)], [Q]
         of_X = [] if E is None else [(E, Z, 2 * L)]
-    # S and R stand under A and B, so that one product has the rests of L and of T.
-    # Pairs of what is left out and a bound on what this leaves out again.
+    # Pairs of a rest and the bound on its error. With S and R stacked under A and B one
+    # product gives the rests of both L and T.
     pair = product(stacked([B, R]), N, stacked([A, S.T]), -stacked([L, T]))
     rests = list(zip(*(jnp.split(M, [n]) for M in pair), strict=True))
     if of_X:
@@ -225,7 +225,7 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
     error, lost = product(left.T, right, *added)
     error += factor @ rest
     lost += jnp.abs(factor) @ (rest_lost + (4 * n + 2 * m + 8) * eps * sizes)
-    # What is wrong with L, times what is wrong with the factor beside it.
+    # The second-order terms: an error of L times an error of the factor beside it.
     most_L, most_T, around = most[:n], most[n : n + m], (n + 4) * eps * jnp.abs(Y)
     if of_X:
         most_Y = most[n + m : 2 * n + m]
@@ -252,11 +252,11 @@ def _twice(M):
 
 
 def linear_residual(discrete, A, B, C, X) -> Array:
-    """What is left of `A X + X B = C`, or of `X - A X B = C`, at `X`, over
+    """The residual of `A X + X B = C`, or of `X - A X B = C`, over
     `(|A| + |B|) |X| + |C|`, or over `(|A| |B| + 1) |X| + |C|`.
 
-    Relative to these norms, rounding counts for little, and its bound is added. So it
-    is the backward error: how far, relatively, the data are from some that `X` solves.
+    It is the backward error: the relative change of the data that makes `X` exact.
+    Relative to these norms rounding is small, and its bound is added.
     """
     eps = jnp.finfo(X.dtype).eps
     size_A, size_B = jnp.linalg.norm(A), jnp.linalg.norm(B)
@@ -280,12 +280,12 @@ def polish(
     units: int,
     to_working_precision: bool = False,
 ) -> tuple[Array, Residual]:
-    """Newton steps on the equation itself, if it asks for them, while they help.
+    """Newton refinement while the residual decreases.
 
-    `residual(X, accurately)` is what is left of it, in so many `units`, and
-    `correction(X, closed_loop, error)` solves it to first order. Where rounding may
-    hide more than there is to be left, the steps go on with accurate residuals, unless
-    they are to end in working precision. Returns the best `X`, and what is left there.
+    `residual(X, accurately)` evaluates the residual, in so many `units`, and
+    `correction(X, closed_loop, error)` is the Newton step. Where its bound is too wide
+    for a certificate the steps go on with accurate residuals, unless they are to end in
+    working precision. Returns the best `X`, and its residual.
 
     Source: Kleinman, 1968; each step solves the Lyapunov equation of the last loop.
     """
@@ -299,8 +299,8 @@ def polish(
         X = symmetric(X + step((X, *last), going & ~first))
         new = residual(X, going & accurately)
         better = first | (new.relative < best[1].relative)
-        # Where steps stop to help much, rounding is all that is left. But far from the
-        # solution the first may not help and yet be one towards it.
+        # Steps that gain little are at the level of rounding. But far from the solution
+        # the residual may rise in the first one.
         helped = first | (new.relative < best[1].relative / 4)
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), (X, new), best)
         rest = best[1].relative
@@ -314,11 +314,11 @@ def polish(
         return X, last, best, accurately | hidden, again | hidden, helped, k
 
     def step(at, needed):
-        """The correction. A loop of one round is not run for a batch in which no member
-        needs it, as in the first round, which only measures."""
+        """The Newton step, in a loop of one round, which is not run for a batch in
+        which no member needs it, as in the first round, which only measures."""
 
         def once(carry):
-            # What is carried changes, so that no work on it is moved ahead of the loop.
+            # The carry changes, or compilers would hoist the work out of the loop.
             nothing = jax.tree.map(jnp.zeros_like, at)
             return jnp.zeros_like(needed), correction(*carry[2]), nothing
 

@@ -1,5 +1,5 @@
-"""The attempts that a Riccati solver makes until it has a certified solution or knows
-why there is none: their order, and the weights and units of each."""
+"""The retry strategy of the algebraic Riccati solver: balancing, restarts, and
+perturbed problems that tell why there is no solution."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -20,62 +20,72 @@ from ._residual import tolerance
 FIRST, BALANCED, SECOND, PERTURBED, UNIT, REGULARISED, DONE = range(7)
 """The kinds of attempt.
 
-- `FIRST`: at the problem.
-- `BALANCED`: in units of the states that balance it, which those after it keep.
-- `SECOND`: from another start.
-- `PERTURBED`: with a state weight less by rounding, of which a solution on the boundary
-    makes another or none.
-- `UNIT`: with unit weights, which has a solution if and only if the pair is
-    stabilisable.
-- `REGULARISED`: with a state weight more by the root of rounding, whose loop tells by
-    being close to the boundary that the problem's is on it.
+- `FIRST`: the problem as given.
+- `BALANCED`: after diagonal balancing of the states, which later attempts keep.
+- `SECOND`: from another starting point.
+- `PERTURBED`: with `Q` less by rounding. If the closed loop is stable by rounding
+    alone, the solution of this problem differs much, or there is none.
+- `UNIT`: with `Q` and `R` multiples of the identity. This problem has a stabilising
+    solution if and only if the pair is stabilisable.
+- `REGULARISED`: with `Q` more by the root of rounding. If its closed loop is near the
+    boundary of stability, that of the problem is on it.
 """
 _NEXT = (
-    # after success, failure in units that do not fit, and other failure of
-    (PERTURBED, BALANCED, SECOND),  # FIRST
-    (PERTURBED, SECOND, SECOND),  # BALANCED
-    (PERTURBED, UNIT, UNIT),  # SECOND
-    (DONE, BALANCED, UNIT),  # PERTURBED
-    (REGULARISED, DONE, DONE),  # UNIT
-    (DONE, DONE, DONE),  # REGULARISED
+    # Following a success, a failure in badly scaled units, and any other failure.
+    #
+    # FIRST: a success near the boundary is to be confirmed. A failure may be due to the
+    # scaling, if that is bad, and otherwise to the starting point.
+    (PERTURBED, BALANCED, SECOND),
+    # BALANCED: likewise, and the scaling is ruled out.
+    (PERTURBED, SECOND, SECOND),
+    # SECOND: the last attempt at a solution. The others find out why there is none.
+    (PERTURBED, UNIT, UNIT),
+    # PERTURBED: the solution is confirmed, or marginal. That may be due to bad scaling;
+    # if not, the question is whether the pair is stabilisable.
+    (DONE, BALANCED, UNIT),
+    # UNIT: a stabilisable pair may have its closed loop on the boundary; without one
+    # there is nothing more to find out.
+    (REGULARISED, DONE, DONE),
+    # REGULARISED: the last question.
+    (DONE, DONE, DONE),
 )
-"""What is attempted next. A loop far from the boundary needs no `PERTURBED`."""
+"""The next attempt. Far from the boundary a solution needs no `PERTURBED`."""
 _ALIKE = 0.3
-"""How much of its distance from the boundary a loop may owe to rounding."""
+"""The largest relative change of the gap under `PERTURBED` of a robust solution."""
 _SWEEPS = 100
 _APART = 4
-"""Units that are no more powers of two apart are left as they are."""
+"""Units within this many powers of two of each other are left as they are."""
 
 
 class Candidate(NamedTuple):
-    """What may be the stabilising solution."""
+    """A candidate for the stabilising solution."""
 
     X: Square
-    residual: Scalar  # in units that balance the problem
-    given: Scalar  # the residual in the units that the problem was given in
+    residual: Scalar  # after balancing
+    unscaled: Scalar  # the residual in the user's units
     bound: Scalar  # spectral radius or abscissa of the closed loop
-    gap: Scalar  # the distance from the boundary, positive if it is stable
+    gap: Scalar  # its distance from the boundary of stability, positive if stable
 
 
 class Attempt(NamedTuple):
-    """A candidate, and what it takes to judge it."""
+    """A candidate, and the quantities that decide on it."""
 
     candidate: Candidate
     rounding: Scalar  # of the gap
-    near: BoolScalar  # whether the gap is so small that it has to be looked at
-    around: BoolScalar  # whether it is small
-    least: Scalar  # the residual that rounding of X may leave, if balanced
-    modest: BoolScalar  # whether X is far from what rounding makes of infinity
+    near: BoolScalar  # whether the gap is within reach of rounding of the data
+    around: BoolScalar  # the same for the wider margin of `REGULARISED`
+    attainable: Scalar  # the balanced residual that rounding of X alone may cause
+    bounded: BoolScalar  # whether |X| is well below |Q| / sqrt(eps)
     iterations: Int[Array, ""]
 
 
 class SearchResult(NamedTuple):
-    """The best candidate, and what the other attempts told."""
+    """The best candidate, and the diagnosis of the other attempts."""
 
     best: Candidate
     solved: BoolScalar
     stable: BoolScalar
-    fragile: BoolScalar  # whether data changed by rounding have no such solution
+    fragile: BoolScalar  # whether rounding of the data changes or removes the solution
     stabilisable: BoolScalar
     on_edge: BoolScalar
     balanced: BoolScalar
@@ -110,10 +120,9 @@ def search(
 ) -> SearchResult:
     """Make attempts of the kinds above, as few as are needed.
 
-    An attempt is of a kind, in balanced units or in those given, which may be `apart`.
-
-    Most problems are solved by the first. In a batch, the others are made if any member
-    has need of them.
+    `attempt(kind, balanced)` is in balanced or in the user's units, which `apart` tells
+    to be badly scaled. Most problems are solved by the first attempt. In a batch, the
+    others are made if any member needs them.
     """
     dtype = X.dtype
     close = tolerance(dtype)
@@ -127,63 +136,58 @@ def search(
         new = attempt(kind, balanced)
         at = new.candidate
         stable = at.gap > new.rounding
-        # No X of this precision may come closer; a hundred times is looked past.
-        enough = jnp.clip(new.least, close, 100 * close)
-        # In units that do not fit, a wrong X may leave little.
+        # Rounding of X may not allow a smaller residual: up to a hundred times the
+        # tolerance is accepted then.
+        enough = jnp.clip(new.attainable, close, 100 * close)
+        # With bad scaling a wrong X can have a small balanced residual.
         unfit = apart & ~balanced
-        solved = stable & (at.residual <= enough) & (~unfit | (at.given <= close))
-        given = kind <= SECOND
-        # Of two that are solved the one with the smaller residual is kept, and of two
-        # that are not the first, unless the second alone is stable.
-        take = solved & (~before.solved | (at.given < best.given))
-        take = given & (take | (kind == FIRST) | stable & ~before.stable)
+        solved = stable & (at.residual <= enough) & (~unfit | (at.unscaled <= close))
+        unchanged = kind <= SECOND  # the user's problem, not a perturbed one
+        # Between two solutions the smaller residual decides. Between two failures the
+        # first is kept, unless only the second is stable.
+        take = solved & (~before.solved | (at.unscaled < best.unscaled))
+        take = unchanged & (take | (kind == FIRST) | stable & ~before.stable)
 
-        # Of a problem that was changed a rough solution tells enough.
+        # For a perturbed problem a rough solution is enough.
         survives = stable & (at.residual <= close**0.5)
-        # Rounding hides on which side of the boundary the loop is.
+        # Stable or not: the gap is smaller than its rounding.
         undecided = ~stable & (at.gap >= -new.rounding)
-        undecided &= (at.residual <= close) & new.modest
-        # The gap of a loop inside the boundary changes little with the weight; that of
-        # one that only rounding keeps off it changes by as much as it is.
+        undecided &= (at.residual <= close) & new.bounded
+        # The gap of a robust solution hardly changes with Q; that of a marginal one
+        # changes by as much as itself.
         same = jnp.abs(at.gap - best.gap) <= _ALIKE * best.gap
-        fragile = jnp.where(
-            kind == PERTURBED, ~(survives & same), before.fragile & ~(given & solved)
-        )
+        fragile = before.fragile & ~(unchanged & solved)
+        fragile = jnp.where(kind == PERTURBED, ~(survives & same), fragile)
         unit = kind == UNIT
         solved_now, stable_now, kept = jax.tree.map(
             lambda now, then: jnp.where(take, now, then),
             (solved, stable, at),
             (before.solved, before.stable, best),
         )
+        stabilisable = survives | undecided | stable_now
+        on_edge = jnp.where(kind == REGULARISED, survives & new.around, before.on_edge)
         after = before._replace(
             best=kept,
             solved=solved_now,
             stable=stable_now,
             fragile=fragile,
-            stabilisable=jnp.where(
-                unit, survives | undecided | stable_now, before.stabilisable
-            ),
-            on_edge=jnp.where(
-                unit,
-                undecided,
-                jnp.where(kind == REGULARISED, survives & new.around, before.on_edge),
-            ),
+            stabilisable=jnp.where(unit, stabilisable, before.stabilisable),
+            on_edge=jnp.where(unit, undecided, on_edge),
             balanced=balanced,
-            iterations=before.iterations + jnp.where(given, new.iterations, 0),
+            iterations=before.iterations + jnp.where(unchanged, new.iterations, 0),
         )
-        # The row of the table: of a changed problem it is no failure to have no
-        # stabilising solution, but an answer.
-        success = jnp.where(given, solved, ~fragile & (~unit | survives))
+        # The column of the table.
+        success = jnp.where(unchanged, solved, ~fragile & (~unit | survives))
         outcome = jnp.where(success, 0, jnp.where(unfit, 1, 2))
         # No index from outside: nothing is clipped, which compiles sooner.
         following = jnp.asarray(_NEXT).at[kind, outcome].get(mode="promise_in_bounds")
-        over = given & solved & ~new.near
+        over = unchanged & solved & ~new.near
         return jnp.where(over, DONE, following), after
 
     most, no = jnp.asarray(jnp.inf, dtype), jnp.asarray(False)
     flags = "solved", "stable", "fragile", "on_edge", "balanced"
     nothing = SearchResult(
-        Candidate(X, residual=most, given=most, bound=most, gap=-most),
+        Candidate(X, residual=most, unscaled=most, bound=most, gap=-most),
         **dict.fromkeys(flags, no),
         stabilisable=jnp.asarray(True),
         posed=posed,
@@ -194,18 +198,17 @@ def search(
 
 
 def weights(kind: Int[Array, ""], data: RiccatiData) -> tuple[RiccatiData, Scalar]:
-    """The problem with the weights of an attempt of this kind, and the size of the
-    state weight."""
+    """The data of an attempt of this kind, and the size of the state weight."""
     Q, R, S = data.Q, data.R, data.S
     n, m, dtype = Q.shape[0], R.shape[0], Q.dtype
     eps = jnp.finfo(dtype).eps
-    # Where a weight is zero the other one sets the scale.
+    # Where `Q` is zero `R` sets the scale.
     eye_Q, eye_R = jnp.eye(n, dtype=dtype), jnp.eye(m, dtype=dtype)
     size_Q, size_R = size(Q), size(R)
     scale_R = one_if_zero(size_R)
     scale_Q = jnp.where(size_Q > 0, size_Q, scale_R)
-    # Less by some rounding errors of Q: data that are the same to the user. More by the
-    # root of rounding: eigenvalues on the boundary then leave it by about eps^(1/4).
+    # A change of Q by eps is within the rounding of the data. One by the root of eps
+    # moves eigenvalues off the boundary by about eps^(1/4).
     change = jnp.where(kind == PERTURBED, -10 * n * eps * size_Q, 0)
     change = jnp.where(kind == REGULARISED, eps**0.5 * scale_Q, change)
     unit = kind == UNIT
@@ -215,13 +218,11 @@ def weights(kind: Int[Array, ""], data: RiccatiData) -> tuple[RiccatiData, Scala
 
 
 def units(data: RiccatiData) -> Float[Array, "2 n"]:
-    """Powers of two, by which the states and the rows of A, B and E are multiplied.
+    """Diagonal balancing: powers of two that scale states and the rows of A, B and E.
 
-    In them a row of the Hamiltonian matrix is as large as its column: what moves a
-    state, other states and controls, is as large as what the state moves, other states
-    and costs. A state in a unit that does not fit is lost in the rounding of the
-    others. States that nothing moves, or that move nothing, keep their units. The rows
-    of an E that is given are then as large as each other.
+    They make the row and the column norms of the Hamiltonian matrix equal, state by
+    state: a badly scaled state is lost in the rounding of the others. A state with a
+    zero row or column keeps its scale. The rows of a given E then have equal norms.
 
     Source: Parlett and Reinsch, 1969 (balancing); Benner, 2001 (of a Hamiltonian).
     """
@@ -234,8 +235,8 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
         exponent = jnp.log2(M)
         return jnp.where(jnp.isfinite(exponent), exponent, lowest)
 
-    # In units of the controls in which their weights are one, and of the cost such that
-    # a state's weight is the square of a length: all in logarithms, base 2.
+    # The quadratic blocks are products: B R^-1/2 and Q^1/2 have the scale of one state
+    # each. All in base-2 logarithms.
     effort = jnp.sqrt(_diagonal_sizes(R))
     force = jnp.max(jnp.abs(plain_B) / one_if_zero(effort), axis=1)
     weight = logarithm(jnp.sqrt(_diagonal_sizes(Q)))
@@ -250,18 +251,18 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
         k, _, d = carry
         moved = inside + d[:, None] - d
         forced, weighed = force + d, weight - d
-        # The size of the cost is free: that at which both have the same weight.
+        # The scale of the cost is free: it is chosen to make both blocks alike.
         rows = jnp.maximum(jnp.max(moved, axis=1), forced + jnp.max(weighed))
         columns = jnp.maximum(jnp.max(moved, axis=0), weighed + jnp.max(forced))
-        # Half of the step that each state would take alone.
+        # Half of the step that each state would take alone, as all move at once.
         change = (columns - rows) / 4
-        # It is huge where a side has only zeros, whose logarithm stands as `lowest`.
+        # A zero row or column, with the logarithm `lowest`, asks for a huge step.
         change = jnp.where(jnp.abs(change) < -lowest / 8, change, 0)
         return k + 1, change, d + change
 
     start = jnp.zeros(n, dtype)
     *_, d = lax.while_loop(more, sweep, (0, start + 1, start))
-    # A unit common to all states changes nothing: no overflow is to come of it.
+    # A factor common to all states has no effect: it is removed to avoid overflow.
     d -= jnp.mean(d)
     f = d
     if E is not None:
@@ -278,9 +279,9 @@ def _diagonal_sizes(M):
 
 
 def in_units(by: Float[Array, "2 n"], data: RiccatiData) -> RiccatiData:
-    """The data of the equation with states and rows that are `by` times these."""
-    # The new state is z = state x, so that x'Qx is z'Q z / state^2. The rows of A and E
-    # may have another unit: an equation may be multiplied by any number.
+    """The data with states and rows scaled `by` these factors."""
+    # With the new state z = state x, the cost x'Qx is z'Qz / state^2. The rows of A, B
+    # and E have a scale of their own, as each equation may be multiplied by a number.
     A, B, Q, R, S, E = data
     state, row = (unit[:, None] for unit in by)
     across = row / by[0]

@@ -48,7 +48,7 @@ than `Q`, as where a control is weak."""
 
 
 class RiccatiSolution(eqx.Module):
-    """The solution of a Riccati equation, with the facts to judge it by.
+    """The solution of a Riccati equation, with diagnostics.
 
     **Attributes:**
 
@@ -69,8 +69,8 @@ class RiccatiSolution(eqx.Module):
 
     `X`, `K` and `closed_loop` are differentiable. `residual`, `spectral_radius` and
     `spectral_abscissa` are measurements and have no gradient. Where the solve failed
-    and the loop is not stable there is nothing to differentiate, and the derivatives
-    are zero, so that they do not spoil a batch.
+    and the loop is not stable the derivatives are zero, so that a failed member does
+    not affect the gradient of a batch.
 
     !!! example
 
@@ -95,7 +95,7 @@ class RiccatiSolution(eqx.Module):
     spectral_abscissa: Array | None = None
 
     def _facts(self) -> str:
-        """What an error says of a failure."""
+        """The diagnostics of an error."""
         radius, abscissa = self.spectral_radius, self.spectral_abscissa
         name, bound = ("abscissa", abscissa) if radius is None else ("radius", radius)
         return (
@@ -119,8 +119,8 @@ def stabilising_solution(
 @eqx.filter_jit
 @full_precision
 def _as_complex(solution: RiccatiSolution, discrete: bool, data: RiccatiData):
-    """A solution in complex form, for which the residual is bounded once more: rounding
-    may have left an X that is no real form."""
+    """The solution in complex form, with a new residual bound: rounding may have left
+    an `X` that is not exactly a real form."""
     solution = eqx.tree_at(
         lambda s: (s.X, s.K, s.closed_loop), solution, replace_fn=complex_form
     )
@@ -139,7 +139,7 @@ def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
     solution = _certified(discrete, data, by)
     # The gain is a formula in X and the data, whose derivatives are then its own.
     K, closed_loop = _feedback(discrete, solution.differentiable, data, solution.X)
-    residual, bound = lax.stop_gradient((solution.best.given, solution.best.bound))
+    residual, bound = lax.stop_gradient((solution.best.unscaled, solution.best.bound))
     return RiccatiSolution(
         X=solution.X * (f[:, None] * f),
         K=K * d,
@@ -154,11 +154,11 @@ def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
-    """The stabilising `X` in balanced units, `by` times those given, and what is known
-    about it."""
+    """The certified search for the stabilising `X`, for data in balanced units, `by`
+    times the user's."""
     A, B, Q, R, S, E = data
     n, eps = A.shape[0], float(jnp.finfo(A.dtype).eps)
-    # The starts are those of E^-1 A and E^-1 B.
+    # The starting points are computed for E^-1 A and E^-1 B.
     explicit = data
     if E is not None:
         solved = factorised(E)
@@ -172,12 +172,12 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
     magnified = 1 if E is None else size(E) ** 2
 
     def attempt(kind: Array, balanced: Array) -> Attempt:
-        # From the units that balance the problem to those of the attempt.
+        # From balanced units to those of the attempt.
         back = state, row = jnp.where(balanced, 1, 1 / by)
         here, size_Q = weights(kind, in_units(back, data))
         start = here
         if E is not None:
-            # Their rows have the units of the states.
+            # Without E the rows have the units of the states.
             plain = in_units(jnp.stack([state, state]), explicit)
             start = here._replace(A=plain.A, B=plain.B)
         second = kind == SECOND
@@ -196,8 +196,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
         loop = left.closed_loop
         if discrete:
             bound = spectral_radius(loop)
-            # A stable loop may belong to a stationary point of a cost without a
-            # minimum.
+            # A stable loop may belong to a saddle point of an indefinite cost.
             weight = here.R + here.B.T @ X @ here.B
             gap = jnp.where(is_semidefinite(weight), 1 - bound, -jnp.inf)
             rounding, scale = jnp.asarray(n * eps, A.dtype), 1.0
@@ -211,20 +210,19 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             # root.
             reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
             scale = size(loop)
-        # The rest is said in balanced units.
+        # All else is expressed in balanced units.
         balanced_X = X * (row[:, None] * row)
         size_loop = size(loop * (state / state[:, None]))
         gain = 1 + size_loop**2 if discrete else 2 * size_loop
-        # A change dX leaves L'dX L - E'dX E, or E'dX L + L'dX E: the residual that
-        # rounding of X may leave.
+        # A change dX by rounding causes a residual L'dX L - E'dX E, or E'dX L + L'dX E.
         terms = jnp.where(left.terms[2] > 0, left.terms[2], jnp.inf)
         return Attempt(
             Candidate(balanced_X, left.bounds[2], left.bounds[1], bound, gap),
             rounding=rounding,
             near=jnp.abs(gap) < reach,
             around=jnp.abs(gap) < 4 * eps**0.125 * scale,
-            least=8 * eps * size(balanced_X) * gain * magnified / terms,
-            modest=size(X) * eps**0.5 < size_Q,
+            attainable=8 * eps * size(balanced_X) * gain * magnified / terms,
+            bounded=size(X) * eps**0.5 < size_Q,
             iterations=iterations,
         )
 
@@ -234,15 +232,15 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
 @_certified.defjvp
 @full_precision
 def _certified_jvp(discrete, primals, tangents):
-    """By the implicit function theorem; zero in members that are not solved."""
+    """By the implicit function theorem; zero in unsolved members."""
     data, _ = primals
     solution = _certified(discrete, *primals)
     ok = solution.differentiable
-    # Guarded at both ends: what is not finite in a failed member stays in it.
+    # Masked at input and output, so that a failed member's NaN does not spread.
     tangent = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents[0])
     safe, X = _harmless(ok, data, solution.X)
     # The derivative of the equation in X is the Lyapunov operator of the closed loop:
-    # dX solves it for what the change of the data leaves at a fixed X.
+    # dX solves a Lyapunov equation whose constant is the derivative in the data.
     equation = functools.partial(left_side, discrete, X)
     _, error, loop = jax.jvp(equation, (safe,), (tangent,), has_aux=True)
     loop = jnp.where(ok, loop, shifted(-0.5, loop))
@@ -290,14 +288,14 @@ def _feedback_jvp(discrete, primals, tangents):
 
 
 def _harmless(ok: BoolScalar, data: RiccatiData, X: Array):
-    """The data and `X`, and in members that are not `ok` others that are finite."""
+    """The data and `X`, with finite placeholders in members that are not `ok`."""
     A, B, Q, R, S, E = data
     (A, B, Q, S, X), (R, E) = where_solved(ok, (A, B, Q, S, X), (R, E))
     return RiccatiData(A, B, Q, R, S, E), X
 
 
 def _correction(discrete: bool, E: Array | None, loop: Array, error: Array) -> Array:
-    """The `X` that takes an error of the equation away, to first order."""
+    """The Newton step for an `error` of the equation, given its closed loop."""
     return _outside(E, lyapunov(discrete, loop, error))
 
 
