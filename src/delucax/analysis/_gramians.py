@@ -7,9 +7,8 @@ from jaxtyping import Array, Float
 from .._check import check_count, check_positive
 from .._results import raise_if
 from .._typing import BoolScalar, RealScalar, Scalar
-from ..math._gramian import gramian_over
 from ..math._linear_solve import full_precision, symmetric
-from ..math._lyapunov import lyapunov
+from ..math._lyapunov import gramian_over, lyapunov
 from ._state_space import LinearModel, state_space, StateSpace
 
 

@@ -1,17 +1,19 @@
-"""The Lyapunov, Stein and Sylvester equations of stable matrices, by doubling."""
+"""Lyapunov, Stein and Sylvester equations of stable matrices, and Gramians over a
+finite time, by doubling."""
 
 import jax.lax as lax
 import jax.numpy as jnp
+import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
-from .._typing import Square
-from ._linear_solve import factorised
+from .._typing import Scalar, Square
+from ._linear_solve import factorised, full_precision, symmetric
 from ._norms import relative_size
 
 
 _REFINEMENTS = 3
 MAX_DOUBLINGS = 60
-"""Beyond it the spectral radius cannot be told from 1: 2**60 > 1 / eps in float64."""
+"""2**60 steps: a spectral radius closer to 1 is not resolved in float64."""
 
 
 def lyapunov(discrete: bool, A: Square, Q: Square) -> Square:
@@ -115,3 +117,33 @@ def _cayley(A, c):
     shift = c * jnp.eye(len(A), dtype=A.dtype)
     solved = factorised(A - shift)
     return solved, solved(A + shift)
+
+
+@full_precision
+def gramian_over(A: Square, Q: Square, time: Scalar) -> Square:
+    """The integral of `exp(A s) Q exp(A' s)` over `s` from 0 to `time`.
+
+    Over the whole time the exponential of `-A` would overflow where `A` is stiff. It is
+    taken over a short part, with `|A| t < 1`, which is then doubled.
+
+    Source: Van Loan, 1978.
+    """
+    n = A.shape[0]
+    fastest = lax.stop_gradient(time * jnp.linalg.norm(A))
+    doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(fastest, 1))), 0, MAX_DOUBLINGS)
+    short = time * 0.5**doublings
+    block = jnp.block([[-A, Q], [jnp.zeros_like(A), A.T]]) * short
+    exponential = jsl.expm(block)
+    power = exponential[n:, n:].T
+    W = power @ exponential[:n, n:]
+
+    def double(carry, k):
+        W, power = carry
+        more = k < doublings
+        # Zero where it is not used: what overflows there must not reach a derivative.
+        safe_power = jnp.where(more, power, 0)
+        W_next = W + safe_power @ W @ safe_power.T
+        return (W_next, jnp.where(more, safe_power @ safe_power, power)), None
+
+    (W, _), _ = lax.scan(double, (W, power), jnp.arange(MAX_DOUBLINGS))
+    return symmetric(W)

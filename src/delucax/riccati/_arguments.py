@@ -57,17 +57,7 @@ def hermitian_matrix(value: Any, name: str, where: str) -> Array:
 
 
 def riccati_arguments(
-    where: str,
-    A: Any,
-    B: Any,
-    Q: Any,
-    R: Any,
-    S: Any,
-    E: Any,
-    *,
-    definite: bool,
-    names: str = "ABQRSE",
-    dual: bool = False,
+    where: str, A, B, Q, R, S, E, *, definite: bool, names="ABQRSE", dual=False
 ) -> RiccatiData:
     """The arguments as matrices of one precision that fit each other.
 
@@ -212,13 +202,11 @@ def _length(where, horizon, steps):
             f"{where}: leading time axes must have one length of at least 1, got "
             f"{steps}."
         )
-    if not steps:
-        if horizon is None:
-            raise ValueError(
-                f"{where}: horizon must be given where no argument has a time axis."
-            )
-        return horizon
-    name, T = next(iter(steps.items()))
+    name, T = next(iter(steps.items()), (None, horizon))
+    if T is None:
+        raise ValueError(
+            f"{where}: horizon must be given where no argument has a time axis."
+        )
     if horizon not in (None, T):
         raise ValueError(
             f"{where}: horizon must be the length of the time axis of {name} ({T}), "

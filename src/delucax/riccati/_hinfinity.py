@@ -339,9 +339,8 @@ def _implicit_derivative_jvp(discrete, primals, tangents):
 def _barrier(discrete: bool, problem: tuple, gamma: Scalar) -> Array:
     """A barrier function, whose slope diverges at the least level."""
     start = _game_start(discrete, problem)
-    end, _ = bisect_level(
-        functools.partial(_solve_game, discrete), problem, start, gamma
-    )
+    solve_game = functools.partial(_solve_game, discrete)
+    end, _ = bisect_level(solve_game, problem, start, gamma)
     X = _with_implicit_derivative(discrete, problem, gamma, end.game)
     total = jnp.trace(X)
     if discrete:

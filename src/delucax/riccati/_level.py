@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -109,16 +109,9 @@ def joint_gain(discrete: bool, data: RiccatiData, X: Square) -> Array:
     return solve(weight, cross.T)
 
 
-def at_level(
-    solution_of: Callable[..., Any],
-    where: str,
-    discrete: bool,
-    problem: tuple,
-    gamma: Any,
-    tolerance: Any,
-    throw: bool,
-) -> Any:
-    """A game at the level that is given, or at the least one to within a tolerance."""
+def at_level(solver, where, discrete, problem, gamma, tolerance, throw) -> GameSolution:
+    """The checked call of `solver(discrete, problem, gamma, tolerance)`: the game at a
+    given level, or at the least one to within a tolerance."""
     dtype = problem[0].dtype
     if tolerance is None:
         tolerance = 16 * jnp.finfo(dtype).eps if discrete else _LOOSE[dtype.itemsize]
@@ -126,7 +119,7 @@ def at_level(
     if gamma is not None:
         check_step(gamma, where, "gamma")
         gamma = jnp.asarray(gamma, dtype)
-    solution = solution_of(discrete, problem, gamma, jnp.asarray(tolerance, dtype))
+    solution = solver(discrete, problem, gamma, jnp.asarray(tolerance, dtype))
     facts = lambda: f"Level gamma {float(solution.gamma):.6g}."
     return raise_on_failure(solution, where, throw, facts=facts)
 
@@ -158,6 +151,7 @@ class Bisection(NamedTuple):
     trials: Array
 
 
+Barrier = Callable[[tuple, Array], Array]
 Solve = Callable[[tuple, Array, Array], Game]
 """`(A, B, D, Q, R, *others)`, `gamma` and `X0` to the game's solution. `X0` is a point
 below the solution, from which the iteration rises to it."""
@@ -248,12 +242,7 @@ def bisect_level(
 
 
 def game_at_level(
-    solve_game: Solve,
-    barrier: Callable[[tuple, Array], Array],
-    problem: tuple,
-    start: Array,
-    gamma: Array | None,
-    tolerance: Array,
+    solve_game: Solve, barrier: Barrier, problem, start, gamma, tolerance
 ) -> tuple[Bisection, Array, Array]:
     """The game at `gamma`, or at the least level; that level, or 1 if it is 0; and the
     level as it is, with its derivatives."""
@@ -270,9 +259,7 @@ def _where(condition, first, second):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def with_derivative(
-    barrier: Callable[[tuple, Array], Array], problem: tuple, level: Array
-):
+def with_derivative(barrier: Barrier, problem: tuple, level: Array):
     """The least level, with its derivative in the problem.
 
     `barrier(problem, gamma)` is any function whose value or slope diverges at the least

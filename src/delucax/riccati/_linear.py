@@ -14,7 +14,7 @@ from .._results import choose, raise_on_failure, Result, RESULTS
 from ..math._linear_solve import full_precision, no_tangent, solve
 from ..math._lyapunov import smith, stable_sylvester
 from ._arguments import complex_form, is_complex, real_form, square_matrix
-from ._residual import linear_residual, tolerance
+from ._residual import if_needed, linear_residual, tolerance
 from ._spectrum import spectral_abscissa
 
 
@@ -335,20 +335,17 @@ def _wanted(wanted, A, B, C, scale=0):
 def _densely(discrete, A, B, C, X, wanted):
     """The solution as that of one linear system, if it is wanted, else `X`."""
 
-    # A loop of at most one round, which a batch skips where no member needs it.
-    def body(carry):
-        _, going = carry
+    def dense(_):
         # vec(A X + X B), row by row, is this matrix times vec(X).
         other = A.T if B is None else B
-        eye_A = jnp.eye(A.shape[0], dtype=A.dtype)
-        eye_B = jnp.eye(other.shape[0], dtype=A.dtype)
+        eye_A, eye_B = (jnp.eye(size, dtype=A.dtype) for size in C.shape)
         if discrete:
             system = jnp.kron(eye_A, eye_B) - jnp.kron(A, other.T)
         else:
             system = jnp.kron(A, eye_B) + jnp.kron(eye_A, other.T)
-        return solve(system, C.reshape(-1, 1)).reshape(C.shape), ~going
+        return solve(system, C.reshape(-1, 1)).reshape(C.shape)
 
-    return lax.while_loop(lambda carry: carry[1], body, (X, wanted))[0]
+    return if_needed(wanted, dense, X, ())
 
 
 @_solved.defjvp

@@ -92,16 +92,8 @@ def riccati_residual(
     closed_loop = working[1] if E is None else solve(E, working[1])
     needed = jnp.asarray(accurately)
     if accurately is not False:
-
-        def more_accurate(carry):
-            _, working, left = carry
-            left = _sharper(discrete, *data, X, working, left)
-            return jnp.zeros_like(needed), jax.tree.map(jnp.zeros_like, working), left
-
-        # A loop of one round is not run for a batch in which no member needs it. Its
-        # operands are carried and changed, or compilers would hoist the work out of it.
-        start = needed, working, left
-        *_, left = lax.while_loop(lambda carry: carry[0], more_accurate, start)
+        sharper = lambda left, *working: _sharper(discrete, *data, X, working, left)
+        left = if_needed(needed, sharper, left, working)
     error, lost, gap, gap_lost = left
     gap = jnp.abs(gap) + gap_lost
     # |G'W^-1 G| <= |G|' |W^-1| |G| entry by entry; 2 covers the rounding of W^-1.
@@ -119,6 +111,23 @@ def riccati_residual(
     bounds = _MARGIN * relative[:, 1]
     relative = jnp.where(needed, bounds[0], relative[0, 0])
     return Residual(error, relative, bounds, closed_loop, sizes)
+
+
+def if_needed(needed: BoolScalar, function: Callable, value: Any, operands: tuple):
+    """`function(value, *operands)` where it is needed, else `value`.
+
+    By a loop of at most one round, which is not run for a batch in which no member
+    needs it; `lax.cond` would compute both branches. The operands are carried and
+    changed, or compilers would hoist the work out of the loop.
+    """
+
+    def once(carry):
+        _, operands, value = carry
+        nothing = jax.tree.map(jnp.zeros_like, operands)
+        return jnp.zeros_like(needed), nothing, function(value, *operands)
+
+    start = needed, operands, value
+    return lax.while_loop(lambda carry: carry[0], once, start)[2]
 
 
 def stationary(
@@ -296,7 +305,13 @@ def polish(
         # The first round measures, those after it step: so there is one residual in
         # the compiled program, which is most of its size.
         first = k == 0
-        X = symmetric(X + step((X, *last), going & ~first))
+        step = if_needed(
+            going & ~first,
+            lambda _, *at: correction(*at),
+            jnp.zeros_like(X),
+            (X, *last),
+        )
+        X = symmetric(X + step)
         new = residual(X, going & accurately)
         better = first | (new.relative < best[1].relative)
         # Steps that gain little are at the level of rounding. But far from the solution
@@ -312,18 +327,6 @@ def polish(
         k = jnp.where(hidden, 0, k + 1)
         last = new.closed_loop, new.error
         return X, last, best, accurately | hidden, again | hidden, helped, k
-
-    def step(at, needed):
-        """The Newton step, in a loop of one round, which is not run for a batch in
-        which no member needs it, as in the first round, which only measures."""
-
-        def once(carry):
-            # The carry changes, or compilers would hoist the work out of the loop.
-            nothing = jax.tree.map(jnp.zeros_like, at)
-            return jnp.zeros_like(needed), correction(*carry[2]), nothing
-
-        start = needed, jnp.zeros_like(X), at
-        return lax.while_loop(lambda carry: carry[0], once, start)[1]
 
     yes = jnp.asarray(True)
     matrix, number, vector = (jnp.zeros(s, X.dtype) for s in (X.shape, (), units))

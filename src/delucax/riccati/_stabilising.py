@@ -89,9 +89,9 @@ class RiccatiSolution(eqx.Module):
     K: Array
     residual: Array
     closed_loop: Array
-    spectral_radius: Array | None
     iterations: Array
     result: Result
+    spectral_radius: Array | None = None
     spectral_abscissa: Array | None = None
 
     def _facts(self) -> str:
@@ -145,10 +145,9 @@ def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
         K=K * d,
         residual=residual,
         closed_loop=closed_loop / (d[:, None] / d),
-        spectral_radius=bound if discrete else None,
         iterations=solution.iterations,
         result=solution.result,
-        spectral_abscissa=None if discrete else bound,
+        **{"spectral_radius" if discrete else "spectral_abscissa": bound},
     )
 
 
