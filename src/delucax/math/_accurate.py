@@ -103,7 +103,7 @@ def _by_slices(left, right, *added):
     return total, lost + eps * jnp.abs(total)
 
 
-def in_parts(
+def product_in_parts(
     left: Float[Array, "n k"], right: Float[Array, "k m"]
 ) -> tuple[Float[Array, "n m"], int]:
     """The product of two matrices, and its error bound, in units of rounding of the

@@ -89,7 +89,7 @@ class _Elimination(lx.AbstractLinearSolver):
         for k in range(n):
             for i in range(k + 1, n):
                 x[i] = x[i] - rows[i][k] * x[k]
-        x = _apart(x)
+        x = _materialised(x)
         for i in reversed(range(n)):
             for j in range(i + 1, n):
                 x[i] = x[i] - rows[i][j] * x[j]
@@ -109,7 +109,7 @@ class _Elimination(lx.AbstractLinearSolver):
         return True
 
 
-def _apart(tree):
+def _materialised(tree):
     """The same values, materialised before use: a compiler that fuses the whole
     elimination recomputes them for each use, and their number doubles with each
     pivot."""
@@ -128,7 +128,7 @@ def _factor(matrix):
             larger = size > best
             best = lax.select(larger, size, best)
             pivot = lax.select(larger, jnp.asarray(i), pivot)
-        rows, pivot = _apart((rows, pivot))
+        rows, pivot = _materialised((rows, pivot))
         pivots.append(pivot)
         chosen = list(rows[k])
         for i in range(k + 1, n):
@@ -136,13 +136,13 @@ def _factor(matrix):
             for j in range(n):
                 chosen[j] = lax.select(is_pivot, rows[i][j], chosen[j])
                 rows[i][j] = lax.select(is_pivot, rows[k][j], rows[i][j])
-        rows[k] = _apart(chosen)
+        rows[k] = _materialised(chosen)
         for i in range(k + 1, n):
             multiplier = rows[i][k] / rows[k][k]
             rows[i][k] = multiplier
             for j in range(k + 1, n):
                 rows[i][j] = rows[i][j] - multiplier * rows[k][j]
-    return _apart(rows), pivots
+    return _materialised(rows), pivots
 
 
 def is_definite(matrix: Square) -> BoolScalar:

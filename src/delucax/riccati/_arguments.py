@@ -132,7 +132,7 @@ _AXES = dict(A="nn", B="nm", D="nk", Q="nn", R="mm", S="nm", d="n", q="n", r="m"
 """The axes of each argument, an axis being named by its size."""
 
 
-def in_time(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
+def stage_arguments(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
     """Each argument with a leading time axis, in one precision. What is `None` is zero.
 
     The sizes are those of the first argument that has them.

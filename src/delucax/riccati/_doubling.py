@@ -11,7 +11,7 @@ from ..math._linear_solve import factorised, solve, symmetric
 from ..math._lyapunov import MAX_DOUBLINGS
 from ..math._norms import one_if_zero, relative_and_total_size, size
 from ._arguments import RiccatiData
-from ._recursion import Element, joined, without_cross_weight
+from ._recursion import composed, Element, without_cross_weight
 
 
 _SIGN_STEPS = 60
@@ -122,7 +122,7 @@ def double(
 
     def body(carry):
         before, _, k = carry
-        after = joined(before, before)
+        after = composed(before, before)
         finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in after]))
         # An overflow ends the iteration at the last finite step, whose closed loop is
         # not stable, which the caller checks.

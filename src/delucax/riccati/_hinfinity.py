@@ -39,7 +39,7 @@ from ._recursion import (
     short_element,
     without_cross_weight,
 )
-from ._residual import polish, riccati_residual, stationary
+from ._residual import newton_refine, riccati_residual, stationary
 from ._spectrum import spectral_abscissa, spectral_radius
 from ._stabilising import is_semidefinite, left_side, shifted
 
@@ -249,8 +249,8 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
     # Doubling of the equation of X - X0, from below the solution, to which it rises.
     element, unit = _element(discrete, data, problem, gamma, X0)
     J, iterations = double(element, X0 / unit)
-    X, left = polish(
-        lambda X, _: riccati_residual(discrete, data, X, False, players=D.shape[1]),
+    X, left = newton_refine(
+        lambda X, _: riccati_residual(discrete, data, X, False, maximisers=D.shape[1]),
         functools.partial(_correction, discrete),
         X0 + unit * J,
         units=1,

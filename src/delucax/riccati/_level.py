@@ -87,7 +87,7 @@ class GameSolution(eqx.Module):
     spectral_abscissa: Array | None = None
 
 
-def players(B, D, R, gamma) -> tuple[Array, Array]:
+def joint_inputs(B, D, R, gamma) -> tuple[Array, Array]:
     """`[B D]`, and the weight of the joint control `[u; w]`."""
     m, k = B.shape[-1], D.shape[-1]
     weight = jnp.zeros((*R.shape[:-2], m + k, m + k), R.dtype)
@@ -99,7 +99,7 @@ def players(B, D, R, gamma) -> tuple[Array, Array]:
 def joint(problem: tuple, gamma: Scalar) -> RiccatiData:
     """The equation of the game `(A, B, D, Q, R)`."""
     A, B, D, Q, R = problem
-    both, weight = players(B, D, R, gamma)
+    both, weight = joint_inputs(B, D, R, gamma)
     return RiccatiData(A, both, Q, weight, jnp.zeros_like(both), None)
 
 
@@ -275,8 +275,8 @@ def _with_derivative_jvp(barrier, primals, tangents):
     # By implicit differentiation of barrier(problem, gamma) = constant a little above
     # the level: at it both slopes are infinite, and their quotient has a limit.
     problem, level = primals
-    level = once(level)
-    problem = jax.tree.map(once, problem)
+    level = once_differentiable(level)
+    problem = jax.tree.map(once_differentiable, problem)
     still = jax.tree.map(jnp.zeros_like, problem)
     attained = level > 0
     safe = jnp.where(attained, level, 1)
@@ -295,7 +295,7 @@ def _with_derivative_jvp(barrier, primals, tangents):
 
 
 @jax.custom_jvp
-def once(x: Array) -> Array:
+def once_differentiable(x: Array) -> Array:
     """`x`, which cannot be differentiated twice.
 
     The slope of the barrier diverges in the limit: its own derivative would be rounding
@@ -304,8 +304,8 @@ def once(x: Array) -> Array:
     return x
 
 
-@once.defjvp
-def _once_jvp(primals, tangents):
+@once_differentiable.defjvp
+def _once_differentiable_jvp(primals, tangents):
     raise NotImplementedError(
         "The least attainable gamma has first derivatives only. Give gamma as an "
         "argument for higher ones."

@@ -265,7 +265,7 @@ def _solved(discrete, A, B, C) -> _Candidate:
         plain, shifted = kind == _PLAIN, kind == _SHIFTED
         X, iterations = _separated(discrete, A, B, C, plain, shifted)
         if last == _DENSELY:
-            X = _densely(discrete, A, B, C, X, kind == _DENSELY)
+            X = _dense_solution(discrete, A, B, C, X, kind == _DENSELY)
         residual = linear_residual(discrete, A, A.T if B is None else B, C, X)
         # For a linear equation a small residual is a small backward error: enough.
         better = (residual < before.residual) | plain
@@ -287,7 +287,7 @@ def _separated(discrete, A, B, C, plain, shifted):
     """The solution if the spectra are separated, as they are or by a shift."""
     if discrete:
         # An inactive kind gets a trivial problem, which takes one step.
-        X, steps = smith(*_wanted(plain, A, B, C))
+        X, steps = smith(*_or_trivial(plain, A, B, C))
         # Where both spectra are outside the circle, the Cayley transform puts them to
         # the right of the axis.
         eye_A, eye_B = (jnp.eye(size, dtype=C.dtype) for size in C.shape)
@@ -320,11 +320,11 @@ def _one_side(A, B, C, sign, shift, wanted):
     A = sign * (A - shift * jnp.eye(A.shape[0], dtype=A.dtype))
     if B is not None:
         B = sign * (B + shift * jnp.eye(B.shape[0], dtype=B.dtype))
-    A, B, C = _wanted(wanted, A, B, sign * C, -1)
+    A, B, C = _or_trivial(wanted, A, B, sign * C, -1)
     return stable_sylvester(A, B, C)
 
 
-def _wanted(wanted, A, B, C, scale=0):
+def _or_trivial(wanted, A, B, C, scale=0):
     """The problem if it is wanted; else a trivial one."""
     A = jnp.where(wanted, A, scale * jnp.eye(A.shape[0], dtype=A.dtype))
     if B is not None:
@@ -332,7 +332,7 @@ def _wanted(wanted, A, B, C, scale=0):
     return A, B, jnp.where(wanted, C, 0)
 
 
-def _densely(discrete, A, B, C, X, wanted):
+def _dense_solution(discrete, A, B, C, X, wanted):
     """The solution as that of one linear system, if it is wanted, else `X`."""
 
     def dense(_):

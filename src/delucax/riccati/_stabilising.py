@@ -28,7 +28,7 @@ from ._arguments import (
     where_solved,
 )
 from ._doubling import continuous_start, discrete_start
-from ._residual import polish, riccati_residual, stationary
+from ._residual import newton_refine, riccati_residual, stationary
 from ._search import (
     Attempt,
     Candidate,
@@ -163,11 +163,11 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
         solved = factorised(E)
         explicit = RiccatiData(solved(A), solved(B), Q, R, S, None)
     # In discrete time R + B'XB is inverted, in continuous time R alone.
-    posed = (
+    well_posed = (
         is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
     )
     for M in explicit[:5]:
-        posed = posed & jnp.all(jnp.isfinite(M))
+        well_posed = well_posed & jnp.all(jnp.isfinite(M))
     magnified = 1 if E is None else size(E) ** 2
 
     def attempt(kind: Array, balanced: Array) -> Attempt:
@@ -186,7 +186,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             size_G = jnp.zeros_like(size_Q)  # needed in continuous time alone
         else:
             X, size_G, iterations = continuous_start(start, second)
-        X, left = polish(
+        X, left = newton_refine(
             lambda *at: riccati_residual(discrete, here, *at, by[0] * state, state),
             lambda _, *at: _correction(discrete, here.E, *at),
             _outside(here.E, X),
@@ -225,7 +225,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             iterations=iterations,
         )
 
-    return search(attempt, jnp.full_like(Q, jnp.nan), posed, jnp.any(by != 1))
+    return search(attempt, jnp.full_like(Q, jnp.nan), well_posed, jnp.any(by != 1))
 
 
 @_certified.defjvp
