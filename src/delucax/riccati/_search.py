@@ -165,15 +165,15 @@ def search(
             (before.solved, before.stable, best),
         )
         stabilisable = survives | undecided | stable_now
-        on_boundary = jnp.where(unit, undecided, before.on_boundary)
         near_it = survives & new.around
+        on_boundary = jnp.where(kind == REGULARISED, near_it, before.on_boundary)
         after = before._replace(
             best=kept,
             solved=solved_now,
             stable=stable_now,
             marginal=marginal,
             stabilisable=jnp.where(unit, stabilisable, before.stabilisable),
-            on_boundary=jnp.where(kind == REGULARISED, near_it, on_boundary),
+            on_boundary=jnp.where(unit, undecided, on_boundary),
             balanced=balanced,
             iterations=before.iterations + jnp.where(unchanged, new.iterations, 0),
         )
