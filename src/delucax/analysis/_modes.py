@@ -275,6 +275,7 @@ def _modal_test(
 def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
     system = lax.stop_gradient(system)
     eps = jnp.finfo(system.A.dtype).eps
+    # Scaled, so that a distance is relative to each of the matrices.
     scale_A, scale_B = (
         jnp.where(norm > 0, norm, 1)
         for norm in (jnp.linalg.norm(system.A), jnp.linalg.norm(system.B))
@@ -295,6 +296,7 @@ def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
         first, better = distance(eigenvalue)
         mode, least = eigenvalue, first
         for _ in range(_SEARCHES):
+            # The improved mode stays within the error of the eigenvalue.
             step = better - eigenvalue
             length = jnp.abs(step)
             step = step * jnp.minimum(1, radius / jnp.where(length > 0, length, 1))
@@ -348,6 +350,7 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
             "jax.vmap or jax.grad); how many zeros there are depends on its values."
         )
     A, B, C, D = (np.asarray(M) for M in (system.A, system.B, system.C, system.D))
+    # NumPy: the sizes of the reduced systems depend on ranks.
     total = np.linalg.norm(np.block([[A, B], [C, D]]))
     tolerance = 10 * sum(A.shape) * np.finfo(A.dtype).eps * total
     A, B, C, D = _hidden_part(A, B, C, D, tolerance)

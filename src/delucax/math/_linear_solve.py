@@ -53,6 +53,7 @@ def factorised(
     """
     if solver is None:
         solver = _Elimination() if matrix.shape[0] <= SMALL else lx.LU()
+    # The state is computed once. Lineax differentiates the solve, not the elimination.
     operator = lx.MatrixLinearOperator(matrix, tags)
     state = solver.init(operator, {})
 
@@ -79,6 +80,7 @@ class _Elimination(lx.AbstractLinearSolver):
         _, (rows, pivots) = state
         n = len(rows)
         x = [vector[i] for i in range(n)]
+        # The row exchanges, then forward and backward substitution.
         for k in range(n):
             chosen = x[k]
             for i in range(k + 1, n):
@@ -122,6 +124,7 @@ def _factor(matrix):
     rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
     pivots = []
     for k in range(n):
+        # The pivot is the largest entry of the column: a comparison for each row.
         best, pivot = jnp.abs(rows[k][k]), jnp.asarray(k)
         for i in range(k + 1, n):
             size = jnp.abs(rows[i][k])
@@ -150,6 +153,7 @@ def is_definite(matrix: Square) -> BoolScalar:
     n = matrix.shape[0]
     if n > SMALL:
         return jnp.all(jnp.isfinite(jnp.linalg.cholesky(matrix)))
+    # Elimination without pivoting, whose pivots are the squares of Cholesky's diagonal.
     rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
     definite = jnp.asarray(True)
     for k in range(n):

@@ -46,6 +46,7 @@ def hermitian_matrix(value: Any, name: str, where: str) -> Array:
     """
     matrix = square_matrix(value, name, where)
     transposed = matrix.conj().T
+    # As large as products such as C'WC may leave by rounding.
     slack = 100 * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
     wrong = jnp.max(jnp.abs(matrix - transposed)) > slack
     if is_concrete(wrong) and wrong:
@@ -155,6 +156,7 @@ def stage_arguments(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
         if array.ndim > ndim:
             steps[name] = array.shape[0]
     T, dtype = _length(where, horizon, steps), _real_dtype(where, arrays)
+    # Constant arguments are repeated: one scan serves both kinds.
     zero = jnp.zeros((), dtype)
     shape = lambda name: (T, *(sizes[axis] for axis in _AXES[name]))
     return {

@@ -144,6 +144,7 @@ def dre(
     A = stage["A"]
     final, n = final_weight(final, A, where), A.shape[-1]
     is_affine = any(v is not None for v in (d, q, r, final_q))
+    # Without linear terms p, s and k are zero, and are not computed.
     final_q = jnp.zeros(n) if final_q is None else final_q
     final_q = as_vector(final_q, n, "final_q", where).astype(A.dtype)
     solution = _discrete_solution(
@@ -263,6 +264,7 @@ def cre(
 @eqx.filter_jit
 @full_precision
 def _continuous_solution(A, B, Q, R, S, final, times):
+    # Without a definite R the Hamiltonian has no minimum, whatever X is.
     definite = is_clearly_definite(R)
     safe = jnp.where(definite, R, jnp.eye(R.shape[0], dtype=R.dtype))
     X = flow_values(*without_cross_weight(A, B, Q, safe, S), final, times, False)

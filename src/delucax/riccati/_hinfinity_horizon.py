@@ -34,6 +34,7 @@ def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
         return values(A, both, Q, weight, S, final, D.shape[-1], False)
     definite = is_clearly_definite(R)
     safe = jnp.where(definite, R, shifted(1, R))
+    # The quadratic term of both players, which flows like that of control alone.
     G = symmetric(B @ solve(safe, B.T) - D @ D.T / gamma**2)
     X = flow_values(A, G, Q, final, *times, True)
     return jnp.where(definite, X, jnp.nan)

@@ -91,6 +91,7 @@ def joint_inputs(B, D, R, gamma) -> tuple[Array, Array]:
     """`[B D]`, and the weight of the joint control `[u; w]`."""
     m, k = B.shape[-1], D.shape[-1]
     weight = jnp.zeros((*R.shape[:-2], m + k, m + k), R.dtype)
+    # gamma^2 w'w is subtracted from the cost.
     worth = -(gamma**2) * jnp.eye(k, dtype=R.dtype)
     weight = weight.at[..., :m, :m].set(R).at[..., m:, m:].set(worth)
     return jnp.concatenate([B, D], axis=-1), weight
@@ -178,6 +179,7 @@ def bisect_level(
     def more(now):
         if gamma is not None:
             return (now.trials == 0) | (now.solvable & (now.trials < 2))
+        # Until both ends are known the bracket grows, within limits; then it shrinks.
         open_end = jnp.isinf(now.high) | (now.low == 0)
         wide = now.high > now.low * (1 + tolerance)
         near = (now.low < _WIDEST * now.start) & (now.high > now.start / _WIDEST)
@@ -215,6 +217,7 @@ def bisect_level(
         # Between neighbouring floating-point numbers the bracket closes.
         stuck = (trial <= now.low) | (trial >= now.high)
         better = good & ~stuck
+        # Of a search the best game is kept, at a given level the one that was solved.
         keep = better if gamma is None else jnp.ones((), bool)
         later = now._replace(
             low=jnp.where(stuck, now.high, jnp.where(good, now.low, trial)),
@@ -277,6 +280,7 @@ def _with_derivative_jvp(barrier, primals, tangents):
     problem, level = primals
     level = once_differentiable(level)
     problem = jax.tree.map(once_differentiable, problem)
+    # d gamma = -(d barrier / d problem) / (d barrier / d gamma), at some distances.
     still = jax.tree.map(jnp.zeros_like, problem)
     attained = level > 0
     safe = jnp.where(attained, level, 1)
@@ -319,4 +323,5 @@ def inverse_margins(
     eye = jnp.eye(D.shape[-1], dtype=D.dtype)
     margins = gamma**2 * eye - jnp.swapaxes(D, 1, 2) @ X @ D
     inverses = jax.vmap(lambda M: jnp.trace(solve(M, eye)))(margins)
+    # In the unit of X, so that the sum may be added to its trace.
     return lax.stop_gradient(gamma**2 * jnp.linalg.norm(X)) * jnp.sum(inverses)

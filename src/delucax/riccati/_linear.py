@@ -231,6 +231,7 @@ def _solution(discrete, A, B, C) -> MatrixSolution:
     if complex_data:
         A, B, C = jax.tree.map(real_form, (A, B, C))
     solution = _solved(discrete, A, B, C)
+    # A dense solve fails only if the equation is singular.
     failure = RESULTS.ill_posed if C.size <= _DENSE else RESULTS.not_separated
     result = choose(solution.solved, RESULTS.successful, failure)
     return MatrixSolution(
@@ -358,6 +359,7 @@ def _solved_jvp(discrete, primals, tangents):
     # Masked at input and output, so that a failed member's NaN does not spread.
     dA, dB, dC = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents)
     X = jnp.where(ok, solution.X, 0)
+    # -I/2 for what was not solved: a trivial problem in both times.
     half = functools.partial(jnp.where, ok)
     A, B = jax.tree.map(lambda M: half(M, -jnp.eye(len(M), dtype=M.dtype) / 2), (A, B))
     other, d_other = (A.T, dA.T) if B is None else (B, dB)

@@ -55,6 +55,7 @@ def failed_step(X: Float[Array, "T n n"]) -> int:
 
 def gain(A, B, R, S, X):
     """The stationary `K = (R + B'XB)^-1 (B'XA + S')`, and the loop `A - B K`."""
+    # By LU, not Cholesky: in a game the weight is indefinite.
     K = solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
     return K, A - B @ K
 
@@ -176,6 +177,7 @@ def linear_recursion(loop, added, final, parallel: bool, product):
         Z = backwards(back, final, (loop, added))
         return jnp.concatenate([Z, final[None]])
 
+    # The pair (loop, added) is an affine map; composition of such maps is associative.
     def combine(later, earlier):
         (later_loop, later_added), (loop, added) = later, earlier
         moved = jax.vmap(product)(loop, later_added)
@@ -209,6 +211,7 @@ def _values_jvp(maximisers, parallel, primals, tangents):
 
 def scale_of(G: Array, Q: Array) -> Array:
     """The size of `X` at which `X G X` is as large as `Q`; 1 if that is no size."""
+    # |G| x^2 = |Q|; its derivative cancels from the result, as any unit will do.
     quadratic, constant = jnp.linalg.norm(G), jnp.linalg.norm(Q)
     usual = (quadratic > 0) & (constant > 0)
     ratio = jnp.where(usual, constant, 1) / jnp.where(usual, quadratic, 1)
@@ -233,6 +236,7 @@ def short_element(H: Float[Array, "_ _"], time: Array) -> tuple[Array, Array, Ar
     # The denominator of the approximant is its numerator at -Z.
     flow = solve(even - odd, even + odd)
     # Backwards over the time: [U; V] = flow [I; X] and V U^-1 is X before it.
+    # That is J + A' X (I + C X)^-1 A with the three solved for here.
     first, second = flow[:n, :n], flow[:n, n:]
     eye = jnp.eye(n, dtype=H.dtype)
     solved = solve(first, jnp.concatenate([eye, second], axis=1))
@@ -296,6 +300,7 @@ def flow_values(A, G, Q, final, times, is_game: bool):
     def back(carry, here):
         X, good = carry
         element, possible = here
+        # A finite escape time in the interval: the formula below would step over it.
         good &= possible & has_solution(element[1], X, is_game)
         X = passed(element, X)
         good &= jnp.all(jnp.isfinite(X))

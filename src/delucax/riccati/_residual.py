@@ -160,6 +160,7 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
     # for M, `from_L` is what an error of L does to XL.
     unit = jnp.finfo(A.dtype).eps / 2
     size_B, size_S, size_X, size_N = (jnp.abs(M) for M in (B, S, X, K))
+    # From here on the rounded gain -N is taken for exact: any gain gives a valid bound.
     N = -K
     BN, units_BN = product_in_parts(B, N)
     L, T = A + BN, S.T + R @ N
@@ -246,6 +247,7 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
         lost += most_L.T @ from_L
     gap_lost = jnp.abs(B.T) @ around + most_T + (n + 4) * eps * jnp.abs(T)
     lost = symmetric(lost)
+    # Where nothing cancels the first bound may be the sharper one.
     sharper = lost < wide.lost
     return _Left(
         jnp.where(sharper, symmetric(error), wide.error),
