@@ -434,3 +434,19 @@ def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
             f"{where}: {name} must be positive {kind}, got {array}, whose least "
             f"eigenvalue is {least:.3g}."
         )
+
+
+def finite_vector(value: Any, size: int, name: str, where: str) -> Array:
+    """`value` as a real vector of `size` finite entries, or an error."""
+    vector = as_vector(value, size, name, where)
+    check_finite(vector, name, where)
+    return vector
+
+
+def finite_rows(
+    value: Any, size: int, name: str, where: str, steps: int | None = None
+) -> Array:
+    """`value` as `as_rows` has it, with finite entries, or an error."""
+    rows = as_rows(value, size, name, where, steps)
+    check_finite(rows, name, where)
+    return rows

@@ -60,9 +60,8 @@ class Constraints(eqx.Module):
 
     def __check_init__(self):
         check_parameters(self)
-        if self.inequality is None and self.equality is None:
-            if self.final_inequality is None and self.final_equality is None:
-                raise ValueError("Constraints: at least one function must be given.")
+        if all(function is None for function in vars(self).values()):
+            raise ValueError("Constraints: at least one function must be given.")
 
 
 Values: TypeAlias = tuple[Float[Array, "*steps p"], Bool[Array, "*steps p"]]
@@ -86,12 +85,14 @@ def values_of(functions: tuple[Any, Any], arguments: tuple, dtype: Any) -> Value
 
 
 def augmented(c: Array, y: Array, rho: Array, equal: Array) -> Array:
-    """What constraints with values `c` and multipliers `y` add to the cost.
+    """What constraints with values `c` and multipliers `y` add to the cost:
+    `y c + rho c^2 / 2`, or `(max(0, y + rho c)^2 - y^2) / (2 rho)` of an inequality.
 
     Source: Hestenes, 1969; Powell, 1969; Rockafellar, 1973 (inequalities).
     """
-    raised = y + rho * c
-    active = equal | (raised > 0)
+    # The two agree where an inequality is active, and so do their first derivatives at
+    # the switch; the second one jumps there. A weight of zero leaves the Lagrangian.
+    active = equal | (y + rho * c > 0)
     safe = jnp.where(rho > 0, rho, 1)
     return jnp.sum(jnp.where(active, c * (y + rho * c / 2), -(y**2) / (2 * safe)))
 
@@ -103,5 +104,7 @@ def updated(c: Array, y: Array, rho: Array, equal: Array) -> Array:
 
 def violated(c: Array, y: Array, rho: Array, equal: Array) -> Array:
     """How far each constraint is from holding, or its multiplier from being needed."""
+    # max(c, -y / rho) is zero just where c <= 0, y >= 0 and y c = 0: both feasibility
+    # and complementarity, in the unit of the constraint.
     slack = jnp.maximum(c, -y / rho)
     return jnp.where(equal, jnp.abs(c), jnp.abs(slack))

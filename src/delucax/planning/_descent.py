@@ -13,7 +13,7 @@ from jaxtyping import Array
 from .._results import choose, Result, RESULTS
 from ._constraints import Multipliers
 from ._lq import in_parallel, in_sequence, Policy, promised, Stages
-from ._problem import gaps_of, model, Problem, roll_out
+from ._problem import model, Problem, roll_out
 from ._start import begin, controls_of, Start
 
 
@@ -85,25 +85,28 @@ def optimise(
     options if there are any; counting on from `before`, if that is given."""
     T, m = controls_of(start).shape
     n, dtype = problem.x0.shape[0], problem.x0.dtype
-    zero = jnp.zeros((), dtype)
-    gaps = None
+    zero, gaps = jnp.zeros((), dtype), None
+    iteration, rollouts = jnp.asarray(0), jnp.asarray(0)
+    if before is not None:
+        iteration, rollouts = before.iterations, before.rollouts
     if options.states is None:
         _, states, controls, cost = begin(problem, start)
+        rollouts = rollouts + start.count
     else:
         controls = jax.vmap(problem.clip)(controls_of(start))
         states = options.states.at[0].set(problem.x0)
-        gaps = gaps_of(problem, states, controls)
+        # How far each step of the guess misses its next state, shape (T, n).
+        inputs = problem.times(T)[:-1], states[:-1], controls, problem.w
+        reached = jax.vmap(problem.step)(*inputs)
+        gaps = jax.vmap(problem.deviation)(reached, states[1:])
         cost = problem.total(states, controls)
         good = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gaps))
         cost = jnp.where(good, cost, jnp.inf)
     lost = ~jnp.isfinite(cost)
-    iteration = jnp.asarray(0) if before is None else before.iterations
-    rollouts = jnp.asarray(0) if before is None else before.rollouts
-    trace = jnp.full((options.max_iterations + 1,), cost)
+    counts = jnp.arange(options.max_iterations + 1)
+    trace = jnp.full(counts.shape, cost)
     if before is not None:
-        earlier = jnp.arange(options.max_iterations + 1) < iteration
-        trace = jnp.where(earlier, before.trace, trace)
-    rollouts = rollouts + (start.count if options.states is None else 0)
+        trace = jnp.where(counts < iteration, before.trace, trace)
     now = Outcome(
         states=states,
         controls=controls,
@@ -121,9 +124,8 @@ def optimise(
     )
     body = functools.partial(_iterate, problem, options)
     now = lax.while_loop(lambda progress: ~progress.done, body, first).now
-    reached = jnp.arange(options.max_iterations + 1) <= now.iterations
     return now._replace(
-        trace=jnp.where(reached, now.trace, now.cost),
+        trace=jnp.where(counts <= now.iterations, now.trace, now.cost),
         violation=zero,
         multipliers=problem.multipliers,
     )
@@ -134,27 +136,30 @@ def _iterate(problem: Problem, options: Options, before: _Progress) -> _Progress
     mu = now.regularisation
     about = problem, now.states, now.controls, gaps, options.second_order
     stages = model(*about, before.exact, options.spacing)
-    given = problem, stages, now.controls, mu, options
-    policy, residual, settled = directions(*given)
+    policy, residual, settled = directions(problem, stages, now.controls, mu, options)
     penalty = _penalty(before.penalty, gaps, policy)
     missed = 0.0 if gaps is None else jnp.max(jnp.abs(gaps))
-    precise = 1 + jnp.max(jnp.abs(now.states))
-    settled = settled & (missed <= tolerance * precise)
+    closed = missed <= tolerance * (1 + jnp.max(jnp.abs(now.states)))
+    # By how much rounding may change the cost: its own, and that of the states and
+    # controls that it is computed from, which weighs more where targets are far from
+    # zero.
+    z = jnp.concatenate([now.states[:-1], now.controls], axis=1)
+    terms = jnp.sum(jnp.abs(stages.h * z))
+    terms = terms + jnp.sum(jnp.abs(stages.v * now.states[-1]))
+    rounding = jnp.finfo(z.dtype).eps * (jnp.abs(now.cost) + terms)
     # What is promised may be below the rounding of the cost. Full steps still lower the
     # gradient then; when they no longer do there is nothing left to gain.
     promise = -policy.slope - policy.curvature / 2
-    rounding = _rounding(stages, now)
     spent = (jnp.abs(promise) <= rounding) & (mu == 0) & (tolerance > 0)
-    spent = spent & (missed <= tolerance * precise) & (residual >= now.residual)
-    converged = policy.ok & (settled | spent)
+    spent = spent & (residual >= now.residual)
+    converged = policy.ok & closed & (settled | spent)
     out_of_time = now.iterations >= options.max_iterations
     rest = (now.states, now.controls, now.cost, gaps), jnp.asarray(False)
+    given = problem, before, policy, penalty, rounding
     (states, controls, cost, gaps), accepted, tried = lax.cond(
         converged | out_of_time | ~policy.ok,
         lambda: (*rest, jnp.asarray(0)),
-        lambda: _searched(
-            options.line_search, problem, before, policy, penalty, rounding
-        ),
+        lambda: _searched(options.line_search, *given),
     )
     # Where the second derivatives make the problem concave, or mislead, it is tried
     # without them first.
@@ -163,8 +168,8 @@ def _iterate(problem: Problem, options: Options, before: _Progress) -> _Progress
     keep = lambda old, new: jnp.where(flatten, old, new)
     mu, delta = jax.tree.map(keep, (mu, before.delta), changed)
     exact = jnp.where(flatten, False, before.exact | accepted)
-    stuck = (mu > MOST_MU) & ~converged & ~out_of_time
     ended = converged | out_of_time
+    stuck = (mu > MOST_MU) & ~ended
     result = choose(stuck, RESULTS.no_descent, RESULTS.not_converged)
     result = choose(converged, RESULTS.successful, result)
     iteration = now.iterations + jnp.where(ended, 0, 1)
@@ -178,6 +183,7 @@ def _iterate(problem: Problem, options: Options, before: _Progress) -> _Progress
         result=result,
         iterations=iteration,
         rollouts=now.rollouts + tried,
+        # At the end what the last policy was computed with, not what would come next.
         regularisation=jnp.where(ended, now.regularisation, mu),
     )
     return _Progress(after, gaps, delta, exact, penalty, ended | stuck)
@@ -200,6 +206,8 @@ def _searched(
     """
     now, gaps = before.now, before.gaps
     missed = 0.0 if gaps is None else jnp.sum(jnp.abs(gaps))
+    # A step that only rounding makes worse is taken, or the search would end short of
+    # the minimum.
     slack = rounding + 10 * jnp.finfo(now.cost.dtype).eps * jnp.abs(now.cost)
     lengths = 0.5 ** jnp.arange(HALVINGS, dtype=now.cost.dtype)
 
@@ -207,6 +215,8 @@ def _searched(
         states, controls, cost = roll_out(
             problem, now.states, now.controls, policy.K, policy.k, length, gaps
         )
+        # The model's decrease along the step, -(a slope + a^2 curvature / 2), and a
+        # times the gaps, of which a step of length a closes that share.
         curvature = length * policy.curvature / 2
         promise = length * (penalty * missed - policy.slope - curvature)
         gain = now.cost - cost + length * penalty * missed
@@ -216,7 +226,7 @@ def _searched(
     last = now.states, now.controls, now.cost
     if kind == "parallel":
         candidates, enough = jax.vmap(trial)(lengths)
-        best = jnp.argmax(enough)
+        best = jnp.argmax(enough)  # the first of the largest: the longest step
         accepted, length, tried = enough[best], lengths[best], jnp.asarray(HALVINGS)
         candidate = jax.tree.map(lambda a: a[best], candidates)
     else:
@@ -260,6 +270,7 @@ def directions(
     else:
         policy = in_sequence(stages, mu, options.on_state, box)
     if stages.d is not None:
+        # The pass back reads both off its own terms, which holds without gaps alone.
         slope, curvature = promised(stages, policy.K, policy.k)
         policy = policy._replace(slope=slope, curvature=curvature)
     slope, enough = policy.gradient, tolerance * (1 + policy.scale)
@@ -271,18 +282,9 @@ def directions(
     room = jnp.where(slope > 0, -box[0], box[1])
     small = jnp.abs(slope) <= enough
     met = room <= tolerance * (1 + jnp.abs(controls))
+    # The step to the projection of a gradient step, zero just at a stationary point.
     step = jnp.minimum(jnp.maximum(-slope, box[0]), box[1])
     return policy, jnp.max(jnp.abs(step)), jnp.all(small | met)
-
-
-def _rounding(stages: Stages, now: Outcome) -> Array:
-    """By how much rounding may change the cost: its own, and that of the states and
-    controls that it is computed from, which weighs more where targets are far from
-    zero."""
-    z = jnp.concatenate([now.states[:-1], now.controls], axis=1)
-    terms = jnp.sum(jnp.abs(stages.h * z))
-    terms = terms + jnp.sum(jnp.abs(stages.v * now.states[-1]))
-    return jnp.finfo(z.dtype).eps * (jnp.abs(now.cost) + terms)
 
 
 def _penalty(before: Array, gaps: Array | None, policy: Policy) -> Array:
@@ -292,6 +294,8 @@ def _penalty(before: Array, gaps: Array | None, policy: Policy) -> Array:
     """
     if gaps is None:
         return before
+    # The merit function is cost + penalty |gaps|_1. It falls along the step if penalty
+    # (1 - rho) |gaps|_1 covers what the model says that the cost rises, with rho 0.1.
     missed = jnp.sum(jnp.abs(gaps))
     rise = policy.slope + jnp.maximum(policy.curvature, 0) / 2
     least = rise / (0.9 * jnp.where(missed > 0, missed, 1))
@@ -303,6 +307,8 @@ def _schedule(accepted: Array, mu: Array, delta: Array) -> tuple[Array, Array]:
 
     Source: Tassa, Erez and Todorov, 2012.
     """
+    # The factor itself grows while the direction stays the same, so that many orders of
+    # magnitude are crossed in a few iterations.
     down = jnp.minimum(1 / FACTOR, delta / FACTOR)
     lower = jnp.where(mu * down > LEAST_MU, mu * down, 0)
     up = jnp.maximum(FACTOR, delta * FACTOR)

@@ -12,15 +12,16 @@ from .._check import (
     check_count,
     check_positive,
     check_range,
+    finite_rows,
 )
-from .._module import as_float_array, parameter
+from .._module import parameter
 from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ._constraints import Constraints
 from ._descent import Options, SEARCHES
 from ._implicit import solution
-from ._planner import AbstractPlanner, finite_rows, Plan, plan_of
+from ._planner import AbstractPlanner, Plan, plan_of
 from ._problem import Problem
 from ._start import Start
 
@@ -155,18 +156,22 @@ class ILQR(AbstractPlanner):
             n, points = problem.dynamics.state_size, start.horizon + 1
             states = finite_rows(states, n, "states", where, points).astype(dtype)
         eps, spacing = float(jnp.finfo(dtype).eps), self.finite_difference
-        tolerance, feasible = self.tolerance, self.constraint_tolerance
-        if tolerance is None:
-            # What differences leave over is no descent direction of the true cost.
-            tolerance = max(eps**0.5, (spacing or 0.0) ** 2)
-        if feasible is None:
-            feasible = eps**0.4
+        # The error of central differences is of the order of the spacing squared: what
+        # they leave over of the gradient is no descent direction of the true cost.
+        defaults = max(eps**0.5, (spacing or 0.0) ** 2), eps**0.4
+        given = self.tolerance, self.constraint_tolerance
+        tolerance, feasible = (
+            jnp.asarray(default if value is None else value, dtype)
+            for default, value in zip(defaults, given, strict=True)
+        )
+        # Gauss-Newton drops the curvature of the constraints times their multipliers,
+        # which may be large: it converges slowly there.
         second_order = self.second_order
         if second_order is None:
             second_order = problem.constraints is not None and spacing is None
         options = Options(
-            tolerance=as_float_array(tolerance).astype(dtype),
-            constraint_tolerance=as_float_array(feasible).astype(dtype),
+            tolerance=tolerance,
+            constraint_tolerance=feasible,
             states=states,
             second_order=bool(second_order),
             on_state=self.regularise == "state",

@@ -1,7 +1,10 @@
 """Derivatives of a plan, by the implicit function theorem.
 
 At a solution the gradient of the Lagrangian is zero. So the change of the solution with
-the problem solves one linear-quadratic problem, with the exact second derivatives.
+the problem solves one linear-quadratic problem, with the exact second derivatives: with
+the conditions `g(z, p) = 0`, `dz = -(dg/dz)^-1 dg/dp dp`, and `dg/dz` is the matrix of
+that problem. No iteration is differentiated, so neither the number of iterations nor
+the start has a part in the derivative.
 """
 
 from typing import Any, NamedTuple
@@ -41,13 +44,15 @@ def solution(problem: Problem, start: Start, options: Options) -> Outcome:
 def _solution_jvp(primals: Any, tangents: Any) -> Any:
     out = solution(*primals)
     (problem, start, options), change = primals, tangents[0]
+    # None is a tangent of zero that is known to be one.
     nothing = jax.tree.map(lambda _: None, out)
     if not jax.tree.leaves(change):
         return out, nothing
-    is_none = lambda leaf: leaf is None
-    choose = lambda f: jax.tree.map(f, change, problem, is_leaf=is_none)
-    varied = choose(lambda t, p: None if t is None else p)
-    rest = choose(lambda t, p: p if t is None else None)
+    # Only what has a tangent is varied below, so that nothing else is differentiated.
+    has_tangent = jax.tree.map(
+        lambda t, p: t is not None, change, problem, is_leaf=lambda leaf: leaf is None
+    )
+    varied, rest = eqx.partition(problem, has_tangent)
     solved = out.result == RESULTS.successful
     # What failed is not used, but must be finite for what is to have a derivative: so
     # the problem is looked at where it began.
@@ -55,14 +60,9 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
     X = jnp.where(solved, out.states, x0)
     U = jnp.where(solved, out.controls, controls_of(start))
     y = out.multipliers
-
-    def given(varied) -> Problem:
-        return eqx.combine(varied, rest)
-
+    given = lambda varied: eqx.combine(varied, rest)
     dX, dU, dy, free, definite = _change(X, U, y, problem, given, varied, change)
-
-    def cost(varied, X, U):
-        return given(varied).total(X, U)
+    cost = lambda varied, X, U: given(varied).total(X, U)
 
     def gains(varied, X, U, y):
         problem = given(varied).with_multipliers(y)
@@ -71,6 +71,7 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
             return in_parallel(stages, out.regularisation).K
         return in_sequence(stages, out.regularisation, options.on_state, None, free).K
 
+    # The gains of the last pass back are a function of the problem and the solution.
     _, dJ = jax.jvp(cost, (varied, X, U), (change, dX, dU))
     _, dK = jax.jvp(gains, (varied, X, U, y), (change, dX, dU, dy))
     ok = solved & definite
@@ -86,11 +87,15 @@ def _change(
     n, T = X.shape[1], U.shape[0]
     # Without the squares the augmented Lagrangian is the Lagrangian.
     plain = None if y is None else y._replace(rho=jnp.zeros_like(y.rho))
+    # The exact second derivatives: those of the Lagrangian, costates included.
     stages = model(problem.with_multipliers(plain), X, U, None, True)
     costates = costates_of(stages.F, stages.h, stages.v)
     z = jnp.concatenate([X[:-1], U], axis=1)
 
     def conditions(varied):
+        """The gradient of the Lagrangian, what the constraints and the dynamics ask
+        for, and the data; at the solution, which is held. Their change with the problem
+        is the right side of the linear problem."""
         problem = given(varied).with_multipliers(plain)
         times = problem.times(T)
 
@@ -111,6 +116,8 @@ def _change(
     ((slope, *_), *_), ((h, d, v), dx0, ends, dc) = at, linear
     free, fixed = jnp.ones_like(U, bool), jnp.zeros_like(U)
     if problem.bounds is not None:
+        # A control that a bound holds moves with the bound. One that is on it with a
+        # slope of zero is about to leave it, and counts as free.
         low, high = problem.bounds
         at_low = (U <= low) & (slope[:, n:] > 0)
         at_high = (U >= high) & (slope[:, n:] < 0)
@@ -121,26 +128,24 @@ def _change(
         factors = factorise(stages, free)
         dX, dU = substitute(stages, factors, dx0, fixed, free)
         return dX, dU, None, free, jnp.all(factors.ok)
-    active = _active(problem, X, U, z, y)
+    # The slopes of the constraints that hold with equality; zero for the others.
+    times = problem.times(T)
+    stage = lambda z, t: problem.stage_constraints(t, z[:n], z[n:])
+    final = lambda x: problem.final_constraints(times[-1], x)
+    G, equal = jax.vmap(jax.jacfwd(stage, has_aux=True))(z, times[:-1])
+    end, equal_at_end = jax.jacfwd(final, has_aux=True)(X[-1])
+    on, at_end = equal | (y.stage > 0), equal_at_end | (y.final > 0)
+    G, end = jnp.where(on[..., None], G, 0), jnp.where(at_end[:, None], end, 0)
+    active = (G, on), (end, at_end)
     dX, dU, dy, ok = _with_constraints(stages, active, dc, y, dx0, fixed, free)
     return dX, dU, dy, free, ok
 
 
-def _active(problem: Problem, X: Array, U: Array, z: Array, y: Multipliers):
-    """The slopes of the constraints that hold with equality; zero for the others."""
-    n, times = X.shape[1], problem.times(U.shape[0])
-    stage = lambda z, t: problem.stage_constraints(t, z[:n], z[n:])
-    final = lambda x: problem.final_constraints(times[-1], x)
-    slope, equal = jax.vmap(jax.jacfwd(stage, has_aux=True))(z, times[:-1])
-    last, equal_at_end = jax.jacfwd(final, has_aux=True)(X[-1])
-    on, at_end = equal | (y.stage > 0), equal_at_end | (y.final > 0)
-    slope = jnp.where(on[..., None], slope, 0)
-    return (slope, on), (jnp.where(at_end[:, None], last, 0), at_end)
-
-
 def _with_constraints(stages, active, dc, y, dx0, fixed, free):
-    """The linear problem with equality constraints, by the method of multipliers."""
+    """The linear problem with equality constraints `G dz + dc = 0`, by the method of
+    multipliers."""
     (G, on), (end, at_end) = active
+    # The quadratic part is the same in each refinement, so it is factorised once.
     rho = STIFFER * y.rho
     dc = jnp.where(on, dc[0], 0), jnp.where(at_end, dc[1], 0)
     H = stages.H + rho * jnp.einsum("tpi,tpj->tij", G, G)
@@ -179,6 +184,8 @@ def factorise(stages: Stages, free: Array) -> Factors:
     """The quadratic part of the recursion, controls that are not free held."""
     n = stages.V.shape[0]
 
+    # As `in_sequence`, without regularisation: where the problem is not convex there is
+    # no strict minimum, and no derivative.
     def back(V, here):
         F, H, free = here
         M = H + product(F.T, product(V, F))

@@ -82,6 +82,7 @@ def solve_definite(matrix: Array, right: Array) -> tuple[Array, Array]:
     # from the right sides, in which the solution is linear.
     rows = [matrix[i, i:] for i in range(m)]
     sides = [right[i] for i in range(m)]
+    # What is left of a diagonal entry after the elimination may be rounding alone.
     least = m * jnp.finfo(matrix.dtype).eps
     pivots, ok = [], jnp.asarray(True)
     for i in range(m):
@@ -107,6 +108,11 @@ def in_sequence(
 ) -> Policy:
     """The regularised recursion, back in time.
 
+    With the cost-to-go `1/2 x'V x + v'x` of the next state, that of a stage is
+    `1/2 z'M z + g'z` with `M = H + F'V F`, `g = h + F'(v + V d)`. Its minimum over the
+    control, of the blocks `Quu`, `Qux`, `Qu`, is `-k - K dx`, `k = Quu^-1 Qu`,
+    `K = Quu^-1 Qux`.
+
     `box` is `(low, high)` of each change of a control, shapes `(T, m)`, if there are
     bounds. `free`, boolean, shape `(T, m)`, says which controls may change at all.
 
@@ -118,11 +124,12 @@ def in_sequence(
     def back(carry, here):
         V, v = carry
         F, H, h, d, box, free = here
-        VF = product(V, F)
-        M = H + product(F.T, VF)
+        M = H + product(F.T, product(V, F))
         pushed = apply(F.T, v if d is None else v + apply(V, d))
         g = h + pushed
         Quu, Qux, Qu = M[n:, n:], M[n:, :n], g[n:]
+        # Either mu |dx_next|^2 / 2 or mu |du|^2 / 2 is added to what is minimised, but
+        # not to the cost-to-go, which stays that of the policy.
         if on_state:
             extra = mu * product(F[:, n:].T, F)
         else:
@@ -135,17 +142,19 @@ def in_sequence(
         K, k = S[:, :n], S[:, n] if change is None else -change
         ok = ok & jnp.all(jnp.isfinite(k))
         K, k = jnp.where(ok, K, 0), jnp.where(ok, k, 0)
-        # In this form nothing is assumed of K and k.
+        # The cost-to-go under any K and k: the shorter forms hold at the minimum alone,
+        # and bounds and the regularisation lead away from it.
         Quu_k = apply(Quu, k)
         D = product(K.T, product(Quu, K) - Qux)
         V = M[:n, :n] + D - product(Qux.T, K)
         v = g[:n] + apply(K.T, Quu_k - Qu) - apply(Qux.T, k)
-        kept = K, k, Qu, pushed[n:], Quu_k, ok
-        return ((V + V.T) / 2, v), kept
+        # Rounding would let V drift away from symmetry over a long horizon.
+        return ((V + V.T) / 2, v), (K, k, Qu, pushed[n:], Quu_k, ok)
 
     xs = (stages.F, stages.H, stages.h, stages.d, box, free)
     _, kept = lax.scan(back, (stages.V, stages.v), xs, reverse=True)
     K, k, Qu, pushed, Quu_k, ok = kept
+    # Along -a k the cost changes by -a k'Qu + a^2 k'Quu k / 2, summed over the stages.
     slope, curvature = -jnp.sum(k * Qu), jnp.sum(k * Quu_k)
     scale = jnp.max(jnp.abs(pushed))
     return Policy(K, k, Qu, scale, slope, curvature, jnp.all(ok))
@@ -155,6 +164,7 @@ def solve_free(matrix: Array, right: Array, free: Array | None) -> tuple[Array, 
     """As `solve_definite`, over the entries that are free; zero in the others."""
     if free is None:
         return solve_definite(matrix, right)
+    # Rows and columns of the others become those of the identity: the sizes stay fixed.
     both = free[:, None] & free[None]
     matrix = jnp.where(both, matrix, jnp.eye(free.shape[0], dtype=matrix.dtype))
     return solve_definite(matrix, jnp.where(free[:, None], right, 0))
@@ -169,6 +179,7 @@ def box_minimum(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Arr
     """
     m = g.shape[0]
     if m == 1:
+        # Of one control it is the free minimum, clipped.
         ok = H[0] > 0
         u = jnp.clip(-g / jnp.where(ok, H[0], 1), low, high)
         return u, (u > low) & (u < high)
@@ -176,16 +187,12 @@ def box_minimum(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Arr
     lengths = 0.5 ** jnp.arange(16.0, dtype=g.dtype)
     steep = jnp.diagonal(H)
     steep = jnp.where(steep > 0, steep, 1)
-
-    def gradient(u):
-        return g + matvec(H, u)
+    gradient = lambda u: g + matvec(H, u)
+    value = lambda u: jnp.sum(u * (g + gradient(u))) / 2
 
     def is_free(u, slope, near):
         held = (u <= low + near) & (slope > 0) | (u >= high - near) & (slope < 0)
         return ~held
-
-    def value(u):
-        return jnp.sum(u * (g + gradient(u))) / 2
 
     def body(state):
         u, _, count = state
@@ -205,9 +212,7 @@ def box_minimum(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Arr
         going = lower & (left > slack * (1 + jnp.max(jnp.abs(u))))
         return after, going, count + 1
 
-    def going(state):
-        return state[1] & (state[2] < 10 * m)
-
+    going = lambda state: state[1] & (state[2] < 10 * m)
     zero = jnp.clip(jnp.zeros_like(g), low, high)
     u, _, _ = lax.while_loop(going, body, (zero, jnp.asarray(True), 0))
     return u, is_free(u, gradient(u), 0.0)
@@ -223,15 +228,18 @@ def in_parallel(stages: Stages, mu: Array) -> Policy:
     """
     F, H, h, d, V, v = stages
     n = V.shape[0]
-    m = F.shape[2] - n
     A, B = F[..., :n], F[..., n:]
     Q, S, R = H[:, :n, :n], H[:, :n, n:], H[:, n:, n:]
-    damped = R + mu * jnp.eye(m, dtype=F.dtype)
+    eye = jnp.eye(B.shape[2], dtype=F.dtype)
+    damped = R + mu * eye
     X = values(A, B, Q, damped, S, V, 0, True)
     ok = jnp.all(jnp.isfinite(X))
     after = jnp.where(ok, X[1:], 0)
-    safe = jnp.where(ok, damped, jnp.eye(m, dtype=F.dtype))
+    # Not finite numbers would be those of every step after the scans.
+    safe = jnp.where(ok, damped, eye)
     K, loop = jax.vmap(gain)(A, B, safe, S, after)
+    # With the gains known the linear part is a recursion of its own, associative too:
+    # p = (A - B K)'(p_next + V_next d) + q - K'r.
     q, r = h[:, :n], h[:, n:]
     shift = 0 if d is None else jnp.einsum("tij,tj->ti", after, d)
     added = jnp.einsum("tji,tj->ti", loop, shift + jnp.zeros_like(q)) + q
@@ -239,8 +247,7 @@ def in_parallel(stages: Stages, mu: Array) -> Policy:
     p = linear_recursion(loop, added, v, True, lambda loop, p: loop.T @ p)
     pushed = jnp.einsum("tji,tj->ti", B, p[1:] + shift)
     gradient = r + pushed
-    curved = jnp.swapaxes(B, 1, 2) @ after @ B
-    k = jax.vmap(solve)(safe + curved, gradient[..., None])[..., 0]
+    k = jax.vmap(solve)(safe + B.mT @ after @ B, gradient[..., None])[..., 0]
     ok = ok & jnp.all(jnp.isfinite(k))
     K, k = jnp.where(ok, K, 0), jnp.where(ok, k, 0)
     slope, curvature = promised(stages, K, k)
@@ -257,8 +264,7 @@ def promised(stages: Stages, K: Array, k: Array) -> tuple[Array, Array]:
         after = matvec(F, z)
         return after if d is None else after + d, z
 
-    start = jnp.zeros_like(v)
-    last, z = lax.scan(forward, start, (F, K, k, d))
+    last, z = lax.scan(forward, jnp.zeros_like(v), (F, K, k, d))
     slope = jnp.sum(h * z) + v @ last
     curvature = jnp.einsum("ti,tij,tj->", z, H, z) + last @ V @ last
     return slope, curvature

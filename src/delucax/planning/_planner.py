@@ -12,15 +12,14 @@ from jaxtyping import Array, Float
 
 from .._check import (
     as_bounds,
-    as_rows,
-    as_vector,
     check_control_bounds,
     check_count,
-    check_finite,
     check_instance,
     check_key,
     check_number,
     check_step,
+    finite_rows,
+    finite_vector,
 )
 from .._controller import AbstractController, wrong_observation
 from .._module import as_float_array, as_module, function_field, parameter, weight
@@ -32,7 +31,7 @@ from ..math import matvec
 from ..math._steps import row_at, step_at
 from ._constraints import Constraints
 from ._problem import Problem
-from ._start import control_at_rest, default_start, Start
+from ._start import default_start, operating_point, Start
 
 
 class Plan(AbstractController):
@@ -137,8 +136,7 @@ def plan_of(
     problem: Problem, states: Array, controls: Array, cost: Array, **rest: Any
 ) -> Plan:
     """A plan for a problem."""
-    zero = jnp.zeros((), cost.dtype)
-    defaults = dict(violation=zero, regularisation=zero)
+    defaults = dict.fromkeys(("violation", "regularisation"), jnp.zeros_like(cost))
     low, high = problem.bounds or (None, None)
     return Plan(
         states=states,
@@ -261,12 +259,18 @@ class AbstractPlanner(eqx.Module):
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         check_instance(cost, AbstractCost, "cost", where)
         n, m = dynamics.state_size, dynamics.control_size
-        x0 = as_vector(x0, n, "x0", where)
-        check_finite(x0, "x0", where)
+        x0 = finite_vector(x0, n, "x0", where)
         check_number(t0, "t0", where)
         t0 = as_float_array(t0)
         if self.starts_from_states:
-            controls = _at_rest(dynamics, cost, controls, where)
+            if isinstance(controls, Start | Plan):
+                raise ValueError(
+                    f"{where}: states go with an array of controls or a number of "
+                    f"steps, got {type(controls).__name__}."
+                )
+            if isinstance(controls, numbers.Integral):
+                T = check_count(controls, "controls (the horizon)", where)
+                controls = jnp.tile(operating_point(dynamics, cost)[1], (T, 1))
         start = _as_start(dynamics, cost, controls, t0, where)
         # A default start has no precision of its own.
         known = () if isinstance(controls, numbers.Integral) else (start.controls,)
@@ -281,10 +285,9 @@ class AbstractPlanner(eqx.Module):
         if constraints is not None:
             hint = " (`delucax.planning.Constraints`)"
             check_instance(constraints, Constraints, "constraints", where, hint)
-        ends = check_control_bounds(bounds, m, where)
+        ends: Any = check_control_bounds(bounds, m, where)
         if ends is not None:
-            low, high = (jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
-            ends = low, high
+            ends = tuple(jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
         x0, t0, distance = x0.astype(dtype), t0.astype(dtype), as_module(difference)
         problem = Problem(dynamics, cost, x0, t0, w, ends, distance, constraints)
         start = jax.tree.map(lambda a: a.astype(dtype), start)
@@ -300,6 +303,7 @@ class AbstractPlanner(eqx.Module):
 def _with_fallback(plan: Plan, fallback: Start | Plan) -> Plan:
     trajectory = lambda p: (p.states, p.controls, p.gains)
     usable = plan.is_usable
+    # By `where`, not `cond`: under `jax.vmap` each member of a batch has its own.
     keep = lambda new, old: jnp.where(usable, new, old).astype(new.dtype)
     # Controls that are not finite are of no use either, whatever the planner says.
     result = choose(plan.result == RESULTS.successful, RESULTS.diverged, plan.result)
@@ -321,25 +325,3 @@ def _as_start(
         T = check_count(controls, "controls (the horizon)", where)
         return default_start(dynamics, cost, T, t0)
     return Start(finite_rows(controls, m, "controls", where))
-
-
-def _at_rest(dynamics: Any, cost: Any, controls: Any, where: str) -> Any:
-    """The controls for states that are given: those at rest for a number of steps."""
-    if isinstance(controls, Start | Plan):
-        raise ValueError(
-            f"{where}: states go with an array of controls or a number of steps, got "
-            f"{type(controls).__name__}."
-        )
-    if not isinstance(controls, numbers.Integral):
-        return controls
-    T = check_count(controls, "controls (the horizon)", where)
-    return jnp.tile(control_at_rest(dynamics, cost), (T, 1))
-
-
-def finite_rows(
-    value: Any, size: int, name: str, where: str, steps: int | None = None
-) -> Array:
-    """`value` as finite rows of `size` entries, one for each step, or an error."""
-    rows = as_rows(value, size, name, where, steps)
-    check_finite(rows, name, where)
-    return rows

@@ -15,6 +15,7 @@ from .._results import first_of, or_none, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
+from ..math._linear_solve import symmetric
 from ._constraints import augmented, Constraints, Multipliers, Values, values_of
 from ._lq import Stages
 
@@ -82,8 +83,6 @@ class Problem(eqx.Module):
 
     def with_multipliers(self, multipliers: Multipliers | None) -> "Problem":
         """The problem whose cost is the augmented Lagrangian with these, if any."""
-        if multipliers is None:
-            return self
         return dataclasses.replace(self, multipliers=multipliers)
 
     def stage_cost(self, t: Array, x: Array, u: Array, y: Array | None) -> Array:
@@ -132,6 +131,8 @@ def roll_out(
     """
     size = problem.x0.shape[0]
 
+    # The state is carried by its components, as in `delucax.rollout`: most of the time
+    # of a planner is spent here.
     @by_components
     def body(parts, inputs):
         t, planned, u, K, k, gap, w = inputs
@@ -143,6 +144,8 @@ def roll_out(
         u = problem.clip(u)
         x_next, result = problem.dynamics.advance(t, x, u, w)
         x_next = x_next.astype(x.dtype)
+        # Of multiple shooting: the trajectory keeps the share of the gap that a step of
+        # this length does not close, so that it stays near the guess of the states.
         if gap is not None:
             x_next = x_next - (1 - length) * gap
         return split_state(x_next), (parts, u, or_none(result))
@@ -151,18 +154,11 @@ def roll_out(
     inputs = (times, states[:-1], controls, K, k, gaps, problem.w)
     last, (parts, controls, results) = lax.scan(body, split_state(problem.x0), inputs)
     states = stack_steps(parts, size, last)
+    # A cost may forget states that are not finite, and clip what is: all are looked at.
     cost = problem.total(states, controls)
     good = jnp.isfinite(cost) & jnp.all(jnp.isfinite(states))
     good = good & (first_of(results) == RESULTS.successful)
     return states, controls, jnp.where(good, cost, jnp.inf)
-
-
-def gaps_of(problem: Problem, states: Array, controls: Array) -> Array:
-    """How far each step misses the next state of the guess, shape `(T, n)`."""
-    times = problem.times(controls.shape[0])[:-1]
-    inputs = (times, states[:-1], controls, problem.w)
-    reached = jax.vmap(problem.step)(*inputs)
-    return jax.vmap(problem.deviation)(reached, states[1:])
 
 
 def model(
@@ -179,15 +175,12 @@ def model(
     The second derivatives of dynamics and constraints are left out where `use_exact` is
     false. With a `spacing` the dynamics are linearised by central differences.
     """
-    horizon, size = controls.shape[0], states.shape[1]
-    times = problem.times(horizon)
+    size, times = states.shape[1], problem.times(controls.shape[0])
+    t, end = times[:-1], times[-1]
     z = jnp.concatenate([states[:-1], controls], axis=1)
-
-    def step(z, t, w):
-        return problem.step(t, z[:size], z[size:], w)
-
-    def stage_cost(z, t, y):
-        return problem.stage_cost(t, z[:size], z[size:], y)
+    step = lambda z, t, w: problem.step(t, z[:size], z[size:], w)
+    stage_cost = lambda z, t, y: problem.stage_cost(t, z[:size], z[size:], y)
+    final_cost = lambda x: problem.final_cost(end, x)
 
     def stage_hessian(z, t, y):
         """That of the cost, with the constraints as their linear parts squared."""
@@ -198,38 +191,42 @@ def model(
         return cost + squared(c, z, y, problem.multipliers.rho)
 
     y = problem.stage_multipliers
-    v = jax.grad(lambda x: problem.final_cost(times[-1], x))(states[-1])
+    v = jax.grad(final_cost)(states[-1])
     if spacing is None:
-        slopes = jacobian(step)
+        # In reverse where that is possible: a step has fewer outputs than inputs.
+        slopes = first_possible(jax.jacrev(step), jax.jacfwd(step))
     else:
         slopes = central(step, spacing, problem.deviation)
-    F = jax.vmap(slopes)(z, times[:-1], problem.w)
-    h = jax.vmap(jax.grad(stage_cost))(z, times[:-1], y)
-    H = jax.vmap(stage_hessian)(z, times[:-1], y)
-    V = jax.hessian(lambda x: problem.cost.final(times[-1], x))(states[-1])
+    F = jax.vmap(slopes)(z, t, problem.w)
+    h = jax.vmap(jax.grad(stage_cost))(z, t, y)
+    H = jax.vmap(stage_hessian)(z, t, y)
+    V = jax.hessian(lambda x: problem.cost.final(end, x))(states[-1])
     if problem.multipliers is not None:
-        c = lambda x: problem.final_constraints(times[-1], x)
+        c = lambda x: problem.final_constraints(end, x)
         V = V + squared(c, states[-1], *problem.multipliers[1:])
     if second_order:
-        costates = costates_of(F, h, v)
-
-        def lagrangian(z, t, w, y, costate):
+        # Those of the Hamiltonian, cost + costate' F: the curvature of the dynamics
+        # counts by how much the next state is worth.
+        def hamiltonian(z, t, w, y, costate):
             return stage_cost(z, t, y) + costate @ step(z, t, w)
 
-        each = (z, times[:-1], problem.w, y, costates)
-        exact = jax.vmap(curvature(lagrangian))(*each)
-        at_end = jax.hessian(lambda x: problem.final_cost(times[-1], x))(states[-1])
+        slope = jax.grad(hamiltonian)
+        ways = jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(hamiltonian))
+        each = z, t, problem.w, y, costates_of(F, h, v)
+        exact = jax.vmap(first_possible(*ways))(*each)
+        at_end = jax.hessian(final_cost)(states[-1])
         if use_exact is None:
             H, V = exact, at_end
         else:
             H, V = jnp.where(use_exact, exact, H), jnp.where(use_exact, at_end, V)
-    H, V = (H + jnp.swapaxes(H, 1, 2)) / 2, (V + V.T) / 2
-    stages = Stages(F, H, h, gaps, V, v)
+    # Rounding leaves Hessians not quite symmetric, which the pass back relies on.
+    stages = Stages(F, symmetric(H), h, gaps, symmetric(V), v)
     return jax.tree.map(lambda a: a.astype(states.dtype), stages)
 
 
 def squared(c: Callable[[Array], Values], z: Array, y: Array, rho: Array) -> Array:
-    """The Hessian of the active constraints' squares, without second derivatives."""
+    """The Hessian of the active constraints' squares, without second derivatives: that
+    of `rho c'c / 2` by Gauss and Newton, `rho J'J`."""
     slope = jax.jacfwd(lambda z: c(z)[0])(z)
     value, equal = c(z)
     active = equal | (y + rho * value > 0)
@@ -237,7 +234,8 @@ def squared(c: Callable[[Array], Values], z: Array, y: Array, rho: Array) -> Arr
 
 
 def costates_of(F: Array, h: Array, v: Array) -> Array:
-    """The gradient of the cost with respect to each next state, shape `(T, n)`."""
+    """The gradient of the cost with respect to each next state, shape `(T, n)`, by the
+    adjoint equation `p_k = h_x + A'p_{k+1}` with the last one `v`."""
     size = v.shape[0]
 
     def back(costate, here):
@@ -247,16 +245,12 @@ def costates_of(F: Array, h: Array, v: Array) -> Array:
     return lax.scan(back, v.astype(h.dtype), (F, h), reverse=True)[1]
 
 
-def jacobian(f: Callable[..., Array]) -> Callable[..., Array]:
-    """Of the first argument, in reverse: a step has fewer outputs than inputs."""
-    return first_possible(jax.jacrev(f), jax.jacfwd(f))
-
-
 def central(f: Any, spacing: float, deviation: Any) -> Any:
     """The Jacobian in the first argument by central differences: two calls for each
     of its entries."""
 
     def evaluate(z, *args):
+        # By the deviation, because the two sides of a wrapped angle are a turn apart.
         def along(way):
             change = spacing * way
             return deviation(f(z + change, *args), f(z - change, *args))
@@ -265,11 +259,3 @@ def central(f: Any, spacing: float, deviation: Any) -> Any:
         return jax.vmap(along)(ways).T / (2 * spacing)
 
     return evaluate
-
-
-def curvature(f: Callable[..., Array]) -> Callable[..., Array]:
-    """The Hessian in the first argument."""
-    slope = jax.grad(f)
-    return first_possible(
-        jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(f))
-    )

@@ -173,8 +173,9 @@ def default_start(
     check_instance(dynamics, AbstractDynamics, "dynamics", "default_start")
     check_instance(cost, AbstractCost, "cost", "default_start")
     T = check_count(horizon, "horizon", "default_start")
-    dynamics, cost = (_constant(tree) for tree in (dynamics, cost))
-    point = _point(dynamics, cost)
+    constant = lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf
+    dynamics, cost = jax.tree.map(constant, (dynamics, cost))
+    point = operating_point(dynamics, cost)
     try:
         t0 = jnp.asarray(t0, point[0].dtype)
         *matrices, posed = _expanded(dynamics, cost, *point, t0)
@@ -186,12 +187,9 @@ def default_start(
     return _both(point, regulator, controls, T)
 
 
-def control_at_rest(dynamics: AbstractDynamics, cost: AbstractCost) -> Array:
-    """That of the operating point."""
-    return _point(dynamics, cost)[1]
-
-
-def _point(dynamics: AbstractDynamics, cost: AbstractCost) -> tuple[Array, Array]:
+def operating_point(
+    dynamics: AbstractDynamics, cost: AbstractCost
+) -> tuple[Array, Array]:
     """The operating point, or zeros where neither names one."""
     n, m = dynamics.state_size, dynamics.control_size
     return cost.set_point(dynamics) or (jnp.zeros(n), jnp.zeros(m))
@@ -200,11 +198,13 @@ def _point(dynamics: AbstractDynamics, cost: AbstractCost) -> tuple[Array, Array
 @eqx.filter_jit
 def _expanded(dynamics, cost, x, u, t0):
     """The linear-quadratic problem about a point, and whether it is one."""
+    # The local model of a horizon of one step at the point.
     problem = Problem(dynamics, cost, x, t0)
     stages = model(problem, jnp.stack([x, x]), u[None], None, False)
     n, F, H = x.shape[0], stages.F[0], stages.H[0]
     A, B, Q, R, S = F[:, :n], F[:, n:], H[:n, :n], H[n:, n:], H[:n, n:]
     posed = jnp.all(jnp.isfinite(F)) & jnp.all(jnp.isfinite(H)) & is_definite(R)
+    # Identities in place of what is not finite, so that the solver ends at once.
     safe = (jnp.where(posed, M, jnp.eye(*M.shape, dtype=M.dtype)) for M in (A, B, Q, R))
     return *safe, jnp.where(posed, S, 0), posed
 
@@ -228,12 +228,6 @@ def _both(point, regulator, controls, T):
     )
 
 
-def _constant(tree: Any) -> Any:
-    """A module through which no derivative goes."""
-    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(jax.tree.map(lax.stop_gradient, arrays), rest)
-
-
 def controls_of(start: Start) -> Array:
     """The controls of the first start, shape `(T, m)`."""
     return start.controls[0] if start.controls.ndim == 3 else start.controls
@@ -246,8 +240,8 @@ def begin(problem: Problem, start: Start) -> tuple[Start, Array, Array, Array]:
     def roll(start):
         states, gains = start.states, start.gains
         if states is None:
-            T, n = start.controls.shape[0], problem.x0.shape[0]
-            states = jnp.broadcast_to(problem.x0, (T + 1, n))
+            points = start.controls.shape[0] + 1
+            states = jnp.broadcast_to(problem.x0, (points, *problem.x0.shape))
         states, controls, cost = roll_out(problem, states, start.controls, gains)
         # Of a start that diverges at least the controls are as they were given.
         given = jax.vmap(problem.clip)(start.controls)

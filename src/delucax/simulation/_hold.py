@@ -1,6 +1,5 @@
 """Zero-order hold inside one solve, exact at the switch."""
 
-import operator
 from typing import Any, NamedTuple
 
 import diffrax
@@ -61,6 +60,7 @@ class Inputs(eqx.Module):
         u, after = call_controller(self.source, t, self.system.observe(t, x), state)
         check_control(u, self.source, self.system.control_size, "system")
         u = u.astype(x.dtype)
+        # Without bounds the control is applied as it is, and there is no cost here.
         after = self.source.applied(u, jnp.zeros((), x.dtype), after)
         check_state(self.source, self.memory, after)
         return u, eqx.filter(after, eqx.is_array)
@@ -71,7 +71,7 @@ def field(s, x, args):
     return args.start.after(s, lambda t: args.field(t, x))
 
 
-_index = operator.attrgetter("index")
+_index = lambda args: args.index
 
 
 class Recorded(NamedTuple):
@@ -86,6 +86,8 @@ class Recorded(NamedTuple):
 def recorded(t: Any, x: Any, args: Any) -> Recorded:
     """What is saved of a solve with a held controller."""
     del t
+    # Diffrax saves the state itself at the ends of a solve, and an interpolation, which
+    # `_Ends` has completed, in between.
     if isinstance(x, Recorded):
         return x
     return Recorded(x, args.u, _counts(args.memory, x))
@@ -108,6 +110,7 @@ class _Ends(diffrax.AbstractLocalInterpolation):
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
             return self.inside.evaluate(t0, t1, left=left)
+        # An interpolation meets the end of its step to rounding alone.
         x = jnp.where(t0 == self.t1, self.end, self.inside.evaluate(t0, left=left))
         return x if self.held is None else Recorded(x, *self.held)
 
@@ -148,6 +151,7 @@ class Hold(AbstractTransparentSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         inner, last, held = solver_state
         index = self._interval(terms, t0, t1)
+        # No interval is the last one before the first step, which starts at a switch.
         switched = index != last
         args = eqx.tree_at(_index, args, index)
         if self.sampled:
@@ -158,6 +162,8 @@ class Hold(AbstractTransparentSolver):
 
             held = lax.cond(switched, act, lambda held: held, held)
             args = eqx.tree_at(lambda a: a.u, args, held[0])
+        # A switch makes the field jump, after which a solver that keeps its last slope
+        # (first same as last) evaluates it anew.
         y1, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, made_jump | switched
         )
@@ -168,11 +174,8 @@ class Hold(AbstractTransparentSolver):
     def func(self, terms, t0, y0, args):
         forwards = terms.direction == 1
         t = jnp.where(forwards, t0, -t0)
-        after, before = (
-            interval_from(self.switches, t),
-            interval_before(self.switches, t),
-        )
-        args = eqx.tree_at(_index, args, jnp.where(forwards, after, before))
+        both = interval_from(self.switches, t), interval_before(self.switches, t)
+        args = eqx.tree_at(_index, args, jnp.where(forwards, *both))
         return self.solver.func(terms, t0, y0, args)
 
     def _interval(self, terms, t0, t1):
@@ -185,6 +188,7 @@ class Hold(AbstractTransparentSolver):
         low = jnp.where(forwards, t0, -t1)
         high = jnp.where(forwards, t1, -t0)
         index = interval_from(self.switches, low)
+        # The interval in which the larger part of the step lies.
         switch = self.switches[index + 1]
         later = (high - switch > switch - low).astype(index.dtype)
         return jnp.minimum(index + later, self.switches.shape[0] - 2)

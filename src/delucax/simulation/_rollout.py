@@ -11,14 +11,14 @@ import jax.numpy as jnp
 
 from .._check import (
     as_number,
-    as_rows,
     as_vector,
     check_bool,
     check_choice,
     check_count,
-    check_finite,
     check_instance,
     check_key,
+    finite_rows,
+    finite_vector,
 )
 from .._controller import AbstractController, initial_state, tallies
 from .._jax import by_components, join_state, split_state, stack_steps
@@ -130,11 +130,9 @@ def rollout(
     horizon = environment.horizon if horizon is None else horizon
     horizon = check_count(horizon, "horizon", where)
     if x0 is not None:
-        x0 = as_vector(x0, environment.state_size, "x0", where)
-        check_finite(x0, "x0", where)
+        x0 = finite_vector(x0, environment.state_size, "x0", where)
     if w is not None:
-        w = as_rows(w, environment.disturbance_size, "w", where, horizon)
-        check_finite(w, "w", where)
+        w = finite_rows(w, environment.disturbance_size, "w", where, horizon)
     keep = (keep,) if isinstance(keep, str) else keep
     named = isinstance(keep, tuple | list | set | frozenset)
     if not named or not set(keep) <= set(KEEP):
@@ -158,10 +156,13 @@ def rollout(
 @eqx.filter_jit
 def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, truncate):
     dynamics = env.dynamics
+    # Always in four parts: what is drawn does not depend on what else is given.
     start_key, w_key, noise_key, controller_key = env.split_key(key)
     if x0 is None:
         x0 = env.reset(start_key)
     size, dtype, dt = x0.shape[0], x0.dtype, env.dt
+    # Drawn for the whole horizon at once, outside of the loop. A disturbance that is
+    # known to be zero is left out of it.
     if w is None and not isinstance(env.disturbance, Zero):
         w = env.disturbance.draw(w_key, dt, horizon, dtype)
     noise = None
@@ -172,17 +173,24 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
     keeps_y = not ("states" in keep and noise is None and dynamics.observes_state)
 
     first = initial_state(controller, controller_key)
+    # A loop carries arrays alone. The rest of a controller's state, such as the names
+    # of its tallies, is put back at each step.
     first, static = eqx.partition(first, eqx.is_array)
 
     def body(carry, inputs):
         parts, memory, ended, total = carry
         k, w, noise = inputs
+        # By a product: a sum of steps would be rounded anew at each of them.
         t = (k * dt).astype(dtype)
         x = join_state(parts, size)
+        # The same value, with `decay` times its derivative.
         if decay is not None:
             x = lax.stop_gradient(x) + decay * (x - lax.stop_gradient(x))
         if truncate is not None:
-            x, memory = _cut((k > 0) & (k % truncate == 0), (x, memory))
+            is_cut = (k > 0) & (k % truncate == 0)
+            real, rest = eqx.partition((x, memory), eqx.is_inexact_array)
+            cut = lambda leaf: jnp.where(is_cut, lax.stop_gradient(leaf), leaf)
+            x, memory = eqx.combine(jax.tree.map(cut, real), rest)
         y = dynamics.observe(t, x)
         if not eqx.is_inexact_array(y) or y.ndim != 1:
             y = as_vector(y, env.observation_size, "observe(t, x)", "rollout")
@@ -190,7 +198,8 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         observed, (done, length) = y, ended or (None, None)
         if done is not None:
             # What is computed after the end is not used, but its derivatives must be
-            # finite: so it is computed where the episode began.
+            # finite, because zero times infinity is NaN: so it is computed where the
+            # episode began.
             y0 = lax.stop_gradient(dynamics.observe(t, x0)).astype(y.dtype)
             observed = jnp.where(done, y0, y)
             x = jnp.where(done, lax.stop_gradient(x0), x)
@@ -223,10 +232,12 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
             cost, applied = jnp.where(done, 0, cost), jnp.where(done, 0, applied)
             x_next = jnp.where(done, join_state(parts, size), x_next)
             after = jax.tree.map(lambda a, b: jnp.where(done, a, b), memory, after)
+            # A result that is statically a success stays one, and costs nothing.
             if result is not RESULTS.successful:
                 result = choose(done, RESULTS.successful, result)
             ended = (done | step.terminated, length + ~done)
         after_parts = split_state(x_next.astype(dtype))
+        # The state before the step, not after it: `stack_steps` says why.
         kept = {
             "states": parts,
             "observations": split_state(y) if keeps_y else None,
@@ -236,6 +247,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
             "incidents": incidents,
         }
         kept = {name: value for name, value in kept.items() if name in keep}
+        # Costs that are kept are summed afterwards, in a tree: less rounding.
         total = None if total is None else total + cost
         return (after_parts, after, ended, total), (kept, or_none(result))
 
@@ -294,21 +306,17 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
     )
 
 
-def _cut(now, tree):
-    """`tree` without its derivatives where `now` holds."""
-
-    real, rest = eqx.partition(tree, eqx.is_inexact_array)
-    cut = lambda leaf: jnp.where(now, lax.stop_gradient(leaf), leaf)
-    return eqx.combine(jax.tree.map(cut, real), rest)
-
-
 def _scan(body, carry, inputs, horizon, checkpoint):
     """`lax.scan` over the horizon, with what the gradient stores chosen."""
     body = by_components(body)
+    # Without it the gradient would store what each operation of a step needs, many
+    # times the state. To compute a step again costs less than to write that out.
     if checkpoint == "step":
         body = jax.checkpoint(body)
     if checkpoint != "sqrt":
         return lax.scan(body, carry, inputs)
+    # Blocks of sqrt(T) steps: one state is stored for each block, and those of a block
+    # while it is run again (Chen, Xu, Zhang and Guestrin, 2016).
     block = max(1, math.isqrt(horizon))
     blocks, rest = divmod(horizon, block)
     inner = jax.checkpoint(body)

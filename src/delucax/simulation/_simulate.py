@@ -10,13 +10,12 @@ from jaxtyping import Array
 
 from .._check import (
     as_number,
-    as_rows,
-    as_vector,
     check_bool,
     check_choice,
     check_count,
-    check_finite,
     check_key,
+    finite_rows,
+    finite_vector,
     is_concrete,
 )
 from .._controller import AbstractController, tallies
@@ -163,8 +162,7 @@ def simulate(
     check_system(system, w, where)
     check_choice(hold, ("zero", None), "hold", where)
     check_bool(throw, "throw", where)
-    x0 = as_vector(x0, system.state_size, "x0", where)
-    check_finite(x0, "x0", where)
+    x0 = finite_vector(x0, system.state_size, "x0", where)
     if key is not None:
         check_key(key, where)
     t0, t1 = as_number(t0, "t0", where), as_number(t1, "t1", where)
@@ -174,16 +172,14 @@ def simulate(
     source = controller_or_controls
     if not callable(source):
         name = "controller_or_controls"
-        source = as_rows(source, system.control_size, name, where)
-        check_finite(source, name, where)
+        source = finite_rows(source, system.control_size, name, where)
         if hold is None:
             raise ValueError(
                 f"{where}: hold=None needs a controller or a function of time; an "
                 "array of controls is held, hold='zero'."
             )
     if w is not None:
-        w = as_rows(w, system.disturbance_size, "w", where)
-        check_finite(w, "w", where)
+        w = finite_rows(w, system.disturbance_size, "w", where)
     substeps = check_count(substeps, "substeps", where)
     adaptive = stepsize_controller is not None
     sampled = hold == "zero" and isinstance(source, AbstractController)

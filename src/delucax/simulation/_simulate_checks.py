@@ -18,7 +18,7 @@ def check_system(system: Any, w: Any, where: str) -> None:
     """Raise unless one solve can integrate `system`."""
     check_instance(system, AbstractSystem, "system", where)
     name, reason = type(system).__name__, None
-    if type(system).project is not AbstractSystem.project:
+    if system.projects_state:
         reason = f"system {name} projects its state after each interval"
     elif system.noise == "brownian":
         reason = f"system {name} has a diffusion, whose increments are of fixed steps"

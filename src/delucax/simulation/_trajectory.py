@@ -192,7 +192,6 @@ class Trajectory(eqx.Module):
                 "Trajectory: states and costs must be kept to slice in time; got "
                 "keep= without them."
             )
-
         ends = lambda tree: jax.tree.map(lambda leaf: leaf[start : stop + 1], tree)
         steps = lambda tree: jax.tree.map(lambda leaf: leaf[start:stop], tree)
         costs, incidents = steps(self.costs), steps(self.incidents)
@@ -312,16 +311,12 @@ class Trajectory(eqx.Module):
         """
         pd = extra("pandas", "tables")
 
-        total = np.ravel(self.total_cost)
-        length = np.ravel(self.length)
-        final = np.ravel(self.final_cost)
-        ok = np.ravel(np.asarray(self.result == RESULTS.successful))
-        ok = np.broadcast_to(ok, total.shape)
+        given = self.total_cost, self.length, self.final_cost
+        total, length, final = map(np.ravel, given)
+        # A result that is statically a success has no batch axis.
         codes = np.broadcast_to(np.ravel(jax.tree.leaves(self.result)[0]), total.shape)
-        words = [
-            "successful" if fine else _message(code)
-            for fine, code in zip(ok, codes, strict=True)
-        ]
+        result_of = lambda code: jax.tree.map(lambda _: code, RESULTS.successful)
+        words = [RESULTS[result_of(code)] or "successful" for code in codes]
         columns = {
             "total_cost": total,
             "final_cost": final,
@@ -373,7 +368,3 @@ def checked(trajectory: Trajectory, where: str) -> Trajectory:
                 )
         raise RuntimeError(message + " Pass throw=False to look at the trajectory.")
     return trajectory
-
-
-def _message(code: Any) -> str:
-    return RESULTS[jax.tree.map(lambda _: np.asarray(code), RESULTS.successful)]
