@@ -1,7 +1,10 @@
 """How vector fields are integrated: what `Discretized` and `simulate` share."""
 
-from ._field import check_returned as check_returned, evaluate_field as evaluate_field
-from ._late_times import Start as Start
+from ._field import (
+    check_returned as check_returned,
+    evaluate_field as evaluate_field,
+    Start as Start,
+)
 from ._runge_kutta import (
     RK4 as RK4,
     runge_kutta_step as runge_kutta_step,

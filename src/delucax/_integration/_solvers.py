@@ -111,6 +111,7 @@ def solve_result(solution: diffrax.Solution, controller: Any, dtype: Any) -> Res
     result = promote(solution.result)
     if controller is None:
         return result
+    # A tolerance that is a Python number is known now, and most are far from rounding.
     is_fine = controller.rtol < 4 * float(jnp.finfo(dtype).eps)
     if is_fine is False:
         return result
@@ -123,7 +124,7 @@ def _forwarded(name: str) -> Any:
 
 
 class AbstractTransparentSolver(diffrax.AbstractWrappedSolver):
-    """A solver around another, with the attributes of that one."""
+    """A solver around another, with the attributes and methods of that one."""
 
     solver: eqx.AbstractVar[diffrax.AbstractSolver]
 
@@ -134,21 +135,11 @@ class AbstractTransparentSolver(diffrax.AbstractWrappedSolver):
     root_finder = _forwarded("root_finder")
     root_find_max_steps = _forwarded("root_find_max_steps")
     scan_kind = _forwarded("scan_kind")
-
-    def order(self, terms):
-        return self.solver.order(terms)
-
-    def strong_order(self, terms):
-        return self.solver.strong_order(terms)
-
-    def error_order(self, terms):
-        return self.solver.error_order(terms)
-
-    def init(self, terms, t0, t1, y0, args):
-        return self.solver.init(terms, t0, t1, y0, args)
-
-    def func(self, terms, t0, y0, args):
-        return self.solver.func(terms, t0, y0, args)
+    order = _forwarded("order")
+    strong_order = _forwarded("strong_order")
+    error_order = _forwarded("error_order")
+    init = _forwarded("init")
+    func = _forwarded("func")
 
 
 class _Chord(diffrax.VeryChord):
@@ -162,10 +153,12 @@ class _Chord(diffrax.VeryChord):
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
+        # Changes that shrink by `rate` are a geometric series, whose rest is the
+        # distance to the root (Hairer and Wanner, 1996, IV.8).
         size = state.diffsize  # of the last change, in units of the tolerance
         rate = size / state.diffsize_prev
-        left = size * rate / (1 - rate)  # the distance to the root at this rate
-        enough = state.step >= 2
+        left = size * rate / (1 - rate)
+        enough = state.step >= 2  # two changes, or there is no rate
         # Close to the root rounding takes over, and the rate says nothing.
         converged = enough & ((size < 0.1) | (rate < 1) & (left < 0.01))
         diverged = enough & ~converged & (~jnp.isfinite(size) | (rate > 2))
@@ -192,24 +185,23 @@ class _FixedStep(AbstractTransparentSolver):
         return self._with_tolerances(1e-3, 1.0).root_finder
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        # Some four digits above rounding, far below the error of any sensible step.
         is_double = y0.dtype == jnp.float64
         rtol, atol = (1e-10, 1e-12) if is_double else (1e-5, 1e-6)
+        # A tolerance decides how many iterations there are, and has no derivative.
         scale = lax.stop_gradient(atol + rtol * jnp.abs(y0))
         solver: Any = self.solver
-        is_runge_kutta = isinstance(self.solver, diffrax.AbstractDIRK)
-        if is_runge_kutta and solver.tableau.fsal:
-            # Then Diffrax solves for the slope.
+        if isinstance(self.solver, diffrax.AbstractDIRK) and solver.tableau.fsal:
+            # Then Diffrax solves for the slope, and else for its product with the step.
             scale = scale / lax.stop_gradient(t1 - t0)
         solver = self._with_tolerances(rtol, scale)
         return solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
 
     def _with_tolerances(self, rtol: float, atol: Any) -> Any:
         finder = self.solver.root_finder  # pyright: ignore
-        if isinstance(finder, diffrax.VeryChord | optx.Chord):
-            finder = _Chord(
-                rtol, atol, optx.rms_norm, linear_solver=finder.linear_solver
-            )
         values = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
+        if isinstance(finder, diffrax.VeryChord | optx.Chord):
+            finder = _Chord(**values, linear_solver=finder.linear_solver)
         for name in _unset(finder):
             get = operator.attrgetter(name)
             finder = eqx.tree_at(get, finder, values[name])
@@ -231,6 +223,8 @@ def for_fixed_steps(solver: Any) -> Any:
     """An implicit solver that works without a step-size controller and outside of
     `diffeqsolve`, and can be differentiated both ways there.
     """
+    # Diffrax's default loop over the stages is one that `diffeqsolve` sets for itself;
+    # this one has a reverse mode outside of it, too.
     if isinstance(solver, diffrax.AbstractDIRK) and solver.scan_kind is None:
         is_none = lambda leaf: leaf is None
         solver = eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=is_none)

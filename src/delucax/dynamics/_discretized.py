@@ -25,6 +25,7 @@ from .._integration import (
 from .._jax import by_components, join_state, split_state
 from .._module import parameter
 from .._results import choose, first_of, or_none, promote, RESULTS
+from .._typing import Real
 from ..systems import AbstractSystem
 from ._base import AbstractDiscretization, zeros_if_none
 
@@ -106,37 +107,24 @@ class Discretized(AbstractDiscretization):
     """
 
     system: AbstractSystem
-    dt: Array = parameter()
-    solver: diffrax.AbstractSolver
-    substeps: int = eqx.field(static=True)
-    stepsize_controller: diffrax.AbstractStepSizeController | None
-    adjoint: diffrax.AbstractAdjoint | None
-    max_steps: int | None = eqx.field(static=True)
+    dt: Real = parameter()
+    solver: diffrax.AbstractSolver = eqx.field(default=None)
+    substeps: int = eqx.field(default=1, static=True)
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None
+    adjoint: diffrax.AbstractAdjoint | None = None
+    max_steps: int | None = eqx.field(default=None, static=True)
 
-    def __init__(
-        self,
-        system: AbstractSystem,
-        dt: Any,
-        solver: diffrax.AbstractSolver | None = None,
-        substeps: int = 1,
-        stepsize_controller: diffrax.AbstractStepSizeController | None = None,
-        adjoint: diffrax.AbstractAdjoint | None = None,
-        max_steps: int | None = None,
-    ):
-        where = "Discretized"
-        self.system = system
-        self.dt = dt
-        self.substeps = check_count(substeps, "substeps", where)
-        if solver is None:
+    def __post_init__(self):
+        system, where = self.system, "Discretized"
+        self.substeps = check_count(self.substeps, "substeps", where)
+        if self.solver is None:
             noisy = isinstance(system, AbstractSystem) and system.noise == "brownian"
-            solver = diffrax.Euler() if noisy else RK4()
-        if stepsize_controller is not None:
-            if adjoint is None:
-                adjoint = diffrax.RecursiveCheckpointAdjoint()
-            max_steps = 256 if max_steps is None else max_steps
-            max_steps = check_count(max_steps, "max_steps", where)
-        self.solver, self.stepsize_controller = solver, stepsize_controller
-        self.adjoint, self.max_steps = adjoint, max_steps
+            self.solver = diffrax.Euler() if noisy else RK4()
+        if self.stepsize_controller is not None:
+            if self.adjoint is None:
+                self.adjoint = diffrax.RecursiveCheckpointAdjoint()
+            steps = 256 if self.max_steps is None else self.max_steps
+            self.max_steps = check_count(steps, "max_steps", where)
 
     def __check_init__(self):
         where, system, solver = "Discretized", self.system, self.solver
@@ -188,7 +176,8 @@ class Discretized(AbstractDiscretization):
         else:
             increments = zeros_if_none(w, self.disturbance_size, x)
             increments = increments.reshape(self.substeps, -1)
-        # An interval is integrated from 0 to dt: where t is large, t + dt is rounded.
+        # An interval is integrated from 0 to dt: where t is large, t + dt is rounded,
+        # and so would the length of the interval be.
         t = jnp.asarray(t, x.dtype)
         start = Start(t, lambda t: evaluate_field(system, t, x, u, held))
         args = system, start, u, held
@@ -201,6 +190,7 @@ class Discretized(AbstractDiscretization):
                 x_next, result = step(0, x, increments[0] if noisy else None)
             else:
                 x_next, result = self._repeat(step, x, increments)
+        # Once an interval, not once a step: the field is that of the whole space.
         x_next = system.project(x_next)
         check_returned(x_next, x, system, "project")
         if added is not None:
@@ -223,6 +213,8 @@ class Discretized(AbstractDiscretization):
             check_returned(dx, x, system, "vector_field")
             return dx
 
+        # The field itself is in the loop where nothing is to be corrected: fewer frames
+        # lie between it and an error that it raises.
         rhs = at_late_time if start.is_corrected else field
 
         def step(s, x, _):
@@ -240,6 +232,8 @@ class Discretized(AbstractDiscretization):
             return start.after(s, lambda t: system.diffusion(t, x, u))
 
         def step(s, x, dB):
+            # Euler and Maruyama's method; Diffrax's takes a term with a path of its
+            # own.
             if type(self.solver) is diffrax.Euler:
                 x_next = x + h * _field(s, x, args) + _apply(g(s, x), dB)
                 return x_next, RESULTS.successful

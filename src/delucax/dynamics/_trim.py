@@ -166,6 +166,8 @@ class _Problem(eqx.Module):
         if isinstance(model, AbstractSystem):
             w = jnp.zeros(model.disturbance_size, x.dtype)
             held = w if model.disturbance_names else None
+            # A state is at rest on its manifold: off it, there would be roots that no
+            # trajectory reaches.
             return evaluate_field(model, self.t, model.project(x), u, held)
         return model.difference(model.advance(self.t, x, u, None)[0], x)
 
@@ -186,6 +188,7 @@ class _Problem(eqx.Module):
 
     def terms(self, J: Array) -> Array:
         """The size of the terms of each equation at the guess, a unit of it."""
+        # Of J dz, entry by entry: a residual is small if it is beside these.
         terms = jnp.abs(J) @ self.units
         return jnp.where(terms > 0, terms, 1)
 
@@ -221,6 +224,7 @@ def _expand(problem: _Problem, z: Array, terms: Array) -> _Point:
     rtol = float(100 * max(J.shape) * jnp.finfo(J.dtype).eps)
     # Not by Lineax, whose solves raise in their derivative where there is NaN.
     P = jnp.linalg.pinv(J, rtol=rtol)
+    # The least solution of the linear model r + J (z' - z) = 0 is z' = P (J z - r).
     linear = J @ z - r
     near = P @ linear
     offset = z - near
@@ -258,11 +262,16 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
         step, newton, converged, _, z, d, damping, radius, old, best = carry
         new = _expand(problem, z + d, old.terms)
         finite = jnp.isfinite(jnp.sum(new.slope) + jnp.sum(new.gram))
+        # Newton's steps are all taken: towards a saddle of the cost, too.
         better = newton | (finite & (new.cost < old.cost))
         z, new = select(better, (z + d, new), (z, old))
+        # Marquardt's rule. The radius bounds the step in the largest entry, because far
+        # from the guess the model may have other roots.
         damping = jnp.where(better, jnp.maximum(damping / 4, eps), damping * 4)
         radius = jnp.where(better, 2 * radius, jnp.max(jnp.abs(d)) / 4)
         diagonal = jnp.diagonal(new.gram)
+        # Scaled by the diagonal, so that units don't matter; unknowns that no equation
+        # has would make it singular.
         floor = eps * (jnp.max(diagonal) + eps)
         damped = new.gram + jnp.diag(damping * (diagonal + floor))
         matrix = jnp.where(newton, new.slope, damped)
@@ -285,13 +294,15 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
     best = inf, zero, blank.drift, blank.jacobian, inf
     start = jnp.array(0), no, no, no, zero, zero, one, one / 2, blank, best
     end = lax.while_loop(proceeds, body, start)
-    _, _, _, _, z, d, _, _, point, (cost, *best) = end
+    *_, z, d, _, _, point, (cost, *best) = end
     gap = jnp.max(jnp.abs(d))
     good = _settled(gap, z) & (point.cost <= 1.01 * cost + eps)
     return select(good, (z, point.drift, point.jacobian, gap), tuple(best))
 
 
 def _settled(gap: Array, z: Array) -> Array:
+    """Whether a step was short: at a multiple root, where Newton's method is slow and
+    the root known to a part of its digits, too."""
     return gap <= jnp.finfo(z.dtype).eps ** (1 / 3) * (1 + jnp.max(jnp.abs(z)))
 
 
@@ -305,6 +316,7 @@ def _nearest_jvp(primals, tangents):
         return _expand(problem, z, problem.terms(jacobian)).offset
 
     _, change = eqx.filter_jvp(lambda problem: offset(problem, z), primals, tangents)
+    # offset(problem, z) = 0, so d offset/dz dz = -d offset/d problem.
     dz = -jnp.linalg.solve(jax.jacfwd(offset, 1)(primals[0], z), change)
     drift_at = lambda problem, z: problem.drift(problem.at(z))
     _, drift = eqx.filter_jvp(drift_at, (*primals, z), (*tangents, dz))

@@ -1,5 +1,6 @@
 """Dynamics around others: dead times, and an adversary that acts on the state."""
 
+from dataclasses import KW_ONLY
 from typing import Any
 
 import equinox as eqx
@@ -8,6 +9,7 @@ from jaxtyping import Array, Float
 
 from .._check import as_matrix, as_vector, check_count, check_instance, check_positive
 from .._module import parameter
+from .._typing import Real
 from ..math import matvec
 from ..math._norms import within_ball
 from ._base import AbstractDynamics, AbstractWrapper
@@ -45,14 +47,12 @@ class Delayed(AbstractWrapper):
     """
 
     dynamics: AbstractDynamics
-    controls: int = eqx.field(static=True)
-    sensor: int = eqx.field(static=True)
+    controls: int = eqx.field(default=0, static=True)
+    sensor: int = eqx.field(default=0, static=True)
 
-    def __init__(self, dynamics: AbstractDynamics, controls: int = 0, sensor: int = 0):
-        where = "Delayed"
-        self.dynamics = dynamics
-        self.controls = check_count(controls, "controls", where, least=0)
-        self.sensor = check_count(sensor, "sensor", where, least=0)
+    def __check_init__(self):
+        check_count(self.controls, "controls", "Delayed", least=0)
+        check_count(self.sensor, "sensor", "Delayed", least=0)
 
     @property
     def state_names(self):
@@ -105,6 +105,8 @@ class Delayed(AbstractWrapper):
     def advance(self, t, x, u, w):
         own, controls, observed = self._cut(x)
         acting, late = u, []
+        # The newest comes first, and the oldest acts, or is read. Slices of no entries
+        # are left out, so that the state stays one of components.
         if self.controls:
             m = u.shape[0]
             acting = controls[-m:]
@@ -178,15 +180,13 @@ class WorstCase(AbstractWrapper):
 
     dynamics: AbstractDynamics
     L: Float[Array, "k n"] = parameter()
-    bound: Array | None = parameter()
-
-    def __init__(self, dynamics: AbstractDynamics, L: Any, *, bound: Any = None):
-        self.dynamics, self.L, self.bound = dynamics, L, bound
+    _: KW_ONLY
+    bound: Real | None = parameter(None)
 
     def __check_init__(self):
         where, dynamics = "WorstCase", self.dynamics
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
-        dynamics.equilibrium()
+        dynamics.equilibrium()  # raises where none is named
         as_matrix(self.L, "L", where)
         shape = dynamics.disturbance_size, dynamics.state_size
         if self.L.shape != shape:
