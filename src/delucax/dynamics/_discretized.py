@@ -27,7 +27,7 @@ from .._module import parameter
 from .._results import choose, first_of, or_none, promote, RESULTS
 from .._typing import Real
 from ..systems import AbstractSystem
-from ._base import AbstractDiscretization, zeros_if_none
+from ._base import AbstractDiscretization
 
 
 _SDE_SOLVERS = (
@@ -171,11 +171,10 @@ class Discretized(AbstractDiscretization):
         added = held = increments = None
         if noise == "additive":
             added = w
-        elif noise is None:
-            held = zeros_if_none(w, self.disturbance_size, x)
         else:
-            increments = zeros_if_none(w, self.disturbance_size, x)
-            increments = increments.reshape(self.substeps, -1)
+            held = jnp.zeros(self.disturbance_size, x.dtype) if w is None else w
+        if noise == "brownian":
+            held, increments = None, held.reshape(self.substeps, -1)
         # An interval is integrated from 0 to dt: where t is large, t + dt is rounded,
         # and so would the length of the interval be.
         t = jnp.asarray(t, x.dtype)

@@ -56,12 +56,8 @@ class Delayed(AbstractWrapper):
 
     @property
     def state_names(self):
-        inner = self.dynamics
-        late = [
-            f"{name}[-{k + 1}]"
-            for k in range(self.controls)
-            for name in inner.control_names
-        ]
+        inner, ages = self.dynamics, range(self.controls)
+        late = [f"{name}[-{k + 1}]" for k in ages for name in inner.control_names]
         outputs = range(inner.observation_size if self.sensor else 0)
         late += [f"y{i}[-{k + 1}]" for k in range(self.sensor) for i in outputs]
         return (*inner.state_names, *late)

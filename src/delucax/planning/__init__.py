@@ -6,4 +6,4 @@ from ._ilqr import ILQR as ILQR, ilqr as ilqr
 from ._iterative_learning import igpc as igpc, ilc as ilc
 from ._planner import AbstractPlanner as AbstractPlanner, Plan as Plan
 from ._sampling import CEM as CEM, MPPI as MPPI
-from ._start import default_start as default_start, Start as Start
+from ._start import Start as Start

@@ -29,18 +29,18 @@ MOST_MU = 1e10
 
 
 class Options(eqx.Module):
-    """What the planner was asked for, defaults filled in."""
+    """The fields of `ILQR`, defaults filled in."""
 
     tolerance: Array
     constraint_tolerance: Array
     states: Array | None
     """States to start from that need not follow from the controls."""
     second_order: bool = eqx.field(static=True)
-    on_state: bool = eqx.field(static=True)
+    regularise: str = eqx.field(static=True)
     line_search: str = eqx.field(static=True)
     parallel: bool = eqx.field(static=True)
     max_iterations: int = eqx.field(static=True)
-    spacing: float | None = eqx.field(static=True, default=None)
+    finite_difference: float | None = eqx.field(static=True)
 
 
 class Outcome(NamedTuple):
@@ -76,10 +76,7 @@ class _Progress(NamedTuple):
 
 
 def optimise(
-    problem: Problem,
-    start: Start,
-    options: Options,
-    before: Outcome | None = None,
+    problem: Problem, start: Start, options: Options, before: Outcome | None = None
 ) -> Outcome:
     """Iterate from the cheapest start, or from its controls and the states of the
     options if there are any; counting on from `before`, if that is given."""
@@ -135,7 +132,7 @@ def _iterate(problem: Problem, options: Options, before: _Progress) -> _Progress
     now, gaps, tolerance = before.now, before.gaps, options.tolerance
     mu = now.regularisation
     about = problem, now.states, now.controls, gaps, options.second_order
-    stages = model(*about, before.exact, options.spacing)
+    stages = model(*about, before.exact, options.finite_difference)
     policy, residual, settled = directions(problem, stages, now.controls, mu, options)
     penalty = _penalty(before.penalty, gaps, policy)
     missed = 0.0 if gaps is None else jnp.max(jnp.abs(gaps))
@@ -257,18 +254,14 @@ def first_accepted(
 
 
 def directions(
-    problem: Problem,
-    stages: Stages,
-    controls: Array,
-    mu: Array,
-    options: Options,
+    problem: Problem, stages: Stages, controls: Array, mu: Array, options: Options
 ) -> tuple[Policy, Array, Array]:
     """The policy of the model, the residual, and whether that is small enough."""
     box, tolerance = problem.room(controls), options.tolerance
     if options.parallel:
         policy = in_parallel(stages, mu)
     else:
-        policy = in_sequence(stages, mu, options.on_state, box)
+        policy = in_sequence(stages, mu, options.regularise == "state", box)
     if stages.d is not None:
         # The pass back reads both off its own terms, which holds without gaps alone.
         slope, curvature = promised(stages, policy.K, policy.k)

@@ -169,18 +169,14 @@ class ILQR(AbstractPlanner):
         second_order = self.second_order
         if second_order is None:
             second_order = problem.constraints is not None and spacing is None
-        options = Options(
+        filled = dict(
             tolerance=tolerance,
             constraint_tolerance=feasible,
-            states=states,
             second_order=bool(second_order),
-            on_state=self.regularise == "state",
-            line_search=self.line_search,
-            parallel=self.parallel,
-            max_iterations=self.max_iterations,
-            spacing=None if spacing is None else float(spacing),
+            finite_difference=spacing and float(spacing),
+            states=states,
         )
-        return _solve(problem, start, options)
+        return _solve(problem, start, Options(**(vars(self) | filled)))
 
 
 _IN_SEQUENCE = (
@@ -213,7 +209,7 @@ def ilqr(
     - `cost`: the stage and final cost.
     - `x0`: the first state, shape `(n,)`.
     - `controls`: what to start from: controls, shape `(T, m)`; the number of steps `T`,
-        for [`delucax.planning.default_start`][]; feedback, or several starts of which
+        for [`delucax.planning.Start.default`][]; feedback, or several starts of which
         the cheapest is taken, as [`delucax.planning.Start`][]; or an earlier plan, with
         its gains.
     - `t0`: the time of the first state, 0 by default.

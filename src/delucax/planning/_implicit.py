@@ -69,7 +69,8 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
         stages = model(problem, X, U, None, options.second_order)
         if options.parallel:
             return in_parallel(stages, out.regularisation).K
-        return in_sequence(stages, out.regularisation, options.on_state, None, free).K
+        on_state = options.regularise == "state"
+        return in_sequence(stages, out.regularisation, on_state, None, free).K
 
     # The gains of the last pass back are a function of the problem and the solution.
     _, dJ = jax.jvp(cost, (varied, X, U), (change, dX, dU))

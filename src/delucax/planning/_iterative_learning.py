@@ -207,18 +207,7 @@ def igpc(
     return _learned(where, *given, rules, throw)
 
 
-def _learned(
-    where: str,
-    plant: AbstractDynamics,
-    model: AbstractDynamics,
-    cost: AbstractCost,
-    plan: Plan,
-    w: Any,
-    step: Any,
-    rate: Any,
-    rules: _Rules,
-    throw: bool,
-) -> Plan:
+def _learned(where, plant, model, cost, plan, w, step, rate, rules, throw) -> Plan:
     """Check what both kinds take, and iterate."""
     models = ("plant", plant), ("model", model)
     for name, dynamics in models:

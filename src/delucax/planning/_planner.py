@@ -31,7 +31,7 @@ from ..math import matvec
 from ..math._steps import row_at, step_at
 from ._constraints import Constraints
 from ._problem import Problem
-from ._start import default_start, operating_point, Start
+from ._start import operating_point, Start
 
 
 class Plan(AbstractController):
@@ -231,7 +231,7 @@ class AbstractPlanner(eqx.Module):
         - `cost`: the stage and final cost.
         - `x0`: the first state, shape `(n,)`.
         - `controls`: what to start from: controls, shape `(T, m)`; the number of steps
-            `T`, for [`delucax.planning.default_start`][]; feedback, or several starts
+            `T`, for [`delucax.planning.Start.default`][]; feedback, or several starts
             of which the cheapest is taken, as [`delucax.planning.Start`][]; or an
             earlier plan, with its gains.
         - `t0`: the time of the first state, 0 by default.
@@ -323,5 +323,5 @@ def _as_start(
         return controls.checked(dynamics.state_size, m, "controls", where)
     if isinstance(controls, numbers.Integral):
         T = check_count(controls, "controls (the horizon)", where)
-        return default_start(dynamics, cost, T, t0)
+        return Start.default(dynamics, cost, T, t0)
     return Start(finite_rows(controls, m, "controls", where))

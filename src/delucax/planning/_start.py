@@ -113,78 +113,80 @@ class Start(eqx.Module):
             )
         return Start(*arrays)
 
+    @staticmethod
+    def default(
+        dynamics: AbstractDynamics,
+        cost: AbstractCost,
+        horizon: int,
+        t0: RealScalar = 0.0,
+        *,
+        controls: Any = None,
+    ) -> "Start":
+        """The start that planners take by default, of which they use the cheaper one:
 
-def default_start(
-    dynamics: AbstractDynamics,
-    cost: AbstractCost,
-    horizon: int,
-    t0: RealScalar = 0.0,
-    *,
-    controls: Any = None,
-) -> Start:
-    """The start that planners take by default, of which they use the cheaper one:
+        1. under the LQR about an operating point,
+        2. with its control held.
 
-    1. under the LQR about an operating point,
-    2. with its control held.
+        The operating point is the `targets` of the cost where they name both a state
+        and a control. Otherwise it is the equilibrium that the dynamics name. Where
+        they name none, zeros stand in for the target that is missing, or for both. Such
+        a point need not be an equilibrium, and an LQR about it may be a poor start:
+        name the state to regulate to and the control that holds it, which
+        [`delucax.trim`][] finds. A [`delucax.costs.Quadratic`][] has targets, and so
+        has what is made of it by `+`, `*` or [`delucax.costs.Rate`][].
 
-    The operating point is the `targets` of the cost where they name both a state and a
-    control. Otherwise it is the equilibrium that the dynamics name. Where they name
-    none, zeros stand in for the target that is missing, or for both. Such a point need
-    not be an equilibrium, and an LQR about it may be a poor start: name the state to
-    regulate to and the control that holds it, which [`delucax.trim`][] finds. A
-    [`delucax.costs.Quadratic`][] has targets, and so has what is made of it by `+`, `*`
-    or [`delucax.costs.Rate`][].
+        The weights of the LQR are the second derivatives of the stage cost at that
+        point.
 
-    The weights of the LQR are the second derivatives of the stage cost at that point.
+        There is no such LQR where the derivatives at that point are not finite, the
+        second derivative of the cost with respect to the control is not positive
+        definite, no gain stabilises the plant, or the dynamics cannot be
+        differentiated. The gain of the first start is then zero, and no LQR is tried.
 
-    There is no such LQR where the derivatives at that point are not finite, the second
-    derivative of the cost with respect to the control is not positive definite, no gain
-    stabilises the plant, or the dynamics cannot be differentiated. The gain of the
-    first start is then zero, and no LQR is tried.
+        A trajectory that rests at the operating point is not among the starts, for it
+        does not begin at the first state. The LQR leads there.
 
-    A trajectory that rests at the operating point is not among the starts, for it does
-    not begin at the first state. The LQR leads there.
+        **Arguments:**
 
-    **Arguments:**
+        - `dynamics`: the discrete-time dynamics.
+        - `cost`: the stage and final cost.
+        - `horizon`: the steps `T`.
+        - `t0`: the time at which both are looked at, 0 by default.
+        - `controls`: in place of those of the second one, shape `(T, m)`.
 
-    - `dynamics`: the discrete-time dynamics.
-    - `cost`: the stage and final cost.
-    - `horizon`: the steps `T`.
-    - `t0`: the time at which both are looked at, 0 by default.
-    - `controls`: in place of those of the second one, shape `(T, m)`.
+        **Returns:** a [`delucax.planning.Start`][]. No derivative goes through it.
 
-    **Returns:** a [`delucax.planning.Start`][]. No derivative goes through it.
+        **Raises:** `ValueError` if `dynamics` or `cost` is not one, or the horizon is
+        not a whole number of at least 1.
 
-    **Raises:** `ValueError` if `dynamics` or `cost` is not one, or the horizon is not a
-    whole number of at least 1.
+        Source: Rawlings, Mayne and Diehl, 2017 (the regulator as a warm start).
 
-    Source: Rawlings, Mayne and Diehl, 2017 (the regulator as a warm start).
+        !!! example
 
-    !!! example
+            ```python
+            import delucax as dlx
 
-        ```python
-        import delucax as dlx
-
-        env = dlx.make("pendulum")
-        start = dlx.planning.default_start(env.dynamics, env.cost, 20)
-        start.gains[0, 0]
-        ```
-    """
-    check_instance(dynamics, AbstractDynamics, "dynamics", "default_start")
-    check_instance(cost, AbstractCost, "cost", "default_start")
-    T = check_count(horizon, "horizon", "default_start")
-    constant = lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf
-    dynamics, cost = jax.tree.map(constant, (dynamics, cost))
-    point = operating_point(dynamics, cost)
-    try:
-        t0 = jnp.asarray(t0, point[0].dtype)
-        *matrices, posed = _expanded(dynamics, cost, *point, t0)
-    except (NotImplementedError, RuntimeError, TypeError, ValueError):
-        # Not differentiable. A planner that needs derivatives says so itself.
-        regulator = None
-    else:
-        regulator = dare(*matrices, throw=False), posed
-    return _both(point, regulator, controls, T)
+            env = dlx.make("pendulum")
+            start = dlx.planning.Start.default(env.dynamics, env.cost, 20)
+            start.gains[0, 0]
+            ```
+        """
+        where = "Start.default"
+        check_instance(dynamics, AbstractDynamics, "dynamics", where)
+        check_instance(cost, AbstractCost, "cost", where)
+        T = check_count(horizon, "horizon", where)
+        constant = lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf
+        dynamics, cost = jax.tree.map(constant, (dynamics, cost))
+        point = operating_point(dynamics, cost)
+        try:
+            t0 = jnp.asarray(t0, point[0].dtype)
+            *matrices, posed = _expanded(dynamics, cost, *point, t0)
+        except (NotImplementedError, RuntimeError, TypeError, ValueError):
+            # Not differentiable. A planner that needs derivatives says so itself.
+            regulator = None
+        else:
+            regulator = dare(*matrices, throw=False), posed
+        return _both(point, regulator, controls, T)
 
 
 def operating_point(

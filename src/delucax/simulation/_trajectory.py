@@ -315,7 +315,7 @@ class Trajectory(eqx.Module):
         total, length, final = map(np.ravel, given)
         # A result that is statically a success has no batch axis.
         codes = np.broadcast_to(np.ravel(jax.tree.leaves(self.result)[0]), total.shape)
-        result_of = lambda code: jax.tree.map(lambda _: code, RESULTS.successful)
+        result_of = lambda c: jax.tree.map(lambda _: np.asarray(c), RESULTS.successful)
         words = [RESULTS[result_of(code)] or "successful" for code in codes]
         columns = {
             "total_cost": total,
