@@ -1,5 +1,6 @@
 """A continuous system integrated over one control interval."""
 
+import functools
 from typing import Any
 
 import diffrax
@@ -204,9 +205,6 @@ class Discretized(AbstractDiscretization):
             solver, term = for_fixed_steps(self.solver), diffrax.ODETerm(_field)
             return lambda s, x, _: _solver_step(solver, term, s, x, h, args)
 
-        def at_late_time(s, x):
-            return _field(s, x, args)
-
         def field(s, x):
             dx = system.vector_field(start.t + s, x, u, held)
             check_returned(dx, x, system, "vector_field")
@@ -214,12 +212,9 @@ class Discretized(AbstractDiscretization):
 
         # The field itself is in the loop where nothing is to be corrected: fewer frames
         # lie between it and an error that it raises.
-        rhs = at_late_time if start.is_corrected else field
-
-        def step(s, x, _):
-            return runge_kutta_step(tableau, rhs, s, x, h), RESULTS.successful
-
-        return step
+        rhs = (lambda s, x: _field(s, x, args)) if start.is_corrected else field
+        step = functools.partial(runge_kutta_step, tableau, rhs)
+        return lambda s, x, _: (step(s, x, h), RESULTS.successful)
 
     def _noisy_step(self, x, args):
         """The same with an increment of the Brownian motions."""

@@ -98,8 +98,6 @@ class LinearDynamics(AbstractDynamics):
                     f"{where}: {name} must have shape {shape}, got {jnp.shape(array)}."
                 )
             check_real(array, name, where)
-        checked_names(self.state_names, "x", n, "state_names", where)
-        checked_names(self.control_names, "u", m, "control_names", where)
 
     @property
     def is_time_varying(self) -> bool:

@@ -7,9 +7,8 @@ import jax.lax as lax
 import jax.numpy as jnp
 
 from .._results import choose, RESULTS
-from ._constraints import Multipliers, updated, violated
 from ._descent import optimise, Options, Outcome
-from ._problem import Problem
+from ._problem import Multipliers, Problem, updated, violated
 from ._start import begin, controls_of, Start
 
 

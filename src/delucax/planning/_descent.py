@@ -11,9 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._results import choose, Result, RESULTS
-from ._constraints import Multipliers
 from ._lq import in_parallel, in_sequence, Policy, promised, Stages
-from ._problem import model, Problem, roll_out
+from ._problem import model, Multipliers, Problem, roll_out
 from ._start import begin, controls_of, Start
 
 

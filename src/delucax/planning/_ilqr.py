@@ -18,11 +18,10 @@ from .._module import parameter
 from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ._constraints import Constraints
 from ._descent import Options, SEARCHES
 from ._implicit import solution
 from ._planner import AbstractPlanner, Plan, plan_of
-from ._problem import Problem
+from ._problem import Constraints, Problem
 from ._start import Start
 
 

@@ -20,10 +20,9 @@ from .._results import RESULTS
 from ..math import matvec
 from ..math._linear_solve import full_precision
 from ._augmented import with_constraints
-from ._constraints import Multipliers
 from ._descent import Options, Outcome
 from ._lq import apply, in_parallel, in_sequence, product, solve_free, Stages
-from ._problem import costates_of, model, Problem
+from ._problem import costates_of, model, Multipliers, Problem
 from ._start import controls_of, Start
 
 

@@ -43,17 +43,6 @@ class _Online(NamedTuple):
     aligned: bool
 
 
-class _Rules(NamedTuple):
-    """What is fixed when an iterative learner is compiled."""
-
-    iterations: int
-    online: _Online | None = None
-    candidates: int = 10  # of a search
-    strict: bool = False  # whether a trial must be better, not only as good
-    slower: float | None = None
-    """What a failed search multiplies the learning rate by. If none, it is the end."""
-
-
 def ilc(
     plant: AbstractDynamics,
     model: AbstractDynamics,
@@ -119,8 +108,8 @@ def ilc(
         learned.trace
         ```
     """
-    rules = _Rules(check_count(iterations, "iterations", "ilc"))
-    return _learned("ilc", plant, model, cost, plan, w, step, 0.0, rules, throw)
+    given = plant, model, cost, plan, w, iterations, step
+    return _learned("ilc", *given, 0.0, None, False, throw)
 
 
 def igpc(
@@ -200,14 +189,14 @@ def igpc(
         check_count(horizon, "horizon", where),
         aligned=indices == "aligned",
     )
-    rules = _Rules(check_count(iterations, "iterations", where), online)
-    if check_bool(anneal, "anneal", where):
-        rules = rules._replace(candidates=6, strict=True, slower=SLOWER)
-    given = plant, model, cost, plan, w, step, learning_rate
-    return _learned(where, *given, rules, throw)
+    check_bool(anneal, "anneal", where)
+    given = plant, model, cost, plan, w, iterations, step
+    return _learned(where, *given, learning_rate, online, anneal, throw)
 
 
-def _learned(where, plant, model, cost, plan, w, step, rate, rules, throw) -> Plan:
+def _learned(
+    where, plant, model, cost, plan, w, iterations, step, rate, online, anneal, throw
+) -> Plan:
     """Check what both kinds take, and iterate."""
     models = ("plant", plant), ("model", model)
     for name, dynamics in models:
@@ -225,6 +214,7 @@ def _learned(where, plant, model, cost, plan, w, step, rate, rules, throw) -> Pl
             )
     if w is not None:
         w = finite_rows(w, plant.disturbance_size, "w", where, T)
+    iterations = check_count(iterations, "iterations", where)
     check_number(step, "step", where)
     check_positive(step, "step", where)
     x0 = plan.states[0].astype(plan.controls.dtype)
@@ -234,7 +224,8 @@ def _learned(where, plant, model, cost, plan, w, step, rate, rules, throw) -> Pl
     # The model knows nothing of `w`: it is what the plant has and the model lacks.
     true = Problem(plant, cost, x0, t0, w, bounds, plan.difference)
     known = dataclasses.replace(true, dynamics=model, w=None)
-    out = _iterate(true, known, plan, as_float_array(step), as_float_array(rate), rules)
+    rates = as_float_array(step), as_float_array(rate)
+    out = _iterate(true, known, plan, *rates, iterations, online, bool(anneal))
     if not throw:
         return out
     # That a search failed is no failure here, but how learning usually ends.
@@ -256,7 +247,14 @@ class _Progress(NamedTuple):
 
 @eqx.filter_jit
 def _iterate(
-    plant: Problem, model: Problem, plan: Plan, step: Array, rate: Array, rules: _Rules
+    plant: Problem,
+    model: Problem,
+    plan: Plan,
+    step: Array,
+    rate: Array,
+    iterations: int,
+    online: _Online | None,
+    anneal: bool,
 ) -> Plan:
     """Iterate from the first run, which follows the feedback of `plan`."""
     dtype = plan.controls.dtype
@@ -284,26 +282,26 @@ def _iterate(
             # j = 0, 1, ... is 1.1, 1, 0.75, 0.47, ..., as in the original library.
             power = 1.0 - tried.astype(dtype) ** 2
             length = now.step * jnp.asarray(1.1, dtype) ** power
-            if rules.online is None:
+            if online is None:
                 after = roll_out(plant, states, controls, policy.K, policy.k, length)
             else:
-                rest = states, controls, policy, length, now.rate, rules.online
+                rest = states, controls, policy, length, now.rate, online
                 after = _perturbed(plant, model, *rest)
-            good = after[2] < cost if rules.strict else after[2] <= cost
+            good = after[2] < cost if anneal else after[2] <= cost
             return (length, after), good
 
         last = now.step, now.last
-        tried, (length, after), good = first_accepted(trial, rules.candidates, last)
+        tried, (length, after), good = first_accepted(trial, 6 if anneal else 10, last)
         keep = lambda new, old: jnp.where(good, new, old)
         after = jax.tree.map(keep, after, now.last)
         iteration = now.iteration + 1
-        ended = iteration >= rules.iterations
+        ended = iteration >= iterations
         # Without a rate to lower, a failed search would only fail again.
-        ended = ended | ~good if rules.slower is None else ended
+        ended = ended if anneal else ended | ~good
         return _Progress(
             last=after,
             step=keep(length, now.step),
-            rate=keep(now.rate, (rules.slower or 1) * now.rate),
+            rate=keep(now.rate, SLOWER * now.rate) if anneal else now.rate,
             runs=now.runs + tried,
             trace=now.trace.at[iteration].set(after[2]),
             iteration=iteration,
@@ -311,13 +309,13 @@ def _iterate(
         )
 
     step, rate = (jnp.asarray(number, dtype) for number in (step, rate))
-    trace, count = jnp.full((rules.iterations + 1,), first[2]), jnp.asarray(0)
+    trace, count = jnp.full((iterations + 1,), first[2]), jnp.asarray(0)
     start = _Progress(first, step, rate, count + 1, trace, count, done=lost)
     end = lax.while_loop(lambda now: ~now.done, body, start)
     states, controls, cost = end.last
     mu, policy = policy_of(states, controls)
-    reached = jnp.arange(rules.iterations + 1) <= end.iteration
-    early = end.iteration < rules.iterations
+    reached = jnp.arange(iterations + 1) <= end.iteration
+    early = end.iteration < iterations
     result = choose(early, RESULTS.no_descent, RESULTS.successful)
     return plan_of(
         plant,

@@ -29,8 +29,7 @@ from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ..math._steps import row_at, step_at
-from ._constraints import Constraints
-from ._problem import Problem
+from ._problem import Constraints, Problem
 from ._start import operating_point, Start
 
 
@@ -123,8 +122,8 @@ class Plan(AbstractController):
         if y.shape != (size,):
             raise wrong_observation(self, size, y)
         step = step_at(t - self.t0, self.dt, len(self.controls), "Plan")
-        rows = row_at((self.states[:-1], self.controls, self.gains), step)
-        x_ref, u_ref, K = rows
+        rows = self.states[:-1], self.controls, self.gains
+        x_ref, u_ref, K = row_at(rows, step)
         e = y - x_ref if self.difference is None else self.difference(y, x_ref)
         u = u_ref - matvec(K, e)
         if self.low is not None and self.high is not None:
@@ -153,13 +152,10 @@ def plan_of(
 
 def checked_plan(plan: Plan, where: str, throw: bool = True) -> Plan:
     """Raise if asked to, unless the plan is a solution."""
-
-    def facts():
-        return (
-            f"After {int(plan.iterations)} iterations the cost is "
-            f"{float(plan.cost):.6g} and the residual {float(plan.residual):.2g}."
-        )
-
+    facts = lambda: (
+        f"After {int(plan.iterations)} iterations the cost is {float(plan.cost):.6g} "
+        f"and the residual {float(plan.residual):.2g}."
+    )
     return raise_on_failure(plan, where, throw, "the plan", facts)
 
 
@@ -262,18 +258,26 @@ class AbstractPlanner(eqx.Module):
         x0 = finite_vector(x0, n, "x0", where)
         check_number(t0, "t0", where)
         t0 = as_float_array(t0)
-        if self.starts_from_states:
-            if isinstance(controls, Start | Plan):
+        known = ()
+        if isinstance(controls, Start | Plan):
+            if self.starts_from_states:
                 raise ValueError(
                     f"{where}: states go with an array of controls or a number of "
                     f"steps, got {type(controls).__name__}."
                 )
-            if isinstance(controls, numbers.Integral):
-                T = check_count(controls, "controls (the horizon)", where)
-                controls = jnp.tile(operating_point(dynamics, cost)[1], (T, 1))
-        start = _as_start(dynamics, cost, controls, t0, where)
+            start = Start(controls.controls, controls.states, controls.gains)
+            start = start.checked(n, m, "controls", where)
+            known = (start.controls,)
+        elif not isinstance(controls, numbers.Integral):
+            start = Start(finite_rows(controls, m, "controls", where))
+            known = (start.controls,)
         # A default start has no precision of its own.
-        known = () if isinstance(controls, numbers.Integral) else (start.controls,)
+        elif self.starts_from_states:
+            T = check_count(controls, "controls (the horizon)", where)
+            start = Start(jnp.tile(operating_point(dynamics, cost)[1], (T, 1)))
+        else:
+            T = check_count(controls, "controls (the horizon)", where)
+            start = Start.default(dynamics, cost, T, t0)
         dtype = jnp.result_type(x0, *known)
         if w is not None:
             size = dynamics.disturbance_size
@@ -310,18 +314,3 @@ def _with_fallback(plan: Plan, fallback: Start | Plan) -> Plan:
     result = choose(usable, plan.result, result)
     kept = jax.tree.map(keep, trajectory(plan), trajectory(fallback))
     return eqx.tree_at(lambda p: (*trajectory(p), p.result), plan, (*kept, result))
-
-
-def _as_start(
-    dynamics: AbstractDynamics, cost: AbstractCost, controls: Any, t0: Array, where: str
-) -> Start:
-    """What to start from, or an error."""
-    m = dynamics.control_size
-    if isinstance(controls, Plan):
-        controls = Start(controls.controls, controls.states, controls.gains)
-    if isinstance(controls, Start):
-        return controls.checked(dynamics.state_size, m, "controls", where)
-    if isinstance(controls, numbers.Integral):
-        T = check_count(controls, "controls (the horizon)", where)
-        return Start.default(dynamics, cost, T, t0)
-    return Start(finite_rows(controls, m, "controls", where))

@@ -60,11 +60,11 @@ def check_state(controller: AbstractController, first: PyTree, after: PyTree) ->
     (old, structure), (new, structure_after) = (
         jax.tree_util.tree_flatten_with_path(state) for state in (first, after)
     )
-    pairs = [((), first, after)]
+    changed = [((), first, after)]
     if structure == structure_after:
         leaves = zip(old, new, strict=True)
-        pairs = [(path, a, b) for (path, a), (_, b) in leaves if not _same_kind(a, b)]
-    for path, before, now in pairs:
+        changed = [(path, a, b) for (path, a), (_, b) in leaves if not _same_kind(a, b)]
+    for path, before, now in changed:
         raise ValueError(
             f"{type(controller).__name__}: state{jax.tree_util.keystr(path)} must keep "
             "the structure, shape and dtype that init gives it, "
@@ -78,6 +78,6 @@ def _same_kind(before: Any, now: Any) -> bool:
         return False
     if not eqx.is_array(before):
         return before is now or bool(eqx.tree_equal(before, now))
-    # The dtype of a weakly typed number follows from what it meets.
+    # The dtype of a weakly typed number follows from what it meets in the first step.
     same_dtype = before.dtype == now.dtype or before.weak_type
     return before.shape == now.shape and same_dtype

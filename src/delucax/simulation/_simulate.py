@@ -211,9 +211,8 @@ def simulate(
     start = jnp.asarray(t0, x0.dtype)
     # The length of the horizon before its ends are rounded, if they are known.
     length = jnp.asarray(t1 - t0, x0.dtype)
-    trajectory = _simulate(
-        system, source, w, x0, start, length, ts, key, hold, steps, substeps, options
-    )
+    given = system, source, w, x0, start, length, ts, key, hold, steps, substeps
+    trajectory = _simulate(*given, options)
     return checked(trajectory, where) if throw else trajectory
 
 
@@ -226,6 +225,7 @@ def _simulate(
     grid: Any = None
     switches: Any = None
     if steps is not None:
+        # By fractions of the length, and the end as it is: no sum of steps is rounded.
         grid = length * (jnp.arange(steps * substeps + 1) / (steps * substeps))
         grid = grid.astype(dtype).at[-1].set(length)
         switches = grid[::substeps]
@@ -236,14 +236,15 @@ def _simulate(
     sampled = hold == "zero" and isinstance(source, AbstractController)
     args = _inputs(system, source, w, x0, t0, switches, key, hold)
     if sampled:
+        # The control in force at the start; the first step asks again, from the same
+        # state, because it is the first of its interval.
         u, _ = args.act(grid[0], x0, eqx.filter(args.memory, eqx.is_array))
         args = eqx.tree_at(lambda a: a.u, args, u, is_leaf=lambda leaf: leaf is None)
     start = Start(t0, lambda t: args.field(t, x0))
     args = eqx.tree_at(lambda a: a.start, args, start)
 
-    saved: dict[str, Any] = (
-        dict(t0=True, ts=saves[1:]) if ts is None else dict(t1=True, ts=saves)
-    )
+    # Either the ends of the intervals, or what is asked for and the end of the horizon.
+    saved: Any = dict(t0=True, ts=saves[1:]) if ts is None else dict(t1=True, ts=saves)
     if sampled:
         saved["fn"] = recorded
     held = hold == "zero" or w is not None
@@ -278,10 +279,11 @@ def _simulate(
     else:
         controls = jax.vmap(args.control)(times[:-1], states[:-1])
     finite = jnp.all(jnp.isfinite(final_state))
-    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
     result = solve_result(solution, options["stepsize_controller"], dtype)
-    result = first_failure(result, diverged)
-    last = {name: totals[-1] for name, totals in counts.items()}
+    result = first_failure(result, choose(finite, RESULTS.successful, RESULTS.diverged))
+    # At the last time asked for: what is saved at the end itself knows nothing of it.
+    last = {name: totals[count - 1] for name, totals in counts.items()}
+    incidents = {n: at[1:count] > at[: count - 1] for n, at in counts.items()}
     result = first_failure(result, controller_result(last, tallies(args.memory)))
     sensor = None
     if not system.observes_state:
@@ -301,10 +303,7 @@ def _simulate(
         recorded_observations=sensor,
         recorded_disturbances=before(w),
         recorded_terminated=None,
-        incidents={
-            n: totals[1:count] > totals[: count - 1] for n, totals in counts.items()
-        },
-        controller_state=None,
+        incidents=incidents,
         steps=count - 1,
         # There is no cost to keep, which is not to have left it out.
         keep=("states", "observations", "controls", "disturbances", "costs"),
@@ -346,6 +345,7 @@ def _with_switches(options, held: bool, sampled: bool, grid, switches):
         if held and "solver" in options:
             options["solver"] = Hold(options["solver"], switches, sampled)
         controller = options.get("stepsize_controller")
+        # No adaptive step crosses a switch: its error estimate would be of two fields.
         if held and controller is not None and switches.shape[0] > 2:
             clipped = diffrax.ClipStepSizeController(controller, step_ts=switches[1:-1])
             options["stepsize_controller"] = clipped
@@ -355,6 +355,7 @@ def _with_switches(options, held: bool, sampled: bool, grid, switches):
     fixed = options["stepsize_controller"] is None
     if fixed and isinstance(solver, diffrax.AbstractImplicitSolver):
         solver = for_fixed_steps(solver)
+    # The backward solve has a solver of its own, which must hold the controls, too.
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         adjoint = diffrax.BacksolveAdjoint(**fitted(adjoint.kwargs))
     adjoint = raise_on_failure(adjoint)
@@ -375,5 +376,6 @@ def _since(t0: Array, ts: Array, grid: Array | None, length: Array) -> Array:
         return saves
     steps = grid.shape[0] - 1
     near = grid[jnp.round(saves / length * steps).astype(int)]
+    # Both times are rounded to their own size, and so is their difference.
     slack = 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(ts))
     return jnp.where(jnp.abs(saves - near) <= slack, near, saves)

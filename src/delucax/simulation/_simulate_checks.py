@@ -17,7 +17,7 @@ from ..systems import AbstractSystem
 def check_system(system: Any, w: Any, where: str) -> None:
     """Raise unless one solve can integrate `system`."""
     check_instance(system, AbstractSystem, "system", where)
-    name, reason = type(system).__name__, None
+    name = type(system).__name__
     if system.projects_state:
         reason = f"system {name} projects its state after each interval"
     elif system.noise == "brownian":
@@ -27,11 +27,12 @@ def check_system(system: Any, w: Any, where: str) -> None:
             f"w cannot be given, as {name} names no disturbances: w would be added to "
             "the state after each interval"
         )
-    if reason is not None:
-        raise ValueError(
-            f"{where}: {reason}, which one solve cannot do; use `delucax.open_loop` or "
-            "`delucax.rollout` with delucax.Discretized(system, dt)."
-        )
+    else:
+        return
+    raise ValueError(
+        f"{where}: {reason}, which one solve cannot do; use `delucax.open_loop` or "
+        "`delucax.rollout` with delucax.Discretized(system, dt)."
+    )
 
 
 def count_intervals(

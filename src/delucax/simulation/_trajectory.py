@@ -195,7 +195,12 @@ class Trajectory(eqx.Module):
         ends = lambda tree: jax.tree.map(lambda leaf: leaf[start : stop + 1], tree)
         steps = lambda tree: jax.tree.map(lambda leaf: leaf[start:stop], tree)
         costs, incidents = steps(self.costs), steps(self.incidents)
-        is_end = stop == self.steps
+        # A failure that incidents speak of may have been outside of the stretch.
+        result, is_end = self.result, stop == self.steps
+        for name, kind in INCIDENTS.items():
+            if incidents is not None and name in incidents:
+                elsewhere = (result == kind) & ~jnp.any(incidents[name])
+                result = choose(elsewhere, RESULTS.successful, result)
         final_cost = self.final_cost if is_end else jnp.zeros_like(self.final_cost)
         return dataclasses.replace(
             self,
@@ -207,7 +212,7 @@ class Trajectory(eqx.Module):
             total_cost=final_cost if costs is None else jnp.sum(costs) + final_cost,
             length=jnp.clip(self.length - start, 0, stop - start),
             ended=self.ended & (self.length <= stop),
-            result=_result_of(self.result, incidents),
+            result=result,
             recorded_times=ends(self.times),
             recorded_observations=steps(self.recorded_observations),
             recorded_disturbances=steps(self.recorded_disturbances),
@@ -331,15 +336,6 @@ class Trajectory(eqx.Module):
                 columns[f"{name}_count"] = count
                 columns[f"{name}_time"] = np.ravel(self.incident_times[name])
         return pd.DataFrame(columns)
-
-
-def _result_of(result: Result, incidents: dict[str, Array] | None) -> Result:
-    """The result of a stretch in which the incidents that it speaks of may not be."""
-    for name, kind in INCIDENTS.items():
-        if incidents is not None and name in incidents:
-            elsewhere = (result == kind) & ~jnp.any(incidents[name])
-            result = choose(elsewhere, RESULTS.successful, result)
-    return result
 
 
 def plant_fields(plant: AbstractPlant) -> dict[str, Any]:
