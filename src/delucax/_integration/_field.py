@@ -39,13 +39,14 @@ def check_returned(value: Any, x: Array, system: AbstractSystem, method: str) ->
     )
 
 
-class Start(eqx.Module):
-    """The time at which a solve's own begins, for one function of time.
+class TimeOffset(eqx.Module):
+    """The start `t` of a solve that counts its own time `s` from 0, for one function of
+    time `f`.
 
-    The sum `t + s` is rounded, and its rounding error `e` is known: a function `f` of
-    time is `f(t + s) + e f' + e^2 f'' / 2`. That is for functions that vary with time
-    (in float32, at 1e5, `e` is up to 0.004); any other is evaluated as it is, and so is
-    one that has no two derivatives forwards, or none that is finite.
+    The sum `t + s` is rounded, and its rounding error `e` is known (in float32, at 1e5,
+    it is up to 0.004): `f` is evaluated as `f(t + s) + e f' + e^2 f'' / 2`. A function
+    that is constant in time, not twice forward-differentiable, or without finite
+    derivatives is evaluated without correction.
 
     Source: Knuth, 1969 (the error of a sum).
     """
@@ -59,8 +60,8 @@ class Start(eqx.Module):
         rounded = function is not None and _is_rounded(t.dtype)
         self.is_corrected = rounded and _varies(function, t)
 
-    def after(self, s: RealScalar, function: Callable[[Array], Array]) -> Array:
-        """`function` at `s` after the start."""
+    def evaluate(self, s: RealScalar, function: Callable[[Array], Array]) -> Array:
+        """`function` at the time `s` after the start."""
         time = self.t + s
         # An s that is a Python number is 0: the start itself.
         if not self.is_corrected or not eqx.is_array(s) or not _is_rounded(time.dtype):
@@ -90,8 +91,8 @@ def _change(function, time, off):
 def _varies(function, t):
     """Whether `function` has derivatives with respect to time that are not all zero.
 
-    They are traced and not compiled. A function without them raises one of many errors;
-    what is wrong with the function itself raises when it is evaluated.
+    They are traced, not compiled. A function that is not differentiable raises one of
+    many errors here; any other error of it is raised again when it is evaluated.
     """
     # A derivative of zero is a constant of the program. (Values cannot tell, because a
     # derivative may be zero at this time alone.)

@@ -72,7 +72,7 @@ def tableau_of(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau | None:
     """The tableau of an explicit Runge-Kutta solver; `None` for any other."""
     if type(solver) is diffrax.Euler:
         return _EULER
-    # A wrapped solver passes for the one inside, but has no tableau of its own.
+    # `isinstance` is true of wrapped solvers, too, but they have no tableau.
     is_wrapped = isinstance(solver, diffrax.AbstractWrappedSolver)
     if is_wrapped or not isinstance(solver, diffrax.AbstractERK):
         return None

@@ -48,8 +48,8 @@ class AbstractDynamics(AbstractPlant):
     @property
     def increments(self) -> int:
         """How many Brownian increments of equal variance `w` holds one after the other,
-        each of `disturbance_size / increments` entries: 1 if `noise` is `"brownian"`
-        and nothing else is said, and 0 if it is not.
+        each of `disturbance_size / increments` entries; by default 1 if `noise` is
+        `"brownian"`, else 0.
         """
         return 1 if self.noise == "brownian" else 0
 
@@ -57,7 +57,7 @@ class AbstractDynamics(AbstractPlant):
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
     ) -> tuple[Array, Result]:
-        """One step, with what became of it.
+        """One step and its status.
 
         `result` is that of the solver alone. The numbers are not checked: from NaN, or
         from a finite state so large that it overflows, `x_next` is not finite although
@@ -163,24 +163,24 @@ def _open_loop(dynamics, x0, controls, w, t0):
 
 
 def _forwarded(name: str) -> Any:
-    """A property of the plant inside."""
+    """A property of the wrapped plant."""
     return property(
-        lambda self: getattr(self._inside, name), doc="That of the plant inside."
+        lambda self: getattr(self._inside, name), doc="That of the wrapped plant."
     )
 
 
 def _forwarded_units(what: str) -> Any:
-    """The units of the plant inside, where its names are the wrapper's too."""
+    """The units of the wrapped plant if the names are unchanged, else `()`."""
 
     def units(self):
         same = getattr(self, f"{what}_names") == getattr(self._inside, f"{what}_names")
         return getattr(self._inside, f"{what}_units") if same else ()
 
-    return property(units, doc="Those of the plant inside, where the names are.")
+    return property(units, doc="Those of the wrapped plant if the names are, else ().")
 
 
 class _Forwarding(AbstractDynamics):
-    """Dynamics whose names, sizes and hooks are those of a plant inside by default."""
+    """Dynamics whose names, sizes and hooks are by default those of a wrapped plant."""
 
     @property
     @abc.abstractmethod
@@ -252,12 +252,11 @@ class AbstractDiscretization(_Forwarding):
 
 
 class AbstractWrapper(_Forwarding):
-    """Dynamics with a field `dynamics`, like which they are in all that a subclass does
-    not say otherwise.
+    """A wrapper around a field `dynamics`, to which everything is forwarded that a
+    subclass does not override.
 
     A subclass writes `advance`. One whose state has more entries also gives
-    `state_names`, `observe`, `difference` and `equilibrium`. Anything else that
-    environments, planners and learners ask of dynamics is asked of the field.
+    `state_names`, `observe`, `difference` and `equilibrium`.
 
     !!! example
 

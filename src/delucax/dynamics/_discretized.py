@@ -11,17 +11,17 @@ from jaxtyping import Array
 
 from .._check import check_count, check_instance
 from .._integration import (
+    as_fixed_step_solver,
     check_kind,
     check_method,
     check_returned,
     evaluate_field,
-    for_fixed_steps,
-    raise_on_failure,
     RK4,
     runge_kutta_step,
     solve_result,
-    Start,
     tableau_of,
+    throwing_adjoint,
+    TimeOffset,
 )
 from .._jax import by_components, join_state, split_state
 from .._module import parameter
@@ -43,7 +43,8 @@ _SDE_SOLVERS = (
 
 
 class Discretized(AbstractDiscretization):
-    r"""The exact-at-the-switch, zero-order-hold discretisation of a system.
+    r"""Zero-order-hold discretisation: a system is integrated over one control interval
+    with the control held.
 
     `x_next = x + integral over [t, t + dt] of f(s, x(s), u, w) ds`, the control (and a
     disturbance that enters the field) held over the interval; then the system's
@@ -55,11 +56,11 @@ class Discretized(AbstractDiscretization):
     `diffrax.diffeqsolve`, whose gradient is taken as `adjoint` says.
 
     The interval is integrated in its own time, from 0, so that an autonomous step is
-    the same at any `t`. A field of time, or a diffusion, is evaluated at `t + s`. Below
-    double precision that sum is rounded (by up to 5e-4 at 1e4 in float32), and the
-    field is then corrected by its first two derivatives with respect to time along the
-    rounding error. One that cannot be differentiated twice forwards (a
-    `jax.custom_vjp` of time) stays as it is at the rounded time.
+    the same at any `t`. A time-dependent field or diffusion is evaluated at `t + s`.
+    Below double precision that sum is rounded (by up to 5e-4 at 1e4 in float32), and
+    the field is then corrected by its first two derivatives with respect to time along
+    the rounding error. One without a second forward-mode derivative (a
+    `jax.custom_vjp` of time) is evaluated at the rounded time.
 
     If the system has a `diffusion`, then `w` holds the Brownian increments of the
     substeps one after the other, each with variance `dt / substeps`, and the solver is
@@ -73,7 +74,7 @@ class Discretized(AbstractDiscretization):
         compile again).
     - `solver`: a Diffrax solver; [`delucax.dynamics.RK4`][] by default, and
         `diffrax.Euler` for a system with a diffusion.
-    - `substeps`: solver steps an interval, 1 by default; fixed-step only.
+    - `substeps`: solver steps per interval, 1 by default; fixed-step only.
     - `stepsize_controller`: such as `diffrax.PIDController(rtol=1e-6, atol=1e-8)`;
         `None` for fixed steps.
     - `adjoint`: any `diffrax.AbstractAdjoint`; `diffrax.RecursiveCheckpointAdjoint()`
@@ -109,7 +110,7 @@ class Discretized(AbstractDiscretization):
 
     system: AbstractSystem
     dt: Real = parameter()
-    solver: diffrax.AbstractSolver = eqx.field(default=None)
+    solver: diffrax.AbstractSolver | None = None
     substeps: int = eqx.field(default=1, static=True)
     stepsize_controller: diffrax.AbstractStepSizeController | None = None
     adjoint: diffrax.AbstractAdjoint | None = None
@@ -157,14 +158,14 @@ class Discretized(AbstractDiscretization):
 
     @property
     def disturbance_size(self):
-        """That of the system; of a diffusion, its Brownian motions times the substeps,
-        of each of which `w` holds the increments.
+        """The size of `w`: that of the system; with a diffusion times the substeps, as
+        `w` holds one increment of each Brownian motion per substep.
         """
         return self.system.disturbance_size * (self.increments or 1)
 
     @property
     def increments(self):
-        """One a substep, where the system has a diffusion."""
+        """One increment per substep for a system with a diffusion, else 0."""
         return self.substeps if self.noise == "brownian" else 0
 
     def advance(self, t, x, u, w):
@@ -179,7 +180,7 @@ class Discretized(AbstractDiscretization):
         # An interval is integrated from 0 to dt: where t is large, t + dt is rounded,
         # and so would the length of the interval be.
         t = jnp.asarray(t, x.dtype)
-        start = Start(t, lambda t: evaluate_field(system, t, x, u, held))
+        start = TimeOffset(t, lambda t: evaluate_field(system, t, x, u, held))
         args = system, start, u, held
         if self.stepsize_controller is not None:
             x_next, result = self._adaptive(x, args)
@@ -190,7 +191,8 @@ class Discretized(AbstractDiscretization):
                 x_next, result = step(0, x, increments[0] if noisy else None)
             else:
                 x_next, result = self._repeat(step, x, increments)
-        # Once an interval, not once a step: the field is that of the whole space.
+        # Once per interval, not per substep: the field is defined off the manifold,
+        # too.
         x_next = system.project(x_next)
         check_returned(x_next, x, system, "project")
         if added is not None:
@@ -198,11 +200,12 @@ class Discretized(AbstractDiscretization):
         return x_next.astype(x.dtype), result
 
     def _fixed_step(self, args):
-        """A step, as a function of the time in the interval and the state."""
+        """A substep, as a function of the time in the interval and the state."""
         system, start, u, held = args
+        assert self.solver is not None
         h, tableau = self.dt / self.substeps, tableau_of(self.solver)
         if tableau is None:
-            solver, term = for_fixed_steps(self.solver), diffrax.ODETerm(_field)
+            solver, term = as_fixed_step_solver(self.solver), diffrax.ODETerm(_field)
             return lambda s, x, _: _solver_step(solver, term, s, x, h, args)
 
         def field(s, x):
@@ -217,13 +220,13 @@ class Discretized(AbstractDiscretization):
         return lambda s, x, _: (step(s, x, h), RESULTS.successful)
 
     def _noisy_step(self, x, args):
-        """The same with an increment of the Brownian motions."""
+        """A substep with an increment of the Brownian motions."""
         system, start, u, _ = args
         h = self.dt / self.substeps
-        start = Start(start.t, lambda t: system.diffusion(t, x, u))
+        start = TimeOffset(start.t, lambda t: system.diffusion(t, x, u))
 
         def g(s, x):
-            return start.after(s, lambda t: system.diffusion(t, x, u))
+            return start.evaluate(s, lambda t: system.diffusion(t, x, u))
 
         def step(s, x, dB):
             # Euler and Maruyama's method; Diffrax's takes a term with a path of its
@@ -251,22 +254,27 @@ class Discretized(AbstractDiscretization):
         return join_state(parts, x.shape[0]), first_of(results)
 
     def _adaptive(self, x, args):
-        assert self.stepsize_controller is not None and self.adjoint is not None
+        solver, controller, adjoint = (
+            self.solver,
+            self.stepsize_controller,
+            self.adjoint,
+        )
+        assert solver is not None and controller is not None and adjoint is not None
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(_field),
-            self.solver,
+            solver,
             jnp.zeros((), x.dtype),
             self.dt,
             dt0=None,
             y0=x,
             args=args,
-            stepsize_controller=self.stepsize_controller,
-            adjoint=raise_on_failure(self.adjoint),
+            stepsize_controller=controller,
+            adjoint=throwing_adjoint(adjoint),
             max_steps=self.max_steps,
             throw=False,
         )
         assert solution.ys is not None
-        result = solve_result(solution, self.stepsize_controller, x.dtype)
+        result = solve_result(solution, controller, x.dtype)
         return solution.ys[0], result
 
 
@@ -293,11 +301,11 @@ class _BrownianTerm(diffrax.AbstractTerm):
 
 
 def _field(s, x, args):
-    """The vector field at `s` after the start of the interval. An adjoint reaches what
-    is in `args`, not what a function closes over.
+    """The vector field at `s` after the start of the interval. Adjoints differentiate
+    `args` only, not closures.
     """
     system, start, u, held = args
-    return start.after(s, lambda t: evaluate_field(system, t, x, u, held))
+    return start.evaluate(s, lambda t: evaluate_field(system, t, x, u, held))
 
 
 def _solver_step(solver, term, s, x, h, args):
@@ -312,6 +320,6 @@ def _solver_step(solver, term, s, x, h, args):
     )
     if result is diffrax.RESULTS.successful:
         return x_next, RESULTS.successful
-    # The words of Diffrax for it speak of the steps of a step-size controller.
+    # Diffrax's message refers to a step-size controller, which there is not.
     solved = promote(result) == RESULTS.successful
     return x_next, choose(solved, RESULTS.successful, RESULTS.stage_not_solved)

@@ -85,17 +85,17 @@ def linearize(
     - `model`: an [`delucax.AbstractDynamics`][] or [`delucax.AbstractSystem`][].
     - `t`: time, 0 by default.
     - `x`, `u`: the state and control to linearise at; by default the `equilibrium` that
-        the model names. The [`delucax.dynamics.OperatingPoint`][] that
-        [`delucax.trim`][] computes stands as `x` for both. Any point will do: it is the
-        regulators which ask that the plant rests there, as
-        [`delucax.controllers.LQR`][] says.
+        the model defines. The [`delucax.dynamics.OperatingPoint`][] that
+        [`delucax.trim`][] computes may be passed as `x`; it supplies both. Any point is
+        valid here, but regulators such as [`delucax.controllers.LQR`][] need an
+        equilibrium.
 
     **Returns:** [`delucax.LinearDynamics`][] of dynamics, with the same `dt`;
     [`delucax.systems.LinearSystem`][] of a system. `E` is the derivative with respect
     to the disturbance.
 
     **Raises:** `ValueError` on a wrong shape, or if no point is given and the model
-    names none.
+    defines no equilibrium.
 
     !!! example
 

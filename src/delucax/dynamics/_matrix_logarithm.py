@@ -12,17 +12,17 @@ from ..math._linear_solve import full_precision, solve
 _MAX_ROOTS = 40
 _MAX_ROOT_STEPS = 60
 _CLOSE = 0.25
-"""How far from the identity the quadrature is exact to rounding."""
+"""The distance from the identity up to which the quadrature is exact to rounding."""
 _SQUARINGS = 12
 _TERMS = 9
-"""Of the exponential's series: exact to rounding for norms up to 300."""
+"""The terms of the exponential's series: exact to rounding for norms up to 300."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
 def logarithm(
     A: Float[Array, "n n"],
 ) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
-    """The principal logarithm, and whether there is none.
+    """The principal logarithm, and whether it failed.
 
     It is differentiated as the inverse of the exponential that it is: the derivative of
     the exponential is linear, and the block logarithm below solves it.
@@ -120,8 +120,8 @@ def _by_roots(A: Array) -> tuple[Array, Array]:
 def _square_root(A: Array) -> tuple[Array, Array]:
     """The principal square root, by the product form of Denman and Beavers' iteration.
 
-    `M` goes to the identity and `Y` to the root. On the negative half-line there is
-    none, and `M` goes nowhere.
+    `M` converges to the identity and `Y` to the root, and neither does if an eigenvalue
+    is on the closed negative real axis.
     """
     n, eps = A.shape[0], jnp.finfo(A.dtype).eps
     # Y_{k+1} = Y_k (I + M_k^-1) / 2, M_{k+1} = (I + (M_k + M_k^-1) / 2) / 2, which is
@@ -145,5 +145,5 @@ def _square_root(A: Array) -> tuple[Array, Array]:
     far = jnp.asarray(jnp.inf, A.dtype)
     start = (A, A, jnp.asarray(jnp.finfo(A.dtype).max, A.dtype), far, jnp.asarray(0))
     _, root, error, *_ = lax.while_loop(proceeds, body, start)
-    # A NaN compares false, and is no root.
+    # Written so that NaN counts as no root.
     return root, error < eps**0.5 * n

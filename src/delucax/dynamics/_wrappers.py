@@ -16,13 +16,14 @@ from ._base import AbstractDynamics, AbstractWrapper
 
 
 class Delayed(AbstractWrapper):
-    """Dynamics whose controls act, or whose sensor reads, some whole steps late,
+    """Dynamics with an input delay, an output delay or both, in whole steps,
 
     `x_next = F(t, x, u[k - controls], w)`, `y = observe(t, x)[k - sensor]`.
 
-    What is under way is part of the state: `(x, u[k - 1], ..., u[k - controls],
-    y[k - 1], ..., y[k - sensor])`. It is a true transport delay, differentiable like
-    any other state; for the delay of a fraction of a step discretise a lag.
+    Pending controls and observations are part of the state: `(x, u[k - 1], ...,
+    u[k - controls], y[k - 1], ..., y[k - sensor])`. It is a true transport delay,
+    differentiable like any other state. For a fraction of a step use a first-order lag
+    or a Padé approximation in the system.
 
     **Arguments:**
 
@@ -63,7 +64,7 @@ class Delayed(AbstractWrapper):
         return (*inner.state_names, *late)
 
     def _cut(self, x: Array) -> tuple[Array, Array, Array]:
-        """The plant's own state, the controls and the observations under way."""
+        """The plant's own state, the pending controls and the pending observations."""
         n = self.dynamics.state_size
         m = n + self.controls * self.dynamics.control_size
         return x[:n], x[n:m], x[m:]
@@ -83,10 +84,10 @@ class Delayed(AbstractWrapper):
         **Arguments:**
 
         - `x`: the plant's own state.
-        - `u`: the control that is under way, zero by default.
+        - `u`: the pending control, zero by default.
 
-        **Returns:** the state, with the control and what the sensor reads of `x` in
-        every place under way.
+        **Returns:** the state, in which every pending control is `u` and every pending
+        observation that of `x`.
 
         **Raises:** `ValueError` on a wrong shape.
         """
@@ -141,19 +142,19 @@ class WorstCase(AbstractWrapper):
 
     `x_next = F(t, x, u, w + L difference(x, x_ref))`,
 
-    about the operating point that the dynamics name. With the `L` of
+    about the operating point that the dynamics define. With the `L` of
     [`delucax.controllers.HInfinity`][] or of [`delucax.riccati.hinf_dare`][] it is the
     worst disturbance of the H-infinity game; a `bound` keeps it within what a
     disturbance can be.
 
     **Arguments:**
 
-    - `dynamics`: the plant, which names an equilibrium.
+    - `dynamics`: the plant, which defines an equilibrium.
     - `L`: the adversary's gain, shape `(k, n)`.
     - `bound`: what it adds is scaled back to this Euclidean norm; none by default.
 
-    **Raises:** `ValueError` if `dynamics` are none or name no equilibrium, `L` does not
-    fit them, or `bound` is not positive.
+    **Raises:** `ValueError` if `dynamics` are none or define no equilibrium, `L` does
+    not fit them, or `bound` is not positive.
 
     Source: Basar and Bernhard, 1995.
 
@@ -182,7 +183,7 @@ class WorstCase(AbstractWrapper):
     def __check_init__(self):
         where, dynamics = "WorstCase", self.dynamics
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
-        dynamics.equilibrium()  # raises where none is named
+        dynamics.equilibrium()  # raises where there is none
         as_matrix(self.L, "L", where)
         shape = dynamics.disturbance_size, dynamics.state_size
         if self.L.shape != shape:
@@ -194,7 +195,7 @@ class WorstCase(AbstractWrapper):
             check_positive(self.bound, "bound", where)
 
     def attack(self, x: Array) -> Array:
-        """What the adversary adds to the disturbance.
+        """The adversary's part of the disturbance.
 
         **Arguments:** `x`: the state.
 

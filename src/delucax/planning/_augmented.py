@@ -1,4 +1,4 @@
-"""Constraints, by the method of multipliers."""
+"""Constrained plans, by the method of multipliers (augmented Lagrangian)."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from .._results import choose, RESULTS
 from ._descent import optimise, Options, Outcome
 from ._problem import Multipliers, Problem, updated, violated
-from ._start import begin, controls_of, Start
+from ._start import controls_of, Start
 
 
 FIRST_RHO = 10.0
@@ -74,9 +74,9 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
     zeros = (jnp.zeros(c.shape, dtype) for c, _ in sizes)
     multipliers = Multipliers(*zeros, jnp.full((), FIRST_RHO, dtype))
     rollouts = 0
-    if start.count > 1:
+    if start.controls.ndim == 3:
         rollouts = start.count
-        start = begin(problem.with_multipliers(multipliers), start)[0]
+        start = start.cheapest(problem.with_multipliers(multipliers))[0]
     states = start.states if options.states is None else options.states
     if states is None:
         states = jnp.broadcast_to(problem.x0, (T + 1, n))

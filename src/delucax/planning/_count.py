@@ -1,4 +1,4 @@
-"""How often the dynamics are evaluated, counted as it happens."""
+"""A run-time counter of evaluations of the dynamics, by host callbacks."""
 
 from collections.abc import Callable
 from queue import SimpleQueue
@@ -29,9 +29,9 @@ def count_evaluations(
 ) -> tuple[Any, Evaluations]:
     """Run a function of dynamics, and count how often it evaluates them.
 
-    The dynamics that it is given report each evaluation to the host as it happens, in
-    compiled loops whose length only the data decide, too. Under `jax.vmap` each lane
-    counts. What XLA finds that nothing depends on is not evaluated, and not counted. It
+    The dynamics that it is given report each evaluation to the host as it happens, also
+    in compiled loops whose length depends on the data. Under `jax.vmap` each lane
+    counts. Dead code that XLA removes is not counted. It
     is for counting, not for timing: each report takes microseconds, and each call
     compiles anew.
 

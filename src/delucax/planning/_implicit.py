@@ -22,19 +22,20 @@ from ..math._linear_solve import full_precision
 from ._augmented import with_constraints
 from ._descent import Options, Outcome
 from ._lq import apply, in_parallel, in_sequence, product, solve_free, Stages
-from ._problem import costates_of, model, Multipliers, Problem
+from ._model import costates_of, model
+from ._problem import Multipliers, Problem
 from ._start import controls_of, Start
 
 
 REFINEMENTS = 20
-"""Of the linear problem with constraints, each of which gains more than a digit."""
+"""The refinements of the constrained linear solve, each worth more than a digit."""
 STIFFER = 10.0
-"""The weight of constraints there, times that at which the planner converged."""
+"""The weight of the constraints in it, relative to the planner's last one."""
 
 
 @eqx.filter_custom_jvp
 def solution(problem: Problem, start: Start, options: Options) -> Outcome:
-    """What the iteration ends with; differentiable with respect to the problem."""
+    """The outcome of the iteration, differentiable with respect to the problem."""
     return by_lanes(with_constraints, problem, start, options)
 
 
@@ -53,8 +54,8 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
     )
     varied, rest = eqx.partition(problem, has_tangent)
     solved = out.result == RESULTS.successful
-    # What failed is not used, but must be finite for what is to have a derivative: so
-    # the problem is looked at where it began.
+    # A failed outcome is not used, but derivatives at it must be finite for those of
+    # other members of a batch: so they are taken at the start.
     x0 = jnp.where(jnp.isfinite(problem.x0), problem.x0, 0)
     X = jnp.where(solved, out.states, x0)
     U = jnp.where(solved, out.controls, controls_of(start))
@@ -82,8 +83,8 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
 def _change(
     X: Array, U: Array, y: Multipliers | None, problem: Problem, given, varied, change
 ):
-    """Of states, controls and multipliers with the problem; which controls are free;
-    and whether the solution is a strict minimum."""
+    """The tangents of states, controls and multipliers; which controls are free; and
+    whether the solution is a strict minimum."""
     n, T = X.shape[1], U.shape[0]
     # Without the squares the augmented Lagrangian is the Lagrangian.
     plain = None if y is None else y._replace(rho=jnp.zeros_like(y.rho))
@@ -93,9 +94,8 @@ def _change(
     z = jnp.concatenate([X[:-1], U], axis=1)
 
     def conditions(varied):
-        """The gradient of the Lagrangian, what the constraints and the dynamics ask
-        for, and the data; at the solution, which is held. Their change with the problem
-        is the right side of the linear problem."""
+        """The optimality conditions at the fixed solution. Their tangents with respect
+        to the problem are the right side of the linear problem."""
         problem = given(varied).with_multipliers(plain)
         times = problem.times(T)
 
@@ -172,7 +172,7 @@ def _with_constraints(stages, active, dc, y, dx0, fixed, free):
 
 
 class Factors(NamedTuple):
-    """What a linear problem with other linear terms has in common."""
+    """The factorised quadratic part of a linear-quadratic problem."""
 
     K: Array
     V: Array  # of the next state

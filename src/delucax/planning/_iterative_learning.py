@@ -25,18 +25,20 @@ from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ._descent import first_accepted, LEAST_MU, MOST_MU
 from ._lq import in_sequence, Policy
-from ._planner import checked_plan, Plan, plan_of
-from ._problem import model as local_model, Problem, roll_out
+from ._model import model as local_model
+from ._plan import Plan
+from ._planner import checked_plan
+from ._problem import Problem, roll_out
 
 
 GROWTH = 10.0
-"""Of the regularisation, from pass to pass, until the problem is convex."""
+"""The growth of the regularisation per pass, until the problem is convex."""
 SLOWER = 0.01
-"""What a failed search of `igpc` multiplies the learning rate by."""
+"""The factor of the learning rate after a failed search of `igpc`."""
 
 
 class _Online(NamedTuple):
-    """What `igpc` learns within a run."""
+    """The options of the online learning within a run of `igpc`."""
 
     memory: int
     horizon: int
@@ -55,7 +57,7 @@ def ilc(
     throw: bool = True,
 ) -> Plan:
     """Iterative learning control: improve a plan by running it on the plant, and
-    learning from a model that is not the plant how to change it.
+    changing it by the derivatives of a model that is not the plant.
 
     Each iteration linearises the model along the last run of the plant, solves the
     linear-quadratic problem, and runs `u - a k - K (x - x_last)` on the plant, for
@@ -129,17 +131,16 @@ def igpc(
     throw: bool = True,
 ) -> Plan:
     """Iterative gradient perturbation control: iterative learning control in which each
-    run learns online, too, from how the plant leaves the model:
+    run learns online, too, from the model mismatch:
 
     `u_t = u_last - a k - K (x_t - x_last) + sum_{i=1..memory} E_i w_{t-i} + o`, with
     `w_t = x_{t+1} - F(t, x_t, u_t)`, F being the model.
 
-    E and o start at zero in each run, and follow at step t, by `learning_rate / t`, the
-    gradient of the last cost of a roll-out of `horizon` steps, from a state that was
-    met to the present one, through the model and what it left over. The next iteration
-    linearises along the run, so what was learned within it stays. For the rest it is
-    [`delucax.planning.ilc`][]. On the paper's quadrotor it needs fewer runs than
-    that; over many winds, with the steps of both well chosen, it does not.
+    E and o start at zero in each run. At step t they descend, with rate
+    `learning_rate / t`, along the gradient of a counterfactual cost: the last one of
+    `horizon` steps through the model, with the observed mismatch added. The next
+    iteration linearises along the run, so what was learned within it stays. Otherwise
+    it is identical to [`delucax.planning.ilc`][].
 
     **Arguments:**
 
@@ -147,12 +148,12 @@ def igpc(
         [`delucax.planning.ilc`][].
     - `learning_rate`: 0.001 by default.
     - `memory`: the number of past disturbances, 3 by default.
-    - `horizon`: of the roll-out, 3 by default.
+    - `horizon`: the steps of the counterfactual cost, 3 by default.
     - `indices`: `"aligned"` (default), each disturbance at the step that it was met;
         or `"deluca"`, for comparison: one step early, as in the original library.
-    - `anneal`: if true (default), a search tries six steps, of which one must lower the
-        cost, or else the learning rate is divided by 100; if false, it tries ten, of
-        which one must not raise it, or else it ends.
+    - `anneal`: if true (default), a search tries up to 6 steps until one lowers the
+        cost, and divides the learning rate by 100 if none does. If false, it tries up
+        to 10 steps until one does not raise the cost, and stops if all do.
 
     **Returns:** a [`delucax.planning.Plan`][], as from [`delucax.planning.ilc`][]:
     the best run of the plant, what was learned within it included, and feedback about
@@ -180,7 +181,7 @@ def igpc(
     """
     where = "igpc"
     check_number(learning_rate, "learning_rate", where)
-    # A rate of zero is legal, because it leaves the feedback alone.
+    # A rate of zero is valid: only the feedback acts then.
     if not (isinstance(learning_rate, int | float) and learning_rate == 0):
         check_positive(learning_rate, "learning_rate", where)
     check_choice(indices, ("aligned", "deluca"), "indices", where)
@@ -317,8 +318,7 @@ def _iterate(
     reached = jnp.arange(iterations + 1) <= end.iteration
     early = end.iteration < iterations
     result = choose(early, RESULTS.no_descent, RESULTS.successful)
-    return plan_of(
-        plant,
+    return plant.plan(
         states,
         controls,
         cost,
@@ -357,9 +357,9 @@ def _perturbed(
         return plant.clip(u + jnp.einsum("imn,in->m", E, w) + o)
 
     def last_cost(learned, x, first, w):
-        """Of a roll-out through the model, from step `first`: what would have been
-        charged if `learned` had acted all along. The disturbances are those that the
-        plant showed, which is what makes the cost counterfactual."""
+        """The counterfactual cost: the last one of a rollout through the model, from
+        step `first`, as if `learned` had acted in it, with the observed disturbances.
+        """
         cost = jnp.zeros((), dtype)
         for j in range(horizon):
             k = first + j

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from ..math import matvec
 from ..math._linear_solve import full_precision, is_definite, SMALL, solve
-from ..riccati._recursion import gain, linear_recursion, values
+from ..riccati import dre
 
 
 _UNROLL = 16
@@ -32,10 +32,8 @@ class Stages(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """The changes `-k - K dx` of the controls, and what they promise.
-
-    A step of length `alpha` is promised to change the cost by
-    `alpha slope + alpha^2 curvature / 2`.
+    """The changes `-k - K dx` of the controls, and the predicted change of the cost:
+    `alpha slope + alpha^2 curvature / 2` for a step of length `alpha`.
     """
 
     K: Array
@@ -82,7 +80,7 @@ def solve_definite(matrix: Array, right: Array) -> tuple[Array, Array]:
     # from the right sides, in which the solution is linear.
     rows = [matrix[i, i:] for i in range(m)]
     sides = [right[i] for i in range(m)]
-    # What is left of a diagonal entry after the elimination may be rounding alone.
+    # A pivot below this share of its diagonal entry may be rounding alone.
     least = m * jnp.finfo(matrix.dtype).eps
     pivots, ok = [], jnp.asarray(True)
     for i in range(m):
@@ -137,7 +135,7 @@ def in_sequence(
         pivot, cross = Quu + extra[:, n:], Qux + extra[:, :n]
         change = None
         if box is not None:
-            change, free = box_minimum(pivot, Qu, *box)
+            change, free = solve_box_qp(pivot, Qu, *box)
         S, ok = solve_free(pivot, jnp.concatenate([cross, Qu[:, None]], 1), free)
         K, k = S[:, :n], S[:, n] if change is None else -change
         ok = ok & jnp.all(jnp.isfinite(k))
@@ -170,7 +168,7 @@ def solve_free(matrix: Array, right: Array, free: Array | None) -> tuple[Array, 
     return solve_definite(matrix, jnp.where(free[:, None], right, 0))
 
 
-def box_minimum(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Array]:
+def solve_box_qp(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Array]:
     """The minimum of `1/2 u'H u + g'u` between bounds, and which entries are free.
 
     By projected Newton steps, which find the active bounds in a few.
@@ -228,33 +226,22 @@ def in_parallel(stages: Stages, mu: Array) -> Policy:
     """
     F, H, h, d, V, v = stages
     n = V.shape[0]
-    A, B = F[..., :n], F[..., n:]
+    A, B, q, r = F[..., :n], F[..., n:], h[:, :n], h[:, n:]
     Q, S, R = H[:, :n, :n], H[:, :n, n:], H[:, n:, n:]
-    eye = jnp.eye(B.shape[2], dtype=F.dtype)
-    damped = R + mu * eye
-    X = values(A, B, Q, damped, S, V, 0, True)
-    ok = jnp.all(jnp.isfinite(X))
-    after = jnp.where(ok, X[1:], 0)
-    # Not finite numbers would be those of every step after the scans.
-    safe = jnp.where(ok, damped, eye)
-    K, loop = jax.vmap(gain)(A, B, safe, S, after)
-    # With the gains known the linear part is a recursion of its own, associative too:
-    # p = (A - B K)'(p_next + V_next d) + q - K'r.
-    q, r = h[:, :n], h[:, n:]
-    shift = 0 if d is None else jnp.einsum("tij,tj->ti", after, d)
-    added = jnp.einsum("tji,tj->ti", loop, shift + jnp.zeros_like(q)) + q
-    added = added - jnp.einsum("tji,tj->ti", K, r)
-    p = linear_recursion(loop, added, v, True, lambda loop, p: loop.T @ p)
-    pushed = jnp.einsum("tji,tj->ti", B, p[1:] + shift)
-    gradient = r + pushed
-    k = jax.vmap(solve)(safe + B.mT @ after @ B, gradient[..., None])[..., 0]
-    ok = ok & jnp.all(jnp.isfinite(k))
-    K, k = jnp.where(ok, K, 0), jnp.where(ok, k, 0)
-    slope, curvature = promised(stages, K, k)
-    return Policy(K, k, gradient, jnp.max(jnp.abs(pushed)), slope, curvature, ok)
+    damped = R + mu * jnp.eye(B.shape[2], dtype=F.dtype)
+    rest = dict(final=V, d=d, q=q, r=r, final_q=v, parallel=True, throw=False)
+    solution = dre(A, B, Q, damped, S, **rest)
+    ok = jnp.all(jnp.isfinite(solution.K)) & jnp.all(jnp.isfinite(solution.k))
+    parts = solution.X[1:], solution.p[1:], solution.K, solution.k
+    X, p, K, k = (jnp.where(ok, part, 0) for part in parts)
+    # The gradient of the cost-to-go 1/2 x'X x + p'x of the next state, by the control.
+    shift = 0 if d is None else jnp.einsum("tij,tj->ti", X, d)
+    pushed = jnp.einsum("tji,tj->ti", B, p + shift)
+    slope, curvature = predicted_change(stages, K, k)
+    return Policy(K, k, r + pushed, jnp.max(jnp.abs(pushed)), slope, curvature, ok)
 
 
-def promised(stages: Stages, K: Array, k: Array) -> tuple[Array, Array]:
+def predicted_change(stages: Stages, K: Array, k: Array) -> tuple[Array, Array]:
     """Slope and curvature of the cost along the step, by following the linear model."""
     F, H, h, d, V, v = stages
 

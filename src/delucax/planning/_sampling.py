@@ -1,4 +1,4 @@
-"""Planners that draw sequences of controls: MPPI and the cross-entropy method."""
+"""Sampling-based planners: MPPI and the cross-entropy method."""
 
 import abc
 from typing import ClassVar
@@ -19,16 +19,16 @@ from .._check import (
 )
 from .._message import shortened
 from .._module import parameter
-from .._results import choose, RESULTS
 from .._typing import PRNGKey
-from ._planner import AbstractPlanner, Plan, plan_of
-from ._problem import Problem, roll_out
-from ._start import begin, controls_of, Start
+from ._plan import Plan
+from ._planner import AbstractPlanner
+from ._problem import Problem
+from ._start import controls_of, Start
 
 
 class AbstractSampler(AbstractPlanner):
-    """A planner that draws sequences of controls about a mean, moves the mean, and so
-    on. The cheapest of the means is the plan."""
+    """A sampling-based planner: sequences of controls are drawn about a mean, which
+    `update` moves, in each iteration. The cheapest of the means is the plan."""
 
     samples: eqx.AbstractVar[int]
     iterations: eqx.AbstractVar[int]
@@ -86,7 +86,7 @@ def _draw(key: PRNGKey, correlation: Array, count: int, like: Array) -> Array:
     T, m = like.shape
     fresh = jr.normal(key, (T, count - 1, m), like.dtype)
     # An autoregression of order one, v_k = rho v_{k-1} + sqrt(1 - rho^2) e_k, whose
-    # variance stays 1. The square root has an infinite slope at rho = 1.
+    # variance stays 1. sqrt(1 - rho^2) is not differentiable at rho = 1.
     rest = jnp.maximum(1 - correlation**2, jnp.finfo(like.dtype).eps)
 
     def follow(before, now):
@@ -104,11 +104,9 @@ def _search(
 ) -> Plan:
     controls = controls_of(start)
     if start.gains is not None or start.count > 1:
-        controls = begin(problem, start)[2]
+        controls = start.cheapest(problem)[2]
     T, m = controls.shape
-    # Without gains no state is followed, so any will do.
-    held = jnp.broadcast_to(problem.x0, (T + 1, *problem.x0.shape))
-    cost_of = lambda controls: roll_out(problem, held, controls)[2]
+    cost_of = lambda controls: problem.roll_out(controls)[2]
 
     def better(best, *now):
         return jax.tree.map(lambda a, b: jnp.where(now[1] < best[1], a, b), now, best)
@@ -133,16 +131,13 @@ def _search(
     keys = jr.split(key, planner.iterations)
     (mean, _, best, moved), trace = lax.scan(body, first, keys)
     best = better(best, mean, cost_of(mean))
-    states, planned, cost = roll_out(problem, held, best[0])
-    return plan_of(
-        problem,
+    states, planned, cost = problem.roll_out(best[0])
+    return problem.plan(
         states,
         planned,
         cost,
-        gains=jnp.zeros((T, m, problem.x0.shape[0]), mean.dtype),
         trace=jnp.concatenate([trace, cost[None]]),
         residual=moved,
-        result=choose(jnp.isfinite(cost), RESULTS.successful, RESULTS.diverged),
         iterations=jnp.asarray(planner.iterations),
         rollouts=jnp.asarray(planner.samples * planner.iterations + 1),
     )

@@ -1,4 +1,4 @@
-"""Where planners start: trajectories under feedback, of which the cheapest is taken."""
+"""The starts of planners: trajectories under feedback."""
 
 from typing import Any
 
@@ -16,7 +16,8 @@ from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math._linear_solve import is_definite
 from ..riccati import dare
-from ._problem import model, Problem, roll_out
+from ._model import model
+from ._problem import Problem
 
 
 class Start(eqx.Module):
@@ -113,6 +114,29 @@ class Start(eqx.Module):
             )
         return Start(*arrays)
 
+    def cheapest(self, problem: Problem) -> tuple["Start", Array, Array, Array]:
+        """The start with the cheapest trajectory.
+
+        **Arguments:** `problem`: a [`delucax.planning.Problem`][].
+
+        **Returns:** `(start, states, controls, cost)`: the start alone, and what
+        `problem.roll_out` returns for it; the cost is infinite if all diverge.
+        """
+
+        def roll(start):
+            states, gains = start.states, start.gains
+            states, controls, cost = problem.roll_out(start.controls, states, gains)
+            # The controls of a start that diverges are finite at least as given.
+            given = jax.vmap(problem.clip)(start.controls)
+            return states, jnp.where(jnp.isfinite(cost), controls, given), cost
+
+        if self.controls.ndim == 2:
+            return self, *roll(self)
+        # A loop over scalars is faster on CPU than one over vectors of a few entries.
+        rolled = lax.map(roll, self)
+        best = jnp.argmin(lax.stop_gradient(rolled[2]))
+        return jax.tree.map(lambda a: a[best], (self, *rolled))
+
     @staticmethod
     def default(
         dynamics: AbstractDynamics,
@@ -128,12 +152,12 @@ class Start(eqx.Module):
         2. with its control held.
 
         The operating point is the `targets` of the cost where they name both a state
-        and a control. Otherwise it is the equilibrium that the dynamics name. Where
-        they name none, zeros stand in for the target that is missing, or for both. Such
-        a point need not be an equilibrium, and an LQR about it may be a poor start:
-        name the state to regulate to and the control that holds it, which
-        [`delucax.trim`][] finds. A [`delucax.costs.Quadratic`][] has targets, and so
-        has what is made of it by `+`, `*` or [`delucax.costs.Rate`][].
+        and a control; otherwise the equilibrium that the dynamics define; otherwise
+        zeros stand in for a target that is missing. A [`delucax.costs.Quadratic`][] has
+        targets, and so has what is made of it by `+`, `*` or [`delucax.costs.Rate`][].
+
+        If that point is not an equilibrium, an LQR about it may be a poor start: give
+        the cost both targets, which [`delucax.trim`][] finds.
 
         The weights of the LQR are the second derivatives of the stage cost at that
         point.
@@ -151,7 +175,7 @@ class Start(eqx.Module):
         - `dynamics`: the discrete-time dynamics.
         - `cost`: the stage and final cost.
         - `horizon`: the steps `T`.
-        - `t0`: the time at which both are looked at, 0 by default.
+        - `t0`: the time at which both are evaluated, 0 by default.
         - `controls`: in place of those of the second one, shape `(T, m)`.
 
         **Returns:** a [`delucax.planning.Start`][]. No derivative goes through it.
@@ -233,25 +257,3 @@ def _both(point, regulator, controls, T):
 def controls_of(start: Start) -> Array:
     """The controls of the first start, shape `(T, m)`."""
     return start.controls[0] if start.controls.ndim == 3 else start.controls
-
-
-def begin(problem: Problem, start: Start) -> tuple[Start, Array, Array, Array]:
-    """The cheapest start, and its states, controls and cost, infinite if all of them
-    diverge."""
-
-    def roll(start):
-        states, gains = start.states, start.gains
-        if states is None:
-            points = start.controls.shape[0] + 1
-            states = jnp.broadcast_to(problem.x0, (points, *problem.x0.shape))
-        states, controls, cost = roll_out(problem, states, start.controls, gains)
-        # Of a start that diverges at least the controls are as they were given.
-        given = jax.vmap(problem.clip)(start.controls)
-        return states, jnp.where(jnp.isfinite(cost), controls, given), cost
-
-    if start.controls.ndim == 2:
-        return start, *roll(start)
-    # A loop over scalars is faster on CPU than one over vectors of a few entries.
-    rolled = lax.map(roll, start)
-    best = jnp.argmin(lax.stop_gradient(rolled[2]))
-    return jax.tree.map(lambda a: a[best], (start, *rolled))

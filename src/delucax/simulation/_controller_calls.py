@@ -23,8 +23,8 @@ def call_controller(
         if isinstance(returned, jax.Array):
             got = f"an array of shape {returned.shape}"
         raise ValueError(
-            f"{type(controller).__name__}: must return (u, state), the state as it was "
-            f"given if there is none to keep, got {got}."
+            f"{type(controller).__name__}: must return (u, state), the state unchanged "
+            f"if the controller has none, got {got}."
         )
     u, after = returned
     return u, after
@@ -43,7 +43,7 @@ def check_control(u: Any, source: Any, size: int, taker: str) -> None:
 
 
 def controller_result(counts: dict[str, Array], before: dict[str, Array]) -> Result:
-    """What became of a controller, by its tallies before a run and after it."""
+    """The result by a controller's incident counters before a run and after it."""
     result = RESULTS.successful
     for name, kind in INCIDENTS.items():
         if name in counts:
@@ -53,7 +53,7 @@ def controller_result(counts: dict[str, Array], before: dict[str, Array]) -> Res
 
 
 def check_state(controller: AbstractController, first: PyTree, after: PyTree) -> None:
-    """Raise unless a controller's state is made as the `first` one, that of `init`.
+    """Raise unless a controller's state has the structure of the `first`, of `init`.
 
     A loop carries arrays of fixed shapes and dtypes, and nothing else.
     """

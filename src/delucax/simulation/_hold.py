@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._controller import AbstractController, tallies
-from .._integration import AbstractTransparentSolver, evaluate_field, Start
+from .._integration import AbstractForwardingSolver, evaluate_field, TimeOffset
 from ..systems import AbstractSystem
 from ._controller_calls import call_controller, check_control, check_state
 
@@ -22,7 +22,7 @@ class Inputs(eqx.Module):
     """
 
     system: AbstractSystem
-    start: Start  # the time at which the solve's own begins
+    start: TimeOffset  # the time at which the solve's own begins
     source: Any  # a controller, or a function of time; None for an array
     memory: Any  # the controller's first state
     controls: Array | None
@@ -68,13 +68,13 @@ class Inputs(eqx.Module):
 
 def field(s, x, args):
     """The vector field at `s` after the start."""
-    return args.start.after(s, lambda t: args.field(t, x))
+    return args.start.evaluate(s, lambda t: args.field(t, x))
 
 
 _index = lambda args: args.index
 
 
-class Recorded(NamedTuple):
+class SavedState(NamedTuple):
     """A saved state with the held control of the step that it comes from, and the
     controller's tallies then."""
 
@@ -83,14 +83,14 @@ class Recorded(NamedTuple):
     counts: dict[str, Array]
 
 
-def recorded(t: Any, x: Any, args: Any) -> Recorded:
-    """What is saved of a solve with a held controller."""
+def save_fn(t: Any, x: Any, args: Any) -> SavedState:
+    """The function by which a solve with a held controller saves."""
     del t
     # Diffrax saves the state itself at the ends of a solve, and an interpolation, which
     # `_Ends` has completed, in between.
-    if isinstance(x, Recorded):
+    if isinstance(x, SavedState):
         return x
-    return Recorded(x, args.u, _counts(args.memory, x))
+    return SavedState(x, args.u, _counts(args.memory, x))
 
 
 def _counts(memory: Any, like: Array) -> dict[str, Array]:
@@ -112,21 +112,21 @@ class _Ends(diffrax.AbstractLocalInterpolation):
             return self.inside.evaluate(t0, t1, left=left)
         # An interpolation meets the end of its step to rounding alone.
         x = jnp.where(t0 == self.t1, self.end, self.inside.evaluate(t0, left=left))
-        return x if self.held is None else Recorded(x, *self.held)
+        return x if self.held is None else SavedState(x, *self.held)
 
 
-class Hold(AbstractTransparentSolver):
+class Hold(AbstractForwardingSolver):
     """A solver of which each step uses the control of the interval that it lies in.
 
-    The times of a step's stages do not tell the interval: its last stage is at the
-    switch itself, and rounding puts others beyond it. So the interval is found once a
-    step, from the step's two ends, and handed to the vector field as an index. What a
-    solver keeps from its last step (the slope at its end) is dropped at a switch. Steps
-    must not cross one, which is the step-size controller's part.
+    The interval cannot be inferred from the times of the stages: the last stage is at
+    the switch itself, and rounding puts others beyond it. So it is found once per step,
+    from the step's two ends, and handed to the vector field as an index. A slope that a
+    solver reuses from its last step is dropped at a switch. The step-size controller
+    ensures that no step crosses one.
 
-    With `sampled`, a controller is asked at the start of each interval for the control
+    With `sampled`, a controller is called at the start of each interval for the control
     to hold; the control and the controller's memory are carried in the solver's state,
-    so that a rejected step takes them back.
+    so that rejected steps restore them.
     """
 
     solver: diffrax.AbstractSolver

@@ -62,13 +62,13 @@ def rollout(
     truncate: int | None = None,
     throw: bool = True,
 ) -> Trajectory:
-    """Run a controller in an environment: the one closed loop of the library.
+    """Simulate a controller in an environment, step by step.
 
     At each step k, with `t_k = k dt`: the controller acts on the observation `y_k`; the
-    environment clips the control, charges `c(t_k, x_k, u_k)` and steps; the controller
-    is told the control that was applied and its cost. The final cost is charged once,
-    at `x_T` or on entering a terminated state, after which the state is held at no
-    cost.
+    environment clips the control, charges `c(t_k, x_k, u_k)` and steps; then
+    `controller.applied(u, cost, state)` is called with the clipped control and its
+    cost. The final cost is charged once, at `x_T` or on entering a terminated state,
+    after which the state is held at no cost.
 
     It is already compiled, as `diffrax.diffeqsolve` is: a second call with other
     numbers, another key or start does not compile again. A batch is `jax.vmap` of it.
@@ -82,17 +82,19 @@ def rollout(
         controller.
     - `horizon`: steps; the environment's own by default.
     - `x0`: the first state, shape `(n,)`; drawn by the environment by default.
-    - `w`: disturbances, shape `(horizon, k)`; drawn by the environment by default.
+    - `w`: disturbances, shape `(horizon, k)`, in place of those that the environment
+        draws, which is the default. For a system with a diffusion they are its Brownian
+        increments: standard normal numbers times `sqrt(dt / substeps)`.
     - `keep`: what the trajectory stores, of `"states"`, `"observations"`, `"controls"`,
         `"disturbances"`, `"costs"`, `"terminated"`, `"incidents"` and
         `"controller_state"`; all by default.
     - `checkpoint`: what the gradient stores. `"step"` (default): the state at each
         step, and the step is computed again; `"sqrt"`: the state at each of about the
-        square root of T steps, for long horizons; `None`: all that is needed, nothing
-        computed again.
+        square root of T steps, for long horizons; `None`: all intermediate values,
+        without recomputation.
     - `gradient_decay`: the gradient passing back through the state is multiplied by it
         at each step. 1, the true gradient, by default; 0.9 damps the exploding
-        gradients of a long unstable horizon. It is a factor a step: `exp(-dt / tau)`
+        gradients of a long unstable horizon. It is a factor per step: `exp(-dt / tau)`
         forgets over the time `tau` at any `dt`.
     - `truncate`: the gradient is cut before every `truncate`-th step, in the state and
         in the memory of the controller: truncated back-propagation. Never by default.
@@ -102,8 +104,8 @@ def rollout(
     **Returns:** a [`delucax.Trajectory`][]. Its `result` is the first failure of a
     step, else `diverged`, else `update_refused` if a learner's update was not finite,
     else `plan_failed` if a plan of the controller did not succeed. `throw` raises on
-    all but the last: what follows a failed plan is for the controller to say (`throw=`
-    of [`delucax.controllers.MPC`][]).
+    all but the last: failed plans are handled by the controller (`throw=` of
+    [`delucax.controllers.MPC`][]).
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape; an error at run
     time as `throw` says.
@@ -169,7 +171,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
     if env.sensor_noise is not None:
         noise = env.sensor_noise.draw(noise_key, dt, horizon, dtype)
     can_end = env.terminated is not None
-    # A trajectory reads observations off the states where they are the same.
+    # Observations are not stored if they equal the states.
     keeps_y = not ("states" in keep and noise is None and dynamics.observes_state)
 
     first = initial_state(controller, controller_key)
@@ -197,9 +199,8 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         y = y if noise is None else (y + noise).astype(dtype)
         observed, (done, length) = y, ended or (None, None)
         if done is not None:
-            # What is computed after the end is not used, but its derivatives must be
-            # finite, because zero times infinity is NaN: so it is computed where the
-            # episode began.
+            # After termination everything is evaluated at the first state: it is not
+            # used, but its derivatives must be finite, because 0 times infinity is NaN.
             y0 = lax.stop_gradient(dynamics.observe(t, x0)).astype(y.dtype)
             observed = jnp.where(done, y0, y)
             x = jnp.where(done, lax.stop_gradient(x0), x)

@@ -1,4 +1,4 @@
-"""The whole horizon in one solve."""
+"""Continuous-time simulation of a whole horizon by one solve."""
 
 from typing import Any, Literal
 
@@ -20,18 +20,18 @@ from .._check import (
 )
 from .._controller import AbstractController, tallies
 from .._integration import (
+    as_fixed_step_solver,
     check_method,
-    for_fixed_steps,
-    raise_on_failure,
     solve_result,
-    Start,
+    throwing_adjoint,
+    TimeOffset,
 )
 from .._results import choose, first_failure, RESULTS
 from .._typing import PRNGKey
 from ..math._steps import check_steps
 from ..systems import AbstractSystem
 from ._controller_calls import check_control, controller_result
-from ._hold import field, Hold, Inputs, interval_before, Recorded, recorded
+from ._hold import field, Hold, Inputs, interval_before, save_fn, SavedState
 from ._simulate_checks import (
     as_save_times,
     check_adjoint,
@@ -73,8 +73,8 @@ def simulate(
     The solve counts its time from `t0`, so that a late start costs no precision: its
     switches are rounded to that of `t1 - t0`, about `1e-7 (t1 - t0)` in single
     precision, however large `t0` is. The field, with a control that is not held, is
-    corrected for the rounding of `t0 + s` as in [`delucax.Discretized`][]; what is
-    sampled at a switch is given the rounded time.
+    corrected for the rounding of `t0 + s` as in [`delucax.Discretized`][]; held
+    controllers receive the rounded time.
 
     There is no cost here: `costs` is `None`, and the trajectory's `final_cost` and
     `total_cost` are zero. It is already compiled, as [`delucax.rollout`][] is.
@@ -83,8 +83,9 @@ def simulate(
 
     - `system`: the continuous-time system.
     - `controller_or_controls`: an array of controls, shape `(T, m)`; a function of time
-        to a control; or a controller. A controller that is held samples the sensor at
-        each switch, and is told by `applied` of its own control and a cost of zero.
+        to a control; or a controller. A held controller samples the sensor at each
+        switch, and its `applied` is called at once, with its own control and a cost of
+        zero; controllers that learn from costs are therefore refused.
     - `t0`, `t1`: start and end of the horizon, numbers with `t1 > t0`.
     - `x0`: the state at `t0`, shape `(n,)`.
     - `hold`: `"zero"` (default), the control is held over each interval; `None`, it is
@@ -98,13 +99,13 @@ def simulate(
     - `solver`: a Diffrax solver; `diffrax.Tsit5()` by default.
     - `stepsize_controller`: such as `diffrax.PIDController(rtol=1e-6, atol=1e-8)`;
         `None` (default) for fixed steps.
-    - `substeps`: fixed steps an interval, 1 by default.
+    - `substeps`: fixed steps per interval, 1 by default.
     - `adjoint`: any of `diffrax.RecursiveCheckpointAdjoint()` (default),
         `diffrax.DirectAdjoint()`, `diffrax.ForwardMode()`, or
         `diffrax.BacksolveAdjoint()`, which needs a `stepsize_controller`, takes no
         held controller, whose memory cannot be run backwards, and raises if a gradient
         with respect to `t0` or `t1` is asked for.
-    - `max_steps`: the most adaptive steps over the horizon; by default 4096, or 64 an
+    - `max_steps`: the most adaptive steps over the horizon; by default 4096, or 64 per
         interval if that is more.
     - `ts`: the times to save at, increasing and between `t0` and `t1`; by default the
         T + 1 ends of the intervals, where the saved states are the solver's own, not
@@ -120,11 +121,12 @@ def simulate(
     are what the sensor reads at each time but the last.
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, on a solver or
-    adjoint that does not fit, on more than 2^22 steps in single precision, whose times
-    do not tell them apart, and on systems that one solve cannot integrate: those
-    that `project` their state after each interval, that have a `diffusion`, or, with
-    `w`, that name no disturbances; discretise these with [`delucax.Discretized`][]. An
-    error at run time as `throw` says.
+    adjoint that does not fit, on a controller that learns from costs, on more than
+    2^22 steps in single precision, which is too coarse for their times, and on systems
+    that one solve cannot integrate: those that `project` their state after each
+    interval, that have a `diffusion`, or, with `w`, that name no disturbances;
+    discretise these with [`delucax.Discretized`][]. An error at run time as `throw`
+    says.
 
     Source: Kidger, 2021 (Diffrax).
 
@@ -170,6 +172,11 @@ def simulate(
     if is_concrete(t0) and is_concrete(t1) and not t1 > t0:
         raise ValueError(f"{where}: t1 must be above t0, got t0 = {t0}, t1 = {t1}.")
     source = controller_or_controls
+    if isinstance(source, AbstractController) and source.learns_from_cost:
+        raise ValueError(
+            f"{where}: {type(source).__name__} learns from the cost of each step, of "
+            "which one solve knows nothing; use `delucax.rollout`."
+        )
     if not callable(source):
         name = "controller_or_controls"
         source = finite_rows(source, system.control_size, name, where)
@@ -240,13 +247,13 @@ def _simulate(
         # state, because it is the first of its interval.
         u, _ = args.act(grid[0], x0, eqx.filter(args.memory, eqx.is_array))
         args = eqx.tree_at(lambda a: a.u, args, u, is_leaf=lambda leaf: leaf is None)
-    start = Start(t0, lambda t: args.field(t, x0))
+    start = TimeOffset(t0, lambda t: args.field(t, x0))
     args = eqx.tree_at(lambda a: a.start, args, start)
 
     # Either the ends of the intervals, or what is asked for and the end of the horizon.
     saved: Any = dict(t0=True, ts=saves[1:]) if ts is None else dict(t1=True, ts=saves)
     if sampled:
-        saved["fn"] = recorded
+        saved["fn"] = save_fn
     held = hold == "zero" or w is not None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
@@ -262,12 +269,12 @@ def _simulate(
     states: Any = solution.ys
     applied: Any = None
     counts: dict[str, Any] = {}
-    if isinstance(states, Recorded):
+    if isinstance(states, SavedState):
         states, applied, counts = states
     final_state, states = states[-1], states[:count]
 
     def before(held):
-        """Of a held sequence, what is in force just before each time but the first."""
+        """The rows of a held sequence just before each save time but the first."""
         if held is None or ts is None:
             return held
         return held[jax.vmap(lambda s: interval_before(switches, s))(saves[1:])]
@@ -305,14 +312,14 @@ def _simulate(
         recorded_terminated=None,
         incidents=incidents,
         steps=count - 1,
-        # There is no cost to keep, which is not to have left it out.
+        # With costs, although there are none, so that they don't count as left out.
         keep=("states", "observations", "controls", "disturbances", "costs"),
         **plant_fields(system),
     )
 
 
 def _inputs(system, source, w, x0, t0, switches, key, hold) -> Inputs:
-    """What the solve's vector field takes, before a controller is first asked."""
+    """The arguments of the solve's vector field before a controller is called."""
     controls: Any = None
     memory: Any = None
     if isinstance(source, AbstractController):
@@ -334,7 +341,7 @@ def _inputs(system, source, w, x0, t0, switches, key, hold) -> Inputs:
     if controls is not None:
         controls, source = controls.astype(x0.dtype), None
     index = jnp.zeros((), jnp.int32)
-    return Inputs(system, Start(t0), source, memory, controls, w, index, None)
+    return Inputs(system, TimeOffset(t0), source, memory, controls, w, index, None)
 
 
 def _with_switches(options, held: bool, sampled: bool, grid, switches):
@@ -354,11 +361,11 @@ def _with_switches(options, held: bool, sampled: bool, grid, switches):
     solver, adjoint = options["solver"], options["adjoint"]
     fixed = options["stepsize_controller"] is None
     if fixed and isinstance(solver, diffrax.AbstractImplicitSolver):
-        solver = for_fixed_steps(solver)
+        solver = as_fixed_step_solver(solver)
     # The backward solve has a solver of its own, which must hold the controls, too.
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         adjoint = diffrax.BacksolveAdjoint(**fitted(adjoint.kwargs))
-    adjoint = raise_on_failure(adjoint)
+    adjoint = throwing_adjoint(adjoint)
     options = fitted(options | dict(solver=solver, adjoint=adjoint))
     if fixed:
         options["stepsize_controller"] = diffrax.StepTo(grid)
@@ -368,8 +375,8 @@ def _with_switches(options, held: bool, sampled: bool, grid, switches):
 def _since(t0: Array, ts: Array, grid: Array | None, length: Array) -> Array:
     """The save times `ts`, counted from `t0`.
 
-    A time that rounding puts beside a point of the grid is that point, so that what is
-    in force before it is known.
+    They are snapped to grid points within rounding, so that the interval before each is
+    unambiguous.
     """
     saves = jnp.clip(ts - t0, 0, length)
     if grid is None:

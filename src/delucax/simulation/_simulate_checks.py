@@ -68,7 +68,7 @@ def count_intervals(
 
 
 def as_save_times(ts: Any, t0: Any, t1: Any, where: str) -> Any:
-    """`ts` as an array of increasing times from `t0` to `t1`, or an error."""
+    """`ts` as an array of increasing times from `t0` to `t1`; raise if it is not."""
     ts = as_float_array(ts)
     if not eqx.is_inexact_array(ts) or ts.ndim != 1 or ts.shape[0] < 2:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What a closed loop leaves behind."""
+"""The trajectory of a closed loop."""
 
 import dataclasses
 from typing import Any, TYPE_CHECKING
@@ -33,7 +33,7 @@ class Trajectory(eqx.Module):
     - `controls`: what was applied, after the bounds, shape `(T, m)`.
     - `disturbances`: shape `(T, k)`.
     - `costs`: stage costs, shape `(T,)`; 0 after termination.
-    - `terminated`: whether step k ended the episode, or found it ended, shape `(T,)`.
+    - `terminated`: whether the episode had terminated after step k, shape `(T,)`.
     - `final_state`: shape `(n,)`.
     - `final_cost`: a scalar, charged once.
     - `total_cost`: the sum of the stage costs and the final cost.
@@ -78,8 +78,8 @@ class Trajectory(eqx.Module):
     ended: Array
     result: Result
     dt: Array
-    # What follows from the rest is not stored but made on demand: writing it out would
-    # cost a batch more than the simulation does.
+    # Arrays that follow from others are computed lazily: to write them out would cost a
+    # batch more than the simulation does.
     recorded_times: Array | None
     recorded_observations: Array | None
     recorded_disturbances: Array | None
@@ -125,15 +125,15 @@ class Trajectory(eqx.Module):
 
     @property
     def terminated(self) -> Array | None:
-        """Whether step k ended the episode, or found it ended, shape `(T,)`."""
+        """Whether the episode had terminated after step k, shape `(T,)`."""
         if self.recorded_terminated is None and "terminated" in self.keep:
             return jnp.zeros((*self.batch_shape, self.steps), bool)
         return self.recorded_terminated
 
     @property
     def failed(self) -> Array:
-        """Whether a step failed, the run diverged or a learner refused an update. A
-        failed plan, which `result` names too, is no failure of the run."""
+        """Whether `result` is neither `successful` nor `plan_failed`: a step failed,
+        the run diverged, or a learner refused an update."""
         planned = self.result == RESULTS.plan_failed
         return (self.result != RESULTS.successful) & ~planned
 
@@ -195,7 +195,7 @@ class Trajectory(eqx.Module):
         ends = lambda tree: jax.tree.map(lambda leaf: leaf[start : stop + 1], tree)
         steps = lambda tree: jax.tree.map(lambda leaf: leaf[start:stop], tree)
         costs, incidents = steps(self.costs), steps(self.incidents)
-        # A failure that incidents speak of may have been outside of the stretch.
+        # A failure by incidents is dropped if none of them is in the slice.
         result, is_end = self.result, stop == self.steps
         for name, kind in INCIDENTS.items():
             if incidents is not None and name in incidents:

@@ -1,4 +1,4 @@
-"""Between continuous linear systems and their sampled form."""
+"""Conversion of linear systems to their sampled form and back: c2d and d2c."""
 
 from typing import Any
 
@@ -104,8 +104,9 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
 
     **Raises:** `ValueError` if `dynamics` is not `LinearDynamics`, is time-varying, or
     `method` is unknown. If there is no such system, `RuntimeError` (an error at run
-    time under `jax.jit`): `"zoh"` cannot have eigenvalues of `A_d` that are zero or
-    negative, which no sampled real system has but in pairs, `"tustin"` none that is -1.
+    time under `jax.jit`): for `"zoh"` if `A_d` has an eigenvalue that is zero or
+    negative, which sampled real systems have in pairs alone; for `"tustin"` if it has
+    the eigenvalue -1.
 
     Source: Cheng, Higham, Kenney and Laub, 2001 (the logarithm by square roots).
 
@@ -139,7 +140,7 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
 
 
 def _inputs(model: LinearSystem | LinearDynamics, drift: Vector) -> Matrix:
-    """What enters beside `A`: the control, a constant and the disturbance."""
+    """The input matrices side by side: of the control, a constant, the disturbance."""
     columns = [model.B, drift[:, None], *([] if model.E is None else [model.E])]
     return jnp.concatenate(columns, axis=1)
 
