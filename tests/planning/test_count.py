@@ -6,7 +6,7 @@ from helpers import assert_close, needs_x64, once, thorough, user_error
 
 import delucax as dlx
 from delucax.planning import count_evaluations, Problem
-from delucax.planning._model import model
+from delucax.planning._lq import model
 
 
 T = 30

@@ -199,6 +199,7 @@ class _FixedStep(AbstractForwardingSolver):
 
     def _with_tolerances(self, rtol: float, atol: Any) -> Any:
         finder = self.solver.root_finder  # pyright: ignore
+        # Only tolerances that the user left to a step-size controller are set.
         values = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
         if isinstance(finder, diffrax.VeryChord | optx.Chord):
             finder = _Chord(**values, linear_solver=finder.linear_solver)

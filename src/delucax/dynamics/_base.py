@@ -91,6 +91,7 @@ class AbstractDynamics(AbstractPlant):
         if w is not None:
             w = as_vector(w, self.disturbance_size, "w (the disturbance)", where)
         x_next, result = self.advance(t, x, u, w)
+        # Explicit steps cannot fail, and their programs carry no check.
         if result is RESULTS.successful:
             return x_next
         return result.error_if(x_next, result != RESULTS.successful)
@@ -156,6 +157,7 @@ def _open_loop(dynamics, x0, controls, w, t0):
     steps = jnp.arange(controls.shape[0])
     last, (parts, results) = lax.scan(body, split_state(x0), (steps, controls, w))
     states = stack_steps(parts, size, last)
+    # NaN propagates, so the last state tells of all.
     finite = jnp.all(jnp.isfinite(states[-1]))
     end = choose(finite, RESULTS.successful, RESULTS.diverged)
     result = first_failure(first_of(results), end)
@@ -199,6 +201,8 @@ class _Forwarding(AbstractDynamics):
     @property
     def observes_state(self):
         """Whether `observe` returns the state itself."""
+        # A sensor of the wrapper's own is traced; else the wrapped plant is asked,
+        # which may know without tracing.
         own = type(self).observe is not _Forwarding.observe
         if own or self.state_size != self._inside.state_size:
             return super().observes_state

@@ -125,6 +125,7 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
     check_choice(method, _METHODS, "method", "d2c")
     convert, distance, rule = _INVERSES[method]
     inputs = _inputs(dynamics, dynamics.x_next - dynamics.x_ref)
+    # Control, constant and disturbance are converted alike, as columns of one matrix.
     A, inputs, failed = convert(dynamics.A, inputs, dynamics.dt)
     # Of numbers that are known the eigenvalue at fault can be named.
     if not is_concrete(failed):

@@ -170,13 +170,12 @@ class Discretized(AbstractDiscretization):
 
     def advance(self, t, x, u, w):
         system, noise = self.system, self.noise
-        added = held = increments = None
-        if noise == "additive":
-            added = w
-        else:
-            held = jnp.zeros(self.disturbance_size, x.dtype) if w is None else w
-        if noise == "brownian":
-            held, increments = None, held.reshape(self.substeps, -1)
+        given: Any = w
+        if w is None and noise != "additive":
+            given = jnp.zeros(self.disturbance_size, x.dtype)
+        added = given if noise == "additive" else None
+        held = given if noise is None else None
+        increments = given.reshape(self.substeps, -1) if noise == "brownian" else None
         # An interval is integrated from 0 to dt: where t is large, t + dt is rounded,
         # and so would the length of the interval be.
         t = jnp.asarray(t, x.dtype)

@@ -110,6 +110,7 @@ def linearize(
     hint = "for an environment, its `dynamics`"
     model, x, u = at_point(model, t, x, u, "linearize", hint)
     t = jnp.asarray(t, x.dtype)
+    # The sensor is linearised, too, so that estimators can be designed on the result.
     C = jacobian(lambda x: model.observe(t, x))(x)
     names = dict(state_names=model.state_names, control_names=model.control_names)
     w = jnp.zeros(model.disturbance_size, x.dtype)
@@ -122,6 +123,7 @@ def linearize(
         dx = f(t, x, u, held)
         return LinearSystem(A, B, C, E, x_ref=x, u_ref=u, dx_ref=dx, **names)
     step = functools.partial(model, t)
+    # The public call, whose solver failures raise, and not `advance`.
     A, B, E = jacobian(step, (0, 1, 2))(x, u, w)
     return LinearDynamics(A, B, C, E, model.dt, x, u, step(x, u, w), **names)
 

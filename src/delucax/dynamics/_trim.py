@@ -285,7 +285,7 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
             *select(new.cost < best[0], here, best[:-1]),
             jnp.where(newton, best[-1], gap),
         )
-        # One more step after Newton's method has converged.
+        # One more step after convergence, whose error is the square of the last one.
         converged, done = newton & small, converged
         newton = newton | small | (step >= _MAX_STEPS)
         return step + 1, newton, converged, done, z, d, damping, radius, new, best
@@ -316,7 +316,8 @@ def _nearest_jvp(primals, tangents):
         return _expand(problem, z, problem.terms(jacobian)).offset
 
     _, change = eqx.filter_jvp(lambda problem: offset(problem, z), primals, tangents)
-    # offset(problem, z) = 0, so d offset/dz dz = -d offset/d problem.
+    # The implicit function theorem for offset(problem, z) = 0: d offset/dz dz =
+    # -change.
     dz = -jnp.linalg.solve(jax.jacfwd(offset, 1)(primals[0], z), change)
     drift_at = lambda problem, z: problem.drift(problem.at(z))
     _, drift = eqx.filter_jvp(drift_at, (*primals, z), (*tangents, dz))

@@ -125,9 +125,11 @@ class Delayed(AbstractWrapper):
         own, _, observed = self._cut(x)
         if not self.sensor:
             return self.dynamics.observe(t, own)
+        # The oldest observation is the last block.
         return observed[-(observed.shape[0] // self.sensor) :]
 
     def difference(self, x, x_ref):
+        # Angles wrap in the plant's own state alone.
         n = self.dynamics.state_size
         own = self.dynamics.difference(x[:n], x_ref[:n])
         return jnp.concatenate([own, x[n:] - x_ref[n:]])
@@ -209,4 +211,6 @@ class WorstCase(AbstractWrapper):
 
     def advance(self, t, x, u, w):
         added = self.attack(x)
+        # Beside the environment's own disturbance, which the adversary does not
+        # replace.
         return self.dynamics.advance(t, x, u, added if w is None else w + added)

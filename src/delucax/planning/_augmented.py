@@ -51,6 +51,7 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         holds = violation <= options.constraint_tolerance
         settled = (after.result == RESULTS.successful) & precise & holds
         spent = after.iterations >= options.max_iterations
+        stage, final = (updated(*given) for given in each)
         # The multipliers converge by themselves, at a rate that grows with the weight:
         # it rises only where they are too slow (Bertsekas, 1982).
         enough = holds | (violation <= ENOUGH * before.violation)
@@ -62,7 +63,7 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         after = after._replace(
             violation=violation,
             # The new multipliers are those of the weight that was minimised with.
-            multipliers=Multipliers(*(updated(*given) for given in each), raised),
+            multipliers=Multipliers(stage, final, raised),
             result=choose(lost, RESULTS.diverged, result),
         )
         # Once the constraints hold, the last minimisations are to full precision.
@@ -71,8 +72,8 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
 
     like = jnp.zeros((T + 1, n), dtype)
     sizes = jax.eval_shape(problem.constraints_along, like, controls_of(start))
-    zeros = (jnp.zeros(c.shape, dtype) for c, _ in sizes)
-    multipliers = Multipliers(*zeros, jnp.full((), FIRST_RHO, dtype))
+    stage, final = (jnp.zeros(c.shape, dtype) for c, _ in sizes)
+    multipliers = Multipliers(stage, final, jnp.full((), FIRST_RHO, dtype))
     rollouts = 0
     if start.controls.ndim == 3:
         rollouts = start.count

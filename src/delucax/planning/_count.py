@@ -69,6 +69,7 @@ def count_evaluations(
     reports: SimpleQueue[tuple[str, int]] = SimpleQueue()
     out = function(_Counted(dynamics, reports))
     jax.block_until_ready(eqx.filter(out, eqx.is_array))
+    # Callbacks may still be under way when the arrays are ready.
     jax.effects_barrier()
     counts = dict.fromkeys(Evaluations._fields, 0)
     while not reports.empty():
@@ -112,6 +113,7 @@ def _called(x: Any, where: Any, *, reports: Any, kind: str, lanes: int) -> Array
 
 
 def _batch(values, dims, *, lanes, **params):
+    # Under `jax.vmap` one report stands for all members of the batch.
     size = next(v.shape[d] for v, d in zip(values, dims, strict=True) if d is not None)
     x = batching.bdim_at_front(values[0], dims[0], size)
     return _report.bind(x, values[1], lanes=lanes * size, **params), 0

@@ -11,8 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._results import choose, Result, RESULTS
-from ._lq import in_parallel, in_sequence, Policy, predicted_change, Stages
-from ._model import model
+from ._lq import in_parallel, in_sequence, model, Policy, predicted_change, Stages
 from ._problem import Multipliers, Problem, roll_out
 from ._start import controls_of, Start
 
@@ -185,14 +184,7 @@ def _iterate(problem: Problem, options: Options, before: _Progress) -> _Progress
     return _Progress(after, defects, delta, exact, penalty, ended | stuck)
 
 
-def _searched(
-    kind: str,
-    problem: Problem,
-    before: _Progress,
-    policy: Policy,
-    penalty: Array,
-    rounding: Array,
-) -> tuple[tuple[Array, Array, Array, Array | None], Array, Array]:
+def _searched(kind, problem, before: _Progress, policy: Policy, penalty, rounding):
     """Backtracking line search: the states, controls, cost and defects after the
     longest step of sufficient decrease, or as before; whether one was accepted; and how
     many were tried.

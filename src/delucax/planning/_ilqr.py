@@ -168,7 +168,7 @@ class ILQR(AbstractPlanner):
         second_order = self.second_order
         if second_order is None:
             second_order = problem.constraints is not None and spacing is None
-        filled = dict(
+        filled: dict[str, Any] = dict(
             tolerance=tolerance,
             constraint_tolerance=feasible,
             second_order=bool(second_order),

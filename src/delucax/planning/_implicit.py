@@ -21,8 +21,16 @@ from ..math import matvec
 from ..math._linear_solve import full_precision
 from ._augmented import with_constraints
 from ._descent import Options, Outcome
-from ._lq import apply, in_parallel, in_sequence, product, solve_free, Stages
-from ._model import costates_of, model
+from ._lq import (
+    apply,
+    costates_of,
+    in_parallel,
+    in_sequence,
+    model,
+    product,
+    solve_free,
+    Stages,
+)
 from ._problem import Multipliers, Problem
 from ._start import controls_of, Start
 
@@ -112,6 +120,7 @@ def _change(
             c = [c for c, _ in problem.constraints_along(X, U)]
         return (h, after, v), problem.x0, problem.bounds, c
 
+    # Only products with the tangent are needed, whatever number of parameters varies.
     at, linear = jax.jvp(conditions, (varied,), (change,))
     ((slope, *_), *_), ((h, d, v), dx0, ends, dc) = at, linear
     free, fixed = jnp.ones_like(U, bool), jnp.zeros_like(U)
@@ -161,8 +170,8 @@ def _with_constraints(stages, active, dc, y, dx0, fixed, free):
         moved = jnp.einsum("tpi,ti->tp", G, dz) + dc[0], end @ dX[-1] + dc[1]
         return dX, dU, (dy[0] + rho * moved[0], dy[1] + rho * moved[1])
 
-    def refine(dy, _):
-        return minimum(dy)[2], None
+    # Each pass contracts the error of the multipliers by about 1 / rho.
+    refine = lambda dy, _: (minimum(dy)[2], None)
 
     nothing = jnp.zeros_like(y.stage), jnp.zeros_like(y.final)
     dy, _ = lax.scan(refine, nothing, None, length=REFINEMENTS)
@@ -205,6 +214,8 @@ def substitute(
     n = dx0.shape[0]
 
     def back(v, here):
+        # As in `factorise`, for the linear terms: change = -Quu^-1 (Qu + Quu fixed)
+        # where free, and `fixed` elsewhere.
         F, h, d, V, M, free, fixed = here
         g = h + apply(F.T, v + apply(V, d))
         push = (g[n:] + apply(M[:, n:], fixed))[:, None]

@@ -24,8 +24,7 @@ from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ._descent import first_accepted, LEAST_MU, MOST_MU
-from ._lq import in_sequence, Policy
-from ._model import model as local_model
+from ._lq import in_sequence, model as local_model, Policy
 from ._plan import Plan
 from ._planner import checked_plan
 from ._problem import Problem, roll_out
@@ -247,16 +246,7 @@ class _Progress(NamedTuple):
 
 
 @eqx.filter_jit
-def _iterate(
-    plant: Problem,
-    model: Problem,
-    plan: Plan,
-    step: Array,
-    rate: Array,
-    iterations: int,
-    online: _Online | None,
-    anneal: bool,
-) -> Plan:
+def _iterate(plant, model, plan, step, rate, iterations, online, anneal) -> Plan:
     """Iterate from the first run, which follows the feedback of `plan`."""
     dtype = plan.controls.dtype
     zero = jnp.zeros((), dtype)
@@ -332,16 +322,7 @@ def _iterate(
     )
 
 
-def _perturbed(
-    plant: Problem,
-    model: Problem,
-    states: Array,
-    controls: Array,
-    policy: Policy,
-    length: Array,
-    rate: Array,
-    online: _Online,
-) -> tuple[Array, Array, Array]:
+def _perturbed(plant, model, states, controls, policy, length, rate, online):
     """A run of the plant under the policy and what is learned online; its states,
     controls and cost, infinite if it diverged."""
     memory, horizon, aligned = online

@@ -1,9 +1,10 @@
-"""The linear-quadratic problem that each iteration of a planner solves.
+"""The linear-quadratic model of a problem about a trajectory, and its solution.
 
-`minimise sum_k 1/2 z'H z + h'z + 1/2 x_T'V x_T + v'x_T` along `x_next = F z + d`, with
-`z = (x, u)`: in sequence, or in parallel over time.
+Each iteration of a planner minimises `sum_k 1/2 z'H z + h'z + 1/2 x_T'V x_T + v'x_T`
+along `x_next = F z + d`, with `z = (x, u)`, in sequence or in parallel over time.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -11,9 +12,11 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._jax import first_possible
 from ..math import matvec
-from ..math._linear_solve import full_precision, is_definite, SMALL, solve
+from ..math._linear_solve import full_precision, is_definite, SMALL, solve, symmetric
 from ..riccati import dre
+from ._problem import Problem, Values
 
 
 _UNROLL = 16
@@ -43,6 +46,114 @@ class Policy(NamedTuple):
     slope: Array
     curvature: Array
     ok: Array
+
+
+def model(
+    problem: Problem,
+    states: Array,
+    controls: Array,
+    defects: Array | None,
+    second_order: bool,
+    use_exact: Array | None = None,
+    spacing: float | None = None,
+) -> Stages:
+    """The linear-quadratic model of the problem about a trajectory.
+
+    The second derivatives of dynamics and constraints are left out where `use_exact` is
+    false. With a `spacing` the dynamics are linearised by central differences.
+    """
+    size, times = states.shape[1], problem.times(controls.shape[0])
+    t, end = times[:-1], times[-1]
+    # State and control are one vector, so that each derivative is taken once, with its
+    # cross terms.
+    z = jnp.concatenate([states[:-1], controls], axis=1)
+    step = lambda z, t, w: problem.step(t, z[:size], z[size:], w)
+    stage_cost = lambda z, t, y: problem.stage_cost(t, z[:size], z[size:], y)
+    final_cost = lambda x: problem.final_cost(end, x)
+
+    def stage_hessian(z, t, y):
+        """The Hessian of the cost and of the constraints' squared linear parts."""
+        if problem.multipliers is None:
+            return jax.hessian(stage_cost)(z, t, y)
+        c = lambda z: problem.stage_constraints(t, z[:size], z[size:])
+        cost = jax.hessian(lambda z: problem.cost(t, z[:size], z[size:]))(z)
+        return cost + squared(c, z, y, problem.multipliers.rho)
+
+    y = problem.stage_multipliers
+    v = jax.grad(final_cost)(states[-1])
+    if spacing is None:
+        # In reverse mode if possible, because a step has fewer outputs than inputs.
+        slopes = first_possible(jax.jacrev(step), jax.jacfwd(step))
+    else:
+        slopes = central(step, spacing, problem.deviation)
+    F = jax.vmap(slopes)(z, t, problem.w)
+    h = jax.vmap(jax.grad(stage_cost))(z, t, y)
+    H = jax.vmap(stage_hessian)(z, t, y)
+    V = jax.hessian(lambda x: problem.cost.final(end, x))(states[-1])
+    # By default Gauss-Newton: exact Hessians of the cost, linear dynamics and
+    # constraints.
+    if problem.multipliers is not None:
+        c = lambda x: problem.final_constraints(end, x)
+        V = V + squared(c, states[-1], *problem.multipliers[1:])
+    if second_order:
+        # The Hessian of the Hamiltonian, cost + costate' F: the curvature of the
+        # dynamics is weighted by the costates.
+        def hamiltonian(z, t, w, y, costate):
+            return stage_cost(z, t, y) + costate @ step(z, t, w)
+
+        # Forward over reverse is cheapest. Implicit solvers inside may have one mode
+        # only.
+        slope = jax.grad(hamiltonian)
+        ways = jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(hamiltonian))
+        each = z, t, problem.w, y, costates_of(F, h, v)
+        exact = jax.vmap(first_possible(*ways))(*each)
+        at_end = jax.hessian(final_cost)(states[-1])
+        # Both are computed where a flag of the loop decides, because the flag is
+        # traced.
+        if use_exact is None:
+            H, V = exact, at_end
+        else:
+            H, V = jnp.where(use_exact, exact, H), jnp.where(use_exact, at_end, V)
+    # Rounding leaves Hessians not quite symmetric, which the pass back relies on.
+    stages = Stages(F, symmetric(H), h, defects, symmetric(V), v)
+    return jax.tree.map(lambda a: a.astype(states.dtype), stages)
+
+
+def squared(c: Callable[[Array], Values], z: Array, y: Array, rho: Array) -> Array:
+    """The Hessian of the active constraints' squares, without second derivatives: that
+    of `rho c'c / 2` by Gauss and Newton, `rho J'J`."""
+    slope = jax.jacfwd(lambda z: c(z)[0])(z)
+    value, equal = c(z)
+    active = equal | (y + rho * value > 0)
+    return rho * slope.T @ jnp.where(active[:, None], slope, 0)
+
+
+def costates_of(F: Array, h: Array, v: Array) -> Array:
+    """The gradient of the cost with respect to each next state, shape `(T, n)`, by the
+    adjoint equation `p_k = h_x + A'p_{k+1}` with the last one `v`."""
+    size = v.shape[0]
+
+    def back(costate, here):
+        F, h = here
+        return h[:size] + matvec(F[:, :size].T, costate), costate
+
+    return lax.scan(back, v.astype(h.dtype), (F, h), reverse=True)[1]
+
+
+def central(f: Any, spacing: float, deviation: Any) -> Any:
+    """The Jacobian in the first argument by central differences: two calls for each
+    of its entries."""
+
+    def evaluate(z, *args):
+        # By the deviation, because a wrapped angle may jump between the two sides.
+        def along(way):
+            change = spacing * way
+            return deviation(f(z + change, *args), f(z - change, *args))
+
+        ways = jnp.eye(z.shape[0], dtype=z.dtype)
+        return jax.vmap(along)(ways).T / (2 * spacing)
+
+    return evaluate
 
 
 def product(a: Array, b: Array) -> Array:
@@ -195,13 +306,14 @@ def solve_box_qp(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Ar
     def body(state):
         u, _, count = state
         slope = gradient(u)
-        # Entries that are near a bound and go to it are kept out of the Newton step,
+        # Entries near a bound and on the way to it are kept out of the Newton step,
         # or they would shorten it.
         plain = -slope / steep
         left = jnp.max(jnp.abs(jnp.clip(u + plain, low, high) - u))
         free = is_free(u, slope, jnp.minimum(left, 0.01 * (high - low)))
         newton, _ = solve_free(H, -slope[:, None], free)
         step = jnp.where(free, newton[:, 0], plain)
+        # The projected line search, for all lengths at once: they are few and cheap.
         tried = jnp.clip(u + lengths[:, None] * step, low, high)
         values = jax.vmap(value)(tried)
         best = tried[jnp.argmin(values)]
@@ -229,12 +341,13 @@ def in_parallel(stages: Stages, mu: Array) -> Policy:
     A, B, q, r = F[..., :n], F[..., n:], h[:, :n], h[:, n:]
     Q, S, R = H[:, :n, :n], H[:, :n, n:], H[:, n:, n:]
     damped = R + mu * jnp.eye(B.shape[2], dtype=F.dtype)
-    rest = dict(final=V, d=d, q=q, r=r, final_q=v, parallel=True, throw=False)
-    solution = dre(A, B, Q, damped, S, **rest)
+    linear = dict(d=d, q=q, r=r, final_q=v)
+    solution = dre(A, B, Q, damped, S, final=V, **linear, parallel=True, throw=False)
     ok = jnp.all(jnp.isfinite(solution.K)) & jnp.all(jnp.isfinite(solution.k))
     parts = solution.X[1:], solution.p[1:], solution.K, solution.k
     X, p, K, k = (jnp.where(ok, part, 0) for part in parts)
-    # The gradient of the cost-to-go 1/2 x'X x + p'x of the next state, by the control.
+    # The gradient of stage cost and cost-to-go, 1/2 x'X x + p'x of the next state, with
+    # respect to the control.
     shift = 0 if d is None else jnp.einsum("tij,tj->ti", X, d)
     pushed = jnp.einsum("tji,tj->ti", B, p + shift)
     slope, curvature = predicted_change(stages, K, k)
@@ -247,6 +360,7 @@ def predicted_change(stages: Stages, K: Array, k: Array) -> tuple[Array, Array]:
 
     def forward(dx, here):
         F, K, k, d = here
+        # The linear model under du = -k - K dx, from dx = 0.
         z = jnp.concatenate([dx, -k - matvec(K, dx)])
         after = matvec(F, z)
         return after if d is None else after + d, z

@@ -95,6 +95,7 @@ class Plan(AbstractController):
         A plan of too few iterations, or whose search failed, is the best so far.
         """
         finite = jnp.all(jnp.isfinite(self.controls), axis=(-2, -1))
+        # Of other failures, such as too few iterations, the best iterate is left.
         lost = (self.result == RESULTS.diverged) | (self.result == RESULTS.infeasible)
         return finite & ~lost
 
@@ -102,11 +103,13 @@ class Plan(AbstractController):
         size = self.states.shape[1]
         if y.shape != (size,):
             raise wrong_observation(self, size, y)
+        # By the number of steps, because a time k dt is rounded.
         step = step_at(t - self.t0, self.dt, len(self.controls), "Plan")
         rows = self.states[:-1], self.controls, self.gains
         x_ref, u_ref, K = row_at(rows, step)
         e = y - x_ref if self.difference is None else self.difference(y, x_ref)
         u = u_ref - matvec(K, e)
+        # The feedback may leave the bounds that the planned controls respect.
         if self.low is not None and self.high is not None:
             u = jnp.minimum(jnp.maximum(u, self.low), self.high)
         return u.astype(y.dtype), state

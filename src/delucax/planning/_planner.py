@@ -152,7 +152,7 @@ class AbstractPlanner(eqx.Module):
         x0 = finite_vector(x0, n, "x0", where)
         check_number(t0, "t0", where)
         t0 = as_float_array(t0)
-        known = ()
+        is_count = isinstance(controls, numbers.Integral)
         if isinstance(controls, Start | Plan):
             if self.starts_from_states:
                 raise ValueError(
@@ -161,18 +161,16 @@ class AbstractPlanner(eqx.Module):
                 )
             start = Start(controls.controls, controls.states, controls.gains)
             start = start.checked(n, m, "controls", where)
-            known = (start.controls,)
-        elif not isinstance(controls, numbers.Integral):
+        elif not is_count:
             start = Start(finite_rows(controls, m, "controls", where))
-            known = (start.controls,)
-        # A default start has no precision of its own.
-        elif self.starts_from_states:
-            T = check_count(controls, "controls (the horizon)", where)
-            start = Start(jnp.tile(operating_point(dynamics, cost)[1], (T, 1)))
         else:
             T = check_count(controls, "controls (the horizon)", where)
-            start = Start.default(dynamics, cost, T, t0)
-        dtype = jnp.result_type(x0, *known)
+            if self.starts_from_states:
+                start = Start(jnp.tile(operating_point(dynamics, cost)[1], (T, 1)))
+            else:
+                start = Start.default(dynamics, cost, T, t0)
+        # A default start has no precision of its own.
+        dtype = jnp.result_type(x0, *(() if is_count else (start.controls,)))
         if w is not None:
             size = dynamics.disturbance_size
             w = finite_rows(w, size, "w", where, start.horizon)
@@ -186,6 +184,7 @@ class AbstractPlanner(eqx.Module):
         ends: Any = check_control_bounds(bounds, m, where)
         if ends is not None:
             ends = tuple(jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
+        # One precision for all: the loops of the planners carry it unchanged.
         x0, t0, distance = x0.astype(dtype), t0.astype(dtype), as_module(difference)
         problem = Problem(dynamics, cost, x0, t0, w, ends, distance, constraints)
         start = jax.tree.map(lambda a: a.astype(dtype), start)

@@ -171,6 +171,7 @@ class Problem(eqx.Module):
 
         **Arguments:** `horizon`: T.
         """
+        # By products, not by a sum, so that rounding does not accumulate.
         steps = jnp.arange(horizon + 1)
         return (self.t0 + steps * self.dynamics.dt).astype(self.x0.dtype)
 
@@ -285,7 +286,7 @@ class Problem(eqx.Module):
         """
         zero, finite = jnp.zeros_like(cost), jnp.isfinite(cost)
         low, high = self.bounds or (None, None)
-        defaults = dict(
+        defaults: dict[str, Any] = dict(
             gains=jnp.zeros((*controls.shape, states.shape[1]), controls.dtype),
             trace=cost[None],
             residual=jnp.full_like(cost, jnp.nan),
@@ -345,5 +346,6 @@ def roll_out(
     # All states are checked, because a cost may ignore some of them, or clip them.
     cost = problem.total(states, controls)
     good = jnp.isfinite(cost) & jnp.all(jnp.isfinite(states))
+    # A step whose solver failed may still give finite numbers.
     good = good & (first_of(results) == RESULTS.successful)
     return states, controls, jnp.where(good, cost, jnp.inf)

@@ -16,7 +16,7 @@ from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math._linear_solve import is_definite
 from ..riccati import dare
-from ._model import model
+from ._lq import model
 from ._problem import Problem
 
 
@@ -246,6 +246,7 @@ def _both(point, regulator, controls, T):
         stable = posed & (solution.spectral_radius < 1)
         stable = stable & jnp.all(jnp.isfinite(solution.K))
         K = jnp.where(stable, solution.K, K)
+    # Both starts are feedback, the second with a gain of zero, so that they stack.
     held = jnp.tile(u, (T, 1))
     return Start(
         jnp.stack([held, held if controls is None else controls]),

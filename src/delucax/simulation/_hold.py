@@ -135,6 +135,7 @@ class Hold(AbstractForwardingSolver):
 
     @property
     def interpolation_cls(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        # Diffrax calls it with the step's `dense_info` as keywords.
         inside = self.solver.interpolation_cls
 
         def ends(*, t0, t1, inner, end, held):
@@ -146,12 +147,12 @@ class Hold(AbstractForwardingSolver):
         args = eqx.tree_at(_index, args, self._interval(terms, t0, t1))
         inner = self.solver.init(terms, t0, t1, y0, args)
         held = (args.u, eqx.filter(args.memory, eqx.is_array)) if self.sampled else None
+        # No interval yet, so that the first step counts as a switch.
         return inner, jnp.full((), -1, jnp.int32), held
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         inner, last, held = solver_state
         index = self._interval(terms, t0, t1)
-        # No interval is the last one before the first step, which starts at a switch.
         switched = index != last
         args = eqx.tree_at(_index, args, index)
         if self.sampled:
@@ -197,6 +198,7 @@ class Hold(AbstractForwardingSolver):
 def interval_from(switches: Array, t: Array) -> Array:
     """k with `switches[k] <= t < switches[k + 1]`, of equal intervals."""
     count = switches.shape[0] - 1
+    # By division, as the intervals are equal: a search would cost a loop per step.
     share = (t - switches[0]) / (switches[-1] - switches[0])
     k = jnp.clip(jnp.floor(share * count).astype(jnp.int32), 0, count - 1)
     # Rounding can put the quotient on the wrong side of a switch, never beyond it.

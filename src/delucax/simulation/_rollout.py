@@ -143,10 +143,9 @@ def rollout(
         )
     keep = tuple(name for name in KEEP if name in keep)
     check_choice(checkpoint, ("step", "sqrt", None), "checkpoint", where)
+    decay = as_float_array(as_number(gradient_decay, "gradient_decay", where))
     if isinstance(gradient_decay, int | float) and gradient_decay == 1:
         decay = None
-    else:
-        decay = as_float_array(as_number(gradient_decay, "gradient_decay", where))
     if truncate is not None:
         truncate = check_count(truncate, "truncate", where)
     trajectory = _rollout(
@@ -212,6 +211,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         step = env._advance(t, x, env._applied(u), w)
         cost, x_next, result = step.cost.astype(dtype), step.state, step.result
         applied = step.control
+        # Broadcasting would otherwise give the loop's state another shape.
         if x_next.shape != x.shape:
             raise ValueError(
                 f"rollout: a step must give a state of shape {x.shape} and a scalar "
@@ -272,6 +272,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         )
 
     has_ended, length = ended or (jnp.zeros((), bool), jnp.asarray(horizon))
+    # At the time of termination, where there was one: the state is held from then on.
     end = (length * dt).astype(dtype)
     final_cost = jnp.asarray(env.cost.final(end, final_state), dtype)
     if final_cost.shape != ():
@@ -281,8 +282,10 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         )
     costs = kept.get("costs")
     total_cost = (jnp.sum(costs) if total is None else total) + final_cost
+    # NaN propagates, so the last state tells of all.
     finite = jnp.all(jnp.isfinite(final_state)) & jnp.isfinite(total_cost)
     result = choose(finite, RESULTS.successful, RESULTS.diverged)
+    # In order of cause: a failed step, divergence, then what the controller counted.
     result = first_failure(result, controller_result(tallies(last), tallies(first)))
     return Trajectory(
         states=over_time("states", size, parts),

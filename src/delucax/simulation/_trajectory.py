@@ -318,7 +318,7 @@ class Trajectory(eqx.Module):
 
         given = self.total_cost, self.length, self.final_cost
         total, length, final = map(np.ravel, given)
-        # A result that is statically a success has no batch axis.
+        # A result that is statically a success has no batch axis, but broadcasts.
         codes = np.broadcast_to(np.ravel(jax.tree.leaves(self.result)[0]), total.shape)
         result_of = lambda c: jax.tree.map(lambda _: np.asarray(c), RESULTS.successful)
         words = [RESULTS[result_of(code)] or "successful" for code in codes]
