@@ -442,3 +442,19 @@ def as_finite(
     array = _as_array(value, name, where, rule, fits)
     check_finite(array, name, where)
     return array
+
+
+def finite_vector(value: Any, size: int, name: str, where: str) -> Array:
+    """`value` as a real vector of `size` finite entries, or an error."""
+    vector = as_vector(value, size, name, where)
+    check_finite(vector, name, where)
+    return vector
+
+
+def finite_rows(
+    value: Any, size: int, name: str, where: str, steps: int | None = None
+) -> Array:
+    """`value` as `as_rows` has it, with finite entries, or an error."""
+    rows = as_rows(value, size, name, where, steps)
+    check_finite(rows, name, where)
+    return rows

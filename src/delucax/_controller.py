@@ -14,7 +14,7 @@ from jaxtyping import Array, PyTree
 
 from ._check import check_instance
 from ._message import shortened
-from ._module import check_parameters
+from ._module import check_parameters, parts_of
 from ._typing import PRNGKey, RealScalar
 
 
@@ -83,6 +83,12 @@ class AbstractController(eqx.Module):
         """
         del u, cost
         return state
+
+    @property
+    def learns_from_cost(self) -> bool:
+        """Whether `applied` learns from the cost, which [`delucax.simulate`][] does not
+        know; by default whether a controller among its fields does."""
+        return any(p.learns_from_cost for p in parts_of(self, AbstractController))
 
 
 class AbstractLearner(AbstractController):

@@ -55,7 +55,7 @@ class AbstractCost(eqx.Module):
 
         A cost made of others has the first state and the first control that they name.
         Where planners start by default depends on it; see
-        [`delucax.planning.default_start`][].
+        [`delucax.planning.Start.default`][].
         """
         named = [part.targets for part in parts_of(self, AbstractCost)]
         pairs = [pair for pair in named if pair is not None]
