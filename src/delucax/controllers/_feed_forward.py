@@ -11,11 +11,11 @@ from jaxtyping import Array, Float
 
 from .._check import as_vector, output_of
 from .._module import function_field, parameter
-from .._typing import RealScalar
+from .._typing import Difference, RealScalar
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..references import Constant
-from ._operating_point import deviation, Difference
+from ._operating_point import deviation
 
 
 Signal = Callable[[Any], Array]

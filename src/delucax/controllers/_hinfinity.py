@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 from .._check import check_count, check_positive, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
+from .._typing import Difference
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..math._steps import row_at, step_at
@@ -15,7 +16,6 @@ from ._operating_point import (
     check_linear_state_feedback,
     check_state,
     deviation,
-    Difference,
     operating_state,
 )
 

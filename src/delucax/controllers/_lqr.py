@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from .._check import as_matrix, check_count, check_instance, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
+from .._typing import Difference
 from ..dynamics import AbstractDynamics, LinearDynamics, OperatingPoint
 from ..math import matvec
 from ..math._linear_solve import solve
@@ -20,7 +21,6 @@ from ._operating_point import (
     check_linear_state_feedback,
     check_state,
     deviation,
-    Difference,
     linear_at,
     operating_state,
 )

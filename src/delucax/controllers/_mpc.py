@@ -22,12 +22,12 @@ from .._check import (
 from .._controller import AbstractController, Tally
 from .._module import check_parameters, function_field
 from .._results import Result, RESULTS
-from .._typing import Control, Observation, PRNGKey
+from .._typing import Control, Difference, Observation, PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ..planning import AbstractPlanner, Constraints, default_start, ILQR, Start
-from ._operating_point import check_state, deviation, Difference
+from ._operating_point import check_state, deviation
 
 
 class MPCState(NamedTuple):

@@ -1,7 +1,6 @@
 """What the regulators ask of the linear dynamics that they are designed on."""
 
-from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,13 +10,11 @@ from jaxtyping import Array, Float
 
 from .._check import check_instance, check_time_invariant, is_concrete
 from .._controller import AbstractController, wrong_observation
+from .._typing import Difference
 from ..dynamics import LinearDynamics, linearize, OperatingPoint
 from ..math._drift import relative_drift
 from ..systems import LinearSystem
 
-
-Difference: TypeAlias = Callable[[Array, Array], Array]
-"""`(x, x_ref) -> deviation`."""
 
 _RESTS = 1e-4
 """The share of the terms that move a state which may be left over at an equilibrium,

@@ -10,10 +10,10 @@ from jaxtyping import Array, Float, PyTree
 from .._check import check_instance
 from .._controller import AbstractController, check_controller
 from .._module import parameter
+from .._typing import Difference
 from ..dynamics import LinearDynamics
 from ..estimators import AbstractEstimator, KalmanFilter
 from ._lqr import LQR
-from ._operating_point import Difference
 
 
 class _State(NamedTuple):

@@ -6,11 +6,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_matrix, check_instance, check_positive, symmetric_matrix
+from .._typing import Difference
 from ..dynamics import c2d, linearize, OperatingPoint
 from ..math._gramian import gramian_over
 from ..systems import AbstractSystem, LinearSystem
 from ._lqr import LQR
-from ._operating_point import Difference, linear_at
+from ._operating_point import linear_at
 
 
 def sampled_weights(

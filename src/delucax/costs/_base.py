@@ -18,7 +18,7 @@ from .._module import (
     parameter,
     parts_of,
 )
-from .._typing import Control, RealScalar, State
+from .._typing import Control, Real, RealScalar, State
 from ..systems import AbstractPlant
 
 
@@ -94,8 +94,6 @@ class AbstractCost(eqx.Module):
     __array_ufunc__: ClassVar = None
 
     def __add__(self, other: "AbstractCost") -> "AbstractCost":
-        from ._base import Sum
-
         if not isinstance(other, AbstractCost):
             return NotImplemented
         return Sum(self, other)
@@ -105,8 +103,6 @@ class AbstractCost(eqx.Module):
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
     def __mul__(self, factor: Any) -> "AbstractCost":
-        from ._base import Scaled
-
         if isinstance(factor, AbstractCost):
             return NotImplemented
         return Scaled(self, factor)
@@ -223,7 +219,7 @@ class Scaled(AbstractCost):
     """
 
     cost: AbstractCost
-    factor: Array = parameter()
+    factor: Real = parameter()
 
     def __check_init__(self):
         check_instance(self.cost, AbstractCost, "cost", "Scaled")
@@ -258,7 +254,7 @@ class Rate(AbstractCost):
     """
 
     cost: AbstractCost
-    dt: Array = parameter()
+    dt: Real = parameter()
 
     def __check_init__(self):
         check_instance(self.cost, AbstractCost, "cost", "Rate")

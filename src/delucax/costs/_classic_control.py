@@ -76,8 +76,8 @@ class PendulumCost(AbstractCost):
         ```
     """
 
-    velocity_weight: Array = parameter(0.1)
-    torque_weight: Array = parameter(0.001)
+    velocity_weight: Real = parameter(0.1)
+    torque_weight: Real = parameter(0.001)
 
     def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
         angle = wrap(x[0])
@@ -113,9 +113,9 @@ class AcrobotHeight(AbstractCost):
         ```
     """
 
-    velocity_weight: Array = parameter(0.01)
-    torque_weight: Array = parameter(0.01)
-    final_weight: Array = parameter(0.0)
+    velocity_weight: Real = parameter(0.01)
+    torque_weight: Real = parameter(0.01)
+    final_weight: Real = parameter(0.0)
 
     def _state(self, x: State) -> Scalar:
         lack = 2 + cos(x[0]) + cos(x[0] + x[1])

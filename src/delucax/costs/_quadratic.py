@@ -11,7 +11,7 @@ from jaxtyping import Array
 from .._check import as_vector, check_finite, symmetric_matrix
 from .._message import shortened
 from .._module import function_field, parameter
-from .._typing import Control, Matrix, RealScalar, Scalar, State, Vector
+from .._typing import Control, Difference, Matrix, RealScalar, Scalar, State, Vector
 from ..math import quadratic_form
 from ..math._small import dot
 from ._base import AbstractCost
@@ -93,7 +93,7 @@ class Quadratic(_AbstractQuadratic):
     Qf: Matrix | Vector | None = parameter()
     state_target: Array | None = parameter()
     control_target: Array | None = parameter()
-    difference: Callable[[Array, Array], Array] | None = function_field()
+    difference: Difference | None = function_field()
 
     def __init__(
         self,
@@ -103,11 +103,10 @@ class Quadratic(_AbstractQuadratic):
         state_target: Any = None,
         control_target: Any = None,
         *,
-        difference: Callable[[Array, Array], Array] | None = None,
+        difference: Difference | None = None,
     ):
         self.Q, self.R, self.Qf = Q, R, final
-        self.state_target = state_target
-        self.control_target = control_target
+        self.state_target, self.control_target = state_target, control_target
         self.difference = difference
 
     def __check_init__(self):
@@ -180,8 +179,7 @@ class Tracking(_AbstractQuadratic):
         output: Callable[[Array], Array] | None = None,
     ):
         self.Q, self.R, self.Qf = Q, R, final
-        self.reference = reference
-        self.output = output
+        self.reference, self.output = reference, output
 
     def __check_init__(self):
         if not callable(self.reference):

@@ -9,10 +9,10 @@ from jaxtyping import Array
 
 from .._check import as_matrix, check_count, check_range
 from .._module import parameter, positive
-from .._typing import PRNGKey, Vector
+from .._typing import PRNGKey, Real, Vector
 from ..math import sin
 from ..math._steps import coarsest, position, step_between
-from ._base import AbstractDisturbance, AbstractEntrywise, Rows
+from ._base import AbstractDisturbance, AbstractEntrywise, as_size, Rows
 
 
 class Zero(AbstractDisturbance):
@@ -59,14 +59,40 @@ class Constant(AbstractEntrywise):
         ```
     """
 
-    value: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(self, value: Any, *, size: int | None = None):
-        self._set_entries(size, value=value)
+    value: Real = parameter()
+    size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         return self._rows(self.value, times)
+
+
+def shock(
+    value: Any, start: Any, duration: Any, *, size: int | None = None
+) -> AbstractDisturbance:
+    """A constant push for a while: a `Constant`, `between` two times.
+
+    **Arguments:**
+
+    - `value`: a number, or a vector of `size` entries.
+    - `start`, `duration`: in units of time.
+    - `size`: entries a step; follows from `value` if that is a vector.
+
+    **Returns:** the disturbance.
+
+    **Raises:** `ValueError` if the size is unknown or does not fit, or `duration` is
+    negative.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        push = dlx.disturbances.shock(jnp.array([0.0, 0.5]), start=5.0, duration=0.5)
+        ```
+    """
+    check_range(duration, "duration", "shock")
+    return Constant(value, size=size).between(start, start + duration)
 
 
 class Sinusoid(AbstractEntrywise):
@@ -93,24 +119,11 @@ class Sinusoid(AbstractEntrywise):
         ```
     """
 
-    amplitude: Array = parameter()
-    frequency: Array = parameter()
-    phase: Array = parameter()
-    offset: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(
-        self,
-        amplitude: Any,
-        frequency: Any,
-        phase: Any = 0.0,
-        offset: Any = 0.0,
-        *,
-        size: int | None = None,
-    ):
-        self._set_entries(
-            size, amplitude=amplitude, frequency=frequency, phase=phase, offset=offset
-        )
+    amplitude: Real = parameter()
+    frequency: Real = parameter()
+    phase: Real = parameter(0.0)
+    offset: Real = parameter(0.0)
+    size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         angle = 2 * np.pi * self.frequency * times[:, None] + self.phase
@@ -145,15 +158,10 @@ class Square(AbstractEntrywise):
         ```
     """
 
-    amplitude: Array = parameter()
-    period: Array = parameter(constraint=positive)
-    duty: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(
-        self, amplitude: Any, period: Any, duty: Any = 0.5, *, size: int | None = None
-    ):
-        self._set_entries(size, amplitude=amplitude, period=period, duty=duty)
+    amplitude: Real = parameter()
+    period: Real = parameter(constraint=positive)
+    duty: Real = parameter(0.5)
+    size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
     def __check_init__(self):
         check_range(self.duty, "duty", "Square", 0, 1)

@@ -11,10 +11,10 @@ from jaxtyping import Array
 from .._check import check_count, check_key, check_range, check_step
 from .._jax import normal
 from .._module import parameter
-from .._typing import PRNGKey, Vector
+from .._typing import PRNGKey, Real, Vector
 from ..math import clip
 from ..math._steps import step_between
-from ._base import AbstractDisturbance, AbstractEntrywise, Rows
+from ._base import AbstractDisturbance, AbstractEntrywise, as_size, Rows
 
 
 class Gaussian(AbstractEntrywise):
@@ -41,12 +41,9 @@ class Gaussian(AbstractEntrywise):
         ```
     """
 
-    std: Array = parameter()
-    mean: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(self, std: Any, mean: Any = 0.0, *, size: int | None = None):
-        self._set_entries(size, std=std, mean=mean)
+    std: Real = parameter()
+    mean: Real = parameter(0.0)
+    size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
     def __check_init__(self):
         check_range(self.std, "std", "Gaussian")
@@ -79,12 +76,9 @@ class Uniform(AbstractEntrywise):
         ```
     """
 
-    low: Array = parameter()
-    high: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(self, low: Any, high: Any, *, size: int | None = None):
-        self._set_entries(size, low=low, high=high)
+    low: Real = parameter()
+    high: Real = parameter()
+    size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
     def __check_init__(self):
         check_range(self.high, "high", "Uniform", self.low)
@@ -121,12 +115,9 @@ class RandomWalk(AbstractEntrywise):
         ```
     """
 
-    std: Array = parameter()
-    bound: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(self, std: Any = 0.3, bound: Any = 1.0, *, size: int | None = None):
-        self._set_entries(size, std=std, bound=bound)
+    std: Real = parameter(0.3)
+    bound: Real = parameter(1.0)
+    size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
     def __check_init__(self):
         check_range(self.std, "std", "RandomWalk")

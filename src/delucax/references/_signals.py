@@ -7,7 +7,7 @@ from jaxtyping import Array
 
 from .._check import as_matrix, check_step
 from .._module import check_parameters, parameter, positive
-from .._typing import RealScalar, Vector
+from .._typing import Real, RealScalar, Vector
 from ..math import sin
 from ..math._steps import step_at
 
@@ -68,7 +68,7 @@ class Sequence(eqx.Module):
     """
 
     values: Array = parameter()
-    dt: Array = parameter(constraint=positive)
+    dt: Real = parameter(constraint=positive)
 
     def __check_init__(self):
         check_step(self.dt, "Sequence")
@@ -103,9 +103,9 @@ class FigureEight(eqx.Module):
         ```
     """
 
-    period: Array = parameter(constraint=positive)
-    width: Array = parameter(1.0)
-    height: Array = parameter(1.0)
+    period: Real = parameter(constraint=positive)
+    width: Real = parameter(1.0)
+    height: Real = parameter(1.0)
     centre: Array = parameter((0.0, 0.0))
 
     def __check_init__(self):
