@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.random as jr
 import numpy as np
 from jaxtyping import Array, PyTree
 
@@ -146,22 +145,21 @@ class AbstractStochasticPolicy(AbstractController):
         import jax.numpy as jnp
         from jaxtyping import Array
 
-        class Dithered(dlx.AbstractStochasticPolicy):
-            gain: Array = dlx.weight(20.0)
+        class Coin(dlx.AbstractStochasticPolicy):
+            logit: Array = dlx.weight(0.0)
 
             def init(self, *, key=None):
                 return key
 
-            def __call__(self, t, y, state):
-                state, now = jax.random.split(state)
-                return -self.gain * y[:1] + jax.random.normal(now, (1,), y.dtype), state
+            def __call__(self, t, y, key):
+                key, now = jax.random.split(key)
+                heads = jax.random.bernoulli(now, jax.nn.sigmoid(self.logit))
+                return jnp.where(heads, jnp.ones(1), -jnp.ones(1)), key
 
-            def log_prob(self, t, y, state, u):
-                return -0.5 * jnp.sum((u + self.gain * y[:1]) ** 2)
+            def log_prob(self, t, y, key, u):
+                return jax.nn.log_sigmoid(self.logit * u[0])
 
-        policy = Dithered()
-        state = policy.init(key=jax.random.key(0))
-        policy.log_prob(0.0, jnp.zeros(2), state, jnp.ones(1))
+        Coin().log_prob(0.0, jnp.zeros(2), None, jnp.ones(1))
         ```
     """
 
@@ -267,12 +265,6 @@ def initial_state(controller: AbstractController, key: PRNGKey | None) -> PyTree
         return jnp.asarray(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
 
     return jax.tree.map(as_array, controller.init(key=key))
-
-
-def has_state(controller: AbstractController) -> bool:
-    """Whether a controller carries arrays from one step to the next."""
-    start = lambda: eqx.filter(initial_state(controller, jr.key(0)), eqx.is_array)
-    return bool(jax.tree.leaves(jax.eval_shape(start)))
 
 
 def replay(

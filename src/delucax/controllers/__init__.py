@@ -12,7 +12,7 @@ from ._basic import (
 from ._finite_horizon import FiniteHorizonLQR as FiniteHorizonLQR
 from ._hinfinity import HInfinity as HInfinity
 from ._lqr import LQI as LQI, LQR as LQR
-from ._mpc import MPC as MPC, MPCState as MPCState
+from ._mpc import MPC as MPC
 from ._network import (
     GRU as GRU,
     History as History,
@@ -23,22 +23,15 @@ from ._network import (
 from ._output_feedback import LQG as LQG, OutputFeedback as OutputFeedback
 from ._pid import LeakyPID as LeakyPID, PID as PID
 from ._sampled import lqrd as lqrd, sampled_weights as sampled_weights
-from ._stochastic import (
-    Categorical as Categorical,
-    Gaussian as Gaussian,
-    Likeliest as Likeliest,
-)
+from ._stochastic import Categorical as Categorical, Gaussian as Gaussian
 from .online import (
     adagrad_norm as adagrad_norm,
     Adaptive as Adaptive,
     best_in_hindsight as best_in_hindsight,
     BPC as BPC,
     drc as drc,
-    dsc as dsc,
     Explore as Explore,
-    FixedPolicy as FixedPolicy,
     gpc as gpc,
-    Hindsight as Hindsight,
     neural_gpc as neural_gpc,
     online_newton as online_newton,
     OnlineLearner as OnlineLearner,

@@ -64,16 +64,13 @@ class HInfinity(AbstractController):
 
         ```python
         import delucax as dlx
-        import jax
         import jax.numpy as jnp
 
-        env = dlx.make("pendulum")
-        upright = dlx.linearize(env.dynamics)
-        controller = dlx.controllers.HInfinity(
-            upright, jnp.eye(2), jnp.eye(1), difference=env.dynamics.difference
-        )
-        x0 = jnp.array([0.1, 0.0])
-        dlx.rollout(env, controller, key=jax.random.key(0), x0=x0).total_cost
+        A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
+        dynamics, weight = dlx.LinearDynamics(A, B), jnp.eye(2)
+        best = dlx.controllers.HInfinity(dynamics, weight, jnp.eye(1))
+        calm = dlx.controllers.HInfinity(dynamics, weight, jnp.eye(1), gamma=10.0)
+        best.gamma, best.K, calm.K
         ```
     """
 

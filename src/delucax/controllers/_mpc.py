@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from .._check import (
     as_rows,
@@ -31,31 +31,9 @@ from ._operating_point import check_state, deviation
 
 
 class MPCState(NamedTuple):
-    """What [`delucax.controllers.MPC`][] remembers.
+    """What [`delucax.controllers.MPC`][] remembers."""
 
-    **Attributes:** `controls`, shape `(T, m)`, `states`, shape `(T+1, n)`, and `gains`,
-    shape `(T, m, n)`, of the last plan a step later, from which the next one starts;
-    `result`, that of the last plan; `failures`, a [`delucax.controllers.Tally`][] of
-    the plans that did not succeed; `iterations`, how many the last plan took; `key`,
-    for planners that draw.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        dynamics = dlx.LinearDynamics(jnp.eye(1), jnp.eye(1))
-        cost = dlx.costs.Quadratic([1.0], [1.0])
-        mpc = dlx.controllers.MPC(dynamics, cost, 5)
-        u, state = mpc(0.0, jnp.ones(1), mpc.init())
-        state.failures.count
-        ```
-    """
-
-    controls: Float[Array, "T m"]
-    states: Float[Array, "T+1 n"]
-    gains: Float[Array, "T m n"]
+    last: Start
     result: Result
     failures: Tally
     iterations: Int[Array, ""]
@@ -88,8 +66,11 @@ class MPC(AbstractController):
     control is not positive definite there, no gain stabilises the plant, or the
     dynamics cannot be differentiated.
 
-    What became of a plan is in the controller's state: `result`, and how often it was
-    no success, `failures`, which are `incidents["failed_plan"]` of a rollout. A plan
+    What became of a plan is in the controller's state: `result`, that of the last plan;
+    `iterations`, how many it took; and how often it was no success, `failures`, which
+    are `incidents["failed_plan"]` of a rollout. There too is `last`, a
+    [`delucax.planning.Start`][], the last plan a step later, from which the next one
+    starts. A plan
     that ran out of iterations or found no descent is used as it is, the best so far.
     Where there is none to use, since every start diverges or the constraints cannot
     hold, `throw` says what happens.
@@ -214,11 +195,8 @@ class MPC(AbstractController):
         draws = self.planner.is_stochastic
         if draws:
             check_key(key, "MPC.init")
-        first = jax.tree.map(lambda a: a[0], self.start)
         return MPCState(
-            first.controls,
-            first.states,
-            first.gains,
+            last=jax.tree.map(lambda a: a[0], self.start),
             result=jax.tree.map(jnp.asarray, RESULTS.successful),
             failures=Tally("failed_plan"),
             iterations=jnp.zeros((), int),
@@ -230,8 +208,7 @@ class MPC(AbstractController):
         key, draw = state.key, None
         if self.planner.is_stochastic:
             key, draw = jr.split(key)
-        last = Start(state.controls, state.states, state.gains)
-        starts = state.controls
+        last, starts = state.last, state.last.controls
         if not self.planner.starts_from_states:
             join = lambda a, b: jnp.concatenate([a[None], b])
             starts = jax.tree.map(join, last, self.start)
@@ -251,15 +228,16 @@ class MPC(AbstractController):
         lost, u = ~plan.is_usable, plan.controls[0]
         u = jnp.where(lost, self._followed(y, last), u)
         if self.throw:
+            # Hung on the control, which every caller reads: on the state it would be
+            # removed as dead code where nobody does.
             u = plan.result.error_if(u, lost)
+        # The warm start is the plan a step later, its last step held for the new one. A
+        # lost plan is forgotten, or the next one would start from what had failed.
         shift = lambda a: jnp.concatenate([a[1:], a[-1:]])
         later = Start(*(shift(a) for a in (plan.controls, plan.states, plan.gains)))
         renewed = lambda new, old: jnp.where(lost, old[0], new).astype(old.dtype)
-        later = jax.tree.map(renewed, later, self.start)
         after = MPCState(
-            later.controls,
-            later.states,
-            later.gains,
+            last=jax.tree.map(renewed, later, self.start),
             result=plan.result,
             failures=state.failures.add(plan.result != RESULTS.successful),
             iterations=jnp.asarray(plan.iterations, state.iterations.dtype),
@@ -271,6 +249,7 @@ class MPC(AbstractController):
         """The first control of the last plan, under its gains."""
         assert last.states is not None and last.gains is not None
         x, u = last.states[0], last.controls[0]
+        # Gains of a plan that diverged may not be finite: its controls alone, then.
         tried = u - matvec(last.gains[0], deviation(y, x, self.difference))
         u = jnp.where(jnp.isfinite(tried), tried, u)
         if self.bounds is None:

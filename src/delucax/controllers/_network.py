@@ -24,7 +24,7 @@ from .._check import (
 )
 from .._controller import AbstractController, check_controller, wrong_observation
 from .._module import as_float_array, as_module, function_field, parameter, weight
-from .._typing import PRNGKey
+from .._typing import PRNGKey, Real
 from ..environments import Environment
 from ._stochastic import Gaussian
 
@@ -213,14 +213,9 @@ class GRU(AbstractController):
 
     **Arguments:**
 
-    - `in_size`: the size of the features.
-    - `out_size`: the number of controls.
+    - `in_size`, `out_size`, `features`, `bounds`, `key`: as of
+        [`delucax.controllers.MLP`][].
     - `width`: the size of the memory, 32 by default.
-    - `features`: what the network is given of an observation, a function such as
-        `env.encode`; the observation itself by default.
-    - `bounds`: `(low, high)`, each a finite number or vector, that the control is
-        squashed into; none by default.
-    - `key`: a random key, for the first weights.
 
     **Attributes:** `cell`, an `eqx.nn.GRUCell`, and `readout`, an `eqx.nn.Linear`,
     trainable.
@@ -391,21 +386,13 @@ class Standardise(eqx.Module):
     """
 
     mean: Array = parameter()
-    std: Array = parameter()
-    features: Callable[[Array], Array] | None = function_field()
+    std: Real = parameter(1.0)
+    features: Callable[[Array], Array] | None = function_field(None)
 
-    def __init__(
-        self,
-        mean: Any,
-        std: Any = 1.0,
-        features: Callable[[Array], Array] | None = None,
-    ):
-        self.mean = as_float_array(mean)
-        std = as_float_array(std)
-        if eqx.is_inexact_array(self.mean) and jnp.ndim(std) == 0:
-            std = jnp.broadcast_to(std, self.mean.shape).astype(self.mean.dtype)
-        self.std = std
-        self.features = features
+    def __post_init__(self):
+        mean, std = as_float_array(self.mean), as_float_array(self.std)
+        if eqx.is_inexact_array(mean) and jnp.ndim(std) == 0:
+            self.std = jnp.broadcast_to(std, mean.shape).astype(mean.dtype)
 
     def __check_init__(self):
         where, mean = "Standardise", self.mean

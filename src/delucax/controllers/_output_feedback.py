@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._check import check_instance
 from .._controller import AbstractController, check_controller
@@ -164,8 +164,8 @@ class LQG(AbstractController):
         V: Any,
         S: Any = None,
         *,
-        mean: Any = None,
-        covariance: Any = None,
+        mean: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
         steady_state: bool = True,
         y_ref: Any = None,
         difference: Difference | None = None,

@@ -1,8 +1,9 @@
 """Proportional-integral-derivative control."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY
-from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -84,10 +85,6 @@ class _AbstractPID(AbstractController):
     reference: eqx.AbstractVar[Array | Callable[[Any], Array] | None]
     output: eqx.AbstractVar[Any]
     bounds: eqx.AbstractVar[Bounds | None]
-    if TYPE_CHECKING:  # a static checker would ask for it as an argument
-        _times: ClassVar[tuple[str, ...]]
-    else:
-        _times: eqx.AbstractClassVar[tuple[str, ...]]
 
     def __check_init__(self):
         where = type(self).__name__
@@ -100,12 +97,13 @@ class _AbstractPID(AbstractController):
         """The number of loops: the size that all vectors have; 1 where all are
         numbers."""
         where = type(self).__name__
-        low, high = (None, None) if self.bounds is None else self.bounds
-        vectors = {"low bounds": low, "high bounds": high}
-        vectors |= {name: getattr(self, name) for name in ("kp", "ki", "kd")}
-        vectors |= {name: getattr(self, name) for name in self._times}
-        if not callable(self.reference):
-            vectors["reference"] = self.reference
+        low, high = self.bounds or (None, None)
+        skipped = "output", "bounds", "derivative_on"
+        names = [f.name for f in dataclasses.fields(self) if f.name not in skipped]
+        vectors = {name: getattr(self, name) for name in names}
+        if callable(self.reference):
+            del vectors["reference"]
+        vectors |= {"low bounds": low, "high bounds": high}
         sizes = {}
         for name, value in vectors.items():
             if value is None:
@@ -148,8 +146,7 @@ class _AbstractPID(AbstractController):
                 f"{name}: expects {loops} outputs, one a loop, but {what} shape "
                 f"{measured.shape}; choose what each loop follows, such as output=0."
             )
-        given = self.reference
-        reference = given(t) if callable(given) else given
+        reference = self.reference(t) if callable(self.reference) else self.reference
         reference = jnp.asarray(0 if reference is None else reference)
         if reference.shape not in ((), (loops,)):
             raise ValueError(
@@ -233,8 +230,6 @@ class PID(_AbstractPID):
     )
     anti_windup_time: Real | None = parameter(None, constraint=positive)
 
-    _times: ClassVar = ("derivative_time_constant", "anti_windup_time")
-
     def __check_init__(self):
         check_choice(
             self.derivative_on, ("measurement", "error"), "derivative_on", "PID"
@@ -255,9 +250,13 @@ class PID(_AbstractPID):
         step = jnp.where(state.started, moving - state.previous, 0)
         lag = self.derivative_time_constant
         lag = self.dt if lag is None else lag
+        # Backward Euler on `T_d D' + D = dz/dt`: stable whatever T_d, and with T_d = 0
+        # the plain difference `step / dt`.
         slope = (lag * state.slope + step) / (lag + self.dt)
         asked = self.kp * error + state.integral + self.kd * slope
         integral = state.integral + self.dt * self.ki * error
+        # The integral of this step acts from the next one on, so that `applied`, which
+        # comes in between, corrects what the next control is made of.
         after = _Memory(integral, slope, moving, jnp.ones((), bool), asked)
         return self._clip(asked, y), _as(after, state)
 
@@ -267,9 +266,13 @@ class PID(_AbstractPID):
 
     def _windup_rate(self):
         """`1 / T_a`, and 0 where there is no integral to wind up."""
+        # Faster than the sample the correction would overshoot, and oscillate.
         fastest = 1 / self.dt
         if self.anti_windup_time is None:
             no_kp = self.kp == 0
+            # The integral time T_i = kp / ki for T_a, a textbook's choice for PI
+            # (Astrom and Hagglund, 2006). 1 in place of a kp of 0, because `where`
+            # differentiates both of its sides.
             rate = jnp.abs(self.ki / jnp.where(no_kp, 1, self.kp))
             rate = jnp.where(no_kp, fastest, jnp.minimum(rate, fastest))
         else:
@@ -297,14 +300,10 @@ class LeakyPID(_AbstractPID):
 
     **Arguments:**
 
-    - `kp`, `ki`, `kd`: the gains, each a number or a vector with an entry for each
-        loop; 3, 4 and 0 by default. Trainable.
-    - `dt`: the control interval, that of the environment.
+    - `kp`, `ki`, `kd`: the gains, as of [`delucax.controllers.PID`][]; 3, 4 and 0 by
+        default.
+    - `dt`, `reference`, `output`, `bounds`: as there.
     - `time_constant`: T, 0.5 by default.
-    - `reference`: r, a function of time, a vector or a number; 0 by default.
-    - `output`: h, what the loops follow: an index into the observation, a tuple of
-        indices, a matrix, or a function of the observation; all of it by default.
-    - `bounds`: `(low, high)`, each a number or a vector; none by default.
 
     **Raises:** `ValueError` if sizes do not fit, or a time is not positive; when it is
     run, if there are not as many outputs as loops.
@@ -333,8 +332,6 @@ class LeakyPID(_AbstractPID):
     reference: Array | Callable[[Any], Array] | None = parameter(None)
     output: Callable[[Array], Array] | int | Sequence[int] | None = _output_field()
     bounds: tuple[Array, Array] | None = bounds_field("LeakyPID", default=None)
-
-    _times: ClassVar = ("time_constant",)
 
     def init(self, *, key=None):
         zeros = self._zeros()

@@ -16,7 +16,7 @@ from .._controller import (
     AbstractController,
     AbstractStochasticPolicy,
     check_controller,
-    has_state,
+    initial_state,
     replay,
 )
 from .._message import shortened
@@ -46,7 +46,8 @@ class _AroundBase(AbstractStochasticPolicy):
     @property
     def has_memory(self) -> bool:
         """Whether `base` has a state, on which the distribution depends."""
-        return has_state(self.base)
+        start = lambda: eqx.filter(initial_state(self.base, jr.key(0)), eqx.is_array)
+        return bool(jax.tree.leaves(jax.eval_shape(start)))
 
 
 class Gaussian(_AroundBase):
@@ -127,12 +128,8 @@ class Gaussian(_AroundBase):
     def log_prob(self, t: RealScalar, y: Array, state: PyTree, u: Array) -> Array:
         """The log-probability with which `__call__(t, y, state)` gives `u`.
 
-        **Arguments:**
-
-        - `t`: time, a scalar.
-        - `y`: observation, a vector.
-        - `state`: the controller's state, before the call.
-        - `u`: a control, shape `(m,)`; beyond the bounds it counts as clipped to them.
+        **Arguments:** `t`, `y`, `state`: as of a call. `u`: a control, shape `(m,)`;
+            beyond the bounds it counts as clipped to them.
 
         **Returns:** a scalar: a density over the controls that are between their
         bounds, a probability over those that are at one.
@@ -145,11 +142,7 @@ class Gaussian(_AroundBase):
 
         `sum_i log std_i + log(2 pi e) / 2`.
 
-        **Arguments:**
-
-        - `t`: time, a scalar.
-        - `y`: observation, a vector.
-        - `state`: the controller's state, before the call.
+        **Arguments:** `t`, `y`, `state`: as of a call.
 
         **Returns:** a scalar.
         """
@@ -253,6 +246,11 @@ class Categorical(_AroundBase):
         check_controller(self.base, "base", "Categorical")
         as_matrix(self.actions, "actions", "Categorical")
 
+    @property
+    def greedy(self) -> AbstractController:
+        """The deterministic controller that gives the likeliest of the controls."""
+        return _Greedy(self)
+
     def _logits(self, t, y, state):
         logits, base = self.base(t, y, state.base)
         if logits.shape != self.actions.shape[:1]:
@@ -271,12 +269,8 @@ class Categorical(_AroundBase):
     def log_prob(self, t: RealScalar, y: Array, state: PyTree, u: Array) -> Array:
         """The log-probability with which `__call__(t, y, state)` gives `u`.
 
-        **Arguments:**
-
-        - `t`: time, a scalar.
-        - `y`: observation, a vector.
-        - `state`: the controller's state, before the call.
-        - `u`: a control, shape `(m,)`; it counts as the nearest one of the table.
+        **Arguments:** `t`, `y`, `state`: as of a call. `u`: a control, shape `(m,)`; it
+            counts as the nearest one of the table.
 
         **Returns:** a scalar.
         """
@@ -287,11 +281,7 @@ class Categorical(_AroundBase):
     def entropy(self, t: RealScalar, y: Array, state: PyTree) -> Array:
         """The entropy of the draw, `-sum_i p_i log p_i`.
 
-        **Arguments:**
-
-        - `t`: time, a scalar.
-        - `y`: observation, a vector.
-        - `state`: the controller's state, before the call.
+        **Arguments:** `t`, `y`, `state`: as of a call.
 
         **Returns:** a scalar.
         """
@@ -299,31 +289,13 @@ class Categorical(_AroundBase):
         return -jnp.sum(jnp.exp(logits) * logits)
 
 
-class Likeliest(AbstractController):
-    """The control that a [`delucax.controllers.Categorical`][] gives most often.
-
-    **Arguments:** `policy`: the controller that draws.
-
-    **Raises:** `ValueError` if it is not a `Categorical`.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-
-        logits = dlx.controllers.MLP(2, 3, width=8, depth=1, key=jax.random.key(0))
-        policy = dlx.controllers.Categorical(logits, [[-2.0], [0.0], [2.0]])
-        best = dlx.controllers.Likeliest(policy)
-        env = dlx.make("pendulum")
-        dlx.rollout(env, best, key=jax.random.key(1), horizon=10).controls
-        ```
-    """
+class _Greedy(AbstractController):
+    """The control that a `Categorical` gives most often."""
 
     policy: Categorical
 
     def __check_init__(self):
-        check_instance(self.policy, Categorical, "policy", "Likeliest")
+        check_instance(self.policy, Categorical, "policy", "greedy")
 
     def init(self, *, key=None):
         return self.policy.base.init(key=key)

@@ -19,7 +19,7 @@ from ..._check import (
 )
 from ..._controller import AbstractController, AbstractLearner
 from ..._module import parameter
-from ..._typing import PRNGKey
+from ..._typing import PRNGKey, Real
 
 
 class AdaptiveState(NamedTuple):
@@ -96,8 +96,8 @@ class Adaptive(AbstractController):
     _: KW_ONLY
     slots: int = eqx.field(default=8, static=True)
     every: int = eqx.field(default=64, static=True)
-    rate: Array = parameter(0.5)
-    share: Array = parameter(0.02)
+    rate: Real = parameter(0.5)
+    share: Real = parameter(0.02)
     play: Literal["mix", "switch"] = eqx.field(default="mix", static=True)
 
     def __check_init__(self):
@@ -115,10 +115,8 @@ class Adaptive(AbstractController):
         if self.play == "switch":
             own, base_key = jr.split(check_key(key, "Adaptive.init"))
             chosen = jnp.zeros((), jnp.int32)
-        experts = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (self.slots, *leaf.shape)),
-            self.base.init(key=base_key),
-        )
+        copies = lambda leaf: jnp.broadcast_to(leaf, (self.slots, *leaf.shape))
+        experts = jax.tree.map(copies, self.base.init(key=base_key))
         first, zero = jnp.arange(self.slots) == 0, jnp.zeros(())
         return AdaptiveState(
             experts,
@@ -151,8 +149,10 @@ class Adaptive(AbstractController):
     ) -> AdaptiveState:
         """New weights, up to a factor, and perhaps another choice, after a step."""
         old, alive = state.weights, state.weights > 0
+        # An empty slot holds a stale state, whose loss may not be finite.
         losses = jnp.where(alive, losses, 0)
         played = old @ losses
+        # The mean of all losses at first, then an exponential one over `every` steps.
         fading = 1 / jnp.minimum(state.step + 1, self.every).astype(old.dtype)
         mean = state.mean + fading * (played - state.mean)
         variance = state.variance + fading * ((played - mean) ** 2 - state.variance)
@@ -183,6 +183,7 @@ class Adaptive(AbstractController):
         step, ends = state.step, state.ends
         is_birth, births = step % self.every == 0, jnp.maximum(step // self.every, 1)
         slot = jnp.argmin(ends)
+        # `births & -births` is the largest power of two that divides it.
         life = self.every * (4 * (births & -births) + 1)
         newborn = is_birth & (jnp.arange(self.slots) == slot)
         ends = jnp.where(newborn, step + life, ends)
@@ -201,10 +202,11 @@ class Adaptive(AbstractController):
         kept = alive & ~newborn
         weights = jnp.where(kept, state.weights, 0)
         weights = weights / jnp.sum(weights)
+        # Herbster and Warmuth's share: no weight falls below share / (number alive), so
+        # an expert that becomes the best leads after some log(1 / share) / rate steps.
         weights = (1 - self.share) * weights + self.share * (alive / jnp.sum(alive))
-        state = state._replace(
-            experts=experts, ends=ends, weights=weights.astype(state.weights.dtype)
-        )
+        weights = weights.astype(state.weights.dtype)
+        state = state._replace(experts=experts, ends=ends, weights=weights)
         if state.chosen is None:
             return state
         return self._rechosen(weights, jnp.where(kept[state.chosen], 1, 0), state)

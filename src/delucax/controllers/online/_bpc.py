@@ -1,5 +1,6 @@
 """Learning from the cost alone."""
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from ..._check import check_count, check_instance, check_key, check_step
 from ..._controller import AbstractController, Tally
 from ..._module import parameter
-from ..._typing import PRNGKey
+from ..._typing import PRNGKey, Real
 from ...dynamics import AbstractDynamics
 from ...math._norms import safe_norm
 from ._closed_loop import ClosedLoop, ClosedLoopState, in_first_responses, shift
@@ -97,8 +98,8 @@ class BPC(AbstractController):
 
     loop: ClosedLoop
     policy: LinearPolicy
-    delta: Array = parameter()
-    learning_rate: Array = parameter()
+    delta: Real = parameter()
+    learning_rate: Real = parameter()
     optimiser: optax.GradientTransformation = eqx.field(static=True)
     window: int = eqx.field(static=True)
 
@@ -119,9 +120,7 @@ class BPC(AbstractController):
         memory = check_count(memory, "memory", where)
         # A roll-out as long as it takes a control to show.
         loop = ClosedLoop(dynamics, base, dynamics.state_size, where, memory=memory)
-        scale = lambda given, name, units: in_first_responses(
-            loop, given, name, units, where
-        )
+        scale = functools.partial(in_first_responses, loop, where)
         start = jnp.zeros((dynamics.control_size, loop.feature_size), loop.dtype)
         self.loop = loop
         self.policy = LinearPolicy(start, scale(radius, "radius", RADIUS))
@@ -165,21 +164,12 @@ class BPC(AbstractController):
         # The first cost has nothing to be compared with.
         off = jnp.where(state.steps > 0, cost - state.level, 0)
         size = state.theta.size
+        # The one-point estimate of Flaxman, Kalai and McMahan (2005): the mean of
+        # (d / delta) c(theta + delta e) e over the sphere is the gradient of c smoothed
+        # over the ball. A cost counts for all directions whose effect may still last.
         gradient = size / self.delta * off * jnp.sum(state.tried, axis=0)
-        theta, optimiser, refused = projected_step(
-            self.optimiser,
-            self.learning_rate,
-            self.policy.project,
-            gradient.astype(state.theta.dtype),
-            state.theta,
-            state.optimiser,
-            state.refused,
-        )
-        return state._replace(
+        return projected_step(self, gradient.astype(state.theta.dtype), state)._replace(
             loop=self.loop.applied(u, cost, state.loop),
-            theta=theta,
-            optimiser=optimiser,
-            refused=refused,
             level=state.level + (cost - state.level) / steps,
             steps=steps,
         )

@@ -121,10 +121,8 @@ class ClosedLoop(eqx.Module):
         self.dynamics, self.base = dynamics, base
         self.observed = dynamics.observes_state
         self.nature = not self.observed if nature is None else nature
-        is_linear = isinstance(dynamics, LinearDynamics)
-        is_constant = (
-            is_linear and not dynamics.is_time_varying and isinstance(base, _AFFINE)
-        )
+        is_linear = isinstance(dynamics, LinearDynamics) and isinstance(base, _AFFINE)
+        is_constant = is_linear and not dynamics.is_time_varying
         if not is_constant and not self.observed:
             raise ValueError(
                 f"{where}: where the state is not observed, dynamics must be linear "
@@ -148,9 +146,14 @@ class ClosedLoop(eqx.Module):
         self.response = self.first_response = None
         if tangents is not None:
             first = jax.tree.map(lambda a: a if a.ndim == 2 else a[0], tangents)
-            response = _impulse_response(first, self.horizon)
-            self.first_response = _first_size(response[:, : dynamics.observation_size])
+            step = lambda z, _: (first.transition @ z, first.output @ z)
+            response = lax.scan(step, first.input, length=self.horizon)[1]
             self.response = response if is_constant else None
+            moved = response[:, : dynamics.observation_size]
+            sizes = jnp.sqrt(jnp.sum(moved**2, axis=(1, 2)))
+            # A control may take several steps to show: what is below is rounding.
+            slack = jnp.finfo(sizes.dtype).eps ** 0.5 * jnp.max(sizes)
+            self.first_response = sizes[jnp.argmax(sizes > slack)]
 
     def __check_init__(self):
         _check_control(self.dynamics, self.base, "ClosedLoop")
@@ -289,7 +292,7 @@ def shift(new: Array, history: Array) -> Array:
 
 
 def in_first_responses(
-    loop: ClosedLoop, given: ArrayLike | None, name: str, units: float, where: str
+    loop: ClosedLoop, where: str, given: ArrayLike | None, name: str, units: float
 ) -> Any:
     """A step size or radius as given, or so many `units / first_response`: in units of
     the control that undoes what was observed."""
@@ -300,10 +303,8 @@ def in_first_responses(
         raise ValueError(
             f"{where}: {name} must be given, for dynamics that name no equilibrium."
         )
-    responds = loop.first_response > 0
-    return jnp.where(
-        responds, units / jnp.where(responds, loop.first_response, 1), units
-    )
+    # Where a control never shows there is no unit; 1 keeps the quotient finite.
+    return units / jnp.where(loop.first_response > 0, loop.first_response, 1)
 
 
 def _check_control(
@@ -375,15 +376,14 @@ def _equilibrium_tangents(
 def _roll_out_length(radius: float | None, horizon: int | None, where: str) -> int:
     """As given, or until an impulse has faded; raise unless the base stabilises the
     plant."""
-    if horizon is not None:
-        horizon = check_count(horizon, "horizon", where)
+    given = None if horizon is None else check_count(horizon, "horizon", where)
     if radius is not None and not radius < 1:
         raise ValueError(
             f"{where}: base must stabilise dynamics, got a closed loop of spectral "
             f"radius {radius:.6g}."
         )
-    if horizon is not None:
-        return horizon
+    if given is not None:
+        return given
     if radius is None:
         raise ValueError(
             f"{where}: horizon must be given where the closed loop cannot be seen: "
@@ -411,17 +411,3 @@ def _spectral_radius(tangents: Tangents) -> float | None:
     # Numbers that a base only carries along, such as a covariance, do not fade.
     parts = transitions[:, reached][:, :, reached]
     return max(np.max(np.abs(np.linalg.eigvals(part)), initial=0) for part in parts)
-
-
-def _first_size(moved: Array) -> Array:
-    """The size of the first response that is not zero."""
-    sizes = jnp.sqrt(jnp.sum(moved**2, axis=(1, 2)))
-    slack = jnp.finfo(sizes.dtype).eps ** 0.5 * jnp.max(sizes)
-    return sizes[jnp.argmax(sizes > slack)]
-
-
-def _impulse_response(tangents: Tangents, horizon: int) -> Array:
-    def step(z, _):
-        return tangents.transition @ z, tangents.output @ z
-
-    return lax.scan(step, tangents.input, length=horizon)[1]

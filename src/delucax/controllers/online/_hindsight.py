@@ -21,30 +21,7 @@ from ._policy import FixedPolicy
 
 
 class Hindsight(NamedTuple):
-    """The best controller of a class for disturbances that are known.
-
-    - `controller`: it, and `trajectory`, its run.
-    - `decrement`: how much less Newton's method still expected, relative to the cost.
-    - `iterations`: steps tried.
-    - `result`: success, or `delucax.RESULTS.not_converged`.
-
-    [`delucax.controllers.best_in_hindsight`][] returns it.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-        import jax.numpy as jnp
-
-        push = dlx.disturbances.Constant(0.1 * jnp.ones(2))
-        env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
-        gain = dlx.controllers.Linear(jnp.zeros((1, 2)))
-        run = dlx.rollout(env, gain, key=jax.random.key(0))
-        best = dlx.controllers.best_in_hindsight(env, gain, run)
-        best.controller.K, best.decrement, best.result
-        ```
-    """
+    """What `best_in_hindsight` returns."""
 
     controller: AbstractController
     trajectory: Trajectory
@@ -65,8 +42,8 @@ def best_in_hindsight(
 
     `min over theta of sum_t c(t, x_t(theta), u_t(theta)) + final(x_T(theta))`,
 
-    with theta the trainable weights of `controller` (of a
-    [`delucax.controllers.FixedPolicy`][] those of its policy, not of its base), from
+    with theta the trainable weights of `controller` (of `learner.fixed()` those of its
+    policy, not of its base), from
     the start and under the disturbances and sensor noise of `trajectory`. It is found
     by Newton's method with Levenberg's damping through the rollout, and is the global
     minimum where the cost is convex in theta: of a disturbance-action policy on a
@@ -87,7 +64,12 @@ def best_in_hindsight(
     - `tolerance`: stop when a step promises less than this part of the cost; by default
         the square root of the rounding error.
 
-    **Returns:** [`delucax.controllers.Hindsight`][].
+    **Returns:** a named tuple of
+
+    - `controller`: the best of the class, and `trajectory`, its run;
+    - `decrement`: how much less Newton's method still expected, relative to the cost;
+    - `iterations`: steps tried;
+    - `result`: success, or `delucax.RESULTS.not_converged`.
 
     **Raises:** `ValueError` if the trajectory has no states or disturbances (or
     observations, where they are noisy), or the controller no trainable weights.

@@ -1,5 +1,6 @@
 """Online control: learning what to add to a base controller's control."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from ..._check import check_instance, check_step, is_concrete, output_of
 from ..._controller import AbstractController, AbstractLearner, Tally
 from ..._jax import is_constant
 from ..._module import function_field, parameter
+from ..._typing import Real
 from ...dynamics import AbstractDynamics, LinearDynamics, linearize
 from .._basic import Scheduled
 from .._lqr import LQR
@@ -102,7 +104,7 @@ class OnlineLearner(AbstractLearner):
     loop: ClosedLoop
     cost: Callable[..., Array] = function_field()
     policy: AbstractPolicy
-    learning_rate: Array = parameter()
+    learning_rate: Real = parameter()
     optimiser: optax.GradientTransformation = eqx.field(static=True)
 
     def __check_init__(self):
@@ -125,10 +127,8 @@ class OnlineLearner(AbstractLearner):
         loop, theta = self.loop, self.policy.init()
         inner, h = loop.init(key, loop.horizon), loop.horizon
         weighted = None
-        uses_curvature = isinstance(
-            self.optimiser, optax.GradientTransformationExtraArgs
-        )
-        if uses_curvature and loop.response is not None:
+        with_extra = optax.GradientTransformationExtraArgs
+        if isinstance(self.optimiser, with_extra) and loop.response is not None:
             root = self._constant_root()
             weighted = None if root is None else self._weighted(root, inner)
         return LearnerState(
@@ -144,19 +144,11 @@ class OnlineLearner(AbstractLearner):
         before = lambda features: self.policy(state.theta, features)
         features, _, loop = self.loop.act(self, t, y, state.loop, before)
         state = state._replace(loop=loop, features=shift(features, state.features))
-        theta, optimiser, refused = projected_step(
-            self.optimiser,
-            self.learning_rate,
-            self.policy.project,
-            jax.grad(self._loss)(state.theta, state),
-            state.theta,
-            state.optimiser,
-            state.refused,
-            curvature=lambda: self._curvature(state),
-        )
-        v = self.policy(theta, features)
-        state = state._replace(theta=theta, optimiser=optimiser, refused=refused)
-        return (loop.u_base + v).astype(y.dtype), state
+        gradient = jax.grad(self._loss)(state.theta, state)
+        curvature = lambda: self._curvature(state)
+        after = projected_step(self, gradient, state, curvature=curvature)
+        v = self.policy(after.theta, features)
+        return (loop.u_base + v).astype(y.dtype), after
 
     def applied(self, u, cost, state):
         return state._replace(loop=self.loop.applied(u, cost, state.loop))
@@ -176,12 +168,16 @@ class OnlineLearner(AbstractLearner):
         **Arguments:** `theta`: what it has learned, from its state; by default what it
         starts with.
 
-        **Returns:** a controller whose `policy.start` is trainable.
+        **Returns:** a controller, `u_t = base(y_t) + policy(theta, features_t)`. Its
+        `policy.start` is theta, trainable; its `loop` is the learner's.
         """
         policy = self.policy if theta is None else self.policy.at(theta)
         return FixedPolicy(self.loop, policy)
 
     def _outcome(self, theta, state):
+        # One theta for all steps of the roll-out, as if it had been held. As it moves
+        # slowly, regret in these losses bounds that of the run (Anava, Hazan and
+        # Mannor, 2015; Agarwal et al., 2019).
         v = jax.vmap(self.policy, in_axes=(None, 0))(theta, state.features)
         return self.loop.counterfactual(v[0], v[1:], state.loop)
 
@@ -220,17 +216,24 @@ class OnlineLearner(AbstractLearner):
 
 
 def linear_learner(
-    loop: ClosedLoop,
+    where: str,
+    dynamics: AbstractDynamics,
     cost: Callable[..., Array],
+    base: AbstractController | None,
+    horizon: int | None,
     learning_rate: ArrayLike | None,
     optimiser: optax.GradientTransformation | None,
     radius: ArrayLike | None,
-    where: str,
+    **signal: Any,
 ) -> OnlineLearner:
-    """A learner of a linear map from features to control."""
-    start = jnp.zeros((loop.dynamics.control_size, loop.feature_size), loop.dtype)
-    ball = in_first_responses(loop, radius, "radius", RADIUS, where)
-    rate = in_first_responses(loop, learning_rate, "learning_rate", STEP, where)
+    """A learner of a linear map from features to control; `signal` says what the
+    features are, as to a `ClosedLoop`."""
+    base = base_for(dynamics, cost, base, where)
+    loop = ClosedLoop(dynamics, base, horizon, where, **signal)
+    start = jnp.zeros((dynamics.control_size, loop.feature_size), loop.dtype)
+    scale = functools.partial(in_first_responses, loop, where)
+    ball = scale(radius, "radius", RADIUS)
+    rate = scale(learning_rate, "learning_rate", STEP)
     if optimiser is None:
         # Newton's step where gradients alone are slow: nature's outputs are much alike
         # from step to step, and a response that changes points elsewhere each time.

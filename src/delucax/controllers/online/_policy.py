@@ -110,22 +110,7 @@ class FixedPolicy(AbstractController):
 
     `u_t = base(y_t) + policy(theta, features_t)`.
 
-    It is the policy that a learner has come to, or the best one in hindsight
-    ([`delucax.controllers.best_in_hindsight`][]). `learner.fixed(theta)` makes it.
-
-    **Attributes:** `loop`, the model with its base controller and the features of its
-    signal; `policy`, the family of policies, whose `policy.start` is theta, trainable.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-
-        env = dlx.make("lds", key=jax.random.key(0))
-        policy = dlx.controllers.gpc(env.dynamics, env.cost).fixed()
-        dlx.rollout(env, policy, key=jax.random.key(0)).total_cost
-        ```
+    `learner.fixed(theta)` makes it.
     """
 
     loop: ClosedLoop
