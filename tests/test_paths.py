@@ -350,7 +350,7 @@ def test_bounds_become_arrays():
             dlx.replace(controller, {"bounds.0": 3.0})
     wide = dlx.replace(pid, {"kp": [1.0, 2.0]})
     assert wide.loops == 2 and wide.init().integral.shape == (2,)
-    with user_error(match="one entry a loop"):
+    with user_error(match="one entry per loop"):
         dlx.replace(wide, {"ki": [1.0, 2.0, 3.0]})
 
 

@@ -1,4 +1,4 @@
-"""What a controller is; the protocols alone."""
+"""The protocols of controllers, the counter of incidents, and how to call both."""
 
 import abc
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 
 from ._check import check_instance
 from ._message import shortened
-from ._module import check_parameters
+from ._module import check_parameters, parts_of
 from ._typing import PRNGKey, RealScalar
 
 
@@ -25,6 +25,9 @@ class AbstractController(eqx.Module):
     controller the control that was really applied, and its cost. Trained weights are
     fields; what is learned or remembered along the way lives in the state, a pytree of
     arrays.
+
+    A controller that draws at each step keeps a random key in its state: `init` puts
+    it there, and each call splits it. A wrapper gives each part a key of its own.
 
     !!! example
 
@@ -40,6 +43,23 @@ class AbstractController(eqx.Module):
 
         import jax
         dlx.rollout(dlx.make("pendulum"), Damper(), key=jax.random.key(0)).total_cost
+        ```
+
+    !!! example "One that draws"
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        class Dither(dlx.AbstractController):
+            def init(self, *, key=None):
+                return key
+
+            def __call__(self, t, y, state):
+                state, now = jax.random.split(state)
+                return jax.random.normal(now, (1,), y.dtype), state
+
+        dlx.rollout(dlx.make("pendulum"), Dither(), key=jax.random.key(0)).total_cost
         ```
     """
 
@@ -70,12 +90,13 @@ class AbstractController(eqx.Module):
         """
 
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
-        """Told what was really applied, after saturation; ignored by default.
+        """The state after the step, given the saturated control and its cost; by
+        default the state as it is.
 
         **Arguments:**
 
         - `u`: the control that was applied.
-        - `cost`: the stage cost that it was charged.
+        - `cost`: its stage cost.
         - `state`: the controller's state.
 
         **Returns:** the new state.
@@ -83,11 +104,18 @@ class AbstractController(eqx.Module):
         del u, cost
         return state
 
+    @property
+    def learns_from_cost(self) -> bool:
+        """Whether `applied` learns from the cost, which [`delucax.simulate`][] does not
+        know; by default whether a controller among its fields does."""
+        return any(p.learns_from_cost for p in parts_of(self, AbstractController))
+
 
 class AbstractLearner(AbstractController):
-    """A controller that learns online by what it would have been charged.
+    """A controller that learns online from a counterfactual loss.
 
-    `loss` and `fresh` are all that a wrapper such as an adaptive meta-controller needs.
+    `loss` and `fresh` are for meta-controllers such as
+    [`delucax.controllers.Adaptive`][]; [`delucax.rollout`][] does not call them.
 
     !!! example
 
@@ -132,7 +160,7 @@ class AbstractLearner(AbstractController):
 
 
 class AbstractStochasticPolicy(AbstractController):
-    """A controller that draws its controls, with a probability that it can tell.
+    """A stochastic policy whose log-probability can be computed.
 
     [`delucax.training.PPO`][], [`delucax.training.LikelihoodRatio`][] and
     [`delucax.training.scored_cost`][] train such controllers.
@@ -186,8 +214,8 @@ class AbstractStochasticPolicy(AbstractController):
         - `y`: observation, a vector.
         - `state`: the controller's state, before the call.
 
-        **Returns:** a scalar; `None` (the default) where there is no closed form, and
-        `-log_prob` of what was drawn is the estimate.
+        **Returns:** a scalar; or `None` (the default) where there is no closed form.
+        Callers then take `-log_prob` of the control that was drawn.
         """
         del t, y, state
         return None
@@ -202,8 +230,8 @@ class Tally(eqx.Module):
     """How often something went wrong in a controller, kept in the controller's state.
 
     [`delucax.rollout`][] reads every tally in the state, however deep, after each step:
-    the steps at which one rose are in `trajectory.incidents`. So a wrapper has nothing
-    to pass on.
+    the steps at which one rose are in `trajectory.incidents`. Wrappers need not forward
+    them.
 
     **Attributes:**
 
@@ -301,7 +329,7 @@ def tallies(state: PyTree) -> dict[str, Array]:
 
 
 def wrong_observation(controller: Any, expected: int, y: Array) -> ValueError:
-    """The error for an observation that a controller was not made for."""
+    """The error for an observation of the wrong size."""
     return ValueError(
         f"{type(controller).__name__}: expects an observation of size {expected}, got "
         f"size {y.shape[0] if y.ndim else 0}. If it was made for the encoded "

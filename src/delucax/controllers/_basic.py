@@ -25,7 +25,7 @@ from ..math._steps import row_at, step_at
 
 
 class Zero(AbstractController):
-    """`u = 0`: the floor that every method must beat.
+    """`u = 0`, the baseline.
 
     **Arguments:** `control_size`: the number of controls.
 
@@ -54,7 +54,7 @@ class Zero(AbstractController):
 class Constant(AbstractController):
     """`u = value`.
 
-    **Arguments:** `value`: a vector, one entry a control.
+    **Arguments:** `value`: a vector, one entry per control.
 
     **Raises:** `ValueError` if `value` is not a finite vector.
 
@@ -84,7 +84,7 @@ class Random(AbstractController):
 
     **Arguments:**
 
-    - `std`: standard deviation, a vector with one entry a control.
+    - `std`: standard deviation, a vector with one entry per control.
     - `mean`: a number or vector, 0 by default.
 
     **Raises:** `ValueError` if `std` is not a vector; or, when it is run, if there is
@@ -155,7 +155,7 @@ class Linear(AbstractController):
 
 
 class OpenLoop(AbstractController):
-    """Given controls, one after the other: open loop.
+    """Open-loop control by a given sequence.
 
     `u_k = values[k]`; the last is held after the end.
 
@@ -196,8 +196,8 @@ class Scheduled(AbstractController):
     """A controller for each time step, `u_k = controllers[k](t_k, y_k)`.
 
     The last one is used after the end; before the start the control is NaN, which a
-    rollout reports. They share one state, so that it must mean the
-    same to each of them.
+    rollout reports. All share one state, which must have the same structure and meaning
+    for each of them.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""Signals known in advance: what to follow, and what will disturb."""
+"""References and disturbances known in advance, and the feed-forward for them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -25,9 +25,9 @@ class KnownSignals(eqx.Module):
     """A state and control to follow, and a disturbance, each known at every time.
 
     About them the linear dynamics are `e_next = A e + B v + d`, with
-    `e = difference(x, r)`, `v = u - u_r`, and `d[k]` what the reference leaves over:
-    the distance from `r[k+1]` to where the dynamics go from `r[k]` under `u_r[k]` and
-    `w[k]`.
+    `e = difference(x, r)`, `v = u - u_r`, and `d[k]` the residual of the reference: the
+    difference of where the dynamics go from `r[k]` under `u_r[k]` and `w[k]` from
+    `r[k+1]`.
     """
 
     dynamics: LinearDynamics

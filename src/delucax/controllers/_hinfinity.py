@@ -30,8 +30,8 @@ class HInfinity(AbstractController):
     deviations from the operating point. Over all time, or over a horizon; then the gain
     varies in time, and `dx' final dx` at the end counts too.
 
-    By default `gamma` is the least that is attainable. A larger one trades some of the
-    worst case for the average.
+    By default `gamma` is the least that is attainable. A larger one improves the
+    average at the expense of the worst case.
 
     **Arguments:**
 

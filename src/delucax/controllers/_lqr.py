@@ -15,7 +15,6 @@ from ..dynamics import AbstractDynamics, LinearDynamics, OperatingPoint
 from ..math import matvec
 from ..math._linear_solve import solve
 from ..riccati import dare
-from ..riccati._arguments import riccati_arguments
 from ._feed_forward import as_signal, as_signals, KnownSignals, Preview
 from ._operating_point import (
     check_linear_state_feedback,
@@ -49,10 +48,8 @@ class LQR(AbstractController):
 
     - `dynamics`: time-invariant linear dynamics whose operating point is an equilibrium
         and whose state is observed, of [`delucax.linearize`][] for example; or any
-        dynamics, with a `point`. At an equilibrium what is left to move each state is
-        below 1e-4 of the terms `|A - I| |x_ref| + |B| |u_ref|` that move it, or below
-        the rounding of the state (4 units in the last place). A zero counts there as
-        the largest state or control, at most 1, and as 1 if all are zero.
+        dynamics, with a `point`. The residual of the equilibrium must be below 1e-4 of
+        the terms `|A - I| |x_ref| + |B| |u_ref|`.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `S`: cross weight, shape `(n, m)`; zero by default.
@@ -134,9 +131,7 @@ class LQR(AbstractController):
                 f"{where}: preview must be 0 without a reference or disturbance that "
                 f"is looked up ahead, got {preview}."
             )
-        A, B = linear.A, linear.B
-        A, B, Q, R, S, _ = riccati_arguments(where, A, B, Q, R, S, None, definite=False)
-        solution = dare(A, B, Q, R, S)
+        solution = dare(linear.A, linear.B, Q, R, S)
         self.K, self.P, self.feed_forward = solution.K, solution.X, None
         if is_known:
             B, P = linear.B, solution.X
@@ -184,8 +179,8 @@ class LQI(AbstractController):
     disturbance. The gains minimise the sum of `v'Q v + 2 v'S du + du'R du`, `v` being
     the deviation of the state and the integral `z`, one under the other.
 
-    Where the control is limited, the integral is set back to the value at which what
-    was really applied would have been asked for, so that it cannot wind up.
+    Where the control is limited, back-calculation sets the integral to the value that
+    would have given the applied control, so that it cannot wind up.
 
     **Arguments:**
 

@@ -41,8 +41,8 @@ class MPCState(NamedTuple):
 
 
 class MPC(AbstractController):
-    """Model predictive control: plan from where the plant is, apply the first control,
-    and plan again.
+    """Model predictive control (receding horizon): plan from the current state, apply
+    the first control, and plan again.
 
     `u_k` is the first control of the plan over `T` steps from `y_k` at `t_k`. It works
     with every [`delucax.planning.AbstractPlanner`][], and with a cost
@@ -55,29 +55,28 @@ class MPC(AbstractController):
     2. the LQR about an operating point,
     3. the control of that point, held.
 
-    The second one keeps an unstable plant where the model is worth something, and a
-    plan of [`delucax.planning.ILQR`][] without constraints costs at most as much as
-    each of them. It is computed when the controller is made, about the point that
+    The second one keeps an unstable plant near the point of linearisation, and a plan
+    of [`delucax.planning.ILQR`][] without constraints costs at most as much as each of
+    them. It is computed when the controller is made, about the point that
     [`delucax.planning.default_start`][] chooses: the targets of the cost, or the
-    equilibrium of the dynamics, or zero where neither names one, as with
+    equilibrium of the dynamics, or zero where neither defines one, as with
     [`delucax.costs.Function`][] or [`delucax.costs.Tracking`][] over dynamics of your
     own. An unstable plant needs a `start` where it is to be held far from that point,
     and where there is no LQR: the second derivative of the cost with respect to the
     control is not positive definite there, no gain stabilises the plant, or the
     dynamics cannot be differentiated.
 
-    What became of a plan is in the controller's state: `result`, that of the last plan;
+    The status of a plan is in the controller's state: `result`, that of the last plan;
     `iterations`, how many it took; and how often it was no success, `failures`, which
     are `incidents["failed_plan"]` of a rollout. There too is `last`, a
     [`delucax.planning.Start`][], the last plan a step later, from which the next one
-    starts. A plan
-    that ran out of iterations or found no descent is used as it is, the best so far.
-    Where there is none to use, since every start diverges or the constraints cannot
-    hold, `throw` says what happens.
+    starts. A plan that ran out of iterations or found no descent is used as it is, the
+    best so far. Where there is none to use, since every start diverges or the
+    constraints cannot hold, `throw` says what happens.
 
     Derivatives are those of the planner: of [`delucax.planning.ILQR`][] by the implicit
-    function theorem, NaN where a plan did not converge. Of a planner that samples they
-    go through the start that was taken; which one that is, is held.
+    function theorem, NaN where a plan did not converge. For a planner that samples they
+    go through the chosen start; the choice itself has none.
 
     **Arguments:**
 
@@ -98,7 +97,7 @@ class MPC(AbstractController):
         [`delucax.planning.Start`][] in place of both, such as another stabilising law,
         or controls alone.
     - `throw`: raise at run time where there is no plan to use (default). If false, the
-        last plan is followed for one more step, under its gains, and forgotten; if
+        last plan is used for one more step, under its gains, and then discarded; if
         there is no plan in the next step either, the first one of `start`, by default
         the LQR, is applied.
     - `constraints`: [`delucax.planning.Constraints`][] on states and controls, for

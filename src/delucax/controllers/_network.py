@@ -1,4 +1,4 @@
-"""Policies that are neural networks, and what they are given."""
+"""Neural network policies, and their features."""
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY
@@ -126,7 +126,7 @@ def features_of(controller: Any, y: Array, size: int) -> Float[Array, " size"]:
 
 
 def squash(u: Array, bounds: tuple[Array, Array] | None) -> Array:
-    """The real line mapped between the bounds."""
+    """`u` squashed between the bounds by `tanh`."""
     if bounds is None:
         return u
     low, high = bounds
@@ -283,7 +283,7 @@ class _Past(NamedTuple):
 
 
 class History(AbstractController):
-    """A controller that is given a window of the past beside the observation,
+    """A controller whose input is a window of past observations and controls,
 
     `u_t = base(t, (z_t, z_{t-1}, ..., z_{t-n}, u_{t-1}, ..., u_{t-n}))`
 
@@ -359,8 +359,8 @@ class Standardise(eqx.Module):
 
     `clip((features(y) - mean) / std, -10, 10)`: the `features=` of a network.
 
-    [`delucax.training.PPO`][] and [`delucax.training.SHAC`][] set `mean` and `std` by
-    what they see on the way, wherever in their model there is one.
+    [`delucax.training.PPO`][] and [`delucax.training.SHAC`][] set `mean` and `std` of
+    each one in their model from the observations of training.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""What the regulators ask of the linear dynamics that they are designed on."""
+"""Checks of the linear dynamics that a regulator is designed for."""
 
 from typing import Any
 
@@ -17,8 +17,7 @@ from ..systems import LinearSystem
 
 
 _RESTS = 1e-4
-"""The share of the terms that move a state which may be left over at an equilibrium,
-which may be written in few digits."""
+"""The relative residual of an equilibrium, which users may give to few digits."""
 
 
 def linear_at(

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._check import check_instance
-from .._controller import AbstractController, check_controller
+from .._controller import AbstractController, check_controller, Tally
 from .._module import parameter
+from .._results import RESULTS
 from .._typing import Difference
 from ..dynamics import LinearDynamics
 from ..estimators import AbstractEstimator, KalmanFilter
@@ -20,14 +21,16 @@ class _State(NamedTuple):
     controller: PyTree
     estimator: PyTree
     time: Array
+    failures: Tally
 
 
 class OutputFeedback(AbstractController):
     """Any controller of the state, run on an estimate of it.
 
     At each step the estimator takes in the observation, the controller acts on the mean
-    of its estimate, and the estimator moves on with the control that was really
-    applied, after saturation.
+    of its estimate, and the estimator predicts with the control that was really
+    applied, after saturation. Steps at which its `status` is no success are
+    `incidents["failed_estimate"]` of a rollout.
 
     **Arguments:**
 
@@ -68,19 +71,24 @@ class OutputFeedback(AbstractController):
         keys = (None, None) if key is None else jax.random.split(key)
         state = self.estimator.init(key=keys[1])
         time = jnp.zeros((), self.estimator.estimate(state).mean.dtype)
-        return _State(self.controller.init(key=keys[0]), state, time)
+        memory = self.controller.init(key=keys[0])
+        return _State(memory, state, time, Tally("failed_estimate"))
 
     def __call__(self, t, y, state):
         after = self.estimator.update(t, y, state.estimator)
         mean = self.estimator.estimate(after).mean.astype(y.dtype)
         u, memory = self.controller(t, mean, state.controller)
         time = jnp.asarray(t, state.time.dtype)
-        return u, _State(memory, after, time)
+        return u, _State(memory, after, time, self._counted(after, state))
 
     def applied(self, u, cost, state):
         memory = self.controller.applied(u, cost, state.controller)
         after = self.estimator.predict(state.time, u, state.estimator)
-        return _State(memory, after, state.time)
+        return _State(memory, after, state.time, self._counted(after, state))
+
+    def _counted(self, after: PyTree, state: _State) -> Tally:
+        failed = self.estimator.status(after) != RESULTS.successful
+        return state.failures.add(failed)
 
 
 class LQG(AbstractController):
@@ -88,10 +96,10 @@ class LQG(AbstractController):
 
     `u = u_ref - K (mean - x_ref)`,
 
-    `mean` being the estimate with the current observation in it; it is moved on with
-    the control that was really applied. Of all controllers that see
-    `y = C x + v`, `v ~ N(0, V)`, of `x_next = A x + B u + E w`, `w ~ N(0, W)`, it has
-    the least average cost `dx'Q dx + 2 dx'S du + du'R du`:
+    `mean` being the filtered estimate, the current observation included; the prediction
+    takes the saturated control. Of all controllers that see `y = C x + v`,
+    `v ~ N(0, V)`, of `x_next = A x + B u + E w`, `w ~ N(0, W)`, it has the least
+    average cost `dx'Q dx + 2 dx'S du + du'R du`:
 
     `trace(P E W E') + trace(K' (R + B'PB) K Sigma)`,
 

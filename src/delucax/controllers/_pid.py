@@ -76,7 +76,7 @@ def _as(after: Any, before: Any) -> Any:
 
 
 class _AbstractPID(AbstractController):
-    """Loops side by side, each of which follows an output."""
+    """Independent loops, each with one output and one control."""
 
     kp: eqx.AbstractVar[Real]
     ki: eqx.AbstractVar[Real]
@@ -122,7 +122,7 @@ class _AbstractPID(AbstractController):
             sizes["output"] = self.output.C.shape[0]
         if len(set(sizes.values())) > 1 or 0 in sizes.values():
             got = ", ".join(f"{name} of size {size}" for name, size in sizes.items())
-            raise ValueError(f"{where}: there must be one entry a loop; got {got}.")
+            raise ValueError(f"{where}: there must be one entry per loop; got {got}.")
         return next(iter(sizes.values()), 1)
 
     def _zeros(self) -> Array:
@@ -143,7 +143,7 @@ class _AbstractPID(AbstractController):
         if measured.shape != (loops,):
             what = "the observation has" if output is None else "output gives"
             raise ValueError(
-                f"{name}: expects {loops} outputs, one a loop, but {what} shape "
+                f"{name}: expects {loops} outputs, one per loop, but {what} shape "
                 f"{measured.shape}; choose what each loop follows, such as output=0."
             )
         reference = self.reference(t) if callable(self.reference) else self.reference
@@ -168,7 +168,7 @@ class _Memory(NamedTuple):
 
 
 class PID(_AbstractPID):
-    """Proportional, integral and derivative action, one loop a control.
+    """Proportional, integral and derivative action, one loop per control.
 
     With the error `e = r(t) - h(y)`, over a step of `dt`:
 
@@ -177,9 +177,9 @@ class PID(_AbstractPID):
     `D = (T_d D_before + z - z_before) / (T_d + dt)`,
 
     `D` being the derivative of `z = -h(y)` (so that a jump of the reference makes no
-    kick), or of `e`, through a first-order lag; it starts at 0. The integral is a true
-    one. Its second term, back-calculation, keeps it from winding up: `u_applied` is the
-    control that was really applied, so the environment's bounds count as the
+    kick), or of `e`, through a first-order lag; it starts at 0. The integral does not
+    leak. Its second term, back-calculation, keeps it from winding up: `u_applied` is
+    the control that was really applied, so the environment's bounds count as the
     controller's own do. Where `ki` is 0 there is no integral.
 
     **Arguments:**

@@ -1,4 +1,4 @@
-"""Continuous problems under a control that is held between samples."""
+"""The sampled-data regulator, and the discretisation of quadratic costs."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from ._operating_point import linear_at
 def sampled_weights(
     system: LinearSystem, Q: Any, R: Any, dt: Any, S: Any = None
 ) -> tuple[Array, Array, Array]:
-    """The weights of the sampled problem that charge what the continuous one does,
+    """The exact discretisation of a continuous quadratic cost under a held control,
 
     `x'Qd x + 2 x'Sd u + u'Rd u`
     `= integral over [0, dt] of x(t)'Q x(t) + 2 x(t)'S u + u'R u`

@@ -1,4 +1,4 @@
-"""Controls that are drawn, around what another controller gives."""
+"""Stochastic policies whose mean or logits another controller gives."""
 
 from dataclasses import KW_ONLY
 from typing import Any, NamedTuple
@@ -62,7 +62,7 @@ class Gaussian(_AroundBase):
     The log-probability is that of the control which comes out: its normal density
     between the bounds, and at a bound the probability of all that is clipped to it.
     Given the bounds of the environment, it therefore is the log-probability of the
-    controls that a [`delucax.Trajectory`][] records, and that of a run is had from its
+    controls that a [`delucax.Trajectory`][] records, and that of a run follows from its
     record, without the draws.
 
     **Arguments:**
@@ -156,8 +156,8 @@ class Gaussian(_AroundBase):
         each = -0.5 * z**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi)
         if self.bounds is not None:
             low, high = self.bounds
-            # Finite stand-ins for what is not reached: an infinity has no gradient,
-            # even where it is not chosen.
+            # The double-where trick: an infinite bound has a NaN gradient even where
+            # `jnp.where` does not choose it.
             near_low = jnp.where(jnp.isinf(low), 0, low)
             near_high = jnp.where(jnp.isinf(high), 0, high)
             below = (near_low - mean) / std
@@ -173,7 +173,7 @@ class Gaussian(_AroundBase):
 
         The record is data: it is held fixed when this is differentiated with respect to
         the weights, while the state of `base` is followed anew and keeps its gradient.
-        So a stochastic `base` is not followed as it was.
+        A stochastic `base` is not supported: it would draw anew.
 
         **Arguments:** `trajectory`: one run of this controller, with its observations,
             controls and costs; for a batch, use `jax.vmap`. The bounds of this
@@ -217,7 +217,7 @@ class Categorical(_AroundBase):
 
     **Arguments:**
 
-    - `base`: a controller whose outputs are the logits, one an action; such as a
+    - `base`: a controller whose outputs are the logits, one per action; such as a
         [`delucax.controllers.MLP`][].
     - `actions`: the table, shape `(actions, m)`, such as `env.actions`.
 

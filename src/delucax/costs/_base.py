@@ -50,12 +50,11 @@ class AbstractCost(eqx.Module):
 
     @property
     def targets(self) -> tuple[Array | None, Array | None] | None:
-        """The state and the control that the cost draws to, each `None` where it is not
-        named; `None` alone, as by default, for a cost that draws to no fixed point.
+        """The target of the state and that of the control, each `None` where there is
+        none; `None` alone, as by default, for a cost without a fixed target.
 
-        A cost made of others has the first state and the first control that they name.
-        Where planners start by default depends on it; see
-        [`delucax.planning.default_start`][].
+        A cost made of others has the first target of each that they have. Planners use
+        it for their default start; see [`delucax.planning.default_start`][].
         """
         named = [part.targets for part in parts_of(self, AbstractCost)]
         pairs = [pair for pair in named if pair is not None]
@@ -65,13 +64,13 @@ class AbstractCost(eqx.Module):
         return first(x for x, _ in pairs), first(u for _, u in pairs)
 
     def set_point(self, plant: AbstractPlant) -> tuple[State, Control] | None:
-        """The state and the control to regulate a plant about: the `targets` where they
-        name both, else the equilibrium of the plant, else the one that is named and
+        """The state and the control to regulate a plant about: the `targets` where
+        there are both, else the equilibrium of the plant, else the one there is and
         zeros.
 
         **Arguments:** `plant`: a system or dynamics.
 
-        **Returns:** `(x, u)`; `None` if neither names one, or they do not fit.
+        **Returns:** `(x, u)`; `None` if there is none of them, or they do not fit.
         """
         x, u = targets = self.targets or (None, None)
         if x is None or u is None:
@@ -86,7 +85,7 @@ class AbstractCost(eqx.Module):
                     for at, size in zip(targets, sizes, strict=True)
                 )
         x, u = jnp.asarray(as_float_array(x)), jnp.asarray(as_float_array(u))
-        # What does not fit the plant is an error of what uses the point.
+        # Whoever uses the point reports a size that does not fit.
         fits = x.shape == (plant.state_size,) and u.shape == (plant.control_size,)
         return (x, u) if fits else None
 
@@ -235,7 +234,8 @@ class Scaled(AbstractCost):
 class Rate(AbstractCost):
     """A cost a second, charged for a step of `dt`: `c(t, x, u) dt`.
 
-    The problem then stays the same when `dt` changes. The final cost is unchanged.
+    The sum approximates the integral over time, so that weights need not change with
+    `dt`. The final cost is unchanged.
 
     **Arguments:**
 

@@ -15,8 +15,8 @@ class Arrival(AbstractCost):
     """`step_cost + control_weight u'u` a step, and `arrival_cost` once, if the last
     state is a goal.
 
-    The costs of most Gym tasks. It says nothing of the way to the goal: the gradient
-    with respect to the state is 0 wherever there is one.
+    The costs of most Gym tasks. It is sparse: the gradient with respect to the state is
+    0 almost everywhere.
 
     **Arguments:**
 
@@ -89,7 +89,7 @@ class PendulumCost(AbstractCost):
 
 
 class AcrobotHeight(AbstractCost):
-    """What the tip of the acrobot lacks in height, squared:
+    """The squared height deficit of the tip of the acrobot:
 
     `(2 + cos(angle_1) + cos(angle_1 + angle_2))^2 + velocity_weight (velocity_1^2 +
     velocity_2^2) + torque_weight torque^2`, and at the end `final_weight` times the

@@ -64,8 +64,7 @@ class Quadratic(_AbstractQuadratic):
 
     **Arguments:**
 
-    - `Q`: state weight, shape `(n, n)`, symmetric; or its diagonal, shape `(n,)`, which
-        takes n products a step where the matrix takes n^2.
+    - `Q`: state weight, shape `(n, n)`, symmetric; or its diagonal, shape `(n,)`.
     - `R`: control weight, shape `(m, m)`, symmetric; or its diagonal, shape `(m,)`.
     - `final`: final weight Qf, as `Q`; none by default.
     - `state_target`: x*, shape `(n,)`; zero by default.
@@ -137,7 +136,7 @@ class Quadratic(_AbstractQuadratic):
 class Tracking(_AbstractQuadratic):
     """`e' Q e + u' R u` with `e = h(x) - r(t)`, and `e' Qf e` at the end.
 
-    It names no `targets`, as the reference moves.
+    It has no `targets`, as the reference moves.
 
     **Arguments:**
 

@@ -63,7 +63,7 @@ class AbstractDisturbance(eqx.Module):
 
         **Arguments:**
 
-        - `key`: a random key; those that draw nothing take `None` too.
+        - `key`: a random key; deterministic disturbances also take `None`.
         - `times`: the start of each step, shape `(T,)`, increasing. A rollout gives
             `0, dt, ...` in the precision of the state, so a time of `k dt` is rounded:
             compare it with another to the nearest step, not exactly.
@@ -78,15 +78,15 @@ class AbstractDisturbance(eqx.Module):
 
         - `key`: of `sequence`.
         - `dt`: the control interval.
-        - `steps`: how many steps.
+        - `steps`: the number of steps.
         - `dtype`: the precision of the times.
 
         **Returns:** shape `(steps, size)`.
 
         **Raises:** `ValueError` if `sequence` returns another shape.
         """
-        # Of two times at least, because Brownian motion reads the interval off them;
-        # but of no more than are recorded.
+        # Two times at least, because Brownian motion infers the interval from them; but
+        # no more than are recorded.
         recorded = self.recorded_steps
         count = max(steps, 2 if recorded is None else min(recorded, 2))
         w = self.sequence(key, (jnp.arange(count) * dt).astype(dtype))
@@ -102,15 +102,15 @@ class AbstractDisturbance(eqx.Module):
     def between(self, start: ArrayLike, stop: ArrayLike) -> "AbstractDisturbance":
         """The disturbance inside a time window, `start <= t < stop`, and zero outside.
 
-        An end within rounding of the time of a step is that step's: a window of 5 steps
-        acts on 5. Elsewhere the times are compared as they are.
+        An end within rounding error of the time of a step is snapped to it, so that a
+        window of 5 steps acts on 5.
 
         **Arguments:** `start`, `stop`: the ends of the window, in units of time.
 
         **Returns:** the disturbance.
 
-        **Raises:** `ValueError` if `stop` is before `start`; in a horizon of more than
-        2^22 steps in single precision, whose times do not tell the steps apart.
+        **Raises:** `ValueError` if `stop` is before `start`; or for a horizon of more
+        than 2^22 steps in single precision, whose times are too coarse for the steps.
         """
         return _Window(self, start, stop)
 

@@ -145,8 +145,8 @@ class Square(AbstractEntrywise):
     everywhere.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, the period is not
-    positive, or `duty` is not between 0 and 1; in a horizon of more than 2^22 steps in
-    single precision, whose times do not tell the steps apart.
+    positive, or `duty` is not between 0 and 1; or for a horizon of more than 2^22 steps
+    in single precision, whose times are too coarse for the steps.
 
     !!! example
 
@@ -168,13 +168,13 @@ class Square(AbstractEntrywise):
 
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         dt = step_between(times, "Square")
-        # Counted from 0 in steps, which late times of a few steps do not tell.
+        # In steps where the grid begins at 0; late times give their step less exactly.
         unit = self.period if dt is None else jnp.where(times[0] == 0, dt, self.period)
         eps = coarsest(times, self.period, self.duty)
         at, period = (
             sum(position(t, unit, 0.0, eps)) for t in (times[:, None], self.period)
         )
-        # Steps are whole numbers, between which rounding by `slack` decides nothing.
+        # `slack` absorbs rounding error: steps are whole numbers.
         slack = jnp.minimum(2 * eps * (jnp.abs(at) + 1), 0.25)
         phase = at - period * jnp.floor((at + slack) / period)
         w = jnp.where(

@@ -149,7 +149,7 @@ class Brownian(AbstractDisturbance):
         follow one another in `w`.
 
     **Raises:** `ValueError` if `dt` is not positive or `substeps` is below 1, or if
-    `dt` is left out and the times are too late for their precision to tell it.
+    `dt` is left out and the precision of late times is too coarse for it.
 
     !!! example
 
@@ -180,7 +180,7 @@ class Brownian(AbstractDisturbance):
         if self.dt is None and times.shape[0] < 2:
             raise ValueError(
                 f"Brownian: dt must be given for {times.shape[0]} times, which do not "
-                "tell it."
+                "define it."
             )
         dt = step_between(times, "Brownian") if self.dt is None else self.dt
         e = normal(check_key(key, "Brownian"), (times.shape[0], self.size), times.dtype)

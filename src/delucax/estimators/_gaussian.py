@@ -1,4 +1,4 @@
-"""What all Kalman filters share: second moments, and the steps made of them."""
+"""The conditioning of normal distributions that all Kalman filters share."""
 
 import abc
 import math
@@ -31,7 +31,7 @@ from ._base import AbstractEstimator, Belief
 
 
 class Joint(eqx.Module):
-    """A state `x` and an image `z` of it with noise added, as jointly normal,
+    """The joint normal distribution of a state `x` and of `z`, its image plus noise,
 
     `x = E[x] + X e`, `z = mean + Z e + noise`, `e ~ (0, P)`.
 

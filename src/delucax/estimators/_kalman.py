@@ -287,10 +287,10 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
 
     The points are the mean, and the mean plus and minus the columns of
     `sqrt(c) chol(covariance)`, with `c = alpha^2 (n + kappa)`; the outer ones weigh
-    `1 / (2 c)`, the middle one `1 - n / c` in the mean and
-    `2 - n / c - alpha^2 + beta` in the covariance. They are drawn anew for each update.
-    The disturbance counts to first order, by `E W E'` with `E = dF/dw` at the mean,
-    which is exact where it is added to the state. On linear dynamics this is the
+    `1 / (2 c)`, the middle one `1 - n / c` in the mean and `2 - n / c - alpha^2 + beta`
+    in the covariance. They are computed anew for each update. The disturbance counts to
+    first order, by `E W E'` with `E = dF/dw` at the mean, which is exact where it is
+    added to the state. On linear dynamics this is the
     [`delucax.estimators.KalmanFilter`][].
 
     With the default weights no weight is negative, so that covariances stay
@@ -304,8 +304,8 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
         [`delucax.estimators.ExtendedKalmanFilter`][]. The `difference` of the dynamics
         measures the spread of the moved points.
     - `alpha`: spread of the points, a positive number; 1 by default.
-    - `beta`: what is added to the weight of the middle point in covariances, a number;
-        2 by default, which suits normal states.
+    - `beta`: prior knowledge of the distribution, a number that is added to the weight
+        of the middle point in covariances; 2 by default, optimal for normal states.
     - `kappa`: more spread, a number above `-n`; 0 by default.
 
     **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not one, a

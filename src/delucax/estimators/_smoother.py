@@ -126,15 +126,15 @@ def smooth(
     r"""The estimate of each state from the whole record, by the smoother of Rauch, Tung
     and Striebel.
 
-    Back from the end, with `G_k = P_k A' Sigma_{k+1}^-1`, the filter's belief being
-    `N(mu_k, Sigma_k)` before `y_k` and `N(m_k, P_k)` after it:
+    The backward recursion is, with `G_k = P_k A' Sigma_{k+1}^-1`, the filter's belief
+    being `N(mu_k, Sigma_k)` before `y_k` and `N(m_k, P_k)` after it:
 
     `mean_k = m_k + G_k (mean_{k+1} - mu_{k+1})`,
     `covariance_k = P_k + G_k (covariance_{k+1} - Sigma_{k+1}) G_k'`,
 
     the latter in a form that stays semidefinite. Of a nonlinear filter, `P_k A'` is the
-    covariance of the state with the next one, as that filter finds it. What does not
-    vary needs no care: a first state that is known, or noise in some states alone.
+    covariance of the state with the next one, as that filter finds it. Covariances may
+    be singular: a first state that is known, or noise in some states alone.
 
     **Arguments:**
 
@@ -204,8 +204,8 @@ def _filter(estimator, y, u, times) -> Filtered:
         updated = estimator._corrected(belief, *expected)
         after = estimator.predict(t, u, updated)
         ok &= updated.is_finite & after.is_finite
-        # From a failure on, steps are taken from the start again, and then masked: so
-        # no NaN of one member of a batch gets into the derivative of the others.
+        # After a failure go on from the first belief, and mask the steps at the end: no
+        # NaN of one member of a batch may get into the derivative of the others.
         after = jax.tree.map(lambda a, b: jnp.where(ok, a, b), after, first)
         return (after, ok), (updated, after, density, ok)
 

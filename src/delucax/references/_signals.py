@@ -88,7 +88,7 @@ class FigureEight(eqx.Module):
 
     **Arguments:**
 
-    - `period`: time for one round.
+    - `period`: the period of the curve.
     - `width`, `height`: half the extent to each side, 1 by default.
     - `centre`: shape `(2,)`, the origin by default.
 

@@ -1,4 +1,4 @@
-"""Learners that start anew, each followed for as long as it does well."""
+"""A meta-learner over copies of a learner that start at different times."""
 
 from dataclasses import KW_ONLY
 from typing import Literal, NamedTuple
@@ -59,9 +59,9 @@ class Adaptive(AbstractController):
     deviation of the losses lately, so that their scale does not matter; then a part
     `share` is dealt out evenly to all that live, so that each can rise quickly.
 
-    What is played is the mixture `u = sum_i p_i u_i`; or the control of one expert,
-    chosen anew only with the probability by which its weight has fallen, so that it is
-    seldom exchanged. With [`delucax.controllers.gpc`][] as base it is AdaGPC.
+    With `play="mix"` the control is `u = sum_i p_i u_i`. With `"switch"` it is that of
+    one expert, drawn again only with the probability by which its weight has fallen, so
+    that it seldom changes. With [`delucax.controllers.gpc`][] as base it is AdaGPC.
 
     **Arguments:**
 
@@ -157,7 +157,7 @@ class Adaptive(AbstractController):
         mean = state.mean + fading * (played - state.mean)
         variance = state.variance + fading * ((played - mean) ** 2 - state.variance)
         spread = jnp.sqrt(jnp.where(variance > 0, variance, 1))
-        # None falls by more than a factor at once, however bad it was.
+        # Clipped, to bound the decrease of a weight in one step.
         excess = jnp.clip((losses - played) / spread, -1, 1)
         new = jnp.where(alive, old * jnp.exp(-self.rate * excess), 0)
         state = state._replace(mean=mean, variance=variance)
@@ -190,7 +190,7 @@ class Adaptive(AbstractController):
         old = jax.tree.map(lambda leaf: leaf[slot], state.experts)
 
         def renewed(leaf, before, after):
-            # What a birth leaves as it is is not written: most of the state.
+            # Write the leaves that a birth changes alone: most stay as they are.
             if after is before:
                 return leaf
             mask = newborn.reshape((-1,) + (1,) * (leaf.ndim - 1))

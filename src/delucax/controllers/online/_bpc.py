@@ -43,8 +43,7 @@ class BPCState(NamedTuple):
 
 
 class BPC(AbstractController):
-    """The bandit perturbation controller, which is told the cost of each step and
-    nothing about how it came about,
+    """The bandit perturbation controller, which observes the scalar cost of each step,
 
     `u_t = base(y_t) + (theta_t + delta e_t) s`, `e_t` uniform on the unit sphere,
 
@@ -64,7 +63,7 @@ class BPC(AbstractController):
         [`delucax.controllers.LQR`][].
     - `memory`: the number of past values of the signal, 5 by default: each adds a
         dimension to search.
-    - `horizon`: how long a direction is held responsible, 5 by default.
+    - `horizon`: the number of steps whose directions enter the gradient, 5 by default.
     - `delta`: the size of the directions tried; by default 0.2 over the size of the
         first response of the observation to a unit of control.
     - `learning_rate`: scales the optimiser's step; by default 0.05 over the same size.
@@ -118,7 +117,7 @@ class BPC(AbstractController):
         where = "BPC"
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         memory = check_count(memory, "memory", where)
-        # A roll-out as long as it takes a control to show.
+        # Long enough for the response to a control to reach any state.
         loop = ClosedLoop(dynamics, base, dynamics.state_size, where, memory=memory)
         scale = functools.partial(in_first_responses, loop, where)
         start = jnp.zeros((dynamics.control_size, loop.feature_size), loop.dtype)
@@ -132,6 +131,11 @@ class BPC(AbstractController):
     def __check_init__(self):
         check_step(self.delta, "BPC", "delta")
         check_step(self.learning_rate, "BPC", "learning_rate")
+
+    @property
+    def learns_from_cost(self) -> bool:
+        """True: the cost is all that it observes."""
+        return True
 
     def init(self, *, key=None):
         own, base_key = jr.split(check_key(key, "BPC.init"))

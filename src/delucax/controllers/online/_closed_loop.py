@@ -28,7 +28,7 @@ _AFFINE = (Zero, Constant, Linear, LQR, LQI, LQG, HInfinity)
 """Controllers whose control and state depend on the observation by an affine map that
 is the same at all times."""
 _LEFT_OF_HORIZON, _HORIZONS = 0.03, (10, 1000)
-"""What is left of an impulse at the end of a roll-out, and the shortest and longest."""
+"""The residual of an impulse at the end of a roll-out, and the shortest and longest."""
 _LEFT_OF_MEMORY, _MEMORIES = 0.1, (10, 50)
 """The same of the default memory. A longer policy gains a little, and costs more to
 learn: under noise it is worse."""
@@ -86,7 +86,7 @@ class ClosedLoop(eqx.Module):
     - `tangents`: the derivatives of a step, and `response`: that of the observation and
       of the base's control to an impulse; `None` where they change.
     - `first_response`: the size of the first change of the observation that a unit of
-      added control makes; `None` if the dynamics name no equilibrium.
+      added control makes; `None` if the dynamics define no equilibrium.
     - `filters`: shape `(f, memory)`, newest first; `None` for the values themselves.
     - `horizon`: the length of the roll-out.
     - `memory`: how many values of the signal are kept.
@@ -230,12 +230,12 @@ class ClosedLoop(eqx.Module):
         assert state.predicted is not None
         off = self.dynamics.difference(state.y, state.predicted)
         size = jnp.max(jnp.abs(state.y) + jnp.abs(state.predicted))
-        # Compiled twice, a step may round differently: of that nothing is learned.
+        # The same step compiled twice may differ in rounding, which is no disturbance.
         is_more = jnp.abs(off) > 4 * jnp.finfo(off.dtype).eps * size
         return jnp.where(state.started & is_more, off, 0)
 
     def _nature(self, state: ClosedLoopState) -> Float[Array, " p"]:
-        """The observation, had nothing been added to the base's control."""
+        """Nature's output: the observation under the base controller alone."""
         p = state.y.shape[0]
         assert state.forced is not None
         if self.tangents is None:
@@ -301,7 +301,7 @@ def in_first_responses(
         return given
     if loop.first_response is None:
         raise ValueError(
-            f"{where}: {name} must be given, for dynamics that name no equilibrium."
+            f"{where}: {name} must be given, for dynamics that define no equilibrium."
         )
     # Where a control never shows there is no unit; 1 keeps the quotient finite.
     return units / jnp.where(loop.first_response > 0, loop.first_response, 1)
@@ -355,8 +355,8 @@ def _tangents(dynamics, base, t, x, state, v) -> Tangents:
 def _equilibrium_tangents(
     dynamics: AbstractDynamics, base: AbstractController
 ) -> Tangents | None:
-    """The derivatives at the operating point, at each time if they depend on it;
-    `None` if the dynamics name no such point."""
+    """The derivatives at the operating point, at each time if they depend on it; `None`
+    if the dynamics define no such point."""
 
     def at(t, x, u):
         state = base.init(key=None)
@@ -386,8 +386,8 @@ def _roll_out_length(radius: float | None, horizon: int | None, where: str) -> i
         return given
     if radius is None:
         raise ValueError(
-            f"{where}: horizon must be given where the closed loop cannot be seen: "
-            "inside a transformation of JAX, or of dynamics that name no equilibrium."
+            f"{where}: horizon must be given inside a transformation of JAX, or for "
+            "dynamics that define no equilibrium: its default needs the closed loop."
         )
     return _steps(radius, _LEFT_OF_HORIZON, *_HORIZONS)
 
@@ -408,6 +408,6 @@ def _spectral_radius(tangents: Tangents) -> float | None:
     reached = np.any(np.asarray(tangents.input).reshape(-1, q, m) != 0, axis=(0, 2))
     for _ in range(q):
         reached = reached | np.any(transitions[..., reached] != 0, axis=(0, 2))
-    # Numbers that a base only carries along, such as a covariance, do not fade.
+    # States of the base that no control moves, such as a covariance, do not decay.
     parts = transitions[:, reached][:, :, reached]
     return max(np.max(np.abs(np.linalg.eigvals(part)), initial=0) for part in parts)

@@ -51,7 +51,7 @@ class Explore(AbstractController):
 
     `B = N_0`, and `A - BK` is the least-squares solution of
     `(A - BK) [N_0 ... N_{order-1}] = [N_1 ... N_order]`. From then on the controller
-    that `build` makes for `x_next = A x + B u` is in charge. With
+    that `build` makes for `x_next = A x + B u` is used. With
     [`delucax.controllers.gpc`][] and `steps` near `T^(2/3)`, its regret over T steps
     grows as `T^(2/3)`.
 
@@ -122,7 +122,7 @@ class Explore(AbstractController):
     def init(self, *, key=None):
         key = check_key(key, "Explore.init")
         (m, n), dtype = self.K.shape, self.K.dtype
-        # Any plant that every design has an answer for.
+        # A placeholder, for the structure of the state; stable, so that designs exist.
         model = self._model(jnp.eye(n, dtype=dtype) / 2, jnp.eye(n, m, dtype=dtype))
         arrays, inner = self._designed(model)
         return ExploreState(

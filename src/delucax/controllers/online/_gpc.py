@@ -46,8 +46,8 @@ def gpc(
     disturbances are.
 
     The dynamics are linear, time-varying or not, or any others that observe their
-    state; those are linearised along the way, and the disturbance is what the true map
-    leaves over.
+    state; those are linearised along the way, and the disturbance is the residual of
+    the nonlinear map.
 
     **Arguments:**
 
@@ -64,9 +64,9 @@ def gpc(
     - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
         1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
         loop.
-    - `learning_rate`: scales the optimiser's step, of Newton's the longest; by default
-        `0.15 / |B|_F`, with `|B|` the size of what a unit of control does to the state
-        in a step.
+    - `learning_rate`: scales the optimiser's step; of Newton's method, the longest
+        step. By default `0.15 / |B|_F`, with `|B|` the size of what a unit of control
+        does to the state in a step.
     - `optimiser`: an Optax transformation; by default
         [`delucax.controllers.adagrad_norm`][] where dynamics are linear and
         time-invariant, and otherwise [`delucax.controllers.online_newton`][]. Neither
@@ -137,8 +137,8 @@ def drc(
     hindsight grows as `sqrt(T)`.
 
     With `base` zero it is the gradient response controller; a base such as
-    [`delucax.controllers.LQG`][] makes it as good as that from the start, and right for
-    plants that are not stable by themselves.
+    [`delucax.controllers.LQG`][] gives its performance at the start, and stabilises
+    plants that are unstable.
 
     **Arguments:**
 
@@ -153,8 +153,9 @@ def drc(
     - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
         1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
         loop.
-    - `learning_rate`: scales the optimiser's step, of Newton's the longest; by default
-        0.15 over the size of the first response of the output to a unit of control.
+    - `learning_rate`: scales the optimiser's step; of Newton's method, the longest
+        step. By default 0.15 over the size of the first response of the output to a
+        unit of control.
     - `optimiser`: an Optax transformation; [`delucax.controllers.online_newton`][] with
         a prior of 4 steps by default.
     - `radius`: M is kept inside this ball in the Frobenius norm; by default 50 over the

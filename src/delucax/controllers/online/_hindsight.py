@@ -61,13 +61,13 @@ def best_in_hindsight(
     - `trajectory`: a run with its states and disturbances, over the whole of which the
         search goes.
     - `iterations`: Newton steps at most, 30 by default.
-    - `tolerance`: stop when a step promises less than this part of the cost; by default
-        the square root of the rounding error.
+    - `tolerance`: stop when the predicted decrease is below this part of the cost; by
+        default the square root of the rounding error.
 
     **Returns:** a named tuple of
 
     - `controller`: the best of the class, and `trajectory`, its run;
-    - `decrement`: how much less Newton's method still expected, relative to the cost;
+    - `decrement`: the predicted decrease of the last Newton step, relative to the cost;
     - `iterations`: steps tried;
     - `result`: success, or `delucax.RESULTS.not_converged`.
 
@@ -202,7 +202,7 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
         tried = derivatives(best + change)
         pick = lambda new, old: jnp.where(tried[0] < cost, new, old)  # noqa: E731
         left = promised / (jnp.abs(cost) + jnp.finfo(start.dtype).tiny)
-        # What is promised below rounding is not to be had.
+        # A predicted decrease below zero is rounding.
         left = jnp.where((k > 0) & (promised >= 0), left, jnp.inf)
         # With less damping, rounding would move what the cost does not depend on.
         damping = pick(jnp.maximum(damping / 10, least), damping * 10)

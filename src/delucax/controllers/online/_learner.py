@@ -1,4 +1,4 @@
-"""Online control: learning what to add to a base controller's control."""
+"""Online learners of a policy that is added to a base controller."""
 
 import functools
 from collections.abc import Callable
@@ -59,8 +59,9 @@ class OnlineLearner(AbstractLearner):
     `u_t = base(y_t) + policy(theta_t, features_t)`,
 
     where the features are filters of a signal that does not depend on what was added:
-    the past disturbances, or nature's output. Before it acts, theta moves against the
-    gradient of what this step would have cost had it been in use all along a roll-out,
+    the past disturbances, or nature's output. Before it acts, theta takes a step
+    against the gradient of a counterfactual loss, the cost of this step had theta been
+    held during a roll-out,
 
     `loss_t(theta) = c(t, y_t(theta), u_t(theta))`,
     `y_t(theta) = y_t + sum_{j < horizon} G_j (v_{t-1-j}(theta) - v_{t-1-j})`,
@@ -294,7 +295,7 @@ def _default_base(
         x, u = dynamics.equilibrium()
     except ValueError as error:
         raise ValueError(
-            f"{where}: base must be given, for dynamics that name no equilibrium to "
+            f"{where}: base must be given, for dynamics that define no equilibrium to "
             "design one at."
         ) from error
     t = jnp.zeros((), x.dtype)

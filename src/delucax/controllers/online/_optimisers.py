@@ -120,7 +120,8 @@ class _OnlineNewtonUpdate(eqx.Module):
         factor = curvature()
         root, total, count = state
         size = jnp.sum(factor**2)
-        # Next to this step all before it is rounding: start anew.
+        # Where this update is larger than all before it by 1 / sqrt(eps), they would be
+        # lost in rounding: start anew.
         first = size > total / jnp.sqrt(jnp.finfo(size.dtype).eps)
         total, count = jnp.where(first, 0, total), jnp.where(first, 0, count)
         new_total, new_count = total + size, count + (size > 0)
