@@ -262,15 +262,14 @@ class Tally(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    count: Array
+    count: Array = eqx.field(init=False)
 
-    def __init__(self, name: str):
-        if name == "clipped_control":
+    def __post_init__(self):
+        if self.name == "clipped_control":
             raise ValueError(
                 "Tally: name must not be 'clipped_control', which a rollout counts "
                 "itself."
             )
-        self.name = name
         self.count = jnp.zeros((), jnp.int32)
 
     def __repr__(self):

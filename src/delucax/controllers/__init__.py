@@ -24,17 +24,13 @@ from ._output_feedback import LQG as LQG, OutputFeedback as OutputFeedback
 from ._pid import LeakyPID as LeakyPID, PID as PID
 from ._sampled import lqrd as lqrd, sampled_weights as sampled_weights
 from ._stochastic import Categorical as Categorical, Gaussian as Gaussian
-from .online import (
+from .online._adaptive import Adaptive as Adaptive
+from .online._bpc import BPC as BPC
+from .online._explore import Explore as Explore
+from .online._gpc import drc as drc, gpc as gpc, neural_gpc as neural_gpc, sfc as sfc
+from .online._hindsight import best_in_hindsight as best_in_hindsight, regret as regret
+from .online._learner import OnlineLearner as OnlineLearner
+from .online._optimisers import (
     adagrad_norm as adagrad_norm,
-    Adaptive as Adaptive,
-    best_in_hindsight as best_in_hindsight,
-    BPC as BPC,
-    drc as drc,
-    Explore as Explore,
-    gpc as gpc,
-    neural_gpc as neural_gpc,
     online_newton as online_newton,
-    OnlineLearner as OnlineLearner,
-    regret as regret,
-    sfc as sfc,
 )

@@ -251,6 +251,7 @@ class Scheduled(AbstractController):
         arrays, rest = eqx.partition(self.controllers, eqx.is_array)
         count = len(jax.tree.leaves(arrays)[0])
         k = step_at(t, self.dt, count, "Scheduled")
+        # Held after the end; row -1, of times before the start, is NaN.
         return eqx.combine(row_at(arrays, jnp.minimum(k, count - 1)), rest)
 
     def init(self, *, key=None):

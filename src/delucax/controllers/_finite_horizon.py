@@ -109,7 +109,7 @@ class FiniteHorizonLQR(AbstractController):
         if steps is not None:
             check_at_most(T, steps, "horizon", where, "steps of dynamics")
         given = reference, control_reference, disturbance
-        signals = as_signals(dynamics, *given, where)
+        signals = as_signals(dynamics, given, where)
 
         def along(t):
             here = KnownSignals(dynamics.at(t), *signals, difference)
@@ -118,6 +118,7 @@ class FiniteHorizonLQR(AbstractController):
         times = jnp.arange(T) * dynamics.dt
         self.x_ref, self.u_ref, x_next = jax.vmap(along)(times)
         end = T * dynamics.dt
+        # The last step needs the reference one step beyond the horizon.
         if signals[0] is not None:
             last = signals[0](end)
         elif steps == T:
@@ -128,6 +129,8 @@ class FiniteHorizonLQR(AbstractController):
         d = jax.vmap(lambda a, b: deviation(a, b, difference))(x_next, targets)
         A, B = dynamics.A, dynamics.B
         A, B = (A, B) if steps is None else (A[:T], B[:T])
+        # With the residual d of the reference the cost to go has a linear term, whose
+        # share of the control is the feed-forward k.
         solution = dre(A, B, Q, R, S, final=final, horizon=T, d=d, parallel=parallel)
         self.K, self.k, self.P = solution.K, solution.k, solution.X
         self.dt, self.difference = dynamics.dt, difference

@@ -110,6 +110,8 @@ class HInfinity(AbstractController):
         else:
             solution = hinf_dare(*matrices, gamma=gamma)
         self.K, self.P, self.L = solution.K, solution.X, solution.L
+        # The sign is that of the Riccati package: u = -K dx minimises, w = +L dx
+        # maximises, and the closed loop of both is A - B K + E L.
         self.gamma, self.dt = solution.gamma, dynamics.dt if is_finite else None
 
     def __check_init__(self):
@@ -123,6 +125,7 @@ class HInfinity(AbstractController):
         if self.dt is not None:
             step = step_at(t, self.dt, len(K), "HInfinity")
             K = row_at(K, step)
+            # Gains may vary about one operating point, or about one at each step.
             if x_ref.ndim == 2:
                 x_ref, u_ref = row_at((x_ref, u_ref), step)
         u = u_ref - matvec(K, deviation(y, x_ref, self.difference))

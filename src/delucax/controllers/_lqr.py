@@ -123,7 +123,8 @@ class LQR(AbstractController):
         check_linear_state_feedback(linear, where, time_invariant=True)
         self.x_ref = operating_state(linear, difference, where)
         self.u_ref, self.difference = linear.u_ref, difference
-        given = as_signals(linear, reference, control_reference, disturbance, where)
+        given = reference, control_reference, disturbance
+        given = as_signals(linear, given, where)
         is_known = any(signal is not None for signal in given)
         preview = check_count(preview, "preview", where, least=0)
         if preview and not is_known:
@@ -135,6 +136,8 @@ class LQR(AbstractController):
         self.K, self.P, self.feed_forward = solution.K, solution.X, None
         if is_known:
             B, P = linear.B, solution.X
+            # (R + B'PB)^-1 B', once: the weight of each control by what it does to the
+            # cost to go.
             M = solve(jnp.asarray(R, P.dtype) + B.T @ P @ B, B.T)
             signals = KnownSignals(linear, *given, difference)
             known = signals, P, M, solution.closed_loop
@@ -260,7 +263,8 @@ class LQI(AbstractController):
         self.x_ref = operating_state(dynamics, difference, where)
         self.u_ref, self.dt, self.difference = dynamics.u_ref, dynamics.dt, difference
         self.output = C.astype(dynamics.A.dtype)
-        self.reference = as_signal(reference, p, "reference", where)
+        self.reference = as_signal(where, reference, p, "reference")
+        # `z_next = z - dt C e`, below the plant: the reference drops out of the design.
         integrals = [-dynamics.dt * C, jnp.eye(p, dtype=C.dtype)]
         A = jnp.block([[dynamics.A, jnp.zeros((n, p), C.dtype)], integrals])
         B = jnp.concatenate([dynamics.B, jnp.zeros((p, m), C.dtype)])
@@ -269,7 +273,7 @@ class LQI(AbstractController):
 
     def __check_init__(self):
         check_step(self.dt, "LQI")
-        as_signal(self.reference, self.Ki.shape[1], "reference", "LQI")
+        as_signal("LQI", self.reference, self.Ki.shape[1], "reference")
 
     def init(self, *, key=None):
         dtype = jnp.result_type(self.K, self.Ki)
@@ -279,6 +283,8 @@ class LQI(AbstractController):
     def __call__(self, t, y, state):
         check_state(self, y, self.x_ref.shape[0])
         dx = deviation(y, self.x_ref, self.difference)
+        # r - C x with x = x_ref + dx; the part of x_ref cancels where no reference is
+        # given.
         error = -matvec(self.output, dx)
         if self.reference is not None:
             error = error + self.reference(t) - matvec(self.output, self.x_ref)
@@ -289,9 +295,11 @@ class LQI(AbstractController):
         return u.astype(y.dtype), after
 
     def applied(self, u, cost, state):
-        # The least change of the integral that would have asked for this control.
+        # The least change `dz` of the integral with `Ki dz = asked - applied`, so that
+        # the law would have given the applied control: back-calculation in one step.
         excess = state.asked - u.astype(state.asked.dtype)
         gain = lx.MatrixLinearOperator(self.Ki)
+        # Where there are fewer outputs than controls, Ki is tall: least squares.
         solver = lx.AutoLinearSolver(well_posed=None)
         change = lx.linear_solve(gain, excess, solver, throw=False).value
         limited = jnp.any(excess != 0)

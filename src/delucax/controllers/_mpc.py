@@ -20,7 +20,7 @@ from .._check import (
     check_key,
 )
 from .._controller import AbstractController, Tally
-from .._module import check_parameters, function_field
+from .._module import function_field
 from .._results import Result, RESULTS
 from .._typing import Control, Difference, Observation, PRNGKey
 from ..costs import AbstractCost
@@ -180,7 +180,6 @@ class MPC(AbstractController):
         check_instance(self.cost, AbstractCost, "cost", where)
         check_cost_sizes(self.cost, (n, m), "cost", where)
         check_instance(self.planner, AbstractPlanner, "planner", where)
-        check_parameters(self)
         check_instance(self.start, Start, "start", where)
         start = self.start.checked(n, m, "start", where)
         if start.controls.ndim != 3 or start.states is None or start.gains is None:
@@ -209,7 +208,10 @@ class MPC(AbstractController):
             key, draw = jr.split(key)
         last, starts = state.last, state.last.controls
         if not self.planner.starts_from_states:
+            # First, as of starts of equal cost the first is taken.
             join = lambda a, b: jnp.concatenate([a[None], b])
+            # One batch: the planner rolls all of them out together and refines the
+            # best.
             starts = jax.tree.map(join, last, self.start)
         plan = self.planner(
             self.dynamics,
@@ -224,6 +226,8 @@ class MPC(AbstractController):
             key=draw,
             throw=False,
         )
+        # Usable plans include those that ran out of iterations: the best so far beats
+        # the last one, which is a step older.
         lost, u = ~plan.is_usable, plan.controls[0]
         u = jnp.where(lost, self._followed(y, last), u)
         if self.throw:
@@ -264,6 +268,7 @@ def _stacked(start: Start, n: int) -> Start:
     controls, states, gains = start.controls, start.states, start.gains
     c, T, m = controls.shape
     if states is None or gains is None:
+        # Zero gains make the states irrelevant; all starts then stack in one shape.
         states = jnp.zeros((c, T + 1, n), controls.dtype)
         gains = jnp.zeros((c, T, m, n), controls.dtype)
     return Start(controls, states, gains)

@@ -130,6 +130,7 @@ def squash(u: Array, bounds: tuple[Array, Array] | None) -> Array:
     if bounds is None:
         return u
     low, high = bounds
+    # Smooth, where clipping has no gradient beyond a bound and learning stalls.
     return (high + low) / 2 + (high - low) / 2 * jnp.tanh(u)
 
 
@@ -200,6 +201,8 @@ def mlp_policy(
     std = jnp.ones(size)
     if bounds is not None:
         std = jnp.broadcast_to((bounds[1] - bounds[0]) / 4, (size,))
+    # The bounds of the environment, infinite ones included: `log_prob` is then that of
+    # what is applied.
     return Gaussian(network, jnp.log(std), bounds=environment.control_bounds)
 
 
@@ -340,6 +343,7 @@ class History(AbstractController):
 
     def __call__(self, t, y, state):
         z = features_of(self, y, self.size).astype(state.observations.dtype)
+        # The first observation fills the window: zeros would look like motion.
         past = jnp.where(state.started, state.observations, z)
         window = jnp.concatenate([z, past.ravel(), state.controls.ravel()])
         u, base = self.base(t, window.astype(y.dtype), state.base)
@@ -420,4 +424,6 @@ class Standardise(eqx.Module):
 
         **Returns:** a vector.
         """
+        # Ten deviations, as in OpenAI's baselines: an outlier may not saturate the
+        # network.
         return jnp.clip((self.of(y) - self.mean) / self.std, -10, 10)

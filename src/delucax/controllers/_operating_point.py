@@ -34,6 +34,8 @@ def linear_at(
             f"{where}: point must have x of shape {sizes[0]} and u of shape "
             f"{sizes[1]}, got {point.x.shape} and {point.u.shape}."
         )
+    # Linear dynamics have no angles of their own: for them subtraction stays the
+    # default.
     if difference is None and not isinstance(dynamics, LinearDynamics | LinearSystem):
         difference = dynamics.difference
     return linearize(dynamics, x=point), difference
@@ -54,6 +56,7 @@ def check_linear_state_feedback(
     C, n = dynamics.C, dynamics.state_size
     if C is None:
         return
+    # A traced C cannot be inspected: its shape alone decides.
     if C.shape != (n, n) or is_concrete(C) and not np.array_equal(C, np.eye(n)):
         raise ValueError(
             f"{where}: dynamics must observe their state (C the identity), for {where} "
@@ -83,6 +86,7 @@ def operating_state(
         hint = "`delucax.trim(system, x=..., u=...)` computes one that does; "
         drift = deviation(x_next, x_ref, difference)
     moved = _relative_drift(drift, A, B, x, u_ref)
+    # Negated, so that a NaN counts as motion.
     moves = ~(moved <= _RESTS)
     if not is_concrete(moves):
         return eqx.error_if(x_ref, moves, f"{rule}.")
@@ -97,6 +101,7 @@ def operating_state(
 @jax.jit
 def _relative_drift(drift, A, B, x, u):
     """What moves the state, relative to the terms that do."""
+    # The derivative of x_next - x: what moves the state is J (x, u).
     J = jnp.concatenate([A - jnp.eye(A.shape[-1], dtype=A.dtype), B], axis=-1)
     return relative_drift(drift, J, x, u, is_map=True)
 

@@ -70,6 +70,7 @@ class OutputFeedback(AbstractController):
     def init(self, *, key=None):
         keys = (None, None) if key is None else jax.random.split(key)
         state = self.estimator.init(key=keys[1])
+        # `applied` is told no time, but the prediction needs it.
         time = jnp.zeros((), self.estimator.estimate(state).mean.dtype)
         memory = self.controller.init(key=keys[0])
         return _State(memory, state, time, Tally("failed_estimate"))
@@ -181,6 +182,7 @@ class LQG(AbstractController):
     ):
         plant: Any = dynamics
         if isinstance(dynamics, LinearDynamics) and dynamics.C is not None:
+            # LQR takes dynamics that observe their state; here the filter supplies it.
             plant = eqx.tree_at(lambda d: d.C, dynamics, None)
         self.regulator = LQR(plant, Q, R, S, difference=difference)
         self.estimator = KalmanFilter(
@@ -196,6 +198,9 @@ class LQG(AbstractController):
         self.average_cost = None
         covariance = self.estimator.updated_covariance
         if covariance is not None:
+            # Separation: the first term is the cost with the state known, the second
+            # that of the control du = -K (mean - x) which acts on the error of the
+            # estimate.
             noise = self.estimator._noise(dynamics)
             K, P, B = self.regulator.K, self.regulator.P, dynamics.B
             # The weight of an error of the estimate.

@@ -247,6 +247,7 @@ class PID(_AbstractPID):
     def __call__(self, t, y, state):
         error, measured = self._error(t, y)
         moving = -measured if self.derivative_on == "measurement" else error
+        # No derivative on the first call, which has nothing before it.
         step = jnp.where(state.started, moving - state.previous, 0)
         lag = self.derivative_time_constant
         lag = self.dt if lag is None else lag
@@ -261,6 +262,8 @@ class PID(_AbstractPID):
         return self._clip(asked, y), _as(after, state)
 
     def applied(self, u, cost, state):
+        # Back-calculation: with the bounds of the environment included in u, because
+        # this is told what was applied.
         correction = self.dt * self._windup_rate() * (u - state.asked)
         return _as(state._replace(integral=state.integral + correction), state)
 
@@ -339,6 +342,7 @@ class LeakyPID(_AbstractPID):
 
     def __call__(self, t, y, state):
         error, _ = self._error(t, y)
+        # The low-pass filter dI/dt = (e - I) / T by backward Euler.
         share = self.dt / (self.dt + self.time_constant)
         integral = state.integral + share * (error - state.integral)
         change = error - state.error

@@ -64,8 +64,11 @@ def sampled_weights(
                 f"{M.shape}."
             )
     size = n + m
+    # The held control as a state with du/dt = 0: the cost of a step is then a Gramian
+    # of one exponential (Van Loan).
     field = jnp.zeros((size, size), A.dtype).at[:n, :n].set(A).at[:n, n:].set(B)
     charge = jnp.block([[Q, S], [S.T, R]]).astype(A.dtype)
+    # integral of expm(F' s) charge expm(F s) over [0, dt], by blocks: Qd, Sd and Rd.
     total = gramian_over(field.T, charge, jnp.asarray(dt, A.dtype))
     return total[:n, :n], total[n:, n:], total[:n, n:]
 

@@ -162,6 +162,7 @@ class Gaussian(_AroundBase):
             near_high = jnp.where(jnp.isinf(high), 0, high)
             below = (near_low - mean) / std
             above = (mean - near_high) / std
+            # A clipped draw has an atom at each bound (Fujita and Maeda, 2018).
             each = jnp.where(u >= high, log_ndtr(above), each)
             each = jnp.where(u <= low, log_ndtr(below), each)
         return jnp.sum(each).astype(mean.dtype)
@@ -203,6 +204,7 @@ class Gaussian(_AroundBase):
             return self._log_prob(mean, u), state
 
         scores = replay(self.base, self.base.init(), record, act)
+        # Steps after termination are padding.
         alive = jnp.arange(trajectory.steps) < trajectory.length
         return jnp.sum(jnp.where(alive, scores, 0))
 
@@ -275,6 +277,8 @@ class Categorical(_AroundBase):
         **Returns:** a scalar.
         """
         logits, _ = self._logits(t, y, state)
+        # Controls of a record may be rounded: the nearest row is the one that was
+        # drawn.
         away = jnp.sum((lax.stop_gradient(self.actions) - u) ** 2, axis=1)
         return logits[jnp.argmin(away)]
 

@@ -60,6 +60,7 @@ class AbstractCost(eqx.Module):
         pairs = [pair for pair in named if pair is not None]
         if not pairs:
             return None
+        # The first term that has a target decides, so that a penalty may be added.
         first = lambda values: next((a for a in values if a is not None), None)
         return first(x for x, _ in pairs), first(u for _, u in pairs)
 

@@ -51,6 +51,7 @@ class Arrival(AbstractCost):
     def final(self, t: RealScalar, x: State) -> Scalar:
         if self.reached is None:
             return super().final(t, x)
+        # Once, at the end: the goal terminates the episode.
         return jnp.where(self.reached(t, x), self.arrival_cost, 0.0).astype(x.dtype)
 
 

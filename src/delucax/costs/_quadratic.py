@@ -109,6 +109,7 @@ class Quadratic(_AbstractQuadratic):
         self.difference = difference
 
     def __check_init__(self):
+        # A weight that is no array is reported by the base class.
         for name, weight in (("state_target", self.Q), ("control_target", self.R)):
             target = getattr(self, name)
             if target is not None and jnp.ndim(weight) > 0:
@@ -200,6 +201,7 @@ class Tracking(_AbstractQuadratic):
 
 def _form(weight: Matrix | Vector, d: Vector) -> Scalar:
     """`d' weight d`, the weight a matrix or its diagonal."""
+    # Written out for small sizes, which fuses in the loop of a rollout.
     if weight.ndim == 2:
         return quadratic_form(weight, d)
     return dot(weight * d, d)

@@ -165,6 +165,8 @@ class Sum(AbstractDisturbance):
         n = len(self.terms)
         if key is not None:
             check_key(key, "Sum")
+        # A key for each term: with one key for all, equal terms would draw the same
+        # noise.
         keys = [None] * n if key is None else list(jr.split(key, n))
         drawn = (w.sequence(k, times) for w, k in zip(self.terms, keys, strict=True))
         return functools.reduce(operator.add, drawn)
@@ -189,6 +191,8 @@ class _Window(AbstractDisturbance):
         dt = step_between(times, "between")
         inside = reached(times, self.start, dt) & ~reached(times, self.stop, dt)
         w = jnp.where(inside[:, None], w, jnp.zeros((), w.dtype))
+        # A step of NaN says that the times are too coarse: the result is then NaN too,
+        # and not a window at the wrong place.
         return w if dt is None else jnp.where(jnp.isnan(dt), jnp.nan, w)
 
 

@@ -126,6 +126,7 @@ class RandomWalk(AbstractEntrywise):
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         shape = (times.shape[0], self.size)
         e = normal(check_key(key, "RandomWalk"), shape, times.dtype)
+        # In the precision of the times, as the carry of a scan must keep its type.
         std, bound = self.std.astype(e.dtype), self.bound.astype(e.dtype)
 
         def step(w, e):
@@ -184,4 +185,5 @@ class Brownian(AbstractDisturbance):
             )
         dt = step_between(times, "Brownian") if self.dt is None else self.dt
         e = normal(check_key(key, "Brownian"), (times.shape[0], self.size), times.dtype)
+        # Increments of each substep: their variance is its length.
         return (jnp.sqrt(dt / self.substeps) * e).astype(times.dtype)

@@ -210,12 +210,9 @@ class AbstractGaussianFilter(AbstractEstimator):
         posed, p = is_definite(S), len(S)
         L = jnp.linalg.cholesky(jnp.where(posed, S, jnp.eye(p, dtype=S.dtype)))
         # `r' S^-1 r = |L^-1 r|^2` and `log det S = 2 sum log L_ii`, from one factor.
-        operator, solver = (
-            lx.MatrixLinearOperator(L, lx.lower_triangular_tag),
-            lx.Triangular(),
-        )
+        lower = lx.MatrixLinearOperator(L, lx.lower_triangular_tag)
         r = innovation.astype(S.dtype)
-        whitened = lx.linear_solve(operator, r, solver, throw=False).value
+        whitened = lx.linear_solve(lower, r, lx.Triangular(), throw=False).value
         log_scale = jnp.sum(jnp.log(jnp.diagonal(L))) + 0.5 * p * math.log(2 * math.pi)
         value = -0.5 * jnp.sum(whitened**2) - log_scale
         return jnp.where(posed, value, jnp.nan).astype(belief.mean.dtype)

@@ -79,6 +79,7 @@ class Sequence(eqx.Module):
         """The signal at time `t`."""
         count = self.values.shape[0]
         k = step_at(t, self.dt, count, "Sequence")
+        # Indexed, not interpolated: a rollout asks at the steps alone.
         return self.values[jnp.clip(k, 0, count - 1)]
 
 

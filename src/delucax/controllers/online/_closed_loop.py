@@ -228,6 +228,7 @@ class ClosedLoop(eqx.Module):
     def _disturbance(self, state: ClosedLoopState) -> Float[Array, " n"]:
         """The last disturbance: the state less where the model went."""
         assert state.predicted is not None
+        # w_{t-1} = x_t - F(x_{t-1}, u_{t-1}), an angle by the shorter way.
         off = self.dynamics.difference(state.y, state.predicted)
         size = jnp.max(jnp.abs(state.y) + jnp.abs(state.predicted))
         # The same step compiled twice may differ in rounding, which is no disturbance.
@@ -253,8 +254,12 @@ class ClosedLoop(eqx.Module):
         if predicted is not None:
             predicted, _ = self.dynamics.advance(state.t, state.y, u, None)
         if impulses is not None:
+            # The state after an impulse j steps ago is A_t ... A_{t-j+1} B_{t-j}: each
+            # is moved on by one step, so that no product is computed twice.
             impulses = shift(tangents.input, tangents.transition @ impulses)
         if forced is not None:
+            # With what was really applied, so that saturation does not look like a
+            # disturbance.
             forced = matvec(tangents.transition, forced) + matvec(tangents.input, v)
         return state._replace(
             base=self.base.applied(u, cost, state.base),
@@ -273,6 +278,9 @@ class ClosedLoop(eqx.Module):
     ) -> tuple[Float[Array, " p"], Float[Array, " m"]]:
         """The observation and control of this step, had `v` been added at it and
         `v_past` at the steps of the roll-out before, newest first."""
+        # Superposition: of a linear loop exact, else to first order about the true run.
+        # Only the difference from what was added counts, so that saturation and noise
+        # stay in.
         change = jnp.einsum("hom,hm->o", self.past(state), v_past - state.added)
         p = state.y.shape[0]
         return state.y + change[:p], state.u_base + change[p:] + v
@@ -343,6 +351,7 @@ def _tangents(dynamics, base, t, x, state, v) -> Tangents:
         y = dynamics.observe(t, x)
         u, after = base(t, y, back(z[n:]))
         x_next, _ = dynamics.advance(t, x, u + v, None)
+        # The base learns what was applied, so that its anti-windup is part of the loop.
         after = base.applied(u + v, jnp.zeros((), x.dtype), after)
         z_next = jnp.concatenate([x_next, _vector(after)[0].astype(x.dtype)])
         return z_next, jnp.concatenate([y, u.astype(y.dtype)])
@@ -394,6 +403,7 @@ def _roll_out_length(radius: float | None, horizon: int | None, where: str) -> i
 
 def _steps(radius: float, left: float, least: int, most: int) -> int:
     """After how many steps no more than a part `left` is left, between limits."""
+    # radius^steps = left.
     steps = math.log(left) / math.log(radius) if 0 < radius < 1 else 0
     return min(max(least, math.ceil(steps)), most)
 
@@ -406,6 +416,7 @@ def _spectral_radius(tangents: Tangents) -> float | None:
     q, m = tangents.input.shape[-2:]
     transitions = np.asarray(tangents.transition, float).reshape(-1, q, q)
     reached = np.any(np.asarray(tangents.input).reshape(-1, q, m) != 0, axis=(0, 2))
+    # The states that the added control reaches, as a graph: q sweeps suffice.
     for _ in range(q):
         reached = reached | np.any(transitions[..., reached] != 0, axis=(0, 2))
     # States of the base that no control moves, such as a covariance, do not decay.

@@ -1,7 +1,8 @@
 """Control of a plant that is not known."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import KW_ONLY
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,10 +11,10 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float, Int, PyTree
 
-from ..._check import as_matrix, check_count, check_instance, check_key, check_step
-from ..._controller import AbstractController, wrong_observation
+from ..._check import as_matrix, check_count, check_key, check_step
+from ..._controller import AbstractController, check_controller, wrong_observation
 from ..._module import function_field, parameter
-from ..._typing import PRNGKey
+from ..._typing import PRNGKey, Real
 from ...dynamics import LinearDynamics
 from ...math._linear_solve import solve
 from ._closed_loop import shift
@@ -92,27 +93,17 @@ class Explore(AbstractController):
 
     build: Callable[[LinearDynamics], AbstractController] = function_field()
     K: Array = parameter()
-    scale: Array = parameter()
-    dt: Array = parameter()
     steps: int = eqx.field(static=True)
-    order: int = eqx.field(static=True)
+    _: KW_ONLY
+    scale: Real = parameter(1.0)
+    order: int = eqx.field(default=None, static=True)
+    dt: Real = parameter(1.0)
 
-    def __init__(
-        self,
-        build: Callable[[LinearDynamics], AbstractController],
-        K: Any,
-        steps: int,
-        *,
-        scale: Any = 1.0,
-        order: int | None = None,
-        dt: Any = 1.0,
-    ):
-        where = "Explore"
-        self.K = as_matrix(K, "K", where)
-        order = self.K.shape[1] if order is None else order
-        self.order = check_count(order, "order", where)
-        self.steps = check_count(steps, "steps", where, least=self.order + 2)
-        self.build, self.scale, self.dt = build, scale, dt
+    def __post_init__(self):
+        where, order = "Explore", self.order
+        n = as_matrix(self.K, "K", where).shape[1]
+        self.order = check_count(n if order is None else order, "order", where)
+        self.steps = check_count(self.steps, "steps", where, least=self.order + 2)
 
     def __check_init__(self):
         as_matrix(self.K, "K", "Explore")
@@ -140,6 +131,8 @@ class Explore(AbstractController):
             raise wrong_observation(self, self.K.shape[1], y)
         dtype, y = y.dtype, y.astype(self.K.dtype)
         # Row j of the excitations is that of j + 1 steps ago.
+        # Signs e have E[e e'] = I and are independent of the past: x e' has the mean of
+        # the response alone, whatever the disturbances.
         moments = y[:, None] * state.excitations[:, None, :] / self.scale**2
         exploring = state.step < self.steps
         moments = jnp.where(exploring, state.moments + moments, state.moments)
@@ -186,10 +179,10 @@ class Explore(AbstractController):
         @eqx.filter_jit
         def design(model):
             controller = self.build(model)
-            made = "what build makes"
-            check_instance(controller, AbstractController, made, "Explore")
+            check_controller(controller, "what build makes", "Explore")
             return eqx.filter(controller, eqx.is_array), controller.init(key=None)
 
+        # A weak type would change in the loop, where `cond` wants one type.
         strong = lambda x: lax.convert_element_type(x, x.dtype)  # noqa: E731
         return jax.tree.map(strong, design(model))
 

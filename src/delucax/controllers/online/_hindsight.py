@@ -187,6 +187,8 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
 
     def derivatives(theta):
         total = lambda theta: run(theta, checkpoint="sqrt")[1].total_cost  # noqa: E731
+        # One linearisation, then a batch of products with the Hessian: forward over
+        # reverse.
         (cost, gradient), jvp = jax.linearize(jax.value_and_grad(total), theta)
         _, hessian = jax.vmap(jvp)(eye)
         return cost, gradient, (hessian + hessian.T) / 2
@@ -195,10 +197,13 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
         best, local, damping, _, k = carry
         cost, gradient, hessian = local
         size = jnp.trace(jnp.abs(hessian)) / len(start)
+        # Levenberg's damping, in units of the mean curvature: theta has no scale.
         damped = hessian + damping * jnp.where(size > 0, size, 1) * eye
         change = solve(damped, -gradient[:, None])[:, 0]
         change = jnp.where(k > 0, change, 0)
+        # The decrease that the quadratic model predicts, of the undamped model.
         promised = -(gradient @ change + change @ hessian @ change / 2)
+        # Cost and derivatives in one pass: a trial that succeeds needs them next.
         tried = derivatives(best + change)
         pick = lambda new, old: jnp.where(tried[0] < cost, new, old)  # noqa: E731
         left = promised / (jnp.abs(cost) + jnp.finfo(start.dtype).tiny)

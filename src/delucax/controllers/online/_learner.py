@@ -199,6 +199,7 @@ class OnlineLearner(AbstractLearner):
         at each step of the roll-out, newest first, shape (horizon + 1, p + m, m)."""
         past = self.loop.past(loop)
         p, m = loop.y.shape[0], past.shape[2]
+        # What is added now changes the control of this step, and no observation yet.
         direct = jnp.eye(p + m, m, -p, past.dtype)
         response = jnp.concatenate([direct[None], past])
         return jnp.einsum("ok,hom->hkm", root, response)
@@ -206,6 +207,8 @@ class OnlineLearner(AbstractLearner):
     def _root(self, t, z):
         p = self.loop.dynamics.observation_size
         cost = lambda z: self.cost(t, z[:p], z[p:])  # noqa: E731
+        # Gauss and Newton: the curvature by theta is J' H J, as outcomes are linear in
+        # theta.
         return positive_root(jax.hessian(cost)(z))
 
     def _constant_root(self):
@@ -252,7 +255,12 @@ def base_for(
     where: str,
 ) -> AbstractController:
     """The base of a learner with this model and cost, which are checked: as given, or
-    the default one."""
+    by default the regulator for the curvature of the cost at the operating point.
+
+    For each time of time-varying dynamics it is the one that would be best if they
+    stayed as they are; where not the state but `C x` is observed, it acts on the
+    estimate of a Kalman filter for disturbances and sensor noise of unit covariance.
+    """
     hint = (
         ", the model that it learns with (`delucax.controllers.Explore` identifies one)"
     )
@@ -263,34 +271,8 @@ def base_for(
             f"delucax.costs, got {type(cost).__name__}."
         )
     check_scalar_cost(cost, dynamics, where)
-    return _default_base(dynamics, cost, where) if base is None else base
-
-
-def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None:
-    """Raise unless a cost of what `dynamics` show is a scalar."""
-    y, u = (dynamics.observation_size,), (dynamics.control_size,)
-    try:
-        value = output_of(cost, (), y, u)
-    except ValueError as error:
-        raise ValueError(
-            f"{where}: cost must take the observation, of shape {y}, where a state is "
-            f"asked for, and a control of shape {u}: {error}"
-        ) from error
-    got = getattr(value, "shape", None)
-    if got != ():
-        got = type(value).__name__ if got is None else f"an array of shape {got}"
-        raise ValueError(f"{where}: cost must give a scalar, got {got}.")
-
-
-def _default_base(
-    dynamics: AbstractDynamics, cost: Callable[..., Array], where: str
-) -> AbstractController:
-    """The regulator for the curvature of the cost at the operating point.
-
-    For each time of time-varying dynamics it is the one that would be best if they
-    stayed as they are; where not the state but `C x` is observed, it acts on what a
-    Kalman filter for disturbances and sensor noise of unit covariance makes of it.
-    """
+    if base is not None:
+        return base
     try:
         x, u = dynamics.equilibrium()
     except ValueError as error:
@@ -314,18 +296,38 @@ def _default_base(
     return Scheduled(design(times), dynamics.dt)
 
 
+def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None:
+    """Raise unless a cost of what `dynamics` show is a scalar."""
+    y, u = (dynamics.observation_size,), (dynamics.control_size,)
+    try:
+        value = output_of(cost, (), y, u)
+    except ValueError as error:
+        raise ValueError(
+            f"{where}: cost must take the observation, of shape {y}, where a state is "
+            f"asked for, and a control of shape {u}: {error}"
+        ) from error
+    got = getattr(value, "shape", None)
+    if got != ():
+        got = type(value).__name__ if got is None else f"an array of shape {got}"
+        raise ValueError(f"{where}: cost must give a scalar, got {got}.")
+
+
 def _curvature(dynamics, cost, t, x, u, where):
     """The second derivatives of the cost, as weights of a regulator."""
     y, n = dynamics.observe(t, x), x.shape[0]
 
     def charged(z):
+        # Gauss and Newton in the observation: the curvature of the sensor, which could
+        # make the cost concave, is left out.
         y_here = y + jax.jvp(lambda x: dynamics.observe(t, x), (x,), (z[:n],))[1]
         return cost(t, y_here, u + z[n:])
 
+    # c = dx'Q dx + ...: half of the second derivatives.
     H = jax.hessian(charged)(jnp.zeros(n + u.shape[0], x.dtype)) / 2
     Q, R, S = H[:n, :n], H[n:, n:], H[:n, n:]
     if is_concrete(H):
         H = np.asarray(H, float)
+        # Above the rounding of a Hessian in float32.
         slack = 1e-6 * np.max(np.abs(H), initial=0)
         curved = np.all(np.linalg.eigvalsh(H) >= -slack)
         if not (curved and np.all(np.linalg.eigvalsh(np.asarray(R)) > slack)):

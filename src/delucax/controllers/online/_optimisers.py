@@ -128,6 +128,8 @@ class _OnlineNewtonUpdate(eqx.Module):
         # Until the prior is outweighed it is worth `prior` of the average step so far.
         mean = lambda total, count: total / jnp.where(count > 0, count, 1)  # noqa: E731
         early = (size > 0) & (count > 0) & (count < self.prior)
+        # The prior: a multiple of the identity with the trace of `prior` average
+        # updates.
         fresh = gradient.size / (self.prior * jnp.where(first, size, 1))
         fresh = jnp.sqrt(fresh) * jnp.eye(gradient.size, dtype=gradient.dtype)
         after = jnp.where(early, mean(new_total, new_count), 1)
@@ -140,6 +142,8 @@ class _OnlineNewtonUpdate(eqx.Module):
             gain = 1 + along @ along
             root = root - jnp.outer(root @ along, along) / (gain + jnp.sqrt(gain))
         step = root @ (gradient @ root) / learning_rate
+        # A trust region of radius 1 (times the learning rate): early curvature is a
+        # guess.
         squared = jnp.sum(step**2)
         long = squared > 1
         step = step * jnp.where(long, 1 / jnp.sqrt(jnp.where(long, squared, 1)), 1)
@@ -194,6 +198,7 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
 def positive_root(H: Float[Array, "z z"]) -> Float[Array, "z z"]:
     """The Cholesky factor of the positive part of a symmetric matrix; columns that
     have no positive pivot are zero."""
+    # Pivots below are rounding, and their square roots would be noise.
     slack = len(H) * jnp.finfo(H.dtype).eps * jnp.max(jnp.abs(jnp.diag(H)), initial=0)
 
     columns = []

@@ -54,6 +54,7 @@ class AbstractPolicy(eqx.Module):
             v = jax.vmap(self, in_axes=(None, 0))(unravel(flat), features)
             return jnp.einsum("hom,hm->o", response, v)
 
+        # Few outcomes, many weights: reverse mode.
         return jax.jacrev(outcome)(flat)
 
 
