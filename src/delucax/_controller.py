@@ -319,11 +319,9 @@ def replay(
 
 def tallies(state: PyTree) -> dict[str, Array]:
     """The sum of the tallies of each name in a controller's state."""
-    is_tally = lambda node: isinstance(node, Tally)
     counts: dict[str, Any] = {}
-    for node in jax.tree.leaves(state, is_leaf=is_tally):
-        if is_tally(node):
-            counts[node.name] = counts.get(node.name, 0) + jnp.sum(node.count)
+    for tally in parts_of([state], Tally):
+        counts[tally.name] = counts.get(tally.name, 0) + jnp.sum(tally.count)
     return counts
 
 

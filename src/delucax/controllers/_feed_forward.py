@@ -72,12 +72,13 @@ class KnownSignals(eqx.Module):
 
 def as_signals(
     dynamics: LinearDynamics, given: tuple[Any, Any, Any], where: str
-) -> tuple[Signal | None, ...]:
+) -> tuple[Signal | None, Signal | None, Signal | None]:
     """The reference, control reference and disturbance that were given, checked at
     time 0."""
     sizes = dynamics.state_size, dynamics.control_size, dynamics.disturbance_size
     names = "reference", "control_reference", "disturbance"
-    return tuple(map(functools.partial(as_signal, where), given, sizes, names))
+    r, u_r, w = map(functools.partial(as_signal, where), given, sizes, names)
+    return r, u_r, w
 
 
 def as_signal(where: str, value: Any, size: int, name: str) -> Any:

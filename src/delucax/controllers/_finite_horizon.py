@@ -115,8 +115,7 @@ class FiniteHorizonLQR(AbstractController):
             here = KnownSignals(dynamics.at(t), *signals, difference)
             return here.state(t), here.control(t), here.next_state(t)
 
-        times = jnp.arange(T) * dynamics.dt
-        self.x_ref, self.u_ref, x_next = jax.vmap(along)(times)
+        self.x_ref, self.u_ref, x_next = jax.vmap(along)(jnp.arange(T) * dynamics.dt)
         end = T * dynamics.dt
         # The last step needs the reference one step beyond the horizon.
         if signals[0] is not None:
@@ -127,8 +126,7 @@ class FiniteHorizonLQR(AbstractController):
             last = dynamics.at(end).x_ref
         targets = jnp.concatenate([self.x_ref[1:], last[None]])
         d = jax.vmap(lambda a, b: deviation(a, b, difference))(x_next, targets)
-        A, B = dynamics.A, dynamics.B
-        A, B = (A, B) if steps is None else (A[:T], B[:T])
+        A, B = (a if steps is None else a[:T] for a in (dynamics.A, dynamics.B))
         # With the residual d of the reference the cost to go has a linear term, whose
         # share of the control is the feed-forward k.
         solution = dre(A, B, Q, R, S, final=final, horizon=T, d=d, parallel=parallel)

@@ -140,8 +140,7 @@ class LQR(AbstractController):
             # cost to go.
             M = solve(jnp.asarray(R, P.dtype) + B.T @ P @ B, B.T)
             signals = KnownSignals(linear, *given, difference)
-            known = signals, P, M, solution.closed_loop
-            self.feed_forward = Preview(*known, preview)
+            self.feed_forward = Preview(signals, P, M, solution.closed_loop, preview)
 
     def __check_init__(self):
         if self.feed_forward is None:

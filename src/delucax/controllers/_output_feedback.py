@@ -185,16 +185,9 @@ class LQG(AbstractController):
             # LQR takes dynamics that observe their state; here the filter supplies it.
             plant = eqx.tree_at(lambda d: d.C, dynamics, None)
         self.regulator = LQR(plant, Q, R, S, difference=difference)
-        self.estimator = KalmanFilter(
-            dynamics,
-            W,
-            V,
-            mean=mean,
-            covariance=covariance,
-            steady_state=steady_state,
-            y_ref=y_ref,
-            observation_difference=observation_difference,
-        )
+        start: Any = dict(mean=mean, covariance=covariance, steady_state=steady_state)
+        sensor: Any = dict(y_ref=y_ref, observation_difference=observation_difference)
+        self.estimator = KalmanFilter(dynamics, W, V, **start, **sensor)
         self.average_cost = None
         covariance = self.estimator.updated_covariance
         if covariance is not None:

@@ -202,7 +202,7 @@ class AbstractEntrywise(AbstractDisturbance):
     """
 
     def __post_init__(self):
-        self.size = self._common_size()
+        self.size = self._common_size()  # pyright: ignore[reportAttributeAccessIssue]
 
     def __check_init__(self):
         self._common_size()

@@ -92,7 +92,8 @@ def shock(
         ```
     """
     check_range(duration, "duration", "shock")
-    return Constant(value, size=size).between(start, start + duration)
+    given = {} if size is None else {"size": size}
+    return Constant(value, **given).between(start, start + duration)
 
 
 class Sinusoid(AbstractEntrywise):

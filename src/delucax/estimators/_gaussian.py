@@ -151,9 +151,9 @@ class AbstractGaussianFilter(AbstractEstimator):
         precision of all; where they are not given, `default` or zero and the identity.
         """
         where, dynamics, mean = type(self).__name__, self.dynamics, self.mean
-        n, k = dynamics.state_size, dynamics.disturbance_size
+        n, p = dynamics.state_size, dynamics.observation_size
+        k = dynamics.disturbance_size
         W = _covariance_matrix(self.W, k, "W", "the disturbance", where)
-        p = dynamics.observation_size
         V = _covariance_matrix(self.V, p, "V", "the observation", where)
         default = jnp.zeros(n, W.dtype) if default is None else default
         mean = default if mean is None else as_vector(mean, n, "mean", where)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_matrix, check_step
+from .._check import as_matrix, check_step, check_vector
 from .._module import check_parameters, parameter, positive
 from .._typing import Real, RealScalar, Vector
 from ..math import sin
@@ -32,11 +32,7 @@ class Constant(eqx.Module):
     value: Array = parameter()
 
     def __check_init__(self):
-        if jnp.ndim(self.value) != 1:
-            raise ValueError(
-                f"Constant: value must be a vector, got shape {jnp.shape(self.value)}."
-            )
-        check_parameters(self)
+        check_vector(self.value, "value", "Constant")
 
     def __call__(self, t: RealScalar) -> Vector:
         """The signal at time `t`."""

@@ -121,8 +121,8 @@ class ClosedLoop(eqx.Module):
         self.dynamics, self.base = dynamics, base
         self.observed = dynamics.observes_state
         self.nature = not self.observed if nature is None else nature
-        is_linear = isinstance(dynamics, LinearDynamics) and isinstance(base, _AFFINE)
-        is_constant = is_linear and not dynamics.is_time_varying
+        is_lti = isinstance(dynamics, LinearDynamics) and not dynamics.is_time_varying
+        is_constant = is_lti and isinstance(base, _AFFINE)
         if not is_constant and not self.observed:
             raise ValueError(
                 f"{where}: where the state is not observed, dynamics must be linear "
@@ -181,8 +181,7 @@ class ClosedLoop(eqx.Module):
     def init(self, key: Any, horizon: int) -> ClosedLoopState:
         """Before the first step; `horizon` is 0 without counterfactuals."""
         dynamics, dtype = self.dynamics, self.dtype
-        n, m = dynamics.state_size, dynamics.control_size
-        p = dynamics.observation_size
+        n, m, p = dynamics.state_size, dynamics.control_size, dynamics.observation_size
         base = self.base.init(key=key)
         q = n + _vector(base)[0].shape[0]
         zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731

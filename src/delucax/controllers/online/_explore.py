@@ -114,7 +114,8 @@ class Explore(AbstractController):
         key = check_key(key, "Explore.init")
         (m, n), dtype = self.K.shape, self.K.dtype
         # A placeholder, for the structure of the state; stable, so that designs exist.
-        model = self._model(jnp.eye(n, dtype=dtype) / 2, jnp.eye(n, m, dtype=dtype))
+        A, B = jnp.eye(n, dtype=dtype) / 2, jnp.eye(n, m, dtype=dtype)
+        model = LinearDynamics(A, B, dt=self.dt)
         arrays, inner = self._designed(model)
         return ExploreState(
             step=jnp.zeros((), jnp.int32),
@@ -166,12 +167,9 @@ class Explore(AbstractController):
         least = jnp.finfo(gram.dtype).eps * jnp.trace(gram)
         gram = gram + least * jnp.eye(len(gram), dtype=gram.dtype)
         closed_loop = solve(gram, before @ after.T).T
-        model = self._model(closed_loop + N[0] @ self.K, N[0])
+        model = LinearDynamics(closed_loop + N[0] @ self.K, N[0], dt=self.dt)
         arrays, inner = self._designed(model)
         return state._replace(model=model, arrays=arrays, inner=inner)
-
-    def _model(self, A: Array, B: Array) -> LinearDynamics:
-        return LinearDynamics(A, B, dt=self.dt)
 
     def _designed(self, model: LinearDynamics) -> tuple[PyTree, PyTree]:
         """The arrays of the controller for a model, and its state."""
