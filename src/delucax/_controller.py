@@ -262,15 +262,15 @@ class Tally(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    count: Array = eqx.field(init=False)
+    count: Array
 
-    def __post_init__(self):
-        if self.name == "clipped_control":
+    def __init__(self, name: str):
+        if name == "clipped_control":
             raise ValueError(
                 "Tally: name must not be 'clipped_control', which a rollout counts "
                 "itself."
             )
-        self.count = jnp.zeros((), jnp.int32)
+        self.name, self.count = name, jnp.zeros((), jnp.int32)
 
     def __repr__(self):
         return f"Tally({self.name!r}, count={shortened(self.count)})"
@@ -300,7 +300,7 @@ def replay(
     record: tuple[Array, ...],
     act: Callable[..., tuple[PyTree, PyTree]],
 ) -> PyTree:
-    """What `act` measures at each step of a recorded run.
+    """The measurements of `act` at each step of a recorded run.
 
     `measured, state = act(t, y, state, u, ...)` calls the controller, from `state` on
     and along `record`: the times, observations, applied controls and costs, and what

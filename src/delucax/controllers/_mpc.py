@@ -31,7 +31,7 @@ from ._operating_point import check_state, deviation
 
 
 class MPCState(NamedTuple):
-    """What [`delucax.controllers.MPC`][] remembers."""
+    """The state of [`delucax.controllers.MPC`][]."""
 
     last: Start
     result: Result

@@ -100,7 +100,7 @@ def operating_state(
 
 @jax.jit
 def _relative_drift(drift, A, B, x, u):
-    """What moves the state, relative to the terms that do."""
+    """The residual of an equilibrium, relative to its terms."""
     # The derivative of x_next - x: what moves the state is J (x, u).
     J = jnp.concatenate([A - jnp.eye(A.shape[-1], dtype=A.dtype), B], axis=-1)
     return relative_drift(drift, J, x, u, is_map=True)

@@ -49,7 +49,7 @@ class _Project(eqx.Module):
 
 
 def _as_output(output: Any) -> Any:
-    """What the loops follow, as a function of the observation."""
+    """The outputs of the loops, as a function of the observation."""
     if output is None or callable(output):
         return as_module(output)
     if isinstance(output, int | np.integer) and not isinstance(output, bool):

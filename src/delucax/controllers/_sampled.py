@@ -93,7 +93,7 @@ def lqrd(
     **Arguments:**
 
     - `system`: a linear system about an equilibrium, or any system, which is linearised
-        at the `point`, or else about the equilibrium it names.
+        at the `point`, or else about the equilibrium it defines.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `dt`: the step, a positive number.
@@ -105,7 +105,7 @@ def lqrd(
 
     **Returns:** a [`delucax.controllers.LQR`][].
 
-    **Raises:** `ValueError` if `system` is no system or names no equilibrium, a weight
+    **Raises:** `ValueError` if `system` is no system or defines no equilibrium, a weight
     does not fit, or `dt` is not positive; an error at run time if there is no
     stabilising gain.
 

@@ -38,10 +38,10 @@ class _AbstractQuadratic(AbstractCost):
 
     @abc.abstractmethod
     def _state_error(self, t: RealScalar, x: State) -> Vector:
-        """What `Q` weighs."""
+        """The error that `Q` weighs."""
 
     def _control_error(self, u: Control) -> Control:
-        """What `R` weighs."""
+        """The error that `R` weighs."""
         return u
 
     def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:

@@ -183,7 +183,7 @@ class _Window(AbstractDisturbance):
 
     @property
     def size(self) -> int:
-        """That of the disturbance inside."""
+        """The size of the disturbance inside."""
         return self.disturbance.size
 
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:

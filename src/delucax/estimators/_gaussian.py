@@ -57,7 +57,7 @@ class Joint(eqx.Module):
     @property
     @full_precision
     def covariance(self):
-        """That of `z`."""
+        """The covariance of `z`."""
         if self.known_covariance is not None:
             return self.known_covariance
         return symmetric(self._form(self.Z, self.Z) + self.noise)
@@ -205,7 +205,7 @@ class AbstractGaussianFilter(AbstractEstimator):
 
     @full_precision
     def _log_density(self, belief, joint, innovation):
-        """That of the innovation under `N(0, S)`; NaN if `S` is not definite."""
+        """The log-density of the innovation under `N(0, S)`; NaN if `S` is not definite."""
         S = joint.covariance
         posed, p = is_definite(S), len(S)
         L = jnp.linalg.cholesky(jnp.where(posed, S, jnp.eye(p, dtype=S.dtype)))

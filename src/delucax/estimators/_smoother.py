@@ -18,7 +18,7 @@ from ._gaussian import AbstractGaussianFilter
 
 
 class Filtered(eqx.Module):
-    """What `run_filter` returns."""
+    """The result of `run_filter`."""
 
     predicted: Belief
     updated: Belief
@@ -27,7 +27,7 @@ class Filtered(eqx.Module):
 
     @property
     def log_likelihood(self) -> Array:
-        """That of the whole record, a scalar; of a batch, of each of its records."""
+        """The log-likelihood of the whole record, or of each record of a batch."""
         return jnp.sum(self.log_likelihoods, axis=-1)
 
     def _facts(self) -> str:
@@ -36,7 +36,7 @@ class Filtered(eqx.Module):
 
 
 class Smoothed(eqx.Module):
-    """What `smooth` returns."""
+    """The result of `smooth`."""
 
     mean: Array
     covariance: Array

@@ -23,7 +23,7 @@ from ..._typing import PRNGKey, Real
 
 
 class AdaptiveState(NamedTuple):
-    """What is remembered of the experts.
+    """The state of the experts.
 
     - `experts`: their states, with a leading axis of slots.
     - `weights`: of each, 0 in an empty slot; they add up to 1.

@@ -22,7 +22,7 @@ from ._policy import LinearPolicy
 
 
 class BPCState(NamedTuple):
-    """What it remembers.
+    """The state of a `BPC`.
 
     - `loop`: of the plant and the base controller.
     - `theta`: what has been learned, and `optimiser`, the state of the optimiser.

@@ -48,7 +48,7 @@ class Tangents(NamedTuple):
 
 
 class ClosedLoopState(NamedTuple):
-    """What is remembered of the closed loop.
+    """The state of the closed loop.
 
     - `base`: the state of the base controller.
     - `t`, `y`, `u_base`: of the current step.
@@ -168,13 +168,13 @@ class ClosedLoop(eqx.Module):
 
     @property
     def dtype(self) -> Any:
-        """Of what is remembered."""
+        """The precision of the state."""
         arrays = jax.tree.leaves(eqx.filter(self.dynamics, eqx.is_inexact_array))
         return jnp.result_type(*arrays) if arrays else jnp.zeros(()).dtype
 
     @property
     def feature_size(self) -> int:
-        """Of the vector of features."""
+        """The size of the vector of features."""
         count = self.memory if self.filters is None else self.filters.shape[0]
         return count * self.dynamics.observation_size
 

@@ -21,7 +21,7 @@ from ._closed_loop import shift
 
 
 class ExploreState(NamedTuple):
-    """What is remembered.
+    """The state of an exploring controller.
 
     - `step`: how many steps were made.
     - `excitations`: the last random controls, newest first.

@@ -21,7 +21,7 @@ from ._policy import FixedPolicy
 
 
 class Hindsight(NamedTuple):
-    """What `best_in_hindsight` returns."""
+    """The result of `best_in_hindsight`."""
 
     controller: AbstractController
     trajectory: Trajectory
@@ -202,13 +202,13 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
         change = solve(damped, -gradient[:, None])[:, 0]
         change = jnp.where(k > 0, change, 0)
         # The decrease that the quadratic model predicts, of the undamped model.
-        promised = -(gradient @ change + change @ hessian @ change / 2)
+        predicted = -(gradient @ change + change @ hessian @ change / 2)
         # Cost and derivatives in one pass: a trial that succeeds needs them next.
         tried = derivatives(best + change)
         pick = lambda new, old: jnp.where(tried[0] < cost, new, old)  # noqa: E731
-        left = promised / (jnp.abs(cost) + jnp.finfo(start.dtype).tiny)
+        left = predicted / (jnp.abs(cost) + jnp.finfo(start.dtype).tiny)
         # A predicted decrease below zero is rounding.
-        left = jnp.where((k > 0) & (promised >= 0), left, jnp.inf)
+        left = jnp.where((k > 0) & (predicted >= 0), left, jnp.inf)
         # With less damping, rounding would move what the cost does not depend on.
         damping = pick(jnp.maximum(damping / 10, least), damping * 10)
         local = jax.tree.map(pick, tried, local)

@@ -34,7 +34,7 @@ _PRIOR_OF_OUTPUTS = 4.0
 
 
 class LearnerState(NamedTuple):
-    """What an online learner remembers.
+    """The state of an online learner.
 
     - `loop`: of the plant and the base controller.
     - `features`: of this step and those of the roll-out before it, newest first.

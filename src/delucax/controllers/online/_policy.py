@@ -1,4 +1,4 @@
-"""What is learned: a map from features to what is added to the base's control."""
+"""The policies that are learned: maps from features to controls."""
 
 import abc
 
@@ -34,7 +34,7 @@ class AbstractPolicy(eqx.Module):
     def __call__(
         self, theta: PyTree, features: Float[Array, " f"]
     ) -> Float[Array, " m"]:
-        """What is added to the base's control."""
+        """The control that is added to that of the base."""
 
     @abc.abstractmethod
     def project(self, theta: PyTree) -> PyTree:
@@ -107,7 +107,7 @@ class NetworkPolicy(AbstractPolicy):
 
 
 class FixedPolicy(AbstractController):
-    """What an online learner learns about, without the learning,
+    """The policy of an online learner, held fixed,
 
     `u_t = base(y_t) + policy(theta, features_t)`.
 
