@@ -21,10 +21,9 @@ class AbstractController(eqx.Module):
     """A feedback law with a state of its own.
 
     [`delucax.rollout`][] makes the calls, in this order at each step: `__call__` acts
-    on the observation; the environment saturates and steps; `applied` tells the
-    controller the control that was really applied, and its cost. Trained weights are
-    fields; what is learned or remembered along the way lives in the state, a pytree of
-    arrays.
+    on the observation; the environment saturates and steps; `applied` gets the control
+    that was really applied, and its cost. Trained weights are fields; what is learned
+    or remembered along the way lives in the state, a pytree of arrays.
 
     A controller that draws at each step keeps a random key in its state: `init` puts
     it there, and each call splits it. A wrapper gives each part a key of its own.
@@ -304,7 +303,7 @@ def replay(
 
     `measured, state = act(t, y, state, u, ...)` calls the controller, from `state` on
     and along `record`: the times, observations, applied controls and costs, and what
-    else `act` takes. Then the controller is told the control and the cost.
+    else `act` takes. Then its `applied` is called with the control and the cost.
     """
     state, static = eqx.partition(state, eqx.is_array)
 

@@ -32,7 +32,7 @@ class LQR(AbstractController):
 
     which minimises the sum over all time of `dx'Q dx + 2 dx'S du + du'R du` on the
     linear dynamics, `dx` and `du` being the deviations from the operating point. The
-    minimum is `dx' P dx`; with unit white noise it is `trace(P)` a step.
+    minimum is `dx' P dx`; with unit white noise it is `trace(P)` per step.
 
     With a `reference` r(t), a `control_reference` u_r(t) or a known `disturbance` w(t),
     the deviations are those from r and u_r, and a feed-forward is added, the best one

@@ -105,8 +105,8 @@ def lqrd(
 
     **Returns:** a [`delucax.controllers.LQR`][].
 
-    **Raises:** `ValueError` if `system` is no system or defines no equilibrium, a weight
-    does not fit, or `dt` is not positive; an error at run time if there is no
+    **Raises:** `ValueError` if `system` is no system or defines no equilibrium, a
+    weight does not fit, or `dt` is not positive; an error at run time if there is no
     stabilising gain.
 
     Source: Levis, Schlueter and Athans, 1971; Van Loan, 1978.

@@ -26,8 +26,8 @@ class AbstractCost(eqx.Module):
     """A stage cost `c(t, x, u)` and a final cost.
 
     A cost is minus a reward. The stage cost is charged at the current state and the
-    control that was applied, once a step; the final cost once, at the last state or on
-    entering a terminated one.
+    control that was applied, once per step; the final cost once, at the last state or
+    on entering a terminated one.
 
     Add two with `+`, and multiply one by a number with `*`.
 
@@ -233,14 +233,14 @@ class Scaled(AbstractCost):
 
 
 class Rate(AbstractCost):
-    """A cost a second, charged for a step of `dt`: `c(t, x, u) dt`.
+    """A cost per second, charged for a step of `dt`: `c(t, x, u) dt`.
 
     The sum approximates the integral over time, so that weights need not change with
     `dt`. The final cost is unchanged.
 
     **Arguments:**
 
-    - `cost`: the cost a second.
+    - `cost`: the cost per second.
     - `dt`: the step.
 
     **Raises:** `ValueError` if `dt` is not positive.

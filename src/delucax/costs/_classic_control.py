@@ -12,7 +12,7 @@ from ._base import AbstractCost
 
 
 class Arrival(AbstractCost):
-    """`step_cost + control_weight u'u` a step, and `arrival_cost` once, if the last
+    """`step_cost + control_weight u'u` per step, and `arrival_cost` once, if the last
     state is a goal.
 
     The costs of most Gym tasks. It is sparse: the gradient with respect to the state is

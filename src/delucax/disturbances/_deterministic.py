@@ -18,7 +18,7 @@ from ._base import AbstractDisturbance, AbstractEntrywise, as_size, Rows
 class Zero(AbstractDisturbance):
     """No disturbance.
 
-    **Arguments:** `size`: entries a step.
+    **Arguments:** `size`: entries per step.
 
     !!! example
 
@@ -45,7 +45,7 @@ class Constant(AbstractEntrywise):
     **Arguments:**
 
     - `value`: a number, or a vector of `size` entries.
-    - `size`: entries a step; follows from `value` if that is a vector.
+    - `size`: entries per step; follows from `value` if that is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit.
 
@@ -75,7 +75,7 @@ def shock(
 
     - `value`: a number, or a vector of `size` entries.
     - `start`, `duration`: in units of time.
-    - `size`: entries a step; follows from `value` if that is a vector.
+    - `size`: entries per step; follows from `value` if that is a vector.
 
     **Returns:** the disturbance.
 
@@ -105,7 +105,7 @@ class Sinusoid(AbstractEntrywise):
     - `frequency`: in hertz if time is in seconds.
     - `phase`: in radians, 0 by default.
     - `offset`: 0 by default.
-    - `size`: entries a step; follows from the others if one is a vector.
+    - `size`: entries per step; follows from the others if one is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit.
 
@@ -139,7 +139,7 @@ class Square(AbstractEntrywise):
     - `amplitude`.
     - `period`: in units of time, positive.
     - `duty`: the part of a period at `+amplitude`, from 0 to 1; 0.5 by default.
-    - `size`: entries a step; follows from the others if one is a vector.
+    - `size`: entries per step; follows from the others if one is a vector.
 
     A period, or a part of one, within rounding of a whole number of steps is that
     number of steps. The gradient with respect to `period` and `duty` is zero almost

@@ -24,7 +24,7 @@ class Gaussian(AbstractEntrywise):
 
     - `std`: standard deviation.
     - `mean`: 0 by default.
-    - `size`: entries a step; follows from the others if one is a vector.
+    - `size`: entries per step; follows from the others if one is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `std` is
     negative.
@@ -59,7 +59,7 @@ class Uniform(AbstractEntrywise):
     **Arguments:** each a number or a vector of `size` entries.
 
     - `low`, `high`: the ends.
-    - `size`: entries a step; follows from the others if one is a vector.
+    - `size`: entries per step; follows from the others if one is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `high` is
     below `low`.
@@ -98,7 +98,7 @@ class RandomWalk(AbstractEntrywise):
 
     - `std`: standard deviation of a step, 0.3 by default.
     - `bound`: 1 by default.
-    - `size`: entries a step; follows from the others if one is a vector.
+    - `size`: entries per step; follows from the others if one is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `std` or
     `bound` is negative.

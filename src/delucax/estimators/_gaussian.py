@@ -205,7 +205,7 @@ class AbstractGaussianFilter(AbstractEstimator):
 
     @full_precision
     def _log_density(self, belief, joint, innovation):
-        """The log-density of the innovation under `N(0, S)`; NaN if `S` is not definite."""
+        """The log-density of an innovation, `N(0, S)`; NaN if `S` is not definite."""
         S = joint.covariance
         posed, p = is_definite(S), len(S)
         L = jnp.linalg.cholesky(jnp.where(posed, S, jnp.eye(p, dtype=S.dtype)))

@@ -217,9 +217,9 @@ def sfc(
     `H_jk = (1 - margin)^(j + k - 1) / (j + k - 1)`.
 
     A few such filters do for a long memory what [`delucax.controllers.gpc`][] and
-    [`delucax.controllers.drc`][] need a matrix a step for: there is less to learn where
-    the closed loop is slow. They depend on the memory and the margin alone, not on the
-    plant.
+    [`delucax.controllers.drc`][] need a matrix per step for: there is less to learn
+    where the closed loop is slow. They depend on the memory and the margin alone, not
+    on the plant.
 
     The double spectral controller, for a state that is not observed, also adds
 
