@@ -6,16 +6,15 @@ from ._basic import (
     Linear as Linear,
     OpenLoop as OpenLoop,
     Random as Random,
-    Scheduled as Scheduled,
     Zero as Zero,
 )
+from ._composed import History as History, Scheduled as Scheduled
 from ._finite_horizon import FiniteHorizonLQR as FiniteHorizonLQR
 from ._hinfinity import HInfinity as HInfinity
 from ._lqr import LQI as LQI, LQR as LQR
 from ._mpc import MPC as MPC
 from ._network import (
     GRU as GRU,
-    History as History,
     MLP as MLP,
     mlp_policy as mlp_policy,
     Standardise as Standardise,

@@ -37,11 +37,6 @@ class KnownSignals(eqx.Module):
     disturbance: Signal | None = function_field()
     difference: Difference | None = function_field()
 
-    def check(self, where: str) -> None:
-        """Raise unless the signals have the sizes of the dynamics."""
-        given = self.reference, self.control_reference, self.disturbance
-        as_signals(self.dynamics, given, where)
-
     def state(self, t: RealScalar) -> Float[Array, " n"]:
         """`r(t)`."""
         return self.dynamics.x_ref if self.reference is None else self.reference(t)

@@ -25,12 +25,12 @@ from ._operating_point import (
 class FiniteHorizonLQR(AbstractController):
     """The linear-quadratic regulator over a finite horizon,
 
-    `u[k] = u_r[k] - K[k] difference(x[k], r[k]) - k[k]`,
+    `u[t] = u_r[t] - K[t] difference(x[t], r[t]) - k[t]`,
 
-    which minimises the sum over `k < T` of `e'Q e + 2 e'S v + v'R v`, and
+    which minimises the sum over steps `t < T` of `e'Q e + 2 e'S v + v'R v`, and
     `e' final e` at the end, with `e = difference(x, r)` and `v = u - u_r`. All of the
     reference and of a known disturbance is taken into account: `k`, the feed-forward,
-    is zero if the dynamics go from each `r[k]` to `r[k+1]` under `u_r[k]`, as along a
+    is zero if the dynamics go from each `r[t]` to `r[t+1]` under `u_r[t]`, as along a
     trajectory that was planned.
 
     **Arguments:**
@@ -51,8 +51,8 @@ class FiniteHorizonLQR(AbstractController):
     - `parallel`: solve the recursion in parallel over time, for accelerators.
 
     **Attributes:** `K`, the gains, trainable, shape `(T, m, n)`; `k`, shape `(T, m)`;
-    `P`, shape `(T+1, n, n)`; `x_ref` and `u_ref`, shapes `(T, n)` and `(T, m)`. From
-    step `T` on the control is NaN, which a rollout reports.
+    `P`, shape `(T+1, n, n)`; `x_ref` and `u_ref`, shapes `(T, n)` and `(T, m)`. Outside
+    of the horizon the control is NaN, so that a rollout fails.
 
     **Raises:** `ValueError` if `dynamics` is not linear or does not observe its state,
     there is no horizon, or a weight or signal does not fit; an error at run time if a

@@ -153,7 +153,9 @@ class LQR(AbstractController):
                 f"is, got M of shape {shapes[0]} and dynamics with B of shape "
                 f"{shapes[1]}."
             )
-        self.feed_forward.signals.check("LQR")
+        known = self.feed_forward.signals
+        given = known.reference, known.control_reference, known.disturbance
+        as_signals(known.dynamics, given, "LQR")
 
     def __call__(self, t, y, state):
         check_state(self, y, self.x_ref.shape[0])

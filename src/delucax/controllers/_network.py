@@ -1,15 +1,14 @@
 """Neural network policies, and their features."""
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from .._check import (
     as_bounds,
@@ -22,7 +21,7 @@ from .._check import (
     check_vector,
     is_concrete,
 )
-from .._controller import AbstractController, check_controller, wrong_observation
+from .._controller import AbstractController, wrong_observation
 from .._module import as_float_array, as_module, function_field, parameter, weight
 from .._typing import PRNGKey, Real
 from ..environments import Environment
@@ -276,86 +275,6 @@ class GRU(AbstractController):
         z = features_of(self, y, int(self.cell.input_size))
         after = self.cell(z.astype(state.dtype), state)
         return squash(self.readout(after), self.bounds).astype(y.dtype), after
-
-
-class _Past(NamedTuple):
-    base: PyTree
-    observations: Array
-    controls: Array
-    started: Array
-
-
-class History(AbstractController):
-    """A controller whose input is a window of past observations and controls,
-
-    `u_t = base(t, (z_t, z_{t-1}, ..., z_{t-n}, u_{t-1}, ..., u_{t-n}))`
-
-    with `z = features(y)` and u the controls that were applied. Before the beginning
-    the controls are zero and the observations the first one.
-
-    **Arguments:**
-
-    - `base`: the controller of the window, which has `size (n + 1) + controls n`
-        entries.
-    - `size`: the size of the features.
-    - `controls`: the number of controls.
-    - `length`: n, the steps of the past, 1 by default.
-    - `features`: of an observation, a function such as `env.encode`; the observation
-        itself by default.
-
-    **Raises:** `ValueError` if `base` is not a controller or a size is below 1; when it
-    is run, if the features have another size.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-
-        env = dlx.make("pendulum")
-        angle = lambda y: env.encode(y)[:2]
-        size = 2 * (3 + 1) + 3
-        base = dlx.controllers.MLP(size, 1, width=8, depth=1, key=jax.random.key(0))
-        blind = dlx.controllers.History(base, 2, 1, length=3, features=angle)
-        dlx.rollout(env, blind, key=jax.random.key(1), horizon=10).total_cost
-        ```
-    """
-
-    base: AbstractController
-    size: int = eqx.field(static=True)
-    controls: int = eqx.field(static=True)
-    length: int = eqx.field(default=1, static=True)
-    _: KW_ONLY
-    features: Callable[[Array], Array] | None = function_field(None)
-
-    def __check_init__(self):
-        check_controller(self.base, "base", "History")
-        for name in ("size", "controls", "length"):
-            check_count(getattr(self, name), name, "History")
-
-    def init(self, *, key=None):
-        return _Past(
-            self.base.init(key=key),
-            jnp.zeros((self.length, self.size)),
-            jnp.zeros((self.length, self.controls)),
-            jnp.zeros((), bool),
-        )
-
-    def __call__(self, t, y, state):
-        z = features_of(self, y, self.size).astype(state.observations.dtype)
-        # The first observation fills the window: zeros would look like motion.
-        past = jnp.where(state.started, state.observations, z)
-        window = jnp.concatenate([z, past.ravel(), state.controls.ravel()])
-        u, base = self.base(t, window.astype(y.dtype), state.base)
-        observations = jnp.concatenate([z[None], past[:-1]])
-        return u, _Past(base, observations, state.controls, jnp.ones((), bool))
-
-    def applied(self, u, cost, state):
-        u = u.astype(state.controls.dtype)
-        return state._replace(
-            base=self.base.applied(u, cost, state.base),
-            controls=jnp.concatenate([u[None], state.controls[:-1]]),
-        )
 
 
 class Standardise(eqx.Module):

@@ -88,8 +88,7 @@ class OutputFeedback(AbstractController):
         return _State(memory, after, state.time, self._counted(after, state))
 
     def _counted(self, after: PyTree, state: _State) -> Tally:
-        failed = self.estimator.status(after) != RESULTS.successful
-        return state.failures.add(failed)
+        return state.failures.add(self.estimator.status(after) != RESULTS.successful)
 
 
 class LQG(AbstractController):

@@ -235,10 +235,8 @@ class PID(_AbstractPID):
             self.derivative_on, ("measurement", "error"), "derivative_on", "PID"
         )
         lag, windup, dt = self.derivative_time_constant, self.anti_windup_time, self.dt
-        if lag is not None:
-            check_range(lag, "derivative_time_constant", "PID")
-        if windup is not None:
-            check_range(windup, "anti_windup_time", "PID", dt)
+        check_range(dt if lag is None else lag, "derivative_time_constant", "PID")
+        check_range(dt if windup is None else windup, "anti_windup_time", "PID", dt)
 
     def init(self, *, key=None):
         zeros = self._zeros()

@@ -101,11 +101,10 @@ class Gaussian(_AroundBase):
     def __check_init__(self):
         where = "Gaussian"
         check_controller(self.base, "base", where)
-        log_std = self.log_std
-        if not eqx.is_inexact_array(log_std) or log_std.ndim > 1:
+        if not eqx.is_inexact_array(self.log_std) or self.log_std.ndim > 1:
             raise ValueError(
                 f"{where}: log_std must be a number or a vector with an entry for each "
-                f"control, got {shortened(log_std)}."
+                f"control, got {shortened(self.log_std)}."
             )
         as_bounds(self.bounds, where)
 

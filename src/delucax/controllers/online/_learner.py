@@ -17,7 +17,7 @@ from ..._jax import is_constant
 from ..._module import function_field, parameter
 from ..._typing import Real
 from ...dynamics import AbstractDynamics, LinearDynamics, linearize
-from .._basic import Scheduled
+from .._composed import Scheduled
 from .._lqr import LQR
 from .._output_feedback import LQG
 from ._closed_loop import ClosedLoop, ClosedLoopState, in_first_responses, shift
