@@ -1,5 +1,6 @@
 """Array aliases shared by every signature."""
 
+from collections.abc import Callable
 from typing import Any, Literal, TYPE_CHECKING, TypeAlias
 
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, Num, UInt32
@@ -24,6 +25,8 @@ Bounds: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."]]
 BoolScalar: TypeAlias = Bool[Array, ""]
 PRNGKey: TypeAlias = Key[Array, "..."] | UInt32[Array, "... 2"]
 """A key from `jax.random.key` (or the older `jax.random.PRNGKey`)."""
+Difference: TypeAlias = Callable[[Array, Array], Array]
+"""`(x, x_ref) -> deviation`, as a system measures it; it wraps angles."""
 Checkpoint: TypeAlias = Literal["step", "sqrt"] | None
 """What the gradient of a rollout stores."""
 

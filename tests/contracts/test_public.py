@@ -115,11 +115,11 @@ LONG = {
     analysis.Margins analysis.margins c2d controllers.Adaptive
     controllers.best_in_hindsight controllers.BPC controllers.Categorical
     controllers.drc controllers.Explore estimators.ExtendedKalmanFilter
-    estimators.Filtered controllers.FiniteHorizonLQR controllers.FixedPolicy
-    controllers.Gaussian controllers.gpc controllers.Hindsight controllers.HInfinity
+    controllers.FiniteHorizonLQR
+    controllers.Gaussian controllers.gpc controllers.HInfinity
     estimators.KalmanFilter controllers.Linear
     controllers.LQG controllers.LQI controllers.LQR controllers.lqrd controllers.MLP
-    controllers.MPC controllers.MPCState controllers.online_newton
+    controllers.MPC controllers.online_newton
     controllers.OutputFeedback controllers.regret estimators.run_filter
     controllers.Scheduled estimators.smooth controllers.Standardise
     estimators.UnscentedKalmanFilter d2c Discretized dynamics.OperatingPoint

@@ -43,9 +43,10 @@ class Trajectory(eqx.Module):
     - `incidents`: from the name of something that went wrong in the controller to the
         steps at which it did, booleans of shape `(T,)`. `"clipped_control"`: the
         environment's bounds changed the control. `"failed_plan"`: a plan of
-        [`delucax.controllers.MPC`][] did not succeed. `"refused_update"`: what a
-        learner would have learned was not finite. Others are those that a controller
-        counts with [`delucax.controllers.Tally`][].
+        [`delucax.controllers.MPC`][] did not succeed. `"failed_estimate"`: nor did an
+        estimator. `"refused_update"`: what a learner would have learned was not finite.
+        Others are those that a controller counts with
+        [`delucax.controllers.Tally`][].
     - `controller_state`: the arrays of the controller's state at the end.
     - `steps`: T, an int. `dt`: the control interval. `disturbance_size`: k.
     - `keep`: the names of what was kept.

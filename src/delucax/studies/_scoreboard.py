@@ -197,7 +197,7 @@ FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
         ),
         "DRC": lambda name: _learning(name, controllers.drc),
         "SFC": lambda name: _learning(name, controllers.sfc),
-        "DSC": lambda name: _learning(name, controllers.dsc),
+        "DSC": lambda name: _learning(name, controllers.sfc, double=True),
         "BPC": lambda name: controllers.BPC(
             task_of(name).dynamics, agent_of(name, "LQR")
         ),
