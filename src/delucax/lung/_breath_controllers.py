@@ -143,11 +143,6 @@ class BangBang(AbstractController):
         return jnp.where(y > self.waveform(t), 0, self.high).astype(y.dtype), state
 
 
-class _Window(NamedTuple):
-    errors: Array
-    controls: Array
-
-
 class BreathPolicy(AbstractController):
     r"""A network of the last errors, the targets to come, and the last controls,
 
@@ -239,12 +234,15 @@ class BreathPolicy(AbstractController):
 
     def init(self, *, key=None):
         zeros = lambda size: jnp.zeros(size, jnp.result_type(self.dt))  # noqa: E731
-        return _Window(zeros(self.errors), zeros(self.controls))
+        return zeros(self.errors), zeros(self.controls)
 
     def __call__(self, t, y, state):
+        errors, controls = state
         now = self.waveform.pressure(t)
-        error = ((now - y) / 10).astype(state.errors.dtype)
-        errors = jnp.concatenate([error, state.errors[:-1]])
+        # Scaled, so that what enters the network is about 1: errors by 10 cmH2O,
+        # targets by 15, controls by 50 %.
+        error = ((now - y) / 10).astype(errors.dtype)
+        errors = jnp.concatenate([error, errors[:-1]])
         ahead = [self.waveform.pressure(t + k * self.dt) for k in (1, 2)]
         targets = (jnp.stack([*ahead, now]) - self.waveform.peep) / 15
         features = errors
@@ -253,98 +251,13 @@ class BreathPolicy(AbstractController):
             windows = [means[i : self.errors - 4 + i] for i in range(5)]
             convolved = jnp.stack(windows, 1) @ self.convolution
             features = jnp.ravel(jnp.maximum(0, convolved))
-        z = jnp.concatenate([features, targets, state.controls]).astype(y.dtype)
+        z = jnp.concatenate([features, targets, controls]).astype(y.dtype)
         u = 100 * jax.nn.sigmoid(self.network(z) + self.shift)
-        after = state._replace(errors=errors.astype(state.errors.dtype))
-        return jnp.reshape(u, (1,)).astype(y.dtype), after
+        return jnp.reshape(u, (1,)).astype(y.dtype), (errors, controls)
 
     def applied(self, u, cost, state):
         if not self.controls:
             return state
-        last = (u[:1] / 50).astype(state.controls.dtype)
-        return state._replace(controls=jnp.concatenate([last, state.controls[:-1]]))
-
-
-class Summed(AbstractController):
-    """The sum of two controllers, such as a PID and a network trained on top of it,
-
-    `u = first(y) + second(y) - offset`.
-
-    **Arguments:**
-
-    - `first`: any controller.
-    - `second`: another one of as many controls.
-    - `offset`: 0 by default.
-
-    **Raises:** `ValueError` if what is given is no controller.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-        from delucax import lung
-
-        waveform = lung.BreathWaveform()
-        pid = dlx.controllers.LeakyPID(dt=0.03, reference=waveform)
-        policy = lung.BreathPolicy(waveform, 0.03, key=jax.random.key(0))
-        controller = lung.Summed(pid, policy, offset=50.0)
-        ```
-    """
-
-    first: AbstractController
-    second: AbstractController
-    offset: Array = parameter(0.0)
-
-    def __check_init__(self):
-        check_controller(self.first, "first", "Summed")
-        check_controller(self.second, "second", "Summed")
-
-    def init(self, *, key=None):
-        keys = (None, None) if key is None else jr.split(key)
-        return self.first.init(key=keys[0]), self.second.init(key=keys[1])
-
-    def __call__(self, t, y, state):
-        u, first = self.first(t, y, state[0])
-        v, second = self.second(t, y, state[1])
-        return (u + (v - self.offset)).astype(y.dtype), (first, second)
-
-    def applied(self, u, cost, state):
-        first = self.first.applied(u, cost, state[0])
-        return first, self.second.applied(u, cost, state[1])
-
-
-class FeedForward(AbstractController):
-    """A control that goes with the target, `u = gain (r(t) - peep) + offset`.
-
-    Add it to a PID with [`delucax.lung.Summed`][].
-
-    **Arguments:**
-
-    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
-    - `gain`: [%/cmH2O], 1 by default. Trainable.
-    - `offset`: [%], 0 by default. Trainable.
-
-    **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`.
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax.lung import BreathWaveform, FeedForward
-
-        forward = FeedForward(BreathWaveform(), gain=0.5)
-        forward(0.1, jnp.array([5.0]), forward.init())
-        ```
-    """
-
-    waveform: BreathWaveform
-    gain: Array = weight(1.0)
-    offset: Array = weight(0.0)
-
-    def __check_init__(self):
-        check_waveform(self.waveform, "FeedForward")
-
-    def __call__(self, t, y, state):
-        u = self.gain * (self.waveform(t) - self.waveform.peep) + self.offset
-        return u.astype(y.dtype), state
+        errors, controls = state
+        last = (u[:1] / 50).astype(controls.dtype)
+        return errors, jnp.concatenate([last, controls[:-1]])

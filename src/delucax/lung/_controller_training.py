@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._check import (
     check_bool,
@@ -17,7 +17,7 @@ from .._check import (
     check_positive,
 )
 from .._controller import AbstractController, check_controller
-from .._module import as_float_array
+from .._module import as_float_array, count_of, stack
 from .._typing import PRNGKey
 from ..controllers import LeakyPID, PID
 from ..environments import Environment
@@ -25,9 +25,8 @@ from ..simulation import rollout
 from ..training import analytic, fit, Fitted
 from ._breath_controllers import Breathing
 from ._breaths import GAINS
-from ._lung_fitting import count_of, kept_at, stack
 from ._ventilation import waveform_of
-from ._waveform import as_pips, at_pip, LENGTH, PIPS
+from ._waveform import as_pips, BreathWaveform, LENGTH, PIPS
 
 
 _KINDS: dict[str, Any] = {"leaky": LeakyPID, "true": PID}
@@ -79,13 +78,11 @@ def breath_error(
     horizon = check_count(horizon, "horizon", where)
     is_whole = isinstance(controller, Breathing)
     whole = controller if is_whole else Breathing(controller, waveform)
+    options: Any = dict(horizon=horizon, keep=("costs",), throw=False)
 
     def one(pip, key):
-        world, policy = at_pip((env, whole), pip)
-        run: Any = rollout(
-            world, policy, key=key, horizon=horizon, keep=("costs",), throw=False
-        )
-        return jnp.mean(run.costs)
+        world, policy = BreathWaveform.at_pip((env, whole), pip)
+        return jnp.mean(rollout(world, policy, key=key, **options).costs)
 
     keys = jax.random.split(check_key(key, where), pips.shape[0])
     return jax.vmap(one)(pips, keys)
@@ -105,9 +102,10 @@ class _TrackingError(eqx.Module):
         return errors if self.throw else jnp.where(jnp.isfinite(errors), errors, 0)
 
     def __call__(self, controllers: Any, key: PRNGKey) -> Array:
+        given: Any = dict(pips=self.pips, horizon=self.horizon)
+
         def in_lung(env, controller, key):
-            options: Any = dict(pips=self.pips, horizon=self.horizon, key=key)
-            return jnp.mean(breath_error(env, controller, **options))
+            return jnp.mean(breath_error(env, controller, key=key, **given))
 
         own = None if self.shared else eqx.if_array(0)
         in_lungs = eqx.filter_vmap(in_lung, in_axes=(eqx.if_array(0), own, 0))
@@ -169,8 +167,9 @@ def train_controllers(
 
     **Arguments:**
 
-    - `envs`: tasks of lungs, stacked by [`delucax.lung.stack`][]. Of fitted lungs
-        that are stacked, `equinox.filter_vmap(lung_environment)(models)` makes them.
+    - `envs`: tasks of lungs in one module, each array with a leading axis over them.
+        Of fitted lungs that are stacked so, `equinox.filter_vmap(learned_lung)(models)`
+        makes them, and of resistances a function that makes a task of one.
     - `controllers`: of the inspiratory valve, stacked over seeds, and within a seed
         over the lungs: leaves of shape `(seeds, lungs, ...)`. With `shared`, of shape
         `(seeds, ...)`.
@@ -197,22 +196,26 @@ def train_controllers(
     !!! example
 
         ```python
+        import equinox as eqx
         import jax
+        import jax.numpy as jnp
         from delucax import lung
 
-        envs = lung.stack([lung.single_compartment(resistance=R) for R in (5.0, 20.0)])
-        forward = lung.FeedForward(lung.BreathWaveform(), gain=0.5)
-        one = lung.stack([lung.stack([forward, forward])])
-        few = dict(steps=3, horizon=2, pips=[20.0])
-        lung.train_controllers(envs, one, key=jax.random.key(0), **few).history.loss
+        task = lambda R: lung.single_compartment(resistance=R)
+        envs = eqx.filter_vmap(task)(jnp.array([5.0, 20.0]))
+        keys = jax.random.split(jax.random.key(0), (1, 2))  # one seed, two lungs
+        policy = lambda key: lung.BreathPolicy(lung.BreathWaveform(), 0.03, key=key)
+        policies = eqx.filter_vmap(eqx.filter_vmap(policy))(keys)
+        few = dict(steps=3, horizon=2, pips=[20.0], key=jax.random.key(1))
+        lung.train_controllers(envs, policies, **few).history.loss
         ```
     """
     where = "train_controllers"
     if not isinstance(envs, Environment) or jnp.ndim(envs.dt) != 1:
         raise ValueError(
-            f"{where}: envs must be tasks of lungs that delucax.lung.stack made one "
-            f"of, got one {type(envs).__name__}; equinox.filter_vmap("
-            "delucax.lung.lung_environment) makes them of stacked models."
+            f"{where}: envs must be tasks of lungs that are stacked, got one "
+            f"{type(envs).__name__}; equinox.filter_vmap(delucax.lung.learned_lung) "
+            "makes them of stacked models."
         )
     waveform = waveform_of(envs, where, stacked=True)
     steps = check_count(steps, "steps", where)
@@ -234,39 +237,9 @@ def train_controllers(
         gradient=analytic if throw else _FiniteGradients(1 if shared else 2),
         progress=progress,
         throw=throw,
-        **kept_at(checkpoint),
+        checkpoint=checkpoint,
+        checkpoint_every=100 if checkpoint else None,
     )
-
-
-class PIDGrid(eqx.Module):
-    """The errors of a grid of PIDs in some lungs.
-
-    **Attributes:**
-
-    - `gains`: (kp, ki, kd) of each, shape `(grid, 3)`.
-    - `errors`: the mean error of each in each lung, shape `(lungs, grid)` [cmH2O].
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax.lung import PIDGrid
-
-        grid = PIDGrid(jnp.ones((2, 3)), jnp.array([[3.0, 2.0]]))
-        grid.best()
-        ```
-    """
-
-    gains: Array
-    errors: Array
-
-    def best(self) -> Array:
-        """The gains with the least error in each lung, shape `(lungs, 3)`."""
-        return self.gains[jnp.argmin(self.errors, axis=1)]
-
-    def best_of_all(self) -> Array:
-        """The gains with the least error on average over the lungs, shape `(3,)`."""
-        return self.gains[jnp.argmin(jnp.mean(self.errors, axis=0))]
 
 
 @eqx.filter_jit
@@ -294,13 +267,13 @@ def pid_grid(
     ki: Any = GAINS,
     kd: Any = (0.0,),
     pips: Any = PIPS,
-) -> PIDGrid:
+) -> tuple[Float[Array, "grid 3"], Float[Array, "lungs grid"]]:
     """The error of every PID of a grid in every lung, all at once.
 
     **Arguments:**
 
-    - `envs`: tasks of lungs, as [`delucax.lung.stack`][] makes one of them, or a
-        single task.
+    - `envs`: tasks of lungs in one module, each array with a leading axis over them, or
+        a single task.
     - `key`: a random key, for the noise of the sensor, which is the same for all.
     - `kind`: `"leaky"` for [`delucax.controllers.LeakyPID`][], which is that of the
         original (default); `"true"` for [`delucax.controllers.PID`][].
@@ -308,7 +281,9 @@ def pid_grid(
         0.9, 1, 2, ..., 10 for the first two and 0 for the last by default.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
 
-    **Returns:** a [`delucax.lung.PIDGrid`][], that of one lung for a single task.
+    **Returns:** the gains (kp, ki, kd) of each, shape `(grid, 3)`, and the mean error
+        of each in each lung, shape `(lungs, grid)` [cmH2O]; that of one lung for a
+        single task.
 
     **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
     say).
@@ -316,12 +291,16 @@ def pid_grid(
     !!! example
 
         ```python
+        import equinox as eqx
         import jax
+        import jax.numpy as jnp
         from delucax import lung
 
-        envs = lung.stack([lung.single_compartment(resistance=R) for R in (5.0, 20.0)])
+        task = lambda R: lung.single_compartment(resistance=R)
+        envs = eqx.filter_vmap(task)(jnp.array([5.0, 20.0]))
         few = dict(kp=[0.5, 1.0], ki=[1.0], pips=[20.0])
-        lung.pid_grid(envs, key=jax.random.key(0), **few).best()
+        gains, errors = lung.pid_grid(envs, key=jax.random.key(0), **few)
+        best_in_each_lung = gains[jnp.argmin(errors, axis=1)]
         ```
     """
     where = "pid_grid"
@@ -336,4 +315,4 @@ def pid_grid(
         check_finite(array, name, where)
         lists.append(array)
     envs = envs if jnp.ndim(envs.dt) else stack([envs])
-    return PIDGrid(*_searched(envs, lists, pips, key, kind))
+    return _searched(envs, lists, pips, key, kind)

@@ -1,88 +1,19 @@
 """Fitting lungs to breaths, one or several stacked."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jaxtyping import Array
 
-from .._check import check_count, check_instance, check_key, is_concrete
+from .._check import check_count, check_instance, check_key
+from .._module import stack, unstack
 from .._typing import PRNGKey
 from ..training import fit, Fitted
 from ._breaths import Breaths
 from ._learned_lung import LearnedLung
-
-
-def stack(trees: Sequence[Any]) -> Any:
-    """Modules of one structure as one, each array with a leading axis over them.
-
-    **Arguments:** `trees`: the modules.
-
-    **Returns:** the stacked module.
-
-    **Raises:** `ValueError` if `trees` is empty, or their structures differ.
-
-    !!! example
-
-        ```python
-        from delucax.lung import SingleCompartment, stack
-
-        stack([SingleCompartment(r) for r in (5.0, 20.0, 50.0)]).resistance
-        ```
-    """
-    trees = list(trees)
-    if not trees:
-        raise ValueError("stack: trees must not be empty.")
-    structures = {jax.tree.structure(eqx.filter(tree, eqx.is_array)) for tree in trees}
-    if len(structures) > 1:
-        raise ValueError("stack: trees must be of one structure.")
-
-    def together(*leaves):
-        if not eqx.is_array(leaves[0]):
-            return leaves[0]
-        if all(_is_plain(leaf) for leaf in leaves):
-            return jnp.asarray(np.stack(leaves))
-        return jnp.stack(leaves)
-
-    return jax.tree.map(together, *trees)
-
-
-def unstack(tree: Any) -> list[Any]:
-    """The modules that [`delucax.lung.stack`][] made one of.
-
-    **Arguments:** `tree`: the stacked module.
-
-    **Returns:** a list of modules.
-
-    !!! example
-
-        ```python
-        from delucax.lung import SingleCompartment, stack, unstack
-
-        unstack(stack([SingleCompartment(r) for r in (5.0, 20.0)]))[1].resistance
-        ```
-    """
-    arrays, rest = eqx.partition(tree, eqx.is_array)
-    arrays = jax.tree.map(lambda a: np.asarray(a) if _is_plain(a) else a, arrays)
-    return [
-        eqx.combine(jax.tree.map(lambda a, i=i: jnp.asarray(a[i]), arrays), rest)
-        for i in range(count_of(tree))
-    ]
-
-
-def _is_plain(leaf: Any) -> bool:
-    """Whether NumPy can stack and slice it, which compiles nothing for each shape."""
-    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-    return is_concrete(leaf) and not is_key
-
-
-def count_of(tree: Any) -> int:
-    """How many modules are stacked."""
-    return jax.tree.leaves(eqx.filter(tree, eqx.is_array))[0].shape[0]
 
 
 class _Simulation(eqx.Module):
@@ -102,13 +33,6 @@ class _Simulation(eqx.Module):
 
         errors = eqx.filter_vmap(one)(models, u_in, pressure)
         return jnp.mean(errors / self.scale)
-
-
-def kept_at(checkpoint: Any, ending: str = "") -> dict[str, Any]:
-    """Where `fit` writes its checkpoints, and how often."""
-    if checkpoint is None:
-        return {}
-    return dict(checkpoint=f"{checkpoint}{ending}", checkpoint_every=100)
 
 
 def fit_lungs(
@@ -136,7 +60,8 @@ def fit_lungs(
     **Arguments:**
 
     - `models`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][], or
-        several as [`delucax.lung.stack`][] makes one of them.
+        several in one module, each array with a leading axis over them, as
+        `equinox.filter_vmap` makes of them.
     - `breaths`: [`delucax.lung.Breaths`][] of shape `(B, T)`; of `(models, B, T)` for
         several.
     - `key`: a random key, for the batches.
@@ -192,56 +117,24 @@ def fit_lungs(
     for teacher, count, name, times in parts:
         if check_count(count, name, where, least=0) == 0:
             continue
+        schedule = optax.cosine_decay_schedule(times * learning_rate, count)
+        adam = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
         fitted = fit(
             _Simulation(scale, teacher),
             models,
-            _adam(times * learning_rate, count) if optimiser is None else optimiser,
+            adam if optimiser is None else optimiser,
             count,
             key=jax.random.fold_in(key, int(teacher)),
             data=data,
             batch_size=batch_size,
             trainable=trainable,
             progress=progress,
-            **kept_at(checkpoint, ".first" if teacher else ""),
+            checkpoint=checkpoint and f"{checkpoint}{'.first' if teacher else ''}",
+            checkpoint_every=100 if checkpoint else None,
         )
         models = fitted.model
     if fitted is None:
         raise ValueError(f"{where}: steps must not all be 0.")
     if single:
-        (model,) = unstack(fitted.model)
-        fitted = Fitted(model, fitted.history, fitted.result)
+        fitted = Fitted(unstack(fitted.model)[0], fitted.history, fitted.result)
     return fitted
-
-
-def _adam(rate: float, steps: int) -> optax.GradientTransformation:
-    schedule = optax.cosine_decay_schedule(rate, steps)
-    return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
-
-
-def open_loop_error(model: Any, breaths: Breaths) -> Array:
-    """The mean absolute error of a lung that is given the recorded controls alone.
-
-    Against the truth of the breaths where it is known, else against what the sensor
-    read.
-
-    **Arguments:**
-
-    - `model`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][].
-    - `breaths`: [`delucax.lung.Breaths`][], shape `(B, T)`.
-
-    **Returns:** a scalar [cmH2O].
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax import lung
-
-        model = lung.LungModel(lung.SingleCompartment())
-        u = 20.0 * jnp.ones((2, 10))
-        breaths = lung.Breaths(u, 0 * u, 5 + 0 * u, dt=0.03)
-        lung.open_loop_error(model, breaths)
-        ```
-    """
-    truth = breaths.pressure if breaths.truth is None else breaths.truth
-    return jnp.mean(jnp.abs(jax.vmap(model.predict)(breaths.u_in) - truth))

@@ -5,8 +5,15 @@ from pathlib import Path
 from typing import Any
 
 import diffrax
+import numpy as np
 
-from .._check import check_count, check_instance, check_keywords, keywords_of
+from .._check import (
+    check_count,
+    check_instance,
+    check_keywords,
+    is_concrete,
+    keywords_of,
+)
 from .._module import load
 from ..dynamics import Delayed, Discretized
 from ..environments import Environment
@@ -20,7 +27,7 @@ from ._lungs import (
     SingleCompartment,
 )
 from ._ventilation import ventilation
-from ._waveform import BreathWaveform, check_peep, LENGTH
+from ._waveform import BreathWaveform
 
 
 def _task(
@@ -58,9 +65,15 @@ def _task(
     if delay:
         dynamics = Delayed(dynamics, controls=delay)
         rest = dynamics.filled(rest)
-    options.setdefault("rest", rest)
-    env = ventilation(dynamics, waveform, **options)
-    check_peep(waveform, valves, where)
+    env = ventilation(dynamics, waveform, **(dict(rest=rest) | options))
+    asked, least = waveform.peep, valves.peep
+    # Checked where both are known. Numbers of another precision may differ by rounding.
+    if is_concrete(asked) and is_concrete(least):
+        if np.any(np.asarray(asked) < np.asarray(least) - 1e-3):
+            raise ValueError(
+                f"{where}: the peep of waveform must be at least that of valves, "
+                f"{least}, below which no lung empties, got {asked}. Give both."
+            )
     return env
 
 
@@ -206,22 +219,26 @@ def double_compartment(
 
 
 def learned_lung(
-    model: LearnedLung | None = None, *, horizon: int = 100, **options: Any
+    model: LearnedLung | LungModel | None = None,
+    *,
+    horizon: int = 100,
+    **options: Any,
 ) -> Environment:
-    """Make a lung breathe that was learned from breaths.
+    """Make a lung breathe that was learned from breaths: where controllers are trained.
 
     As `lung/balloon_lung`; its time step is that of the breaths, and what it is let out
-    to is the pressure that they start at, whatever the PEEP of `waveform`.
+    to is the pressure that they start at, whatever the PEEP of `waveform`. The sensor
+    of a [`delucax.lung.LungModel`][] is as late as the model says.
 
     **Arguments:**
 
-    - `model`: a [`delucax.lung.LearnedLung`][]. By default the one that comes with the
-        library, learned from breaths of the task `lung/double_compartment`; its sensor
-        is two samples late, and so is its pressure. In the repository,
-        `python -m benchmarks.learned_lung` makes it.
+    - `model`: a [`delucax.lung.LearnedLung`][] or a [`delucax.lung.LungModel`][]. By
+        default the learned lung that comes with the library, from breaths of the task
+        `lung/double_compartment`; its sensor is two samples late, and so is its
+        pressure. In the repository, `python -m benchmarks.learned_lung` makes it.
     - `horizon`: steps an episode, 100 by default.
-    - `**options`: `waveform`, `noise` and others of [`delucax.lung.ventilation`][] and
-        [`delucax.Environment`][].
+    - `**options`: `waveform`, `noise`, `limit` and others of
+        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
@@ -234,54 +251,19 @@ def learned_lung(
 
         ```python
         import delucax as dlx
-
-        env = dlx.make("lung/learned_lung")
-        ```
-    """
-    lung: Any = model
-    if model is None:
-        lung = load(Path(__file__).with_name("learned_lung.dlx"))
-    check_instance(lung, LearnedLung, "model", "learned_lung")
-    check_keywords(options, "learned_lung", learned_lung, ventilation, Environment)
-    options.setdefault("rest", lung.resting())
-    return ventilation(lung, horizon=horizon, **options)
-
-
-def lung_environment(
-    model: LearnedLung | LungModel,
-    waveform: BreathWaveform | None = None,
-    *,
-    noise: Any = 0.2,
-    horizon: int = LENGTH,
-    **options: Any,
-) -> Environment:
-    """A task in a fitted lung: where controllers are trained.
-
-    **Arguments:**
-
-    - `model`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][].
-    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]; the default one by
-        default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
-    - `horizon`: steps an episode, 29 by default.
-    - `**options`: other arguments of [`delucax.lung.ventilation`][], such as `limit`.
-
-    **Returns:** an [`delucax.Environment`][].
-
-    **Raises:** `ValueError` if it is no such model, or `waveform` is not a
-    `BreathWaveform`.
-
-    !!! example
-
-        ```python
         from delucax import lung
 
-        env = lung.lung_environment(lung.LungModel(lung.SingleCompartment()))
+        env = dlx.make("lung/learned_lung")
+        fitted = lung.LungModel(lung.SingleCompartment())
+        env = lung.learned_lung(fitted, noise=0.2, horizon=29)
         ```
     """
-    where = "lung_environment"
-    check_keywords(options, where, lung_environment, ventilation, Environment)
+    where = "learned_lung"
+    check_keywords(options, where, learned_lung, ventilation, Environment)
+    if model is None:
+        model = load(Path(__file__).with_name("learned_lung.dlx"))
     if isinstance(model, LungModel):
+        # The task senses before it delays; so it takes what the model delays.
         options |= dict(sensor_delay=model.dynamics.sensor)
         dynamics, rest = model.dynamics.dynamics, model.system.resting(model.peep)
     elif isinstance(model, LearnedLung):
@@ -291,5 +273,4 @@ def lung_environment(
             f"{where}: model must be a LearnedLung or a LungModel, got "
             f"{type(model).__name__}."
         )
-    options.setdefault("rest", rest)
-    return ventilation(dynamics, waveform, noise=noise, horizon=horizon, **options)
+    return ventilation(dynamics, horizon=horizon, **(dict(rest=rest) | options))

@@ -72,8 +72,10 @@ class AbstractLung(AbstractSystem):
         return jnp.reshape(self.pressure(x), (1,))
 
 
-class _AbstractCompartment(AbstractLung):
-    """One elastic volume at the end of one resistance, `dV/dt = (p - P(V)) / R`."""
+class _AbstractRigidPipe(AbstractLung):
+    """A lung whose airway holds no air: the flows of the valves and of the lung balance
+    there, `p` being what makes them. The state begins with the inflow and the opening.
+    """
 
     if TYPE_CHECKING:  # pyright takes an AbstractVar for the first argument
         resistance: ClassVar[Any]
@@ -81,6 +83,18 @@ class _AbstractCompartment(AbstractLung):
     else:
         resistance: eqx.AbstractVar[Array]
         valves: eqx.AbstractVar[Valves]
+
+    @abc.abstractmethod
+    def _inside(self, x: State) -> Array:
+        """The pressure behind the resistance [cmH2O]."""
+
+    def pressure(self, x: State) -> Scalar:
+        inside = self._inside(x)
+        return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
+
+
+class _AbstractCompartment(_AbstractRigidPipe):
+    """One elastic volume at the end of one resistance, `dV/dt = (p - P(V)) / R`."""
 
     state_names: ClassVar = ("inflow", "opening", "volume")
     state_units: ClassVar = ("L/s", "", "L")
@@ -98,9 +112,8 @@ class _AbstractCompartment(AbstractLung):
     def _volume(self, pressure: RealScalar) -> Scalar:
         """The volume at which the elastic pressure is `pressure`."""
 
-    def pressure(self, x: State) -> Scalar:
-        inside = self.elastic_pressure(x[2])
-        return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
+    def _inside(self, x: State) -> Array:
+        return self.elastic_pressure(x[2])
 
     def resting(self, pressure: RealScalar) -> State:
         volume = self._volume(pressure)
@@ -108,7 +121,7 @@ class _AbstractCompartment(AbstractLung):
 
     def vector_field(self, t, x, u, w):
         inflow, opening = self.valves.slopes(x[0], x[1], u)
-        filling = (self.pressure(x) - self.elastic_pressure(x[2])) / self.resistance
+        filling = (self.pressure(x) - self._inside(x)) / self.resistance
         return jnp.stack([inflow, opening, filling])
 
 
@@ -159,7 +172,7 @@ class SingleCompartment(_AbstractCompartment):
         return PER_ML * self.compliance * pressure
 
 
-class DoubleCompartment(AbstractLung):
+class DoubleCompartment(_AbstractRigidPipe):
     r"""Two elastic compartments side by side, a fast and a slow one,
 
     `dV_i/dt = (p_c - V_i / C_i) / R_i`, `p_c = p - R_0 (dV_1/dt + dV_2/dt)`.
@@ -219,15 +232,13 @@ class DoubleCompartment(AbstractLung):
         p1, p2 = x[2] / (self.share * whole), x[3] / ((1 - self.share) * whole)
         return fast, slow, p1, p2, (fast * p1 + slow * p2) / (fast + slow)
 
-    def pressure(self, x: State) -> Scalar:
-        inside = self._parts(x)[-1]
-        return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
+    def _inside(self, x: State) -> Array:
+        return self._parts(x)[-1]
 
     def resting(self, pressure: RealScalar) -> State:
         volume = PER_ML * self.compliance * pressure
-        return jnp.stack(
-            [0 * volume, 0 * volume, self.share * volume, (1 - self.share) * volume]
-        )
+        fast, slow = self.share * volume, (1 - self.share) * volume
+        return jnp.stack([0 * volume, 0 * volume, fast, slow])
 
     def vector_field(self, t, x, u, w):
         inflow, opening = self.valves.slopes(x[0], x[1], u)
@@ -256,9 +267,6 @@ class BalloonLung(_AbstractCompartment):
     first, gives way, and past `V = 2.65 rest` the pressure falls as it grows. The state
     is (inflow [L/s], opening, volume [L]). Smooth where the volume is above a tenth of
     `rest`, below which the pressure is held, but for an opening of 0.
-
-    For the map of the original Deluca, with its constants, see
-    [`delucax.lung.OriginalBalloonLung`][].
 
     **Arguments:**
 

@@ -189,16 +189,6 @@ class Recording(NamedTuple):
     - `times` [s], `pressure` [cmH2O], `u_in` [%], `u_out`: an entry a step.
     - `aborted`: whether the run was given up; the last entry is then the reading that
         was too high, and the controls of the clean-up.
-
-    !!! example
-
-        ```python
-        import numpy as np
-        from delucax.lung import Recording
-
-        empty = np.zeros(0)
-        recording = Recording(empty, empty, empty, empty, aborted=False)
-        ```
     """
 
     times: np.ndarray
@@ -228,7 +218,10 @@ def run_breaths(
     - `steps`: 100 by default.
     - `key`: a random key for the controller; none by default.
 
-    **Returns:** a [`delucax.lung.Recording`][].
+    **Returns:** a named tuple of NumPy arrays with an entry a step, `times` [s],
+        `pressure` [cmH2O], `u_in` [%] and `u_out`; and `aborted`, whether the run was
+        given up: the last entry is then the reading that was too high, and the controls
+        of the clean-up.
 
     **Raises:** `ValueError` if what is given is no runner or no controller, or a
         control is not finite.

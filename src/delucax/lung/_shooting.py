@@ -1,7 +1,7 @@
 """Controls of a breath by gradient descent through a lung."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,12 +15,7 @@ from .._module import parameter, positive
 from ..environments import Environment
 from ._learned_lung import LearnedLung
 from ._ventilation import waveform_of
-from ._waveform import as_pips, at_pip, BreathWaveform, check_waveform, LENGTH, PIPS
-
-
-class _Shooting(NamedTuple):
-    lung: Array
-    plan: Array
+from ._waveform import as_pips, BreathWaveform, check_waveform, LENGTH, PIPS
 
 
 class ShootingMPC(AbstractController):
@@ -76,11 +71,11 @@ class ShootingMPC(AbstractController):
 
     def init(self, *, key=None):
         lung = self.model.resting()
-        return _Shooting(lung, jnp.full(self.horizon, -2.0, lung.dtype))
+        return lung, jnp.full(self.horizon, -2.0, lung.dtype)
 
     def __call__(self, t, y, state):
-        model = self.model
-        lung = model.corrected(state.lung, y[0], 1 - self.memory)
+        model, (predicted, plan) = self.model, state
+        lung = model.corrected(predicted, y[0], 1 - self.memory)
         ahead = t + model.dt * jnp.arange(1, self.horizon + 1)
         target = self.waveform.pressure(ahead)
 
@@ -91,15 +86,16 @@ class ShootingMPC(AbstractController):
 
             return jnp.mean(jnp.abs(jax.lax.scan(body, lung, plan)[1] - target))
 
-        start = jnp.append(state.plan[1:], state.plan[-1])
+        # Begins at the plan of the step before, whose first control has been used.
+        start = jnp.append(plan[1:], plan[-1])
         optimiser = optax.adam(self.learning_rate)
         plan, _ = _descended(error, start, optimiser, self.iterations)
-        return _controls(plan[0])[:1].astype(y.dtype), _Shooting(lung, plan)
+        return _controls(plan[0])[:1].astype(y.dtype), (lung, plan)
 
     def applied(self, u, cost, state):
+        lung, plan = state
         u = jnp.stack([u[0], jnp.zeros_like(u[0])])
-        lung, _ = self.model.advance(0.0, state.lung, u, None)
-        return state._replace(lung=lung)
+        return self.model.advance(0.0, lung, u, None)[0], plan
 
 
 def least_error(
@@ -140,10 +136,11 @@ def least_error(
     optimiser = optax.adam(optax.cosine_decay_schedule(0.3, steps))
 
     def of(pip):
-        world = at_pip(env, pip)
+        world = BreathWaveform.at_pip(env, pip)
         x0: Any = world.initial_state
 
         def error(z):
+            # Kept for the gradient are the states alone, not what a step computes.
             @jax.checkpoint
             def body(x, inputs):
                 k, z = inputs
@@ -153,8 +150,7 @@ def least_error(
             _, costs = jax.lax.scan(body, x0, (jnp.arange(horizon), z))
             return jnp.mean(costs)
 
-        z = jnp.full(horizon, -1.0)
-        _, errors = _descended(error, z, optimiser, steps)
+        _, errors = _descended(error, jnp.full(horizon, -1.0), optimiser, steps)
         return jnp.min(errors, initial=jnp.inf)
 
     return eqx.filter_jit(jax.vmap(of))(pips)

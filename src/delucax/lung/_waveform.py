@@ -142,6 +142,44 @@ class BreathWaveform(eqx.Module):
         """The target pressure at time `t`, shape `(1,)`."""
         return jnp.atleast_1d(self.pressure(t))
 
+    @staticmethod
+    def at_pip(tree: _T, pip: Any) -> _T:
+        """A copy of a pytree in which every breath waveform has that peak pressure.
+
+        An environment and its controller each hold the waveform; under `jax.vmap` this
+        makes a batch of both over several pressures, which compiles once.
+
+        **Arguments:**
+
+        - `tree`: a waveform, an environment, a controller, or a tuple of them.
+        - `pip`: the peak inspiratory pressure [cmH2O].
+
+        **Returns:** the copy.
+
+        **Raises:** `ValueError` if there is no waveform in it, or `pip` is below PEEP.
+
+        !!! example
+
+            ```python
+            import delucax as dlx
+            from delucax.lung import BreathWaveform
+
+            env = BreathWaveform.at_pip(dlx.make("lung/single_compartment"), 20.0)
+            ```
+        """
+        pip = as_float_array(pip)
+        if not eqx.is_inexact_array(pip):
+            raise ValueError(f"at_pip: pip must be a number, got {pip!r}.")
+        waveforms = lambda tree: parts_of((tree,), BreathWaveform)
+        every = waveforms(tree)
+        if not every:
+            name = type(tree).__name__
+            raise ValueError(f"at_pip: there is no BreathWaveform in the {name}.")
+        for waveform in every:
+            _check_pip(pip, waveform.peep, "pip", "at_pip")
+        pips = lambda tree: [waveform.pip for waveform in waveforms(tree)]
+        return eqx.tree_at(pips, tree, [pip] * len(every))
+
 
 def _slack(breaths: Array) -> Array:
     """Of a period: by how much rounding of `k dt` may be off after so many breaths."""
@@ -152,19 +190,6 @@ def _slack(breaths: Array) -> Array:
 def check_waveform(waveform: Any, where: str) -> None:
     """Raise unless it is a breath waveform."""
     check_instance(waveform, BreathWaveform, "waveform", where)
-
-
-def check_peep(waveform: BreathWaveform, valves: Any, where: str) -> None:
-    """Raise if the PEEP of a waveform is below what the valves let a lung out to, if
-    their values are known."""
-    asked, least = waveform.peep, valves.peep
-    if is_concrete(asked) and is_concrete(least):
-        # Numbers of another precision may differ by their rounding.
-        if np.any(np.asarray(asked) < np.asarray(least) - 1e-3):
-            raise ValueError(
-                f"{where}: the peep of waveform must be at least that of valves, "
-                f"{least}, below which no lung empties, got {asked}. Give both."
-            )
 
 
 def as_pips(pips: Any, tree: Any, where: str) -> Array:
@@ -178,15 +203,10 @@ def as_pips(pips: Any, tree: Any, where: str) -> Array:
         got = f"shape {array.shape}" if eqx.is_array(array) else shortened(pips)
         raise ValueError(f"{where}: pips must be a vector of pressures, got {got}.")
     check_real(array, "pips", where)
-    for waveform in _waveforms(tree):
+    for waveform in parts_of((tree,), BreathWaveform):
         if is_concrete(waveform.peep):
             _check_pip(array, np.max(np.asarray(waveform.peep)), "pips", where)
     return jnp.asarray(array, float)
-
-
-def _waveforms(tree: Any) -> list[BreathWaveform]:
-    """The breath waveforms in a pytree."""
-    return parts_of((tree,), BreathWaveform)
 
 
 def _check_pip(pip: Array, peep: Any, name: str, where: str) -> None:
@@ -197,42 +217,3 @@ def _check_pip(pip: Array, peep: Any, name: str, where: str) -> None:
             raise ValueError(
                 f"{where}: {name} must be at least peep = {peep}, got {pip}."
             )
-
-
-def at_pip(tree: _T, pip: Any) -> _T:
-    """A copy in which every breath waveform has that peak pressure.
-
-    An environment and its controller each hold the waveform; under `jax.vmap` this
-    makes a batch of both over several pressures, which compiles once.
-
-    **Arguments:**
-
-    - `tree`: any pytree: an environment, a controller, or both.
-    - `pip`: the peak inspiratory pressure [cmH2O].
-
-    **Returns:** the copy.
-
-    **Raises:** `ValueError` if there is no [`delucax.lung.BreathWaveform`][] in it, or
-    `pip` is below PEEP.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        from delucax import lung
-
-        env = lung.at_pip(dlx.make("lung/single_compartment"), 20.0)
-        ```
-    """
-    pip = as_float_array(pip)
-    if not eqx.is_inexact_array(pip):
-        raise ValueError(f"at_pip: pip must be a number, got {pip!r}.")
-    waveforms = _waveforms(tree)
-    if not waveforms:
-        raise ValueError(
-            f"at_pip: there is no BreathWaveform in the {type(tree).__name__}."
-        )
-    for waveform in waveforms:
-        _check_pip(pip, waveform.peep, "pip", "at_pip")
-    pips = [pip] * len(waveforms)
-    return eqx.tree_at(lambda tree: [w.pip for w in _waveforms(tree)], tree, pips)

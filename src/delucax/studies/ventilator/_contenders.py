@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ... import lung
+from ..._controller import AbstractController
+from ..._module import parameter, stack, taken, unstack, weight
 from ..._typing import PRNGKey
 from ...controllers import gpc, LeakyPID, online_newton, OutputFeedback, PID
 from ...costs import Tracking
@@ -19,7 +21,7 @@ from ...dynamics import LinearDynamics
 from ...environments import Environment
 from ...estimators import KalmanFilter
 from ...training.sysid import arx
-from ._stages import ABORT, SEEN, Size
+from ._stages import ABORT, NOISE, SEEN, Size, Stages
 
 
 TRUE_PID = dict(
@@ -28,11 +30,44 @@ TRUE_PID = dict(
     kd=(0.0, 0.01, 0.03),
 )
 """The gains of the true PIDs that are tried."""
-_NOISE = 0.2
 _TUNED_FURTHER = 4
 """How many of the PIDs that are drawn at random are trained on."""
 _CAREFUL = ABORT - 15
 """One that does not know its lung has to stay well below the limit."""
+
+
+class Summed(AbstractController):
+    """The sum of two controllers, such as a PID and a network trained on top of it,
+    `u = first(y) + second(y) - offset`."""
+
+    first: AbstractController
+    second: AbstractController
+    offset: Array = parameter(0.0)
+
+    def init(self, *, key=None):
+        keys = (None, None) if key is None else jr.split(key)
+        return self.first.init(key=keys[0]), self.second.init(key=keys[1])
+
+    def __call__(self, t, y, state):
+        u, first = self.first(t, y, state[0])
+        v, second = self.second(t, y, state[1])
+        return (u + (v - self.offset)).astype(y.dtype), (first, second)
+
+    def applied(self, u, cost, state):
+        first = self.first.applied(u, cost, state[0])
+        return first, self.second.applied(u, cost, state[1])
+
+
+class FeedForward(AbstractController):
+    """A control that goes with the target, `u = gain (r(t) - peep) + offset`."""
+
+    waveform: lung.BreathWaveform
+    gain: Array = weight(1.0)
+    offset: Array = weight(0.0)
+
+    def __call__(self, t, y, state):
+        u = self.gain * (self.waveform(t) - self.waveform.peep) + self.offset
+        return u.astype(y.dtype), state
 
 
 class Contender(NamedTuple):
@@ -71,10 +106,11 @@ class Trainer(NamedTuple):
         self, start: Any, steps: int, fold: int, *, limit: Any = None, **options: Any
     ) -> Any:
         """The trained controllers: see [`delucax.lung.train_controllers`][]."""
-        task = lambda model: lung.lung_environment(model, self.waveform, limit=limit)
+        options |= dict(steps=steps, key=jr.fold_in(self.key, fold))
+        given: Any = dict(waveform=self.waveform, noise=NOISE, limit=limit)
+        task = lambda model: lung.learned_lung(model, **given)
         # Compiled, as the trainings are: then the first states round as they do there.
         envs = eqx.filter_jit(eqx.filter_vmap(task))(self.simulators)
-        options |= dict(steps=steps, key=jr.fold_in(self.key, fold))
         return lung.train_controllers(envs, start, **options).model
 
     def pid(self, kind: type[LeakyPID | PID], gains: Any) -> LeakyPID | PID:
@@ -88,7 +124,7 @@ class Trainer(NamedTuple):
 
 
 def _stacked(make: Callable[[PRNGKey], Any], keys: PRNGKey) -> Any:
-    return lung.stack([_stacked(make, k) for k in keys]) if keys.ndim else make(keys)
+    return stack([_stacked(make, k) for k in keys]) if keys.ndim else make(keys)
 
 
 def searched_pids(envs: Environment, trainer: Trainer) -> dict[str, LeakyPID | PID]:
@@ -96,9 +132,11 @@ def searched_pids(envs: Environment, trainer: Trainer) -> dict[str, LeakyPID | P
     best: dict[str, Any] = {}
     true: Any = dict(TRUE_PID, kind="true")
     for name, kind, options in (("leaky PID", LeakyPID, {}), ("PID", PID, true)):
-        grid = lung.pid_grid(envs, key=jr.fold_in(trainer.key, 6), **options)
-        best[name] = lung.stack([trainer.pid(kind, gains) for gains in grid.best()])
-        best[f"{name} for all"] = trainer.pid(kind, grid.best_of_all())
+        key = jr.fold_in(trainer.key, 6)
+        grid, errors = lung.pid_grid(envs, key=key, **options)
+        own, of_all = jnp.argmin(errors, axis=1), jnp.argmin(jnp.mean(errors, axis=0))
+        best[name] = stack([trainer.pid(kind, gains) for gains in grid[own]])
+        best[f"{name} for all"] = trainer.pid(kind, grid[of_all])
     return best
 
 
@@ -106,43 +144,42 @@ def trained_pids(
     trainer: Trainer, pids: dict[str, Any], *, checkpoint: Path, progress: bool
 ) -> dict[str, Any]:
     """Those PIDs trained on, by themselves and with a feed-forward."""
-    forward = lung.FeedForward(trainer.waveform, jnp.asarray(0.3))
+    forward = FeedForward(trainer.waveform, jnp.asarray(0.3))
     starts = {f"trained {name}": pid for name, pid in pids.items()}
-    starts["PID + feed-forward"] = eqx.filter_vmap(lung.Summed)(
-        pids["PID"], lung.stack([forward] * trainer.count)
+    starts["PID + feed-forward"] = eqx.filter_vmap(Summed)(
+        pids["PID"], stack([forward] * trainer.count)
     )
-    starts["PID + feed-forward for all"] = lung.Summed(pids["PID for all"], forward)
+    starts["PID + feed-forward for all"] = Summed(pids["PID for all"], forward)
     trained, options = {}, dict(learning_rate=0.05, progress=progress)
     for name, start in starts.items():
         steps = trainer.size.pid_steps * (2 if "forward" in name else 1)
         file = f"{checkpoint}.{name.replace(' ', '_')}"
         options |= dict(shared=name.endswith("for all"), checkpoint=file)
-        models = trainer(lung.stack([start]), steps, 6, **options)
-        trained[name] = lung.unstack(models)[0]
+        models = trainer(stack([start]), steps, 6, **options)
+        trained[name] = unstack(models)[0]
     return trained
-
-
-def _log_uniform(key: PRNGKey, low: float, high: float) -> Array:
-    return jnp.exp(jr.uniform(key, minval=jnp.log(low), maxval=jnp.log(high)))
 
 
 @eqx.filter_jit
 def _drawn(
     kind: type[LeakyPID | PID], count: int, dt: Array, waveform: Any, key: PRNGKey
-) -> lung.Summed:
+) -> Summed:
     """PIDs with a feed-forward, gains at random over orders of magnitude."""
 
+    def between(key, low, high):
+        return jnp.exp(jr.uniform(key, minval=jnp.log(low), maxval=jnp.log(high)))
+
     def one(key):
-        keys, between = jr.split(key, 7), _log_uniform
+        keys = jr.split(key, 7)
         some = jr.bernoulli(keys[0], 0.5, (3,))
         kd = between(keys[1], 0.003, 0.2) * (1.0 if kind is PID else 20.0)
         gains = between(keys[2], 0.03, 8.0), between(keys[3], 0.05, 40.0), some[0] * kd
-        forward = lung.FeedForward(
+        forward = FeedForward(
             waveform,
             some[1] * jr.uniform(keys[4], maxval=3.0),
             some[2] * jr.uniform(keys[5], minval=-10.0, maxval=15.0),
         )
-        return lung.Summed(kind(*gains, dt=dt, reference=waveform), forward)
+        return Summed(kind(*gains, dt=dt, reference=waveform), forward)
 
     return eqx.filter_vmap(one)(jr.split(key, count))
 
@@ -159,11 +196,6 @@ def _errors(
     over = eqx.if_array(1) if own else None
     errors = eqx.filter_vmap(across, in_axes=(eqx.if_array(0), over))(envs, controllers)
     return jnp.where(jnp.isfinite(errors), errors, jnp.inf)
-
-
-def taken(tree: Any, index: Any) -> Any:
-    """What an index takes of each array of stacked modules."""
-    return jax.tree.map(lambda a: a[index] if eqx.is_array(a) else a, tree)
 
 
 def best_of(candidates: Any, errors: Any, shared: bool) -> Any:
@@ -200,8 +232,8 @@ def tuned_pids(
             file = Path(f"{checkpoint}.{label.replace(' ', '_')}")
             options |= dict(checkpoint=file, shared=shared)
             trained = lung.train_controllers(envs, begin, key=fit_key, **options)
-            both = [*lung.unstack(begin), *lung.unstack(trained.model)]
-            candidates = lung.stack(both)
+            both = [*unstack(begin), *unstack(trained.model)]
+            candidates = stack(both)
             judged = _errors(envs, candidates, judge_key, not shared)
             if words := divergence_note(trained.history["diverged"], judged):
                 say(f"  {label}: {words}")
@@ -223,43 +255,6 @@ def divergence_note(diverged: Any, errors: Any) -> str:
 def pid_contenders(pids: dict[str, Any]) -> list[Contender]:
     """PIDs by name, those that end with "for all" alike in each lung."""
     return [Contender(n, 0, pid, n.endswith("for all")) for n, pid in pids.items()]
-
-
-def networks(
-    trainer: Trainer, kind: Literal["mlp", "cnn"], seeds: int, **options: Any
-) -> lung.BreathPolicy:
-    """A network for each lung, of shape `(seeds, lungs)`."""
-    width = 32 if kind == "mlp" else 12
-    start = trainer.policies((seeds, trainer.count), 7, kind=kind, width=width)
-    return trainer(start, trainer.size.controller_steps, 8, **options)
-
-
-def networks_on_pids(
-    trainer: Trainer, pids: dict[str, Any], **options: Any
-) -> lung.Summed:
-    """A PID and a network on top of it for each lung, of shape `(1, lungs)`."""
-    # So that the network adds nothing before it is trained.
-    offset = 100 * jax.nn.sigmoid(jnp.asarray(-2.0))
-    summed = eqx.filter_vmap(lambda a, b: lung.Summed(a, b, offset=offset))
-    policies = trainer.policies((trainer.count,), 9)
-    start = lung.stack([summed(pids["leaky PID"], policies)])
-    return trainer(start, trainer.size.controller_steps, 10, **options)
-
-
-def networks_for_all(trainer: Trainer, **options: Any) -> lung.BreathPolicy:
-    """A network for all lungs, of shape `(seeds,)`."""
-    size = trainer.size
-    width, controls = size.shared_network
-    start = trainer.policies((size.seeds,), 11, width=width, controls=controls)
-    options |= dict(shared=True, limit=_CAREFUL)
-    return trainer(start, size.shared_steps, 12, **options)
-
-
-def planners(trainer: Trainer) -> Contender:
-    """Predictive control in the learned lungs."""
-    waveforms = lung.stack([trainer.waveform] * trainer.count)
-    plan = eqx.filter_vmap(lung.ShootingMPC)(trainer.simulators, waveforms)
-    return Contender("MPC", 0, plan)
 
 
 def online_learners(
@@ -286,13 +281,13 @@ def online_learners(
         cost = Tracking(error, jnp.zeros(1), _Target(waveform, n))
         online = gpc(model, cost, base=base, horizon=10, optimiser=newton)
         # All that the fit leaves over moves the lung; the sensor is taken at its word.
-        process = jnp.diag(_NOISE**2 * error)
+        process = jnp.diag(NOISE**2 * error)
         mean = error.at[1].set(1.0) * waveform.peep
         kalman = KalmanFilter(identified, process, 1e-4 * jnp.eye(1), mean=mean)
         return OutputFeedback(online, kalman)
 
-    each = lung.unstack(train), lung.unstack(pids["leaky PID"])
-    return lung.stack([*map(learner, *each)])
+    each = unstack(train), unstack(pids["leaky PID"])
+    return stack([*map(learner, *each)])
 
 
 class _Target(eqx.Module):
@@ -303,3 +298,67 @@ class _Target(eqx.Module):
 
     def __call__(self, t):
         return jnp.zeros(self.size).at[0].set(self.waveform.pressure(t))
+
+
+def contenders(
+    stages: Stages, envs: Environment, train: lung.Breaths, trainer: Trainer
+) -> list[Contender]:
+    """All controllers, in the order of the report."""
+    size, waveform, count = trainer.size, trainer.waveform, trainer.count
+    search = lambda: searched_pids(envs, trainer)
+    pids = stages.stage("pids", "PID grids", search)
+
+    def networks(name, words, shape, fold, steps, sizes, **options):
+        def train(**kept):
+            start = trainer.policies(shape, fold, **sizes)
+            return trainer(start, steps, fold + 1, **options, **kept)
+
+        return stages.training(name, words, train)
+
+    def residuals(**kept):
+        # So that the network adds nothing before it is trained.
+        offset = 100 * jax.nn.sigmoid(jnp.asarray(-2.0))
+        summed = eqx.filter_vmap(lambda a, b: Summed(a, b, offset=offset))
+        start = stack([summed(pids["leaky PID"], trainer.policies((count,), 9))])
+        return trainer(start, size.controller_steps, 10, **kept)
+
+    # No control is a PID without gains, as which it compiles nothing of its own.
+    none = trainer.pid(LeakyPID, (0.0, 0.0, 0.0))
+    rows = [Contender("zero", 0, none, True), *pid_contenders(pids)]
+    words = f"A network for each lung, {size.seeds} seeds at once"
+    shape, steps = (size.seeds, count), size.controller_steps
+    own = networks("own", words, shape, 7, steps, dict(width=32))
+    words = f"A network for all lungs, {size.seeds} seeds at once"
+    shape, steps = (size.seeds,), size.shared_steps
+    sizes = dict(zip(("width", "controls"), size.shared_network, strict=True))
+    alike: Any = dict(shared=True, limit=_CAREFUL)
+    shared = networks("shared", words, shape, 11, steps, sizes, **alike)
+    if size.tuned:
+        words = "PIDs with feed-forward tuned on the lungs"
+        given = envs, trainer, stages.say
+        rows += pid_contenders(stages.training("tuned_pids", words, tuned_pids, *given))
+    if size.extras:
+        words, given = "PIDs trained on", (trainer, pids)
+        more = stages.training("trained_pids", words, trained_pids, *given)
+        words = "A convolutional network for each lung"
+        shape, steps = (1, count), size.controller_steps
+        sizes = dict(kind="cnn", width=12)
+        convolved = networks("own_cnn", words, shape, 7, steps, sizes)
+        words = "A PID and a network for each lung"
+        residual = stages.training("residual", words, residuals)
+        learn = lambda: online_learners(train, pids, waveform, size.sensor_delay)
+        online = stages.stage("online", "GPC around the best PIDs", learn)
+        each = stack([waveform] * count)
+        planners = eqx.filter_vmap(lung.ShootingMPC)(trainer.simulators, each)
+        rows += [
+            *pid_contenders(more),
+            Contender("bang-bang", 0, lung.BangBang(waveform), True),
+            Contender("GPC", 0, online),
+            Contender("MPC", 0, planners),
+            Contender("CNN", 0, unstack(convolved)[0]),
+            Contender("PID + MLP", 0, unstack(residual)[0]),
+        ]
+    rows += [Contender("MLP", seed, one) for seed, one in enumerate(unstack(own))]
+    for seed, one in enumerate(unstack(shared)):
+        rows.append(Contender("MLP for all", seed, one, True))
+    return rows

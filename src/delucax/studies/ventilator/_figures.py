@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ... import lung
+from ..._module import unstack
 from ...environments import Environment
 from ...plotting import animate
 from ...plotting.figures import color_of, NEUTRAL, NotebookFigure, style_axes
@@ -27,7 +28,7 @@ def tracking_figure(
     lungs = sorted({0, count // 2, count - 1})
     figure = NotebookFigure(figsize=(9.5, 6.2), layout="constrained")
     axes = figure.subplots(2, len(lungs), squeeze=False, height_ratios=(1.15, 1))
-    cost: Any = lung.unstack(envs)[0].cost
+    cost: Any = unstack(envs)[0].cost
     index = cost.index
     for ax, i in zip(axes[0], lungs, strict=True):
         for k, (label, runs) in enumerate(shown.items()):
@@ -35,7 +36,8 @@ def tracking_figure(
             times = float(envs.dt[i]) * np.arange(len(pressure))
             ax.plot(times, pressure, color=_color(label, k), lw=1.5, label=label)
         times = np.linspace(0, 2.99, 600)
-        target = np.asarray(lung.at_pip(cost.waveform, SHOWN).pressure(times))
+        waveform = lung.BreathWaveform.at_pip(cost.waveform, SHOWN)
+        target = np.asarray(waveform.pressure(times))
         ax.plot(times, target, color="0.2", lw=1, ls=(0, (4, 2)), label="target")
         ax.set_title(names[i], fontsize=_SIZE + 1)
         ax.set_xlabel("time [s]", fontsize=_SIZE)
@@ -102,7 +104,7 @@ def simulator_figure(
     for k, (label, model) in enumerate(models.items()):
         if label not in ("learned", "single compartment", "balloon"):
             continue
-        predicted = np.asarray(eqx.filter_jit(lung.unstack(model)[middle].predict)(u))
+        predicted = np.asarray(eqx.filter_jit(unstack(model)[middle].predict)(u))
         left.plot(times, predicted, color=color_of(k), lw=1.5, label=label)
     left.set_title(f"{names[middle]}, from its controls alone", fontsize=_SIZE + 1)
     left.set_xlabel("time [s]", fontsize=_SIZE)
@@ -123,5 +125,5 @@ def simulator_figure(
 def draw_breath(path: Path, envs: Environment, runs: Any) -> None:
     """A breath in the middle one of the lungs, as a moving picture."""
     middle = len(envs.dt) // 2
-    env = lung.at_pip(lung.unstack(envs)[middle], SHOWN)
-    animate(env, lung.unstack(runs)[middle], path=path, max_frames=40)
+    env = lung.BreathWaveform.at_pip(unstack(envs)[middle], SHOWN)
+    animate(env, unstack(runs)[middle], path=path, max_frames=40)

@@ -27,6 +27,8 @@ BETWEEN = ((10.0, 15.0), (10.0, 35.0), (35.0, 15.0), (35.0, 35.0))
 """Lungs between those that are trained on, (R, C)."""
 SENSOR_DELAY = 2
 """Samples that the sensor is late."""
+NOISE = 0.2
+"""The standard deviation of what the sensor adds [cmH2O]."""
 
 
 class Size(NamedTuple):
@@ -106,12 +108,22 @@ class Stages:
     ):
         self.out, self.say, self.progress = out, say, progress
         self.seconds: dict[str, float] = {}
-        known = out / "settings.json"
+        known, text = out / "settings.json", json.dumps(settings, indent=1) + "\n"
         (out / "controllers").mkdir(parents=True, exist_ok=True)
-        if known.exists():
-            _check_settings(known, settings)
-        else:
-            self.write("settings.json", json.dumps(settings, indent=1) + "\n")
+        if not known.exists():
+            self.write("settings.json", text)
+        instead = "delete the folder, or name another one with out."
+        try:
+            stored, given = json.loads(known.read_text()), json.loads(text)
+        except ValueError as error:
+            words = f"lung: '{known}' is damaged ({error}); {instead}"
+            raise ValueError(words) from None
+        for name in sorted(given.keys() | stored.keys()):
+            if given.get(name) != stored.get(name):
+                raise ValueError(
+                    f"lung: '{out}' holds a study with other settings: {name} is "
+                    f"{stored.get(name)} there and {given.get(name)} here; {instead}"
+                )
 
     def training(
         self, name: str, words: str, train: Callable[..., Any], *args: Any
@@ -151,22 +163,3 @@ class Stages:
         writer.writeheader()
         writer.writerows(rows)
         self.write(name, text.getvalue())
-
-
-def _check_settings(known: Path, settings: dict[str, Any]) -> None:
-    """Raise unless a study was begun with the same settings."""
-    try:
-        stored = json.loads(known.read_text())
-    except ValueError as error:
-        raise ValueError(
-            f"lung: '{known}' is damaged ({error}); delete the folder, or name "
-            "another one with out."
-        ) from None
-    given = json.loads(json.dumps(settings))
-    for name in sorted(given.keys() | stored.keys()):
-        if given.get(name) != stored.get(name):
-            raise ValueError(
-                f"lung: '{known.parent}' holds a study with other settings: {name} is "
-                f"{stored.get(name)} there and {given.get(name)} here. Delete the "
-                "folder, or name another one with out."
-            )
