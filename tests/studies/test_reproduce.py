@@ -101,6 +101,6 @@ def test_a_load_that_comes_and_goes_meets_all_simulators(monkeypatch):
 
     turns = 0
     monkeypatch.setattr(_wall_clock.time, "perf_counter", lambda: now)
-    seconds = _wall_clock._take_turns([taking(0.01), taking(1.0)], 6)
+    seconds = _wall_clock.take_turns([taking(0.01), taking(1.0)], 6)
     assert seconds.shape == (6, 2) and seconds.std(axis=0).min() > 0
     np.testing.assert_allclose(seconds[:, 1] / seconds[:, 0], 100)

@@ -7,13 +7,7 @@ from ._breath_controllers import (
 )
 from ._breath_file import read_breaths as read_breaths, write_breaths as write_breaths
 from ._breaths import Breaths as Breaths, explore as explore, Explorer as Explorer
-from ._controller_training import (
-    breath_error as breath_error,
-    pid_grid as pid_grid,
-    train_controllers as train_controllers,
-)
 from ._learned_lung import LearnedLung as LearnedLung
-from ._lung_fitting import fit_lungs as fit_lungs
 from ._lung_models import (
     GreyBoxLung as GreyBoxLung,
     LungModel as LungModel,
@@ -25,6 +19,12 @@ from ._lung_tasks import (
     double_compartment as double_compartment,
     learned_lung as learned_lung,
     single_compartment as single_compartment,
+)
+from ._lung_training import (
+    breath_error as breath_error,
+    fit_lungs as fit_lungs,
+    pid_grid as pid_grid,
+    train_controllers as train_controllers,
 )
 from ._lungs import (
     AbstractLung as AbstractLung,

@@ -11,7 +11,7 @@ from jaxtyping import Array, PyTree
 from .._check import check_choice, check_count, check_key, check_step
 from .._controller import AbstractController, check_controller
 from .._module import parameter, positive, weight
-from .._typing import PRNGKey
+from .._typing import PRNGKey, Real
 from ..math import clip
 from ._learned_lung import tanh_network
 from ._waveform import BreathWaveform, check_waveform
@@ -193,8 +193,8 @@ class BreathPolicy(AbstractController):
     network: eqx.nn.MLP = weight()
     convolution: Array | None = weight()
     waveform: BreathWaveform
-    dt: Array = parameter(constraint=positive)
-    shift: Array = parameter()
+    dt: Real = parameter(constraint=positive)
+    shift: Real = parameter()
     kind: Literal["mlp", "cnn"] = eqx.field(static=True)
     errors: int = eqx.field(static=True)
     controls: int = eqx.field(static=True)
@@ -226,15 +226,15 @@ class BreathPolicy(AbstractController):
             depth = 0
         check_count(depth, "depth", where, least=0)
         self.network = tanh_network(size, "scalar", width, depth, key=key)
-        self.shift = -2.0  # pyright: ignore[reportAttributeAccessIssue]
+        self.shift = -2.0
 
     def __check_init__(self):
         check_waveform(self.waveform, "BreathPolicy")
         check_step(self.dt, "BreathPolicy")
 
     def init(self, *, key=None):
-        zeros = lambda size: jnp.zeros(size, jnp.result_type(self.dt))  # noqa: E731
-        return zeros(self.errors), zeros(self.controls)
+        dtype = jnp.result_type(self.dt)
+        return jnp.zeros(self.errors, dtype), jnp.zeros(self.controls, dtype)
 
     def __call__(self, t, y, state):
         errors, controls = state

@@ -1,6 +1,6 @@
 """A lung learned from breaths."""
 
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
 import jax
@@ -109,20 +109,20 @@ class LearnedLung(AbstractDynamics):
         for name, value in sizes.items():
             check_count(value, name, where)
         hidden_key, output_key, valve_key, key = jr.split(key, 4)
-        size = 2 * max(u_window, p_window, boundary)
+        inputs, size = u_window + p_window, 2 * max(u_window, p_window, boundary)
         shape = boundary, 16
+        # Variances of one over the inputs keep what enters a tanh about 1.
         self.hidden = jr.normal(hidden_key, (*shape, size)) / size**0.5
         self.output = 0.1 * jr.normal(output_key, shape) / 16**0.5
-        self.line = jnp.zeros(u_window + p_window)
+        self.line = jnp.zeros(inputs)
         self.valve = tanh_network("scalar", "scalar", 8, 1, key=valve_key)
-        inputs = u_window + p_window
         self.network = tanh_network(inputs, "scalar", width, depth, key=key)
-        closed = breaths.u_out < 0.5
-        count = jnp.sum(closed)
-        mean = lambda a: jnp.sum(jnp.where(closed, a, 0)) / count  # noqa: E731
-        self.u_mean, self.p_mean = mean(breaths.u_in), mean(breaths.pressure)
-        self.u_std = jnp.sqrt(mean((breaths.u_in - self.u_mean) ** 2)) + 1e-3
-        self.p_std = jnp.sqrt(mean((breaths.pressure - self.p_mean) ** 2)) + 1e-3
+        inhaling = breaths.u_out < 0.5
+        moments = lambda a: (jnp.mean(a, where=inhaling), jnp.std(a, where=inhaling))
+        self.u_mean, u_std = moments(breaths.u_in)
+        self.p_mean, p_std = moments(breaths.pressure)
+        # It is divided by, and 0 where all are the same.
+        self.u_std, self.p_std = u_std + 1e-3, p_std + 1e-3
         self.start = jnp.mean(breaths.pressure[..., 0])
         self.dt = breaths.dt
         self.u_window, self.p_window = u_window, p_window
@@ -174,17 +174,14 @@ class LearnedLung(AbstractDynamics):
 
     def _straight(self, controls: Array) -> Array:
         """Controls as the network of the later steps is given them."""
-        if self.published:
-            return controls
-        return controls + jax.vmap(self.valve)(controls)
+        return controls if self.published else controls + jax.vmap(self.valve)(controls)
 
     def _late(self, straight: Array, pressures: Array) -> Array:
         """The next pressure, after the first steps."""
         z = jnp.concatenate([straight, pressures[: self.p_window]])
         predicted = self.network(z)
-        if self.published:
-            return predicted
-        return pressures[0] + self.line @ z + predicted
+        # The networks learn the change: for a short step it is small and near linear.
+        return predicted if self.published else pressures[0] + self.line @ z + predicted
 
     def _early(self, history: Array, late: Any, hidden: Array, output: Array) -> Array:
         """The next pressure in one of the first steps; `late` is that afterwards."""
@@ -270,13 +267,11 @@ class LearnedLung(AbstractDynamics):
         return self.p_mean + self.p_std * jnp.concatenate([start[:1], early, late])
 
 
+_Size: TypeAlias = int | Literal["scalar"]
+
+
 def tanh_network(
-    inputs: int | Literal["scalar"],
-    outputs: int | Literal["scalar"],
-    width: int,
-    depth: int,
-    *,
-    key: PRNGKey,
+    inputs: _Size, outputs: _Size, width: int, depth: int, *, key: PRNGKey
 ) -> eqx.nn.MLP:
     """A fully connected network whose hidden layers are tanh."""
     tanh, identity = as_module(jnp.tanh), as_module(jax.nn.identity)

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from .._check import check_count, check_instance, check_key, check_step
 from .._module import parameter, positive, weight
-from .._typing import PRNGKey, RealScalar, Scalar, State
+from .._typing import PRNGKey, Real, RealScalar, Scalar, State
 from ..dynamics import Delayed, Discretized
 from ._learned_lung import tanh_network
 from ._lungs import AbstractLung, SingleCompartment
@@ -80,9 +80,8 @@ class LungModel(eqx.Module):
 
         @jax.checkpoint
         def body(x, u):
-            after, _ = self.dynamics.advance(
-                0.0, x, jnp.stack([u, jnp.zeros_like(u)]), None
-            )
+            both = jnp.stack([u, jnp.zeros_like(u)])
+            after, _ = self.dynamics.advance(0.0, x, both, None)
             return after, self.dynamics.observe(0.0, x)[0]
 
         x0 = self.resting().astype(u_in.dtype)
@@ -123,9 +122,9 @@ class NeuralLung(AbstractLung):
     """
 
     network: eqx.nn.MLP = weight()
-    p_mean: Array = parameter()
-    p_std: Array = parameter(constraint=positive)
-    rate: Array = parameter(constraint=positive)
+    p_mean: Real = parameter()
+    p_std: Real = parameter(constraint=positive)
+    rate: Real = parameter(constraint=positive)
     valves: Valves
     hidden: int = eqx.field(static=True)
 
@@ -145,8 +144,7 @@ class NeuralLung(AbstractLung):
         check_key(key, where)
         sizes = self.hidden + 3, self.hidden + 1, width, depth
         self.network = tanh_network(*sizes, key=key)
-        scales: Any = 20.0, 10.0, 10.0
-        self.p_mean, self.p_std, self.rate = scales
+        self.p_mean, self.p_std, self.rate = 20.0, 10.0, 10.0
         self.valves = Valves() if valves is None else valves
 
     @property
@@ -201,8 +199,8 @@ class GreyBoxLung(AbstractLung):
     single: SingleCompartment
     network: eqx.nn.MLP = weight()
     memory: eqx.nn.MLP = weight()
-    p_std: Array = parameter(constraint=positive)
-    rate: Array = parameter(constraint=positive)
+    p_std: Real = parameter(constraint=positive)
+    rate: Real = parameter(constraint=positive)
 
     state_names: ClassVar = ("inflow", "opening", "volume", "memory")
     state_units: ClassVar = ("L/s", "", "L", "")
@@ -221,10 +219,9 @@ class GreyBoxLung(AbstractLung):
         network, self.memory = (
             tanh_network(3, "scalar", width, 1, key=k) for k in jr.split(key)
         )
-        last = lambda mlp: mlp.layers[-1].weight  # noqa: E731
+        last = lambda mlp: mlp.layers[-1].weight
         self.network = eqx.tree_at(last, network, 0.1 * last(network))
-        scales: Any = 10.0, 5.0
-        self.p_std, self.rate = scales
+        self.p_std, self.rate = 10.0, 5.0
 
     @property
     def valves(self) -> Valves:

@@ -19,7 +19,7 @@ from jaxtyping import Array
 from .. import controllers
 from .._controller import AbstractController
 from ..controllers import mlp_policy, OpenLoop, Zero
-from ..costs import AbstractCost, Function
+from ..costs import Function
 from ..disturbances import Gaussian
 from ..dynamics import linearize
 from ..environments import Environment, make, UniformState
@@ -55,16 +55,14 @@ class Unsuitable(Exception):
 @functools.cache
 def task_of(name: str) -> Environment:
     """The task, with what it needs drawn from a fixed key."""
+    options: dict[str, Any] = {}
     if name == "neural":
-        return make(name, width=8, key=jax.random.key(0))
-    if name != "lds":
-        return make(name)
-    options: dict[str, Any] = {
-        "initial_state": UniformState(-jnp.ones(4), jnp.ones(4)),
-        "disturbance": Gaussian(0.1, size=4),
-        "spectral_radius": 1.05,
-    }
-    return make(name, key=jax.random.key(0), states=4, controls=2, **options)
+        options = dict(width=8, key=jax.random.key(0))
+    elif name == "lds":
+        start, w = UniformState(-jnp.ones(4), jnp.ones(4)), Gaussian(0.1, size=4)
+        options = dict(states=4, controls=2, key=jax.random.key(0))
+        options |= dict(initial_state=start, disturbance=w, spectral_radius=1.05)
+    return make(name, **options)
 
 
 @functools.cache
@@ -76,12 +74,13 @@ def _local(name: str) -> tuple[Any, Any, Any]:
     model = linearize(env.dynamics, jnp.zeros(()), x, u)
     n = x.shape[0]
 
-    def charged(z: Any) -> Any:
-        return env.cost(jnp.zeros(()), x + z[:n], u + z[n:])
-
-    H = np.asarray(jax.hessian(charged)(jnp.zeros(n + u.shape[0]))) / 2
+    cost = lambda z: env.cost(jnp.zeros(()), x + z[:n], u + z[n:])
+    # A cost `x @ Q @ x + u @ R @ u` has twice those for its Hessian.
+    H = np.asarray(jax.hessian(cost)(jnp.zeros(n + u.shape[0]))) / 2
     if not np.all(np.isfinite(H)):
         raise Unsuitable("the cost has no curvature at the equilibrium")
+    # Designs need R definite: a direction that costs nothing is given a weight that is
+    # a ten-thousandth of the largest.
     values, vectors = np.linalg.eigh(H)
     scale = max(values.max(), 1e-3)
     H = vectors * np.clip(values, 1e-4 * scale, None) @ vectors.T
@@ -120,23 +119,16 @@ def _receding(name: str, kind: type[AbstractPlanner], **options: Any) -> Any:
         low, high = (np.asarray(bound, float) for bound in bounds)
         width = high - low
         options["scale"] = np.where(np.isfinite(width), width / 4, 1.0)
+    cost, lqr = env.cost, _suited(name, "LQR")
+    if lqr is not None:
+
+        def to_go(t, x):
+            deviation = env.dynamics.difference(x, lqr.x_ref)
+            return deviation @ lqr.P @ deviation
+
+        cost = Function(env.cost, to_go)
     how: dict[str, Any] = {"planner": kind(**options), "bounds": bounds, "throw": False}
-    return controllers.MPC(env.dynamics, _with_cost_to_go(name), LOOKAHEAD, **how)
-
-
-def _with_cost_to_go(name: str) -> AbstractCost:
-    """The cost of the task, with the LQR's cost to go for a final cost."""
-    env = task_of(name)
-    try:
-        lqr = agent_of(name, "LQR")
-    except Unsuitable:
-        return env.cost
-
-    def to_go(t: Any, x: Any) -> Any:
-        deviation = env.dynamics.difference(x, lqr.x_ref)
-        return deviation @ lqr.P @ deviation
-
-    return Function(env.cost, to_go)
+    return controllers.MPC(env.dynamics, cost, LOOKAHEAD, **how)
 
 
 def _by_gradient(name: str, network: Callable[..., Any], **options: Any) -> Any:
@@ -171,12 +163,10 @@ def _by_actor_critic(name: str, method: type[PPO] | type[SHAC]) -> Any:
 
 def _fitted(loss: Any, model: Any, steps: int, key: Any) -> Any:
     """The model, trained by Adam."""
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(1.0),
-        optax.adam(optax.cosine_decay_schedule(0.01, steps)),
-    )
-    quiet: dict[str, Any] = {"progress": False, "throw": False}
-    return fit(loss, model, optimiser, steps, key=key, **quiet).model
+    adam = optax.adam(optax.cosine_decay_schedule(0.01, steps))
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), adam)
+    options: Any = dict(key=key, progress=False, throw=False)
+    return fit(loss, model, optimiser, steps, **options).model
 
 
 FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
@@ -251,10 +241,9 @@ def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
     for agent in (Zero(env.control_size), *guides):
         run: Any = rollout(env, agent, key=key, throw=False)
         guess = jnp.nan_to_num(run.controls)
-        w = run.disturbances if env.disturbance_size else None
-        options: Any = dict(w=w, bounds=env.control_bounds, throw=False)
-        problem = env.dynamics, env.cost, run.states[0], guess
-        plan = ilqr(*problem, max_iterations=100, **options)
+        options: Any = dict(bounds=env.control_bounds, max_iterations=100, throw=False)
+        options["w"] = run.disturbances if env.disturbance_size else None
+        plan = ilqr(env.dynamics, env.cost, run.states[0], guess, **options)
         for controls in (guess, plan.controls):
             cost = float(_cost(env, OpenLoop(controls), key))
             if np.isfinite(cost) and cost < least:

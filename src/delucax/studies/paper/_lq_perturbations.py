@@ -38,10 +38,10 @@ def lq_perturbations(small: bool = False) -> Finding:
         "constant": np.ones((seeds, steps, 2)),
     }
 
+    options: Any = dict(key=jr.key(0), x0=jnp.zeros(2), horizon=steps, keep=("costs",))
+
     @jax.jit
     def costs(controller, w):
-        options: Any = dict(key=jr.key(0), x0=jnp.zeros(2), horizon=steps)
-        options["keep"] = ("costs",)
         return jax.vmap(lambda w: rollout(env, controller, w=w, **options).costs)(w)
 
     costs_of = {
@@ -54,27 +54,26 @@ def lq_perturbations(small: bool = False) -> Finding:
         for name in contenders:
             mean, half = mean_and_half_width(means[name, kind])
             row = {"perturbation": kind, "controller": name}
-            rows.append({**row, "cost": mean, "+-": half})
-    against_lqr = lambda kind: paired_ratio(means["GPC", kind], means["LQR", kind])
-    ratio = {kind: against_lqr(kind) for kind in kinds}
+            rows.append(row | {"cost": mean, "+-": half})
+    gpc_over = lambda name, kind: paired_ratio(means["GPC", kind], means[name, kind])
+    ratio, _, high = gpc_over("LQR", "Gaussian")
     claims = [
         Claim(
             "Under Gaussian noise GPC costs at most 1.05 times what LQR does, which is "
             "optimal there",
-            f"{ratio['Gaussian'][0]:.3f} times (to {ratio['Gaussian'][2]:.3f})",
-            bool(ratio["Gaussian"][2] <= 1.05),
+            f"{ratio:.3f} times (to {high:.3f})",
+            bool(high <= 1.05),
         )
     ]
     for kind in ("sinusoidal", "constant"):
-        other = paired_ratio(means["GPC", kind], means["H-infinity", kind])
-        claims.append(
-            Claim(
-                f"Under a {kind} perturbation GPC costs at most 0.25 times what LQR "
-                "does, and less than H-infinity",
-                f"{ratio[kind][0]:.3f} times LQR, {other[0]:.3f} times H-infinity",
-                bool(ratio[kind][2] <= 0.25 and other[2] < 1),
-            )
+        lqr, robust = gpc_over("LQR", kind), gpc_over("H-infinity", kind)
+        statement = (
+            f"Under a {kind} perturbation GPC costs at most 0.25 times what LQR does, "
+            "and less than H-infinity"
         )
+        measured = f"{lqr[0]:.3f} times LQR, {robust[0]:.3f} times H-infinity"
+        holds = bool(lqr[2] <= 0.25 and robust[2] < 1)
+        claims.append(Claim(statement, measured, holds))
     axes = draw_panels(3, (10, 3))
     for ax, kind in zip(axes, kinds, strict=True):
         for name in contenders:

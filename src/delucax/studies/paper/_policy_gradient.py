@@ -31,7 +31,7 @@ def policy_gradient(small: bool = False) -> Finding:
 
     exact = train(training.analytic, 0)
     first, faster = _first(exact), _first(train(training.analytic, 0, TWICE))
-    rows = [_row("through the rollout", 1, int(first is not None), first, exact[-1])]
+    rows = [("through the rollout", 1, int(first is not None), first, exact[-1])]
     curves, reached, total, fewest = {}, 0, 0, []
     for scale in scales:
         for count in pairs:
@@ -45,7 +45,7 @@ def policy_gradient(small: bool = False) -> Finding:
             name = f"evolution strategies, sigma {scale}, {count} pairs"
             median = float(np.median(cost)) if cost else None
             at_end = float(np.median([run[-1] for run in runs]))
-            rows.append(_row(name, seeds, len(cost), median, at_end))
+            rows.append((name, seeds, len(cost), median, at_end))
     least = min(fewest) if fewest else None
     claims = [
         descent_claim(first, faster),
@@ -73,20 +73,11 @@ def policy_gradient(small: bool = False) -> Finding:
         "mean cost of Gym (with the sum it sticks at once). Evolution strategies are "
         f"antithetic, {seeds} seeds a setting, {steps} updates; lines are medians."
     )
-    tables, figures = {"Rollouts to cost 2.0": rows}, {"policy_gradient": ax.figure}
+    columns = "gradient", "runs", "reach 2.0", "rollouts, median"
+    columns += ("cost at the end, median",)
+    table = [dict(zip(columns, row, strict=True)) for row in rows]
+    tables, figures = {"Rollouts to cost 2.0": table}, {"policy_gradient": ax.figure}
     return Finding("Policy gradient of the pendulum", claims, tables, figures, notes)
-
-
-def _row(
-    gradient: str, runs: int, reached: int, rollouts: float | None, cost: float
-) -> dict[str, Any]:
-    return {
-        "gradient": gradient,
-        "runs": runs,
-        "reach 2.0": reached,
-        "rollouts, median": rollouts,
-        "cost at the end, median": cost,
-    }
 
 
 @functools.cache

@@ -97,11 +97,6 @@ class Trainer(NamedTuple):
         """How many lungs there are."""
         return self.simulators.dt.shape[0]
 
-    @property
-    def dt(self) -> Array:
-        """The control interval."""
-        return self.simulators.dt[0]
-
     def __call__(
         self, start: Any, steps: int, fold: int, *, limit: Any = None, **options: Any
     ) -> Any:
@@ -115,24 +110,22 @@ class Trainer(NamedTuple):
 
     def pid(self, kind: type[LeakyPID | PID], gains: Any) -> LeakyPID | PID:
         """A PID that follows the waveform."""
-        return kind(*gains, dt=self.dt, reference=self.waveform)
+        return kind(*gains, dt=self.simulators.dt[0], reference=self.waveform)
 
     def policies(self, shape: tuple[int, ...], fold: int, **options: Any) -> Any:
         """Networks before they are trained, stacked to `shape`."""
-        make = lambda key: lung.BreathPolicy(self.waveform, self.dt, key=key, **options)
-        return _stacked(make, jr.split(jr.fold_in(self.key, fold), shape))
-
-
-def _stacked(make: Callable[[PRNGKey], Any], keys: PRNGKey) -> Any:
-    return stack([_stacked(make, k) for k in keys]) if keys.ndim else make(keys)
+        given = self.waveform, self.simulators.dt[0]
+        make = lambda key: lung.BreathPolicy(*given, key=key, **options)
+        for _ in shape:
+            make = lambda keys, one=make: stack(map(one, keys))
+        return make(jr.split(jr.fold_in(self.key, fold), shape))
 
 
 def searched_pids(envs: Environment, trainer: Trainer) -> dict[str, LeakyPID | PID]:
     """The best PID of each kind, for each lung and for all."""
     best: dict[str, Any] = {}
-    true: Any = dict(TRUE_PID, kind="true")
+    key, true = jr.fold_in(trainer.key, 6), dict(TRUE_PID, kind="true")
     for name, kind, options in (("leaky PID", LeakyPID, {}), ("PID", PID, true)):
-        key = jr.fold_in(trainer.key, 6)
         grid, errors = lung.pid_grid(envs, key=key, **options)
         own, of_all = jnp.argmin(errors, axis=1), jnp.argmin(jnp.mean(errors, axis=0))
         best[name] = stack([trainer.pid(kind, gains) for gains in grid[own]])
@@ -145,18 +138,16 @@ def trained_pids(
 ) -> dict[str, Any]:
     """Those PIDs trained on, by themselves and with a feed-forward."""
     forward = FeedForward(trainer.waveform, jnp.asarray(0.3))
+    forwards = stack([forward] * trainer.count)
     starts = {f"trained {name}": pid for name, pid in pids.items()}
-    starts["PID + feed-forward"] = eqx.filter_vmap(Summed)(
-        pids["PID"], stack([forward] * trainer.count)
-    )
+    starts["PID + feed-forward"] = eqx.filter_vmap(Summed)(pids["PID"], forwards)
     starts["PID + feed-forward for all"] = Summed(pids["PID for all"], forward)
     trained, options = {}, dict(learning_rate=0.05, progress=progress)
     for name, start in starts.items():
         steps = trainer.size.pid_steps * (2 if "forward" in name else 1)
         file = f"{checkpoint}.{name.replace(' ', '_')}"
         options |= dict(shared=name.endswith("for all"), checkpoint=file)
-        models = trainer(stack([start]), steps, 6, **options)
-        trained[name] = unstack(models)[0]
+        trained[name] = taken(trainer(stack([start]), steps, 6, **options), 0)
     return trained
 
 
@@ -174,11 +165,9 @@ def _drawn(
         some = jr.bernoulli(keys[0], 0.5, (3,))
         kd = between(keys[1], 0.003, 0.2) * (1.0 if kind is PID else 20.0)
         gains = between(keys[2], 0.03, 8.0), between(keys[3], 0.05, 40.0), some[0] * kd
-        forward = FeedForward(
-            waveform,
-            some[1] * jr.uniform(keys[4], maxval=3.0),
-            some[2] * jr.uniform(keys[5], minval=-10.0, maxval=15.0),
-        )
+        gain = some[1] * jr.uniform(keys[4], maxval=3.0)
+        offset = some[2] * jr.uniform(keys[5], minval=-10.0, maxval=15.0)
+        forward = FeedForward(waveform, gain, offset)
         return Summed(kind(*gains, dt=dt, reference=waveform), forward)
 
     return eqx.filter_vmap(one)(jr.split(key, count))
@@ -232,8 +221,7 @@ def tuned_pids(
             file = Path(f"{checkpoint}.{label.replace(' ', '_')}")
             options |= dict(checkpoint=file, shared=shared)
             trained = lung.train_controllers(envs, begin, key=fit_key, **options)
-            both = [*unstack(begin), *unstack(trained.model)]
-            candidates = stack(both)
+            candidates = stack([*unstack(begin), *unstack(trained.model)])
             judged = _errors(envs, candidates, judge_key, not shared)
             if words := divergence_note(trained.history["diverged"], judged):
                 say(f"  {label}: {words}")
@@ -273,12 +261,11 @@ def online_learners(
         # A model to predict with: each of its numbers need not be known.
         lags: Any = dict(outputs_back=2, controls_back=4, delay=delay + 1)
         identified = arx(outputs, controls, dt=dt, throw=False, **lags).model
-        n = identified.state_size
         model = LinearDynamics(identified.A, identified.B, dt=dt)
         gains = pid.kp, pid.ki, pid.kd
         base = LeakyPID(*gains, dt=dt, reference=waveform, output=0)
-        error = jnp.zeros(n).at[0].set(1.0)
-        cost = Tracking(error, jnp.zeros(1), _Target(waveform, n))
+        error = jnp.zeros(identified.state_size).at[0].set(1.0)
+        cost = Tracking(error, jnp.zeros(1), _Target(waveform, len(error)))
         online = gpc(model, cost, base=base, horizon=10, optimiser=newton)
         # All that the fit leaves over moves the lung; the sensor is taken at its word.
         process = jnp.diag(NOISE**2 * error)
@@ -286,8 +273,7 @@ def online_learners(
         kalman = KalmanFilter(identified, process, 1e-4 * jnp.eye(1), mean=mean)
         return OutputFeedback(online, kalman)
 
-    each = unstack(train), unstack(pids["leaky PID"])
-    return stack([*map(learner, *each)])
+    return stack(map(learner, unstack(train), unstack(pids["leaky PID"])))
 
 
 class _Target(eqx.Module):
@@ -305,8 +291,7 @@ def contenders(
 ) -> list[Contender]:
     """All controllers, in the order of the report."""
     size, waveform, count = trainer.size, trainer.waveform, trainer.count
-    search = lambda: searched_pids(envs, trainer)
-    pids = stages.stage("pids", "PID grids", search)
+    pids = stages.stage("pids", "PID grids", lambda: searched_pids(envs, trainer))
 
     def networks(name, words, shape, fold, steps, sizes, **options):
         def train(**kept):
@@ -355,8 +340,8 @@ def contenders(
             Contender("bang-bang", 0, lung.BangBang(waveform), True),
             Contender("GPC", 0, online),
             Contender("MPC", 0, planners),
-            Contender("CNN", 0, unstack(convolved)[0]),
-            Contender("PID + MLP", 0, unstack(residual)[0]),
+            Contender("CNN", 0, taken(convolved, 0)),
+            Contender("PID + MLP", 0, taken(residual, 0)),
         ]
     rows += [Contender("MLP", seed, one) for seed, one in enumerate(unstack(own))]
     for seed, one in enumerate(unstack(shared)):

@@ -45,8 +45,7 @@ def error_rows(
     `between` are other lungs, as many as the first, and the names of those that count:
     controllers that are the same for all lungs are run in them too.
     """
-    rows: Rows = []
-    runs: dict[str, Any] = {}
+    rows, runs = [], {}
     pips, count = jnp.asarray(SEEN + UNSEEN), len(names)
     waveforms = stack([waveform] * count)
     place = (SEEN + UNSEEN).index(SHOWN)
@@ -165,13 +164,14 @@ def summarise(
     }
     reached = [row["highest"] for row in rows if row["controller"] in LEARNED]
     highest = float(np.max(reached))
+    error, gain = np.array([*learned.values()]), np.array([*gains.values()])
     words = [
-        f"Learned lungs: open-loop error {np.mean(list(learned.values())):.3f} cmH2O "
-        f"on average, {max(learned.values()):.3f} at most; relative to the better of "
-        f"single compartment and balloon at most {max(ratios.values()):.2f}.",
+        f"Learned lungs: open-loop error {error.mean():.3f} cmH2O on average, "
+        f"{error.max():.3f} at most; relative to the better of single compartment and "
+        f"balloon at most {max(ratios.values()):.2f}.",
         "A network for each lung: its error over that of the best PID is "
-        f"{np.mean(list(gains.values())):.2f} on average, {max(gains.values()):.2f} at "
-        "most, at peak pressures that are not trained on.",
+        f"{gain.mean():.2f} on average, {gain.max():.2f} at most, at peak pressures "
+        "that are not trained on.",
         f"A network for all lungs, over the best PID for all: {shared['unseen']:.2f} "
         f"on the lungs of the training, {shared['between']:.2f} on lungs between.",
         f"The highest pressure with what was learned: {highest:.1f} cmH2O; the limit "

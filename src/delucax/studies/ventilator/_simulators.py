@@ -35,27 +35,21 @@ class Kind(NamedTuple):
     learning_rate: float = 0.05
 
 
-_DOUBLE: Any = dict(central=0.5, share=0.4, imbalance=3.0)
 KINDS = {
     "single compartment": Kind(
         lambda key: lung.SingleCompartment(), "resistance compliance"
     ),
     "balloon": Kind(lambda key: lung.BalloonLung(), "resistance stiffness rest"),
     "double compartment": Kind(
-        lambda key: lung.DoubleCompartment(**_DOUBLE),
-        positive="resistance compliance imbalance",
-        free="central share",
-        steps=2,
+        lambda key: lung.DoubleCompartment(central=0.5, share=0.4, imbalance=3.0),
+        *("resistance compliance imbalance", "central share", 2),
     ),
     "neural ODE": Kind(
         lambda key: lung.NeuralLung(key=key), steps=2, learning_rate=1e-2
     ),
     "grey box": Kind(
         lambda key: lung.GreyBoxLung(key=key),
-        positive="single.resistance single.compliance",
-        free="network memory",
-        steps=2,
-        learning_rate=1e-2,
+        *("single.resistance single.compliance", "network memory", 2, 1e-2),
     ),
 }
 
@@ -138,19 +132,6 @@ def fitted(
         batch_size=32,
     )
     return lung.fit_lungs(stack(models), train, key=jr.fold_in(key, 5), **options).model
-
-
-def open_loop_rows(
-    names: list[str], test: lung.Breaths, models: dict[str, Any]
-) -> list[dict[str, Any]]:
-    """The error of each simulator on the breaths of each lung, a row each."""
-    error_of = eqx.filter_jit(eqx.filter_vmap(lung.Breaths.open_loop_error))
-    errors = {kind: np.asarray(error_of(test, model)) for kind, model in models.items()}
-    return [
-        {"lung": name, "simulator": kind, "mae": float(error)}
-        for kind, each in errors.items()
-        for name, error in zip(names, each, strict=True)
-    ]
 
 
 @eqx.filter_jit

@@ -109,22 +109,27 @@ def lung_study(
     for kind in size.physics:
         stage = kind.replace(" ", "_"), f"Fitted {kind}, {words}", fitting.fitted
         models[kind] = stages.training(*stage, kind, *given)
-    table = fitting.open_loop_rows(names, test, models)
+    error_of = eqx.filter_jit(eqx.filter_vmap(lung.Breaths.open_loop_error))
+    table: list[dict[str, Any]] = [
+        {"lung": name, "simulator": kind, "mae": float(error)}
+        for kind, model in models.items()
+        for name, error in zip(names, error_of(test, model), strict=True)
+    ]
 
     between = None
     if recorded is None:
         around = [size.between[i % len(size.between)] for i in range(len(lungs))]
         envs, others = (
-            stack([fitting.task_of(R, C, sensor_delay) for R, C in each])
-            for each in (lungs, around)
+            stack([fitting.task_of(*each, sensor_delay) for each in all])
+            for all in (lungs, around)
         )
         between = others, [_lung_name(*each) for each in size.between]
         judge = "the lungs themselves"
     else:
         # What no controller was trained in stands in for the lungs.
-        task: Any = dict(waveform=waveform, noise=NOISE, horizon=BREATH)
+        options: Any = dict(waveform=waveform, noise=NOISE, horizon=BREATH)
         boxes = unstack(models["grey box"])
-        envs = stack([lung.learned_lung(model, **task) for model in boxes])
+        envs = stack([lung.learned_lung(box, **options) for box in boxes])
         judge = "grey-box lungs fitted to the same breaths, for want of the lungs"
     trainer = making.Trainer(models["learned"], waveform, size, key)
     contenders = making.contenders(stages, envs, train, trainer)
