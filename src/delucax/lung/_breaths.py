@@ -236,26 +236,29 @@ class Explorer(AbstractController):
         check_waveform(self.waveform, "Explorer")
         check_step(self.dt, "Explorer")
 
+    def _pid(self, gains: Array) -> LeakyPID:
+        return LeakyPID(gains[0], gains[1], dt=self.dt, reference=self.waveform)
+
     def init(self, *, key=None):
-        key = jr.key(0) if key is None else key
-        keys = jr.split(key, 4)
+        keys = jr.split(jr.key(0) if key is None else key, 4)
         gains = self.scale * jr.choice(keys[0], jnp.array(GAINS), (2,))
         low = jnp.array([-30.0, 0.1, 0.0, 0.0, 0.05])
         high = jnp.array([30.0, 0.5, 1.0, 100.0, 0.3])
         bump = low + (high - low) * jr.uniform(keys[1], (5,))
         is_ramp = jr.bernoulli(keys[2], 0.15)
-        return gains, bump, is_ramp, LeakyPID(*gains, dt=self.dt).init()
+        return gains, bump, is_ramp, self._pid(gains).init()
 
     def __call__(self, t, y, state):
         gains, bump, is_ramp, memory = state
-        waveform = self.waveform
-        u, memory = LeakyPID(*gains, dt=self.dt, reference=waveform)(t, y, memory)
+        waveform, pid = self.waveform, self._pid(gains)
+        u, memory = pid(t, y, memory)
         since = waveform.share(t) * waveform.period
         inspiration = waveform.inspiration * waveform.period
-        half = bump[1] / 2
-        middle = half + bump[2] * (inspiration - bump[1])
-        triangle = bump[0] * jnp.maximum(0, 1 - jnp.abs(since - middle) / half)
-        ramp = bump[3] * jnp.maximum(0, 1 - since / bump[4])
+        height, width, place, top, duration = (bump[i] for i in range(5))
+        # The triangle lies within the inspiration, its middle at a place from 0 to 1.
+        middle = width / 2 + place * (inspiration - width)
+        triangle = height * jnp.maximum(0, 1 - jnp.abs(since - middle) / (width / 2))
+        ramp = top * jnp.maximum(0, 1 - since / duration)
         u = clip(u[0] + jnp.where(is_ramp, ramp, triangle), 0, 100)
         inhale = waveform.is_inspiration(t)
         u = jnp.stack([jnp.where(inhale, u, 0), jnp.where(inhale, 0.0, 1.0)])
@@ -347,10 +350,8 @@ def explore(
             f"{where}: abort must be a limit that some breaths stay below, but of "
             f"{200 * breaths} breaths only {count} stayed below {abort}: lower scale."
         )
-    u_in, u_out, pressure, truth = (
-        jnp.asarray(np.concatenate(column)[:breaths])
-        for column in zip(*kept, strict=True)
-    )
+    whole = [np.concatenate(column)[:breaths] for column in zip(*kept, strict=True)]
+    *columns, truth = map(jnp.asarray, whole)
     each = lambda value: None if value is None else jnp.full(breaths, float(value))
     lungs = each(resistance), each(compliance)
-    return Breaths(u_in, u_out, pressure, env.dt, *lungs, truth)
+    return Breaths(*columns, env.dt, *lungs, truth)

@@ -1,6 +1,7 @@
 """The main job in one command: from the pendulum's ODE to a trained controller; and the
 paper, in small."""
 
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +25,7 @@ from ..simulation import rollout, Trajectory
 from ._swing_up import BATCH, holds_upright, HORIZON, STEPS, train_swing_up
 from .paper import reproduce, STUDIES
 from .paper._finding import mean_and_half_width
-from .paper._policy_gradient import train_linear
+from .paper._gradients import train_linear
 from .paper._wall_clock import gymnasium_run, take_turns
 
 
@@ -171,9 +172,7 @@ def _writable(out: Path) -> Path:
     """The folder, made and tried before any work is done."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".writable"
-        probe.touch()
-        probe.unlink()
+        tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
         message = f"demo: out must be a folder to write to, got {out}: {error}"
         raise OSError(message) from error

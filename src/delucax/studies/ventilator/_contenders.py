@@ -1,5 +1,6 @@
 """The controllers of the study: designed, searched for, or trained in simulators."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -119,6 +120,13 @@ class Trainer(NamedTuple):
         for _ in shape:
             make = lambda keys, one=make: stack(map(one, keys))
         return make(jr.split(jr.fold_in(self.key, fold), shape))
+
+    def networks(
+        self, shape: tuple[int, ...], fold: int, steps: int, **sizes: Any
+    ) -> Callable[..., Any]:
+        """What trains networks of some sizes, stacked to `shape`."""
+        start = lambda: self.policies(shape, fold, **sizes)
+        return lambda **options: self(start(), steps, fold + 1, **options)
 
 
 def searched_pids(envs: Environment, trainer: Trainer) -> dict[str, LeakyPID | PID]:
@@ -291,46 +299,37 @@ def contenders(
 ) -> list[Contender]:
     """All controllers, in the order of the report."""
     size, waveform, count = trainer.size, trainer.waveform, trainer.count
+    training, steps = stages.training, size.controller_steps
     pids = stages.stage("pids", "PID grids", lambda: searched_pids(envs, trainer))
-
-    def networks(name, words, shape, fold, steps, sizes, **options):
-        def train(**kept):
-            start = trainer.policies(shape, fold, **sizes)
-            return trainer(start, steps, fold + 1, **options, **kept)
-
-        return stages.training(name, words, train)
 
     def residuals(**kept):
         # So that the network adds nothing before it is trained.
         offset = 100 * jax.nn.sigmoid(jnp.asarray(-2.0))
         summed = eqx.filter_vmap(lambda a, b: Summed(a, b, offset=offset))
         start = stack([summed(pids["leaky PID"], trainer.policies((count,), 9))])
-        return trainer(start, size.controller_steps, 10, **kept)
+        return trainer(start, steps, 10, **kept)
 
     # No control is a PID without gains, as which it compiles nothing of its own.
     none = trainer.pid(LeakyPID, (0.0, 0.0, 0.0))
     rows = [Contender("zero", 0, none, True), *pid_contenders(pids)]
-    words = f"A network for each lung, {size.seeds} seeds at once"
-    shape, steps = (size.seeds, count), size.controller_steps
-    own = networks("own", words, shape, 7, steps, dict(width=32))
-    words = f"A network for all lungs, {size.seeds} seeds at once"
-    shape, steps = (size.seeds,), size.shared_steps
+    seeds = f"{size.seeds} seeds at once"
+    networks = trainer.networks((size.seeds, count), 7, steps, width=32)
+    own = training("own", f"A network for each lung, {seeds}", networks)
     sizes = dict(zip(("width", "controls"), size.shared_network, strict=True))
-    alike: Any = dict(shared=True, limit=_CAREFUL)
-    shared = networks("shared", words, shape, 11, steps, sizes, **alike)
+    networks = trainer.networks((size.seeds,), 11, size.shared_steps, **sizes)
+    networks = functools.partial(networks, shared=True, limit=_CAREFUL)
+    shared = training("shared", f"A network for all lungs, {seeds}", networks)
     if size.tuned:
-        words = "PIDs with feed-forward tuned on the lungs"
-        given = envs, trainer, stages.say
-        rows += pid_contenders(stages.training("tuned_pids", words, tuned_pids, *given))
+        words, given = "PIDs with feed-forward tuned on the lungs", (envs, trainer)
+        tuned = training("tuned_pids", words, tuned_pids, *given, stages.say)
+        rows += pid_contenders(tuned)
     if size.extras:
-        words, given = "PIDs trained on", (trainer, pids)
-        more = stages.training("trained_pids", words, trained_pids, *given)
-        words = "A convolutional network for each lung"
-        shape, steps = (1, count), size.controller_steps
-        sizes = dict(kind="cnn", width=12)
-        convolved = networks("own_cnn", words, shape, 7, steps, sizes)
-        words = "A PID and a network for each lung"
-        residual = stages.training("residual", words, residuals)
+        more = training("trained_pids", "PIDs trained on", trained_pids, trainer, pids)
+        networks = trainer.networks((1, count), 7, steps, kind="cnn", width=12)
+        convolved = training(
+            "own_cnn", "A convolutional network for each lung", networks
+        )
+        residual = training("residual", "A PID and a network for each lung", residuals)
         learn = lambda: online_learners(train, pids, waveform, size.sensor_delay)
         online = stages.stage("online", "GPC around the best PIDs", learn)
         each = stack([waveform] * count)

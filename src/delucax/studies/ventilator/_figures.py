@@ -35,10 +35,12 @@ def tracking_figure(
     count = len(names)
     lungs = sorted({0, count // 2, count - 1})
     figure = NotebookFigure(figsize=(9.5, 6.2), layout="constrained")
-    axes = figure.subplots(2, len(lungs), squeeze=False, height_ratios=(1.15, 1))
+    panels: Any = [lungs, ["errors"] * len(lungs)]
+    axes: Any = figure.subplot_mosaic(panels, height_ratios=(1.15, 1))
     cost: Any = envs.cost
     waveform = lung.BreathWaveform.at_pip(unstack(cost)[0].waveform, SHOWN)
-    for ax, i in zip(axes[0], lungs, strict=True):
+    for i in lungs:
+        ax = axes[i]
         for k, (label, runs) in enumerate(shown.items()):
             pressure = np.asarray(runs.states[i, :, cost.index])
             times = float(envs.dt[i]) * np.arange(len(pressure))
@@ -48,12 +50,9 @@ def tracking_figure(
         ax.plot(times, target, color="0.2", lw=1, ls=(0, (4, 2)), label="target")
         style_axes(ax, size=_SIZE)
         ax.set(title=names[i], xlabel="time [s]", xlim=(0, 1.6))
-    axes[0, 0].set_ylabel("pressure [cmH2O]")
-    axes[0, -1].legend()
-    grid = axes[1, 0].get_gridspec()
-    for ax in axes[1]:
-        ax.remove()
-    ax = figure.add_subplot(grid[1, :])
+    axes[lungs[0]].set_ylabel("pressure [cmH2O]")
+    axes[lungs[-1]].legend()
+    ax = axes["errors"]
 
     chosen = ("MLP for all", "MPC", "CNN", "PID + MLP", "MLP", "least error")
     of = lambda label: [mean_error(rows, label, "unseen", name) for name in names]
