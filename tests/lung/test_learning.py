@@ -128,10 +128,10 @@ def test_expiration_counts_if_it_is_told_to():
     x, u = jnp.array([0.0, 0.0, 9.0]), jnp.zeros(2)  # 4 above PEEP
     assert_close(lung.BreathCost(lung.BreathWaveform(), 2)(2.0, x, u), 0.0)
     assert_close(lung.BreathCost(lung.BreathWaveform(), 2, 0.25)(2.0, x, u), 1.0)
-    env = dlx.make("lung/single_compartment", expiration=0.5)
-    assert_close(env.cost.expiration, 0.5)
-    with user_error(match="expiration must be at least 0, got -1"):
-        dlx.make("lung/single_compartment", expiration=-1.0)
+    env = dlx.make("lung/single_compartment", expiration_weight=0.5)
+    assert_close(env.cost.expiration_weight, 0.5)
+    with user_error(match="expiration_weight must be at least 0, got -1"):
+        dlx.make("lung/single_compartment", expiration_weight=-1.0)
 
 
 def test_stacks_come_apart():

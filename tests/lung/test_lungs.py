@@ -254,7 +254,7 @@ def test_valve_is_closed_and_fully_open_at_its_ends():
 def test_sensor_is_late():
     plant = lung.SingleCompartment()
     dynamics = dlx.Discretized(plant, dt=DT)
-    env = lung.ventilation(dynamics, rest=plant.resting(5.0), sensor_delay=2)
+    env = lung.ventilation(dynamics, resting_state=plant.resting(5.0), sensor_delay=2)
     controls = jnp.array([[30.0, 0.0]] * 6)
     states = dlx.open_loop(env.dynamics, env.initial_state, controls)
     now = states[:, env.cost.index]

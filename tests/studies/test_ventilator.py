@@ -16,7 +16,7 @@ from delucax.__main__ import main
 from delucax._module import stack
 from delucax.studies.ventilator import _simulators
 from delucax.studies.ventilator._contenders import (
-    best_of,
+    best_candidates,
     Contender,
     divergence_note,
     FeedForward,
@@ -160,8 +160,8 @@ def test_tuned_pids_are_the_best_that_were_tried(tmp_path):
 def test_what_has_no_finite_error_is_not_chosen():
     candidates = dict(number=jnp.arange(6).reshape(3, 2))
     errors = jnp.array([[jnp.inf, 2.0, 1.0], [3.0, jnp.inf, 4.0]])
-    assert best_of(candidates, errors, False)["number"].tolist() == [4, 1]
-    assert best_of(candidates, errors, True)["number"].tolist() == [4, 5]
+    assert best_candidates(candidates, errors, False)["number"].tolist() == [4, 1]
+    assert best_candidates(candidates, errors, True)["number"].tolist() == [4, 5]
     assert divergence_note(np.zeros(5), errors[:, 2]) == ""
     assert "2 of 6 errors are not finite" in divergence_note(np.zeros(5), errors)
     assert "in 1 of 5 steps" in divergence_note(np.eye(5)[0], errors[:, 2])

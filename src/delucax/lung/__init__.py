@@ -1,4 +1,4 @@
-"""Lungs, the breath that a ventilator is to make, and controllers that learn to."""
+"""Ventilators: lungs, breath waveforms, learned lung models and controllers."""
 
 from ._breath_controllers import (
     BangBang as BangBang,

@@ -24,20 +24,21 @@ class _Phases(NamedTuple):
 
 
 class Breathing(AbstractController):
-    r"""A controller of the inspiratory valve, made one of whole breaths.
+    r"""A controller of whole breaths, made of one of the inspiratory valve.
 
     In the inspiratory phase `u = (clip(inspiratory(y), 0, 100), valve(y))`. In the
-    expiratory phase the inspiratory valve is closed; or, with a `hold`, once half a
-    period has gone by it is opened to `hold (1 - exp(-5 s))`, `s` being the time since,
-    which keeps the airway open against a leak. The inspiratory controller begins each
-    breath as it began the first one, and observes none of the expiratory phase.
+    expiratory phase the inspiratory valve is closed; or, with an `expiratory_opening`
+    `u_e`, in the second half of a period it is opened to `u_e (1 - exp(-5 s))`, where
+    `s` is the time since the middle: this keeps the airway open against a leak. The
+    inspiratory controller is reset at the start of each breath, and is not called in
+    the expiratory phase.
 
     **Arguments:**
 
     - `inspiratory`: any controller of one control, such as a
         [`delucax.controllers.PID`][] whose reference is the waveform.
     - `waveform`: a [`delucax.lung.BreathWaveform`][].
-    - `hold`: [%], 0 by default; that of the original is 5.
+    - `expiratory_opening`: [%], 0 by default; that of the original is 5.
     - `valve`: a controller of the expiratory valve; by default it is 0 in the
         inspiratory phase and 1 in the expiratory phase.
 
@@ -63,7 +64,7 @@ class Breathing(AbstractController):
 
     inspiratory: AbstractController
     waveform: BreathWaveform
-    hold: Array = parameter(0.0)
+    expiratory_opening: Array = parameter(0.0)
     valve: AbstractController | None = None
 
     def __check_init__(self):
@@ -85,7 +86,7 @@ class Breathing(AbstractController):
         inner = _where(begins, self.inspiratory.init(key=None), state.inner)
         u_in, after = self.inspiratory(t, y, inner)
         late = jnp.maximum(self.waveform.share(t) - 0.5, 0) * self.waveform.period
-        held = self.hold * (1 - jnp.exp(-5 * late))
+        held = self.expiratory_opening * (1 - jnp.exp(-5 * late))
         u_in = jnp.where(inhale, clip(u_in[0], 0, 100), held)
         u_out, valve = jnp.where(inhale, 0.0, 1.0), None
         if self.valve is not None:
@@ -102,7 +103,7 @@ class Breathing(AbstractController):
 
 
 def _where(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
-    """One of two states. Random keys are those of `no`: none is drawn from twice."""
+    """Select one of two states. Random keys are those of `no`: none is used twice."""
 
     def where(yes, no):
         if not eqx.is_array(no) or jnp.issubdtype(no.dtype, jax.dtypes.prng_key):
@@ -149,8 +150,8 @@ class BreathPolicy(AbstractController):
     `u = 100 sigmoid(network(e[k], ..., e[k + 1 - errors], r[k + 1], r[k + 2], r[k],
     u[k - 1], ..., u[k - controls]) + shift)`,
 
-    all scaled; before the breath there are zeros. The sigmoid keeps the control within
-    the bounds of the valve and its gradient alive.
+    all scaled; before the breath there are zeros. The sigmoid enforces the bounds of
+    the valve without a zero gradient.
 
     The kind `"mlp"` is a fully connected network. The kind `"cnn"` first takes the
     means of the last 1, 2, ..., `errors` errors, and convolves them.

@@ -44,7 +44,7 @@ def read_breaths(
     **Arguments:**
 
     - `path`: the file.
-    - `length`: samples an inspiration, 29 by default.
+    - `length`: samples per inspiration, 29 by default.
     - `dt`: the time between samples [s]; the median of the file's by default.
     - `resistances`, `compliances`: the values that `R` and `C` may have; 5, 20, 50 and
         10, 20, 50 by default.
@@ -120,7 +120,9 @@ def _wrong(path: Path, line: Any, column: str, words: str) -> ValueError:
 def _breaths(
     path: Path, table: dict[str, np.ndarray], allowed: dict[str, Sequence[float]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where each breath begins and ends, if each is one breath of one lung.
+    """The first row of each breath and the row after its last.
+
+    Raises unless each breath is of one lung.
 
     `allowed` holds the values that a column may have.
     """

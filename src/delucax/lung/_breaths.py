@@ -114,7 +114,7 @@ class Breaths(eqx.Module):
 
         - `u_in`, `u_out`, `pressure`: the recording, vectors of one size.
         - `dt`: the time between samples [s].
-        - `length`: samples an inspiration, 29 by default.
+        - `length`: samples per inspiration, 29 by default.
 
         **Returns:** a [`delucax.lung.Breaths`][].
 
@@ -193,7 +193,7 @@ class Breaths(eqx.Module):
 
 
 class Explorer(AbstractController):
-    r"""A PID whose inspiratory control is disturbed, to learn a lung from.
+    r"""A PID with random gains and a random disturbance, to collect data of a lung.
 
     Its control is `(clip(pid + bump(t), 0, 100), 0)`, and `(0, 1)` in the expiratory
     phase. The gains `kp` and `ki` of the [`delucax.controllers.LeakyPID`][] are drawn
@@ -300,7 +300,7 @@ def explore(
     - `env`: a task of a lung, such as `delucax.make("lung/double_compartment")`.
     - `breaths`: how many.
     - `key`: a random key.
-    - `length`: samples a breath, 29 by default.
+    - `length`: samples per breath, 29 by default.
     - `pips`: the peak pressures to draw from, 10, 15, ..., 35 cmH2O by default.
     - `scale`: of the PID gains that are drawn, 1 by default.
     - `abort`: the abort limit [cmH2O], 70 by default.
@@ -308,7 +308,7 @@ def explore(
 
     **Returns:** a [`delucax.lung.Breaths`][], with `truth`.
 
-    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
     say), or hardly a breath stays below the limit.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,

@@ -1,4 +1,4 @@
-"""Lungs of physics, of networks, and of both, as models to be fitted to breaths."""
+"""Physical, neural and grey-box models of a lung, to be fitted to breaths."""
 
 from typing import Any, ClassVar
 
@@ -170,8 +170,9 @@ class GreyBoxLung(AbstractLung):
     `p = p_single(x) + p_std network(inflow, V / C, h)`,
     `dh/dt = rate memory(inflow, V / C, h)`,
 
-    with the state (inflow [L/s], opening, volume [L], memory h). The networks begin so
-    small that it begins as the physics. Smooth but for an opening of 0.
+    with the state (inflow [L/s], opening, volume [L], memory h). The first network starts
+    with a small output, so that the model starts near the physical one. Not smooth at
+    an opening of 0.
 
     **Arguments:**
 
@@ -225,7 +226,7 @@ class GreyBoxLung(AbstractLung):
 
     @property
     def valves(self) -> Valves:
-        """Those of the single compartment."""
+        """The valves of the single compartment."""
         return self.single.valves
 
     def _inputs(self, x: Array) -> Array:

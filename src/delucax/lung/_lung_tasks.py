@@ -1,4 +1,4 @@
-"""The lungs by name."""
+"""Tasks in which a lung is ventilated."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -65,7 +65,7 @@ def _task(
     if delay:
         dynamics = Delayed(dynamics, controls=delay)
         rest = dynamics.filled(rest)
-    env = ventilation(dynamics, waveform, **(dict(rest=rest) | options))
+    env = ventilation(dynamics, waveform, **(dict(resting_state=rest) | options))
     asked, least = waveform.peep, valves.peep
     # Checked where both are known. Numbers of another precision may differ by rounding.
     if is_concrete(asked) and is_concrete(least):
@@ -80,7 +80,7 @@ def _task(
 def balloon_lung(
     system: BalloonLung | None = None, *, horizon: int = 100, **options: Any
 ) -> Environment:
-    """Make a balloon breathe as a waveform says.
+    """Ventilate a balloon, so that the pressure tracks a waveform.
 
     The controls, the observation, the state and the cost are those of
     [`delucax.lung.ventilation`][]. Starts at rest at PEEP. Never terminates.
@@ -88,7 +88,7 @@ def balloon_lung(
     **Arguments:**
 
     - `system`: a [`delucax.lung.BalloonLung`][]; made of `options` by default.
-    - `horizon`: steps an episode, 100 by default.
+    - `horizon`: steps per episode, 100 by default.
     - `**options`: arguments of the lung; the control interval `dt` (0.03 by default),
         `solver` and `substeps` of [`delucax.Discretized`][]; `waveform`,
         `sensor_delay`, `noise` and others of [`delucax.lung.ventilation`][]; those of
@@ -96,7 +96,7 @@ def balloon_lung(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
+    **Raises:** `ValueError` on invalid numbers, or if the PEEP of `waveform` is below
     that of its valves.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
@@ -120,7 +120,7 @@ def delay_lung(
     horizon: int = 100,
     **options: Any,
 ) -> Environment:
-    """Make a balloon breathe through a long pipe, which what is done must first pass.
+    """Ventilate a balloon through a long pipe, with a transport delay.
 
     As `lung/balloon_lung`, but that the controls act some steps late, and that the pipe
     is elastic.
@@ -129,13 +129,13 @@ def delay_lung(
 
     - `system`: a [`delucax.lung.DelayLung`][]; made of `options` by default.
     - `delay`: steps until a control acts, 5 by default.
-    - `horizon`: steps an episode, 100 by default.
+    - `horizon`: steps per episode, 100 by default.
     - `**options`: as of `lung/balloon_lung`; `substeps` is 4 by default, because air
         rushes out of the pipe in some 25 ms.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
+    **Raises:** `ValueError` on invalid numbers, or if the PEEP of `waveform` is below
     that of its valves.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
@@ -157,19 +157,19 @@ def delay_lung(
 def single_compartment(
     system: SingleCompartment | None = None, *, horizon: int = 100, **options: Any
 ) -> Environment:
-    """Make a lung of one compartment breathe as a waveform says.
+    """Ventilate a lung of one compartment, so that the pressure tracks a waveform.
 
     As `lung/balloon_lung`, with another lung.
 
     **Arguments:**
 
     - `system`: a [`delucax.lung.SingleCompartment`][]; made of `options` by default.
-    - `horizon`: steps an episode, 100 by default.
+    - `horizon`: steps per episode, 100 by default.
     - `**options`: as of `lung/balloon_lung`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
+    **Raises:** `ValueError` on invalid numbers, or if the PEEP of `waveform` is below
     that of its valves.
 
     !!! example
@@ -187,7 +187,7 @@ def single_compartment(
 def double_compartment(
     system: DoubleCompartment | None = None, *, horizon: int = 100, **options: Any
 ) -> Environment:
-    """Make a lung of a fast and a slow compartment breathe, with delay and noise.
+    """Ventilate a lung of a fast and a slow compartment, with a late, noisy sensor.
 
     The plant of the ventilator study: as `lung/single_compartment`, with another lung
     and a real sensor.
@@ -195,14 +195,14 @@ def double_compartment(
     **Arguments:**
 
     - `system`: a [`delucax.lung.DoubleCompartment`][]; made of `options` by default.
-    - `horizon`: steps an episode, 100 by default.
+    - `horizon`: steps per episode, 100 by default.
     - `**options`: as of `lung/balloon_lung`; `sensor_delay` is 2 steps and `noise`
         0.2 cmH2O by default, and `substeps` is 2, because with the expiratory valve
         open the fast compartment of a narrow lung is empty within some 10 ms.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
+    **Raises:** `ValueError` on invalid numbers, or if the PEEP of `waveform` is below
     that of its valves.
 
     !!! example
@@ -224,11 +224,11 @@ def learned_lung(
     horizon: int = 100,
     **options: Any,
 ) -> Environment:
-    """Make a lung breathe that was learned from breaths: where controllers are trained.
+    """Ventilate a lung that was learned from breaths: controllers are trained in it.
 
-    As `lung/balloon_lung`; its time step is that of the breaths, and what it is let out
-    to is the pressure that they start at, whatever the PEEP of `waveform`. The sensor
-    of a [`delucax.lung.LungModel`][] is as late as the model says.
+    As `lung/balloon_lung`; its time step is that of the breaths, and it exhales to
+    their start pressure regardless of the PEEP of `waveform`. The sensor of a
+    [`delucax.lung.LungModel`][] has the delay of the model.
 
     **Arguments:**
 
@@ -236,13 +236,13 @@ def learned_lung(
         default the learned lung that comes with the library, from breaths of the task
         `lung/double_compartment`; its sensor is two samples late, and so is its
         pressure. In the repository, `python -m benchmarks.learned_lung` makes it.
-    - `horizon`: steps an episode, 100 by default.
+    - `horizon`: steps per episode, 100 by default.
     - `**options`: `waveform`, `noise`, `limit` and others of
         [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if `model` is another one, or on illegal numbers.
+    **Raises:** `ValueError` if `model` is another one, or on invalid numbers.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -273,4 +273,6 @@ def learned_lung(
             f"{where}: model must be a LearnedLung or a LungModel, got "
             f"{type(model).__name__}."
         )
-    return ventilation(dynamics, horizon=horizon, **(dict(rest=rest) | options))
+    return ventilation(
+        dynamics, horizon=horizon, **(dict(resting_state=rest) | options)
+    )

@@ -93,7 +93,7 @@ def fit_lungs(
 
     **Returns:** a [`delucax.training.Fitted`][], that of the last part.
 
-    **Raises:** `ValueError` if the arguments are illegal, `RuntimeError` if it
+    **Raises:** `ValueError` if the arguments are invalid, `RuntimeError` if it
     diverges.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
@@ -165,7 +165,7 @@ def breath_error(
     pips: Any = PIPS,
     horizon: int = LENGTH,
 ) -> Array:
-    """How far from the target a controller keeps the pressure, on average.
+    """The mean absolute error of the pressure under a controller.
 
     **Arguments:**
 
@@ -175,12 +175,12 @@ def breath_error(
     - `key`: a random key, for the noise of the sensor.
     - `pips`: the peak pressures to follow, each in an episode of its own;
         10, 15, ..., 35 cmH2O by default.
-    - `horizon`: steps an episode, 29 by default: 0.87 s of an inspiration.
+    - `horizon`: steps per episode, 29 by default: 0.87 s of an inspiration.
 
     **Returns:** the mean of `|p - r|` over the steps of each episode, shape `(pips,)`
         [cmH2O]. NaN where a run failed.
 
-    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
     say).
 
     !!! example
@@ -303,16 +303,16 @@ def train_controllers(
     - `steps`: 400 by default.
     - `learning_rate`: 1e-2 by default.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
-    - `horizon`: steps an episode, 29 by default.
+    - `horizon`: steps per episode, 29 by default.
     - `trainable`, `progress`, `checkpoint`: of [`delucax.training.fit`][]; the weights,
         no bar and no file by default.
     - `throw`: raise if an error or its gradient is NaN or infinite (default); if false,
-        that gradient counts as 0, the other controllers are trained as if nothing were,
-        and `history["diverged"]` counts those controllers at each step.
+        a gradient that is not finite is replaced by 0, the other controllers are
+        unaffected, and `history["diverged"]` counts such controllers at each step.
 
     **Returns:** a [`delucax.training.Fitted`][].
 
-    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
     say), `RuntimeError` as `throw` says.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
@@ -410,7 +410,7 @@ def pid_grid(
         of each in each lung, shape `(lungs, grid)` [cmH2O]; that of one lung for a
         single task.
 
-    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
     say).
 
     !!! example

@@ -120,7 +120,7 @@ class _AbstractCompartment(_AbstractRigidPipe):
         return jnp.stack([0 * volume, 0 * volume, volume])
 
     def vector_field(self, t, x, u, w):
-        inflow, opening = self.valves.slopes(x[0], x[1], u)
+        inflow, opening = self.valves.derivatives(x[0], x[1], u)
         filling = (self.pressure(x) - self._inside(x)) / self.resistance
         return jnp.stack([inflow, opening, filling])
 
@@ -132,7 +132,7 @@ class SingleCompartment(_AbstractCompartment):
 
     where the pressure `p` of the airway balances the flows of the valves,
     [`delucax.lung.Valves.airway_pressure`][]. The state is (inflow [L/s], opening,
-    volume [L]). Smooth but for an opening of 0.
+    volume [L]). Not smooth at an opening of 0.
 
     With the inspiratory valve held and no way out but a leak `G`, the pressure settles
     at `flow(u_in) / G`; with the expiratory valve open and no leak, at
@@ -180,9 +180,9 @@ class DoubleCompartment(_AbstractRigidPipe):
     A share of the resistance is central, `R_0 = central R`; the rest is that of both
     ways in parallel, `1 / (1 / R_1 + 1 / R_2) = (1 - central) R`, with
     `R_2 = imbalance R_1`. The compliance is divided as `C_1 = share C` and
-    `C_2 = (1 - share) C`. So a flow that begins meets `R`, and slow breathing `C`. The
-    state is (inflow [L/s], opening, fast [L], slow [L]), the latter two volumes. Smooth
-    but for an opening of 0.
+    `C_2 = (1 - share) C`. So `R` is the resistance at high frequencies, and `C` the
+    static compliance. The state is (inflow [L/s], opening, fast [L], slow [L]), the
+    latter two volumes. Not smooth at an opening of 0.
 
     **Arguments:**
 
@@ -241,7 +241,7 @@ class DoubleCompartment(_AbstractRigidPipe):
         return jnp.stack([0 * volume, 0 * volume, fast, slow])
 
     def vector_field(self, t, x, u, w):
-        inflow, opening = self.valves.slopes(x[0], x[1], u)
+        inflow, opening = self.valves.derivatives(x[0], x[1], u)
         fast, slow, p1, p2, inside = self._parts(x)
         total = (self.pressure(x) - inside) / self.resistance
         centre = inside + (1 - self.central) * self.resistance * total
@@ -263,10 +263,10 @@ class BalloonLung(_AbstractCompartment):
 
     `dV/dt = (p - P(V)) / R`, `P(V) = stiffness (1 - (r0 / r)^6) / (r0^2 r)`,
 
-    with `r` and `r0` the radii of spheres of the volumes `V` and `rest`. It is stiff at
-    first, gives way, and past `V = 2.65 rest` the pressure falls as it grows. The state
-    is (inflow [L/s], opening, volume [L]). Smooth where the volume is above a tenth of
-    `rest`, below which the pressure is held, but for an opening of 0.
+    with `r` and `r0` the radii of spheres of the volumes `V` and `rest`. The pressure
+    rises, is greatest at `V = 2.65 rest`, and then falls. The state is (inflow [L/s],
+    opening, volume [L]). Not smooth at an opening of 0 and at a tenth of `rest`, below
+    which the pressure is constant.
 
     **Arguments:**
 
@@ -356,7 +356,7 @@ class DelayLung(AbstractLung):
         return jnp.stack([0 * volume, 0 * volume, pressure + 0 * volume, volume])
 
     def vector_field(self, t, x, u, w):
-        inflow, opening = self.valves.slopes(x[0], x[1], u)
+        inflow, opening = self.valves.derivatives(x[0], x[1], u)
         inside = balloon_pressure(x[3], self.rest, self.stiffness)
         filling = (x[2] - inside) / self.resistance
         outflow = self.valves.outflow(x[1], x[2])

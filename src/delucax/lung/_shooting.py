@@ -21,10 +21,10 @@ from ._waveform import as_pips, BreathWaveform, check_waveform, LENGTH, PIPS
 class ShootingMPC(AbstractController):
     r"""Plans the next controls in a learned lung, at every step anew.
 
-    The learned lung runs beside the true one under the same controls, and is drawn to
-    what the sensor reads. The plan is improved by some steps of Adam on the error to
-    the target, and its first control is used. With `u = 100 sigmoid(z)` it keeps the
-    bounds of the valve.
+    The learned lung runs beside the true one under the same controls, and its pressure
+    is corrected towards the measured one by a fixed gain. The plan is improved by some
+    steps of Adam on the error to the target, and its first control is applied. With
+    `u = 100 sigmoid(z)` it keeps the bounds of the valve.
 
     **Arguments:**
 
@@ -103,20 +103,20 @@ def least_error(
 ) -> Array:
     """About the least error that any control of the inspiratory valve could have.
 
-    The controls of each breath are chosen by gradient descent with the true lung at
-    hand, nothing to measure and no noise: what a controller that is right from the
-    start would reach, to the accuracy of the descent.
+    The controls of each breath are found by gradient descent with full knowledge of the
+    true lung and without noise: a bound on all controllers, to the accuracy of the
+    descent.
 
     **Arguments:**
 
     - `env`: a task of a lung.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
     - `steps`: of the descent, 600 by default.
-    - `horizon`: steps an episode, 29 by default.
+    - `horizon`: steps per episode, 29 by default.
 
     **Returns:** the mean error at each of the pressures, shape `(pips,)` [cmH2O].
 
-    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
     say).
 
     !!! example
@@ -167,7 +167,7 @@ def _descended(
     optimiser: optax.GradientTransformation,
     steps: int,
 ) -> tuple[Array, Array]:
-    """Where gradient descent ends, and the error before each of its steps."""
+    """The end of a gradient descent, and the error before each of its steps."""
 
     def descend(carry, _):
         z, memory = carry

@@ -1,4 +1,4 @@
-"""The pressure that a clinician asks for, breath by breath."""
+"""The target waveform of the airway pressure."""
 
 from typing import Any, TypeVar
 
@@ -40,9 +40,9 @@ class BreathWaveform(eqx.Module):
     **Arguments:**
 
     - `pip`: the peak inspiratory pressure [cmH2O], 35 by default.
-    - `peep`: the positive end-expiratory pressure [cmH2O], 5 by default. It is what is
-        asked for; what a lung is let out to is the `peep` of its
-        [`delucax.lung.Valves`][], so that whoever changes one changes both.
+    - `peep`: the positive end-expiratory pressure [cmH2O], 5 by default. This is the
+        target; the pressure that a lung exhales to is the `peep` of its
+        [`delucax.lung.Valves`][]. Change both together.
     - `rate`: breaths a minute, 20 by default.
     - `keypoints`: shares of a period, increasing, from 0 to 1; `(0, 1/3, 1/2, 1)` by
         default. The pressure may jump from the end of a breath to the next one.
@@ -108,7 +108,7 @@ class BreathWaveform(eqx.Module):
         return 60 / self.rate
 
     def share(self, t: Any) -> Array:
-        """How much of its breath has gone by at time `t`, from 0 to 1.
+        """The elapsed share of the breath at time `t`, from 0 to 1.
 
         **Arguments:** `t`: time [s].
 
@@ -182,7 +182,7 @@ class BreathWaveform(eqx.Module):
 
 
 def _slack(breaths: Array) -> Array:
-    """Of a period: by how much rounding of `k dt` may be off after so many breaths."""
+    """A bound on the rounding error of `k dt` after so many breaths, in periods."""
     eps = jnp.finfo(breaths.dtype).eps
     return jnp.clip(2 * eps * jnp.abs(breaths), 1e-6, 1e-3)
 
@@ -193,10 +193,10 @@ def check_waveform(waveform: Any, where: str) -> None:
 
 
 def as_pips(pips: Any, tree: Any, where: str) -> Array:
-    """`pips` as a vector of peak pressures, or an error: none may be below the PEEP of
-    a waveform in a pytree.
+    """`pips` as a vector of peak pressures, none of them below the PEEP of a waveform
+    in a pytree.
 
-    Under `jax.vmap` over them, which is what they are for, they could not be looked at.
+    They are mapped over with `jax.vmap`, inside which their values cannot be checked.
     """
     array = as_float_array(pips)
     if not eqx.is_inexact_array(array) or array.ndim != 1 or not array.size:

@@ -1,5 +1,4 @@
-"""The main job in one command: from the pendulum's ODE to a trained controller; and the
-paper, in small."""
+"""The demo: from the pendulum's ODE to a trained controller, and the paper in small."""
 
 import tempfile
 import time

@@ -38,9 +38,9 @@ TRAINING_STEPS, EPISODES, LONGEST = 200, 32, 100
 LOOKAHEAD = 30
 
 
-class Pump(AbstractController):
-    """Push as hard as is allowed the way that it moves, as one does a swing: the least
-    cost by far that is known of the mountain cars before it is refined."""
+class EnergyPumping(AbstractController):
+    """Full force in the direction of motion, which pumps energy into a swing: the best
+    first guess that is known for the mountain cars."""
 
     push: Array
 
@@ -205,14 +205,14 @@ FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
         "PPO": lambda name: _by_actor_critic(name, PPO),
     },
 }
-"""What is compared: how each controller is made for the task of a name."""
+"""The methods by family: each makes a controller for the task of a name."""
 
 
 @functools.cache
 def agent_of(name: str, method: str) -> Any:
     """The controller, designed at the equilibrium or trained.
 
-    **Raises:** `Unsuitable` if it needs what the task has not got.
+    **Raises:** `Unsuitable` if the task lacks what the method needs.
     """
     (maker,) = (family[method] for family in FAMILIES.values() if method in family)
     try:
@@ -273,14 +273,14 @@ def _costs(env: Environment, agent: Any, keys: Any) -> Any:
 
 @functools.cache
 def _batch(task: str, method: str, block: int) -> tuple[list[float], float | None]:
-    """The costs of a block of seeds, and microseconds a step of one of them."""
+    """The costs of a block of seeds, and microseconds per step of one of them."""
     env = task_of(task)
     seeds = range(block * BATCH, (block + 1) * BATCH)
     keys = jax.vmap(jax.random.key)(jnp.array(seeds))
     if method == "plan":
         guides = [agent for name in GUIDES if (agent := _suited(task, name))]
         if task in PUMPED:
-            guides.append(Pump(jnp.ones(1)))
+            guides.append(EnergyPumping(jnp.ones(1)))
         plans = [_planned(env, guides, key) for key in keys]
         pairs = zip(plans, keys, strict=True)
         return [float(_cost(env, plan, key)) for plan, key in pairs], None
@@ -298,7 +298,7 @@ def _batch(task: str, method: str, block: int) -> tuple[list[float], float | Non
 @experiment.parametrize("method", METHODS)
 @experiment.seeds(BATCH)
 def scoreboard(task: str, method: str, seed: int) -> dict[str, Any]:
-    """The cost of an episode, and microseconds a step."""
+    """The cost of an episode, and microseconds per step."""
     try:
         costs, speed = _batch(task, method, seed // BATCH)
     except Unsuitable as error:

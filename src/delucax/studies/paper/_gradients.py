@@ -93,7 +93,7 @@ def policy_gradient(small: bool = False) -> Finding:
 
 @functools.cache
 def _mean_cost() -> Callable[..., Any]:
-    """Of a step from hanging. One object, so that a second seed does not compile."""
+    """The mean cost per step from hanging; cached, as a new function would compile."""
     env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
     total = training.expected_cost(env, batch=1, horizon=EPISODE)
     return lambda controller, key: total(controller, key) / EPISODE
@@ -119,7 +119,7 @@ def descent_claim(first: int | None, faster: int | None) -> Claim:
 
 
 def _first(losses: np.ndarray) -> int | None:
-    """How many rollouts until the cost is at most the goal."""
+    """The number of rollouts until the cost is at most the goal."""
     below = np.flatnonzero(losses <= GOAL)
     return int(below[0]) + 1 if below.size else None
 

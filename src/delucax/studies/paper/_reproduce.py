@@ -110,7 +110,7 @@ def _held(rows: list[dict[str, Any]]) -> str:
 
 
 def _run(name: str, out: Path, small: bool, say: Callable[[str], Any]) -> Finding:
-    """What a study finds: if it fails, that."""
+    """The finding of a study; if it raises, a claim that does not hold."""
     options = {}
     if name == "ventilator":
         options = {"out": out / ("lung-small" if small else "lung"), "say": say}

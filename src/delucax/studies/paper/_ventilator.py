@@ -11,7 +11,7 @@ from ._finding import Claim, Finding
 
 
 def ventilator(small: bool, out: Path, say: Callable[[str], Any]) -> Finding:
-    """What `python -m delucax lung` finds, in the folder that it writes to."""
+    """The results of `python -m delucax lung`, from the folder that it writes to."""
     lung_study(out, small=small, say=lambda line: say(f"  {line}"))
     summary = json.loads((out / "summary.json").read_text())
     simulators = summary["simulators"]

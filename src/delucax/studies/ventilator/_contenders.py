@@ -32,9 +32,9 @@ TRUE_PID = dict(
 )
 """The gains of the true PIDs that are tried."""
 _TUNED_FURTHER = 4
-"""How many of the PIDs that are drawn at random are trained on."""
+"""The number of PIDs drawn at random that are trained further."""
 _CAREFUL = ABORT - 15
-"""One that does not know its lung has to stay well below the limit."""
+"""The alarm of the network for all lungs: well below the limit, as no lung is known."""
 
 
 class Summed(AbstractController):
@@ -95,7 +95,7 @@ class Trainer(NamedTuple):
 
     @property
     def count(self) -> int:
-        """How many lungs there are."""
+        """The number of lungs."""
         return self.simulators.dt.shape[0]
 
     def __call__(
@@ -124,7 +124,7 @@ class Trainer(NamedTuple):
     def networks(
         self, shape: tuple[int, ...], fold: int, steps: int, **sizes: Any
     ) -> Callable[..., Any]:
-        """What trains networks of some sizes, stacked to `shape`."""
+        """A function that trains networks of some sizes, stacked to `shape`."""
         start = lambda: self.policies(shape, fold, **sizes)
         return lambda **options: self(start(), steps, fold + 1, **options)
 
@@ -144,7 +144,7 @@ def searched_pids(envs: Environment, trainer: Trainer) -> dict[str, LeakyPID | P
 def trained_pids(
     trainer: Trainer, pids: dict[str, Any], *, checkpoint: Path, progress: bool
 ) -> dict[str, Any]:
-    """Those PIDs trained on, by themselves and with a feed-forward."""
+    """The PIDs trained further by the gradient, alone and with a feed-forward."""
     forward = FeedForward(trainer.waveform, jnp.asarray(0.3))
     forwards = stack([forward] * trainer.count)
     starts = {f"trained {name}": pid for name, pid in pids.items()}
@@ -195,7 +195,7 @@ def _errors(
     return jnp.where(jnp.isfinite(errors), errors, jnp.inf)
 
 
-def best_of(candidates: Any, errors: Any, shared: bool) -> Any:
+def best_candidates(candidates: Any, errors: Any, shared: bool) -> Any:
     """The candidate with the least error in each lung, or on average over all; errors
     have the shape `(lungs, candidates)`."""
     if shared:
@@ -233,7 +233,7 @@ def tuned_pids(
             judged = _errors(envs, candidates, judge_key, not shared)
             if words := divergence_note(trained.history["diverged"], judged):
                 say(f"  {label}: {words}")
-            best[label] = best_of(candidates, judged, shared)
+            best[label] = best_candidates(candidates, judged, shared)
     return best
 
 
@@ -275,7 +275,7 @@ def online_learners(
         error = jnp.zeros(identified.state_size).at[0].set(1.0)
         cost = Tracking(error, jnp.zeros(1), _Target(waveform, len(error)))
         online = gpc(model, cost, base=base, horizon=10, optimiser=newton)
-        # All that the fit leaves over moves the lung; the sensor is taken at its word.
+        # All of the residual variance is process noise; the sensor has next to none.
         process = jnp.diag(NOISE**2 * error)
         mean = error.at[1].set(1.0) * waveform.peep
         kalman = KalmanFilter(identified, process, 1e-4 * jnp.eye(1), mean=mean)

@@ -1,4 +1,4 @@
-"""How the controllers of the study do at the lungs: its rows, figures and words."""
+"""The results of the ventilator study: its rows, saved controllers and summary."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -116,7 +116,8 @@ def save_controllers(
 
 
 def mean_error(rows: Rows, label: str, split: str, lung: str | None = None) -> float:
-    """Of a controller, over its seeds, in one lung or all; NaN if it was not run."""
+    """The mean error of a controller over its seeds, in one lung or in all; NaN if it
+    was not run."""
     of = lambda row: (row["controller"], row["split"]) == (label, split)
     errors = [r["mae"] for r in rows if of(r) and lung in (None, r["lung"])]
     return float(np.mean(errors)) if errors else float("nan")

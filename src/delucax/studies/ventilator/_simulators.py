@@ -159,8 +159,8 @@ def closed_loop_errors(
     controllers: Any,
     waveform: lung.BreathWaveform,
 ) -> dict[str, np.ndarray]:
-    """How far the pressures in each simulator are from those in the lung, each under
-    the same controller and without noise, by kind: shape `(lungs,)`."""
+    """The mean distance of the pressures in each simulator from those in the lung,
+    under the same controller and without noise, by kind: shape `(lungs,)`."""
     waveforms = stack([waveform] * len(envs.dt))
     whole = eqx.filter_vmap(lung.Breathing)(controllers, waveforms)
     options: Any = jnp.asarray(SEEN), jr.key(0)[None], INSPIRATION

@@ -17,8 +17,10 @@ SEEN = (10.0, 15.0, 20.0, 25.0, 30.0, 35.0)
 UNSEEN = (12.5, 17.5, 22.5, 27.5, 32.5)
 SHOWN = 27.5
 """The peak pressure of the breaths in the figures, one of those."""
-INSPIRATION, BREATH = 29, 100
-"""Steps of an inspiration that is learned from, and of a whole breath."""
+INSPIRATION = 29
+"""Steps of an inspiration, from which lungs are learned."""
+BREATH = 100
+"""Steps of a whole breath."""
 ABORT = 60.0
 """The pressure that no controller is to reach [cmH2O]."""
 LUNGS = tuple((R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0))
@@ -32,7 +34,7 @@ NOISE = 0.2
 
 
 class Size(NamedTuple):
-    """How much of everything; the full study by default.
+    """The sizes of a study; the full one by default.
 
     `shared_network` are hidden units of the network for all lungs, and how many
     controls it is given; `tuned` is how many PIDs with feed-forward are drawn;
@@ -134,7 +136,7 @@ class Stages:
         return self.stage(name, words, lambda: train(*args, **options))
 
     def stage(self, name: str, words: str, make: Callable[[], Any]) -> Any:
-        """What `make` returns, or what it returned before, from its file."""
+        """The value of `make()`; if it was made before, from its file."""
         path = self.out / f"{name}.dlx"
         if path.exists():
             stored = load(path)

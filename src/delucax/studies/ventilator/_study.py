@@ -17,7 +17,7 @@ import numpy as np
 from ... import lung
 from ..._check import check_count
 from ..._module import stack, unstack
-from . import _contenders as making, _report as reporting, _simulators as fitting
+from . import _contenders, _report, _simulators
 from ._stages import BREATH, FULL, NOISE, SEEN, SENSOR_DELAY, SMALL, Stages, UNSEEN
 
 
@@ -64,7 +64,7 @@ def lung_study(
 
     **Returns:** the rows of the report, dictionaries.
 
-    **Raises:** `ValueError` if an argument is illegal, the folder holds a study with
+    **Raises:** `ValueError` if an argument is invalid, the folder holds a study with
         other settings, a file in it is damaged, or the data are not what they should
         be; `OSError` if a file cannot be read or written.
 
@@ -93,21 +93,21 @@ def lung_study(
 
     if recorded is None:
         lungs = size.lungs
-        breaths = stages.stage("breaths", "Breaths", lambda: fitting.explored(size))
+        breaths = stages.stage("breaths", "Breaths", lambda: _simulators.explored(size))
     else:
-        make = lambda: fitting.grouped(recorded)
+        make = lambda: _simulators.grouped(recorded)
         lungs, breaths = stages.stage("breaths", "Breaths", make)
-        if words := fitting.left_out(recorded, breaths):
+        if words := _simulators.left_out(recorded, breaths):
             say(words)
         kinds = dict.fromkeys((*size.physics, "grey box"))
         size = size._replace(physics=tuple(kinds), between=())
     names = [_lung_name(*each) for each in lungs]
-    train, test = fitting.divided(breaths, jr.fold_in(key, 1))
+    train, test = _simulators.divided(breaths, jr.fold_in(key, 1))
     words, given = f"all {len(lungs)} at once", (train, size, key)
-    learned = "simulators", f"Learned lungs, {words}", fitting.learned
+    learned = "simulators", f"Learned lungs, {words}", _simulators.learned
     models: dict[str, Any] = {"learned": stages.training(*learned, *given)}
     for kind in size.physics:
-        stage = kind.replace(" ", "_"), f"Fitted {kind}, {words}", fitting.fitted
+        stage = kind.replace(" ", "_"), f"Fitted {kind}, {words}", _simulators.fitted
         models[kind] = stages.training(*stage, kind, *given)
     error_of = eqx.filter_jit(eqx.filter_vmap(lung.Breaths.open_loop_error))
     table: list[dict[str, Any]] = [
@@ -120,7 +120,7 @@ def lung_study(
     if recorded is None:
         around = [size.between[i % len(size.between)] for i in range(len(lungs))]
         envs, others = (
-            stack([fitting.task_of(*each, sensor_delay) for each in all])
+            stack([_simulators.task_of(*each, sensor_delay) for each in all])
             for all in (lungs, around)
         )
         between = others, [_lung_name(*each) for each in size.between]
@@ -131,48 +131,48 @@ def lung_study(
         boxes = unstack(models["grey box"])
         envs = stack([lung.learned_lung(box, **options) for box in boxes])
         judge = "grey-box lungs fitted to the same breaths, for want of the lungs"
-    trainer = making.Trainer(models["learned"], waveform, size, key)
-    contenders = making.contenders(stages, envs, train, trainer)
+    trainer = _contenders.Trainer(models["learned"], waveform, size, key)
+    contenders = _contenders.contenders(stages, envs, train, trainer)
     if size.extras and recorded is None:
         pids = next(c.controllers for c in contenders if c.label == "PID")
         words = "Simulators and lungs under the same PIDs"
-        make = lambda: fitting.closed_loop_errors(envs, models, pids, waveform)
+        make = lambda: _simulators.closed_loop_errors(envs, models, pids, waveform)
         closed = stages.stage("closed_loop", words, make)
         for row in table:
             errors = closed[row["simulator"]]
             row["closed_loop_mae"] = float(errors[names.index(row["lung"])])
     stages.write_table("simulators.csv", table)
     keys = jr.split(jr.fold_in(key, 99), size.noises)
-    rows, runs = reporting.error_rows(contenders, envs, names, waveform, keys, between)
+    rows, runs = _report.error_rows(contenders, envs, names, waveform, keys, between)
     if size.bound_steps:
         pips = jnp.asarray(SEEN + UNSEEN)
         of = lambda env: lung.least_error(env, pips=pips, steps=size.bound_steps)
         words, make = "The least error, with the lung at hand", eqx.filter_vmap(of)
         bound = stages.stage("bound", words, lambda: make(envs))
-        rows += reporting.rows_of(names, "least error", 0, np.asarray(bound))
+        rows += _report.rows_of(names, "least error", 0, np.asarray(bound))
     stages.write_table("report.csv", rows)
     place = stages.out / "controllers"
-    unsafe = reporting.save_controllers(place, contenders, names, waveform, rows)
-    summary = reporting.summarise(rows, table, stages.seconds, judge, unsafe)
+    unsafe = _report.save_controllers(place, contenders, names, waveform, rows)
+    summary = _report.summarise(rows, table, stages.seconds, judge, unsafe)
     stages.write("summary.json", json.dumps(summary, indent=1) + "\n")
     for line in summary["words"]:
         say(line)
-    best = {"best PID": reporting.best_of(rows, reporting.PID_ROWS, "unseen")[1]}
+    best = {"best PID": _report.best_of(rows, _report.PID_ROWS, "unseen")[1]}
     shown = {n: runs[best.get(n, n)] for n in ("best PID", "MLP", "MLP for all")}
     if importlib.util.find_spec("matplotlib") is None:
         say("No figures: they need matplotlib (pip install 'delucax[plot]').")
     else:
-        from . import _figures as figures
+        from . import _figures
 
-        figure = figures.tracking_figure(envs, shown, names, rows)
+        figure = _figures.tracking_figure(envs, shown, names, rows)
         figure.savefig(stages.out / "controllers.png", dpi=130)
-        figure = figures.simulator_figure(test, models, names, table)
+        figure = _figures.simulator_figure(test, models, names, table)
         figure.savefig(stages.out / "simulators.png", dpi=130)
-        figures.draw_breath(stages.out / "breath.gif", envs, shown["MLP"])
+        _figures.draw_breath(stages.out / "breath.gif", envs, shown["MLP"])
     say(f"Written to {stages.out}/ in {time.perf_counter() - began:.0f} s.")
     return rows
 
 
 def _lung_name(resistance: float, compliance: float) -> str:
-    """What a lung is called in the report."""
+    """The name of a lung in the report."""
     return f"R{resistance:g}C{compliance:g}"
