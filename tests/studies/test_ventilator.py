@@ -147,8 +147,8 @@ def test_tuned_pids_are_the_best_that_were_tried(tmp_path):
     size = FULL._replace(tuned=20, pid_steps=3)
     options = dict(checkpoint=tmp_path / "tuned.fit", progress=False)
     said = []
-    trainer = Trainer(envs, waveform, size, KEY)
-    found = tuned_pids(envs, trainer, said.append, **options)
+    trainer = Trainer(envs, waveform, size, KEY, said.append)
+    found = tuned_pids(envs, trainer, **options)
     assert len(found) == 4 and not said
     error = lambda env, pid: jnp.mean(lung.breath_error(env, pid, key=KEY))
     own = eqx.filter_vmap(error)(envs, found["tuned PID + feed-forward"])

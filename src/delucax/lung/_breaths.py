@@ -141,8 +141,7 @@ class Breaths(eqx.Module):
             )
         for name, column in zip(("u_in", "u_out", "pressure"), columns, strict=True):
             check_finite(column, name, where)
-        closed = np.concatenate([[False], columns[1] < 0.5, [False]]).astype(int)
-        edges = np.diff(closed)
+        edges = np.diff((columns[1] < 0.5).astype(int), prepend=0, append=0)
         starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
         fits = starts[ends - starts >= length]
         if not len(fits):

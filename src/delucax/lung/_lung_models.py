@@ -170,9 +170,9 @@ class GreyBoxLung(AbstractLung):
     `p = p_single(x) + p_std network(inflow, V / C, h)`,
     `dh/dt = rate memory(inflow, V / C, h)`,
 
-    with the state (inflow [L/s], opening, volume [L], memory h). The first network starts
-    with a small output, so that the model starts near the physical one. Not smooth at
-    an opening of 0.
+    with the state (inflow [L/s], opening, volume [L], memory h). The first network
+    starts with a small output, so that the model starts near the physical one. Not
+    smooth at an opening of 0.
 
     **Arguments:**
 

@@ -127,24 +127,24 @@ def fit_lungs(
     learned = isinstance(models, LearnedLung)
     parts = [(True, teacher_steps, "teacher_steps", 2)] if learned else []
     parts += [(False, steps, "steps", 1)]
+    options: Any = dict(trainable=trainable, progress=progress, data=data)
     fitted = None
     for teacher, count, name, times in parts:
         if check_count(count, name, where, least=0) == 0:
             continue
         schedule = optax.cosine_decay_schedule(times * learning_rate, count)
         adam = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+        if checkpoint is not None:
+            ending = ".first" if teacher else ""
+            options |= dict(checkpoint=f"{checkpoint}{ending}", checkpoint_every=100)
         fitted = fit(
             _Simulation(scale, teacher),
             models,
             adam if optimiser is None else optimiser,
             count,
             key=jax.random.fold_in(key, int(teacher)),
-            data=data,
             batch_size=batch_size,
-            trainable=trainable,
-            progress=progress,
-            checkpoint=checkpoint and f"{checkpoint}{'.first' if teacher else ''}",
-            checkpoint_every=100 if checkpoint else None,
+            **options,
         )
         models = fitted.model
     if fitted is None:
@@ -257,15 +257,11 @@ class _FiniteGradients(eqx.Module):
     def __call__(self, loss: Any, values: Any, key: PRNGKey) -> tuple[Any, Any]:
         cost, slope = analytic(loss, values, key)
         own = lambda leaf: tuple(range(self.axes, leaf.ndim))
-        of_leaves = [
-            jnp.all(jnp.isfinite(leaf), axis=own(leaf))
-            for leaf in jax.tree.leaves(slope)
-        ]
-        finite = jnp.all(jnp.stack(of_leaves), axis=0)
-        slope = jax.tree.map(
-            lambda leaf: jnp.where(jnp.expand_dims(finite, own(leaf)), leaf, 0), slope
-        )
-        return (cost, {"diverged": jnp.sum(~finite).astype(cost.dtype)}), slope
+        is_finite = lambda leaf: jnp.all(jnp.isfinite(leaf), axis=own(leaf))
+        finite = jnp.all(jnp.stack([*map(is_finite, jax.tree.leaves(slope))]), axis=0)
+        kept = lambda leaf: jnp.where(jnp.expand_dims(finite, own(leaf)), leaf, 0)
+        diverged = jnp.sum(~finite).astype(cost.dtype)
+        return (cost, {"diverged": diverged}), jax.tree.map(kept, slope)
 
 
 def train_controllers(
@@ -352,19 +348,12 @@ def train_controllers(
         check_bool(shared, "shared", where),
         check_bool(throw, "throw", where),
     )
-    return fit(
-        loss,
-        controllers,
-        optax.adam(optax.cosine_decay_schedule(learning_rate, steps)),
-        steps,
-        key=check_key(key, where),
-        trainable=trainable,
-        gradient=analytic if throw else _FiniteGradients(1 if shared else 2),
-        progress=progress,
-        throw=throw,
-        checkpoint=checkpoint,
-        checkpoint_every=100 if checkpoint else None,
-    )
+    adam = optax.adam(optax.cosine_decay_schedule(learning_rate, steps))
+    gradient: Any = analytic if throw else _FiniteGradients(1 if shared else 2)
+    options: Any = dict(trainable=trainable, progress=progress, checkpoint=checkpoint)
+    options |= dict(checkpoint_every=None if checkpoint is None else 100, throw=throw)
+    check_key(key, where)
+    return fit(loss, controllers, adam, steps, key=key, gradient=gradient, **options)
 
 
 @eqx.filter_jit

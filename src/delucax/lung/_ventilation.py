@@ -315,10 +315,9 @@ def ventilation(
     check_range(expiration_weight, "expiration_weight", where)
     delay = check_count(sensor_delay, "sensor_delay", where, least=0)
     waveform = BreathWaveform() if waveform is None else waveform
-    if resting_state is None:
-        resting_state = jnp.zeros(dynamics.state_size)
+    rest = jnp.zeros(dynamics.state_size) if resting_state is None else resting_state
     sensor = sensed = PressureSensor(dynamics)
-    initial_state = sensor.filled(resting_state)
+    initial_state = sensor.filled(rest)
     if delay:
         sensed = Delayed(sensor, sensor=delay)
         initial_state = sensed.filled(initial_state)

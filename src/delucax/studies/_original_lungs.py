@@ -7,7 +7,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_bool, check_count
 from .._module import parameter, positive
 from .._results import RESULTS
 from .._typing import Control, State
@@ -81,9 +80,6 @@ class OriginalBalloonLung(_AbstractOriginalLung):
 
     state_names = ("volume", "pressure")
 
-    def __check_init__(self):
-        check_bool(self.leak, "leak", "OriginalBalloonLung")
-
     def _step(self, x, u):
         volume, pressure = x[0], x[1]
         flow = jnp.clip(self.gain * original_valve(u[0]), 0, 2)
@@ -133,17 +129,11 @@ class OriginalDelayLung(_AbstractOriginalLung):
     delay: int = eqx.field(static=True, default=25)
     dt: Array = parameter(0.03, constraint=positive)
 
-    def __check_init__(self):
-        check_count(self.delay, "delay", "OriginalDelayLung")
-
     @property
     def state_names(self):
-        late = [
-            f"{name}[-{k + 1}]"
-            for k in range(self.delay - 1)
-            for name in self.control_names
-        ]
-        return ("volume", "pressure", "pipe", *late)
+        late = range(1, self.delay)
+        names = [f"{name}[-{k}]" for k in late for name in self.control_names]
+        return ("volume", "pressure", "pipe", *names)
 
     def _step(self, x, u):
         volume, pressure, pipe, late = x[0], x[1], x[2], x[3:]

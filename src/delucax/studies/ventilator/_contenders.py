@@ -92,6 +92,7 @@ class Trainer(NamedTuple):
     waveform: lung.BreathWaveform
     size: Size
     key: PRNGKey
+    say: Callable[[str], Any] = print
 
     @property
     def count(self) -> int:
@@ -204,12 +205,7 @@ def best_candidates(candidates: Any, errors: Any, shared: bool) -> Any:
 
 
 def tuned_pids(
-    envs: Environment,
-    trainer: Trainer,
-    say: Callable[[str], Any],
-    *,
-    checkpoint: Path,
-    progress: bool,
+    envs: Environment, trainer: Trainer, *, checkpoint: Path, progress: bool
 ) -> dict[str, Any]:
     """The best of many at random and of the best few of them trained on, in each lung
     and for all: by their errors in the lungs themselves, which no network is given."""
@@ -232,7 +228,7 @@ def tuned_pids(
             candidates = stack([*unstack(begin), *unstack(trained.model)])
             judged = _errors(envs, candidates, judge_key, not shared)
             if words := divergence_note(trained.history["diverged"], judged):
-                say(f"  {label}: {words}")
+                trainer.say(f"  {label}: {words}")
             best[label] = best_candidates(candidates, judged, shared)
     return best
 
@@ -320,8 +316,8 @@ def contenders(
     networks = functools.partial(networks, shared=True, limit=_CAREFUL)
     shared = training("shared", f"A network for all lungs, {seeds}", networks)
     if size.tuned:
-        words, given = "PIDs with feed-forward tuned on the lungs", (envs, trainer)
-        tuned = training("tuned_pids", words, tuned_pids, *given, stages.say)
+        words = "PIDs with feed-forward tuned on the lungs"
+        tuned = training("tuned_pids", words, tuned_pids, envs, trainer)
         rows += pid_contenders(tuned)
     if size.extras:
         more = training("trained_pids", "PIDs trained on", trained_pids, trainer, pids)
@@ -332,8 +328,8 @@ def contenders(
         residual = training("residual", "A PID and a network for each lung", residuals)
         learn = lambda: online_learners(train, pids, waveform, size.sensor_delay)
         online = stages.stage("online", "GPC around the best PIDs", learn)
-        each = stack([waveform] * count)
-        planners = eqx.filter_vmap(lung.ShootingMPC)(trainer.simulators, each)
+        given: Any = trainer.simulators, envs.cost.waveform  # pyright: ignore
+        planners = eqx.filter_vmap(lung.ShootingMPC)(*given)
         rows += [
             *pid_contenders(more),
             Contender("bang-bang", 0, lung.BangBang(waveform), True),

@@ -19,6 +19,8 @@ from ._stages import ABORT, BREATH, SEEN, SHOWN, UNSEEN
 
 
 Rows = list[dict[str, Any]]
+Which = tuple[str, int]
+"""The label of a controller, and its seed."""
 WRONG = ("single compartment", "balloon")
 """Physics that the lungs of the study do not have."""
 PID_ROWS = (
@@ -35,7 +37,6 @@ def error_rows(
     contenders: list[Contender],
     envs: Environment,
     names: list[str],
-    waveform: lung.BreathWaveform,
     keys: PRNGKey,
     between: tuple[Environment, list[str]] | None,
 ) -> tuple[Rows, dict[str, Any]]:
@@ -47,34 +48,29 @@ def error_rows(
     """
     rows, runs = [], {}
     pips, count = jnp.asarray(SEEN + UNSEEN), len(names)
-    waveforms = stack([waveform] * count)
+    waveforms = envs.cost.waveform  # pyright: ignore[reportAttributeAccessIssue]
     place = (SEEN + UNSEEN).index(SHOWN)
     for label, seed, controllers, shared in contenders:
         each = stack([controllers] * count) if shared else controllers
         whole = eqx.filter_vmap(lung.Breathing)(each, waveforms)
         *errors, breaths = closed_loop(envs, whole, pips, keys, BREATH)
         runs.setdefault(label, jax.tree.map(lambda a: a[:, 0, place], breaths))
-        rows += rows_of(names, label, seed, *errors)
+        rows += rows_of(names, (label, seed), *errors)
         if shared and between is not None:
             # As many lungs as before, so that nothing compiles again.
             others, other_names = between
             *errors, _ = closed_loop(others, whole, pips, keys, BREATH)
             splits = {"between": SPLITS["unseen"]}
-            rows += rows_of(other_names, label, seed, *errors, splits=splits)
+            rows += rows_of(other_names, (label, seed), *errors, splits)
     return rows, runs
 
 
 def rows_of(
-    names: list[str],
-    label: str,
-    seed: int,
-    errors: Any,
-    highest: Any = None,
-    splits: dict[str, slice] = SPLITS,
+    names: list[str], run: Which, errors: Any, highest: Any = None, splits: Any = SPLITS
 ) -> Rows:
     """A row for each lung and each split of the peak pressures, the last axis of the
     errors and the highest pressures."""
-    rows: Rows = []
+    (label, seed), rows = run, []
     for split, at in splits.items():
         of_split = errors[..., at]
         most = None if highest is None else np.asarray(highest)[..., at]

@@ -154,14 +154,11 @@ def closed_loop(
 
 
 def closed_loop_errors(
-    envs: Environment,
-    models: dict[str, Any],
-    controllers: Any,
-    waveform: lung.BreathWaveform,
+    envs: Environment, models: dict[str, Any], controllers: Any
 ) -> dict[str, np.ndarray]:
     """The mean distance of the pressures in each simulator from those in the lung,
     under the same controller and without noise, by kind: shape `(lungs,)`."""
-    waveforms = stack([waveform] * len(envs.dt))
+    waveforms = envs.cost.waveform  # pyright: ignore[reportAttributeAccessIssue]
     whole = eqx.filter_vmap(lung.Breathing)(controllers, waveforms)
     options: Any = jnp.asarray(SEEN), jr.key(0)[None], INSPIRATION
 
@@ -169,6 +166,7 @@ def closed_loop_errors(
         return closed_loop(envs, whole, *options)[-1].observations[:, 0, :, :, 0]
 
     truth = read(eqx.tree_at(lambda env: env.sensor_noise, envs, None))
-    silent = eqx.filter_vmap(lambda model: lung.learned_lung(model, waveform=waveform))
-    apart = lambda model: np.abs(np.asarray(read(silent(model)) - truth))
+    task = lambda model, waveform: lung.learned_lung(model, waveform=waveform)
+    read_in = lambda model: read(eqx.filter_vmap(task)(model, waveforms))
+    apart = lambda model: np.abs(np.asarray(read_in(model) - truth))
     return {name: np.mean(apart(m), axis=(1, 2)) for name, m in models.items()}

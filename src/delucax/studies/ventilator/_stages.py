@@ -5,6 +5,7 @@ import io
 import json
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -87,6 +88,7 @@ SMALL = Size(
 )
 
 
+@dataclass(frozen=True)
 class Stages:
     """A folder that a study is written to, and how far it is.
 
@@ -101,17 +103,16 @@ class Stages:
         whose settings are damaged.
     """
 
-    def __init__(
-        self,
-        out: Path,
-        settings: dict[str, Any],
-        say: Callable[[str], Any],
-        progress: bool,
-    ):
-        self.out, self.say, self.progress = out, say, progress
-        self.seconds: dict[str, float] = {}
-        known, text = out / "settings.json", json.dumps(settings, indent=1) + "\n"
-        (out / "controllers").mkdir(parents=True, exist_ok=True)
+    out: Path
+    settings: dict[str, Any]
+    say: Callable[[str], Any]
+    progress: bool
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self):
+        known = self.out / "settings.json"
+        text = json.dumps(self.settings, indent=1) + "\n"
+        (self.out / "controllers").mkdir(parents=True, exist_ok=True)
         if not known.exists():
             self.write("settings.json", text)
         instead = "delete the folder, or name another one with out."
@@ -123,7 +124,7 @@ class Stages:
         for name in sorted(given.keys() | stored.keys()):
             if given.get(name) != stored.get(name):
                 raise ValueError(
-                    f"lung: '{out}' holds a study with other settings: {name} is "
+                    f"lung: '{self.out}' holds a study with other settings: {name} is "
                     f"{stored.get(name)} there and {given.get(name)} here; {instead}"
                 )
 

@@ -75,11 +75,10 @@ def lung_study(
         ```
     """
     began = time.perf_counter()
-    size = SMALL if small else FULL
+    delay = check_count(sensor_delay, "sensor_delay", "lung", least=0)
+    size = (SMALL if small else FULL)._replace(sensor_delay=delay)
     if seeds is not None:
         size = size._replace(seeds=check_count(seeds, "seeds", "lung"))
-    sensor_delay = check_count(sensor_delay, "sensor_delay", "lung", least=0)
-    size = size._replace(sensor_delay=sensor_delay)
     recorded = None if data is None else lung.read_breaths(data)
     source = None
     if data is not None:
@@ -120,7 +119,7 @@ def lung_study(
     if recorded is None:
         around = [size.between[i % len(size.between)] for i in range(len(lungs))]
         envs, others = (
-            stack([_simulators.task_of(*each, sensor_delay) for each in all])
+            stack([_simulators.task_of(*each, delay) for each in all])
             for all in (lungs, around)
         )
         between = others, [_lung_name(*each) for each in size.between]
@@ -131,25 +130,25 @@ def lung_study(
         boxes = unstack(models["grey box"])
         envs = stack([lung.learned_lung(box, **options) for box in boxes])
         judge = "grey-box lungs fitted to the same breaths, for want of the lungs"
-    trainer = _contenders.Trainer(models["learned"], waveform, size, key)
+    trainer = _contenders.Trainer(models["learned"], waveform, size, key, say)
     contenders = _contenders.contenders(stages, envs, train, trainer)
     if size.extras and recorded is None:
         pids = next(c.controllers for c in contenders if c.label == "PID")
         words = "Simulators and lungs under the same PIDs"
-        make = lambda: _simulators.closed_loop_errors(envs, models, pids, waveform)
+        make = lambda: _simulators.closed_loop_errors(envs, models, pids)
         closed = stages.stage("closed_loop", words, make)
         for row in table:
             errors = closed[row["simulator"]]
             row["closed_loop_mae"] = float(errors[names.index(row["lung"])])
     stages.write_table("simulators.csv", table)
     keys = jr.split(jr.fold_in(key, 99), size.noises)
-    rows, runs = _report.error_rows(contenders, envs, names, waveform, keys, between)
+    rows, runs = _report.error_rows(contenders, envs, names, keys, between)
     if size.bound_steps:
         pips = jnp.asarray(SEEN + UNSEEN)
         of = lambda env: lung.least_error(env, pips=pips, steps=size.bound_steps)
         words, make = "The least error, with the lung at hand", eqx.filter_vmap(of)
         bound = stages.stage("bound", words, lambda: make(envs))
-        rows += _report.rows_of(names, "least error", 0, np.asarray(bound))
+        rows += _report.rows_of(names, ("least error", 0), np.asarray(bound))
     stages.write_table("report.csv", rows)
     place = stages.out / "controllers"
     unsafe = _report.save_controllers(place, contenders, names, waveform, rows)
