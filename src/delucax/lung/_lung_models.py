@@ -207,11 +207,7 @@ class GreyBoxLung(AbstractLung):
     state_units: ClassVar = ("L/s", "", "L", "")
 
     def __init__(
-        self,
-        single: SingleCompartment | None = None,
-        width: int = 16,
-        *,
-        key: PRNGKey,
+        self, single: SingleCompartment | None = None, width: int = 16, *, key: PRNGKey
     ):
         where = "GreyBoxLung"
         check_key(key, where)

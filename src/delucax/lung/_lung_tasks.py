@@ -219,10 +219,7 @@ def double_compartment(
 
 
 def learned_lung(
-    model: LearnedLung | LungModel | None = None,
-    *,
-    horizon: int = 100,
-    **options: Any,
+    model: LearnedLung | LungModel | None = None, *, horizon: int = 100, **options: Any
 ) -> Environment:
     """Ventilate a lung that was learned from breaths: controllers are trained in it.
 

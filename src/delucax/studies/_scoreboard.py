@@ -24,7 +24,7 @@ from ..disturbances import Gaussian
 from ..dynamics import linearize
 from ..environments import Environment, make, UniformState
 from ..experiments import experiment
-from ..lung import Breathing
+from ..lung import BreathCost, Breathing
 from ..planning import AbstractPlanner, CEM, ILQR, ilqr, MPPI
 from ..simulation import rollout
 from ..training import actor_critic, expected_cost, fit, PPO, SHAC
@@ -73,7 +73,6 @@ def _local(name: str) -> tuple[Any, Any, Any]:
     x, u = env.dynamics.equilibrium()
     model = linearize(env.dynamics, jnp.zeros(()), x, u)
     n = x.shape[0]
-
     cost = lambda z: env.cost(jnp.zeros(()), x + z[:n], u + z[n:])
     # A cost `x @ Q @ x + u @ R @ u` has twice those for its Hessian.
     H = np.asarray(jax.hessian(cost)(jnp.zeros(n + u.shape[0]))) / 2
@@ -87,31 +86,33 @@ def _local(name: str) -> tuple[Any, Any, Any]:
     return model, jnp.asarray(H[:n, :n]), jnp.asarray(H[n:, n:])
 
 
-def _regulator(name: str, design: Callable[..., Any], **options: Any) -> Any:
+def _regulator(
+    name: str, env: Environment, design: Callable[..., Any], **options: Any
+) -> Any:
     """A design from the linear model and the curvature of the cost."""
-    difference = task_of(name).dynamics.difference
-    return design(*_local(name), difference=difference, **options)
+    return design(*_local(name), difference=env.dynamics.difference, **options)
 
 
-def _following(name: str) -> Any:
-    """A PID on the waveform that a lung is to breathe as."""
-    env = task_of(name)
-    waveform = getattr(env.cost, "waveform", None)
-    if waveform is None:
+def _following(name: str, env: Environment) -> Any:
+    """A PID on the waveform that a ventilator is to follow."""
+    if not isinstance(env.cost, BreathCost):
         raise Unsuitable("the cost follows no waveform")
+    waveform = env.cost.waveform
     return Breathing(controllers.LeakyPID(dt=env.dt, reference=waveform), waveform)
 
 
-def _learning(name: str, learner: Callable[..., Any], **options: Any) -> Any:
+def _learning(
+    name: str, env: Environment, learner: Callable[..., Any], **options: Any
+) -> Any:
     """An online learner on top of the LQR."""
-    env = task_of(name)
     return learner(env.dynamics, env.cost, base=agent_of(name, "LQR"), **options)
 
 
-def _receding(name: str, kind: type[AbstractPlanner], **options: Any) -> Any:
+def _receding(
+    name: str, env: Environment, kind: type[AbstractPlanner], **options: Any
+) -> Any:
     """MPC with the model and the cost of the task and, at the end of a plan, the cost
     to go of the LQR where there is one."""
-    env = task_of(name)
     if env.dynamics.observation_size != env.dynamics.state_size:
         raise Unsuitable("the state is not observed")
     bounds = env.control_bounds
@@ -131,9 +132,8 @@ def _receding(name: str, kind: type[AbstractPlanner], **options: Any) -> Any:
     return controllers.MPC(env.dynamics, cost, LOOKAHEAD, **how)
 
 
-def _by_gradient(name: str, network: Callable[..., Any], **options: Any) -> Any:
+def _by_gradient(env: Environment, network: Callable[..., Any], **options: Any) -> Any:
     """A network, by gradient descent through the rollout."""
-    env = task_of(name)
     first, key = jax.random.split(jax.random.key(1))
     horizon = min(env.horizon, LONGEST)
     loss = expected_cost(env, batch=EPISODES, horizon=horizon, gradient_decay=0.95)
@@ -148,9 +148,9 @@ def _gru(env: Environment, key: Any) -> Any:
     return controllers.GRU(*sizes, 32, features=env.encode, bounds=bounds, key=key)
 
 
-def _by_actor_critic(name: str, method: type[PPO] | type[SHAC]) -> Any:
+def _by_actor_critic(env: Environment, method: type[PPO] | type[SHAC]) -> Any:
     """The MLP by reinforcement learning."""
-    env, head = task_of(name), "gaussian" if method is PPO else "deterministic"
+    head = "gaussian" if method is PPO else "deterministic"
     first, key = jax.random.split(jax.random.key(1))
     model = actor_critic(env, width=32, depth=1, head=head, key=first)
     loss = method(env, EPISODES, min(env.horizon, LONGEST), discount=0.95)
@@ -169,40 +169,38 @@ def _fitted(loss: Any, model: Any, steps: int, key: Any) -> Any:
     return fit(loss, model, optimiser, steps, **options).model
 
 
-FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
+FAMILIES: dict[str, dict[str, Callable[[str, Environment], Any]]] = {
     "Feedback": {
-        "zero": lambda name: controllers.Zero(task_of(name).control_size),
+        "zero": lambda name, env: controllers.Zero(env.control_size),
         "PID": _following,
-        "LQR": lambda name: _regulator(name, controllers.LQR),
-        "FiniteHorizonLQR": lambda name: _regulator(
-            name, controllers.FiniteHorizonLQR, horizon=task_of(name).horizon
+        "LQR": lambda *task: _regulator(*task, controllers.LQR),
+        "FiniteHorizonLQR": lambda name, env: _regulator(
+            name, env, controllers.FiniteHorizonLQR, horizon=env.horizon
         ),
-        "HInfinity": lambda name: _regulator(name, controllers.HInfinity),
+        "HInfinity": lambda *task: _regulator(*task, controllers.HInfinity),
     },
     "Online learning": {
-        "GPC": lambda name: _learning(name, controllers.gpc),
-        "Adaptive": lambda name: controllers.Adaptive(agent_of(name, "GPC")),
-        "NeuralGPC": lambda name: _learning(
-            name, controllers.neural_gpc, key=jax.random.key(0)
+        "GPC": lambda *task: _learning(*task, controllers.gpc),
+        "Adaptive": lambda name, env: controllers.Adaptive(agent_of(name, "GPC")),
+        "NeuralGPC": lambda *task: _learning(
+            *task, controllers.neural_gpc, key=jax.random.key(0)
         ),
-        "DRC": lambda name: _learning(name, controllers.drc),
-        "SFC": lambda name: _learning(name, controllers.sfc),
-        "DSC": lambda name: _learning(name, controllers.dsc),
-        "BPC": lambda name: controllers.BPC(
-            task_of(name).dynamics, agent_of(name, "LQR")
-        ),
+        "DRC": lambda *task: _learning(*task, controllers.drc),
+        "SFC": lambda *task: _learning(*task, controllers.sfc),
+        "DSC": lambda *task: _learning(*task, controllers.dsc),
+        "BPC": lambda name, env: controllers.BPC(env.dynamics, agent_of(name, "LQR")),
     },
     "Planning": {
-        "MPC": lambda name: _receding(name, ILQR, max_iterations=8),
-        "MPPI": lambda name: _receding(name, MPPI, samples=128, iterations=3),
-        "CEM": lambda name: _receding(name, CEM, samples=128, iterations=3),
+        "MPC": lambda *task: _receding(*task, ILQR, max_iterations=8),
+        "MPPI": lambda *task: _receding(*task, MPPI, samples=128, iterations=3),
+        "CEM": lambda *task: _receding(*task, CEM, samples=128, iterations=3),
     },
     "Training": {
-        "affine": lambda name: _by_gradient(name, mlp_policy, width=1, depth=0),
-        "MLP": lambda name: _by_gradient(name, mlp_policy, width=32, depth=1),
-        "GRU": lambda name: _by_gradient(name, _gru),
-        "SHAC": lambda name: _by_actor_critic(name, SHAC),
-        "PPO": lambda name: _by_actor_critic(name, PPO),
+        "affine": lambda name, env: _by_gradient(env, mlp_policy, width=1, depth=0),
+        "MLP": lambda name, env: _by_gradient(env, mlp_policy, width=32, depth=1),
+        "GRU": lambda name, env: _by_gradient(env, _gru),
+        "SHAC": lambda name, env: _by_actor_critic(env, SHAC),
+        "PPO": lambda name, env: _by_actor_critic(env, PPO),
     },
 }
 """The methods by family: each makes a controller for the task of a name."""
@@ -216,7 +214,7 @@ def agent_of(name: str, method: str) -> Any:
     """
     (maker,) = (family[method] for family in FAMILIES.values() if method in family)
     try:
-        return maker(name)
+        return maker(name, task_of(name))
     except (ValueError, RuntimeError) as error:
         raise Unsuitable(str(error)) from error
 

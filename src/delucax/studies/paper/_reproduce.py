@@ -77,8 +77,7 @@ def reproduce(
     chosen = list(STUDIES) if "all" in chosen else chosen
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    sections: list[str] = []
-    rows: list[dict[str, Any]] = []
+    sections, rows = [], []
     start = time.perf_counter()
     for k, name in enumerate(chosen, 1):
         say(f"[{k}/{len(chosen)}] {name}")
