@@ -85,6 +85,7 @@ class Breathing(AbstractController):
         begins = inhale & ~state.inhaling
         inner = _where(begins, self.inspiratory.init(key=None), state.inner)
         u_in, after = self.inspiratory(t, y, inner)
+        # Opened with a time constant of 0.2 s.
         late = jnp.maximum(self.waveform.share(t) - 0.5, 0) * self.waveform.period
         held = self.expiratory_opening * (1 - jnp.exp(-5 * late))
         u_in = jnp.where(inhale, clip(u_in[0], 0, 100), held)
@@ -248,6 +249,7 @@ class BreathPolicy(AbstractController):
         targets = (jnp.stack([*ahead, now]) - self.waveform.peep) / 15
         features = errors
         if self.convolution is not None:
+            # Means over the last 1, 2, ... errors, convolved with filters of width 5.
             means = jnp.cumsum(errors) / jnp.arange(1, self.errors + 1)
             windows = [means[i : self.errors - 4 + i] for i in range(5)]
             convolved = jnp.stack(windows, 1) @ self.convolution

@@ -335,6 +335,7 @@ def explore(
     explorer = Explorer(dt=env.dt, waveform=waveform, scale=scale)
     kept, count = [], 0
     for attempt in range(50):
+        # Four times as many as asked for, so that one batch mostly does.
         draw_key, run_key = jr.split(jr.fold_in(key, attempt))
         drawn = jr.choice(draw_key, pips, (4 * breaths,))
         keys = jr.split(run_key, 4 * breaths)

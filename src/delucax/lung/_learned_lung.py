@@ -202,12 +202,15 @@ class LearnedLung(AbstractDynamics):
         control = jnp.reshape((u[0] - self.u_mean) / self.u_std, (1,)).astype(x.dtype)
         controls, pressures = jnp.concatenate([control, x[: n - 1]]), x[n : 2 * n]
         step, first = x[2 * n], self.hidden.shape[0]
+        # The count of steps is a float in the state; past `boundary` a slice is still
+        # taken, and not used, because a scan has no branches of other shapes.
         i = jnp.clip(jnp.round(step), 0, first - 1).astype(int)
         late = self._later_step(self._linearised(controls[: self.u_window]), pressures)
         history = jnp.concatenate([controls, pressures])
         early = self._first_step(history, late, self.hidden[i], self.output[i])
         predicted = self._bound(jnp.where(step < first - 0.5, early, late))
         after = jnp.hstack([controls, predicted, pressures[: n - 1], step + 1])
+        # Nothing is learned of expirations: an open valve resets the state.
         after = jnp.where(u[1] > 0.5, self.resting(), after)
         return after.astype(x.dtype), RESULTS.successful
 
@@ -253,6 +256,7 @@ class LearnedLung(AbstractDynamics):
 
         inputs = controls[:first], linearised[:first], *weights
         start = x0[n : 2 * n]
+        # Open loop each step needs the pressure before it; with records none does.
         if recorded is None:
 
             def scan(step, pressures, inputs):

@@ -78,6 +78,7 @@ class LungModel(eqx.Module):
         **Returns:** shape `(T,)` [cmH2O], the first before any control acted.
         """
 
+        # Recomputed for the gradient, of which only the states are kept.
         @jax.checkpoint
         def body(x, u):
             both = jnp.stack([u, jnp.zeros_like(u)])
@@ -159,6 +160,7 @@ class NeuralLung(AbstractLung):
         return jnp.hstack([first, jnp.zeros(self.hidden)])
 
     def vector_field(self, t, x, u, w):
+        # Scaled to be about 1; the valve itself is known and not learned.
         flow = self.valves.flow(u[0]) / self.valves.max_flow
         z = jnp.concatenate([x, jnp.stack([flow, u[1]]).astype(x.dtype)])
         return (self.rate * self.network(z)).astype(x.dtype)

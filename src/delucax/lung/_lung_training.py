@@ -46,6 +46,7 @@ class _Simulation(eqx.Module):
             predict = model.one_step if self.teacher else model.predict
             return jnp.mean(jnp.abs(jax.vmap(predict)(*inputs) - pressure))
 
+        # Relative to each scale: lungs of large pressures do not outweigh the others.
         errors = eqx.filter_vmap(one)(models, u_in, pressure)
         return jnp.mean(errors / self.scale)
 
@@ -132,6 +133,7 @@ def fit_lungs(
     for teacher, count, name, times in parts:
         if check_count(count, name, where, least=0) == 0:
             continue
+        # Open loop, errors and their gradients can grow along a breath: clipped.
         schedule = optax.cosine_decay_schedule(times * learning_rate, count)
         adam = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
         if checkpoint is not None:
@@ -232,6 +234,7 @@ class _TrackingError(eqx.Module):
         def in_lung(env, controller, key):
             return jnp.mean(breath_error(env, controller, key=key, **given))
 
+        # One controller for all lungs is not mapped over them.
         own = None if self.shared else eqx.if_array(0)
         in_lungs = eqx.filter_vmap(in_lung, in_axes=(eqx.if_array(0), own, 0))
 
@@ -258,6 +261,7 @@ class _FiniteGradients(eqx.Module):
         cost, slope = analytic(loss, values, key)
         own = lambda leaf: tuple(range(self.axes, leaf.ndim))
         is_finite = lambda leaf: jnp.all(jnp.isfinite(leaf), axis=own(leaf))
+        # All of the gradient of a controller is replaced, for a part has no meaning.
         finite = jnp.all(jnp.stack([*map(is_finite, jax.tree.leaves(slope))]), axis=0)
         kept = lambda leaf: jnp.where(jnp.expand_dims(finite, own(leaf)), leaf, 0)
         diverged = jnp.sum(~finite).astype(cost.dtype)

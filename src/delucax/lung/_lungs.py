@@ -225,6 +225,7 @@ class DoubleCompartment(_AbstractRigidPipe):
     def _parts(self, x: State) -> tuple[Array, Array, Array, Array, Array]:
         """The conductances of both ways, the pressures at their ends, and the pressure
         of the one compartment that they are to the airway."""
+        # R_1 and R_2 of `1 / (1 / R_1 + 1 / R_2) = parallel` and `R_2 = imbalance R_1`.
         parallel = (1 - self.central) * self.resistance
         fast = self.imbalance / ((1 + self.imbalance) * parallel)
         slow = 1 / ((1 + self.imbalance) * parallel)
@@ -244,6 +245,7 @@ class DoubleCompartment(_AbstractRigidPipe):
         inflow, opening = self.valves.derivatives(x[0], x[1], u)
         fast, slow, p1, p2, inside = self._parts(x)
         total = (self.pressure(x) - inside) / self.resistance
+        # p_c, where the central resistance ends and both ways begin.
         centre = inside + (1 - self.central) * self.resistance * total
         return jnp.stack([inflow, opening, fast * (centre - p1), slow * (centre - p2)])
 
@@ -353,12 +355,14 @@ class DelayLung(AbstractLung):
 
     def resting(self, pressure: RealScalar) -> State:
         volume = _stretched(self.rest, self.stiffness, pressure)
+        # `0 * volume` is a zero of its dtype and shape, whatever `pressure` is.
         return jnp.stack([0 * volume, 0 * volume, pressure + 0 * volume, volume])
 
     def vector_field(self, t, x, u, w):
         inflow, opening = self.valves.derivatives(x[0], x[1], u)
         inside = balloon_pressure(x[3], self.rest, self.stiffness)
         filling = (x[2] - inside) / self.resistance
+        # The pipe stores air, so its pressure is a state, and no balance is solved.
         outflow = self.valves.outflow(x[1], x[2])
         rise = (x[0] - filling - outflow) / (PER_ML * self.pipe)
         return jnp.stack([inflow, opening, rise, filling])

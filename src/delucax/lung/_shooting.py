@@ -75,6 +75,7 @@ class ShootingMPC(AbstractController):
 
     def __call__(self, t, y, state):
         model, (predicted, plan) = self.model, state
+        # An observer with a fixed gain.
         lung = model.corrected(predicted, y[0], 1 - self.memory)
         ahead = t + model.dt * jnp.arange(1, self.horizon + 1)
         target = self.waveform.pressure(ahead)
@@ -151,6 +152,7 @@ def least_error(
             return jnp.mean(costs)
 
         _, errors = _descended(error, jnp.full(horizon, -1.0), optimiser, steps)
+        # The best visited, because Adam does not descend at every step.
         return jnp.min(errors, initial=jnp.inf)
 
     return eqx.filter_jit(jax.vmap(of))(pips)

@@ -81,6 +81,7 @@ class Valves(eqx.Module):
         **Returns:** the flow [L/s], of the shape of `u_in`.
         """
         curve = lambda u: jax.nn.sigmoid(self.steepness * (u - self.midpoint))  # noqa: E731
+        # A sigmoid is neither 0 when closed nor 1 when open: shifted and scaled.
         closed = curve(0.0)
         return self.max_flow * (curve(u_in) - closed) / (curve(100.0) - closed)
 
@@ -117,6 +118,7 @@ class Valves(eqx.Module):
 
         **Returns:** `p` [cmH2O].
         """
+        # Linear in p, so that no iteration is needed within a step of the solver.
         out = self._conductance(opening)
         flows = inflow + pressure / resistance + out * self.peep
         return flows / (1 / resistance + out + self.leak)
@@ -321,6 +323,7 @@ def ventilation(
     if delay:
         sensed = Delayed(sensor, sensor=delay)
         initial_state = sensed.filled(initial_state)
+    # The value of a traced or batched noise cannot be inspected: it is kept.
     silent = isinstance(noise, int | float) and noise == 0
     fields: dict[str, Any] = dict(
         dynamics=sensed,

@@ -116,6 +116,7 @@ class BreathWaveform(eqx.Module):
         counts as its beginning.
         """
         breaths = as_float_array(t) / self.period
+        # `mod` would give almost 1 where rounding puts `k dt` just before a breath.
         return jnp.maximum(breaths - jnp.floor(breaths + _slack(breaths)), 0)
 
     def is_inspiration(self, t: Any) -> Array:

@@ -171,6 +171,7 @@ def _drawn(
 
     def one(key):
         keys = jr.split(key, 7)
+        # Half of them without a derivative, a feed-forward gain or an offset.
         some = jr.bernoulli(keys[0], 0.5, (3,))
         kd = between(keys[1], 0.003, 0.2) * (1.0 if kind is PID else 20.0)
         gains = between(keys[2], 0.03, 8.0), between(keys[3], 0.05, 40.0), some[0] * kd
@@ -219,6 +220,7 @@ def tuned_pids(
         drawn = _drawn(kind, size.tuned, dt, trainer.waveform, draw_key)
         errors = _errors(envs, drawn, search_key, False)
         for shared in (False, True):
+            # The indices of the best: one list for all lungs, or one per lung.
             ranked = jnp.mean(errors, axis=0) if shared else errors.T
             begin = taken(drawn, jnp.argsort(ranked, axis=0)[:_TUNED_FURTHER])
             label = f"tuned {name} + feed-forward" + (" for all" if shared else "")
@@ -273,6 +275,7 @@ def online_learners(
         online = gpc(model, cost, base=base, horizon=10, optimiser=newton)
         # All of the residual variance is process noise; the sensor has next to none.
         process = jnp.diag(NOISE**2 * error)
+        # The outputs among the states start at PEEP.
         mean = error.at[1].set(1.0) * waveform.peep
         kalman = KalmanFilter(identified, process, 1e-4 * jnp.eye(1), mean=mean)
         return OutputFeedback(online, kalman)
