@@ -43,7 +43,7 @@ def policy_gradient(small: bool = False) -> Finding:
     exact = train(training.analytic, 0)
     first, faster = _first(exact), _first(train(training.analytic, 0, TWICE))
     rows = [("through the rollout", 1, int(first is not None), first, exact[-1])]
-    curves, reached, total, fewest = {}, 0, 0, []
+    curves, fewest = {}, []
     for scale in scales:
         for count in pairs:
             estimator = training.EvolutionStrategies(scale, 2 * count)
@@ -51,8 +51,7 @@ def policy_gradient(small: bool = False) -> Finding:
             when = [_first(run) for run in runs]
             # The loss itself, which is one more rollout a step, is not charged.
             cost = [2 * count * w for w in when if w is not None]
-            reached, total, fewest = reached + len(cost), total + seeds, fewest + cost
-            curves[scale, count] = runs
+            curves[scale, count], fewest = runs, fewest + cost
             name = f"evolution strategies, sigma {scale}, {count} pairs"
             median = float(np.median(cost)) if cost else None
             at_end = float(np.median([run[-1] for run in runs]))
@@ -62,7 +61,7 @@ def policy_gradient(small: bool = False) -> Finding:
         descent_claim(first, faster),
         Claim(
             "Evolution strategies need more rollouts at every setting and seed",
-            f"{reached} of {total} runs get there"
+            f"{len(fewest)} of {seeds * len(curves)} runs get there"
             + ("" if least is None else f", the fastest after {least:,} rollouts"),
             least is None or (first is not None and least > first),
         ),
@@ -84,8 +83,8 @@ def policy_gradient(small: bool = False) -> Finding:
         "mean cost of Gym (with the sum it sticks at once). Evolution strategies are "
         f"antithetic, {seeds} seeds a setting, {steps} updates; lines are medians."
     )
-    columns = "gradient", "runs", "reach 2.0", "rollouts, median"
-    columns += ("cost at the end, median",)
+    medians = "rollouts, median", "cost at the end, median"
+    columns = "gradient", "runs", "reach 2.0", *medians
     table = [dict(zip(columns, row, strict=True)) for row in rows]
     tables, figures = {"Rollouts to cost 2.0": table}, {"policy_gradient": ax.figure}
     return Finding("Policy gradient of the pendulum", claims, tables, figures, notes)

@@ -75,12 +75,11 @@ def grouped(breaths: lung.Breaths) -> Any:
     R, C = np.asarray(breaths.resistance), np.asarray(breaths.compliance)
     lungs = sorted(set(zip(R.tolist(), C.tolist(), strict=True)))
     parts = [breaths[np.flatnonzero((R == r) & (C == c))] for r, c in lungs]
-    fewest = min(len(part) for part in parts)
+    fewest, (r, c) = min((len(part), at) for part, at in zip(parts, lungs, strict=True))
     if fewest < 6:
-        worst = lungs[int(np.argmin([len(part) for part in parts]))]
         raise ValueError(
             f"lung: data must have at least 6 breaths of each lung, got {fewest} with "
-            f"R = {worst[0]:g} and C = {worst[1]:g}."
+            f"R = {r:g} and C = {c:g}."
         )
     return np.asarray(lungs), stack(part[:fewest] for part in parts)
 
@@ -121,8 +120,8 @@ def fitted(
     """Models of a kind, stacked, fitted to the breaths of each lung."""
     kind = KINDS[name]
     keys = jr.split(jr.fold_in(key, 4), train.pressure.shape[0])
-    delay = size.sensor_delay
-    models = [lung.LungModel(kind.make(k), train.dt[0], delay) for k in keys]
+    sensor = train.dt[0], size.sensor_delay
+    models = stack([lung.LungModel(kind.make(k), *sensor) for k in keys])
     of_system = lambda names: [f"dynamics.dynamics.system.{n}" for n in names.split()]
     constraints = dict.fromkeys(of_system(kind.positive), positive)
     options |= dict(
@@ -131,7 +130,7 @@ def fitted(
         trainable=constraints | dict.fromkeys(of_system(kind.free)) or None,
         batch_size=32,
     )
-    return lung.fit_lungs(stack(models), train, key=jr.fold_in(key, 5), **options).model
+    return lung.fit_lungs(models, train, key=jr.fold_in(key, 5), **options).model
 
 
 @eqx.filter_jit
