@@ -351,7 +351,7 @@ def explore(
             f"{200 * breaths} breaths only {count} stayed below {abort}: lower scale."
         )
     whole = [np.concatenate(column)[:breaths] for column in zip(*kept, strict=True)]
-    *columns, truth = map(jnp.asarray, whole)
+    u_in, u_out, pressure, truth = map(jnp.asarray, whole)
     each = lambda value: None if value is None else jnp.full(breaths, float(value))
     lungs = each(resistance), each(compliance)
-    return Breaths(*columns, env.dt, *lungs, truth)
+    return Breaths(u_in, u_out, pressure, env.dt, *lungs, truth)

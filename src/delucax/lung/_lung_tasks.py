@@ -65,7 +65,8 @@ def _task(
     if delay:
         dynamics = Delayed(dynamics, controls=delay)
         rest = dynamics.filled(rest)
-    env = ventilation(dynamics, waveform, **(dict(resting_state=rest) | options))
+    options.setdefault("resting_state", rest)
+    env = ventilation(dynamics, waveform, **options)
     asked, least = waveform.peep, valves.peep
     # Checked where both are known. Numbers of another precision may differ by rounding.
     if is_concrete(asked) and is_concrete(least):
@@ -270,6 +271,5 @@ def learned_lung(
             f"{where}: model must be a LearnedLung or a LungModel, got "
             f"{type(model).__name__}."
         )
-    return ventilation(
-        dynamics, horizon=horizon, **(dict(resting_state=rest) | options)
-    )
+    options.setdefault("resting_state", rest)
+    return ventilation(dynamics, horizon=horizon, **options)

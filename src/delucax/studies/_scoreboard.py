@@ -173,27 +173,27 @@ FAMILIES: dict[str, dict[str, Callable[[str, Environment], Any]]] = {
     "Feedback": {
         "zero": lambda name, env: controllers.Zero(env.control_size),
         "PID": _following,
-        "LQR": lambda *task: _regulator(*task, controllers.LQR),
+        "LQR": lambda name, env: _regulator(name, env, controllers.LQR),
         "FiniteHorizonLQR": lambda name, env: _regulator(
             name, env, controllers.FiniteHorizonLQR, horizon=env.horizon
         ),
-        "HInfinity": lambda *task: _regulator(*task, controllers.HInfinity),
+        "HInfinity": lambda name, env: _regulator(name, env, controllers.HInfinity),
     },
     "Online learning": {
-        "GPC": lambda *task: _learning(*task, controllers.gpc),
+        "GPC": lambda name, env: _learning(name, env, controllers.gpc),
         "Adaptive": lambda name, env: controllers.Adaptive(agent_of(name, "GPC")),
-        "NeuralGPC": lambda *task: _learning(
-            *task, controllers.neural_gpc, key=jax.random.key(0)
+        "NeuralGPC": lambda name, env: _learning(
+            name, env, controllers.neural_gpc, key=jax.random.key(0)
         ),
-        "DRC": lambda *task: _learning(*task, controllers.drc),
-        "SFC": lambda *task: _learning(*task, controllers.sfc),
-        "DSC": lambda *task: _learning(*task, controllers.dsc),
+        "DRC": lambda name, env: _learning(name, env, controllers.drc),
+        "SFC": lambda name, env: _learning(name, env, controllers.sfc),
+        "DSC": lambda name, env: _learning(name, env, controllers.dsc),
         "BPC": lambda name, env: controllers.BPC(env.dynamics, agent_of(name, "LQR")),
     },
     "Planning": {
-        "MPC": lambda *task: _receding(*task, ILQR, max_iterations=8),
-        "MPPI": lambda *task: _receding(*task, MPPI, samples=128, iterations=3),
-        "CEM": lambda *task: _receding(*task, CEM, samples=128, iterations=3),
+        "MPC": lambda name, env: _receding(name, env, ILQR, max_iterations=8),
+        "MPPI": lambda name, env: _receding(name, env, MPPI, samples=128, iterations=3),
+        "CEM": lambda name, env: _receding(name, env, CEM, samples=128, iterations=3),
     },
     "Training": {
         "affine": lambda name, env: _by_gradient(env, mlp_policy, width=1, depth=0),

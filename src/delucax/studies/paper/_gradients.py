@@ -42,7 +42,7 @@ def policy_gradient(small: bool = False) -> Finding:
 
     exact = train(training.analytic, 0)
     first, faster = _first(exact), _first(train(training.analytic, 0, TWICE))
-    rows = [("through the rollout", 1, int(first is not None), first, exact[-1])]
+    rows: Any = [("through the rollout", 1, int(first is not None), first, exact[-1])]
     curves, fewest = {}, []
     for scale in scales:
         for count in pairs:
@@ -85,7 +85,7 @@ def policy_gradient(small: bool = False) -> Finding:
     )
     medians = "rollouts, median", "cost at the end, median"
     columns = "gradient", "runs", "reach 2.0", *medians
-    table = [dict(zip(columns, row, strict=True)) for row in rows]
+    table: Any = [dict(zip(columns, row, strict=True)) for row in rows]
     tables, figures = {"Rollouts to cost 2.0": table}, {"policy_gradient": ax.figure}
     return Finding("Policy gradient of the pendulum", claims, tables, figures, notes)
 

@@ -147,7 +147,8 @@ def _costs(
 
     A contender makes a controller of the plan of a seed.
     """
-    costs, options = {}, dict(key=jr.key(0), keep=("costs",), throw=False)
+    costs: dict[tuple[str, str], Any] = {}
+    options: Any = dict(key=jr.key(0), keep=("costs",), throw=False)
     for name, make in contenders.items():
         of_seed = lambda plan, x0, w, make=make: rollout(
             env, make(plan), x0=x0, w=w, horizon=len(w), **options

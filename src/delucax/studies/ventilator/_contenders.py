@@ -133,7 +133,7 @@ class Trainer(NamedTuple):
 def searched_pids(envs: Environment, trainer: Trainer) -> dict[str, LeakyPID | PID]:
     """The best PID of each kind, for each lung and for all."""
     best: dict[str, Any] = {}
-    key, true = jr.fold_in(trainer.key, 6), dict(TRUE_PID, kind="true")
+    key, true = jr.fold_in(trainer.key, 6), dict[str, Any](TRUE_PID, kind="true")
     for name, kind, options in (("leaky PID", LeakyPID, {}), ("PID", PID, true)):
         grid, errors = lung.pid_grid(envs, key=key, **options)
         own, of_all = jnp.argmin(errors, axis=1), jnp.argmin(jnp.mean(errors, axis=0))

@@ -18,7 +18,7 @@ from ._stages import SHOWN
 
 
 _SIZE = 9.0
-_STYLE = {
+_STYLE: Any = {
     "axes.labelsize": _SIZE,
     "axes.titlesize": _SIZE + 1,
     "legend.fontsize": _SIZE - 1,

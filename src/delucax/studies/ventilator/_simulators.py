@@ -159,10 +159,11 @@ def closed_loop_errors(
     under the same controller and without noise, by kind: shape `(lungs,)`."""
     waveforms = envs.cost.waveform  # pyright: ignore[reportAttributeAccessIssue]
     whole = eqx.filter_vmap(lung.Breathing)(controllers, waveforms)
-    options: Any = jnp.asarray(SEEN), jr.key(0)[None], INSPIRATION
+    pips, keys = jnp.asarray(SEEN), jr.key(0)[None]
 
     def read(envs):
-        return closed_loop(envs, whole, *options)[-1].observations[:, 0, :, :, 0]
+        run: Any = closed_loop(envs, whole, pips, keys, INSPIRATION)[-1]
+        return run.observations[:, 0, :, :, 0]
 
     truth = read(eqx.tree_at(lambda env: env.sensor_noise, envs, None))
     task = lambda model, waveform: lung.learned_lung(model, waveform=waveform)

@@ -119,8 +119,8 @@ def lung_study(
     if recorded is None:
         around = [size.between[i % len(size.between)] for i in range(len(lungs))]
         envs, others = (
-            stack([_simulators.task_of(*each, delay) for each in all])
-            for all in (lungs, around)
+            stack([_simulators.task_of(R, C, delay) for R, C in each])
+            for each in (lungs, around)
         )
         between = others, [_lung_name(*each) for each in size.between]
         judge = "the lungs themselves"
