@@ -1,4 +1,4 @@
-"""What the fields of a module are: their kinds, paths, names and files."""
+"""The fields of modules: their kinds, paths, names and files; stacks of modules."""
 
 from ._fields import (
     AbstractConstraint as AbstractConstraint,
@@ -22,3 +22,9 @@ from ._paths import (
     replace as replace,
 )
 from ._serialise import load as load, save as save
+from ._stack import (
+    count_of as count_of,
+    stack as stack,
+    taken as taken,
+    unstack as unstack,
+)
