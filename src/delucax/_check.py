@@ -14,7 +14,11 @@ from jaxtyping import Array
 
 from ._files import as_path as as_path
 from ._message import did_you_mean, shortened
-from ._module import as_float_array, indexed_names
+from ._module import (
+    as_float_array,
+    check_function as check_function,
+    indexed_names,
+)
 from ._typing import Bounds
 
 
@@ -104,6 +108,18 @@ def as_vector(value: Any, size: int, name: str, where: str) -> Array:
     array = _as_array(value, name, where, rule, lambda shape: shape == (size,))
     check_real(array, name, where)
     return array
+
+
+def as_entries(
+    value: Any, size: int | None, name: str, where: str, each: str = "entry"
+) -> Array:
+    """`value`, a number for all or a vector with one for `each`, as a floating-point
+    array, or an error. The vector has `size` entries, or with `None` any number."""
+    if size is None:
+        rule = f"be a number or a vector with an entry for each {each}"
+        return _as_array(value, name, where, rule, lambda shape: len(shape) <= 1)
+    rule, shapes = f"be a number or have shape ({size},)", ((), (size,))
+    return _as_array(value, name, where, rule, lambda shape: shape in shapes)
 
 
 def check_real(array: Array, name: str, where: str) -> None:

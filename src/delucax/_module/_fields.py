@@ -309,19 +309,23 @@ def check_parameters(module: eqx.Module) -> None:
         value = getattr(module, field.name, None)
         name = f"{type(module).__name__}: {field.name}"
         if _FUNCTION in field.metadata and value is not None:
-            _check_function(value, name)
+            check_function(value, field.name, type(module).__name__)
         if _ROLE in field.metadata:
             _check_numbers(value, name, field)
 
 
-def _check_function(value: Any, name: str) -> None:
+def check_function(value: Any, name: str, where: str, of: str = "") -> None:
+    """Raise unless `value` is a function. `of` says what its arguments are, such as
+    " of time"."""
     if not callable(value):
-        raise ValueError(f"{name} must be a function, got {shortened(value)}.")
-    inner = value.function if isinstance(value, StaticFunction) else None
+        raise ValueError(
+            f"{where}: {name} must be a function{of}, got {shortened(value)}."
+        )
+    inner = value.function if isinstance(value, StaticFunction) else value
     if isinstance(inner, type):
         raise ValueError(
-            f"{name} must be a function, got the class {inner.__name__} where "
-            f"{inner.__name__}(...) may be meant."
+            f"{where}: {name} must be a function{of}, got the class {inner.__name__} "
+            f"where {inner.__name__}(...) may be meant."
         )
 
 

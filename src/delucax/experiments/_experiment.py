@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._check import check_choice
+from .._check import check_choice, check_function
 from .._message import did_you_mean
 from ._axes import Axis, axis_of, Mark, Marks, Param, selector, words
 from ._fingerprint import fingerprint, version
@@ -102,10 +102,7 @@ class Experiment:
     fixtures: Mapping[str, Fixture] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        if not callable(self.function):
-            raise ValueError(
-                f"experiment: function must be a function, got {self.function!r}."
-            )
+        check_function(self.function, "function", "experiment")
         if not self.name:
             name = getattr(self.function, "__name__", type(self.function).__name__)
             object.__setattr__(self, "name", name)
