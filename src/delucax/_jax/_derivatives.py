@@ -1,10 +1,14 @@
-"""Derivatives of programs that may have none in one of the two modes."""
+"""Derivatives of programs that may have none: in one of the two modes, or at all."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
-from jax.interpreters import partial_eval
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir, partial_eval
+from jaxtyping import Array
 
 
 def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
@@ -39,3 +43,40 @@ def is_constant(f: Callable[..., Any], *args: Any) -> bool:
     traced = jax.make_jaxpr(f)(*args)
     _, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
     return not any(used)
+
+
+_nan_tangent = Primitive("nan_tangent")
+
+
+def nan_tangent(tangent: Array, ok: Array) -> Array:
+    """The tangent where `ok` holds; elsewhere NaN, unless the tangent is zero.
+
+    The same in reverse: what does not depend on a failed solve (a masked lane of a
+    batch) keeps its gradient, and the gradient of what does is NaN. A product with NaN
+    would not do, because that of NaN and zero is NaN.
+    """
+    return _nan_tangent.bind(tangent, jnp.broadcast_to(ok, tangent.shape))
+
+
+def _value(tangent, ok):
+    return jnp.where(ok | (tangent == 0), tangent, jnp.nan)
+
+
+def _batch(values, dims):
+    size = next(v.shape[d] for v, d in zip(values, dims, strict=True) if d is not None)
+    at_front = functools.partial(batching.bdim_at_front, size=size)
+    return _nan_tangent.bind(*map(at_front, values, dims)), 0
+
+
+def _transpose(cotangent, _, ok):
+    is_zero = type(cotangent) is ad.Zero
+    return cotangent if is_zero else _nan_tangent.bind(cotangent, ok), None
+
+
+_nan_tangent.def_impl(_value)
+_nan_tangent.def_abstract_eval(lambda tangent, ok: tangent)
+batching.primitive_batchers[_nan_tangent] = _batch
+# Linear in the tangent, so that its own derivative is the same map.
+ad.defjvp(_nan_tangent, lambda change, _, ok: _nan_tangent.bind(change, ok), None)
+ad.primitive_transposes[_nan_tangent] = _transpose
+mlir.register_lowering(_nan_tangent, mlir.lower_fun(_value, multiple_results=False))
