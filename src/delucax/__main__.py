@@ -11,6 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from ._extras import extra
+
 
 _COMMANDS: list[tuple[Callable, str, str, tuple]] = []
 """What is called with the options, its help, more of it, and what options it has; in
@@ -45,18 +47,10 @@ def _expression(flag: str, name: str, help: str) -> tuple[str, dict[str, Any]]:
 
 def main(arguments: list[str] | None = None) -> int:
     """The command line; the exit status is 1 if cases failed, 2 on wrong arguments."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    options = vars(_parser().parse_args(arguments))
+    call = options.pop("call")
     try:
-        if options.version:
-            print(f"delucax {version('delucax')}")
-            return 0
-        if options.command is None:
-            parser.print_help()
-            return 0
-        names = ("version", "command", "call")
-        given = {k: v for k, v in vars(options).items() if k not in names}
-        return options.call(**given) or 0
+        return call(**options) or 0
     except (OSError, ValueError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -70,10 +64,12 @@ def _parser() -> argparse.ArgumentParser:
         description="Differentiable control in JAX.",
         epilog=f"{prog} COMMAND --help shows the options of a command.",
     )
-    parser.add_argument("--version", action="store_true", help="show the version")
-    commands = parser.add_subparsers(
-        title="commands", dest="command", metavar="COMMAND"
+    shown = f"delucax {version('delucax')}"
+    parser.add_argument(
+        "--version", action="version", version=shown, help="show the version"
     )
+    parser.set_defaults(call=parser.print_help)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for call, help, more, command_options in _COMMANDS:
         added = commands.add_parser(
             call.__name__.removeprefix("_"),
@@ -192,12 +188,12 @@ def _run(
     file: str, store: str | None, html: str | None, dask: str | None, **options: Any
 ) -> int:
     from .experiments._commands import run_file
-    from .experiments._workers import dask_client
     from .studies._listing import SUITES
 
     with contextlib.ExitStack() as stack:
         if dask is not None:
-            stack.enter_context(dask_client(dask))
+            distributed = extra("distributed", "dask")
+            stack.enter_context(distributed.Client(dask, timeout=20))
             options["backend"] = "dask"
         return run_file(file, SUITES, store, html, options)
 

@@ -91,14 +91,20 @@ def check_key(key: Any, where: str) -> Any:
     )
 
 
+def _error(value: Any, name: str, where: str, rule: str) -> ValueError:
+    """The error that shows a value which is not as it must be."""
+    return ValueError(f"{where}: {name} must {rule}, got {shortened(value)}.")
+
+
 def _as_array(
     value: Any, name: str, where: str, rule: str, fits: Callable[[Shape], bool]
 ) -> Array:
     """`value` as a floating-point array of a shape that fits, or an error."""
     array = as_float_array(value)
     if not eqx.is_inexact_array(array) or not fits(array.shape):
-        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
-        raise ValueError(f"{where}: {name} must {rule}, got {got}.")
+        if not eqx.is_array(array):
+            raise _error(value, name, where, rule)
+        raise ValueError(f"{where}: {name} must {rule}, got shape {array.shape}.")
     return array
 
 
@@ -115,11 +121,15 @@ def as_entries(
 ) -> Array:
     """`value`, a number for all or a vector with one for `each`, as a floating-point
     array, or an error. The vector has `size` entries, or with `None` any number."""
+    rule = f"be a number or have shape ({size},)"
     if size is None:
         rule = f"be a number or a vector with an entry for each {each}"
-        return _as_array(value, name, where, rule, lambda shape: len(shape) <= 1)
-    rule, shapes = f"be a number or have shape ({size},)", ((), (size,))
-    return _as_array(value, name, where, rule, lambda shape: shape in shapes)
+    return _as_array(value, name, where, rule, _fits(size))
+
+
+def _fits(size: int | None) -> Callable[[Shape], bool]:
+    """Whether a shape is that of a number, or of a vector of `size`, if it is given."""
+    return lambda shape: len(shape) <= 1 and (size is None or shape in ((), (size,)))
 
 
 def check_real(array: Array, name: str, where: str) -> None:
@@ -150,9 +160,7 @@ def symmetric_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Arr
         largest = functools.partial(np.max, axis=(-2, -1), initial=0.0)
         slack = 100 * np.finfo(array.dtype).eps * largest(np.abs(array))
         if np.any(largest(np.abs(array - np.swapaxes(array, -2, -1))) > slack):
-            raise ValueError(
-                f"{where}: {name} must be symmetric, got {shortened(array)}."
-            )
+            raise _error(array, name, where, "be symmetric")
     return (matrix + matrix.mT) / 2
 
 
@@ -164,20 +172,15 @@ def as_bounds(
     if value is None:
         return None
     if not isinstance(value, tuple | list) or len(value) != 2:
-        raise ValueError(
-            f"{where}: {name} must be a pair (low, high), got {shortened(value)}."
-        )
+        raise _error(value, name, where, "be a pair (low, high)")
     low, high = (as_float_array(end) for end in value)
     if size is not None:
-        rule, shapes = f"be numbers or have shape ({size},)", ((), (size,))
+        rule, fits = f"be numbers or have shape ({size},)", _fits(size)
         for end in (low, high):
-            _as_array(end, name, where, rule, lambda shape: shape in shapes)
+            _as_array(end, name, where, rule, fits)
     fit = all(eqx.is_inexact_array(end) and end.ndim <= 1 for end in (low, high))
     if not fit or low.ndim == high.ndim == 1 and low.shape != high.shape:
-        raise ValueError(
-            f"{where}: {name} must be numbers or vectors of one size, "
-            f"got {shortened(value)}."
-        )
+        raise _error(value, name, where, "be numbers or vectors of one size")
     if is_concrete(low) and is_concrete(high):
         if not np.all(np.asarray(low) <= np.asarray(high)):
             raise ValueError(
@@ -209,7 +212,7 @@ def check_finite(array: Any, name: str, where: str) -> None:
     """Raise if a concrete `array` holds NaN or infinity."""
     if eqx.is_inexact_array(array) and is_concrete(array):
         if not np.all(np.isfinite(np.asarray(array))):
-            raise ValueError(f"{where}: {name} must be finite, got {shortened(array)}.")
+            raise _error(array, name, where, "be finite")
 
 
 def _check_entries(
@@ -222,7 +225,7 @@ def _check_entries(
         if not is_concrete(array) or np.all(holds(np.asarray(array))):
             return
         value = np.asarray(array)
-    raise ValueError(f"{where}: {name} must be {rule}, got {shortened(value)}.")
+    raise _error(value, name, where, f"be {rule}")
 
 
 def check_positive(value: Any, name: str, where: str) -> None:
@@ -250,17 +253,12 @@ def as_number(value: Any, name: str, where: str) -> Any:
     while other things are being traced.
     """
     if isinstance(value, Tracer):
-        array = as_float_array(value)
-        if array.shape != ():
-            raise ValueError(
-                f"{where}: {name} must be a number, got shape {array.shape}."
-            )
-        return array
+        return _as_array(value, name, where, "be a number", lambda shape: shape == ())
     number = np.asarray(value)
     if number.shape != () or number.dtype.kind not in "iuf":
-        raise ValueError(f"{where}: {name} must be a number, got {shortened(value)}.")
+        raise _error(value, name, where, "be a number")
     if not np.isfinite(number):
-        raise ValueError(f"{where}: {name} must be finite, got {shortened(value)}.")
+        raise _error(value, name, where, "be finite")
     return float(number)
 
 
@@ -283,18 +281,14 @@ def check_choice(value: Any, choices: tuple[Any, ...], name: str, where: str) ->
     """Raise unless `value` is one of `choices`."""
     if value not in choices:
         words = [repr(choice) for choice in choices]
-        expected = (
-            " or ".join(words) if len(words) == 2 else f"one of {', '.join(words)}"
-        )
-        raise ValueError(f"{where}: {name} must be {expected}, got {value!r}.")
+        rule = " or ".join(words) if len(words) == 2 else f"one of {', '.join(words)}"
+        raise ValueError(f"{where}: {name} must be {rule}, got {value!r}.")
 
 
 def check_bool(value: Any, name: str, where: str) -> bool:
     """`value`, if it is True or False, or an error."""
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(
-            f"{where}: {name} must be True or False, got {shortened(value)}."
-        )
+        raise _error(value, name, where, "be True or False")
     return bool(value)
 
 
@@ -302,10 +296,7 @@ def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
     """`value` as an int of at least `least`."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not whole or value < least:
-        raise ValueError(
-            f"{where}: {name} must be a whole number of at least {least}, got "
-            f"{shortened(value)}."
-        )
+        raise _error(value, name, where, f"be a whole number of at least {least}")
     return int(value)
 
 
@@ -323,15 +314,10 @@ def as_rows(
 ) -> Array:
     """`value` as a real array of a row of `size` entries for each step (of `steps`, if
     it is given), or an error."""
-    array = as_float_array(value)
-    fits = eqx.is_inexact_array(array) and array.ndim == 2 and array.shape[1] == size
-    if not fits or steps not in (None, array.shape[0]):
-        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
-        rows = "steps" if steps is None else steps
-        raise ValueError(
-            f"{where}: {name} must have shape ({rows}, {size}), a row for each step, "
-            f"got {got}."
-        )
+    rows = "steps" if steps is None else steps
+    rule = f"have shape ({rows}, {size}), a row for each step"
+    fits = lambda s: len(s) == 2 and s[1] == size and steps in (None, s[0])
+    array = _as_array(value, name, where, rule, fits)
     if array.shape[0] == 0:
         raise ValueError(f"{where}: {name} must have at least one step.")
     check_real(array, name, where)
@@ -430,9 +416,8 @@ def check_time_invariant(model: Any, name: str, where: str) -> None:
 
 def check_vector(value: Any, name: str, where: str) -> None:
     """Raise unless `value` is an array of one axis with finite entries."""
-    if not eqx.is_inexact_array(value) or value.ndim != 1:
-        raise ValueError(f"{where}: {name} must be a vector, got {shortened(value)}.")
-    check_finite(value, name, where)
+    array = _as_array(value, name, where, "be a vector", lambda s: len(s) == 1)
+    check_finite(array, name, where)
 
 
 def check_definite(R: Array, name: str, where: str, definite: bool) -> None:

@@ -99,14 +99,13 @@ class bounded(AbstractConstraint):
         ```
     """
 
-    low: float
-    high: float
+    low: float = eqx.field(converter=float)
+    high: float = eqx.field(converter=float)
 
-    def __init__(self, low: float | int, high: float | int):
+    def __check_init__(self):
+        low, high = self.low, self.high
         if not low < high:
             raise ValueError(f"bounded: low must be below high, got {low} and {high}.")
-        self.low = float(low)
-        self.high = float(high)
 
     def constrain(self, z: Array) -> Array:
         value = self.low + (self.high - self.low) * jax.nn.sigmoid(z)
@@ -252,9 +251,8 @@ def function_field(default: Any = dataclasses.MISSING) -> Any:
 
 def fields_of(node: Any) -> dict[str, dataclasses.Field]:
     """The fields of a module, or of another dataclass, by name; none of other nodes."""
-    if not dataclasses.is_dataclass(node):
-        return {}
-    return {field.name: field for field in dataclasses.fields(node)}
+    fields = dataclasses.fields(node) if dataclasses.is_dataclass(node) else ()
+    return {field.name: field for field in fields}
 
 
 def children_of(node: Any) -> dict[str, Any]:

@@ -131,16 +131,12 @@ def _with(tree: Any, path: str, value: Any) -> Any:
             )
     *_, parent, old = nodes
     if isinstance(parent, eqx.Module):
-        convert = fields_of(parent)[names[-1]].metadata.get("converter")
-        value = value if convert is None else convert(value)
+        metadata = fields_of(parent)[names[-1]].metadata
+        value = metadata.get("converter", lambda value: value)(value)
     elif eqx.is_inexact_array(old):
         value = as_float_array(value)
-    return eqx.tree_at(
-        lambda tree: get_path(tree, path),
-        tree,
-        value,
-        is_leaf=lambda node: node is None,
-    )
+    at = lambda tree: get_path(tree, path)
+    return eqx.tree_at(at, tree, value, is_leaf=lambda node: node is None)
 
 
 def _followed(tree: Any, path: str, before: Any, changes: Mapping[str, Any]) -> Any:
@@ -162,10 +158,8 @@ def _is_within(path: str, other: str) -> bool:
 
 def _owners(changes: Mapping[str, Any]) -> list[str]:
     """The paths of all nodes above the changes, the deepest first."""
-    owners = set()
-    for path in changes:
-        parts = path.split(".")
-        owners |= {".".join(parts[:end]) for end in range(len(parts))}
+    parts = [path.split(".") for path in changes]
+    owners = {".".join(p[:end]) for p in parts for end in range(len(p))}
     return sorted(owners, key=lambda path: (-len(path.split(".")), not path, path))
 
 
@@ -198,9 +192,8 @@ def _error_of(module: Any) -> Exception | None:
 
 def _check_members(module: eqx.Module, before: eqx.Module) -> None:
     """Run the checks of the members of a batch, as `before` was."""
-    legal = lambda one: (
-        _error_of(one) is None or any(map(legal, _members(one).values()))
-    )
+    # Batches of batches go down to what is legal by itself.
+    legal = lambda m: _error_of(m) is None or any(map(legal, _members(m).values()))
     like = next(filter(legal, _members(before).values()), None)
     if like is None:  # no batch, or one that cannot be looked at
         return
@@ -225,12 +218,11 @@ def _members(module: eqx.Module) -> dict[int, eqx.Module]:
     the arrays of `module` share no leading axis or are traced."""
     arrays, rest = eqx.partition(module, eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
-    if any(isinstance(leaf, Tracer) for leaf in leaves):
-        return {}
     lengths = {leaf.shape[:1] for leaf in leaves}
-    if len(lengths) != 1 or () in lengths:
+    is_traced = any(isinstance(leaf, Tracer) for leaf in leaves)
+    if len(lengths) != 1 or () in lengths or is_traced:
         return {}
-    (count,) = lengths.pop()
+    ((count,),) = lengths
     places = range(count) if count <= _MOST_MEMBERS else _sampled(leaves, count)
     rows = zip(*(list(leaf[np.asarray(places)]) for leaf in leaves), strict=True)
     member = lambda row: eqx.combine(jax.tree.unflatten(structure, row), rest)

@@ -13,22 +13,8 @@ from ._fingerprint import fingerprint
 
 @dataclasses.dataclass(frozen=True)
 class Mark:
-    """A label of a case, such as `slow`; made by `experiment.mark`.
-
-    **Arguments:**
-
-    - `name`: `"slow"`, `"skip"`, `"xfail"`, or a name of your own to select by.
-    - `reason`: why; nothing by default.
-
-    !!! example
-
-        ```python
-        from delucax.experiments import experiment
-
-        tired = experiment.mark.skip("does not converge")
-        hard = experiment.param(3.0, marks=tired)
-        ```
-    """
+    """A label of a case, such as `experiment.mark.skip("does not converge")`: `slow`,
+    `skip` and `xfail` have a meaning, other names are there to select by."""
 
     name: str
     reason: str = ""
@@ -80,29 +66,25 @@ class Axis:
     def choices(self, where: str) -> Iterator[Choice]:
         """What there is to choose from; `where` is named in errors."""
         for index, param in enumerate(self.params):
-            named = dict(zip(self.names, param.values, strict=True))
-            shown = {name: self._shown(v, param) for name, v in named.items()}
-            hashes = [(n, _hash(v, n, param, where)) for n, v in named.items()]
+            shown, hashes = {}, []
+            for name, value in zip(self.names, param.values, strict=True):
+                shown[name] = self._shown(value, param)
+                try:
+                    hashes.append((name, fingerprint(value)))
+                except (TypeError, RecursionError) as error:
+                    raise ValueError(
+                        f"{where}: the parameter {name!r} of case {param.id!r} cannot "
+                        f"be written down: it holds {error}. Give a name instead, and "
+                        "make the thing in the function or in a fixture."
+                    ) from error
             yield Choice(index, param, shown, fingerprint(hashes))
 
     def _shown(self, value: Any, param: Param) -> Any:
         """What the table shows: a simple value itself, of another its name or id."""
-        value = value.item() if isinstance(value, np.generic) else value
-        if _is_simple(value):
+        value = _as_python(value)
+        if isinstance(value, _SIMPLE):
             return value
         return (_label(value) if len(self.names) > 1 else None) or param.id
-
-
-def _hash(value: Any, name: str, param: Param, where: str) -> str:
-    """What tells a value from others by its content."""
-    try:
-        return fingerprint(value)
-    except (TypeError, RecursionError) as error:
-        raise ValueError(
-            f"{where}: the parameter {name!r} of case {param.id!r} cannot be "
-            f"written down: it holds {error}. Give a name instead, and make "
-            "the thing in the function or in a fixture."
-        ) from error
 
 
 def axis_of(names: Any, values: Any, ids: Any) -> Axis:
@@ -154,8 +136,7 @@ def _ids(params: list[Param], names: tuple, ids: Any, where: str) -> list[str]:
     for k, param in enumerate(params):
         pairs = zip(param.values, names, strict=True)
         words = (f"{n}{k}" if (w := _label(v)) is None else w for v, n in pairs)
-        automatic = "-".join(words)
-        labels.append(param.id or (automatic if ids is None else ids[k]))
+        labels.append(param.id or ("-".join(words) if ids is None else ids[k]))
     counts = Counter(labels)
     for label, param in zip(labels, params, strict=True):
         if counts[label] > 1 and (ids is not None or param.id is not None):
@@ -166,16 +147,19 @@ def _ids(params: list[Param], names: tuple, ids: Any, where: str) -> list[str]:
     ]
 
 
-def _is_simple(value: Any) -> bool:
-    """Whether a table can hold it."""
-    return value is None or isinstance(value, bool | int | float | str)
+_SIMPLE = bool | int | float | str | None
+"""What a table can hold."""
+
+
+def _as_python(value: Any) -> Any:
+    """A number of NumPy as one of Python."""
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _label(value: Any) -> str | None:
     """What to call a value that has a name or is one."""
-    if isinstance(value, np.generic):
-        return str(value.item())
-    if _is_simple(value):
+    value = _as_python(value)
+    if isinstance(value, _SIMPLE):
         return str(value)
     label = getattr(value, "__name__", None)
     return label if isinstance(label, str) and label != "<lambda>" else None
@@ -205,27 +189,27 @@ def selector(
         return lambda holds: True
     # It becomes an expression of Python, which has the same operators; each word is
     # quoted, so that nothing else is evaluated.
-    python: list[str | None] = []
+    python: list[str] = []
     depth, wants_word = 0, True
-    for token in (*tokens, None):
+    for token in (*tokens, ""):
         python.append(token)
         if wants_word and token in ("not", "("):
             depth += token == "("
-        elif wants_word and token not in ("and", "or", ")", None):
+        elif wants_word and token not in ("and", "or", ")", ""):
             python[-1], wants_word = f"holds({token!r})", False
         elif not wants_word and token in ("and", "or"):
             wants_word = True
         elif not wants_word and token == ")" and depth:
             depth -= 1
-        elif wants_word or token is not None or depth:
+        elif wants_word or token or depth:
             joint = "')'" if depth else "'and' or 'or'"
-            got = "the end" if token is None else repr(token)
             raise ValueError(
                 f"{where}: {argument} must be words joined by and, or, not and "
                 f"parentheses, got {expression!r}: expected "
-                f"{'a word' if wants_word else joint} instead of {got}."
+                f"{'a word' if wants_word else joint} instead of "
+                f"{repr(token) if token else 'the end'}."
             )
-    code = compile(" ".join(filter(None, python)), "<expression>", "eval")
+    code = compile(" ".join(python), "<expression>", "eval")
     return lambda holds: eval(code, {"holds": holds})
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from .._page import as_text, Page
 from ._axes import selector
 from ._experiment import Experiment
-from ._page import as_text, Page
 from ._report import by_experiment, diff, DIFFERENCES, report, summary
 from ._results import Results
 from ._run import run

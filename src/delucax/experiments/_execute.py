@@ -1,10 +1,9 @@
 """One case after another, in the process that it is called in."""
 
 import contextlib
-import functools
+import contextvars
 import inspect
 import os
-import threading
 import time
 import traceback
 import warnings
@@ -18,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
+from .._provenance import device
 from ._experiment import arguments_of, Experiment
-from ._fingerprint import device
 from ._store import RESERVED
 
 
@@ -49,8 +48,6 @@ class Runner:
     def __init__(self, experiment: Experiment):
         self.experiment, self.axes = experiment, experiment.all_axes()
         self.fixtures = experiment.used_fixtures()
-        kinds = [p.kind for p in experiment.arguments.values()]
-        self.takes_any_name = inspect.Parameter.VAR_KEYWORD in kinds
         self.shared: dict[Any, Any] = {}
         self.closing = contextlib.ExitStack()
         self.is_traceable: dict[Any, bool] = {}
@@ -115,10 +112,9 @@ class Runner:
             if key not in self.shared:
                 self.shared[key] = _make(fixture.function, arguments, self.closing)
             given[name] = self.shared[key]
-        if self.takes_any_name:
-            return given
-        known = self.experiment.arguments
-        return {name: value for name, value in given.items() if name in known}
+        takes = self.experiment.arguments
+        takes_any = any(p.kind is p.VAR_KEYWORD for p in takes.values())
+        return {name: v for name, v in given.items() if takes_any or name in takes}
 
     def _call(self, arguments: dict[str, Any], seeds: tuple[int, ...], mesh: Any):
         """What the function returns: a list by seed, or all seeds at once."""
@@ -144,8 +140,7 @@ class Runner:
             dynamic, rest = _split(arguments, kinds)
             static = _Static(rest)
             leaves, structure = jax.tree.flatten(dynamic)
-            shapes = [(np.shape(x), jax.dtypes.result_type(x), type(x)) for x in leaves]
-            key = static, structure, tuple(shapes), numbers.shape
+            key = static, structure, tuple(map(jax.typeof, leaves)), numbers.shape
             if key not in self.is_traceable:
                 if len(self.is_traceable) >= _PROGRAMS:
                     self.is_traceable.clear()
@@ -268,37 +263,33 @@ class _Clock:
     compiling = running = 0.0
 
     def __enter__(self) -> "_Clock":
-        _listen()
-        self._outer, _local.spans = getattr(_local, "spans", None), []
-        self._begin = time.perf_counter()
+        self._token, self._begin = _spans.set([]), time.perf_counter()
         return self
 
     def __exit__(self, *_: Any) -> None:
         total = time.perf_counter() - self._begin
-        spans, _local.spans = _local.spans, self._outer
         # One function is traced within another: what is covered counts once.
         covered, last = 0.0, self._begin
-        for begin, end in sorted(spans):
+        for begin, end in sorted(_spans.get() or ()):
             covered += max(end - max(begin, last), 0.0)
             last = max(end, last)
+        _spans.reset(self._token)
         self.compiling = min(covered, total)
         self.running = total - self.compiling
 
 
-_local = threading.local()
+_spans = contextvars.ContextVar[list | None]("spans", default=None)
+"""When programs were traced and compiled, while a clock runs in this thread."""
 
 
-@functools.cache
-def _listen() -> None:
-    """Note the spans of compilations, from now on."""
+def _note(event: str, duration_secs: float, **_: str | int) -> None:
+    spans = _spans.get()
+    if spans is not None and event.startswith("/jax/core/compile/"):
+        now = time.perf_counter()
+        spans.append((now - duration_secs, now))
 
-    def note(event: str, duration_secs: float, **_: str | int) -> None:
-        spans = getattr(_local, "spans", None)
-        if spans is not None and event.startswith("/jax/core/compile/"):
-            now = time.perf_counter()
-            spans.append((now - duration_secs, now))
 
-    jax.monitoring.register_event_duration_secs_listener(note)
+jax.monitoring.register_event_duration_secs_listener(_note)
 
 
 _IN_USE = Path("/proc/self/maps")
@@ -317,12 +308,10 @@ def release_programs(limit: int | None = None) -> bool:
     whether the programs were forgotten.
     """
     try:
-        if limit is None:
-            limit = int(_LIMIT.read_text()) // 2
+        limit = int(_LIMIT.read_text()) // 2 if limit is None else limit
         used = _IN_USE.read_bytes().count(b"\n")
     except (OSError, ValueError):
         return False
-    if used <= limit:
-        return False
-    jax.clear_caches()
-    return True
+    if used > limit:
+        jax.clear_caches()
+    return used > limit

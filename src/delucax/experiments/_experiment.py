@@ -11,8 +11,9 @@ import numpy as np
 
 from .._check import check_choice, check_function
 from .._message import did_you_mean
+from .._provenance import version
 from ._axes import Axis, axis_of, Mark, Marks, Param, selector, words
-from ._fingerprint import fingerprint, version
+from ._fingerprint import fingerprint
 from ._store import RESERVED
 
 
@@ -23,9 +24,6 @@ class Fixture:
     function: Callable
     scope: str
     axis: Axis | None
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return self.function(*args, **kwargs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,13 +100,12 @@ class Experiment:
     fixtures: Mapping[str, Fixture] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        check_function(self.function, "function", "experiment")
-        if not self.name:
-            name = getattr(self.function, "__name__", type(self.function).__name__)
-            object.__setattr__(self, "name", name)
-        for name in ("__doc__", "__module__"):
-            object.__setattr__(self, name, getattr(self.function, name, None))
-        object.__setattr__(self, "__wrapped__", self.function)
+        f = self.function
+        check_function(f, "function", "experiment")
+        name = self.name or getattr(f, "__name__", type(f).__name__)
+        own = {n: getattr(f, n, None) for n in ("__doc__", "__module__")}
+        # A frozen dataclass takes no assignment.
+        vars(self).update(own, name=name, __wrapped__=f)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """The function's own answer to `args` and `kwargs`."""
@@ -147,12 +144,8 @@ class Experiment:
 
     def all_axes(self) -> tuple[Axis, ...]:
         """The axes, those of its fixtures last."""
-        own = [
-            dataclasses.replace(fixture.axis, names=(name,))
-            for name, fixture in self.used_fixtures().items()
-            if fixture.axis is not None
-        ]
-        return (*self.axes, *own)
+        own = ((f.axis, name) for name, f in self.used_fixtures().items())
+        return (*self.axes, *(Axis((name,), a.params) for a, name in own if a))
 
     def cases(
         self, select: str = "", marks: str = "", slow: bool = False
@@ -172,7 +165,12 @@ class Experiment:
         content.
         """
         self._check()
-        where, code = self.name, self._code()
+        where = self.name
+        functions = [fixture.function for fixture in self.used_fixtures().values()]
+        precise = bool(jax.config.jax_enable_x64)
+        # What all cases share. The experiment's own module counts also in a library.
+        content = [self.function, functions, precise, version("delucax")]
+        code = fingerprint(content, root=getattr(self.function, "__module__", None))
         is_selected = selector(select, "select", where)
         is_marked = selector(marks, "marks", where)
         slow = slow or "slow" in words(marks)
@@ -210,14 +208,6 @@ class Experiment:
         from ._run import run
 
         return run(self, **options)
-
-    def _code(self) -> str:
-        """The hash of the code that all cases share."""
-        module = getattr(self.function, "__module__", None)
-        functions = [fixture.function for fixture in self.used_fixtures().values()]
-        precise = bool(jax.config.jax_enable_x64)
-        content = [self.function, functions, precise, version("delucax")]
-        return fingerprint(content, root=module)
 
     def _check(self) -> None:
         where, arguments, fixtures = self.name, self.arguments, self.used_fixtures()
@@ -427,13 +417,10 @@ def arguments_of(function: Callable) -> Mapping[str, inspect.Parameter]:
 
 def as_seeds(seeds: Any, where: str) -> tuple[int, ...]:
     """Seeds from 0 on, or those given."""
-    several = range(seeds) if isinstance(seeds, int) else seeds
-    is_list = isinstance(several, Iterable) and not isinstance(several, str | bytes)
-    chosen = tuple(several) if is_list and not isinstance(seeds, bool) else ()
-    if not chosen or not all(
-        isinstance(s, int | np.integer) and not isinstance(s, bool) and 0 <= s < 2**31
-        for s in chosen
-    ):
+    is_whole = lambda s: isinstance(s, int | np.integer) and not isinstance(s, bool)
+    several = range(seeds) if is_whole(seeds) else seeds
+    chosen = tuple(several) if isinstance(several, Iterable) else ()
+    if not chosen or not all(is_whole(seed) and 0 <= seed < 2**31 for seed in chosen):
         raise ValueError(
             f"{where}: seeds must be how many, at least 1, or whole numbers from 0 to "
             f"2**31 - 1, got {seeds!r}."

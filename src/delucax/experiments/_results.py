@@ -10,8 +10,8 @@ from typing import Any
 from .._check import as_path
 from .._extras import extra
 from .._files import replaced
+from .._page import as_text, FORMS
 from ._experiment import Case
-from ._page import as_text, FORMS
 from ._store import CASE_COLUMNS, RUN_COLUMNS, Store
 
 
@@ -101,16 +101,11 @@ class Results:
             metrics |= dict.fromkeys(record["values"])
             parameters |= dict.fromkeys(record["parameters"])
             run = store.runs.get(record.get("run", -1), {})
-            row = {
-                **{name: record[name] for name in ("experiment", "case")},
-                **record["parameters"],
-                **{name: record[name] for name in ("seed", "status")},
-                **record["values"],
-                **{name: record[name] for name in CASE_COLUMNS},
-                **{name: run.get(name) for name in RUN_COLUMNS},
-                "versions": run.get("versions", {}),
-            }
-            rows.append(row)
+            of = lambda *names, record=record: {name: record[name] for name in names}
+            row = of("experiment", "case") | record["parameters"]
+            row |= of("seed", "status") | record["values"] | of(*CASE_COLUMNS)
+            row |= {name: run.get(name) for name in RUN_COLUMNS}
+            rows.append(row | {"versions": run.get("versions", {})})
         return cls(rows, tuple(metrics), tuple(parameters))
 
     @property
@@ -179,13 +174,12 @@ class Results:
             short = ("experiment", *short) if several else short
             columns = self.all_columns if form in ("csv", "parquet") else short
         self._check_columns(columns, "Results.export")
-        rows = self.flat_rows()
+        body = [[row.get(name) for name in columns] for row in self.flat_rows()]
         if form == "parquet":
             pd, _ = extra("pandas", "experiments"), extra("pyarrow", "experiments")
-            kept = {n: _of_one_type([row.get(n) for row in rows]) for n in columns}
+            kept = {n: _of_one_type([*v]) for n, *v in zip(columns, *body, strict=True)}
             pd.DataFrame(kept).to_parquet(to, index=False)
             return ""
-        body = [[row.get(name) for name in columns] for row in rows]
         text = as_text(form, list(columns), body, digits)
         if ending is not None:
             with replaced(Path(to)) as file:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from .._check import check_choice, check_count
+from .._provenance import provenance
 from ._execute import Outcome, Runner
 from ._experiment import as_experiment, as_seeds, Case, Experiment
-from ._fingerprint import provenance
 from ._results import FAILED, Results
 from ._store import Store
 from ._workers import Job, run_in_workers
@@ -89,7 +89,10 @@ def run(
     names = [one.name for one in chosen]
     if len(set(names)) < len(names):
         raise ValueError(f"{where}: experiments must have different names: {names}.")
-    workers = _workers(workers, where)
+    if workers == -1:
+        usable = getattr(os, "sched_getaffinity", None)  # not on every system
+        workers = len(usable(0)) if usable else os.cpu_count() or 1
+    workers = check_count(workers, "workers", where)
     check_choice(backend, ("loky", "dask"), "backend", where)
     if mesh is not None and (workers > 1 or backend == "dask"):
         raise ValueError(f"{where}: mesh needs workers=1, got {workers} {backend}.")
@@ -137,15 +140,19 @@ def run(
 
 def _write_outcomes(jobs: list[Job], outcomes: Any, opened: Store, bars: Any) -> None:
     """Write each outcome down as it arrives."""
-    number = opened.begin(provenance(_folder(jobs[0].experiment)))
+    try:
+        file = inspect.getfile(inspect.unwrap(jobs[0].experiment.function))
+        folder = Path(file).resolve().parent
+    except (TypeError, OSError):  # not in a file
+        folder = Path.cwd()
+    number = opened.begin(provenance(folder))
     with bars as tick, contextlib.closing(outcomes):
         for job, outcome in outcomes:
             status = _status(job.case, outcome.error)
             fields = outcome._asdict()
             worker = fields.pop("worker")
-            record = {"kind": "case", "run": number, **job.case.described}
-            record |= {"seeds": job.seeds, "status": status, **fields}
-            opened.append(record)
+            made = {"kind": "case", "run": number, "seeds": job.seeds}
+            opened.append({**made, **job.case.described, "status": status, **fields})
             tick(worker, job.case.id, status)
 
 
@@ -155,9 +162,9 @@ def _with_new_status(case: Case, stored: list[dict[str, Any]]) -> list[dict[str,
     for record in stored:
         status = _status(case, record["error"])
         if record["status"] != status:
-            line = {name: v for name, v in record.items() if name != "seed"}
-            values = {name: [value] for name, value in record["values"].items()}
-            line |= {"seeds": [record["seed"]], "status": status, "values": values}
+            line = {**record, "status": status}
+            line["seeds"] = [line.pop("seed")]
+            line["values"] = {n: [value] for n, value in record["values"].items()}
             again.append(line)
     return again
 
@@ -166,21 +173,6 @@ def _status(case: Case, error: str | None) -> str:
     if case.mark("xfail"):
         return "passed unexpectedly" if error is None else "failed as expected"
     return "passed" if error is None else "failed"
-
-
-def _folder(experiment: Experiment) -> Path:
-    try:
-        file = inspect.getfile(inspect.unwrap(experiment.function))
-        return Path(file).resolve().parent
-    except (TypeError, OSError):
-        return Path.cwd()
-
-
-def _workers(workers: Any, where: str) -> int:
-    if workers == -1:
-        usable = getattr(os, "sched_getaffinity", None)
-        return len(usable(0)) if usable else os.cpu_count() or 1
-    return check_count(workers, "workers", where)
 
 
 def _run_here(jobs: list[Job], mesh: Any) -> Generator[tuple[Job, Outcome], None, None]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -50,6 +50,11 @@ def interquartile_mean(values: Any, axis: int | None = None) -> Any:
     ordered = np.sort(array, axis=-1)[..., inside]
     mean = ordered @ weight[inside] / weight.sum()
     return float(mean) if mean.ndim == 0 else mean
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Whether a result is a number, which statistics can be made of."""
+    return isinstance(value, bool | int | float)
 
 
 def compare(
@@ -121,18 +126,15 @@ def compare(
             f"{where}: confidence must be between 0 and 1, got {confidence}."
         )
     samples: dict[Any, dict[tuple, dict[int, float]]] = {}
-    for row in results.rows:
+    for row in [row for row in results.rows if row["status"] in PASSED]:
         value = row.get(metric)
-        if row["status"] not in PASSED:
-            continue
-        if not isinstance(value, bool | int | float):
+        if not is_number(value):
             raise ValueError(
                 f"{where}: metric {metric!r} must be a number in every row, got "
                 f"{value!r} in {row['case']}."
             )
-        others = tuple(row.get(n) for n in results.parameters if n != by)
-        groups = samples.setdefault(row[by], {})
-        group = groups.setdefault((row["experiment"], others), {})
+        others = (row.get(n) for n in ("experiment", *results.parameters) if n != by)
+        group = samples.setdefault(row[by], {}).setdefault(tuple(others), {})
         group[row["seed"]] = float(value)
     if baseline not in samples:
         raise ValueError(
@@ -149,15 +151,15 @@ def compare(
             common = [s for s in group if s in against]
             if common:
                 pairs.append(np.array([[group[s], against[s]] for s in common]))
-        name = "ratio" if ratio else "difference"
-        names = ("iqm", "low", "high", name, f"{name}_low", f"{name}_high")
-        both = *bootstrap.interval(own), *bootstrap.paired(pairs, ratio)
-        row: dict[str, Any] = dict(zip(names, both, strict=True))
         flat = np.concatenate(pairs) if pairs else np.zeros((0, 2))
-        row["below"] = float(np.mean(flat[:, 0] < flat[:, 1])) if len(flat) else np.nan
-        row["pairs"] = len(flat)
-        rows[label] = row
-    return pd.DataFrame.from_dict(rows, orient="index").rename_axis(by)
+        below = float(np.mean(flat[:, 0] < flat[:, 1])) if pairs else np.nan
+        both = *bootstrap.interval(own), *bootstrap.paired(pairs, ratio)
+        rows[label] = *both, below, len(flat)
+    name = "ratio" if ratio else "difference"
+    names = ["iqm", "low", "high", name, f"{name}_low", f"{name}_high"]
+    names += ["below", "pairs"]
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=names)
+    return frame.rename_axis(by)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,6 +15,11 @@ from typing import Any
 from .._check import as_path
 
 
+try:
+    import fcntl
+except ImportError:  # Windows has no such lock, and two runs could write
+    fcntl = None
+
 _FORMAT = "delucax-results"
 _VERSION = 1
 _HEADER = {"format": _FORMAT, "version": _VERSION}
@@ -22,6 +27,7 @@ _HEADER = {"format": _FORMAT, "version": _VERSION}
 CASE_COLUMNS = "error", "traceback", "compile_seconds", "run_seconds", "device", "hash"
 RUN_COLUMNS = ("date", "commit", "dirty", "dtype")
 _KEYS = ("experiment", "case", "seed", "status", "versions")
+_NEEDED = {"run", "parameters", "status", "error", "device"}
 RESERVED = (*_KEYS, *CASE_COLUMNS, *RUN_COLUMNS)
 """Names that neither a parameter nor a result can have."""
 
@@ -71,13 +77,13 @@ class Store:
     def _check_header(self, line: bytes, path: Path) -> None:
         try:
             header = json.loads(line)
-            is_ours, version = header["format"] == _FORMAT, header["version"]
+            if header["format"] != _FORMAT:
+                raise KeyError
+            version = header["version"]
         except (ValueError, KeyError, TypeError):
-            is_ours, version = False, None
-        if not is_ours:
             raise ValueError(
                 f"{self.where}: '{path}' is not a results file of delucax."
-            )
+            ) from None
         if version != _VERSION:
             raise ValueError(
                 f"{self.where}: '{path}' has format {version}, and this "
@@ -90,16 +96,14 @@ class Store:
             self.runs[record["run"]] = record
             return
         key = record["experiment"], record["case"]
+        values, seeds = record["values"], record["seeds"]
+        is_whole = _NEEDED <= record.keys()
+        if not is_whole or any(len(column) != len(seeds) for column in values.values()):
+            raise ValueError
         entry = self.cases.get(key)
         if entry is None or entry["hash"] != record["hash"]:
             entry = self.cases[key] = {"hash": record["hash"], "seeds": {}}
-        values, seeds = record["values"], record["seeds"]
-        if any(len(column) != len(seeds) for column in values.values()):
-            raise ValueError
         entry["order"] = tuple(record["order"])
-        for name in ("run", "parameters", "status", "error", "device"):
-            if name not in record:
-                raise KeyError(name)
         for place, seed in enumerate(seeds):
             own = {name: column[place] for name, column in values.items()}
             entry["seeds"][seed] = {**record, "seed": seed, "values": own}
@@ -118,13 +122,14 @@ class Store:
             self._file = os.open(self.path, os.O_CREAT | os.O_RDWR | os.O_APPEND, 0o666)
         except OSError as error:
             raise self._unwritable(error) from error
-        try:
-            _lock(self._file)
-        except OSError as error:
-            self.close()
-            raise ValueError(
-                f"{self.where}: '{self.path}' is being written by another run."
-            ) from error
+        if fcntl is not None:
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                self.close()
+                raise ValueError(
+                    f"{self.where}: '{self.path}' is being written by another run."
+                ) from error
         if os.fstat(self._file).st_size > self._whole:
             os.ftruncate(self._file, self._whole)
         if self._whole == 0:
@@ -176,11 +181,3 @@ class Store:
 
 def _line(record: dict[str, Any]) -> bytes:
     return (json.dumps(record, separators=(",", ":")) + "\n").encode()
-
-
-def _lock(file: int) -> None:
-    try:
-        import fcntl
-    except ImportError:  # Windows has no such lock, and two runs could write
-        return
-    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -58,19 +58,15 @@ def run_in_workers(
                 started = [n for n in pending if Path(folder, str(n)).exists()]
                 for job in [pending.pop(n) for n in (started if marks else [*pending])]:
                     yield job, _alone(job, packed, backend)
-        if any(_must_be_closed(job.experiment) for job in jobs):
-            _close_workers(backend)
+        if any(
+            fixture.scope == "process" and inspect.isgeneratorfunction(fixture.function)
+            for job in jobs
+            for fixture in job.experiment.used_fixtures().values()
+        ):
+            _end_fixtures(backend)
 
 
-def _must_be_closed(experiment: Experiment) -> bool:
-    """Whether code must run when its fixtures of a process end."""
-    return any(
-        fixture.scope == "process" and inspect.isgeneratorfunction(fixture.function)
-        for fixture in experiment.used_fixtures().values()
-    )
-
-
-def _close_workers(backend: str) -> None:
+def _end_fixtures(backend: str) -> None:
     """End the fixtures of idle workers; those of loky end with the process."""
     if backend == "dask":
         client = extra("distributed", "dask").default_client()
@@ -158,14 +154,6 @@ def work(
         if marks is not None:
             Path(marks, str(number)).touch()
         return number, runner.run(index, seeds, None)
-
-
-def dask_client(address: str) -> Any:
-    """A client of the Dask scheduler at `address`, a context manager.
-
-    **Raises:** `OSError` if there is none; `ImportError` without the extra `dask`.
-    """
-    return extra("distributed", "dask").Client(address, timeout=20)
 
 
 @contextlib.contextmanager

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..._check import check_choice
 from ..._extras import extra
-from ...experiments import Page
+from ..._page import Page
 from ._estimator_variance import estimator_variance
 from ._finding import Claim, Finding
 from ._lq_perturbations import lq_perturbations

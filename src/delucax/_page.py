@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from .._files import replaced
-from ._fingerprint import device, provenance
+from ._extras import extra
+from ._files import replaced
+from ._provenance import device, provenance
 
 
 FORMS = {".csv": "csv", ".parquet": "parquet", ".md": "markdown", ".tex": "latex"}
@@ -201,9 +202,7 @@ class Page:
 def _svg(figure: Any) -> str:
     """The same text for the same figure: without a date, with names that a fixed salt
     makes."""
-    from matplotlib import rc_context
-
     out = io.StringIO()
-    with rc_context({"svg.hashsalt": "delucax"}):
+    with extra("matplotlib", "plot").rc_context({"svg.hashsalt": "delucax"}):
         figure.savefig(out, format="svg", metadata={"Date": None})
     return "<svg" + out.getvalue().partition("<svg")[2]
