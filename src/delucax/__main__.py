@@ -29,10 +29,15 @@ def _command(help: str, *options: tuple, more: str = "") -> Callable:
     return register
 
 
-def _option(name: str, help: str, **settings: Any) -> tuple[str, dict[str, Any]]:
-    """What `add_argument` is given; the help shows the default, if there is one."""
-    shown = " (default: %(default)s)" if settings.get("default") else ""
-    return name, {"help": help + shown, **settings}
+def _option(
+    name: str, help: str, default: Any = None, **settings: Any
+) -> tuple[str, dict[str, Any]]:
+    """What `add_argument` is given. The help shows the default, if there is one, which
+    has the type of the option."""
+    if default is not None:
+        settings |= {"default": default, "type": type(default)}
+        help += " (default: %(default)s)"
+    return name, {"help": help, **settings}
 
 
 def _flag(name: str, help: str) -> tuple[str, dict[str, Any]]:
@@ -41,8 +46,8 @@ def _flag(name: str, help: str) -> tuple[str, dict[str, Any]]:
 
 def _expression(flag: str, name: str, help: str) -> tuple[str, dict[str, Any]]:
     """The option of an expression that selects cases."""
-    settings = {"dest": name, "default": "", "metavar": "EXPR"}
-    return _option(flag, f"{help} (default: all)", **settings)
+    settings = {"help": f"{help} (default: all)", "default": ""}
+    return flag, {"dest": name, "metavar": "EXPR", **settings}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -94,7 +99,7 @@ _CASES = (
 @_command(
     "swing the pendulum up, then the paper in small; in about two minutes",
     _option("--out", "folder to write to", default="demo"),
-    _option("--seeds", "how many MLPs to train", type=int, default=2),
+    _option("--seeds", "how many MLPs to train", default=2),
 )
 def _demo(out: str, seeds: int) -> None:
     from .studies import demo
@@ -125,20 +130,9 @@ def _reproduce(name: list[str], out: str, small: bool) -> int:
     "learn lungs from breaths, and controllers of a ventilator in them",
     _option("--out", "folder to write to, or go on in", default="lung"),
     _flag("--small", "two lungs, in a minute"),
-    _option(
-        "--data", "breaths, as a CSV file of the public data set (default: simulated)"
-    ),
-    _option(
-        "--seeds",
-        "how many controllers of each kind to train (default: 3, or 1 if --small)",
-        type=int,
-    ),
-    _option(
-        "--sensor-delay",
-        "how late the sensor reads, in samples; holds for DATA too",
-        type=int,
-        default=2,
-    ),
+    _option("--data", "breaths of the public data set, as CSV (default: simulated)"),
+    _option("--seeds", "networks of each kind (default: 3, or 1 if --small)", type=int),
+    _option("--sensor-delay", "of how many samples; holds for DATA too", default=2),
 )
 def _lung(out: str, **options: Any) -> None:
     from .studies import lung_study
@@ -158,7 +152,7 @@ def _list(file: str | None, select: str, marks: str) -> int | None:
         return list_names()
     from .experiments._commands import list_cases
 
-    return list_cases(file, SUITES, select, marks)
+    list_cases(file, SUITES, select, marks)
 
 
 @_command(
@@ -167,7 +161,7 @@ def _list(file: str | None, select: str, marks: str) -> int | None:
     *_CASES,
     _flag("--slow", "also cases marked slow"),
     _option("--seeds", "how many seeds (default: as FILE says)", type=int),
-    _option("--workers", "processes; -1 is one for each core", type=int, default=1),
+    _option("--workers", "processes; -1 is one for each core", default=1),
     _option("--dask", "run on the Dask cluster of this scheduler", metavar="ADDRESS"),
     _option("--store", "results file (default: results/FILE.jsonl)"),
     _option("--html", "write a report too", metavar="PAGE"),
@@ -206,7 +200,7 @@ def _run(
     _option(
         "--export",
         "write all rows to a .csv, .parquet, .md or .tex file",
-        **{"action": "append", "default": [], "metavar": "TABLE"},
+        **{"action": "append", "metavar": "TABLE"},
     ),
     _expression("-k", "select", "only these cases"),
     more="""
@@ -217,12 +211,12 @@ def _run(
         """,
 )
 def _report(
-    results: list[str], diff: bool, html: str | None, export: list[str], select: str
-) -> int:
+    results: list[str], diff: bool, html: str | None, export: list | None, select: str
+) -> None:
     from .experiments._commands import report_diff, report_file
 
     report = report_diff if diff else report_file
-    return report(results, select, html, export)
+    report(results, select, html, export or [])
 
 
 @_command(
@@ -232,10 +226,7 @@ def _report(
 def _bench(name: str | None) -> int:
     sys.path.insert(0, str(Path.cwd()))
     if importlib.util.find_spec("benchmarks") is None:
-        raise ValueError(
-            "bench: the benchmarks are in the repository and not in the package: run "
-            "this in a checkout of it."
-        )
+        raise ValueError("bench: the benchmarks are in the repository: run this there.")
     module = "benchmarks" if name is None else f"benchmarks.{name}"
     if importlib.util.find_spec(module) is None:
         raise ValueError(f"bench: there is no benchmark called {name!r}.")

@@ -95,9 +95,7 @@ INCIDENTS = {
 
 def promote(result: Result) -> Result:
     """A result of Diffrax, Optimistix or Lineax, as one of `RESULTS`."""
-    if isinstance(result, RESULTS):
-        return result
-    return RESULTS.promote(result)
+    return result if isinstance(result, RESULTS) else RESULTS.promote(result)
 
 
 def choose(condition: Array, first: Any, second: Any) -> Result:
@@ -135,11 +133,7 @@ _T = TypeVar("_T")
 
 def raise_if(failed: Bool[Array, ""], value: _T, message: str) -> _T:
     """`value`, or an error: now if it is concrete, else at run time."""
-    if isinstance(failed, Tracer):
-        return eqx.error_if(value, failed, message)
-    if failed:
-        raise RuntimeError(message)
-    return value
+    return eqx.error_if(value, failed, message)
 
 
 def raise_on_failure(

@@ -64,11 +64,9 @@ def save(path: str | os.PathLike, obj: Any) -> None:
     """
     path = _file(path, "save")
     writer = _Writer()
-    header = {"tree": writer.describe(obj, "obj")}
-    header["arrays"] = [
-        {"dtype": array.dtype.name, "shape": list(array.shape)}
-        for array in writer.arrays
-    ]
+    tree = writer.describe(obj, "obj")
+    arrays = [{"dtype": a.dtype.name, "shape": list(a.shape)} for a in writer.arrays]
+    header = {"tree": tree, "arrays": arrays}
     text = json.dumps(header, allow_nan=False, separators=(",", ":"))
     body = b"".join([text.encode(), b"\n", *(a.tobytes() for a in writer.arrays)])
     first = f"{_MAGIC} {_VERSION} {hashlib.sha256(body).hexdigest()}\n"
@@ -170,11 +168,10 @@ def _checked(path: Path) -> tuple[bytes, bytes]:
 def _split(payload: bytes, descriptions: list[dict[str, Any]]) -> list[np.ndarray]:
     arrays, offset = [], 0
     for description in descriptions:
-        dtype, shape = jnp.dtype(description["dtype"]), tuple(description["shape"])
-        end = offset + dtype.itemsize * math.prod(shape)
-        piece = np.frombuffer(payload[offset:end], dtype)
-        arrays.append(piece.reshape(shape).copy())
-        offset = end
+        dtype, shape = jnp.dtype(description["dtype"]), description["shape"]
+        flat = np.frombuffer(payload, dtype, math.prod(shape), offset)
+        arrays.append(flat.reshape(shape).copy())
+        offset += flat.nbytes
     return arrays
 
 
@@ -213,11 +210,9 @@ class _Writer:
             parts["keywords"] = node.keywords
             return {"partial": kind.__name__, **self.fields(parts, path)}
         if isinstance(node, tuple) and hasattr(node, "_fields"):
-            fields: Any = node._asdict()  # pyright: ignore[reportAttributeAccessIssue]
-            return {
-                "namedtuple": self.name(kind, path),
-                "fields": self.fields(fields, path),
-            }
+            fields = dict(zip(kind._fields, node, strict=True))
+            name = self.name(kind, path)
+            return {"namedtuple": name, "fields": self.fields(fields, path)}
         if kind in _SEQUENCES.values():
             items = sorted(node, key=repr) if kind is frozenset else node
             items = [self.describe(c, f"{path}.{i}") for i, c in enumerate(items)]
@@ -251,6 +246,7 @@ class _Writer:
         name = name_of(thing)
         if name is not None:
             return name
+        remedy = "Hold numbers, strings, arrays, modules, or functions by name."
         if isinstance(thing, type):
             remedy = "Define the class at the top level of a module."
         elif callable(thing):
@@ -259,8 +255,6 @@ class _Writer:
                 "is defined at the top level of a module, or an eqx.Module with a "
                 "`__call__`."
             )
-        else:
-            remedy = "Hold numbers, strings, arrays, modules, or functions by name."
         raise ValueError(
             f"save: {path} is {thing!r}, which has no name to find it by. {remedy}"
         )
@@ -385,17 +379,13 @@ class _Reader:
 
     def fitted(self, array: np.ndarray) -> np.ndarray:
         """`array` in the precision that JAX has switched on."""
-        dtype = jax.dtypes.canonicalize_dtype(array.dtype)
-        if dtype == array.dtype:
-            return array
-        narrow = array.astype(dtype)
-        if array.dtype.kind in "iu":
-            if not np.array_equal(narrow, array):
-                raise ValueError(
-                    "it holds whole numbers that need 64 bits; set jax_enable_x64."
-                )
-        else:
-            self.narrowed = True
+        narrow = array.astype(jax.dtypes.canonicalize_dtype(array.dtype), copy=False)
+        is_whole = array.dtype.kind in "iu"
+        if is_whole and not np.array_equal(narrow, array):
+            raise ValueError(
+                "it holds whole numbers that need 64 bits; set jax_enable_x64."
+            )
+        self.narrowed |= not is_whole and narrow.dtype != array.dtype
         return narrow
 
 

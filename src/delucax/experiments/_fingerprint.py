@@ -1,6 +1,7 @@
 """What a case depends on, its code and its values, in one hash."""
 
 import ast
+import contextlib
 import copyreg
 import dataclasses
 import functools
@@ -39,15 +40,12 @@ def fingerprint(value: Any, *, root: str | None = None) -> str:
 
 def is_library(module: str | None) -> bool:
     """Whether a module belongs to an installed package, or to Python."""
-    if not module or module == "__main__":
+    # One that is not loaded was made by `exec`, as in the tests of the pages.
+    if module == "__main__" or module not in sys.modules:
         return False
-    if module.partition(".")[0] == "delucax":
-        return True
-    loaded = sys.modules.get(module)
-    if loaded is None:  # made by `exec`, in the tests of the pages
-        return False
-    file = getattr(loaded, "__file__", None)
-    return file is None or _is_installed(file)
+    file = getattr(sys.modules[module], "__file__", None)
+    is_ours = module.partition(".")[0] == "delucax"
+    return is_ours or file is None or _is_installed(file)
 
 
 @functools.cache
@@ -125,8 +123,8 @@ class _Hasher:
         if content.dtype == object:
             self.word("objects", content.shape)
             self.feed(content.ravel().tolist())
-            return
-        self.word("array", content.dtype, content.shape, content.tobytes())
+        else:
+            self.word("array", content.dtype, content.shape, content.tobytes())
 
     def function(self, f: types.FunctionType) -> None:
         self.word("function", f.__qualname__)
@@ -197,9 +195,9 @@ class _Hasher:
             self.word("again", self.visited[id(value)][0])
             return
         # What pickle would write, and the code of whatever is in there.
-        reduce = copyreg.dispatch_table.get(kind)
+        reduce = copyreg.dispatch_table.get(kind, lambda value: value.__reduce_ex__(4))
         try:
-            parts: Any = value.__reduce_ex__(4) if reduce is None else reduce(value)
+            parts: Any = reduce(value)
         except Exception as error:
             raise TypeError(f"a {kind.__name__}, which {error}") from error
         self.type(kind)
@@ -213,22 +211,18 @@ class _Hasher:
 
 def _functions(member: Any) -> list[types.FunctionType]:
     """The functions of a member of a class: a method, a property or the like."""
-    if isinstance(member, property):
-        parts = [member.fget, member.fset, member.fdel]
-    elif isinstance(member, functools.cached_property):
-        parts = [member.func]
-    else:
-        parts = [member]
+    parts = [member]
+    if isinstance(member, property | functools.cached_property):
+        names = ("fget", "fset", "fdel", "func")
+        parts = [getattr(member, name, None) for name in names]
     return [f for f in map(inspect.unwrap, parts) if isinstance(f, types.FunctionType)]
 
 
 def source_of(f: types.FunctionType) -> str:
     """The code of a function, the same whatever its comments and its layout."""
     if f.__name__ != "<lambda>":
-        try:
+        with contextlib.suppress(OSError, TypeError, SyntaxError):
             return _plain(inspect.getsource(f))
-        except (OSError, TypeError, SyntaxError):
-            pass
     return repr(_bytecode(f.__code__))
 
 
@@ -237,10 +231,8 @@ def _plain(source: str) -> str:
     if len(tree.body) == 1 and hasattr(tree.body[0], "decorator_list"):
         tree.body[0].decorator_list = []  # type: ignore
     for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list) and len(body) > 1:
-            first = body[0]
-            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+        match getattr(node, "body", None):
+            case [ast.Expr(ast.Constant()), _, *_] as body:  # a docstring
                 del body[0]
     return ast.unparse(tree)
 

@@ -6,6 +6,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
+from .._check import check_range
 from .._extras import extra
 from ._results import PASSED, Results
 
@@ -121,10 +122,7 @@ def compare(
             raise ValueError(
                 f"{where}: {name} must be a {kind} ({names}), got {value!r}."
             )
-    if not 0 < confidence < 1:
-        raise ValueError(
-            f"{where}: confidence must be between 0 and 1, got {confidence}."
-        )
+    check_range(confidence, "confidence", where, 0, 1)
     samples: dict[Any, dict[tuple, dict[int, float]]] = {}
     for row in [row for row in results.rows if row["status"] in PASSED]:
         value = row.get(metric)
