@@ -48,8 +48,8 @@ class Runner:
     def __init__(self, experiment: Experiment):
         self.experiment, self.axes = experiment, experiment.all_axes()
         self.fixtures = experiment.used_fixtures()
-        self.shared: dict[Any, Any] = {}
-        self.closing = contextlib.ExitStack()
+        # What fixtures of the process made, and what ends them.
+        self.process: tuple[dict, Any] = {}, contextlib.ExitStack()
         self.is_traceable: dict[Any, bool] = {}
         self.program: Any = jax.jit(self._all_seeds, static_argnums=0)
 
@@ -60,8 +60,8 @@ class Runner:
         values: dict[str, list] = {}
         try:
             with clock, contextlib.ExitStack() as stack:
-                returned = self._call(self._arguments(index, stack), seeds, mesh)
-                values = self._columns(returned)
+                arguments = self._arguments(index, stack)
+                values = self._columns(self._call(arguments, seeds, mesh))
             where = device()
         except KeyboardInterrupt:
             raise
@@ -78,9 +78,10 @@ class Runner:
     def close(self) -> None:
         """End the fixtures of the process. If that fails, it is a warning: the results
         are there."""
-        self.shared.clear()
+        made, end = self.process
+        made.clear()
         try:
-            self.closing.close()
+            end.close()
         except KeyboardInterrupt:
             raise
         except BaseException as raised:
@@ -105,13 +106,11 @@ class Runner:
                 arguments["param"] = given[name]
             known = [origins[w] for w in (*wanted, name) if w in origins]
             origins[name] = frozenset().union(*known)
-            if fixture.scope == "case":
-                given[name] = _make(fixture.function, arguments, stack)
-                continue
+            made, end = ({}, stack) if fixture.scope == "case" else self.process
             key = name, origins[name]
-            if key not in self.shared:
-                self.shared[key] = _make(fixture.function, arguments, self.closing)
-            given[name] = self.shared[key]
+            if key not in made:
+                made[key] = _make(fixture.function, arguments, end)
+            given[name] = made[key]
         takes = self.experiment.arguments
         takes_any = any(p.kind is p.VAR_KEYWORD for p in takes.values())
         return {name: v for name, v in given.items() if takes_any or name in takes}
@@ -166,10 +165,11 @@ class Runner:
         where = self.experiment.name
         if isinstance(returned, list):
             rows = [_as_mapping(row) for row in returned]
-            if any(row.keys() != rows[0].keys() for row in rows):
+            names = {name for row in rows for name in row}
+            if any(row.keys() != names for row in rows):
                 raise ValueError(
                     f"{where}: every seed must return the same names, got "
-                    f"{sorted({name for row in rows for name in row})}."
+                    f"{sorted(names)}."
                 )
             columns = {name: [row[name] for row in rows] for name in rows[0]}
         else:
@@ -243,10 +243,9 @@ def _as_mapping(value: Any) -> Mapping[str, Any]:
 def _simple(value: Any, name: str, where: str) -> Any:
     if value is None or isinstance(value, bool | str):
         return value
-    try:
+    array = np.empty((), object)
+    with contextlib.suppress(Exception):
         array = np.asarray(value)
-    except Exception:
-        array = np.asarray(None, object)
     if jnp.issubdtype(array.dtype, jnp.floating):  # of bfloat16 and its kin as well
         return (array if array.dtype.kind == "f" else array.astype(np.float32)).tolist()
     if array.dtype.kind not in "biu":

@@ -191,8 +191,8 @@ class Experiment:
                     f"{where}: two cases are called {case.id!r}; give other ids."
                 )
             names.add(case.id)
-            skipped = case.mark("slow") and not slow
-            if not skipped and is_selected(case.matches) and is_marked(case.mark):
+            is_wanted = slow or not case.mark("slow")
+            if is_wanted and is_selected(case.matches) and is_marked(case.mark):
                 cases.append(case)
         return tuple(cases)
 
@@ -219,9 +219,9 @@ class Experiment:
             if name in RESERVED or name == "key":
                 raise ValueError(f"{where}: no parameter can be called {name!r}.")
             if name not in taken and not any_name:
+                hint = did_you_mean(name, sorted(taken))
                 raise ValueError(
-                    f"{where}: the function has no argument {name!r}; "
-                    f"{did_you_mean(name, sorted(taken))}"
+                    f"{where}: the function has no argument {name!r}; {hint}"
                 )
         given = {*names, *fixtures}
         self._check_given(self.function, where, {*given, "key", "seed"})
