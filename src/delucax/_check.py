@@ -427,6 +427,8 @@ def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
         return
     array = np.asarray(R)
     least, *_ = eigenvalues = np.linalg.eigvalsh(array)
+    # Eigenvalues of a symmetric matrix are off by a few eps times the largest (Weyl). A
+    # semidefinite matrix made as a product C'C is off by more, the more rows it has.
     rounding = np.finfo(array.dtype).eps * np.max(np.abs(eigenvalues))
     slack = -rounding if definite else 100 * len(array) * rounding
     if least < -slack or definite and least <= 0:

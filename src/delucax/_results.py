@@ -119,6 +119,7 @@ def first_of(results: Result | None) -> Result:
     """The first failure among stacked results; success if there is none to look at."""
     if results is None:
         return RESULTS.successful
+    # argmax of booleans is the first that holds, and the first entry if none does.
     failed = results != RESULTS.successful
     return jax.tree.map(lambda r: r[jnp.argmax(failed)], results)
 

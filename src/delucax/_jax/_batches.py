@@ -32,10 +32,12 @@ def _same(*values, **_):
 
 
 def _stored(*values, batched):
+    # XLA moves nothing across a barrier, and so cannot repeat what is before it.
     return lax.optimization_barrier(list(values)) if batched else list(values)
 
 
 def _batch(values, dims, **_):
+    # Under `vmap` the parameter turns on: that is how the lowering knows of the batch.
     return _fence.bind(*values, batched=True), dims
 
 
@@ -89,8 +91,10 @@ def by_lanes(function: Callable[..., Any], *args: Any) -> Any:
     def _(_, batched, *leaves):
         lanes, shared = eqx.partition(list(leaves), list(batched))
         of = lambda f: lambda lane: f(*eqx.combine(lane, shared))
+        # Which platform it is turns out when the program is lowered, not now.
         out = lax.platform_dependent(
             lanes,
+            # `run`, not `evaluate`: an outer `vmap` goes lane by lane as well.
             cpu=lambda lanes: lax.map(of(run), lanes),
             default=jax.vmap(of(evaluate)),
         )

@@ -76,6 +76,7 @@ def _replay(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]
 def _apply(equation: Any, values: list[Any]) -> Sequence[Any]:
     """The outputs of one equation."""
     primitive, params = equation.primitive, equation.params
+    # An inner `jit` would take and return whole vectors, so it is replayed as well.
     if primitive.name in ("jit", "pjit"):
         inner = params["jaxpr"]
         return _replay(inner.jaxpr, inner.consts, values)
@@ -116,6 +117,7 @@ def _on_components(
     if name == "stack" and shape == (len(values),) and len(values) <= COMPONENTS_UP_TO:
         return [_Components(values)]
     if name in _ELEMENTWISE and size is not None and any(split):
+        # Elementwise primitives have no axes in `params`, so an entry takes the same.
         columns = [_entries(value, size) for value in values]
         if any(column is None for column in columns):
             return None
@@ -131,6 +133,7 @@ def _on_components(
         ends = params["start_indices"] + params["limit_indices"]
         taken = first.entries[slice(*ends, *(params["strides"] or ()))]
         return [_Components(taken)] if taken else None
+    # `x[-1]` and the like: the start is a number, which JAX clamps to the vector.
     if name == "dynamic_slice" and not isinstance(others[0], Tracer):
         (count,) = params["slice_sizes"]
         start = min(max(int(others[0]), 0), len(first.entries) - count)

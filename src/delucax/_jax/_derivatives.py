@@ -40,6 +40,7 @@ def jacobian(
 
 def is_constant(f: Callable[..., Any], *args: Any) -> bool:
     """Whether the array that `f` returns depends on none of its arguments."""
+    # What is left after dead code elimination that keeps the output is what it needs.
     traced = jax.make_jaxpr(f)(*args)
     _, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
     return not any(used)
@@ -63,12 +64,14 @@ def _value(tangent, ok):
 
 
 def _batch(values, dims):
+    # Elementwise, so a batch is the same on arrays with the batch in front.
     size = next(v.shape[d] for v, d in zip(values, dims, strict=True) if d is not None)
     at_front = functools.partial(batching.bdim_at_front, size=size)
     return _nan_tangent.bind(*map(at_front, values, dims)), 0
 
 
 def _transpose(cotangent, _, ok):
+    # The map is diagonal, and so its own transpose.
     is_zero = type(cotangent) is ad.Zero
     return cotangent if is_zero else _nan_tangent.bind(cotangent, ok), None
 

@@ -68,6 +68,8 @@ class _Positive(AbstractConstraint):
 
 def _inside(value: Array, low: float, high: float) -> Array:
     """`value` off the ends of an open interval, which rounding may put it on."""
+    # exp and the sigmoid round to 0 and to the ends far out, where the logarithm of
+    # `unconstrain` is infinite and the gradient gone for good.
     dtype = jnp.result_type(value)
     tiny, ends = jnp.finfo(dtype).tiny, np.asarray([low, high], dtype)
     inner = np.nextafter(ends, ends[::-1])
@@ -112,6 +114,7 @@ class bounded(AbstractConstraint):
         return _inside(value, self.low, self.high)
 
     def unconstrain(self, value: Array) -> Array:
+        # The logit of the part of the way from one end to the other.
         return jnp.log(value - self.low) - jnp.log(self.high - value)
 
     def holds(self, value):
@@ -132,6 +135,7 @@ def as_float_array(value: Any) -> Any:
     if isinstance(value, bool | int | float | np.number) or (
         isinstance(value, np.ndarray) and value.ndim == 0
     ):
+        # Of a Python number, as an array of NumPy would have a strong type.
         return jnp.asarray(float(value))
     if isinstance(value, np.ndarray | list | tuple | jax.Array):
         try:

@@ -93,6 +93,7 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
     changed = tree
     for path, value in changes.items():
         changed = _with(changed, path, value)
+    # The deepest first: what follows by default is in place when an owner is checked.
     for path in _owners(changes):
         before = get_path(tree, path)
         changed = _followed(changed, path, before, changes)
@@ -232,6 +233,7 @@ def _members(module: eqx.Module) -> dict[int, eqx.Module]:
 def _sampled(leaves: list[Any], count: int) -> np.ndarray:
     """The members of a large batch to look at: those with the smallest or the largest
     entry of an array, and others spread evenly."""
+    # A constraint breaks at an extreme first, so these are looked at before others.
     half = _MOST_MEMBERS // 2
     flat = [np.asarray(a).reshape(count, -1) for a in leaves if eqx.is_inexact_array(a)]
     ends = [end for a in flat for end in (np.argmin(a, axis=0), np.argmax(a, axis=0))]

@@ -122,6 +122,7 @@ class Runner:
             return [function(**arguments, seed=seed) for seed in seeds]
         if "key" not in known:
             return [function(**arguments)]
+        # Keys are made of the numbers inside, so that another seed compiles nothing.
         numbers = np.asarray(seeds, np.int32)
         if mesh is not None:
             spread = NamedSharding(mesh, PartitionSpec(mesh.axis_names[0]))

@@ -43,10 +43,12 @@ def interquartile_mean(values: Any, axis: int | None = None) -> Any:
         raise ValueError("interquartile_mean: values must be one at least, got none.")
     cut = count / 4
     place = np.arange(count)
-    # How much of each sorted value lies between the quartiles.
+    # The k-th sorted value fills [k, k + 1] of [0, count]; what of it lies between the
+    # quartiles, count / 4 and 3 count / 4, is its weight.
     weight = np.clip(place + 1 - cut, 0, 1) * np.clip(count - cut - place, 0, 1)
     if count == 1:
         weight = np.ones(1)
+    # Not a product with zero, which would make NaN of an infinite value outside.
     inside = weight > 0
     ordered = np.sort(array, axis=-1)[..., inside]
     mean = ordered @ weight[inside] / weight.sum()
@@ -139,6 +141,8 @@ def compare(
             f"{where}: baseline must be a value of {by!r} that passed "
             f"({', '.join(map(repr, samples))}), got {baseline!r}."
         )
+    # The same draws for all values of the parameter: what is shared by two of them does
+    # not widen the interval of their difference.
     bootstrap = Bootstrap(confidence, resamples, seed)
     rows = {}
     for label, groups in samples.items():
@@ -217,6 +221,7 @@ class Bootstrap:
             return np.nan, np.nan, np.nan
         drawn, flat = self._drawn(groups), np.concatenate(groups)
         of = np.divide if ratio else np.subtract
+        # A baseline of zero has no ratio: infinity or NaN, as the division says.
         with np.errstate(divide="ignore", invalid="ignore"):
             value = of(*self.statistic(flat, axis=0))
             resampled = of(*self.statistic(drawn, axis=1).T)
@@ -224,6 +229,7 @@ class Bootstrap:
 
     def _drawn(self, groups: Sequence[np.ndarray]) -> np.ndarray:
         rng = np.random.default_rng(self.seed)
+        # A group of one would be drawn as it is, and the interval have no width.
         if all(len(group) == 1 for group in groups):
             groups = [np.concatenate(groups)]
         parts = [
@@ -233,6 +239,7 @@ class Bootstrap:
         return np.concatenate(parts, axis=1)
 
     def _ends(self, resampled: np.ndarray) -> tuple[float, float]:
+        # Efron's percentile interval.
         tail = (1 - self.confidence) / 2
         low, high = np.quantile(resampled, [tail, 1 - tail])
         return float(low), float(high)
