@@ -95,6 +95,15 @@ def test_an_id_that_is_given_twice(values):
         experiment.parametrize("x", values)
 
 
+def test_a_mark_of_a_whole_experiment():
+    @mark.skip("all of it")
+    @experiment.parametrize("x", [1, 2])
+    def never(x):
+        raise AssertionError
+
+    assert states(never.run(progress=False)) == ["skipped"] * 2
+
+
 def test_an_experiment_that_takes_any_argument():
     @experiment.parametrize("a, b", [(1, 2)])
     def total(**values):

@@ -508,6 +508,30 @@ WRONG = {
         "scope must be 'case' or 'process'",
     ),
     "no function": (lambda: experiment(3), "function must be a function"),
+    "key and seed": (
+        lambda: quiet(experiment(lambda key, seed: seed)),
+        "the function takes both 'key' and 'seed'",
+    ),
+    "fixtures in a circle": (
+        lambda: quiet(
+            experiment.use(
+                hen=experiment.fixture(lambda egg: egg),
+                egg=experiment.fixture(lambda hen: hen),
+            )(lambda hen: hen)
+        ),
+        "fixtures need each other: hen -> egg -> hen",
+    ),
+    "a fixture by seed": (
+        lambda: quiet(experiment.use(x=experiment.fixture(lambda key: key))(use_x)),
+        "fixture x cannot take 'key': it is made once for all seeds",
+    ),
+    "no expression": (lambda: quiet(stored, select=3), "select must be a string"),
+    "confidence": (
+        lambda: experiments.compare(
+            quiet(stored), by="x", baseline=1.0, metric="y", confidence=95
+        ),
+        "confidence must be between 0 and 1",
+    ),
     "workers": (lambda: quiet(stored, workers=0), "workers"),
     "mesh": (
         lambda: quiet(stored, mesh=jax.make_mesh((jax.device_count(),), ("seeds",))),

@@ -210,9 +210,9 @@ class _Writer:
             parts["keywords"] = node.keywords
             return {"partial": kind.__name__, **self.fields(parts, path)}
         if isinstance(node, tuple) and hasattr(node, "_fields"):
-            fields = dict(zip(kind._fields, node, strict=True))
-            name = self.name(kind, path)
-            return {"namedtuple": name, "fields": self.fields(fields, path)}
+            names: Any = kind._fields  # pyright: ignore[reportAttributeAccessIssue]
+            fields = self.fields(dict(zip(names, node, strict=True)), path)
+            return {"namedtuple": self.name(kind, path), "fields": fields}
         if kind in _SEQUENCES.values():
             items = sorted(node, key=repr) if kind is frozenset else node
             items = [self.describe(c, f"{path}.{i}") for i, c in enumerate(items)]

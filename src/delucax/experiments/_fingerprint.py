@@ -211,7 +211,7 @@ class _Hasher:
 
 def _functions(member: Any) -> list[types.FunctionType]:
     """The functions of a member of a class: a method, a property or the like."""
-    parts = [member]
+    parts: list[Any] = [member]
     if isinstance(member, property | functools.cached_property):
         names = ("fget", "fset", "fdel", "func")
         parts = [getattr(member, name, None) for name in names]
@@ -232,8 +232,8 @@ def _plain(source: str) -> str:
         tree.body[0].decorator_list = []  # type: ignore
     for node in ast.walk(tree):
         match getattr(node, "body", None):
-            case [ast.Expr(ast.Constant()), _, *_] as body:  # a docstring
-                del body[0]
+            case [ast.Expr(ast.Constant()), _, *_]:  # a docstring
+                del node.body[0]  # type: ignore
     return ast.unparse(tree)
 
 
