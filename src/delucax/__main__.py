@@ -146,11 +146,11 @@ def _lung(out: str, **options: Any) -> None:
     *_CASES,
 )
 def _list(file: str | None, select: str, marks: str) -> int | None:
-    from .studies._listing import list_names, SUITES
+    from .studies.listing import list_names, SUITES
 
     if file is None:
         return list_names()
-    from .experiments._commands import list_cases
+    from .experiments.commands import list_cases
 
     list_cases(file, SUITES, select, marks)
 
@@ -181,8 +181,8 @@ def _list(file: str | None, select: str, marks: str) -> int | None:
 def _run(
     file: str, store: str | None, html: str | None, dask: str | None, **options: Any
 ) -> int:
-    from .experiments._commands import run_file
-    from .studies._listing import SUITES
+    from .experiments.commands import run_file
+    from .studies.listing import SUITES
 
     with contextlib.ExitStack() as stack:
         if dask is not None:
@@ -213,7 +213,7 @@ def _run(
 def _report(
     results: list[str], diff: bool, html: str | None, export: list | None, select: str
 ) -> None:
-    from .experiments._commands import report_diff, report_file
+    from .experiments.commands import report_diff, report_file
 
     report = report_diff if diff else report_file
     report(results, select, html, export or [])

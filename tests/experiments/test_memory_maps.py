@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 from helpers import once
 
-from delucax.experiments import _execute, experiment
+from delucax.experiments import _execute, experiment, run
 from delucax.experiments._execute import release_programs
 
 
@@ -44,6 +44,6 @@ def test_a_sweep_forgets_programs_and_keeps_its_results(monkeypatch):
     def total(n, key):
         return jnp.sum(jnp.arange(n)) + 0 * jax.random.normal(key)
 
-    results = total.run(progress=False)
+    results = run(total, progress=False)
     assert [row["value"] for row in results.rows] == [1, 1, 3, 3, 6, 6]
     assert seen and all(seen)

@@ -36,7 +36,7 @@ def timeless(results):
 
 
 def quiet(made, **options):
-    return made.run(progress=False, **options)
+    return experiments.run(made, progress=False, **options)
 
 
 # What is parametrized
@@ -383,7 +383,7 @@ def test_a_device_is_no_store():
         return n
 
     with user_error(match="no regular file"):
-        one.run(store="/dev/zero", progress=False)
+        experiments.run(one, store="/dev/zero", progress=False)
 
 
 def test_a_full_disk_keeps_what_was_done(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Experiments, declared as pytest declares tests."""
 
 from ._experiment import Experiment as Experiment, experiment as experiment
+from ._report import report as report
 from ._results import Results as Results
 from ._run import run as run
 from ._statistics import (

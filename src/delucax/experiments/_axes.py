@@ -12,39 +12,12 @@ from ._fingerprint import fingerprint
 
 
 @dataclasses.dataclass(frozen=True)
-class Mark:
-    """A label of a case, such as `experiment.mark.skip("does not converge")`: `slow`,
-    `skip` and `xfail` have a meaning, other names are there to select by."""
-
-    name: str
-    reason: str = ""
-
-    def __call__(self, what: Any) -> Any:
-        """The mark with the reason `what`, or the experiment `what` with the mark."""
-        if isinstance(what, str):
-            return dataclasses.replace(self, reason=what)
-        from ._experiment import as_experiment
-
-        made = as_experiment(what)
-        return dataclasses.replace(made, marks=(*made.marks, self))
-
-
-class Marks:
-    """`experiment.mark.slow`, and any other name."""
-
-    def __getattr__(self, name: str) -> Mark:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        return Mark(name)
-
-
-@dataclasses.dataclass(frozen=True)
 class Param:
     """A value of each name of an axis, with an id and marks of its own."""
 
     values: tuple
     id: str | None = None
-    marks: tuple[Mark, ...] = ()
+    marks: tuple = ()
 
 
 class Choice(NamedTuple):

@@ -12,9 +12,34 @@ import numpy as np
 from .._check import check_choice, check_function
 from .._message import did_you_mean
 from .._provenance import version
-from ._axes import Axis, axis_of, Mark, Marks, Param, selector, words
+from ._axes import Axis, axis_of, Param, selector, words
 from ._fingerprint import fingerprint
 from ._store import RESERVED
+
+
+@dataclasses.dataclass(frozen=True)
+class Mark:
+    """A label of a case, such as `experiment.mark.skip("does not converge")`: `slow`,
+    `skip` and `xfail` have a meaning, other names are there to select by."""
+
+    name: str
+    reason: str = ""
+
+    def __call__(self, what: Any) -> Any:
+        """The mark with the reason `what`, or the experiment `what` with the mark."""
+        if isinstance(what, str):
+            return dataclasses.replace(self, reason=what)
+        made = as_experiment(what)
+        return dataclasses.replace(made, marks=(*made.marks, self))
+
+
+class Marks:
+    """`experiment.mark.slow`, and any other name."""
+
+    def __getattr__(self, name: str) -> Mark:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return Mark(name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,13 +106,13 @@ class Experiment:
     !!! example
 
         ```python
-        from delucax.experiments import experiment
+        from delucax.experiments import experiment, run
 
         @experiment.parametrize("x", [1.0, 2.0, 3.0])
         def square(x):
             return x**2
 
-        results = square.run(progress=False)
+        results = run(square, progress=False)
         assert [row["value"] for row in results.rows] == [1.0, 4.0, 9.0]
         ```
     """
@@ -196,19 +221,6 @@ class Experiment:
                 cases.append(case)
         return tuple(cases)
 
-    def run(self, **options: Any) -> Any:
-        """Run it: [`delucax.experiments.run`][] of this experiment alone.
-
-        **Arguments:**
-
-        - `**options`: those of [`delucax.experiments.run`][].
-
-        **Returns:** the [`delucax.experiments.Results`][].
-        """
-        from ._run import run
-
-        return run(self, **options)
-
     def _check(self) -> None:
         where, arguments, fixtures = self.name, self.arguments, self.used_fixtures()
         needs = {name: {*arguments_of(f.function)} for name, f in fixtures.items()}
@@ -279,7 +291,7 @@ class experiment:  # noqa: N801
         ```python
         import delucax as dlx
         import jax.numpy as jnp
-        from delucax.experiments import experiment
+        from delucax.experiments import experiment, run
 
         @experiment.parametrize("length", [0.8, 1.0, 1.2])
         @experiment.parametrize("gain", [10.0, 20.0], ids=["weak", "strong"])
@@ -289,7 +301,7 @@ class experiment:  # noqa: N801
             controller = dlx.controllers.Linear(jnp.stack([jnp.stack([gain, 5.0])]))
             return dlx.rollout(env, controller, key=key, horizon=10).total_cost
 
-        results = cost.run(progress=False)
+        results = run(cost, progress=False)
         assert len(results.rows) == 24
         ```
     """

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import os
 from collections import Counter
 from typing import Any, NamedTuple
 
@@ -17,7 +18,32 @@ from ._statistics import Bootstrap, interquartile_mean, is_number
 _PANELS, _CASES = 30, 60
 
 
-def report(results: Results, title: str) -> Page:
+def report(
+    results: Results, path: str | os.PathLike, *, title: str = "Results"
+) -> None:
+    """Write a self-contained HTML page of sortable tables and figures.
+
+    **Arguments:**
+
+    - `results`: from [`delucax.experiments.run`][].
+    - `path`: the HTML file to write.
+    - `title`: its heading.
+
+    **Raises:** `OSError` if it cannot be written.
+
+    !!! example
+
+        ```python
+        from delucax import experiments
+
+        results = experiments.run(experiments.experiment(lambda: 1.0), progress=False)
+        experiments.report(results, "results.html")
+        ```
+    """
+    page_of(results, title).write(path)
+
+
+def page_of(results: Results, title: str) -> Page:
     """A table of means and a figure for each experiment, what failed, and every row."""
     page = Page(title)
     page.paragraph(_made_with(results), "made")

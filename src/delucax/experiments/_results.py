@@ -12,11 +12,9 @@ from .._extras import extra
 from .._files import replaced
 from .._page import as_text, FORMS
 from ._experiment import Case
-from ._store import CASE_COLUMNS, RUN_COLUMNS, Store
+from ._store import CASE_COLUMNS, FAILED, RUN_COLUMNS, Store
 
 
-PASSED = ("passed", "passed unexpectedly")
-FAILED = ("failed", "passed unexpectedly")
 # Columns that differ between two runs of the same thing.
 TIMES = ("compile_seconds", "run_seconds", "date")
 
@@ -41,14 +39,14 @@ class Results:
     !!! example
 
         ```python
-        from delucax.experiments import experiment
+        from delucax.experiments import experiment, run
 
         @experiment.parametrize("x", [1.0, 2.0])
         @experiment.seeds(2)
         def noisy(x, seed):
             return x + 0.1 * seed
 
-        results = noisy.run(progress=False)
+        results = run(noisy, progress=False)
         print(results.export("markdown"))
         ```
     """
@@ -185,20 +183,6 @@ class Results:
             with replaced(Path(to)) as file:
                 file.write(text.encode())
         return text
-
-    def report(self, path: str | os.PathLike, *, title: str = "Results") -> None:
-        """Write a page of sortable tables and figures that needs nothing beside it.
-
-        **Arguments:**
-
-        - `path`: the HTML file to write.
-        - `title`: its heading.
-
-        **Raises:** `OSError` if it cannot be written.
-        """
-        from ._report import report
-
-        report(self, title).write(path)
 
     def _check_columns(
         self, names: Iterable[str], where: str, more: tuple[str, ...] = ()

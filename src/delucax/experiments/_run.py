@@ -22,8 +22,8 @@ from .._extras import extra
 from .._provenance import provenance
 from ._execute import Outcome, Runner
 from ._experiment import as_experiment, as_seeds, Case, Experiment
-from ._results import FAILED, Results
-from ._store import Store
+from ._results import Results
+from ._store import FAILED, Store
 
 
 class Job(NamedTuple):

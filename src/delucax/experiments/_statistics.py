@@ -8,7 +8,8 @@ import numpy as np
 
 from .._check import check_range
 from .._extras import extra
-from ._results import PASSED, Results
+from ._results import Results
+from ._store import PASSED
 
 
 def interquartile_mean(values: Any, axis: int | None = None) -> Any:
@@ -108,7 +109,7 @@ def compare(
         def cost(method, seed):
             return seed + (1.0 if method == "b" else 0.0)
 
-        results = cost.run(progress=False)
+        results = experiments.run(cost, progress=False)
         table = experiments.compare(results, by="method", baseline="a")
         assert table.loc["b", "difference"] == 1.0
         ```

@@ -28,6 +28,8 @@ CASE_COLUMNS = "error", "traceback", "compile_seconds", "run_seconds", "device",
 RUN_COLUMNS = ("date", "commit", "dirty", "dtype")
 _KEYS = ("experiment", "case", "seed", "status", "versions")
 _NEEDED = {"run", "parameters", "status", "error", "device"}
+PASSED = ("passed", "passed unexpectedly")
+FAILED = ("failed", "passed unexpectedly")
 RESERVED = (*_KEYS, *CASE_COLUMNS, *RUN_COLUMNS)
 """Names that neither a parameter nor a result can have."""
 

@@ -12,7 +12,7 @@ from typing import Any
 from .._page import as_text, Page
 from ._axes import selector
 from ._experiment import Experiment
-from ._report import by_experiment, diff, DIFFERENCES, report, summary
+from ._report import by_experiment, diff, DIFFERENCES, page_of, summary
 from ._results import Results
 from ._run import run
 
@@ -49,7 +49,7 @@ def run_file(
         first = str(row["error"] or "passed though it was expected to fail")
         print(f"FAILED {case}: {first.splitlines()[0]}", file=sys.stderr)
     print(f"{len(done)} cases in {place}")
-    _write_page(html, lambda: report(results, Path(file).stem))
+    _write_page(html, lambda: page_of(results, Path(file).stem))
     return bool(failed)
 
 
@@ -64,7 +64,7 @@ def report_file(
     for path in exports:
         results.export(path)
         print(f"written {path}")
-    _write_page(html, lambda: report(results, Path(paths[0]).stem))
+    _write_page(html, lambda: page_of(results, Path(paths[0]).stem))
 
 
 def report_diff(
