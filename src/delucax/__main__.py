@@ -15,8 +15,7 @@ from ._extras import extra
 
 
 _COMMANDS: list[tuple[Callable, str, str, tuple]] = []
-"""What is called with the options, its help, more of it, and what options it has; in
-the order in which they are shown."""
+"""The commands in display order: function, help, epilog, options."""
 
 
 def _command(help: str, *options: tuple, more: str = "") -> Callable:
@@ -32,8 +31,8 @@ def _command(help: str, *options: tuple, more: str = "") -> Callable:
 def _option(
     name: str, help: str, default: Any = None, **settings: Any
 ) -> tuple[str, dict[str, Any]]:
-    """What `add_argument` is given. The help shows the default, if there is one, which
-    has the type of the option."""
+    """The arguments of `add_argument`. A default is shown in the help, and determines
+    the type."""
     if default is not None:
         settings |= {"default": default, "type": type(default)}
         help += " (default: %(default)s)"
@@ -97,7 +96,7 @@ _CASES = (
 
 
 @_command(
-    "swing the pendulum up, then the paper in small; in about two minutes",
+    "swing a pendulum up, then reproduce the paper with fewer seeds (two minutes)",
     _option("--out", "folder to write to", default="demo"),
     _option("--seeds", "how many MLPs to train", default=2),
 )
@@ -164,7 +163,7 @@ def _list(file: str | None, select: str, marks: str) -> int | None:
     _option("--workers", "processes; -1 is one for each core", default=1),
     _option("--dask", "run on the Dask cluster of this scheduler", metavar="ADDRESS"),
     _option("--store", "results file (default: results/FILE.jsonl)"),
-    _option("--html", "write a report too", metavar="PAGE"),
+    _option("--html", "write a report with tables and figures", metavar="PAGE"),
     _flag("--fresh", "run also what is stored"),
     _flag("--retry", "run again what failed"),
     _option("--quiet", "show no progress", dest="progress", action="store_false"),
@@ -196,7 +195,7 @@ def _run(
     "show a results file, or what differs between two",
     _option("results", "results file", nargs="+", metavar="RESULTS"),
     _flag("--diff", "compare two, with paired 95%% intervals"),
-    _option("--html", "write a page of tables, figures", metavar="PAGE"),
+    _option("--html", "write a report with tables and figures", metavar="PAGE"),
     _option(
         "--export",
         "write all rows to a .csv, .parquet, .md or .tex file",

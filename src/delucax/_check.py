@@ -1,4 +1,8 @@
-"""Checks of arguments, with errors that name the argument and what was expected."""
+"""Checks of arguments.
+
+A function `as_...` converts and checks, one `check_...` checks alone. Both raise a
+`ValueError` that names the argument and what was expected.
+"""
 
 import functools
 import inspect
@@ -26,7 +30,7 @@ Shape = tuple[int, ...]
 
 
 def is_concrete(x: Any) -> bool:
-    """Whether the value of `x` can be looked at now (it is not being traced)."""
+    """Whether `x` has a value now, and is not being traced."""
     return not isinstance(x, Tracer)
 
 
@@ -39,7 +43,10 @@ def output_of(function: Any, *shapes: tuple[int, ...]) -> Any:
     try:
         hash(structure)
         arrays = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
-    except (TypeError, AttributeError):  # a field without a hash, a leaf that is none
+    except (
+        TypeError,
+        AttributeError,
+    ):  # an unhashable field, or a leaf that is no array
         return eqx.filter_eval_shape(function, *inputs)
     return _traced(structure, arrays, tuple(inputs))
 
@@ -64,8 +71,8 @@ _HOW_TO_GET = {
 def check_instance(
     value: Any, kind: type, name: str, where: str, hint: str | None = None
 ) -> None:
-    """Raise unless `value` is of a class. `hint` says how to get one, if it is not how
-    one usually does."""
+    """Raise unless `isinstance(value, kind)`. `hint` replaces the default hint of the
+    message, which says how to make one."""
     if not isinstance(value, kind):
         called = kind.__name__
         article = "an" if called[0] in "AEIOU" else "a"
@@ -77,7 +84,7 @@ def check_instance(
 
 
 def check_key(key: Any, where: str) -> Any:
-    """`key`, if it is one random key, or an error."""
+    """`key`, if it is one random key."""
     if eqx.is_array(key):
         if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ():
             return key
@@ -99,7 +106,7 @@ def _error(value: Any, name: str, where: str, rule: str) -> ValueError:
 def _as_array(
     value: Any, name: str, where: str, rule: str, fits: Callable[[Shape], bool]
 ) -> Array:
-    """`value` as a floating-point array of a shape that fits, or an error."""
+    """`value` as a floating-point array whose shape fits, as `rule` says."""
     array = as_float_array(value)
     if not eqx.is_inexact_array(array) or not fits(array.shape):
         if not eqx.is_array(array):
@@ -109,7 +116,7 @@ def _as_array(
 
 
 def as_vector(value: Any, size: int, name: str, where: str) -> Array:
-    """`value` as a real floating-point vector of `size` entries, or an error."""
+    """`value` as a real floating-point vector of `size` entries."""
     rule = f"have shape ({size},)"
     array = _as_array(value, name, where, rule, lambda shape: shape == (size,))
     check_real(array, name, where)
@@ -120,7 +127,7 @@ def as_entries(
     value: Any, size: int | None, name: str, where: str, each: str = "entry"
 ) -> Array:
     """`value`, a number for all or a vector with one for `each`, as a floating-point
-    array, or an error. The vector has `size` entries, or with `None` any number."""
+    array. The vector has `size` entries; any number of them if that is `None`."""
     rule = f"be a number or have shape ({size},)"
     if size is None:
         rule = f"be a number or a vector with an entry for each {each}"
@@ -147,8 +154,7 @@ def as_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
 
 
 def symmetric_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
-    """`value` as a symmetric matrix of finite entries (or with `ndim` 3 a stack of
-    them), or an error.
+    """`value` as a symmetric matrix of finite entries, or a stack of them (`ndim=3`).
 
     An asymmetry of the size of rounding is averaged away.
     """
@@ -167,8 +173,7 @@ def symmetric_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Arr
 def as_bounds(
     value: Any, where: str, name: str = "bounds", size: int | None = None
 ) -> Bounds | None:
-    """`value` as `(low, high)`, each a number or a vector (of `size`, if it is given),
-    or an error."""
+    """`value` as `(low, high)`, each a number or a vector (of `size`, if given)."""
     if value is None:
         return None
     if not isinstance(value, tuple | list) or len(value) != 2:
@@ -190,7 +195,7 @@ def as_bounds(
 
 
 def check_control_bounds(value: Any, size: int, where: str) -> Bounds | None:
-    """`value` as bounds of `size` controls, or an error."""
+    """`value` as bounds of `size` controls."""
     bounds = as_bounds(value, where)
     for end in bounds or ():
         if end.shape not in ((), (size,)):
@@ -218,8 +223,7 @@ def check_finite(array: Any, name: str, where: str) -> None:
 def _check_entries(
     value: Any, name: str, where: str, rule: str, holds: Callable[[Any], Any]
 ) -> None:
-    """Raise unless all entries of a number or an array are as they must be, where
-    they are concrete."""
+    """Raise if a concrete entry violates `rule`; traced values are skipped."""
     array = as_float_array(value)
     if eqx.is_inexact_array(array):
         if not is_concrete(array) or np.all(holds(np.asarray(array))):
@@ -229,29 +233,28 @@ def _check_entries(
 
 
 def check_positive(value: Any, name: str, where: str) -> None:
-    """Raise unless numbers are finite and above zero, where they are concrete."""
+    """Raise unless numbers are positive and finite; traced values are skipped."""
     holds = lambda at: np.isfinite(at) & (at > 0)
     _check_entries(value, name, where, "positive and finite", holds)
 
 
 def check_step(dt: Any, where: str, name: str = "dt") -> None:
-    """Raise unless `dt`, or what has another name, is one positive number."""
+    """Raise unless `dt`, called `name` in the message, is a positive scalar."""
     check_positive(dt, name, where)
     if np.shape(dt) != ():
         raise ValueError(f"{where}: {name} must be a number, got shape {np.shape(dt)}.")
 
 
 def check_number(value: Any, name: str, where: str) -> None:
-    """Raise unless `value` is one finite real number, where they are concrete."""
+    """Raise unless `value` is a finite real scalar; traced values are not inspected."""
     array = _as_array(value, name, where, "be a number", lambda shape: shape == ())
     check_real(array, name, where)
     check_finite(array, name, where)
 
 
 def as_number(value: Any, name: str, where: str) -> Any:
-    """`value` as a scalar: a Python number if it is known, so that it stays known
-    while other things are being traced.
-    """
+    """`value` as a scalar: a Python number if it is concrete, so that it stays concrete
+    while other things are traced."""
     if isinstance(value, Tracer):
         return _as_array(value, name, where, "be a number", lambda shape: shape == ())
     number = np.asarray(value)
@@ -265,7 +268,7 @@ def as_number(value: Any, name: str, where: str) -> Any:
 def check_range(
     value: Any, name: str, where: str, low: Any = 0, high: float | int = np.inf
 ) -> None:
-    """Raise unless numbers lie between `low` and `high`, where they are concrete."""
+    """Raise unless numbers are in `[low, high]`; traced values are skipped."""
     least = as_float_array(low)
 
     def holds(at):
@@ -286,7 +289,7 @@ def check_choice(value: Any, choices: tuple[Any, ...], name: str, where: str) ->
 
 
 def check_bool(value: Any, name: str, where: str) -> bool:
-    """`value`, if it is True or False, or an error."""
+    """`value` as a bool, if it is True or False."""
     if not isinstance(value, bool | np.bool_):
         raise _error(value, name, where, "be True or False")
     return bool(value)
@@ -303,7 +306,7 @@ def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
 def check_at_most(
     value: int, most: int, name: str, where: str, of: str | None = None
 ) -> None:
-    """Raise unless a count is at most `most`, the number `of` something."""
+    """Raise if a count exceeds `most`, which is the number `of` something."""
     if value > most:
         limit = most if of is None else f"the {most} {of}"
         raise ValueError(f"{where}: {name} must be at most {limit}, got {value}.")
@@ -312,8 +315,8 @@ def check_at_most(
 def as_rows(
     value: Any, size: int, name: str, where: str, steps: int | None = None
 ) -> Array:
-    """`value` as a real array of a row of `size` entries for each step (of `steps`, if
-    it is given), or an error."""
+    """`value` as a real array of shape `(steps, size)`; `steps` is any number if it is
+    `None`."""
     rows = "steps" if steps is None else steps
     rule = f"have shape ({rows}, {size}), a row for each step"
     fits = lambda s: len(s) == 2 and s[1] == size and steps in (None, s[0])
@@ -344,7 +347,7 @@ def check_keywords(
 
 
 LARGEST = float(np.finfo(np.float32).max)
-"""Ends a space where there is no bound, because Gymnasium advises against infinity."""
+"""Replaces an infinite bound of a space, as Gymnasium advises."""
 
 
 def check_cost_sizes(cost: Any, sizes: tuple[int, int], name: str, where: str) -> None:
@@ -353,7 +356,7 @@ def check_cost_sizes(cost: Any, sizes: tuple[int, int], name: str, where: str) -
     try:
         output_of(cost, (), (n,), (m,))
         output_of(cost.final, (), (n,))
-    except _UNTRACEABLE:  # it may still be called, one step after the other
+    except _UNTRACEABLE:  # it still works outside of jit
         return
     except (TypeError, ValueError) as error:
         raise ValueError(
@@ -372,7 +375,7 @@ _UNTRACEABLE = (
 def checked_names(
     names: Sequence[str] | None, letter: str, size: int, argument: str, where: str
 ) -> tuple[str, ...]:
-    """`names` as a tuple of `size`, indexed if there are none, or an error."""
+    """`names` as a tuple of `size`; indexed names if there are none."""
     if names is None:
         return indexed_names(letter, size)
     if isinstance(names, str) or len(names) != size:
@@ -383,7 +386,7 @@ def checked_names(
 def check_matrices(
     A: Any, B: Any, C: Any, E: Any, where: str
 ) -> tuple[Array, Array, Any, Any]:
-    """`A`, `B`, `C`, `E` as matrices of fitting shapes, or an error that names one."""
+    """`A`, `B`, `C`, `E` as matrices whose shapes fit."""
     A = as_matrix(A, "A", where)
     n = A.shape[0]
     if A.shape != (n, n) or n == 0:

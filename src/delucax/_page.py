@@ -1,4 +1,4 @@
-"""Tables as text, and a page of HTML that needs nothing beside it."""
+"""Tables as text, and self-contained HTML pages."""
 
 import base64
 import csv
@@ -99,8 +99,7 @@ def escape(text: Any) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Page:
-    """A report of sortable tables and figures, in an HTML file that needs nothing
-    beside it.
+    """A self-contained HTML page of sortable tables and figures.
 
     **Arguments:**
 
@@ -137,7 +136,7 @@ class Page:
         **Arguments:**
 
         - `text`: what it says.
-        - `kind`: `"made"` shows it faint; plain by default.
+        - `kind`: its CSS class; `"made"` is faint.
         """
         attribute = f' class="{kind}"' if kind else ""
         self.parts.append(f"<p{attribute}>{escape(text)}</p>")
@@ -173,7 +172,7 @@ class Page:
 
         **Arguments:**
 
-        - `folder`: where the code lies.
+        - `folder`: of the source, for the commit.
         """
         made = provenance(Path(folder))
         versions = ", ".join(f"{k} {v}" for k, v in made["versions"].items() if v)

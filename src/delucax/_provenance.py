@@ -1,4 +1,4 @@
-"""What results are made with: the commit, versions, precision, device and date."""
+"""Provenance of results: commit, versions, precision, device and date."""
 
 import datetime
 import functools

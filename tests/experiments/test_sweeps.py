@@ -209,7 +209,8 @@ for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(eight), strict=True):
 def cost(key):
     return dlx.rollout(env, controller, key=key, horizon=20).total_cost
 
-a, b = experiments.run(cost, progress=False), experiments.run(cost, progress=False, mesh=mesh)
+a = experiments.run(cost, progress=False)
+b = experiments.run(cost, progress=False, mesh=mesh)
 np.testing.assert_allclose(
     [row["value"] for row in a.rows], [row["value"] for row in b.rows], rtol=1e-5
 )

@@ -541,7 +541,10 @@ WRONG = {
         lambda: quiet(stored, backend="mpi"),
         "backend must be .loky. or .dask.",
     ),
-    "no experiment": (lambda: experiments.run(), "experiments must be one at least"),
+    "no experiment": (
+        lambda: experiments.run(),
+        "at least one experiment must be given",
+    ),
     "one name": (
         lambda: experiments.run(stored, stored),
         "must have different names",
@@ -615,7 +618,7 @@ def test_interquartile_mean():
     # Of five, the second and fourth count by three quarters.
     expected = (0.75 * 2 + 3 + 0.75 * 4) / 2.5
     assert experiments.interquartile_mean([1, 2, 3, 4, np.inf]) == expected
-    with user_error(match="one at least"):
+    with user_error(match="at least one entry"):
         experiments.interquartile_mean([])
 
 

@@ -1,10 +1,10 @@
-"""Batches on CPU: values that they compute once, and lanes that end at different times.
+"""Speed of batches on CPU: a barrier against recomputation, and a sequential `vmap`.
 
 XLA on CPU compiles each component of a loop's state into a program of its own and
 repeats in it all that the component depends on: both components of a pendulum's next
 state compute its sine, and every component of a Runge-Kutta step computes all the
-stages. For a batch it is about twice as fast to store such a value once, in cache. One
-unbatched chain and accelerators are better off without, so there it does nothing.
+stages. For a batch it is about twice as fast to store such a value once, in cache. The
+barrier does nothing without a batch or on accelerators, where it would be slower.
 """
 
 from collections.abc import Callable
@@ -68,13 +68,13 @@ mlir.register_lowering(
 
 
 def by_lanes(function: Callable[..., Any], *args: Any) -> Any:
-    """`function(*args)`, arrays; a batch of it on CPU is run one after the other.
+    """`function(*args)` of arrays, whose batches run sequentially on CPU.
 
-    In a batch each iteration waits for the longest line search and the last lane, and
-    on CPU nothing is gained in return: one after the other takes about as long at
-    worst, and a sixth at best. Accelerators run the batch as one.
+    In a batch each iteration waits for the longest line search and the slowest member,
+    and on CPU nothing is gained in return: a sequential run is between equally fast and
+    six times as fast. Accelerators run the batch as one.
     """
-    # What a cost or a constraint of the user's closes over is batched with the rest.
+    # Arrays that a cost or a constraint of the user closes over are batched as well.
     # Equinox looks into functions with a closure alone, such as this lambda.
     closed = eqx.filter_closure_convert(lambda *args: function(*args), *args)
     arrays, static = eqx.partition((closed, args), eqx.is_array)

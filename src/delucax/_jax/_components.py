@@ -1,4 +1,4 @@
-"""Programs that work on the components of small vectors, not on the vectors.
+"""Small vectors as scalars: a transformation of jaxprs, for speed on CPU.
 
 A user writes `x[0]` and `jnp.stack([...])`. Left as they are, their gradient pads each
 component back to a vector and adds the vectors up, which XLA does not undo, and which
@@ -171,7 +171,7 @@ def stack_steps(
 
     `last` is put behind them: of a few components when they are one array, of more
     one by one, which is what a batch on CPU transposes fastest. (And a loop that keeps
-    the state before each step, not the one after it, does not tempt XLA to compute the
+    the state before each step, not the one after it, keeps XLA from computing the
     step twice, once to carry it and once to keep it.)
     """
     if size <= _STACKED_FIRST_UP_TO:

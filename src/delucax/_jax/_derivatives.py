@@ -1,4 +1,4 @@
-"""Derivatives of programs that may have none: in one of the two modes, or at all."""
+"""Derivatives in the mode that solvers support, and NaN tangents of failed solves."""
 
 import functools
 from collections.abc import Callable
@@ -12,10 +12,10 @@ from jaxtyping import Array
 
 
 def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
-    """The first of some ways to take a derivative that the solvers inside have.
+    """Try several ways to differentiate; use the first that the solvers inside support.
 
-    Some have none in reverse, others none forward. If no way is possible the error is
-    that of the first, and so is one that has nothing to do with derivatives.
+    Some solvers have no reverse mode, others no forward mode. If all ways fail, the
+    error of the first is raised, and so is any error of the program itself.
     """
 
     def evaluate(*args):
@@ -40,7 +40,7 @@ def jacobian(
 
 def is_constant(f: Callable[..., Any], *args: Any) -> bool:
     """Whether the array that `f` returns depends on none of its arguments."""
-    # What is left after dead code elimination that keeps the output is what it needs.
+    # Dead code elimination that keeps the output says which inputs it needs.
     traced = jax.make_jaxpr(f)(*args)
     _, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
     return not any(used)

@@ -1,4 +1,4 @@
-"""Normal noise at the price of the random bits.
+"""Fast standard normal numbers on CPU (Box and Muller).
 
 `jax.random.normal` inverts the error function, which on CPU costs a simulated step more
 than its random bits do. The transform of Box and Muller (1958) makes two normal numbers
@@ -21,7 +21,7 @@ from ..math._trig import cos, sin
 
 
 _PAIRS = 16
-"""Of numbers that are made together: enough to fill the vector registers."""
+"""Pairs of numbers made together: enough to fill the vector registers."""
 
 
 def normal(key: PRNGKey, shape: tuple[int, ...], dtype: Any) -> Array:

@@ -1,4 +1,4 @@
-"""What the fields of a module are: their kinds, paths, names and files."""
+"""Modules: kinds of fields, access by path, names and files."""
 
 from ._fields import (
     AbstractConstraint as AbstractConstraint,

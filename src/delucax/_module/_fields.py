@@ -1,4 +1,4 @@
-"""What a field of a module is: a constant of the physics, or a trainable weight."""
+"""Kinds of fields: constants of the physics, trainable weights, functions."""
 
 import abc
 import dataclasses
@@ -22,15 +22,15 @@ _FUNCTION = "delucax_function"
 
 
 class AbstractConstraint(eqx.Module):
-    """A set of legal values, and a smooth map onto it from all real numbers.
+    """A set of valid values, with a smooth bijection to it from the real numbers.
 
-    Training moves the unconstrained value and the model sees the legal one, so that no
-    step of any optimiser can leave the set.
+    Training moves the unconstrained value and the model gets the constrained one, so
+    that no step of any optimiser can leave the set.
     """
 
     @abc.abstractmethod
     def constrain(self, z: Array) -> Array:
-        """The legal value of an unconstrained `z`."""
+        """The valid value of an unconstrained `z`."""
 
     @abc.abstractmethod
     def unconstrain(self, value: Array) -> Array:
@@ -38,7 +38,7 @@ class AbstractConstraint(eqx.Module):
 
     @abc.abstractmethod
     def holds(self, value: Array) -> Array:
-        """Whether each entry of `value` is legal."""
+        """Whether each entry of `value` is valid."""
 
 
 class _Positive(AbstractConstraint):
@@ -73,7 +73,7 @@ def _inside(value: Array, low: float, high: float) -> Array:
     dtype = jnp.result_type(value)
     tiny, ends = jnp.finfo(dtype).tiny, np.asarray([low, high], dtype)
     inner = np.nextafter(ends, ends[::-1])
-    # Numbers below `tiny` are flushed to zero.
+    # XLA flushes subnormal numbers to zero.
     inner = np.where(np.abs(inner) < tiny, np.copysign(tiny, inner), inner)
     return jnp.clip(value, *map(float, inner))
 
@@ -158,8 +158,9 @@ def parameter(
 
     **Arguments:**
 
-    - `default`: the default value, a number or an array. No default by default.
-    - `constraint`: the legal values, [`delucax.positive`][] or [`delucax.bounded`][].
+    - `default`: the default value, a number or an array; the field is required if it is
+        left out.
+    - `constraint`: the valid values, [`delucax.positive`][] or [`delucax.bounded`][].
         Checked when a module is made, and kept by `delucax.training.fit`.
 
     **Returns:** a dataclass field.
@@ -192,8 +193,8 @@ def weight(
 
     **Arguments:**
 
-    - `default`: the default value. No default by default.
-    - `constraint`: the legal values, as in [`delucax.parameter`][].
+    - `default`: the default value; the field is required if it is left out.
+    - `constraint`: the valid values, as in [`delucax.parameter`][].
 
     **Returns:** a dataclass field.
 
@@ -260,7 +261,7 @@ def fields_of(node: Any) -> dict[str, dataclasses.Field]:
 
 
 def children_of(node: Any) -> dict[str, Any]:
-    """What is inside a node, by the names that paths call it."""
+    """The children of a node, by their names in paths."""
     if isinstance(node, Mapping):
         return {str(key): child for key, child in node.items()}
     if isinstance(node, tuple | list) and not hasattr(node, "_fields"):
@@ -283,7 +284,8 @@ def parts_of(module: Any, kind: type[_Part]) -> list[_Part]:
 def marked_leaves(
     tree: Any,
 ) -> Iterator[tuple[tuple, Any, str | None, AbstractConstraint | None]]:
-    """`(path, leaf, role, constraint)` of every leaf; the innermost mark holds."""
+    """`(path, leaf, role, constraint)` of every leaf, as the innermost `parameter()` or
+    `weight()` declares."""
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         node, role, constraint = tree, None, None
         for key in path:
@@ -303,9 +305,9 @@ def path_string(path: tuple) -> str:
 
 
 def check_parameters(module: eqx.Module) -> None:
-    """Raise unless every `parameter()`, `weight()` and function of `module` is legal.
+    """Raise unless every `parameter()`, `weight()` and function of `module` is valid.
 
-    Traced values cannot be looked at and are let through.
+    Traced values are not inspected.
     """
     for field in dataclasses.fields(module):
         value = getattr(module, field.name, None)

@@ -1,4 +1,4 @@
-"""Functions and classes by name, `"module:qualified.name"`, and back."""
+"""Functions and classes by their names, `"module:qualified.name"`, and back."""
 
 import importlib
 import sys
@@ -28,7 +28,7 @@ _JAX = (
 
 
 def name_of(thing: Any) -> str | None:
-    """The name that leads to `thing` and nothing else; `None` if there is none.
+    """The importable name of `thing`; `None` if it has none.
 
     A public name is preferred to the module that a thing is defined in, which a later
     version of its library may move.
@@ -51,7 +51,7 @@ def name_of(thing: Any) -> str | None:
 
 
 def thing_of(name: str, trust: tuple[str, ...]) -> Any:
-    """What `name` leads to.
+    """Import the function or class called `name`.
 
     **Raises:** `ValueError` if its module is not trusted, or if there is no such thing.
     """
@@ -97,7 +97,7 @@ def _is_in(module: str, packages: tuple[str, ...]) -> bool:
 
 
 def _places(module: str) -> tuple[str, ...]:
-    """Where to look for what says that it is of `module`, the best place first."""
+    """Modules to import an object of `module` from, the preferred one first."""
     if module.partition(".")[0] in ("jax", "jaxlib"):
         return (*_JAX, module)
     public = module.partition("._")[0]

@@ -1,4 +1,4 @@
-"""Modules and trajectories in a file: names, numbers and structure; no code, no pickle.
+"""Modules and trajectories in files, without pickle: names, numbers and structure.
 
 The file is three parts: a line with the format, its version and a SHA-256 of the rest;
 a line of JSON that describes the structure; and the bytes of the arrays.
@@ -82,7 +82,7 @@ def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
 
     Nothing in the file is run: classes and functions are looked up by name, and only in
     packages that are trusted. What was loaded calls the functions that the file names,
-    so use only files from those whom you trust.
+    so only load files from sources that you trust.
 
     **Arguments:**
 
@@ -142,7 +142,7 @@ def _file(path: Any, where: str) -> Path:
 
 
 def _checked(path: Path) -> tuple[bytes, bytes]:
-    """The description, and the bytes of the arrays, of a file that is whole."""
+    """The header and the bytes of the arrays, once the checksum is verified."""
     try:
         first, _, body = path.read_bytes().partition(b"\n")
     except OSError as error:

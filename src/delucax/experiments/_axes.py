@@ -37,7 +37,7 @@ class Axis:
     params: tuple[Param, ...]
 
     def choices(self, where: str) -> Iterator[Choice]:
-        """What there is to choose from; `where` is named in errors."""
+        """The choices; `where` is named in errors."""
         for index, param in enumerate(self.params):
             shown, hashes = {}, []
             for name, value in zip(self.names, param.values, strict=True):
@@ -53,7 +53,7 @@ class Axis:
             yield Choice(index, param, shown, fingerprint(hashes))
 
     def _shown(self, value: Any, param: Param) -> Any:
-        """What the table shows: a simple value itself, of another its name or id."""
+        """A value as the table shows it: a simple one as it is, else its name or id."""
         value = _as_python(value)
         if isinstance(value, _SIMPLE):
             return value
@@ -121,7 +121,7 @@ def _ids(params: list[Param], names: tuple, ids: Any, where: str) -> list[str]:
 
 
 _SIMPLE = bool | int | float | str | None
-"""What a table can hold."""
+"""Values that a table can hold."""
 
 
 def _as_python(value: Any) -> Any:
@@ -130,7 +130,7 @@ def _as_python(value: Any) -> Any:
 
 
 def _label(value: Any) -> str | None:
-    """What to call a value that has a name or is one."""
+    """The label of a value that is simple or has a name."""
     value = _as_python(value)
     if isinstance(value, _SIMPLE):
         return str(value)
@@ -145,7 +145,7 @@ _TOKEN = re.compile(r"[()]|[^\s()]+")
 def selector(
     expression: str, argument: str, where: str
 ) -> Callable[[Callable[[str], Any]], Any]:
-    """A function of a test of single words to whether the whole holds.
+    """Compile an expression of words into a predicate of a test of single words.
 
     Words are joined by `and`, `or`, `not` and parentheses, as in pytest's `-k`. An
     empty expression holds always.
@@ -160,8 +160,8 @@ def selector(
     tokens = [t.lower() if t.lower() in _OPERATORS else t for t in words(expression)]
     if not tokens:
         return lambda holds: True
-    # It becomes an expression of Python, which has the same operators; each word is
-    # quoted, so that nothing else is evaluated.
+    # Converted to a Python expression, which has the same operators; words are quoted,
+    # so that `eval` is safe.
     python: list[str] = []
     depth, wants_word = 0, True
     for token in (*tokens, ""):

@@ -48,7 +48,7 @@ class Runner:
     def __init__(self, experiment: Experiment):
         self.experiment, self.axes = experiment, experiment.all_axes()
         self.fixtures = experiment.used_fixtures()
-        # What fixtures of the process made, and what ends them.
+        # The values of fixtures of the process, and their teardown.
         self.process: tuple[dict, Any] = {}, contextlib.ExitStack()
         self.is_traceable: dict[Any, bool] = {}
         self.program: Any = jax.jit(self._all_seeds, static_argnums=0)
@@ -116,7 +116,7 @@ class Runner:
         return {name: v for name, v in given.items() if takes_any or name in takes}
 
     def _call(self, arguments: dict[str, Any], seeds: tuple[int, ...], mesh: Any):
-        """What the function returns: a list by seed, or all seeds at once."""
+        """Call the function: returns a list by seed, or all seeds at once."""
         function, known = self.experiment.function, self.experiment.arguments
         if "seed" in known:
             return [function(**arguments, seed=seed) for seed in seeds]
@@ -132,9 +132,9 @@ class Runner:
     def _traced(self, arguments: dict[str, Any], numbers: Any) -> Any:
         """Call for all seeds at once, with as much traced as can be.
 
-        First every number is traced, then only those that are no whole numbers, then
-        none. What worked is remembered by what tracing depends on, so that which it is
-        follows from the case alone and not from those that ran before it.
+        Tracing is tried with all numbers, then with floats only, then with none. The
+        choice is cached by the signature, so that it does not depend on the cases that
+        ran before.
         """
         for kinds in _TRACED_KINDS:
             dynamic, rest = _split(arguments, kinds)
@@ -300,7 +300,7 @@ def release_programs(limit: int | None = None) -> bool:
     """Forget all compiled programs if they hold too many memory maps.
 
     A program that XLA has compiled holds tens of the maps that Linux allows a process,
-    65,530 by default, and a compilation that finds none left ends in a
+    65,530 by default, and a compilation without any left ends in a
     segmentation fault. Programs that are still needed are compiled anew. Elsewhere than
     on Linux nothing is done.
 

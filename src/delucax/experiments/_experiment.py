@@ -44,7 +44,7 @@ class Marks:
 
 @dataclasses.dataclass(frozen=True)
 class Fixture:
-    """What cases need, made by a function; see `experiment.fixture`."""
+    """A resource of cases, made by a function; see `experiment.fixture`."""
 
     function: Callable
     scope: str
@@ -64,12 +64,12 @@ class Case:
 
     @property
     def key(self) -> tuple[str, str]:
-        """What the store knows it by."""
+        """Its key in the results store."""
         return self.experiment, self.id
 
     @property
     def described(self) -> dict[str, Any]:
-        """What a line of the store tells of it."""
+        """Its columns in a line of the store."""
         return {
             "experiment": self.experiment,
             "case": self.id,
@@ -89,10 +89,10 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """A function and all that it is called with; made by
+    """A function with its parameters, seeds, fixtures and marks; made by
     [`delucax.experiments.experiment`][].
 
-    Called as a function it is the function that it was made of.
+    Calling it calls the function.
 
     **Arguments:**
 
@@ -133,7 +133,7 @@ class Experiment:
         vars(self).update(own, name=name, __wrapped__=f)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """The function's own answer to `args` and `kwargs`."""
+        """Call the function."""
         return self.function(*args, **kwargs)
 
     @property

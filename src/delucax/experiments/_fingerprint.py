@@ -1,4 +1,4 @@
-"""What a case depends on, its code and its values, in one hash."""
+"""Hashes of the code and the values that a case depends on."""
 
 import ast
 import contextlib
@@ -58,7 +58,7 @@ class _Hasher:
     def __init__(self, root: str | None):
         self.sha = hashlib.sha256()
         self.root = root
-        # What was visited, with its number; held, so that no other gets its id.
+        # Visited objects with their numbers; kept alive, so that ids are not reused.
         self.visited: dict[int, tuple[int, Any]] = {}
 
     def visit(self, thing: Any) -> bool:
@@ -78,7 +78,7 @@ class _Hasher:
 
     def feed(self, value: Any) -> None:
         kind = type(value)
-        # One of the user's is more than the list or the mapping that it also is.
+        # A subclass of list or dict by the user is hashed with its class.
         own = self.own(kind.__module__)
         if value is None or kind in (bool, int, float, complex, str, bytes, range):
             self.word(kind.__name__, repr(value))
@@ -180,7 +180,7 @@ class _Hasher:
                 self.word(_plain(inspect.getsource(module)))
             except (OSError, TypeError, SyntaxError):
                 self.word("no source")
-            # What its code uses of other modules of the user.
+            # Members from other modules of the user.
             for member in vars(module).values():
                 if isinstance(member, types.ModuleType):
                     self.module(member)
@@ -194,7 +194,7 @@ class _Hasher:
         if not self.visit(value):
             self.word("again", self.visited[id(value)][0])
             return
-        # What pickle would write, and the code of whatever is in there.
+        # The parts that pickle would write, and their code.
         reduce = copyreg.dispatch_table.get(kind, lambda value: value.__reduce_ex__(4))
         try:
             parts: Any = reduce(value)

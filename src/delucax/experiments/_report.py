@@ -123,7 +123,7 @@ def _varies(rows: list[dict[str, Any]], metric: str) -> bool:
 
 
 class Difference(NamedTuple):
-    """What differs from the first results to the second.
+    """Differences of two results.
 
     - `changed`: rows of `DIFFERENCES`.
     - `status`: rows of experiment, case, and the status in both.
@@ -137,7 +137,7 @@ class Difference(NamedTuple):
     only: tuple[list[tuple[str, str]], list[tuple[str, str]]]
 
     def page(self, names: tuple[str, str]) -> Page:
-        """It as a page, where the results have these names."""
+        """A page of the differences of results with these names."""
         page = Page(f"{names[1]} against {names[0]}")
         page.paragraph(f"{self.same} cases are the same.")
         page.heading(f"{len(self.changed)} results differ")

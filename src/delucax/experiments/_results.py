@@ -1,4 +1,4 @@
-"""A table of results, and what to make of it."""
+"""Results table with filtering and export."""
 
 import dataclasses
 import json
@@ -108,7 +108,7 @@ class Results:
 
     @property
     def failed(self) -> list[dict[str, Any]]:
-        """The rows of cases that failed, or passed though they were not to."""
+        """The rows of cases that failed or passed unexpectedly."""
         return [row for row in self.rows if row["status"] in FAILED]
 
     @property

@@ -107,7 +107,7 @@ def run(
     where = "run"
     chosen = [*map(as_experiment, experiments)]
     if not chosen:
-        raise ValueError(f"{where}: experiments must be one at least.")
+        raise ValueError(f"{where}: at least one experiment must be given.")
     names = [one.name for one in chosen]
     if len(set(names)) < len(names):
         raise ValueError(f"{where}: experiments must have different names: {names}.")
@@ -181,7 +181,7 @@ def _write_outcomes(
 
 
 def _with_new_status(case: Case, stored: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Lines for what is not run again, where a mark came or went since."""
+    """Status updates of stored cases whose marks changed."""
     again = []
     for record in stored:
         status = _status(case, record["error"])
@@ -291,7 +291,7 @@ def _packed(experiment: Experiment) -> tuple[str, bytes]:
             f"run: {experiment.name} cannot be sent to another process: {error}. Make "
             "what cannot be sent in the function or in a fixture."
         ) from error
-    # As bytes: an array would be put on one worker of a cluster, and die with it.
+    # As bytes: Dask would keep an array on one worker, and lose it with that worker.
     return hashlib.sha256(content).hexdigest(), content
 
 
@@ -309,7 +309,7 @@ def _close_runners() -> None:
 def _work(
     packed: Any, number: int, index: tuple, seeds: tuple, precise: bool, marks: Any
 ) -> tuple[int, Outcome]:
-    """What a worker does: one case. It keeps the runner for the next one."""
+    """Run one case in a worker, which keeps the runner for the next one."""
     import cloudpickle
 
     name, content = packed

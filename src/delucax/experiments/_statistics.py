@@ -41,7 +41,7 @@ def interquartile_mean(values: Any, axis: int | None = None) -> Any:
     array = array.reshape(-1) if axis is None else np.moveaxis(array, axis, -1)
     count = array.shape[-1] if array.ndim else 0
     if count == 0:
-        raise ValueError("interquartile_mean: values must be one at least, got none.")
+        raise ValueError("interquartile_mean: values must have at least one entry.")
     cut = count / 4
     place = np.arange(count)
     # The k-th sorted value fills [k, k + 1] of [0, count]; what of it lies between the
@@ -93,8 +93,8 @@ def compare(
 
     **Returns:** a `pandas.DataFrame`, a row for each value: `iqm`, `low`, `high` of its
     interquartile mean; `difference` (or `ratio`) to the baseline's over the common
-    pairs, its `difference_low`, `difference_high`; `below`, the part of the pairs that
-    are below the baseline's; and `pairs`.
+    pairs, its `difference_low`, `difference_high`; `below`, the fraction of the pairs
+    that are below the baseline; and `pairs`.
 
     **Raises:** `ValueError` if there is no such parameter, value or metric.
 

@@ -3,7 +3,7 @@
 The first line names the format; a line `run` says what the cases after it were made
 with; a line `case` holds a case for some of its seeds. A line is written by one call,
 and one that was cut short is dropped when the file is next opened, so that a process
-may be killed at any moment. Of what was run again the last line counts.
+may be killed at any moment. For cases that ran again the last line counts.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ except ImportError:  # Windows has no such lock, and two runs could write
 _FORMAT = "delucax-results"
 _VERSION = 1
 _HEADER = {"format": _FORMAT, "version": _VERSION}
-# What a line `case` and a line `run` tell of each row of the table.
+# The columns of the table that come from a line `case` and from a line `run`.
 CASE_COLUMNS = "error", "traceback", "compile_seconds", "run_seconds", "device", "hash"
 RUN_COLUMNS = ("date", "commit", "dirty", "dtype")
 _KEYS = ("experiment", "case", "seed", "status", "versions")
@@ -35,7 +35,7 @@ RESERVED = (*_KEYS, *CASE_COLUMNS, *RUN_COLUMNS)
 
 
 class Store:
-    """The lines of a results file, or of none: then they are kept in memory alone.
+    """The lines of a results file; without a path they are kept in memory alone.
 
     `cases` is by experiment and case; each holds `hash`, `order` and `seeds`: what
     counts of each seed, as a line has it but with its own values.
@@ -111,12 +111,12 @@ class Store:
             entry["seeds"][seed] = {**record, "seed": seed, "values": own}
 
     def stored(self, key: tuple[str, str], hash: str) -> dict[int, dict[str, Any]]:
-        """What counts of a case by seed: of the code and the values of this hash."""
+        """The results of a case by seed, if its code and values have this hash."""
         entry = self.cases.get(key, {"hash": None})
         return entry["seeds"] if entry["hash"] == hash else {}
 
     def open(self) -> None:
-        """Make ready to write: alone, after what is whole."""
+        """Open for writing: lock the file and cut off a partial last line."""
         if self.path is None or self._file is not None:
             return
         try:
@@ -138,15 +138,14 @@ class Store:
             self._write(_HEADER)
 
     def begin(self, provenance: dict[str, Any]) -> int:
-        """Note what the cases that follow are made with; its number."""
+        """Write the provenance of the cases that follow; returns its number."""
         number = max(self.runs, default=-1) + 1
         self.append({"kind": "run", "run": number, **provenance})
         return number
 
     def append(self, record: dict[str, Any]) -> None:
         """Add a line."""
-        # What is read back is what counts, so that a fresh table and one that was read
-        # are the same.
+        # Kept as it is read back, so that a fresh table and one from a file are equal.
         if self.path is not None:
             self._write(record)
         self._take(record)

@@ -1,4 +1,4 @@
-"""What the commands `list`, `run` and `report` do."""
+"""The commands `list`, `run` and `report`."""
 
 import dataclasses
 import importlib
