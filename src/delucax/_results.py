@@ -134,7 +134,7 @@ _T = TypeVar("_T")
 
 
 def raise_if(failed: Bool[Array, ""], value: _T, message: str) -> _T:
-    """`value`; raise `message` if `failed`, now if that is concrete, else at run time."""
+    """`value`, or raise if `failed`, now if that is concrete, else at run time."""
     return eqx.error_if(value, failed, message)
 
 

@@ -76,8 +76,8 @@ class Runner:
         return Outcome(values, error, trace, *seconds, where, os.getpid())
 
     def close(self) -> None:
-        """End the fixtures of the process. If that fails, it is a warning: the results
-        are there."""
+        """Tear down the fixtures of the process. An error is a warning, because the
+        results are there."""
         made, end = self.process
         made.clear()
         try:

@@ -214,7 +214,7 @@ def _add_figures(page: Page, results: Results) -> None:
             label = row["case"].partition("[")[2][:-1] or row["case"]
             title = str(row[used[0]]) if len(used) > 1 else ""
             label = label.removeprefix(f"{title}-") if title else label
-            panels.setdefault(title, {}).setdefault(label, []).append(value)
+            panels.setdefault(title, {}).setdefault(label, []).append(float(value))
         panels = dict(itertools.islice(panels.items(), _PANELS))
         most = max(map(len, panels.values()), default=0)
         if most < 2:
