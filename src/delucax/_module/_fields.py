@@ -54,7 +54,7 @@ class _Positive(AbstractConstraint):
     """
 
     def constrain(self, z: Array) -> Array:
-        return _inside(jnp.exp(z), 0.0, np.inf)
+        return _strictly_inside(jnp.exp(z), 0.0, np.inf)
 
     def unconstrain(self, value: Array) -> Array:
         return jnp.log(value)
@@ -66,7 +66,7 @@ class _Positive(AbstractConstraint):
         return "positive"
 
 
-def _inside(value: Array, low: float, high: float) -> Array:
+def _strictly_inside(value: Array, low: float, high: float) -> Array:
     """`value` off the ends of an open interval, which rounding may put it on."""
     # exp and the sigmoid round to 0 and to the ends far out, where the logarithm of
     # `unconstrain` is infinite and the gradient gone for good.
@@ -111,7 +111,7 @@ class bounded(AbstractConstraint):
 
     def constrain(self, z: Array) -> Array:
         value = self.low + (self.high - self.low) * jax.nn.sigmoid(z)
-        return _inside(value, self.low, self.high)
+        return _strictly_inside(value, self.low, self.high)
 
     def unconstrain(self, value: Array) -> Array:
         # The logit of the part of the way from one end to the other.

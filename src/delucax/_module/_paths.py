@@ -96,7 +96,7 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
     # The deepest first: what follows by default is in place when an owner is checked.
     for path in _owners(changes):
         before = get_path(tree, path)
-        changed = _followed(changed, path, before, changes)
+        changed = _with_defaults(changed, path, before, changes)
         _check(get_path(changed, path), before)
     return changed
 
@@ -140,9 +140,11 @@ def _with(tree: Any, path: str, value: Any) -> Any:
     return eqx.tree_at(at, tree, value, is_leaf=lambda node: node is None)
 
 
-def _followed(tree: Any, path: str, before: Any, changes: Mapping[str, Any]) -> Any:
-    """A copy of `tree` in which what the node at `path` had by default of something
-    that was changed is the default of the new one."""
+def _with_defaults(
+    tree: Any, path: str, before: Any, changes: Mapping[str, Any]
+) -> Any:
+    """A copy of `tree` in which the defaults that the node at `path` derived from a
+    changed part are derived from the new one."""
     node = get_path(tree, path)
     if type(node) is not type(before) or not hasattr(node, "__replaced__"):
         return tree

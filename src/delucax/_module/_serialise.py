@@ -24,7 +24,7 @@ from jax.core import Tracer
 
 from .._files import as_path, replaced
 from .._results import Result
-from ._qualified import name_of, thing_of
+from ._qualified import import_named, qualified_name
 
 
 _MAGIC = "delucax-file"
@@ -243,7 +243,7 @@ class _Writer:
         return {kind: len(self.arrays) - 1, **extra}
 
     def name(self, thing: Any, path: str) -> str:
-        name = name_of(thing)
+        name = qualified_name(thing)
         if name is not None:
             return name
         remedy = "Hold numbers, strings, arrays, modules, or functions by name."
@@ -329,7 +329,7 @@ class _Reader:
         return self.arrays[content][()]
 
     def build_name(self, content, node):
-        return thing_of(content, self.trust)
+        return import_named(content, self.trust)
 
     def build_result(self, content, node):
         enumeration, value = self.build_name(content, node), self.build(node["value"])
@@ -372,7 +372,7 @@ class _Reader:
         return {self.build(key): self.build(value) for key, value in content}
 
     def class_of(self, name: str, base: type, what: str) -> Any:
-        cls = thing_of(name, self.trust)
+        cls = import_named(name, self.trust)
         if not (isinstance(cls, type) and issubclass(cls, base)):
             raise ValueError(f"it needs a {what}, and {name!r} is not one.")
         return cls

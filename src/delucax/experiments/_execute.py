@@ -71,7 +71,7 @@ class Runner:
             trace = "".join(traceback.format_exception(raised))[-_LONGEST:]
             values = {}
         if clock.compiling:
-            release_programs()
+            clear_programs()
         seconds = round(clock.compiling, 6), round(clock.running, 6)
         return Outcome(values, error, trace, *seconds, where, os.getpid())
 
@@ -296,7 +296,7 @@ _IN_USE = Path("/proc/self/maps")
 _LIMIT = Path("/proc/sys/vm/max_map_count")
 
 
-def release_programs(limit: int | None = None) -> bool:
+def clear_programs(limit: int | None = None) -> bool:
     """Forget all compiled programs if they hold too many memory maps.
 
     A program that XLA has compiled holds tens of the maps that Linux allows a process,

@@ -34,7 +34,7 @@ def fingerprint(value: Any, *, root: str | None = None) -> str:
     **Raises:** `TypeError` if something in it has no content to tell it by.
     """
     hasher = _Hasher(root)
-    hasher.feed(value)
+    hasher.add(value)
     return hasher.sha.hexdigest()[:16]
 
 
@@ -68,131 +68,131 @@ class _Hasher:
         self.visited[id(thing)] = len(self.visited), thing
         return True
 
-    def own(self, module: str | None) -> bool:
+    def is_own(self, module: str | None) -> bool:
         return module == self.root or not is_library(module)
 
-    def word(self, *words: Any) -> None:
+    def update(self, *words: Any) -> None:
         for word in words:
             word = word if isinstance(word, bytes) else str(word).encode()
             self.sha.update(b"%d:" % len(word) + word)
 
-    def feed(self, value: Any) -> None:
+    def add(self, value: Any) -> None:
         kind = type(value)
         # A subclass of list or dict by the user is hashed with its class.
-        own = self.own(kind.__module__)
+        own = self.is_own(kind.__module__)
         if value is None or kind in (bool, int, float, complex, str, bytes, range):
-            self.word(kind.__name__, repr(value))
+            self.update(kind.__name__, repr(value))
         elif isinstance(value, jax.Array | np.ndarray | np.generic):
             self.array(value)
         elif isinstance(value, Mapping) and not own:
-            self.word("mapping", len(value))
+            self.update("mapping", len(value))
             for _, key in sorted((repr(key), key) for key in value):
-                self.feed(key)
-                self.feed(value[key])
+                self.add(key)
+                self.add(value[key])
         elif isinstance(value, set | frozenset):
             if own:
                 self.type(kind)
-            self.word("set", *sorted(fingerprint(member) for member in value))
+            self.update("set", *sorted(fingerprint(member) for member in value))
         elif isinstance(value, list | tuple) and not own:
-            self.word(kind.__name__, len(value))
+            self.update(kind.__name__, len(value))
             for member in value:
-                self.feed(member)
+                self.add(member)
         elif isinstance(value, types.FunctionType):
             self.function(value)
         elif isinstance(value, types.BuiltinFunctionType | np.ufunc):
-            self.word("builtin", getattr(value, "__module__", ""), value.__name__)
+            self.update("builtin", getattr(value, "__module__", ""), value.__name__)
         elif isinstance(value, type):
             self.type(value)
         elif isinstance(value, types.ModuleType):
             self.module(value)
         elif not own and hasattr(value, "__wrapped__"):
-            self.feed(value.__wrapped__)  # type: ignore
+            self.add(value.__wrapped__)  # type: ignore
         elif dataclasses.is_dataclass(value):
-            self.feed(kind)
+            self.add(kind)
             for field in dataclasses.fields(value):
-                self.word(field.name)
-                self.feed(getattr(value, field.name, None))
+                self.update(field.name)
+                self.add(getattr(value, field.name, None))
         else:
             self.other(value)
 
     def array(self, value: Any) -> None:
         if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
-            self.word("key", value.dtype)
+            self.update("key", value.dtype)
             value = jax.random.key_data(value)
         content = np.asarray(value)
         if content.dtype == object:
-            self.word("objects", content.shape)
-            self.feed(content.ravel().tolist())
+            self.update("objects", content.shape)
+            self.add(content.ravel().tolist())
         else:
-            self.word("array", content.dtype, content.shape, content.tobytes())
+            self.update("array", content.dtype, content.shape, content.tobytes())
 
     def function(self, f: types.FunctionType) -> None:
-        self.word("function", f.__qualname__)
+        self.update("function", f.__qualname__)
         if not self.visit(f):
             return
         names: set[str] = set()
-        if self.own(f.__module__):
-            self.word(source_of(f))
+        if self.is_own(f.__module__):
+            self.update(source_of(f))
             names = _names(f.__code__)
         else:
-            self.word(f.__module__)
-        self.feed([f.__defaults__, f.__kwdefaults__])
+            self.update(f.__module__)
+        self.add([f.__defaults__, f.__kwdefaults__])
         for cell in f.__closure__ or ():
             try:
-                self.feed_named(cell.cell_contents)
+                self.add_named(cell.cell_contents)
             except ValueError:  # not yet set
-                self.word("empty")
+                self.update("empty")
         for name in sorted(names & f.__globals__.keys()):
-            self.word(name)
-            self.feed_named(f.__globals__[name])
+            self.update(name)
+            self.add_named(f.__globals__[name])
 
-    def feed_named(self, value: Any) -> None:
+    def add_named(self, value: Any) -> None:
         """A value that the code names: one without content counts by its type."""
         if id(value) in self.visited:
             return
         before, count = self.sha.copy(), len(self.visited)
         try:
-            self.feed(value)
+            self.add(value)
         except (TypeError, RecursionError):
             self.sha = before
             while len(self.visited) > count:
                 self.visited.popitem()
-            self.word("thing", type(value).__qualname__)
-            if self.own(type(value).__module__):
+            self.update("thing", type(value).__qualname__)
+            if self.is_own(type(value).__module__):
                 self.type(type(value))
 
     def type(self, cls: type) -> None:
-        self.word("type", cls.__module__, cls.__qualname__)
-        if not (self.own(cls.__module__) and self.visit(cls)):
+        self.update("type", cls.__module__, cls.__qualname__)
+        if not (self.is_own(cls.__module__) and self.visit(cls)):
             return
         for name, member in sorted(vars(cls).items()):
-            code = [f for f in _functions(member) if self.own(f.__module__)]
+            code = [f for f in _functions(member) if self.is_own(f.__module__)]
             if code or not name.startswith("__"):
-                self.word(name)
-                self.feed_named(code or member)
+                self.update(name)
+                self.add_named(code or member)
         for base in cls.__bases__:
             self.type(base)
 
     def module(self, module: types.ModuleType) -> None:
-        self.word("module", module.__name__)
-        if self.own(module.__name__) and self.visit(module):
+        self.update("module", module.__name__)
+        if self.is_own(module.__name__) and self.visit(module):
             try:
-                self.word(_plain(inspect.getsource(module)))
+                self.update(_plain(inspect.getsource(module)))
             except (OSError, TypeError, SyntaxError):
-                self.word("no source")
+                self.update("no source")
             # Members from other modules of the user.
             for member in vars(module).values():
                 if isinstance(member, types.ModuleType):
                     self.module(member)
                 elif isinstance(member, types.FunctionType | type):
-                    self.feed_named(member)
+                    self.add_named(member)
 
     def other(self, value: Any) -> None:
         if isinstance(value, Iterator):
             raise TypeError(f"a {type(value).__name__}, which is used up when read")
         kind = type(value)
         if not self.visit(value):
-            self.word("again", self.visited[id(value)][0])
+            self.update("again", self.visited[id(value)][0])
             return
         # The parts that pickle would write, and their code.
         reduce = copyreg.dispatch_table.get(kind, lambda value: value.__reduce_ex__(4))
@@ -202,11 +202,11 @@ class _Hasher:
             raise TypeError(f"a {kind.__name__}, which {error}") from error
         self.type(kind)
         if isinstance(parts, str):
-            self.word(parts)
+            self.update(parts)
             return
         for k, part in enumerate(parts):
             # The fourth and fifth run over members of lists and of dictionaries.
-            self.feed(list(part) if k in (3, 4) and part is not None else part)
+            self.add(list(part) if k in (3, 4) and part is not None else part)
 
 
 def _functions(member: Any) -> list[types.FunctionType]:

@@ -169,7 +169,7 @@ def _write_outcomes(
         folder = Path(file).resolve().parent
     except (TypeError, OSError):  # not in a file
         folder = Path.cwd()
-    number = opened.begin(provenance(folder))
+    number = opened.write_run(provenance(folder))
     with bars as tick, contextlib.closing(outcomes):
         for job, outcome in outcomes:
             status = _status(job.case, outcome.error)

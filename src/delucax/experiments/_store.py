@@ -51,49 +51,49 @@ class Store:
         if self.path is not None and self.path.exists():
             self._read(self.path)
 
+    def _error(self, why: str) -> ValueError:
+        return ValueError(f"{self.where}: '{self.path}' {why}")
+
     def _read(self, path: Path) -> None:
         if path.is_dir():
-            raise ValueError(f"{self.where}: '{path}' is a folder, not a results file.")
+            raise self._error("is a folder, not a results file.")
         if not path.is_file():  # a device may have no end
-            raise ValueError(f"{self.where}: '{path}' is no regular file.")
+            raise self._error("is no regular file.")
         try:
             content = path.read_bytes()
         except OSError as error:
-            raise type(error)(f"{self.where}: '{path}' cannot be read: {error}") from (
-                error
-            )
+            where = f"{self.where}: '{path}'"
+            raise type(error)(f"{where} cannot be read: {error}") from error
         lines = content.split(b"\n")
         # A line without its end was cut short by the end of its process.
         self._whole = len(content) - len(lines.pop())
         if lines or not _line(_HEADER).startswith(content):
-            self._check_header(lines[0] if lines else content, path)
+            self._check_header(lines[0] if lines else content)
         for number, line in enumerate(lines[1:], 2):
             try:
-                self._take(json.loads(line))
+                self._add(json.loads(line))
             except (ValueError, KeyError, TypeError, AttributeError) as error:
                 raise ValueError(
                     f"{self.where}: line {number} of '{path}' is damaged; remove it "
                     "to run its case again."
                 ) from error
 
-    def _check_header(self, line: bytes, path: Path) -> None:
+    def _check_header(self, line: bytes) -> None:
         try:
             header = json.loads(line)
             if header["format"] != _FORMAT:
                 raise KeyError
             version = header["version"]
         except (ValueError, KeyError, TypeError):
-            raise ValueError(
-                f"{self.where}: '{path}' is not a results file of delucax."
-            ) from None
+            raise self._error("is not a results file of delucax.") from None
         if version != _VERSION:
-            raise ValueError(
-                f"{self.where}: '{path}' has format {version}, and this "
-                f"version of delucax reads and writes {_VERSION}; it is left as it is. "
-                "Write to another file, or use the delucax that wrote it."
+            raise self._error(
+                f"has format {version}, and this version of delucax reads and writes "
+                f"{_VERSION}; it is left as it is. Write to another file, or use the "
+                "delucax that wrote it."
             )
 
-    def _take(self, record: dict[str, Any]) -> None:
+    def _add(self, record: dict[str, Any]) -> None:
         if record["kind"] == "run":
             self.runs[record["run"]] = record
             return
@@ -129,15 +129,13 @@ class Store:
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 self.close()
-                raise ValueError(
-                    f"{self.where}: '{self.path}' is being written by another run."
-                ) from error
+                raise self._error("is being written by another run.") from error
         if os.fstat(self._file).st_size > self._whole:
             os.ftruncate(self._file, self._whole)
         if self._whole == 0:
             self._write(_HEADER)
 
-    def begin(self, provenance: dict[str, Any]) -> int:
+    def write_run(self, provenance: dict[str, Any]) -> int:
         """Write the provenance of the cases that follow; returns its number."""
         number = max(self.runs, default=-1) + 1
         self.append({"kind": "run", "run": number, **provenance})
@@ -148,7 +146,7 @@ class Store:
         # Kept as it is read back, so that a fresh table and one from a file are equal.
         if self.path is not None:
             self._write(record)
-        self._take(record)
+        self._add(record)
 
     def _write(self, record: dict[str, Any]) -> None:
         line = _line(record)
