@@ -356,20 +356,13 @@ def check_cost_sizes(cost: Any, sizes: tuple[int, int], name: str, where: str) -
     try:
         output_of(cost, (), (n,), (m,))
         output_of(cost.final, (), (n,))
-    except _UNTRACEABLE:  # it still works outside of jit
+    except jax.errors.JAXTypeError:  # not traceable: it still works outside of jit
         return
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"{where}: {name} does not fit a state of size {n} and a control of size "
             f"{m}: {error}"
         ) from error
-
-
-_UNTRACEABLE = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-)
 
 
 def checked_names(
