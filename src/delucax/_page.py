@@ -105,16 +105,6 @@ class Page:
 
     - `title`: its heading.
     - `parts`: pieces of HTML, to which the methods add.
-
-    !!! example
-
-        ```python
-        from delucax.experiments import Page
-
-        page = Page("Costs")
-        page.table(["controller", "cost"], [["LQR", 1.5], ["zero", 20.0]])
-        page.write("costs.html")
-        ```
     """
 
     title: str
