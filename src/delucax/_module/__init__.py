@@ -1,4 +1,4 @@
-"""Modules: kinds of fields, access by path, names and files."""
+"""The fields of modules: their kinds, paths, names and files; stacks of modules."""
 
 from ._fields import (
     AbstractConstraint as AbstractConstraint,
