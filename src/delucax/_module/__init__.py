@@ -5,6 +5,7 @@ from ._fields import (
     as_float_array as as_float_array,
     as_module as as_module,
     bounded as bounded,
+    check_function as check_function,
     check_parameters as check_parameters,
     function_field as function_field,
     marked_leaves as marked_leaves,

@@ -28,7 +28,7 @@ from ..lung import BreathCost, Breathing
 from ..planning import AbstractPlanner, CEM, ILQR, ilqr, MPPI
 from ..simulation import rollout
 from ..training import actor_critic, expected_cost, fit, PPO, SHAC
-from ._listing import task_names
+from .listing import task_names
 
 
 # Of every training: steps of the optimiser on the gradient, episodes a step, and the

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..._check import check_choice
 from ..._extras import extra
-from ...experiments import Page
+from ..._page import Page
 from ._finding import Claim, Finding
 from ._gradients import estimator_variance, policy_gradient
 from ._online_control import lq_perturbations, pendulum_shock
