@@ -11,8 +11,9 @@ from ._classic_control import (
     MountainCar as MountainCar,
     Pendulum as Pendulum,
 )
-from ._function import (
+from ._general import (
     FunctionSystem as FunctionSystem,
+    LinearSystem as LinearSystem,
     NeuralSystem as NeuralSystem,
     system as system,
 )
@@ -21,16 +22,16 @@ from ._industrial import (
     PermanentMagnetMotor as PermanentMagnetMotor,
     TwoTank as TwoTank,
 )
-from ._linear import LinearSystem as LinearSystem
 from ._oscillators import (
     DoubleIntegrator as DoubleIntegrator,
     Lorenz as Lorenz,
     MassSpringDamper as MassSpringDamper,
     VanDerPol as VanDerPol,
 )
-from ._quadrotors import PlanarQuadrotor as PlanarQuadrotor, Quadrotor as Quadrotor
-from ._winds import (
+from ._quadrotors import (
     ConstantWind as ConstantWind,
     DissipativeWind as DissipativeWind,
+    PlanarQuadrotor as PlanarQuadrotor,
+    Quadrotor as Quadrotor,
     VortexWind as VortexWind,
 )

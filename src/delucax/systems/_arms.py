@@ -5,11 +5,10 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from .._check import check_choice
 from .._module import parameter, positive
-from .._typing import Control, Disturbance, State, Time, Vector
+from .._typing import Control, Disturbance, Real, State, Time, Vector
 from ..math import cos, sin
 from ._base import AbstractSystem
 
@@ -63,14 +62,14 @@ class Acrobot(AbstractSystem):
         ```
     """
 
-    mass_1: Array = parameter(1.0, constraint=positive)
-    mass_2: Array = parameter(1.0, constraint=positive)
-    length_1: Array = parameter(1.0, constraint=positive)
-    center_1: Array = parameter(0.5, constraint=positive)
-    center_2: Array = parameter(0.5, constraint=positive)
-    inertia_1: Array = parameter(1.0, constraint=positive)
-    inertia_2: Array = parameter(1.0, constraint=positive)
-    gravity: Array = parameter(9.8)
+    mass_1: Real = parameter(1.0, constraint=positive)
+    mass_2: Real = parameter(1.0, constraint=positive)
+    length_1: Real = parameter(1.0, constraint=positive)
+    center_1: Real = parameter(0.5, constraint=positive)
+    center_2: Real = parameter(0.5, constraint=positive)
+    inertia_1: Real = parameter(1.0, constraint=positive)
+    inertia_2: Real = parameter(1.0, constraint=positive)
+    gravity: Real = parameter(9.8)
     form: str = eqx.field(static=True, default="book")
 
     state_names: ClassVar = ("angle_1", "angle_2", "velocity_1", "velocity_2")
@@ -89,15 +88,17 @@ class Acrobot(AbstractSystem):
         angle_1, angle_2, velocity_1, velocity_2 = x[0], x[1], x[2], x[3]
         bend, straight = sin(angle_2), cos(angle_2)
         own = m2 * c2**2 + self.inertia_2
+        # The inertia about the first joint, and how it couples to the second.
         d1 = m1 * c1**2 + m2 * (l1**2 + c2**2 + 2 * l1 * c2 * straight)
         d1 = d1 + self.inertia_1 + self.inertia_2
         d2 = m2 * (c2**2 + l1 * c2 * straight) + self.inertia_2
+        # Gravity about the second joint; gravity and Coriolis forces about the first.
         phi2 = m2 * c2 * g * sin(angle_1 + angle_2)
         swing = velocity_2 * velocity_2 + 2 * velocity_1 * velocity_2
         phi1 = (m1 * c1 + m2 * l1) * g * sin(angle_1) + phi2
         phi1 = phi1 - m2 * l1 * c2 * swing * bend
         torque = u[0] if w is None else u[0] + w[0]
-        push = torque + d2 / d1 * phi1 - phi2
+        push = torque + d2 / d1 * phi1 - phi2  # acceleration_1 is eliminated
         if self.form == "book":
             push = push - m2 * l1 * c2 * velocity_1 * velocity_1 * bend
         acceleration_2 = push / (own - d2 * d2 / d1)
@@ -150,11 +151,11 @@ class Reacher(AbstractSystem):
         ```
     """
 
-    mass_1: Array = parameter(1.0, constraint=positive)
-    mass_2: Array = parameter(1.0, constraint=positive)
-    length_1: Array = parameter(1.0, constraint=positive)
-    length_2: Array = parameter(1.0, constraint=positive)
-    gravity: Array = parameter(0.0)
+    mass_1: Real = parameter(1.0, constraint=positive)
+    mass_2: Real = parameter(1.0, constraint=positive)
+    length_1: Real = parameter(1.0, constraint=positive)
+    length_2: Real = parameter(1.0, constraint=positive)
+    gravity: Real = parameter(0.0)
 
     state_names: ClassVar = ("shoulder", "elbow", "shoulder_rate", "elbow_rate")
     angle_names: ClassVar = ("shoulder", "elbow")
@@ -169,13 +170,8 @@ class Reacher(AbstractSystem):
 
         **Returns:** its position, shape `(2,)` [m].
         """
-        both = x[0] + x[1]
-        return jnp.stack(
-            [
-                self.length_1 * cos(x[0]) + self.length_2 * cos(both),
-                self.length_1 * sin(x[0]) + self.length_2 * sin(both),
-            ]
-        )
+        l1, l2, both = self.length_1, self.length_2, x[0] + x[1]
+        return jnp.stack([l1 * along(x[0]) + l2 * along(both) for along in (cos, sin)])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         m2, l1, l2 = self.mass_2, self.length_1, self.length_2
@@ -183,8 +179,10 @@ class Reacher(AbstractSystem):
         d1, d2 = x[2], x[3]
         c, s = cos(x[1]), sin(x[1])
         coupling = m2 * l1 * l2
+        # Gravity pulls along x: its torque is as the sine of the angle from there.
         far = m2 * l2 * self.gravity * sin(x[0] + x[1])
         near = total * l1 * self.gravity * sin(x[0])
+        # M a = b, with the Coriolis and centrifugal forces on the right.
         b1 = u[0] + coupling * (2 * d1 + d2) * d2 * s - far - near
         b2 = u[1] - coupling * (d1 * d1) * s - far
         m22 = m2 * l2**2

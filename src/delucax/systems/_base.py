@@ -93,6 +93,7 @@ class AbstractPlant(eqx.Module):
         """Whether what `observe` returns is the state itself, as its program shows."""
         shapes = (), (self.state_size,)
         t, x = (jax.ShapeDtypeStruct(s, jnp.result_type(float)) for s in shapes)
+        # The program returns its second argument untouched.
         traced = jax.make_jaxpr(self.observe)(t, x).jaxpr
         return list(traced.outvars) == [traced.invars[1]]
 

@@ -3,10 +3,9 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from .._module import parameter, positive
-from .._typing import Control, Disturbance, State, Time
+from .._typing import Control, Disturbance, Real, State, Time
 from ..math import cos, sin
 from ._base import AbstractSystem
 
@@ -43,8 +42,8 @@ class KinematicBicycle(AbstractSystem):
         ```
     """
 
-    front: Array = parameter(1.105, constraint=positive)
-    rear: Array = parameter(1.738, constraint=positive)
+    front: Real = parameter(1.105, constraint=positive)
+    rear: Real = parameter(1.738, constraint=positive)
 
     state_names: ClassVar = ("x", "y", "heading", "speed")
     angle_names: ClassVar = ("heading",)
@@ -55,18 +54,12 @@ class KinematicBicycle(AbstractSystem):
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         share = self.rear / (self.front + self.rear)
         tangent = share * sin(u[1]) / cos(u[1])
-        # Cosine and sine of the slip angle, from its tangent.
+        # Cosine and sine of the slip angle, from its tangent: no arctangent is needed.
         along = (1 + tangent * tangent) ** -0.5
         across = tangent * along
         c, s, v = cos(x[2]), sin(x[2]), x[3]
-        return jnp.stack(
-            [
-                v * (c * along - s * across),
-                v * (s * along + c * across),
-                v * across / self.rear,
-                u[0],
-            ]
-        )
+        dx, dy = v * (c * along - s * across), v * (s * along + c * across)
+        return jnp.stack([dx, dy, v * across / self.rear, u[0]])
 
     def equilibrium(self) -> tuple[State, Control]:
         """Standing at the origin; a standing car is not controllable.
@@ -119,13 +112,13 @@ class DynamicBicycle(AbstractSystem):
         ```
     """
 
-    mass: Array = parameter(1573.0, constraint=positive)
-    inertia: Array = parameter(2873.0, constraint=positive)
-    front: Array = parameter(1.1, constraint=positive)
-    rear: Array = parameter(1.58, constraint=positive)
-    front_stiffness: Array = parameter(160000.0, constraint=positive)
-    rear_stiffness: Array = parameter(160000.0, constraint=positive)
-    standstill: Array = parameter(1.0, constraint=positive)
+    mass: Real = parameter(1573.0, constraint=positive)
+    inertia: Real = parameter(2873.0, constraint=positive)
+    front: Real = parameter(1.1, constraint=positive)
+    rear: Real = parameter(1.58, constraint=positive)
+    front_stiffness: Real = parameter(160000.0, constraint=positive)
+    rear_stiffness: Real = parameter(160000.0, constraint=positive)
+    standstill: Real = parameter(1.0, constraint=positive)
 
     state_names: ClassVar = ("x", "y", "heading", "vx", "vy", "rate")
     angle_names: ClassVar = ("heading",)
@@ -135,23 +128,20 @@ class DynamicBicycle(AbstractSystem):
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         heading, vx, vy, rate = x[2], x[3], x[4], x[5]
+        # Never zero, so that neither the slip angles nor their gradients are NaN.
         speed = (vx * vx + self.standstill**2) ** 0.5
         slip_front = jnp.arctan2(vy + self.front * rate, speed) - u[1]
         slip_rear = jnp.arctan2(vy - self.rear * rate, speed)
         force_front = -self.front_stiffness * slip_front
         force_rear = -self.rear_stiffness * slip_rear
         c, s = cos(heading), sin(heading)
+        dx, dy = vx * c - vy * s, vx * s + vy * c
         aside = force_front * cos(u[1])
-        return jnp.stack(
-            [
-                vx * c - vy * s,
-                vx * s + vy * c,
-                rate,
-                u[0] - force_front * sin(u[1]) / self.mass + vy * rate,
-                (aside + force_rear) / self.mass - vx * rate,
-                (self.front * aside - self.rear * force_rear) / self.inertia,
-            ]
-        )
+        # vy rate and -vx rate: the axes that the velocities are given in turn.
+        along = u[0] - force_front * sin(u[1]) / self.mass + vy * rate
+        across = (aside + force_rear) / self.mass - vx * rate
+        turn = (self.front * aside - self.rear * force_rear) / self.inertia
+        return jnp.stack([dx, dy, rate, along, across, turn])
 
     def equilibrium(self) -> tuple[State, Control]:
         """Standing at the origin.

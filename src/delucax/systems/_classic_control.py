@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from .._module import parameter, positive
-from .._typing import Control, Disturbance, State, Time
+from .._typing import Control, Disturbance, Real, State, Time
 from ..math import cos, sin
 from ._base import AbstractSystem
 
@@ -43,10 +43,10 @@ class Pendulum(AbstractSystem):
         ```
     """
 
-    mass: Array = parameter(1.0, constraint=positive)
-    length: Array = parameter(1.0, constraint=positive)
-    gravity: Array = parameter(10.0)
-    damping: Array = parameter(0.0)
+    mass: Real = parameter(1.0, constraint=positive)
+    length: Real = parameter(1.0, constraint=positive)
+    gravity: Real = parameter(10.0)
+    damping: Real = parameter(0.0)
 
     state_names: ClassVar = ("angle", "velocity")
     angle_names: ClassVar = ("angle",)
@@ -111,10 +111,10 @@ class CartPole(AbstractSystem):
         ```
     """
 
-    cart_mass: Array = parameter(1.0, constraint=positive)
-    pole_mass: Array = parameter(0.1, constraint=positive)
-    half_length: Array = parameter(0.5, constraint=positive)
-    gravity: Array = parameter(9.8)
+    cart_mass: Real = parameter(1.0, constraint=positive)
+    pole_mass: Real = parameter(0.1, constraint=positive)
+    half_length: Real = parameter(0.5, constraint=positive)
+    gravity: Real = parameter(9.8)
 
     state_names: ClassVar = ("position", "velocity", "angle", "spin")
     angle_names: ClassVar = ("angle",)
@@ -135,6 +135,7 @@ class CartPole(AbstractSystem):
         moment = self.pole_mass * self.half_length
         lean, upright = sin(angle), cos(angle)
         push = (force + moment * (spin * spin) * lean) / total
+        # 4/3: of a uniform rod of half-length l about its end, over m l.
         inertia = 4 / 3 - self.pole_mass * (upright * upright) / total
         turn = (self.gravity * lean - upright * push) / (self.half_length * inertia)
         return push - moment * turn * upright / total, turn
@@ -180,8 +181,8 @@ class MountainCar(AbstractSystem):
         ```
     """
 
-    power: Array = parameter(0.0015)
-    gravity: Array = parameter(0.0025)
+    power: Real = parameter(0.0015)
+    gravity: Real = parameter(0.0025)
 
     state_names: ClassVar = ("position", "velocity")
     control_names: ClassVar = ("push",)
@@ -196,6 +197,7 @@ class MountainCar(AbstractSystem):
 
         **Returns:** d(velocity)/dt, a step being the unit of time.
         """
+        # The slope of `height` over 1.35: gravity acts as if the track were flat.
         return self.power * push - self.gravity * cos(3 * position)
 
     def height(self, position: ArrayLike) -> Array:

@@ -5,7 +5,6 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from .._check import check_count
 from .._module import parameter, positive
@@ -39,7 +38,7 @@ class DoubleIntegrator(AbstractSystem):
         ```
     """
 
-    mass: Array = parameter(1.0, constraint=positive)
+    mass: Real = parameter(1.0, constraint=positive)
 
     state_names: ClassVar = ("position", "velocity")
     control_names: ClassVar = ("force",)
@@ -167,7 +166,7 @@ class VanDerPol(AbstractSystem):
         ```
     """
 
-    mu: Array = parameter(1.0)
+    mu: Real = parameter(1.0)
 
     state_names: ClassVar = ("x", "v")
     control_names: ClassVar = ("u",)
@@ -209,21 +208,17 @@ class Lorenz(AbstractSystem):
         ```
     """
 
-    sigma: Array = parameter(10.0)
-    rho: Array = parameter(28.0)
-    beta: Array = parameter(8.0 / 3.0)
+    sigma: Real = parameter(10.0)
+    rho: Real = parameter(28.0)
+    beta: Real = parameter(8.0 / 3.0)
 
     state_names: ClassVar = ("x", "y", "z")
     control_names: ClassVar = ("u",)
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
-        return jnp.stack(
-            [
-                self.sigma * (x[1] - x[0]) + u[0],
-                x[0] * (self.rho - x[2]) - x[1],
-                x[0] * x[1] - self.beta * x[2],
-            ]
-        )
+        dx = self.sigma * (x[1] - x[0]) + u[0]
+        dy = x[0] * (self.rho - x[2]) - x[1]
+        return jnp.stack([dx, dy, x[0] * x[1] - self.beta * x[2]])
 
     def equilibrium(self) -> tuple[State, Control]:
         """The centre of the right wing, `x = y = sqrt(beta (rho - 1))`, `z = rho - 1`;
@@ -232,6 +227,7 @@ class Lorenz(AbstractSystem):
         **Returns:** the state, and no control.
         """
         winged = (self.rho > 1) & (self.beta > 0)
+        # The root of 1 where there are no wings: that of 0 has no gradient.
         height = jnp.where(winged, self.rho - 1, 0.0)
         square = jnp.where(winged, self.beta * height, 1.0)
         wing = jnp.where(winged, jnp.sqrt(square), 0.0)

@@ -1,15 +1,16 @@
-"""Quadrotors, in a vertical plane and in space."""
+"""Quadrotors, in a vertical plane and in space, and the winds that push them."""
 
 from collections.abc import Callable
 from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from .._check import check_choice
-from .._module import function_field, parameter, positive
-from .._typing import Control, Disturbance, State, Time
+from .._module import check_parameters, function_field, parameter, positive
+from .._typing import Control, Disturbance, Real, State, Time, Vector
 from ..math import cos, sin
 from ..math._attitude import attitude_difference, unit_attitude
 from ._base import AbstractSystem
@@ -54,9 +55,9 @@ class PlanarQuadrotor(AbstractSystem):
         ```
     """
 
-    mass: Array = parameter(0.1, constraint=positive)
-    length: Array = parameter(0.2, constraint=positive)
-    gravity: Array = parameter(9.81)
+    mass: Real = parameter(0.1, constraint=positive)
+    length: Real = parameter(0.2, constraint=positive)
+    gravity: Real = parameter(9.81)
     wind: Callable[..., Array] | None = function_field(None)
 
     state_names: ClassVar = ("x", "y", "angle", "vx", "vy", "rate")
@@ -69,16 +70,15 @@ class PlanarQuadrotor(AbstractSystem):
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         thrust, lean = (u[0] + u[1]) / self.mass, x[2]
         ax, ay = -thrust * sin(lean), thrust * cos(lean) - self.gravity
-        if self.wind is not None:
-            force = self.wind(t, x)
-            if jnp.shape(force) != (2,):
-                raise ValueError(
-                    "PlanarQuadrotor: wind must return a force of shape (2,), got "
-                    f"shape {jnp.shape(force)}."
-                )
-            ax, ay = ax + force[0] / self.mass, ay + force[1] / self.mass
-        if w is not None:
-            ax, ay = ax + w[0] / self.mass, ay + w[1] / self.mass
+        wind = None if self.wind is None else self.wind(t, x)
+        if wind is not None and jnp.shape(wind) != (2,):
+            raise ValueError(
+                "PlanarQuadrotor: wind must return a force of shape (2,), got shape "
+                f"{jnp.shape(wind)}."
+            )
+        for force in (wind, w):
+            if force is not None:
+                ax, ay = ax + force[0] / self.mass, ay + force[1] / self.mass
         turn = (u[1] - u[0]) / (self.mass * self.length)
         return jnp.stack([x[3], x[4], x[5], ax, ay, turn])
 
@@ -153,14 +153,14 @@ class Quadrotor(AbstractSystem):
         ```
     """
 
-    mass: Array = parameter(0.716, constraint=positive)
-    arm: Array = parameter(0.17, constraint=positive)
-    inertia_x: Array = parameter(0.007, constraint=positive)
-    inertia_y: Array = parameter(0.007, constraint=positive)
-    inertia_z: Array = parameter(0.012, constraint=positive)
-    moment: Array = parameter(0.016, constraint=positive)
-    drag: Array = parameter(0.0)
-    gravity: Array = parameter(9.81)
+    mass: Real = parameter(0.716, constraint=positive)
+    arm: Real = parameter(0.17, constraint=positive)
+    inertia_x: Real = parameter(0.007, constraint=positive)
+    inertia_y: Real = parameter(0.007, constraint=positive)
+    inertia_z: Real = parameter(0.012, constraint=positive)
+    moment: Real = parameter(0.016, constraint=positive)
+    drag: Real = parameter(0.0)
+    gravity: Real = parameter(9.81)
     inputs: Literal["rotors", "wrench"] = eqx.field(static=True, default="rotors")
 
     state_names: ClassVar = (
@@ -198,20 +198,18 @@ class Quadrotor(AbstractSystem):
         if self.inputs == "wrench":
             return u
         front, left, back, right = u[0], u[1], u[2], u[3]
-        return jnp.stack(
-            [
-                front + left + back + right,
-                self.arm * (left - right),
-                self.arm * (back - front),
-                self.moment * (left + right - front - back),
-            ]
-        )
+        thrust = front + left + back + right
+        roll, pitch = self.arm * (left - right), self.arm * (back - front)
+        # Left and right turn one way, front and back the other.
+        yaw = self.moment * (left + right - front - back)
+        return jnp.stack([thrust, roll, pitch, yaw])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         qw, qx, qy, qz = x[3], x[4], x[5], x[6]
         a, b, c = x[10], x[11], x[12]
         wrench = self.wrench(u)
         lift, pull = wrench[0] / self.mass, self.drag / self.mass
+        # The third column of R(q), along which the rotors push.
         ax = 2 * (qx * qz + qw * qy) * lift - pull * x[7]
         ay = 2 * (qy * qz - qw * qx) * lift - pull * x[8]
         az = (1 - 2 * (qx * qx + qy * qy)) * lift - pull * x[9] - self.gravity
@@ -219,6 +217,7 @@ class Quadrotor(AbstractSystem):
             push = 1 / self.mass
             ax, ay, az = ax + push * w[0], ay + push * w[1], az + push * w[2]
         jx, jy, jz = self.inertia_x, self.inertia_y, self.inertia_z
+        # q (0, omega) / 2, and Euler's equations.
         turning = [
             -0.5 * (qx * a + qy * b + qz * c),
             0.5 * (qw * a + qy * c - qz * b),
@@ -249,3 +248,140 @@ class Quadrotor(AbstractSystem):
         if self.inputs == "rotors":
             return x, jnp.stack([weight / 4] * 4)
         return x, jnp.stack([weight, *[jnp.zeros_like(weight)] * 3])
+
+
+class DissipativeWind(eqx.Module):
+    """The force `strength (x, y)`.
+
+    The name is the paper's. With a positive strength the force points away from the
+    origin and grows with the distance: it takes nothing away, it drives off.
+
+    **Arguments:**
+
+    - `strength`: [N/m], 0.1 by default.
+
+    **Raises:** `ValueError` if the strength is not finite.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.systems.DissipativeWind(0.4)(0.0, jnp.array([1.0, 2.0]))
+        ```
+    """
+
+    strength: Real = parameter(0.1)
+
+    def __check_init__(self):
+        check_parameters(self)
+
+    def __call__(self, t: Time, x: State) -> Vector:
+        """The force.
+
+        **Arguments:** `t`: time. `x`: a state whose first two entries are the position.
+
+        **Returns:** shape `(2,)`.
+        """
+        return jnp.stack([self.strength * x[0], self.strength * x[1]])
+
+
+class ConstantWind(eqx.Module):
+    """The force `strength (cos(direction), sin(direction))`.
+
+    **Arguments:**
+
+    - `strength`: [N], 0.1 by default.
+    - `direction`: [rad], pi / 4 by default.
+
+    **Raises:** `ValueError` if a number is not finite.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.systems.ConstantWind(0.4)(0.0, jnp.zeros(6))
+        ```
+    """
+
+    strength: Real = parameter(0.1)
+    direction: Real = parameter(np.pi / 4)
+
+    def __check_init__(self):
+        check_parameters(self)
+
+    def __call__(self, t: Time, x: State) -> Vector:
+        """The force.
+
+        **Arguments:** `t`: time. `x`: a state, which plays no part.
+
+        **Returns:** shape `(2,)`.
+        """
+        along, across = jnp.cos(self.direction), jnp.sin(self.direction)
+        return jnp.stack([self.strength * along, self.strength * across])
+
+
+class VortexWind(eqx.Module):
+    """The force of vortices that turn counter-clockwise about their centres c,
+
+    `strength sum_c 2 core turn(p - c) / (|p - c|^2 + core^2)`, `turn(x, y) = (-y, x)`.
+
+    One vortex is strongest, `strength`, at the distance `core` from its centre, rotates
+    as a solid inside and dies out as 1 / distance outside. Smooth everywhere.
+
+    **Arguments:**
+
+    - `strength`: [N], 0.1 by default.
+    - `core`: the radius of the core [m], 0.25 by default.
+    - `centres`: shape `(n, 2)` [m]; (1, 0), (0.5, 0.5) and (0, 1) by default.
+
+    **Raises:** `ValueError` if a number is not finite, the core is not positive or the
+        centres are not pairs.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca), for the centres; Scully, 1975, for the profile.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.systems.VortexWind(0.4)(0.0, jnp.array([1.0, 2.0]))
+        ```
+    """
+
+    strength: Real = parameter(0.1)
+    core: Real = parameter(0.25, constraint=positive)
+    centres: Real = parameter(((1.0, 0.0), (0.5, 0.5), (0.0, 1.0)))
+
+    def __check_init__(self):
+        check_parameters(self)
+        if self.centres.ndim != 2 or self.centres.shape[1] != 2:
+            raise ValueError(
+                f"VortexWind: centres must have shape (n, 2), got {self.centres.shape}."
+            )
+
+    def __call__(self, t: Time, x: State) -> Vector:
+        """The force.
+
+        **Arguments:** `t`: time. `x`: a state whose first two entries are the position.
+
+        **Returns:** shape `(2,)`.
+        """
+        centres = self.centres.astype(x.dtype)
+        across, along = jnp.zeros((), x.dtype), jnp.zeros((), x.dtype)
+        for i in range(centres.shape[0]):
+            dx, dy = x[0] - centres[i, 0], x[1] - centres[i, 1]
+            size = 2 * self.core / (dx * dx + dy * dy + self.core**2)
+            across, along = across - size * dy, along + size * dx
+        return jnp.stack([self.strength * across, self.strength * along])
