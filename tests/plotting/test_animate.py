@@ -328,7 +328,7 @@ def test_drawings_are_found_by_type(env):
 
     kept = dict(_BY_TYPE)
     try:
-        dlx.plotting.register_drawing(dlx.environments.GymPendulum, draw)
+        dlx.plotting.register_drawing(type(env.dynamics), draw)
         assert drawing_for(env) is pendulum
         dlx.plotting.register_drawing(dlx.systems.Pendulum, draw)
         assert drawing_for(env) is _BY_TYPE[dlx.systems.Pendulum] is not pendulum

@@ -143,7 +143,7 @@ def test_quadrotor_turns_as_its_quaternion_says():
     x[3:7] = np.array([0.8, 0.1, -0.5, 0.2])
     unit = x.copy()
     unit[3:7] /= np.linalg.norm(x[3:7])
-    rotation = dlx.environments.quadrotor_features(jnp.asarray(unit))[3:12]
+    rotation = dlx.make("quadrotor").encode(jnp.asarray(unit))[3:12]
     np.testing.assert_allclose(attitude(x).ravel(), rotation, atol=1e-6)
 
 

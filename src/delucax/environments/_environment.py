@@ -29,14 +29,27 @@ from .._module import (
     check_parameters,
     function_field,
     parameter,
+    parts_of,
 )
 from .._results import Result
-from .._typing import Control, Disturbance, Observation, PRNGKey, State, Time, Vector
+from .._typing import (
+    BoolScalar,
+    BoundsOrNone,
+    Control,
+    Disturbance,
+    Observation,
+    PRNGKey,
+    RealOrNone,
+    Scalar,
+    State,
+    Time,
+    Vector,
+)
 from ..costs import AbstractCost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics, OperatingPoint, trim
 from ..math import clip
-from ._noise import check_noise
+from ..systems import AbstractPlant
 
 
 class Step(NamedTuple):
@@ -49,10 +62,10 @@ class Step(NamedTuple):
     - `result`: what became of the step, one of `delucax.RESULTS`.
     """
 
-    state: Array
-    control: Array
-    cost: Array
-    terminated: Array
+    state: State
+    control: Control
+    cost: Scalar
+    terminated: BoolScalar
     result: Result
 
 
@@ -113,14 +126,14 @@ class Environment(eqx.Module):
     disturbance: AbstractDisturbance | None = eqx.field(default=None)
     sensor_noise: AbstractDisturbance | None = None
     initial_state: Any = eqx.field(default=None, converter=_as_start)
-    control_bounds: tuple[Any, Any] | None = bounds_field(
+    control_bounds: BoundsOrNone = bounds_field(
         "Environment", "control_bounds", default=None
     )
     horizon: int = eqx.field(static=True, default=200, converter=_as_horizon)
     terminated: Callable[[Time, State], Array] | None = function_field(None)
-    actions: Any = parameter(None)
+    actions: RealOrNone = parameter(None)
     encode: Callable[[Observation], Vector] = function_field(None)
-    observation_bounds: tuple[Any, Any] | None = bounds_field(
+    observation_bounds: BoundsOrNone = bounds_field(
         "Environment", "observation_bounds", default=None
     )
 
@@ -136,7 +149,7 @@ class Environment(eqx.Module):
     def __check_init__(self):
         where, dynamics = "Environment", self.dynamics
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
-        check_noise(dynamics, where)
+        _check_noise(dynamics, where)
         n, m = dynamics.state_size, dynamics.control_size
         check_instance(self.cost, AbstractCost, "cost", where)
         check_cost_sizes(self.cost, (n, m), "cost", where)
@@ -368,3 +381,30 @@ def _check_signal(signal: Any, size: int, name: str) -> None:
 def _default_disturbance(dynamics: AbstractDynamics) -> AbstractDisturbance:
     k, count = dynamics.disturbance_size, dynamics.increments
     return Brownian(k // count, substeps=count) if count else Zero(k)
+
+
+def _check_noise(plant: AbstractPlant, where: str) -> None:
+    """Raise where noise would be lost: `plant`, or another inside it, does not say how
+    `w` acts, while something in it takes Brownian increments."""
+    name, noise = type(plant).__name__, plant.noise
+    if isinstance(plant, AbstractDynamics):
+        if (plant.increments > 0) != (noise == "brownian"):
+            raise ValueError(
+                f"{where}: {name} has noise = {noise!r} and increments = "
+                f"{plant.increments}, but increments must be at least 1 where w is "
+                "Brownian, and 0 where it is not. A subclass of "
+                "delucax.dynamics.AbstractWrapper forwards both."
+            )
+    for part in parts_of(plant, AbstractPlant):
+        _check_noise(part, where)
+        try:
+            is_brownian = part.noise == "brownian"
+        except (TypeError, ValueError):  # a batch: what has no diffusion does not fail
+            is_brownian = True
+        if is_brownian and not plant.declares_noise():
+            raise ValueError(
+                f"{where}: {name} hides the Brownian noise of the "
+                f"{type(part).__name__} that it holds. Derive it from "
+                f"delucax.dynamics.AbstractWrapper, or give {name} `noise` of its own: "
+                "that of what it holds, or `noise = None` where w is not Brownian."
+            )

@@ -1,7 +1,6 @@
 """Tasks by name."""
 
 import importlib
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -51,7 +50,7 @@ def make(name: str, **kwargs: Any) -> Environment:
         env = dlx.make("pendulum", length=1.2)
         ```
     """
-    env = _task(name, "make")(**kwargs)
+    env = _function_of(name)(**kwargs)
     if not isinstance(env, Environment):
         raise ValueError(
             f"make: {name!r} must be an Environment, but {_REGISTRY[name]!r} returned "
@@ -60,33 +59,12 @@ def make(name: str, **kwargs: Any) -> Environment:
     return env
 
 
-def default_horizon(name: str) -> int:
-    """The horizon of a task if no other is given, without making it.
-
-    **Arguments:** `name`: of a task of delucax, as in [`delucax.make`][].
-
-    **Returns:** steps an episode.
-
-    **Raises:** `ValueError` on an unknown name, with the close ones.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-
-        dlx.environments.default_horizon("pendulum")
-        ```
-    """
-    signature = inspect.signature(_task(name, "default_horizon"))
-    return signature.parameters["horizon"].default
-
-
-def _task(name: str, where: str) -> Callable[..., Any]:
+def _function_of(name: str) -> Callable[..., Any]:
     """The function that makes a task."""
     if not isinstance(name, str) or name not in _REGISTRY:
         names = sorted(_REGISTRY)
         raise ValueError(
-            f"{where}: no task is called {name!r}; "
+            f"make: no task is called {name!r}; "
             f"{did_you_mean(str(name), names, cutoff=0.4)} "
             f"All names: {', '.join(names)}."
         )
@@ -95,7 +73,7 @@ def _task(name: str, where: str) -> Callable[..., Any]:
         return getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
         raise ValueError(
-            f"{where}: {name!r} is registered as {_REGISTRY[name]!r}, which cannot be "
+            f"make: {name!r} is registered as {_REGISTRY[name]!r}, which cannot be "
             f"imported: {error}."
         ) from error
 

@@ -3,7 +3,7 @@
 import functools
 import inspect
 from collections.abc import Callable, Iterable
-from typing import Any, TypeAlias
+from typing import Annotated, Any, get_args, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -16,11 +16,14 @@ from .._check import (
     check_instance,
     check_key,
     check_keywords,
+    check_number,
+    check_positive,
+    check_range,
     check_step,
     keywords_of,
 )
 from .._module import parameter
-from .._typing import PRNGKey
+from .._typing import PRNGKey, Real
 from ..dynamics import AbstractDynamics, Discretized
 from ..systems import AbstractSystem
 from ._environment import Environment
@@ -45,12 +48,8 @@ class UniformState(eqx.Module):
         ```
     """
 
-    low: Array = parameter()
-    high: Array = parameter()
-
-    def __init__(self, low: Any, high: Any):
-        self.low = low
-        self.high = high
+    low: Real = parameter()
+    high: Real = parameter()
 
     def __check_init__(self):
         size = np.size(self.low)
@@ -72,6 +71,10 @@ hold."""
 
 Fields: TypeAlias = dict[str, Any]
 """Arguments of `Environment`, by name."""
+# An option of a task, which `task` checks.
+Number: TypeAlias = Annotated[Array | float | int, check_number]
+Positive: TypeAlias = Annotated[Array | float | int, check_positive]
+Limit: TypeAlias = Annotated[Array | float | int, check_range]
 
 
 def task(
@@ -89,8 +92,9 @@ def task(
 
     It decorates a function of the system (with `gym`, of the dynamics) and of options
     to arguments of `Environment`. The task takes a system or the arguments of one, the
-    options, `dt`, `horizon`, `solver` and `substeps`, the arguments of `gym`, and those
-    of `Environment`, which hold instead of what the function returns.
+    options, which it checks as their annotations say, `dt`, `horizon`, `solver` and
+    `substeps`, the arguments of `gym`, and those of `Environment`, which hold instead
+    of what the function returns. It documents those that it adds.
 
     **Arguments:**
 
@@ -104,11 +108,23 @@ def task(
     default_solver, accepts = solver, accepts or kind
     arithmetic = () if gym is None else (gym,)
     derived = inspect.signature(arguments).parameters
+    default_name = "[`delucax.dynamics.RK4`][] by default"
+    if gym is not None:
+        default_name = "in place of Gym's arithmetic, whose limits it does not have"
+    elif solver is not None:
+        default_name = f"`diffrax.{type(solver).__name__}()` by default"
 
     def decorate(added: Callable[..., Fields]) -> Callable[..., Environment]:
         where = added.__name__
-        # The first parameter is the system or the dynamics, the others are options.
+        # The first parameter is the system or the dynamics, the others are options,
+        # each with the check that its annotation holds (alone, or in a union).
         _, *options = inspect.signature(added).parameters.values()
+        checks = [
+            (option.name, check, option.default)
+            for option in options
+            for part in (option.annotation, *get_args(option.annotation))
+            for check in getattr(part, "__metadata__", ())
+        ]
 
         def make(
             system: Any = None,
@@ -119,6 +135,19 @@ def task(
             substeps: int = substeps,
             **others: Any,
         ) -> Environment:
+            """- `system`: a [`delucax.systems.{kind}`][]; made of `others` by default.
+            - `dt`: the control interval [{unit}], {dt} by default.
+            - `horizon`: steps an episode, {horizon} by default.
+            - `solver`: a Diffrax solver, {solver}.
+            - `substeps`: solver steps an interval, {substeps} by default.
+            - `**others`: arguments of [`delucax.systems.{kind}`][] or
+                [`delucax.Environment`][], such as `disturbance`.
+
+            **Returns:** an [`delucax.Environment`][].
+
+            **Raises:** `ValueError` on illegal numbers, on arguments of a system beside
+            one, and on Gym's limits beside a solver or `substeps` without one.
+            """
             check_keywords(others, where, make, kind, *arithmetic, Environment)
             check_step(dt, where)
             # Each takes its own of the other arguments; those of Environment are left.
@@ -147,6 +176,9 @@ def task(
             else:
                 dynamics = gym(system, dt, **limits)
 
+            for name, check, default in checks:
+                if (value := chosen.get(name, default)) is not default:
+                    check(value, name, where)
             fields: Fields = dict(dynamics=dynamics, horizon=horizon)
             fields |= added(system if gym is None else dynamics, **chosen)
             # Bounds of observations are those of the task as it is.
@@ -160,7 +192,13 @@ def task(
         system, *rest = signature.parameters.values()
         system = system.replace(annotation=accepts | None)
         parameters = [system, *options, *derived.values(), *rest]
+        numbers = dict(dt=dt, horizon=horizon, substeps=substeps)
+        names = dict(kind=kind.__name__, unit=kind.time_unit, solver=default_name)
+        shared = (inspect.getdoc(make) or "").format(**numbers, **names)
         functools.update_wrapper(make, added)
+        # They follow the options, and end where the source is named.
+        own, source, rest = (inspect.getdoc(added) or "").partition("\n\nSource:")
+        make.__doc__ = f"{own}\n{shared}{source}{rest}"
         vars(make)["__signature__"] = signature.replace(parameters=parameters)
         return make
 

@@ -1,5 +1,6 @@
 """The tasks under Gymnasium's own `make`."""
 
+import inspect
 from typing import Any
 
 import gymnasium
@@ -7,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from gymnasium.envs.registration import EnvSpec
 
+from ... import environments, lung
 from ..._check import check_count
-from ...environments import default_horizon, Environment, make as make_task
+from ...environments import Environment, make as make_task
 from .._adapter import has_signals, reads_first_argument
 from ._single_env import GymnasiumEnv
 from ._vector_env import GymnasiumVectorEnv
@@ -174,13 +176,14 @@ def register_ids() -> tuple[str, ...]:
         register_ids()
         ```
     """
-    ids = []
+    ids, tasks = [], vars(lung) | vars(environments)
     for name, (task, discrete) in _IDS.items():
+        signature = inspect.signature(tasks[task])
         spec = EnvSpec(
             id=f"delucax/{name}",
             entry_point=f"{__name__}:make_registered",
             vector_entry_point=f"{__package__}:make_vector",
-            max_episode_steps=default_horizon(task),
+            max_episode_steps=signature.parameters["horizon"].default,
             reward_threshold=_THRESHOLDS.get(name),
             # Orders are checked by the environment itself.
             order_enforce=False,

@@ -1,16 +1,17 @@
 """Links on hinges: the pendulum, the acrobot and the reacher."""
 
+import functools
+
 import numpy as np
 from jaxtyping import Float
 
-from ._canvas import Canvas, Drawing, Episode, Points, States, Vector
+from ._canvas import Canvas, Drawing, Episode, Points, Vector
 
 
 def pendulum(canvas: Canvas, episode: Episode) -> Drawing:
     """A rod of length 1 with a bob, hinged at the origin, angle 0 upright and growing
     anticlockwise; the torque is an arc of up to 240 degrees about the hinge."""
-    canvas.ax.set(xlim=(-1.25, 1.25), ylim=(-1.25, 1.25))
-    canvas.reach(1)
+    canvas.reach(1, room=1.25)
     canvas.line([(0, 1.06), (0, 1.16)], color=canvas.NEUTRAL, linewidth=2)
 
     def draw(x: Vector, u: Vector) -> None:
@@ -26,20 +27,17 @@ def pendulum(canvas: Canvas, episode: Episode) -> Drawing:
 
 
 def arm_points(
-    x: Float[np.ndarray, "*times states"], lengths: tuple[float, float]
+    x: Float[np.ndarray, "*times states"],
+    lengths: tuple[float, float],
+    zero: float = 0.0,
 ) -> Float[np.ndarray, "*times 3 2"]:
-    """The hinge, the elbow and the tip of two links that hang at angle 0."""
-    first, both = x[..., 0], x[..., 0] + x[..., 1]
+    """The hinge, the elbow and the tip of two links, which are `zero` from hanging at
+    angle 0."""
+    first = x[..., 0] + zero
+    both = first + x[..., 1]
     elbow = lengths[0] * np.stack([np.sin(first), -np.cos(first)], axis=-1)
     tip = elbow + lengths[1] * np.stack([np.sin(both), -np.cos(both)], axis=-1)
     return np.stack([np.zeros_like(elbow), elbow, tip], axis=-2)
-
-
-def _set_up_arm(canvas: Canvas, reach: float) -> None:
-    """The view of an arm of two links, and the circle that it reaches."""
-    edge = 1.2 * reach
-    canvas.ax.set(xlim=(-edge, edge), ylim=(-edge, edge))
-    canvas.reach(reach)
 
 
 def _draw_arm(canvas: Canvas, points: Points, reach: float, bob: float = 0.0) -> None:
@@ -60,7 +58,7 @@ def acrobot(canvas: Canvas, episode: Episode) -> Drawing:
     # The second link has no length: its centre of mass is taken for its middle.
     lengths = float(system.length_1), 2 * float(system.center_2)
     reach = sum(lengths)
-    _set_up_arm(canvas, reach)
+    canvas.reach(reach)
     height = getattr(episode.environment.terminated, "goal_height", None)
     if height is not None:
         ends = [(-1.2 * reach, float(height)), (1.2 * reach, float(height))]
@@ -81,26 +79,20 @@ def reacher(canvas: Canvas, episode: Episode) -> Drawing:
     system = episode.system
     lengths = float(system.length_1), float(system.length_2)
     reach = sum(lengths)
-    _set_up_arm(canvas, reach)
+    canvas.reach(reach)
     goal = getattr(episode.environment.cost, "goal", None)
     if goal is not None:
         canvas.goal(np.asarray(goal), 0.06 * reach)
 
-    def points(
-        x: Float[np.ndarray, "*times states"],
-    ) -> Float[np.ndarray, "*times 3 2"]:
-        quarter = np.zeros_like(x)
-        quarter[..., 0] = np.pi / 2
-        return arm_points(x + quarter, lengths)
+    points = functools.partial(arm_points, lengths=lengths, zero=np.pi / 2)
 
     def draw(x: Vector, u: Vector) -> None:
-        shoulder, elbow, _ = joints = points(x)
+        joints = points(x)
         _draw_arm(canvas, joints, reach, 0.045)
-        first, second = episode.shares(u)
-        canvas.torque(shoulder, 0.16 * reach, x[0], float(first))
-        canvas.torque(elbow, 0.16 * reach, x[0] + x[1], float(second))
+        outward = np.cumsum(x[:2])
+        for joint, start, share in zip(
+            joints, outward, episode.shares(u), strict=False
+        ):
+            canvas.torque(joint, 0.16 * reach, start, float(share))
 
-    def path(states: States) -> Points:
-        return points(states)[:, 2]
-
-    return Drawing(draw, path)
+    return Drawing(draw, lambda states: points(states)[:, 2])

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ._canvas import box, Canvas, Drawing, Episode, Points, rotation, Vector, View
+from ._canvas import box, Canvas, Drawing, Episode, Points, rotation, Vector
 
 
 # Of the cart under a pole, in lengths of the pole.
@@ -36,9 +36,8 @@ def _cart_pole(
             canvas.line(ends, color=canvas.NEUTRAL, lw=2)
     low = HINGE - 1.2 if hangs else -0.3
     low, high = low * length, (HINGE + 1.2) * length
-    half = np.array([reach + 0.5 * WIDTH * length, (high - low) / 2])
-    view = View(np.array([0.0, (high + low) / 2]), half)
-    view.show(canvas.ax)
+    half = reach + 0.5 * WIDTH * length, (high - low) / 2
+    view = canvas.view((0.0, (high + low) / 2), half)
     width, radius = WIDTH * length, WHEEL * length
     middle = radius + HEIGHT * length / 2
 
@@ -52,9 +51,8 @@ def _cart_pole(
         tip = hinge + length * np.array([math.sin(angle), math.cos(angle)])
         canvas.link(hinge, tip, width=7, color=canvas.SECOND, zorder=3)
         canvas.joint(hinge, 0.045 * length)
-        share = float(episode.shares(u)[0])
-        side = position + math.copysign(width / 2 + 0.04 * length, share)
-        canvas.force((side, middle), (0.6 * length * share, 0.0), 0.6 * length)
+        share, gap = float(episode.shares(u)[0]), width / 2 + 0.04 * length
+        canvas.push((position, middle), gap, 0.6 * length, share)
         view.follow(canvas.ax, (position, view.centre[1]), 0.5 * width)
         if bob:
             canvas.disc(tip, bob * length, canvas.SECOND, zorder=3)
@@ -83,18 +81,13 @@ def linear_cart_pole(canvas: Canvas, episode: Episode) -> Drawing:
 COILS = 6
 
 
-def _draw_mass(canvas: Canvas, at: float, side: float) -> None:
-    """A block on two rollers."""
+def _draw_mass(canvas: Canvas, at: float, side: float, share: float = 0.0) -> None:
+    """A block on two rollers, and the force on it."""
     block = box(side, 0.9 * side, 0.08 * side)
     canvas.polygon(block, (at, 0.65 * side))
     for place in (-0.28, 0.28):
         canvas.wheel((at + place * side, 0.1 * side), 0.1 * side)
-
-
-def _draw_force(canvas: Canvas, at: float, side: float, share: float) -> None:
-    """The force on a mass, at its side."""
-    start = at + math.copysign(0.58 * side, share)
-    canvas.force((start, 0.65 * side), (1.5 * side * share, 0.0), 1.5 * side)
+    canvas.push((at, 0.65 * side), 0.58 * side, 1.5 * side, share)
 
 
 def double_integrator(canvas: Canvas, episode: Episode) -> Drawing:
@@ -104,14 +97,11 @@ def double_integrator(canvas: Canvas, episode: Episode) -> Drawing:
     side = 0.3 * reach
     canvas.ground()
     canvas.ax.plot([0], [-0.25 * side], marker="^", color=canvas.GOAL, markersize=11)
-    half = np.array([1.35 * reach + side, 1.2 * side])
-    view = View(np.array([0.0, 0.5 * side]), half)
-    view.show(canvas.ax)
+    view = canvas.view((0.0, 0.5 * side), (1.35 * reach + side, 1.2 * side))
 
     def draw(x: Vector, u: Vector) -> None:
         place = float(x[0])
-        _draw_mass(canvas, place, side)
-        _draw_force(canvas, place, side, float(episode.shares(u)[0]))
+        _draw_mass(canvas, place, side, float(episode.shares(u)[0]))
         view.follow(canvas.ax, (place, view.centre[1]), side)
 
     return Drawing(draw)
@@ -138,15 +128,15 @@ def mass_spring_damper(canvas: Canvas, episode: Episode) -> Drawing:
     canvas.ax.set(xlim=(-0.4 * side, right), ylim=(-0.7 * side, 1.7 * side))
 
     def draw(x: Vector, u: Vector) -> None:
-        left, place = 0.0, 0.0
-        for place in map(float, rest + x[:count]):
+        left = 0.0
+        shares = [*[0.0] * (count - 1), float(episode.shares(u)[0])]
+        for place, share in zip(rest + x[:count], shares, strict=True):
             right = place - side / 2
             spring = zigzag(left, right, 0.85 * side, 0.14 * side)
             canvas.line(spring, color=canvas.DARK, lw=1.8, zorder=1)
             _draw_damper(canvas, left, right, 0.42 * side, gap, 0.12 * side)
-            _draw_mass(canvas, place, side)
+            _draw_mass(canvas, place, side, share)
             left = place + side / 2
-        _draw_force(canvas, place, side, float(episode.shares(u)[0]))
 
     return Drawing(draw)
 
@@ -155,8 +145,7 @@ def zigzag(start: float, end: float, height: float, swing: float) -> Points:
     """The corners of a spring between two places on a line."""
     lead = 0.12 * (end - start)
     xs = np.linspace(start + lead, end - lead, 2 * COILS + 1)
-    ys = height + swing * np.array([0, *[1, -1] * COILS])[: 2 * COILS + 1]
-    ys[-1] = height
+    ys = height + swing * np.array([0, *[1, -1] * (COILS - 1), 1, 0])
     return np.array([[start, height], *zip(xs, ys, strict=True), [end, height]])
 
 
@@ -216,7 +205,6 @@ def mountain_car(canvas: Canvas, episode: Episode) -> Drawing:
         roof = cabin * [CAR_LENGTH, 0.75 * CAR_HEIGHT] + [0.0, CAR_HEIGHT / 2]
         canvas.polygon(roof, middle, angle, canvas.SECOND)
         share = float(episode.shares(u)[0])
-        end = turned @ (math.copysign(CAR_LENGTH / 2 + 0.015, share), 0.0)
-        canvas.force(middle + end, turned @ (0.22 * share, 0.0), 0.22)
+        canvas.push(middle, CAR_LENGTH / 2 + 0.015, 0.22, share, angle)
 
     return Drawing(draw)

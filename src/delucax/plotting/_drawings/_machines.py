@@ -58,22 +58,15 @@ def lung(canvas: Canvas, episode: Episode) -> Drawing:
             canvas.disc(centre, largest * (0.6 + 0.4 * share), color)
         level = 2.3 * float(np.clip(x[pressure] / _SCALE, 0, 1)) - 0.9
         canvas.bar((1.36, -0.9), 0.22, level, color=canvas.BODY, alpha=0.75)
-        inflow = 0.6 * float(np.clip(u[0] / 100, 0, 1)) if len(u) else 0.0
-        out = 0.6 * float(np.clip(u[1], 0, 1)) if len(u) > 1 else 0.0
-        if inflow > 0.005:
-            _draw_flow(canvas, -0.85, inflow - 0.85, canvas.ACTION)
-        if out > 0.005:
-            _draw_flow(canvas, 0.85 - out, 0.85, canvas.NEUTRAL)
+        inflow, out = 0.6 * np.clip(u / [100, 1], 0, 1)
+        flows = (-0.85, inflow, canvas.ACTION), (0.85 - out, out, canvas.NEUTRAL)
+        for start, length, color in flows:  # arrows to the right, above the lung
+            if length > 0.005:
+                arrow = {"arrowstyle": "-|>", "color": color, "lw": 3}
+                ends = (start + length, 1.5), (start, 1.5)
+                canvas.ax.annotate("", *ends, arrowprops=arrow, zorder=4)
 
     return Drawing(draw)
-
-
-def _draw_flow(canvas: Canvas, start: float, end: float, color: str) -> None:
-    """An arrow to the right, above the lung."""
-    arrow = {"arrowstyle": "-|>", "color": color, "lw": 3}
-    canvas.ax.annotate(
-        "", xy=(end, 1.5), xytext=(start, 1.5), arrowprops=arrow, zorder=4
-    )
 
 
 ROTOR, GAP, STATOR, SPEED = 0.68, 0.76, 1.0, 1.16

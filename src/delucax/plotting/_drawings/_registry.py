@@ -18,7 +18,8 @@ _BY_TYPE: dict[type, Setup] = {
     systems.DoubleIntegrator: _carts.double_integrator,
     systems.DynamicBicycle: _vehicles.car,
     systems.KinematicBicycle: _vehicles.car,
-    systems.Lorenz: _state_space.butterfly,
+    # The plane of x and z, in which the wings are seen.
+    systems.Lorenz: functools.partial(_state_space.plane, columns=(0, 2)),
     systems.MassSpringDamper: _carts.mass_spring_damper,
     systems.MountainCar: _carts.mountain_car,
     systems.Pendulum: _arms.pendulum,

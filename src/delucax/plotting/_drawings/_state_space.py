@@ -20,11 +20,6 @@ def state_space(canvas: Canvas, episode: Episode) -> Drawing:
     return plane(canvas, episode) if planar else bars(canvas, episode)
 
 
-def butterfly(canvas: Canvas, episode: Episode) -> Drawing:
-    """The plane of x and z, in which the wings are seen."""
-    return plane(canvas, episode, (0, 2))
-
-
 def plane(
     canvas: Canvas, episode: Episode, columns: tuple[int, int] = (0, 1)
 ) -> Drawing:
@@ -43,8 +38,7 @@ def plane(
         ax.plot(*target[list(columns)], "o", ms=13, mfc="none", mec=canvas.GOAL, mew=2)
     low, high = points.min(axis=0), points.max(axis=0)
     margin = np.where(high > low, 0.09 * (high - low), 1.0)
-    view = View((low + high) / 2, (high - low) / 2 + margin)
-    view.show(ax)
+    view = canvas.view((low + high) / 2, (high - low) / 2 + margin)
     if dynamics.state_size == 2:
         ax.grid(False)
         _draw_flow(canvas, episode, view)
@@ -54,7 +48,7 @@ def plane(
         at = x[list(columns)]
         ax.plot(*at, "o", color=canvas.ACTION, markersize=9, zorder=4)
         away = np.abs(at - view.centre) / view.half
-        View(view.centre, view.half * np.maximum(1.0, 1.05 * away)).show(ax)
+        canvas.view(view.centre, view.half * np.maximum(1.0, 1.05 * away))
 
     return Drawing(draw, lambda states: states[:, columns])
 
