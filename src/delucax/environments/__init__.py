@@ -1,7 +1,7 @@
 """Environments, and the named tasks."""
 
-from ._arms import acrobot as acrobot, reacher as reacher
 from ._classic_control import (
+    acrobot as acrobot,
     cartpole as cartpole,
     mountain_car as mountain_car,
     mountain_car_discrete as mountain_car_discrete,
@@ -21,10 +21,11 @@ from ._regulation import (
     two_tank as two_tank,
     van_der_pol as van_der_pol,
 )
-from ._task import UniformState as UniformState
-from ._vehicles import (
+from ._robots import (
     dynamic_bicycle as dynamic_bicycle,
     kinematic_bicycle as kinematic_bicycle,
     planar_quadrotor as planar_quadrotor,
     quadrotor as quadrotor,
+    reacher as reacher,
 )
+from ._task import UniformState as UniformState

@@ -1,8 +1,10 @@
 """Tasks in which a plant is brought to a point and held there, at quadratic cost."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from .._typing import PRNGKey
 from ..costs import Quadratic
@@ -18,6 +20,21 @@ from ..systems import (
     VanDerPol,
 )
 from ._task import Fields, Limit, Number, Positive, task, UniformState
+
+
+def _regulation(
+    cost: Quadratic,
+    spread: Array | Sequence[float],
+    bounds: tuple[Limit, Limit],
+    centre: Array | float = 0.0,
+) -> Fields:
+    """A start within `spread` of `centre`, and bounds of the controls."""
+    spread = jnp.asarray(spread)
+    return dict(
+        cost=cost,
+        initial_state=UniformState(centre - spread, centre + spread),
+        control_bounds=bounds,
+    )
 
 
 @task(DoubleIntegrator, dt=0.1, horizon=100)
@@ -41,11 +58,8 @@ def double_integrator(system: DoubleIntegrator, *, max_force: Limit = 1.0) -> Fi
         env = dlx.make("double_integrator", mass=2.0)
         ```
     """
-    return dict(
-        cost=Quadratic([1.0, 1.0], [0.1]),
-        initial_state=UniformState([-2.0, -1.0], [2.0, 1.0]),
-        control_bounds=(-max_force, max_force),
-    )
+    cost = Quadratic([1.0, 1.0], [0.1])
+    return _regulation(cost, [2.0, 1.0], (-max_force, max_force))
 
 
 @task(MassSpringDamper, dt=0.1, horizon=200)
@@ -69,12 +83,8 @@ def mass_spring_damper(system: MassSpringDamper, *, max_force: Limit = 1.0) -> F
         env = dlx.make("mass_spring_damper", masses=3)
         ```
     """
-    corner = jnp.ones(system.state_size)
-    return dict(
-        cost=Quadratic(corner, [0.1]),
-        initial_state=UniformState(-corner, corner),
-        control_bounds=(-max_force, max_force),
-    )
+    ones = jnp.ones(system.state_size)
+    return _regulation(Quadratic(ones, [0.1]), ones, (-max_force, max_force))
 
 
 @task(VanDerPol, dt=0.05, horizon=200)
@@ -98,11 +108,8 @@ def van_der_pol(system: VanDerPol, *, max_control: Limit = 3.0) -> Fields:
         env = dlx.make("van_der_pol", mu=2.0)
         ```
     """
-    return dict(
-        cost=Quadratic([1.0, 1.0], [0.1]),
-        initial_state=UniformState([-2.0, -2.0], [2.0, 2.0]),
-        control_bounds=(-max_control, max_control),
-    )
+    cost = Quadratic([1.0, 1.0], [0.1])
+    return _regulation(cost, [2.0, 2.0], (-max_control, max_control))
 
 
 @task(Lorenz, dt=0.01, horizon=500)
@@ -126,12 +133,10 @@ def lorenz(system: Lorenz, *, max_control: Limit = 50.0) -> Fields:
         env = dlx.make("lorenz", rho=24.0)
         ```
     """
-    centre, _ = system.equilibrium()
-    return dict(
-        cost=Quadratic([1.0, 1.0, 1.0], [0.001], state_target=centre),
-        initial_state=UniformState([-20.0, -20.0, 10.0], [20.0, 20.0, 40.0]),
-        control_bounds=(-max_control, max_control),
-    )
+    wing, _ = system.equilibrium()
+    cost = Quadratic([1.0, 1.0, 1.0], [0.001], state_target=wing)
+    middle = jnp.array([0.0, 0.0, 25.0])
+    return _regulation(cost, [20.0, 20.0, 15.0], (-max_control, max_control), middle)
 
 
 @task(TwoTank, dt=2.0, horizon=200)
@@ -158,11 +163,8 @@ def two_tank(system: TwoTank, *, level: Limit = 10.0, max_flow: Limit = 30.0) ->
         ```
     """
     x, u = system.equilibrium(level)
-    return dict(
-        cost=Quadratic([0.0, 1.0], [0.01], state_target=x, control_target=u),
-        initial_state=UniformState([0.0, 0.0], [20.0, 20.0]),
-        control_bounds=(0.0, max_flow),
-    )
+    cost = Quadratic([0.0, 1.0], [0.01], state_target=x, control_target=u)
+    return _regulation(cost, [10.0, 10.0], (0.0, max_flow), 10.0)
 
 
 @task(CSTR, dt=0.05, horizon=100, substeps=4)
@@ -197,12 +199,8 @@ def cstr(
         ```
     """
     x, u = system.equilibrium(concentration)
-    about = jnp.array([0.05, 3.0])
-    return dict(
-        cost=Quadratic([10.0, 0.01], [0.01], state_target=x, control_target=u),
-        initial_state=UniformState(x - about, x + about),
-        control_bounds=(min_coolant, max_coolant),
-    )
+    cost = Quadratic([10.0, 0.01], [0.01], state_target=x, control_target=u)
+    return _regulation(cost, [0.05, 3.0], (min_coolant, max_coolant), x)
 
 
 @task(PermanentMagnetMotor, dt=0.0005, horizon=200)
@@ -235,11 +233,8 @@ def permanent_magnet_motor(
     """
     x, u = system.equilibrium(speed)
     Q, R = [0.01, 0.01, 0.001], [1e-5, 1e-5]
-    return dict(
-        cost=Quadratic(Q, R, state_target=x, control_target=u),
-        initial_state=UniformState([-1.0, -1.0, -50.0], [1.0, 1.0, 50.0]),
-        control_bounds=(-max_voltage, max_voltage),
-    )
+    cost = Quadratic(Q, R, state_target=x, control_target=u)
+    return _regulation(cost, [1.0, 1.0, 50.0], (-max_voltage, max_voltage))
 
 
 def _drawn(
@@ -281,9 +276,6 @@ def neural(system: AbstractSystem, *, max_control: Limit = 1.0) -> Fields:
         again = dlx.make("neural", system=env.dynamics.system)
         ```
     """
-    corner = jnp.ones(system.state_size)
-    return dict(
-        cost=Quadratic(corner, 0.1 * jnp.ones(system.control_size)),
-        initial_state=UniformState(-corner, corner),
-        control_bounds=(-max_control, max_control),
-    )
+    ones = jnp.ones(system.state_size)
+    cost = Quadratic(ones, 0.1 * jnp.ones(system.control_size))
+    return _regulation(cost, ones, (-max_control, max_control))

@@ -1,12 +1,8 @@
 """Vector fields `dx/dt = f(t, x, u, w)`. They know of no step, cost or solver."""
 
-from ._arms import Acrobot as Acrobot, Reacher as Reacher
 from ._base import AbstractPlant as AbstractPlant, AbstractSystem as AbstractSystem
-from ._bicycles import (
-    DynamicBicycle as DynamicBicycle,
-    KinematicBicycle as KinematicBicycle,
-)
 from ._classic_control import (
+    Acrobot as Acrobot,
     CartPole as CartPole,
     MountainCar as MountainCar,
     Pendulum as Pendulum,
@@ -34,4 +30,9 @@ from ._quadrotors import (
     PlanarQuadrotor as PlanarQuadrotor,
     Quadrotor as Quadrotor,
     VortexWind as VortexWind,
+)
+from ._robots import (
+    DynamicBicycle as DynamicBicycle,
+    KinematicBicycle as KinematicBicycle,
+    Reacher as Reacher,
 )

@@ -1,4 +1,4 @@
-"""Tasks of vehicles: keep a car in its lane, fly a quadrotor to a point."""
+"""Tasks of robots: keep a car in its lane, fly a quadrotor to a point, reach a goal."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -6,12 +6,13 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, ArrayLike
 
-from .._check import LARGEST
-from .._module import as_float_array
-from .._typing import PRNGKey, State, Vector
-from ..costs import Quadratic
+from .._check import as_vector, check_finite, LARGEST
+from .._module import as_float_array, parameter
+from .._typing import Control, PRNGKey, Real, Scalar, State, Time, Vector
+from ..costs import AbstractCost, Quadratic
 from ..math import cos, sin, wrap
 from ..math._attitude import attitude_difference, rotation_entries, unit_attitude
 from ..systems import (
@@ -21,6 +22,7 @@ from ..systems import (
     KinematicBicycle,
     PlanarQuadrotor,
     Quadrotor,
+    Reacher,
     VortexWind,
 )
 from ._task import Fields, Limit, Number, task, UniformState
@@ -271,4 +273,81 @@ def quadrotor(system: Quadrotor, *, max_thrust: Limit = 6.0) -> Fields:
         control_bounds=(low, high),
         encode=quadrotor_features,
         observation_bounds=(-feature_bound, feature_bound),
+    )
+
+
+class ReacherCost(AbstractCost):
+    """`|tip - goal|^2 + torque_weight |torques|^2`."""
+
+    system: Reacher
+    goal: Real = parameter()
+    torque_weight: Real = parameter(0.1)
+
+    def __check_init__(self):
+        as_vector(self.goal, 2, "goal", "ReacherCost")
+        check_finite(self.goal, "goal", "ReacherCost")
+
+    def offset(self, x: State) -> Vector:
+        """Where the tip is, relative to the goal."""
+        return self.system.tip(x) - self.goal.astype(x.dtype)
+
+    def __call__(self, t: Time, x: State, u: Control) -> Scalar:
+        offset = self.offset(x)
+        effort = self.torque_weight * (u[0] * u[0] + u[1] * u[1])
+        return offset[0] * offset[0] + offset[1] * offset[1] + effort
+
+
+class _ReacherFeatures(eqx.Module):
+    """Cosines and sines of the angles, the rates, and the offset of the tip."""
+
+    cost: ReacherCost
+
+    def __call__(self, x: State) -> Vector:
+        offset = self.cost.offset(x)
+        angles = [cos(x[0]), sin(x[0]), cos(x[1]), sin(x[1])]
+        return jnp.stack([*angles, x[2], x[3], offset[0], offset[1]])
+
+
+@task(Reacher, dt=0.01, horizon=200, solver=diffrax.Euler())
+def reacher(
+    system: Reacher, *, goal: ArrayLike | Sequence[float] = (0.0, 1.8)
+) -> Fields:
+    """Bring the tip of an arm of two links to a goal.
+
+    State (shoulder, elbow, shoulder_rate, elbow_rate); control (shoulder_torque,
+    elbow_torque), without bounds. Starts at rest at the angles (pi/4, pi/2). Cost
+    `|tip - goal|^2 + 0.1 |torques|^2` a step. `encode` gives cosines and sines of the
+    angles, the rates and `tip - goal`. Explicit Euler, as in the paper. Never
+    terminates.
+
+    The cost and `encode` hold the arm too: for arms of other lengths call this again,
+    under `jax.vmap` for many, where `delucax.replace` would change one of the three.
+
+    **Arguments:**
+
+    - `goal`: shape `(2,)` [m]; (0, 1.8) by default.
+
+    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
+    2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        model = dlx.make("reacher")
+        plant = dlx.make("reacher", gravity=-10.0)
+        ```
+    """
+    cost = ReacherCost(system, goal)
+    reach = system.length_1 + system.length_2
+    low, high = (
+        jnp.array([sign] * 4 + [sign * LARGEST] * 2 + [*(sign * reach - cost.goal)])
+        for sign in (-1.0, 1.0)
+    )
+    return dict(
+        cost=cost,
+        initial_state=jnp.array([np.pi / 4, np.pi / 2, 0.0, 0.0]),
+        encode=_ReacherFeatures(cost),
+        observation_bounds=(low, high),
     )
