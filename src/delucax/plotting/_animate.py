@@ -53,8 +53,7 @@ class Scene:
         grid = self.figure.add_gridspec(1, 2 if traces else 1)
         self.lines: list[tuple[Line2D, Any]] = []
         if traces:
-            stack = grid[0, 1].subgridspec(len(panels), 1)
-            self.lines = self._panels(panels, stack)
+            self.lines = self._panels(panels, grid[0, 1].subgridspec(len(panels), 1))
         ax = self.figure.add_subplot(grid[0, 0])
         episode = Episode(environment, run.trajectory)
         visited = self.states[: int(run.last[0]) + 1]
@@ -72,8 +71,7 @@ class Scene:
             self.figure.text(x / width, at, "", va="top", fontsize=SIZE + 1)
             for x in (0.2, 2.0)
         ]
-        lines = [line for line, _ in self.lines]
-        self.moving = [self.plant.ax, *self.texts, *lines]
+        self.moving = [self.plant.ax, *self.texts, *(line for line, _ in self.lines)]
         for artist in self.moving:
             artist.set_animated(True)
         self.canvas.draw()
@@ -115,12 +113,10 @@ class Scene:
             costs = self.run.series["costs"][0, :, 0]
             self.texts[1].set_text(f"cost so far {np.nansum(costs[:k]):.4g}")
         for line, values in self.lines:
-            if line.get_marker() == "o":
-                # Costs have no value at the end; their dot stays at the last one.
-                i = k - 1 if k and np.isnan(values[k]) else k
-                line.set_data(times[i : i + 1], values[i : i + 1])
-            else:
-                line.set_data(times[: k + 1], values[: k + 1])
+            # Costs have no value at the end; their dot stays at the last one.
+            last = max(k - 1, 0) if np.isnan(values[k]) else k
+            start = last if line.get_marker() == "o" else 0
+            line.set_data(times[start : k + 1], values[start : k + 1])
         self.plant.draw(*self._moment(k), self.states[: k + 1])
         self.canvas.restore_region(self.background)
         renderer = self.canvas.get_renderer()

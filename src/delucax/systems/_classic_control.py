@@ -1,7 +1,5 @@
 """Classic control: Gym's pendulum, cart-pole, mountain car and acrobot."""
 
-from typing import ClassVar
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -50,11 +48,9 @@ class Pendulum(AbstractSystem):
     gravity: Real = parameter(10.0)
     damping: Real = parameter(0.0)
 
-    state_names: ClassVar = ("angle", "velocity")
-    angle_names: ClassVar = ("angle",)
-    control_names: ClassVar = ("torque",)
-    state_units: ClassVar = ("rad", "rad/s")
-    control_units: ClassVar = ("N m",)
+    state_names, state_units = ("angle", "velocity"), ("rad", "rad/s")
+    control_names, control_units = ("torque",), ("N m",)
+    angle_names = ("angle",)
 
     def acceleration(self, angle: Array, velocity: Array, torque: Array) -> Array:
         """The angular acceleration.
@@ -118,11 +114,10 @@ class CartPole(AbstractSystem):
     half_length: Real = parameter(0.5, constraint=positive)
     gravity: Real = parameter(9.8)
 
-    state_names: ClassVar = ("position", "velocity", "angle", "spin")
-    angle_names: ClassVar = ("angle",)
-    control_names: ClassVar = ("force",)
-    state_units: ClassVar = ("m", "m/s", "rad", "rad/s")
-    control_units: ClassVar = ("N",)
+    state_names = ("position", "velocity", "angle", "spin")
+    state_units = ("m", "m/s", "rad", "rad/s")
+    control_names, control_units = ("force",), ("N",)
+    angle_names = ("angle",)
 
     def accelerations(
         self, angle: Array, spin: Array, force: Array
@@ -186,11 +181,9 @@ class MountainCar(AbstractSystem):
     power: Real = parameter(0.0015)
     gravity: Real = parameter(0.0025)
 
-    state_names: ClassVar = ("position", "velocity")
-    control_names: ClassVar = ("push",)
-    state_units: ClassVar = ("", "1/step")
-    time_unit: ClassVar = "steps"
-    control_units: ClassVar = ("",)
+    state_names, state_units = ("position", "velocity"), ("", "1/step")
+    control_names, control_units = ("push",), ("",)
+    time_unit = "steps"
 
     def acceleration(self, position: Array, push: Array) -> Array:
         """The acceleration.
@@ -277,12 +270,11 @@ class Acrobot(AbstractSystem):
     gravity: Real = parameter(9.8)
     form: str = eqx.field(static=True, default="book")
 
-    state_names: ClassVar = ("angle_1", "angle_2", "velocity_1", "velocity_2")
-    angle_names: ClassVar = ("angle_1", "angle_2")
-    control_names: ClassVar = ("torque",)
-    disturbance_names: ClassVar = ("push",)
-    state_units: ClassVar = ("rad", "rad", "rad/s", "rad/s")
-    control_units: ClassVar = ("N m",)
+    state_names = ("angle_1", "angle_2", "velocity_1", "velocity_2")
+    state_units = ("rad", "rad", "rad/s", "rad/s")
+    control_names, control_units = ("torque",), ("N m",)
+    angle_names = ("angle_1", "angle_2")
+    disturbance_names = ("push",)
 
     def __check_init__(self):
         check_choice(self.form, ("book", "nips"), "form", "Acrobot")

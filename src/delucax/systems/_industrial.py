@@ -1,6 +1,6 @@
 """Plants of industry: a reactor, a pair of tanks and a motor."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -64,11 +64,9 @@ class CSTR(AbstractSystem):
     heat: Real = parameter(209.2, constraint=positive)
     cooling: Real = parameter(2.092, constraint=positive)
 
-    state_names: ClassVar = ("concentration", "temperature")
-    control_names: ClassVar = ("coolant",)
-    state_units: ClassVar = ("mol/l", "K")
-    time_unit: ClassVar = "min"
-    control_units: ClassVar = ("K",)
+    state_names, state_units = ("concentration", "temperature"), ("mol/l", "K")
+    control_names, control_units = ("coolant",), ("K",)
+    time_unit = "min"
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         c, T = x[0], x[1]
@@ -146,10 +144,8 @@ class TwoTank(AbstractSystem):
     gravity: Real = parameter(981.0, constraint=positive)
     smoothing: Real = parameter(0.01, constraint=positive)
 
-    state_names: ClassVar = ("upper", "lower")
-    control_names: ClassVar = ("flow",)
-    state_units: ClassVar = ("cm", "cm")
-    control_units: ClassVar = ("cm^3/s",)
+    state_names, state_units = ("upper", "lower"), ("cm", "cm")
+    control_names, control_units = ("flow",), ("cm^3/s",)
 
     def _outflow(self, outlet: Scalar, level: Scalar) -> Scalar:
         root = level * (level * level + self.smoothing**2) ** -0.25
@@ -222,11 +218,9 @@ class PermanentMagnetMotor(AbstractSystem):
     friction: Real = parameter(0.001)
     pole_pairs: Real = parameter(4.0, constraint=positive)
 
-    state_names: ClassVar = ("i_d", "i_q", "speed")
-    control_names: ClassVar = ("v_d", "v_q")
-    disturbance_names: ClassVar = ("load",)
-    state_units: ClassVar = ("A", "A", "rad/s")
-    control_units: ClassVar = ("V", "V")
+    state_names, state_units = ("i_d", "i_q", "speed"), ("A", "A", "rad/s")
+    control_names, control_units = ("v_d", "v_q"), ("V", "V")
+    disturbance_names = ("load",)
 
     def torque(self, x: State) -> Scalar:
         """What the currents do to the shaft.

@@ -1,7 +1,7 @@
 """Masses on springs, and oscillators whose equations are not linear."""
 
 from dataclasses import KW_ONLY
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -40,10 +40,8 @@ class DoubleIntegrator(AbstractSystem):
 
     mass: Real = parameter(1.0, constraint=positive)
 
-    state_names: ClassVar = ("position", "velocity")
-    control_names: ClassVar = ("force",)
-    state_units: ClassVar = ("m", "m/s")
-    control_units: ClassVar = ("N",)
+    state_names, state_units = ("position", "velocity"), ("m", "m/s")
+    control_names, control_units = ("force",), ("N",)
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         return jnp.stack([x[1], u[0] / self.mass])
@@ -94,8 +92,7 @@ class MassSpringDamper(AbstractSystem):
     _: KW_ONLY
     masses: int = eqx.field(static=True, default=1, converter=_as_count)
 
-    control_names: ClassVar = ("force",)
-    control_units: ClassVar = ("N",)
+    control_names, control_units = ("force",), ("N",)
 
     def __check_init__(self):
         for name in ("mass", "stiffness", "damping"):
@@ -168,8 +165,8 @@ class VanDerPol(AbstractSystem):
 
     mu: Real = parameter(1.0)
 
-    state_names: ClassVar = ("x", "v")
-    control_names: ClassVar = ("u",)
+    state_names = ("x", "v")
+    control_names = ("u",)
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         damping = self.mu * (1 - x[0] * x[0])
@@ -212,8 +209,8 @@ class Lorenz(AbstractSystem):
     rho: Real = parameter(28.0)
     beta: Real = parameter(8.0 / 3.0)
 
-    state_names: ClassVar = ("x", "y", "z")
-    control_names: ClassVar = ("u",)
+    state_names = ("x", "y", "z")
+    control_names = ("u",)
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         dx = self.sigma * (x[1] - x[0]) + u[0]

@@ -1,7 +1,7 @@
 """Quadrotors, in a vertical plane and in space, and the winds that push them."""
 
 from collections.abc import Callable
-from typing import ClassVar, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -60,12 +60,11 @@ class PlanarQuadrotor(AbstractSystem):
     gravity: Real = parameter(9.81)
     wind: Callable[..., Array] | None = function_field(None)
 
-    state_names: ClassVar = ("x", "y", "angle", "vx", "vy", "rate")
-    angle_names: ClassVar = ("angle",)
-    control_names: ClassVar = ("left", "right")
-    disturbance_names: ClassVar = ("force_x", "force_y")
-    state_units: ClassVar = ("m", "m", "rad", "m/s", "m/s", "rad/s")
-    control_units: ClassVar = ("N", "N")
+    state_names = ("x", "y", "angle", "vx", "vy", "rate")
+    state_units = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+    control_names, control_units = ("left", "right"), ("N", "N")
+    angle_names = ("angle",)
+    disturbance_names = ("force_x", "force_y")
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         thrust, lean = (u[0] + u[1]) / self.mass, x[2]
@@ -163,15 +162,15 @@ class Quadrotor(AbstractSystem):
     gravity: Real = parameter(9.81)
     inputs: Literal["rotors", "wrench"] = eqx.field(static=True, default="rotors")
 
-    state_names: ClassVar = (
+    state_names = (
         *("px", "py", "pz", "qw", "qx", "qy", "qz"),
         *("vx", "vy", "vz", "rate_x", "rate_y", "rate_z"),
     )
-    disturbance_names: ClassVar = ("force_x", "force_y", "force_z")
-    state_units: ClassVar = (
+    state_units = (
         *("m", "m", "m", "1", "1", "1", "1"),
         *("m/s", "m/s", "m/s", "rad/s", "rad/s", "rad/s"),
     )
+    disturbance_names = ("force_x", "force_y", "force_z")
 
     def __check_init__(self):
         check_choice(self.inputs, ("rotors", "wrench"), "inputs", "Quadrotor")

@@ -1,8 +1,6 @@
 """Robots on the ground: cars as bicycles, on wheels that roll where they point and on
 tyres that slip; and an arm of two links."""
 
-from typing import ClassVar
-
 import jax.numpy as jnp
 
 from .._module import parameter, positive
@@ -46,11 +44,9 @@ class KinematicBicycle(AbstractSystem):
     front: Real = parameter(1.105, constraint=positive)
     rear: Real = parameter(1.738, constraint=positive)
 
-    state_names: ClassVar = ("x", "y", "heading", "speed")
-    angle_names: ClassVar = ("heading",)
-    control_names: ClassVar = ("acceleration", "steering")
-    state_units: ClassVar = ("m", "m", "rad", "m/s")
-    control_units: ClassVar = ("m/s^2", "rad")
+    state_names, state_units = ("x", "y", "heading", "speed"), ("m", "m", "rad", "m/s")
+    control_names, control_units = ("acceleration", "steering"), ("m/s^2", "rad")
+    angle_names = ("heading",)
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         share = self.rear / (self.front + self.rear)
@@ -121,11 +117,10 @@ class DynamicBicycle(AbstractSystem):
     rear_stiffness: Real = parameter(160000.0, constraint=positive)
     standstill: Real = parameter(1.0, constraint=positive)
 
-    state_names: ClassVar = ("x", "y", "heading", "vx", "vy", "rate")
-    angle_names: ClassVar = ("heading",)
-    control_names: ClassVar = ("acceleration", "steering")
-    state_units: ClassVar = ("m", "m", "rad", "m/s", "m/s", "rad/s")
-    control_units: ClassVar = ("m/s^2", "rad")
+    state_names = ("x", "y", "heading", "vx", "vy", "rate")
+    state_units = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+    control_names, control_units = ("acceleration", "steering"), ("m/s^2", "rad")
+    angle_names = ("heading",)
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         heading, vx, vy, rate = x[2], x[3], x[4], x[5]
@@ -200,11 +195,10 @@ class Reacher(AbstractSystem):
     length_2: Real = parameter(1.0, constraint=positive)
     gravity: Real = parameter(0.0)
 
-    state_names: ClassVar = ("shoulder", "elbow", "shoulder_rate", "elbow_rate")
-    angle_names: ClassVar = ("shoulder", "elbow")
-    control_names: ClassVar = ("shoulder_torque", "elbow_torque")
-    state_units: ClassVar = ("rad", "rad", "rad/s", "rad/s")
-    control_units: ClassVar = ("N m", "N m")
+    state_names = ("shoulder", "elbow", "shoulder_rate", "elbow_rate")
+    state_units = ("rad", "rad", "rad/s", "rad/s")
+    control_names, control_units = ("shoulder_torque", "elbow_torque"), ("N m", "N m")
+    angle_names = ("shoulder", "elbow")
 
     def tip(self, x: State) -> Vector:
         """Where the hand is.

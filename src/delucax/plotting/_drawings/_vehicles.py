@@ -24,15 +24,13 @@ def car(canvas: Canvas, episode: Episode) -> Drawing:
     ax, system = canvas.ax, episode.system
     front, rear = float(system.front), float(system.rear)
     base = front + rear
-    lane = 1.25 * base
-    edge = LANES * lane / 2
+    edge = LANES * 1.25 * base / 2
     ax.axhspan(-edge, edge, color=canvas.NEUTRAL, alpha=0.13, lw=0)
     for side in (-edge, edge):
         ax.axhline(side, color=canvas.NEUTRAL, lw=2)
     ax.axhline(0, color=canvas.GOAL, lw=1.5, alpha=0.7, zorder=0)
-    ys = episode.states[:, 1]
-    reach = float(np.clip(np.abs(ys).max(initial=0.0) + base, 1.25 * edge, 3 * edge))
-    half = 4.2 * base, reach
+    aside = np.abs(episode.states[:, 1]).max(initial=0.0)
+    half = 4.2 * base, float(np.clip(aside + base, 1.25 * edge, 3 * edge))
     canvas.view((0.0, 0.0), half)
 
     width = 0.64 * base
@@ -71,8 +69,7 @@ def _draw_dashes(canvas: Canvas, middle: float, half: float, base: float) -> Non
     starts = pitch * np.arange(first, last + 1)
     dash = np.stack([starts, starts + 0.45 * pitch, np.full_like(starts, np.nan)], -1)
     for k in range(1, LANES):
-        height = (k - LANES / 2) * 1.25 * base
-        heights = np.full(dash.size, height)
+        heights = np.full(dash.size, (k - LANES / 2) * 1.25 * base)
         canvas.ax.plot(dash.ravel(), heights, color="white", lw=2.5)
 
 
