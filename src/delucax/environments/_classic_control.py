@@ -27,16 +27,16 @@ def pendulum(dynamics: GymPendulum | Discretized, *, max_torque: Limit = 2.0) ->
 
     State (angle, velocity) with angle 0 upright; control (torque). Starts with the
     angle uniform over the circle and the velocity in +-1. Cost
-    `wrap(angle)^2 + 0.1 velocity^2 + 0.001 torque^2` a step. Never terminates. `encode`
-    gives the cosine and the sine of the angle, and the velocity.
+    `wrap(angle)^2 + 0.1 velocity^2 + 0.001 torque^2` per step. Never terminates.
+    `encode` gives the cosine and the sine of the angle, and the velocity.
 
-    Not smooth where the speed meets the limit of Gym's arithmetic; a `solver` gives the
+    Not smooth where the speed meets the limit of Gym's integrator; a `solver` gives the
     smooth variant. The slope of the cost jumps where the pendulum hangs straight down.
 
     **Arguments:**
 
     - `max_torque`: 2 by default.
-    - `max_speed`: of Gym's arithmetic, 8 by default.
+    - `max_speed`: of Gym's integrator, 8 by default.
 
     Source: Gymnasium (Towers et al., 2023), `Pendulum-v1`.
 
@@ -94,7 +94,7 @@ def cartpole(
     - `max_force`: 10 by default.
     - `max_position`: where the track ends, 2.4 by default.
     - `max_angle`: beyond which the pole has fallen, 12 degrees by default.
-    - `semi_implicit`: whether in Gym's arithmetic, which is an explicit Euler step, the
+    - `semi_implicit`: whether in Gym's integrator, which is an explicit Euler step, the
         positions move with the new velocities; False by default.
 
     Source: Gymnasium (Towers et al., 2023), `CartPole-v1`; Barto, Sutton and Anderson,
@@ -145,8 +145,8 @@ def mountain_car(
 
     State (position, velocity); control (push), in +-1. Starts at rest with the position
     uniform in [-0.6, -0.4]. A step costs `0.1 push^2`, and the arrival at the goal
-    -100, where the episode ends. Gym charges the push that was asked for; here it is
-    the one that was applied, within the bounds.
+    -100, where the episode ends. The cost is that of the push after clipping; Gym
+    charges the push before.
 
     The arrival has no gradient. For planning and policy gradients give as `cost` a
     [`delucax.costs.Quadratic`][] with the goal as `state_target`, `terminated=None`,
@@ -156,7 +156,7 @@ def mountain_car(
 
     - `goal_position`: 0.45 by default.
     - `goal_velocity`: the least velocity at the goal, 0 by default.
-    - `max_speed`, `min_position`, `max_position`: of Gym's arithmetic, which stops the
+    - `max_speed`, `min_position`, `max_position`: of Gym's integrator, which stops the
         car at the left wall; 0.07, -1.2 and 0.6 by default.
 
     Source: Gymnasium (Towers et al., 2023), `MountainCarContinuous-v0`; Moore, 1990.
@@ -200,7 +200,7 @@ def mountain_car_discrete(
     the integer actions 0, 1, 2 are the pushes -1, 0, 1, and a push between them is
     taken too. A step costs 1, the arrival nothing. The limits are the same.
 
-    That cost has no gradient; what has is named there.
+    The cost is not differentiable; see there for smooth alternatives.
 
     **Arguments:**
 
@@ -226,7 +226,7 @@ def mountain_car_discrete(
 
 
 def _valley(dynamics: GymMountainCar | Discretized, goal: _AtGoal) -> Fields:
-    """What both tasks have: where a car starts, and between what it stays."""
+    """The initial states and bounds that both tasks share."""
     bounds = None
     if isinstance(dynamics, GymMountainCar):
         low = jnp.stack([dynamics.min_position, -dynamics.max_speed])
@@ -278,7 +278,7 @@ def acrobot(
 
     A step is Gym's to rounding. The acrobot is chaotic, so that of 100 episodes under
     random actions about 5 end more than 1e-6 from Gym's in double precision, as Gym's
-    own do when they start at the next floating-point number.
+    own do when the initial state is perturbed by one ulp.
 
     **Arguments:**
 
@@ -289,7 +289,7 @@ def acrobot(
     - `goal_height`: of the line above the first joint, in lengths of a link, 1 by
         default.
     - `disturbance`: of the environment, in place of `torque_noise`; none by default.
-    - `max_velocity_1`, `max_velocity_2`: of Gym's arithmetic, 4 pi and 9 pi by default.
+    - `max_velocity_1`, `max_velocity_2`: of Gym's integrator, 4 pi and 9 pi by default.
 
     Source: Gymnasium (Towers et al., 2023), `Acrobot-v1`; Sutton, 1996.
 

@@ -1,4 +1,4 @@
-"""Gym's arithmetic, which the tasks of classic control have by default."""
+"""Gym's integrators, the default dynamics of the tasks of classic control."""
 
 import abc
 

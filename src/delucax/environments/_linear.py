@@ -21,6 +21,7 @@ from ..costs import Quadratic
 from ..dynamics import c2d, LinearDynamics
 from ..systems import LinearSystem
 from ._environment import Environment
+from ._registry import register
 from ._task import Fields, UniformState
 
 
@@ -53,7 +54,7 @@ def cartpole_linear(
     - `length`: l, of the rod [m], 1 by default.
     - `gravity`: g [m/s^2], 9.81 by default.
     - `dt`: the step, 0.02 by default.
-    - `horizon`: steps an episode, 200 by default: 4 s, where the paper's code stops
+    - `horizon`: steps per episode, 200 by default: 4 s, where the paper's code stops
         after 10 steps.
     - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
@@ -135,7 +136,7 @@ def lds(
     - `states`, `controls`: sizes of random matrices, 2 and 1 by default.
     - `observations`: rows of a random `C`; the identity by default.
     - `spectral_radius`: of the random `A`, 0.9 by default; below 1 is stable.
-    - `horizon`: steps an episode, 200 by default.
+    - `horizon`: steps per episode, 200 by default.
     - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
 
@@ -180,6 +181,10 @@ def lds(
     cost = Quadratic(jnp.ones(n), jnp.ones(m))
     fields: Fields = dict(dynamics=dynamics, cost=cost, horizon=horizon)
     return Environment(**(fields | others))
+
+
+for _name in ("cartpole_linear", "lds"):
+    register(_name, f"{__package__}:{_name}")
 
 
 def _sampled(system: Any, dt: Any) -> LinearDynamics:

@@ -8,21 +8,14 @@ from .._message import did_you_mean
 from ._environment import Environment
 
 
-_ENVIRONMENTS = """
-    acrobot cartpole cartpole_linear cstr double_integrator dynamic_bicycle
-    kinematic_bicycle lds lorenz mass_spring_damper mountain_car mountain_car_discrete
-    neural pendulum permanent_magnet_motor planar_quadrotor quadrotor reacher two_tank
-    van_der_pol
-""".split()
 _LUNGS = """
     balloon_lung delay_lung double_compartment learned_lung single_compartment
 """.split()
 # The names of the paper.
 _CLASSIC = "acrobot cartpole mountain_car pendulum planar_quadrotor reacher".split()
 
-# The entry points. A task of ours is called like the function that makes it.
+# The entry points. The tasks of this package register themselves.
 _REGISTRY: dict[str, str] = {
-    **{name: f"delucax.environments:{name}" for name in _ENVIRONMENTS},
     **{f"classic/{name}": f"delucax.environments:{name}" for name in _CLASSIC},
     **{name: f"delucax.lung:{name}" for name in _LUNGS},
     **{f"lung/{name}": f"delucax.lung:{name}" for name in _LUNGS},
@@ -30,7 +23,7 @@ _REGISTRY: dict[str, str] = {
 
 
 def make(name: str, **kwargs: Any) -> Environment:
-    """The task of that name.
+    """Create a registered environment by its name.
 
     **Arguments:**
 
@@ -39,8 +32,8 @@ def make(name: str, **kwargs: Any) -> Environment:
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on an unknown name, with the close ones, or if what was
-    registered makes no environment.
+    **Raises:** `ValueError` on an unknown name, with similar ones, or if the function
+    does not return an environment.
 
     !!! example
 

@@ -1,4 +1,4 @@
-"""Tasks in which a plant is brought to a point and held there, at quadratic cost."""
+"""Set-point regulation tasks with a quadratic cost."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -42,7 +42,7 @@ def double_integrator(system: DoubleIntegrator, *, max_force: Limit = 1.0) -> Fi
     """Bring a mass on a line to rest at the origin.
 
     State (position, velocity); control (force). Starts with the position uniform in
-    +-2 and the velocity in +-1. Cost `|x|^2 + 0.1 force^2` a step. Never terminates.
+    +-2 and the velocity in +-1. Cost `|x|^2 + 0.1 force^2` per step. Never terminates.
 
     **Arguments:**
 
@@ -67,7 +67,7 @@ def mass_spring_damper(system: MassSpringDamper, *, max_force: Limit = 1.0) -> F
     """Bring a mass on a spring, or a chain of them, to rest by a force on the last.
 
     State (positions, velocities); control (force). Starts with each state uniform in
-    +-1. Cost `|x|^2 + 0.1 force^2` a step. Never terminates.
+    +-1. Cost `|x|^2 + 0.1 force^2` per step. Never terminates.
 
     **Arguments:**
 
@@ -92,7 +92,7 @@ def van_der_pol(system: VanDerPol, *, max_control: Limit = 3.0) -> Fields:
     """Bring van der Pol's oscillator from its limit cycle to rest.
 
     State (x, v); control (u). Starts with each state uniform in +-2. Cost
-    `|x|^2 + 0.1 u^2` a step. Never terminates.
+    `|x|^2 + 0.1 u^2` per step. Never terminates.
 
     **Arguments:**
 
@@ -117,7 +117,7 @@ def lorenz(system: Lorenz, *, max_control: Limit = 50.0) -> Fields:
     """Hold Lorenz's chaotic system at the centre of its right wing.
 
     State (x, y, z); control (u). Starts with x and y uniform in +-20 and z in [10, 40].
-    Cost `|x - x*|^2 + 0.001 u^2` a step, x* being the equilibrium. Never terminates.
+    Cost `|x - x*|^2 + 0.001 u^2` per step, x* being the equilibrium. Never terminates.
 
     **Arguments:**
 
@@ -144,8 +144,8 @@ def two_tank(system: TwoTank, *, level: Limit = 10.0, max_flow: Limit = 30.0) ->
     """Hold the lower of two tanks at a level.
 
     State (upper, lower) [cm]; control (flow) [cm^3/s], not negative. Starts with the
-    levels uniform in [0, 20]. Cost `(lower - level)^2 + 0.01 (flow - flow*)^2` a step,
-    flow* being what holds the level. Never terminates.
+    levels uniform in [0, 20]. Cost `(lower - level)^2 + 0.01 (flow - flow*)^2` per
+    step, where flow* holds the level. Never terminates.
 
     **Arguments:**
 
@@ -179,8 +179,8 @@ def cstr(
 
     State (concentration [mol/l], temperature [K]); control (coolant [K]). Starts within
     0.05 mol/l and 3 K of the equilibrium. Cost
-    `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` a step, with the
-    equilibrium at the concentration. Never terminates. The time is in minutes.
+    `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` per step, with
+    the equilibrium at the concentration. Never terminates. The time is in minutes.
 
     **Arguments:**
 
@@ -211,7 +211,7 @@ def permanent_magnet_motor(
 
     State (i_d, i_q, speed); control (v_d, v_q), each within +-max_voltage; disturbance
     (load). Starts with the currents uniform in +-1 A and the speed in +-50 rad/s. Cost
-    `0.01 (di_d^2 + di_q^2) + 0.001 dspeed^2 + 1e-5 |dv|^2` a step, each measured from
+    `0.01 (di_d^2 + di_q^2) + 0.001 dspeed^2 + 1e-5 |dv|^2` per step, each measured from
     what holds the speed without load. Never terminates.
 
     **Arguments:**
@@ -253,7 +253,7 @@ def _drawn(
 def neural(system: AbstractSystem, *, max_control: Limit = 1.0) -> Fields:
     """Bring the state of a learned vector field to the origin.
 
-    Starts with each state uniform in +-1. Cost `|x|^2 + 0.1 |u|^2` a step. Never
+    Starts with each state uniform in +-1. Cost `|x|^2 + 0.1 |u|^2` per step. Never
     terminates.
 
     **Arguments:**

@@ -14,7 +14,6 @@ from .._module import as_float_array, parameter
 from .._typing import Control, PRNGKey, Real, Scalar, State, Time, Vector
 from ..costs import AbstractCost, Quadratic
 from ..math import cos, sin, wrap
-from ..math._attitude import attitude_difference, rotation_entries, unit_attitude
 from ..systems import (
     ConstantWind,
     DissipativeWind,
@@ -47,8 +46,8 @@ def _lane_keeping(
     max_acceleration: Limit,
     max_steering: Limit,
 ) -> Fields:
-    """What the task of a bicycle adds, which starts within `spread` of driving along
-    the lane.
+    """The common part of the bicycles' tasks, which start within `spread` of driving
+    along the lane.
 
     The cost is `y^2 + heading^2 + 0.1 (speed - speed*)^2`, 0.1 times the squares of
     what else moves, and `0.1 acceleration^2 + steering^2`. Of the features the cosine
@@ -86,13 +85,13 @@ def kinematic_bicycle(
     State (x, y, heading, speed); control (acceleration, steering). Starts at x = 0 with
     y uniform in +-2 m, the heading in +-0.3 rad and the speed within 3 m/s of the one
     to hold. Cost
-    `y^2 + heading^2 + 0.1 (speed - speed*)^2 + 0.1 acceleration^2 + steering^2` a step,
-    the heading wrapped. `encode` gives its cosine and sine. Never terminates.
+    `y^2 + heading^2 + 0.1 (speed - speed*)^2 + 0.1 acceleration^2 + steering^2` per
+    step, the heading wrapped. `encode` gives its cosine and sine. Never terminates.
 
     **Arguments:**
 
     - `speed`: to hold [m/s], 10 by default.
-    - `max_acceleration`: and least, with a minus [m/s^2]; 3 by default.
+    - `max_acceleration`: in either direction [m/s^2], 3 by default.
     - `max_steering`: to either side [rad], 0.5 by default.
 
     Source: Kong, Pfeiffer, Schildbach and Borrelli, 2015.
@@ -123,13 +122,13 @@ def dynamic_bicycle(
     x = 0 with y uniform in +-2 m, the heading in +-0.1 rad, vx within 5 m/s of the
     speed to hold, vy in +-0.5 m/s and the rate in +-0.2 rad/s. Cost
     `y^2 + heading^2 + 0.1 ((vx - speed*)^2 + vy^2 + rate^2) + 0.1 acceleration^2 +
-    steering^2` a step, the heading wrapped. `encode` gives its cosine and sine. Never
+    steering^2` per step, the heading wrapped. `encode` gives its cosine and sine. Never
     terminates.
 
     **Arguments:**
 
     - `speed`: to hold [m/s], 20 by default.
-    - `max_acceleration`: and least, with a minus [m/s^2]; 5 by default.
+    - `max_acceleration`: in either direction [m/s^2], 5 by default.
     - `max_steering`: to either side [rad], 0.2 by default.
 
     Source: Rajamani, 2012.
@@ -179,8 +178,8 @@ def planar_quadrotor(system: PlanarQuadrotor) -> Fields:
 
     State (x, y, angle, vx, vy, rate); control (left, right), the thrusts, without
     bounds; disturbance (force_x, force_y). Starts at rest at (1, 1). Cost
-    `|x|^2 + 0.1 |u - u_hover|^2` a step, u_hover being half of the weight, whatever the
-    wind. Explicit Euler, as in the paper. Never terminates.
+    `|x|^2 + 0.1 |u - u_hover|^2` per step, u_hover being half of the weight, whatever
+    the wind. Explicit Euler, as in the paper. Never terminates.
 
     **Arguments:**
 
@@ -190,8 +189,7 @@ def planar_quadrotor(system: PlanarQuadrotor) -> Fields:
         [`delucax.systems.VortexWind`][].
     - `wind_strength`: of a wind that is named, 0.1 by default.
 
-    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
-    2021 (Deluca).
+    Source: Gradu et al., 2021 (Deluca).
 
     !!! example
 
@@ -219,13 +217,13 @@ class _Start(eqx.Module):
     box: UniformState
 
     def __call__(self, key: PRNGKey) -> Array:
-        return unit_attitude(self.box(key))
+        return Quadrotor.project(self.box(key))
 
 
 def quadrotor_features(x: State) -> Vector:
     """The state with the rotation matrix in place of the quaternion: q and -q, which
     are one attitude, look the same."""
-    return jnp.concatenate([x[:3], jnp.stack(rotation_entries(x)), x[7:]])
+    return jnp.concatenate([x[:3], Quadrotor.rotation(x), x[7:]])
 
 
 @task(Quadrotor, dt=0.02, horizon=250)
@@ -235,7 +233,7 @@ def quadrotor(system: Quadrotor, *, max_thrust: Limit = 6.0) -> Fields:
     State (position, quaternion, velocity, body rates), 13 entries; control (front,
     left, back, right), the thrusts, or (thrust, torque); disturbance, a force. Starts
     with the position uniform in +-1 m, the velocity in +-0.5 m/s, the rates in +-0.5
-    rad/s and the attitude up to about 40 degrees from level. Cost a step: the squares
+    rad/s and the attitude up to about 40 degrees from level. Cost per step: the squares
     of position and of the quaternion's deviation, 0.1 times those of the velocities,
     and 0.1 times those of the control's deviation from hovering. Never terminates.
 
@@ -268,7 +266,7 @@ def quadrotor(system: Quadrotor, *, max_thrust: Limit = 6.0) -> Fields:
     weights = jnp.array([1.0] * 7 + [0.1] * 6), 0.1 * jnp.ones(4)
     target = dict(state_target=x, control_target=hover)
     return dict(
-        cost=Quadratic(*weights, difference=attitude_difference, **target),
+        cost=Quadratic(*weights, difference=Quadrotor.difference, **target),
         initial_state=_Start(UniformState(x - corner, x + corner)),
         control_bounds=(low, high),
         encode=quadrotor_features,
@@ -288,7 +286,7 @@ class ReacherCost(AbstractCost):
         check_finite(self.goal, "goal", "ReacherCost")
 
     def offset(self, x: State) -> Vector:
-        """Where the tip is, relative to the goal."""
+        """The position of the tip relative to the goal."""
         return self.system.tip(x) - self.goal.astype(x.dtype)
 
     def __call__(self, t: Time, x: State, u: Control) -> Scalar:
@@ -316,7 +314,7 @@ def reacher(
 
     State (shoulder, elbow, shoulder_rate, elbow_rate); control (shoulder_torque,
     elbow_torque), without bounds. Starts at rest at the angles (pi/4, pi/2). Cost
-    `|tip - goal|^2 + 0.1 |torques|^2` a step. `encode` gives cosines and sines of the
+    `|tip - goal|^2 + 0.1 |torques|^2` per step. `encode` gives cosines and sines of the
     angles, the rates and `tip - goal`. Explicit Euler, as in the paper. Never
     terminates.
 
@@ -327,8 +325,7 @@ def reacher(
 
     - `goal`: shape `(2,)` [m]; (0, 1.8) by default.
 
-    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
-    2021 (Deluca).
+    Source: Gradu et al., 2021 (Deluca).
 
     !!! example
 

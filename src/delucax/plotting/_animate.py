@@ -1,4 +1,4 @@
-"""A trajectory as a moving picture, whose figure is drawn once and its frames after."""
+"""Animations of trajectories."""
 
 import dataclasses
 import functools
@@ -269,7 +269,7 @@ def animate(
     duration = float(run.times[0, last] - run.times[0, 0])
     frames = min(max_frames, last + 1)
     if fps is None and duration > 0:
-        # Real time; no more frames than it takes, and no slide show of a long run.
+        # Real time: cap the frames, but play at least 5 per second.
         frames = min(frames, max(2, round(FASTEST * duration) + 1))
         fps = min(max((frames - 1) / duration, SLOWEST), FASTEST)
     indices = np.unique(np.round(np.linspace(0, last, frames)).astype(int))

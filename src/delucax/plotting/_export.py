@@ -26,7 +26,7 @@ Indices: TypeAlias = Int[np.ndarray, "..."]
 Palette: TypeAlias = UInt8[np.ndarray, "_ 3"]
 
 TRANSPARENT = 63  # the palette's index that stands for "as in the first frame"
-# Its script waits a moment: some notebooks run it before the rest is on the page.
+# The script is deferred: some notebooks run it before the page's elements exist.
 PLAYER = string.Template(Path(__file__).with_name("_player.html").read_text("utf-8"))
 
 
@@ -61,8 +61,8 @@ def reduced_palette(
 ) -> tuple[Indices, Palette]:
     """A palette of at most `most` colours, and the entry in it for each of `colours`.
 
-    The most frequent are kept as they are: a tint where something was in the frame
-    before would be a ghost of it.
+    The most frequent are kept exactly, which avoids ghosts of earlier frames by
+    quantisation.
     """
     if len(colours) <= most:
         return np.arange(len(colours)), colours

@@ -26,7 +26,7 @@ SIZE = 9.0
 # Of a legend beside a panel.
 COMPACT: dict[str, Any] = {"handlelength": 1.4, "handletextpad": 0.5}
 COMPACT |= {"labelspacing": 0.3, "borderaxespad": 0.3}
-# What a member of a run may have done in the end.
+# Markers at the end of a member of a run.
 END_MARKS: dict[str, dict[str, Any]] = {
     "failed": {"marker": "x"},
     "terminated": {"marker": "o", "markerfacecolor": "none"},
@@ -50,7 +50,7 @@ def plot(
     marks each step at which something went wrong in the controller, such as a failed
     plan, or, of one trajectory, at which the bounds clipped the control.
 
-    The figure belongs to nobody: pyplot does not know it, a notebook shows it, and
+    The figure is not registered with pyplot: a notebook shows it, and
     `figure.savefig("run.pdf")` writes it.
 
     **Arguments:**

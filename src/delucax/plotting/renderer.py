@@ -85,7 +85,7 @@ class Renderer:
         else:
             self.figure = Figure(_INCHES, _DPI, layout="constrained")
             FigureCanvasAgg(self.figure)
-        # A run that says how far things move.
+        # A reference rollout, which sets the limits of the axes.
         idle = Zero(environment.control_size)
         trajectory = rollout(environment, idle, key=jax.random.key(0), throw=False)
         states = np.asarray(trajectory.states, float)

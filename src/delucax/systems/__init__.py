@@ -1,4 +1,4 @@
-"""Vector fields `dx/dt = f(t, x, u, w)`. They know of no step, cost or solver."""
+"""Vector fields `dx/dt = f(t, x, u, w)`. Independent of steps, costs and solvers."""
 
 from ._base import AbstractPlant as AbstractPlant, AbstractSystem as AbstractSystem
 from ._classic_control import (

@@ -1,4 +1,4 @@
-"""Plants of industry: a reactor, a pair of tanks and a motor."""
+"""Process control and drives: a stirred-tank reactor, two tanks, a motor."""
 
 from typing import Any
 
@@ -36,8 +36,8 @@ class CSTR(AbstractSystem):
     - `rate`: k0, of the reaction at infinite temperature [1/min], 7.2e10 by default.
     - `activation`: the activation energy over the gas constant, E/R [K], 8750 by
         default.
-    - `heat`: by how much the tank warms a mole that reacts in a litre [K l/mol], 209.2
-        by default.
+    - `heat`: the temperature rise per concentration that reacts, -dH / (rho c_p)
+        [K l/mol], 209.2 by default.
     - `cooling`: heat conducted to the jacket, over the capacity of the tank [1/min],
         2.092 by default.
 
@@ -70,14 +70,14 @@ class CSTR(AbstractSystem):
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         c, T = x[0], x[1]
-        # Nothing reacts near absolute zero, below which a solver's stage may be.
+        # A stage of a solver may have T <= 0, where the exponential would overflow.
         reaction = self.rate * jnp.exp(-self.activation / jnp.maximum(T, 1.0)) * c
         dc = self.flow * (self.feed_concentration - c) - reaction
         warming = self.flow * (self.feed_temperature - T) + self.heat * reaction
         return jnp.stack([dc, warming + self.cooling * (u[0] - T)])
 
     def equilibrium(self, concentration: Any = 0.5) -> tuple[State, Control]:
-        """Where the coolant holds the tank at a concentration.
+        """The equilibrium at a concentration.
 
         **Arguments:** `concentration`: of the reactant, between 0 and that of the feed
         [mol/l]; 0.5 by default.
@@ -93,7 +93,7 @@ class CSTR(AbstractSystem):
                     "CSTR: concentration must be above 0 and below feed_concentration, "
                     f"{shortened(feed)}, got {shortened(c)}."
                 )
-        # What flows in reacts, which gives the rate; the rate gives the temperature.
+        # All that flows in reacts: this gives the rate, and the rate the temperature.
         reaction = self.flow * (feed - c)
         T = self.activation / jnp.log(self.rate * c / reaction)
         warming = self.flow * (self.feed_temperature - T) + self.heat * reaction
@@ -158,7 +158,7 @@ class TwoTank(AbstractSystem):
         return jnp.stack([filling, (upper - lower) / self.lower_area])
 
     def equilibrium(self, level: Any = 10.0) -> tuple[State, Control]:
-        """Where the pump holds the lower tank at a level.
+        """The equilibrium at a level of the lower tank.
 
         **Arguments:** `level`: of the lower tank, not negative [cm]; 10 by default.
 
@@ -223,7 +223,7 @@ class PermanentMagnetMotor(AbstractSystem):
     disturbance_names = ("load",)
 
     def torque(self, x: State) -> Scalar:
-        """What the currents do to the shaft.
+        """The torque of the currents on the shaft.
 
         **Arguments:** `x`: state.
 

@@ -141,7 +141,8 @@ class VanDerPol(AbstractSystem):
 
     `dx/dt = v`, `dv/dt = mu (1 - x^2) v - x + u`.
 
-    Without control every motion but rest goes to one limit cycle, of amplitude near 2.
+    Without control all trajectories but the origin converge to one limit cycle, of
+    amplitude near 2.
     Smooth; stiff for large mu. The numbers have no units.
 
     **Arguments:**
@@ -165,8 +166,7 @@ class VanDerPol(AbstractSystem):
 
     mu: Real = parameter(1.0)
 
-    state_names = ("x", "v")
-    control_names = ("u",)
+    state_names, control_names, time_unit = ("x", "v"), ("u",), ""
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         damping = self.mu * (1 - x[0] * x[0])
@@ -209,8 +209,7 @@ class Lorenz(AbstractSystem):
     rho: Real = parameter(28.0)
     beta: Real = parameter(8.0 / 3.0)
 
-    state_names = ("x", "y", "z")
-    control_names = ("u",)
+    state_names, control_names, time_unit = ("x", "y", "z"), ("u",), ""
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         dx = self.sigma * (x[1] - x[0]) + u[0]

@@ -1,5 +1,6 @@
 """Quadrotors, in a vertical plane and in space, and the winds that push them."""
 
+import abc
 from collections.abc import Callable
 from typing import Literal
 
@@ -12,7 +13,6 @@ from .._check import check_choice
 from .._module import check_parameters, function_field, parameter, positive
 from .._typing import Control, Disturbance, Real, State, Time, Vector
 from ..math import cos, sin
-from ..math._attitude import attitude_difference, unit_attitude
 from ._base import AbstractSystem
 
 
@@ -40,8 +40,7 @@ class PlanarQuadrotor(AbstractSystem):
     **Raises:** `ValueError` if a mass or length is not positive, a number is not finite
     or the wind is no function.
 
-    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
-    2021 (Deluca).
+    Source: Gradu et al., 2021 (Deluca).
 
     !!! example
 
@@ -120,9 +119,9 @@ class Quadrotor(AbstractSystem):
     `project` puts the quaternion back on the unit sphere after each control interval,
     and `difference` takes that one of q and -q which is closer to the reference. Design
     a regulator on the linearisation of [`delucax.Discretized`][], which projects, and
-    give it this `difference`: of the 13 coordinates the length of the quaternion is not
-    controllable, and is at rest after one step. In the linearisation of the system
-    itself it stays as it is for ever, and no regulator exists.
+    give it this `difference`. The length of the quaternion is not controllable: the
+    projection makes it 1 after one step, while in the linearisation of the system
+    itself it is a marginal mode, for which no regulator exists.
 
     **Arguments:**
 
@@ -188,7 +187,7 @@ class Quadrotor(AbstractSystem):
         return ("N",) * 4 if self.inputs == "rotors" else ("N", "N m", "N m", "N m")
 
     def wrench(self, u: Control) -> Control:
-        """What the rotors do to the body.
+        """The thrust and torque of the rotors on the body.
 
         **Arguments:** `u`: control.
 
@@ -230,11 +229,50 @@ class Quadrotor(AbstractSystem):
         ]
         return jnp.stack([x[7], x[8], x[9], *turning, ax, ay, az, *spin])
 
-    def project(self, x: State) -> State:
-        return unit_attitude(x)
+    @staticmethod
+    def project(x: State) -> State:
+        """`x` with a quaternion of length 1.
 
-    def difference(self, x: State, x_ref: State) -> State:
-        return attitude_difference(x, x_ref)
+        **Arguments:** `x`: state.
+
+        **Returns:** the projected state.
+        """
+        square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5] + x[6] * x[6]
+        # A quaternion of zeros has no direction; it is left, not turned into NaN.
+        scale = jnp.where(square > 0, square, 1.0) ** -0.5
+        q = [scale * x[i] for i in range(3, 7)]
+        return jnp.stack([x[0], x[1], x[2], *q, *(x[i] for i in range(7, 13))])
+
+    @staticmethod
+    def difference(x: State, x_ref: State) -> State:
+        """`x - x_ref`, with q or -q, which represent the same rotation, whichever is
+        closer to the quaternion of `x_ref`.
+
+        **Arguments:** `x`: state. `x_ref`: the state to measure from.
+
+        **Returns:** the deviation, a vector.
+        """
+        along = sum(x[i] * x_ref[i] for i in range(3, 7))
+        sign = jnp.where(along < 0, -1.0, 1.0).astype(x.dtype)
+        q = [sign * x[i] - x_ref[i] for i in range(3, 7)]
+        d = x - x_ref
+        return jnp.stack([d[0], d[1], d[2], *q, *(d[i] for i in range(7, 13))])
+
+    @staticmethod
+    def rotation(x: State) -> Vector:
+        """The rotation matrix from body to world.
+
+        **Arguments:** `x`: state, with a quaternion of length 1.
+
+        **Returns:** its entries row by row, shape `(9,)`.
+        """
+        w, a, b, c = x[3], x[4], x[5], x[6]
+        entries = [
+            *(1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b)),
+            *(2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a)),
+            *(2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b)),
+        ]
+        return jnp.stack(entries)
 
     def equilibrium(self) -> tuple[State, Control]:
         """Hovering at the origin.
@@ -249,11 +287,27 @@ class Quadrotor(AbstractSystem):
         return x, jnp.stack([weight, *[jnp.zeros_like(weight)] * 3])
 
 
-class DissipativeWind(eqx.Module):
+class _AbstractWind(eqx.Module):
+    """A force in the plane, a function of time and the state."""
+
+    def __check_init__(self):
+        check_parameters(self)
+
+    @abc.abstractmethod
+    def __call__(self, t: Time, x: State) -> Vector:
+        """The force.
+
+        **Arguments:** `t`: time. `x`: a state whose first two entries are the position.
+
+        **Returns:** shape `(2,)`.
+        """
+
+
+class DissipativeWind(_AbstractWind):
     """The force `strength (x, y)`.
 
-    The name is the paper's. With a positive strength the force points away from the
-    origin and grows with the distance: it takes nothing away, it drives off.
+    The name is the paper's. Despite it, a positive strength destabilises: the force
+    points away from the origin and grows with the distance.
 
     **Arguments:**
 
@@ -261,8 +315,7 @@ class DissipativeWind(eqx.Module):
 
     **Raises:** `ValueError` if the strength is not finite.
 
-    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
-    2021 (Deluca).
+    Source: Gradu et al., 2021 (Deluca).
 
     !!! example
 
@@ -276,20 +329,11 @@ class DissipativeWind(eqx.Module):
 
     strength: Real = parameter(0.1)
 
-    def __check_init__(self):
-        check_parameters(self)
-
     def __call__(self, t: Time, x: State) -> Vector:
-        """The force.
-
-        **Arguments:** `t`: time. `x`: a state whose first two entries are the position.
-
-        **Returns:** shape `(2,)`.
-        """
         return jnp.stack([self.strength * x[0], self.strength * x[1]])
 
 
-class ConstantWind(eqx.Module):
+class ConstantWind(_AbstractWind):
     """The force `strength (cos(direction), sin(direction))`.
 
     **Arguments:**
@@ -299,8 +343,7 @@ class ConstantWind(eqx.Module):
 
     **Raises:** `ValueError` if a number is not finite.
 
-    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
-    2021 (Deluca).
+    Source: Gradu et al., 2021 (Deluca).
 
     !!! example
 
@@ -315,21 +358,12 @@ class ConstantWind(eqx.Module):
     strength: Real = parameter(0.1)
     direction: Real = parameter(np.pi / 4)
 
-    def __check_init__(self):
-        check_parameters(self)
-
     def __call__(self, t: Time, x: State) -> Vector:
-        """The force.
-
-        **Arguments:** `t`: time. `x`: a state, which plays no part.
-
-        **Returns:** shape `(2,)`.
-        """
         along, across = jnp.cos(self.direction), jnp.sin(self.direction)
         return jnp.stack([self.strength * along, self.strength * across])
 
 
-class VortexWind(eqx.Module):
+class VortexWind(_AbstractWind):
     """The force of vortices that turn counter-clockwise about their centres c,
 
     `strength sum_c 2 core turn(p - c) / (|p - c|^2 + core^2)`, `turn(x, y) = (-y, x)`.
@@ -346,8 +380,7 @@ class VortexWind(eqx.Module):
     **Raises:** `ValueError` if a number is not finite, the core is not positive or the
         centres are not pairs.
 
-    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
-    2021 (Deluca), for the centres; Scully, 1975, for the profile.
+    Source: Gradu et al., 2021 (Deluca), for the centres; Scully, 1975, for the profile.
 
     !!! example
 
@@ -371,12 +404,6 @@ class VortexWind(eqx.Module):
             )
 
     def __call__(self, t: Time, x: State) -> Vector:
-        """The force.
-
-        **Arguments:** `t`: time. `x`: a state whose first two entries are the position.
-
-        **Returns:** shape `(2,)`.
-        """
         centres = self.centres.astype(x.dtype)
         across, along = jnp.zeros((), x.dtype), jnp.zeros((), x.dtype)
         for i in range(centres.shape[0]):

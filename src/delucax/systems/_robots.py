@@ -162,7 +162,7 @@ class Reacher(AbstractSystem):
 
     A positive `gravity` pulls **along the x axis**, towards the arm stretched at zero,
     and a negative one away from it: this is what the paper's experiments change to make
-    a plant that differs from its model. For weight in the common sense, take x to point
+    a plant that differs from its model. For ordinary gravity, let the x axis point
     down.
 
     **Arguments:**
@@ -174,8 +174,7 @@ class Reacher(AbstractSystem):
     **Raises:** `ValueError` if a mass or length is not positive, or a number is not
     finite.
 
-    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
-    2021 (Deluca); Spong, Hutchinson and Vidyasagar, 2006.
+    Source: Gradu et al., 2021 (Deluca); Spong, Hutchinson and Vidyasagar, 2006.
 
     !!! example
 
@@ -201,11 +200,11 @@ class Reacher(AbstractSystem):
     angle_names = ("shoulder", "elbow")
 
     def tip(self, x: State) -> Vector:
-        """Where the hand is.
+        """The position of the hand.
 
         **Arguments:** `x`: state.
 
-        **Returns:** its position, shape `(2,)` [m].
+        **Returns:** shape `(2,)` [m].
         """
         l1, l2, both = self.length_1, self.length_2, x[0] + x[1]
         return jnp.stack([l1 * along(x[0]) + l2 * along(both) for along in (cos, sin)])

@@ -16,14 +16,10 @@ from ._single_env import GymnasiumEnv
 from ._vector_env import GymnasiumVectorEnv
 
 
-_PLAIN = """
-    balloon_lung delay_lung double_compartment double_integrator dynamic_bicycle
-    kinematic_bicycle learned_lung lorenz mass_spring_damper neural pendulum
-    permanent_magnet_motor planar_quadrotor quadrotor reacher single_compartment
-    two_tank van_der_pol
-""".split()
-# The name of a task, and whether its actions are whole numbers.
-_IDS = {f"{name.title().replace('_', '')}-v1": (name, False) for name in _PLAIN} | {
+_TASKS = vars(lung) | vars(environments)
+# The name of a task, and whether its actions are whole numbers: of tasks with an id of
+# their own, and of the others.
+_IDS = {
     "Acrobot-v1": ("acrobot", True),
     "AcrobotContinuous-v1": ("acrobot", False),
     "CartPole-v1": ("cartpole", True),
@@ -34,6 +30,8 @@ _IDS = {f"{name.title().replace('_', '')}-v1": (name, False) for name in _PLAIN}
     "MountainCar-v0": ("mountain_car_discrete", True),
     "MountainCarContinuous-v0": ("mountain_car", False),
 }
+_OTHERS = {*environments.registered()} & {*_TASKS} - {name for name, _ in _IDS.values()}
+_IDS |= {f"{n.title().replace('_', '')}-v1": (n, False) for n in sorted(_OTHERS)}
 
 
 # The mean return at which Gymnasium takes a task to be solved.
@@ -176,9 +174,9 @@ def register_ids() -> tuple[str, ...]:
         register_ids()
         ```
     """
-    ids, tasks = [], vars(lung) | vars(environments)
+    ids = []
     for name, (task, discrete) in _IDS.items():
-        signature = inspect.signature(tasks[task])
+        signature = inspect.signature(_TASKS[task])
         spec = EnvSpec(
             id=f"delucax/{name}",
             entry_point=f"{__name__}:make_registered",

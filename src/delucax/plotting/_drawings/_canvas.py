@@ -1,4 +1,4 @@
-"""What a drawing is made of: the episode, the canvas with its shapes, and the view."""
+"""The building blocks of drawings: the episode, the canvas with shapes, the view."""
 
 import dataclasses
 import functools
@@ -238,7 +238,7 @@ class Episode:
 
     @functools.cached_property
     def target(self) -> Vector | None:
-        """The state that the cost draws to, the origin if it names none; or nothing."""
+        """The target state of the cost, by default the origin; `None` without any."""
         if self.environment.cost.targets is None:
             return None
         x, _ = self.environment.cost.targets
@@ -254,8 +254,8 @@ class Episode:
 
     @functools.cached_property
     def largest_controls(self) -> Vector:
-        """What a full arrow stands for, one a control: its bound if it has one, else
-        the largest that was applied, else 1."""
+        """The magnitude of a full arrow, per control: its bound if it has one, else the
+        largest that was applied, else 1."""
         bounds = self.environment.control_bounds or (0.0, 0.0)
         low, high = (np.abs(np.asarray(end, float)) for end in bounds)
         largest = np.broadcast_to(np.maximum(low, high), self.environment.control_size)
@@ -270,7 +270,7 @@ class Episode:
 
 
 Setup: TypeAlias = Callable[[Canvas, Episode], Drawing]
-"""Draws what stays, sets the limits of the axes, and returns what draws the rest."""
+"""Draws static artists, sets the limits of the axes, and returns the `Drawing`."""
 
 
 def layers(environment: Environment) -> list[Any]:

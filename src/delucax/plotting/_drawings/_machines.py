@@ -28,8 +28,8 @@ LUNG_STATES = (
 
 
 def lung(canvas: Canvas, episode: Episode) -> Drawing:
-    """The lung as it is full, the gauge of the pressure with the levels asked for, and
-    how far the valves are open."""
+    """A lung drawn by its fill level, a pressure gauge with the target levels, and the
+    opening of the valves."""
     environment, states = episode.environment, episode.states
     names = list(environment.dynamics.state_names)
     pressure = next((names.index(name) for name in _PRESSURES if name in names), 0)

@@ -1,4 +1,4 @@
-"""States that stand for nothing to be seen: a plane of two, or bars of many."""
+"""Generic drawings of states: a plane of two, or bars of many."""
 
 import jax
 import jax.numpy as jnp

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.collections import LineCollection
 
-from ...math._attitude import rotation_entries
 from ..figures import color_of
 from ._canvas import box, Canvas, Drawing, Episode, rotation, Vector, View
 
@@ -142,12 +141,6 @@ def projected(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
     return points @ SCREEN.T
 
 
-def attitude(x: Vector) -> Float[np.ndarray, "3 3"]:
-    """The rotation matrix from body to world of a state."""
-    unit = x / (np.linalg.norm(x[3:7]) or 1.0)
-    return np.reshape(rotation_entries(unit), (3, 3))
-
-
 def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
     """Two crossed arms with four rotors, the front one in amber; their thrusts, or the
     thrust of all; a floor with a grid and the shadow on it, and the goal above it."""
@@ -179,7 +172,9 @@ def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
     view = canvas.view((low + high) / 2, 0.52 * (high - low))
 
     def draw(x: Vector, u: Vector) -> None:
-        place, turned = np.asarray(x[:3], float), attitude(x)
+        place = np.asarray(x[:3], float)
+        turned = system.rotation(system.project(jnp.asarray(x)))
+        turned = np.asarray(turned, float).reshape(3, 3)
         hubs = place + arm * ARMS @ turned.T
         discs = [hub + 0.48 * arm * (RIM + [0, 0, 0.3]) @ turned.T for hub in hubs]
         for rotor in (*discs, place + 0.3 * arm * RIM @ turned.T):
