@@ -17,8 +17,8 @@ from PIL import Image
 
 import delucax as dlx
 from delucax.plotting._animate import Scene
-from delucax.plotting._drawings._arms import pendulum
 from delucax.plotting._drawings._canvas import arc_arrow, Canvas, Episode
+from delucax.plotting._drawings._mechanics import pendulum
 from delucax.plotting._drawings._registry import _BY_TYPE, drawing_for
 from delucax.plotting._export import compressed, expanded
 from delucax.plotting._runs import as_runs

@@ -11,8 +11,7 @@ from systems_catalogue import SYSTEMS
 
 import delucax as dlx
 from delucax.plotting._animate import Scene
-from delucax.plotting._drawings._arms import arm_points
-from delucax.plotting._drawings._carts import zigzag
+from delucax.plotting._drawings._mechanics import arm_points, zigzag
 from delucax.plotting._drawings._registry import _BY_TYPE, drawing_for
 from delucax.plotting._runs import as_runs
 

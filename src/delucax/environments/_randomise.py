@@ -59,15 +59,14 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
             f"{{'dynamics.system.length': (0.8, 1.2)}}, got {ranges!r}."
         )
     check_paths(ranges, "randomise")
-    changes, ends = {}, {}
-    for (path, given), one in zip(
-        ranges.items(), jr.split(key, len(ranges)), strict=True
-    ):
+    changes, ends, keys = {}, {}, jr.split(key, len(ranges))
+    for (path, given), one in zip(ranges.items(), keys, strict=True):
         old = get_path(tree, path)
         if callable(given):
             changes[path] = given(one)
         elif isinstance(given, tuple | list) and len(given) == 2:
-            low, high = (as_float_array(end) for end in given)
+            with jax.ensure_compile_time_eval():  # so that jit does not hide numbers
+                low, high = (as_float_array(end) for end in given)
             if not (eqx.is_inexact_array(low) and eqx.is_inexact_array(high)):
                 raise ValueError(
                     f"randomise: the range of {path!r} must be of numbers, got "
@@ -75,10 +74,8 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
                 )
             shape: Any = jnp.broadcast_shapes(jnp.shape(old), low.shape, high.shape)
             dtype = jnp.result_type(old, low, high)
-            with jax.ensure_compile_time_eval():  # so that jit does not hide numbers
-                known = [as_float_array(end) for end in given]
-            if all(map(is_concrete, known)):
-                least, most = (np.asarray(end, dtype) for end in known)
+            if is_concrete(low) and is_concrete(high):
+                least, most = np.asarray(low, dtype), np.asarray(high, dtype)
                 if not np.all((least <= most) & np.isfinite(most - least)):
                     raise ValueError(
                         f"randomise: the range of {path!r} must be finite and have "

@@ -12,19 +12,6 @@ from ._canvas import Canvas, Drawing, Episode, FULL_TURN, rotation, Vector
 _VOLUMES = ("volume", "fast", "slow")
 _PRESSURES = ("sensed pressure", "pipe", "pressure")
 _SCALE = 60.0  # cmH2O at the top of the gauge
-_WINDOW = 6  # that of a learned lung, unless another is given
-# What the states of a lung may be called, which says that it is one.
-LUNG_STATES = (
-    ("inflow", "opening", "volume"),
-    ("inflow", "opening", "fast", "slow"),
-    ("inflow", "opening", "pipe", "volume"),
-    (
-        *(f"u_in[-{i + 1}]" for i in range(_WINDOW)),
-        "pressure",
-        *(f"pressure[-{i}]" for i in range(1, _WINDOW)),
-        "step",
-    ),
-)
 
 
 def lung(canvas: Canvas, episode: Episode) -> Drawing:
