@@ -1,5 +1,6 @@
 """The tasks under Gymnasium's own `make`."""
 
+import inspect
 from typing import Any
 
 import gymnasium
@@ -7,21 +8,18 @@ import jax
 import jax.numpy as jnp
 from gymnasium.envs.registration import EnvSpec
 
+from ... import environments, lung
 from ..._check import check_count
-from ...environments import default_horizon, Environment, make as make_task
+from ...environments import Environment, make as make_task
 from .._adapter import has_signals, reads_first_argument
 from ._single_env import GymnasiumEnv
 from ._vector_env import GymnasiumVectorEnv
 
 
-_PLAIN = """
-    balloon_lung delay_lung double_compartment double_integrator dynamic_bicycle
-    kinematic_bicycle learned_lung lorenz mass_spring_damper neural pendulum
-    permanent_magnet_motor planar_quadrotor quadrotor reacher single_compartment
-    two_tank van_der_pol
-""".split()
-# The name of a task, and whether its actions are whole numbers.
-_IDS = {f"{name.title().replace('_', '')}-v1": (name, False) for name in _PLAIN} | {
+_TASKS = vars(lung) | vars(environments)
+# The name of a task, and whether its actions are whole numbers: of tasks with an id of
+# their own, and of the others.
+_IDS = {
     "Acrobot-v1": ("acrobot", True),
     "AcrobotContinuous-v1": ("acrobot", False),
     "CartPole-v1": ("cartpole", True),
@@ -32,6 +30,8 @@ _IDS = {f"{name.title().replace('_', '')}-v1": (name, False) for name in _PLAIN}
     "MountainCar-v0": ("mountain_car_discrete", True),
     "MountainCarContinuous-v0": ("mountain_car", False),
 }
+_OTHERS = {*environments.registered()} & {*_TASKS} - {name for name, _ in _IDS.values()}
+_IDS |= {f"{n.title().replace('_', '')}-v1": (n, False) for n in sorted(_OTHERS)}
 
 
 # The mean return at which Gymnasium takes a task to be solved.
@@ -176,11 +176,12 @@ def register_ids() -> tuple[str, ...]:
     """
     ids = []
     for name, (task, discrete) in _IDS.items():
+        signature = inspect.signature(_TASKS[task])
         spec = EnvSpec(
             id=f"delucax/{name}",
             entry_point=f"{__name__}:make_registered",
             vector_entry_point=f"{__package__}:make_vector",
-            max_episode_steps=default_horizon(task),
+            max_episode_steps=signature.parameters["horizon"].default,
             reward_threshold=_THRESHOLDS.get(name),
             # Orders are checked by the environment itself.
             order_enforce=False,
