@@ -3,7 +3,6 @@
 from . import sysid as sysid
 from ._actor_critic import actor_critic as actor_critic, ActorCritic as ActorCritic
 from ._costs import (
-    Attack as Attack,
     expected_cost as expected_cost,
     scored_cost as scored_cost,
     worst_case as worst_case,

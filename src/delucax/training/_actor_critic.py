@@ -208,10 +208,10 @@ class AbstractActorCriticLoss(AbstractSurrogate):
     def __check_init__(self):
         where = type(self).__name__
         check_instance(self.environment, Environment, "environment", where)
-        check_count(self.batch, "batch", where)
-        check_count(self.horizon, "horizon", where)
-        check_range(self.discount, "discount", where, 0, 1)
-        check_range(self.decay, "decay", where, 0, 1)
+        for name in ("batch", "horizon"):
+            check_count(getattr(self, name), name, where)
+        for name in ("discount", "decay"):
+            check_range(getattr(self, name), name, where, 0, 1)
         check_range(self.value_weight, "value_weight", where)
         check_bool(self.bootstrap, "bootstrap", where)
 
@@ -255,9 +255,19 @@ class AbstractActorCriticLoss(AbstractSurrogate):
         steps = jnp.arange(horizon)
         continues = ~run.terminated & (self.bootstrap | (steps < horizon - 1))
         valid = steps < run.length
+        # Generalised advantage estimation (Schulman et al., 2016), in cost:
+        # A_k = delta_k + discount decay A_{k+1}, from the temporal-difference errors
+        # delta_k = c_k + discount V_{k+1} - V_k.
         errors = costs + self.discount * following - values
         errors = jnp.where(valid, errors, 0)
-        advantages = _advantages(errors, continues, self.discount, self.decay)
+
+        def backward(later, inputs):
+            error, continues = inputs
+            now = error + self.discount * self.decay * jnp.where(continues, later, 0)
+            return now, now
+
+        zero = jnp.zeros((), errors.dtype)
+        _, advantages = lax.scan(backward, zero, (errors, continues), reverse=True)
         return Episodes(
             times=run.times[:-1],
             observations=run.observations,
@@ -270,27 +280,6 @@ class AbstractActorCriticLoss(AbstractSurrogate):
             targets=advantages + values,
             total_cost=run.total_cost,
         )
-
-
-def _advantages(
-    errors: Float[Array, " steps"],
-    continues: Bool[Array, " steps"],
-    discount: RealScalar,
-    decay: RealScalar,
-) -> Float[Array, " steps"]:
-    """The generalised advantage estimate of each step of one episode,
-
-    `A_k = delta_k + g lambda A_{k+1}` with `delta_k = c_k + g V_{k+1} - V_k`, the
-    temporal-difference errors.
-    """
-
-    def back(later, inputs):
-        error, continues = inputs
-        now = error + discount * decay * jnp.where(continues, later, 0)
-        return now, now
-
-    start = jnp.zeros((), errors.dtype)
-    return lax.scan(back, start, (errors, continues), reverse=True)[1]
 
 
 class Moments(NamedTuple):
@@ -313,6 +302,8 @@ class Moments(NamedTuple):
         mean = jnp.sum(jnp.where(known, values, 0), 0) / jnp.maximum(n, 1)
         squares = jnp.sum(jnp.where(known, (values - mean) ** 2, 0), 0)
         total = jnp.maximum(self.count + n, 1)
+        # Chan, Golub and LeVeque's rule for two samples, 1983: no small difference of
+        # large sums of squares is taken.
         gap = mean - self.mean
         return Moments(
             self.count + n,
@@ -324,8 +315,8 @@ class Moments(NamedTuple):
     def std(self) -> Array:
         """The standard deviation, 1 where it is negligible."""
         variance = self.squares / jnp.maximum(self.count, 1)
-        some = variance > 1e-8
-        return jnp.where(some, jnp.sqrt(jnp.where(some, variance, 1)), 1)
+        # A feature that does not move is left as it is, and not blown up.
+        return jnp.sqrt(jnp.where(variance > 1e-8, variance, 1))
 
 
 class Statistics(NamedTuple):
@@ -352,10 +343,11 @@ class Statistics(NamedTuple):
         """The model, standardised by these moments."""
 
         def places(model):
-            parts = parts_of(model, Standardise)
-            each = [leaf for part in parts for leaf in (part.mean, part.std)]
-            return (*each, model.shift, model.scale)
+            each = [(part.mean, part.std) for part in parts_of(model, Standardise)]
+            return [
+                leaf for pair in (*each, (model.shift, model.scale)) for leaf in pair
+            ]
 
         new = [v for m in (*self.features, self.targets) for v in (m.mean, m.std)]
         new = [n.astype(o.dtype) for n, o in zip(new, places(model), strict=True)]
-        return eqx.tree_at(places, model, tuple(lax.stop_gradient(new)))
+        return eqx.tree_at(places, model, lax.stop_gradient(new))

@@ -7,7 +7,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._check import (
     as_number,
@@ -45,19 +45,12 @@ class _ExpectedCost(eqx.Module):
 
     def __call__(self, controller, key):
         check_key(key, "expected_cost")
+        options: Any = dict(checkpoint=self.checkpoint, truncate=self.truncate)
+        options |= dict(horizon=self.horizon, gradient_decay=self.gradient_decay)
+        options |= dict(keep=(), throw=False)
 
         def total(key):
-            trajectory = rollout(
-                self.environment,
-                controller,
-                key=key,
-                horizon=self.horizon,
-                keep=(),
-                checkpoint=self.checkpoint,
-                gradient_decay=self.gradient_decay,
-                truncate=self.truncate,
-                throw=False,
-            )
+            trajectory = rollout(self.environment, controller, key=key, **options)
             return nan_if_failed(trajectory, trajectory.total_cost)
 
         if self.batch == 1:
@@ -125,14 +118,12 @@ def expected_cost(
     # A decay of 1 is known to leave the gradient alone, and compiles nothing.
     is_one = isinstance(gradient_decay, int | float) and gradient_decay == 1
     horizon = environment.horizon if horizon is None else horizon
-    return _ExpectedCost(
-        environment=environment,
-        gradient_decay=1.0 if is_one else decay,
-        batch=check_count(batch, "batch", where),
-        horizon=check_count(horizon, "horizon", where),
-        checkpoint=checkpoint,
-        truncate=None if truncate is None else check_count(truncate, "truncate", where),
-    )
+    batch = check_count(batch, "batch", where)
+    horizon = check_count(horizon, "horizon", where)
+    if truncate is not None:
+        truncate = check_count(truncate, "truncate", where)
+    decay = 1.0 if is_one else decay
+    return _ExpectedCost(environment, decay, batch, horizon, checkpoint, truncate)
 
 
 class _ScoredCost(eqx.Module):
@@ -220,38 +211,17 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
 
 def nan_if_failed(trajectory: Trajectory, costs: Array) -> Array:
     """Costs of a run, NaN where it failed: those of a failed solve may look finite."""
+    # Costs that are not finite show it already, and stay as they are.
     kept = ~trajectory.failed | ~jnp.isfinite(trajectory.total_cost)
     return jnp.where(kept, costs, jnp.nan)
 
 
-class Attack(NamedTuple):
-    """The worst disturbances of a search.
+class _Attack(NamedTuple):
+    """The worst disturbances of a search, see `worst_case`."""
 
-    - `w`: shape `(horizon, k)`, for `rollout(..., w=w)`.
-    - `total_cost`: what they cost.
-    - `costs`: the total cost at each iteration from that start, shape
-      `(iterations + 1,)`.
-
-    [`delucax.training.worst_case`][] returns it.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-
-        env = dlx.make("pendulum")
-        feedback = dlx.controllers.Linear([[20.0, 5.0]])
-        options = dict(bound=0.01, x0=[0.1, 0.0], horizon=30, iterations=5)
-        search = dlx.training.worst_case
-        attack = search(env, feedback, key=jax.random.key(0), **options)
-        attack.w.shape, attack.costs
-        ```
-    """
-
-    w: Array
+    w: Float[Array, "horizon disturbances"]
     total_cost: Array
-    costs: Array
+    costs: Float[Array, " iterations"]
 
 
 def worst_case(
@@ -264,7 +234,7 @@ def worst_case(
     horizon: int | None = None,
     iterations: int = 20,
     starts: int = 8,
-) -> Attack:
+) -> _Attack:
     r"""Bounded disturbances that cost a controller as much as a local search can find,
 
     `max over w of the total cost, with |w_t| <= bound for each t`.
@@ -289,7 +259,9 @@ def worst_case(
     - `iterations`: 20 by default.
     - `starts`: 8 by default.
 
-    **Returns:** [`delucax.training.Attack`][].
+    **Returns:** a named tuple: `w`, shape `(horizon, k)`, for `rollout(..., w=w)`;
+    `total_cost`, what they cost; and `costs`, the total cost at each iteration from
+    the start that led to them, shape `(iterations + 1,)`.
 
     **Raises:** `ValueError` on an argument of the wrong kind, shape or range, or if the
     environment takes no disturbance.
@@ -324,9 +296,8 @@ def worst_case(
     starts = check_count(starts, "starts", where)
     if x0 is not None:
         x0 = as_vector(x0, environment.state_size, "x0", where)
-    bound = as_float_array(bound)
-    sizes = horizon, iterations, starts
-    return _attack(environment, controller, key, bound, x0, *sizes)
+    options = as_float_array(bound), x0, horizon, iterations, starts
+    return _attack(environment, controller, key, *options)
 
 
 @eqx.filter_jit
@@ -342,6 +313,8 @@ def _attack(environment, controller, key, bound, x0, horizon, iterations, starts
         moved = (norm > 0) & jnp.isfinite(norm)
         return jnp.where(moved, bound * g / jnp.where(moved, norm, 1), old)
 
+    # One iteration of Frank and Wolfe: the maximum over the balls of the cost's linear
+    # model lies on the spheres, along the gradient.
     def step(carry, _):
         w, best, most = carry
         cost, g = jax.value_and_grad(total)(w)
@@ -354,9 +327,8 @@ def _attack(environment, controller, key, bound, x0, horizon, iterations, starts
         carry = w, w, jnp.asarray(-jnp.inf, like.dtype)
         (w, best, most), costs = lax.scan(step, carry, length=iterations)
         last = total(w)
-        better = last > most
         costs = jnp.append(costs, last)
-        return Attack(jnp.where(better, w, best), jnp.maximum(last, most), costs)
+        return _Attack(jnp.where(last > most, w, best), jnp.maximum(last, most), costs)
 
     shape = horizon, environment.disturbance_size
     like = jax.eval_shape(total, jnp.zeros(shape))

@@ -139,8 +139,7 @@ class PPO(AbstractActorCriticLoss):
         rows, total_cost = self._rows(model, key)
         count = rows.times.shape[0]
         check_at_most(self.minibatches, count, "minibatches", "PPO", "rows of a batch")
-        none = Statistics.empty(model, rows.costs.dtype)
-        statistics = none.updated(model, rows)
+        statistics = Statistics.empty(model, rows.costs.dtype).updated(model, rows)
         zero = jnp.zeros((), int)
         return _Memory(rows, jnp.arange(count), zero, statistics, total_cost)
 
@@ -159,16 +158,12 @@ class PPO(AbstractActorCriticLoss):
         # of `init` are in the memory already.
         again = (part == 0) & (step > 0)
         old = memory.statistics
-        statistics = lax.cond(
-            again, lambda: old.updated(model, memory.rows), lambda: old
-        )
-        memory = memory._replace(statistics=statistics)
+        updated = lambda: old.updated(model, memory.rows)
+        memory = memory._replace(statistics=lax.cond(again, updated, lambda: old))
         memory = lax.cond(part == 0, fresh, lambda: memory)
-        order = lax.cond(
-            part % self.minibatches == 0,
-            lambda: jr.permutation(order_key, memory.order),
-            lambda: memory.order,
-        )
+        shuffled = lambda: jr.permutation(order_key, memory.order)
+        is_pass = part % self.minibatches == 0
+        order = lax.cond(is_pass, shuffled, lambda: memory.order)
         return memory._replace(order=order, part=part)
 
     def __call__(
@@ -182,22 +177,21 @@ class PPO(AbstractActorCriticLoss):
         rows = jax.tree.map(lambda leaf: leaf[chosen], memory.rows)
         log_prob, entropy = _scores(model, rows)
         weights = rows.valid / jnp.maximum(jnp.sum(rows.valid), 1)
-
-        def mean(values):
-            return jnp.sum(jnp.where(rows.valid, values, 0) * weights)
-
+        mean = lambda values: jnp.sum(jnp.where(rows.valid, values, 0) * weights)
         change = jnp.where(rows.valid, log_prob - rows.log_prob, 0)
-        ratio = jnp.exp(change)
+        ratio, advantages = jnp.exp(change), rows.advantages
         clipped = jnp.clip(ratio, 1 - self.clip, 1 + self.clip)
-        surrogate = mean(
-            jnp.maximum(ratio * rows.advantages, clipped * rows.advantages)
-        )
+        # The larger of the two, because these are costs: a pessimistic bound, without a
+        # slope where the ratio has gained all that the clip allows.
+        surrogate = mean(jnp.maximum(ratio * advantages, clipped * advantages))
         value_loss = mean(self._value_errors(model, rows) ** 2)
         bonus = mean(entropy)
         loss = surrogate + self.value_weight * value_loss - self.entropy_weight * bonus
         metrics = {
             "total_cost": memory.total_cost,
             "entropy": bonus,
+            # E[r - 1 - log r] is the divergence from the old policy, and no sample of
+            # it is negative (Schulman, 2020).
             "kl": mean(ratio - 1 - change),
             "clipped": mean((jnp.abs(ratio - 1) > self.clip).astype(ratio.dtype)),
             "value_loss": value_loss,

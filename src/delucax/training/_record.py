@@ -69,14 +69,10 @@ class History(eqx.Module):
 
         **Raises:** `KeyError` if there is no such column.
         """
-        if name in COLUMNS:
-            return getattr(self, name)
-        if name in self.metrics:
-            return self.metrics[name]
-        raise KeyError(
-            f"History: no column {name!r}; there are "
-            f"{', '.join((*COLUMNS, *self.metrics))}."
-        )
+        if name not in self._columns:
+            names = ", ".join(self._columns)
+            raise KeyError(f"History: no column {name!r}; there are {names}.")
+        return self._columns[name]
 
     def to_pandas(self) -> "pandas.DataFrame":
         """A table with a row for each step.
@@ -85,16 +81,11 @@ class History(eqx.Module):
 
         **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
         """
-        pd = extra("pandas", "tables")
+        return extra("pandas", "tables").DataFrame(self._columns)
 
-        return pd.DataFrame({name: self[name] for name in (*COLUMNS, *self.metrics)})
-
-
-def history_of(columns: dict[str, Any]) -> History:
-    """A history of its columns by name."""
-    columns = {name: np.asarray(column) for name, column in columns.items()}
-    metrics = {name: c for name, c in columns.items() if name not in COLUMNS}
-    return History(**{name: columns[name] for name in COLUMNS}, metrics=metrics)
+    @property
+    def _columns(self) -> dict[str, np.ndarray]:
+        return {name: getattr(self, name) for name in COLUMNS} | self.metrics
 
 
 class Checkpoint(NamedTuple):
@@ -124,7 +115,14 @@ class Checkpoint(NamedTuple):
             ) from None
         for what in self.run | saved["run"]:
             old, new = saved["run"].get(what), self.run.get(what)
-            if not _agree(old, new):
+            if isinstance(old, tuple) and isinstance(new, tuple):
+                # To three digits, so that a run may resume on another machine, where
+                # the same model comes out a little different.
+                difference = np.abs(np.subtract(old, new))
+                same = np.all(difference <= 1e-3 * max(old[1], new[1]))
+            else:
+                same = old == new
+            if not same:
                 raise self._other_run(f"{what} is {old} there and {new} here")
         arrays = jax.tree.unflatten(jax.tree.structure(arrays), saved["arrays"])
         return arrays, saved["history"], saved["seconds"]
@@ -152,8 +150,7 @@ class Checkpoint(NamedTuple):
                 f"{', '.join(sorted(columns))}"
             )
         for name in ("loss", "gradient_norm"):
-            new = rows[name]
-            old = saved[name][: len(new)]
+            old, new = saved[name][: len(rows[name])], rows[name]
             if not np.allclose(old, new, rtol=1e-4, atol=0):
                 raise self._other_run(
                     f"the {name} of its first steps is {old} and is {new} here, so "
@@ -206,8 +203,12 @@ def describe_run(
             options[f"{name} {place}"] = _kind(leaf)
     for place, leaf in _placed(model):
         if is_float(leaf):
+            # On a fixed pattern of signs and sizes, which a change of few entries moves
+            # as well. Bounds may be infinite.
+            values = np.nan_to_num(np.asarray(leaf, float).ravel(), posinf=1, neginf=-1)
+            projection = float(values @ np.cos(np.arange(values.size)))
             what = f"(projection, norm) of model{place} at the start"
-            options[what] = _fingerprint(leaf)
+            options[what] = projection, float(np.linalg.norm(values))
     return options
 
 
@@ -218,20 +219,3 @@ def _placed(tree: PyTree) -> list[tuple[str, Any]]:
 
 def _kind(leaf: Any) -> str:
     return f"{leaf.dtype}{list(leaf.shape)}"
-
-
-def _fingerprint(leaf: Any) -> tuple[float, float]:
-    """The projection of an array on a fixed pattern, and its norm."""
-    # Bounds may be infinite.
-    values = np.nan_to_num(np.asarray(leaf, float).ravel(), posinf=1, neginf=-1)
-    projection = values @ np.cos(np.arange(values.size))
-    return float(projection), float(np.linalg.norm(values))
-
-
-def _agree(old: Any, new: Any) -> bool:
-    if isinstance(old, tuple) and isinstance(new, tuple):
-        # To three digits, so that a run may resume on another machine, where the same
-        # model comes out a little different.
-        difference = np.abs(np.subtract(old, new))
-        return bool(np.all(difference <= 1e-3 * max(old[1], new[1])))
-    return old == new

@@ -81,23 +81,23 @@ class Steps(NamedTuple):
     def finished(self, state: State) -> PyTree:
         """The trained model, with what a surrogate learned beside its weights."""
         model = self.assembly(state.values)
-        if isinstance(self.loss, AbstractSurrogate):
-            model = _finished(self.loss, model, state.memory, self.seeds)
-        return model
+        if not isinstance(self.loss, AbstractSurrogate):
+            return model
+        return _finished(self.loss, model, state.memory, self.seeds)
 
     @eqx.filter_jit
     def _compiled(
         self, state: State, span: Int[Array, "2"]
     ) -> tuple[State, tuple[dict[str, Array], Array]]:
         def step_of_all(state, k):
-            stepped = _over_seeds(self._step, self.seeds, last=None)
-            return stepped(self.assembly, self.key, state, k)
+            step = lambda *of_seed: self._step(*of_seed, k)
+            return _over_seeds(step, self.seeds)(self.assembly, self.key, state)
 
         first, stop = span[0], span[1]
         # Traced once, here: the loop needs the shapes of a row before it begins.
         step: Any = eqx.filter_closure_convert(step_of_all, state, first)
-        row = step.out_struct[1]
-        rows = {n: jnp.zeros((CAPACITY, *s.shape), s.dtype) for n, s in row.items()}
+        empty = lambda entry: jnp.zeros((CAPACITY, *entry.shape), entry.dtype)
+        rows = jax.tree.map(empty, step.out_struct[1])
 
         def going(carry):
             state, _, count = carry
@@ -106,11 +106,8 @@ class Steps(NamedTuple):
         def body(carry):
             state, rows, count = carry
             state, row = step(state, first + count)
-            rows = {
-                name: lax.dynamic_update_index_in_dim(rows[name], row[name], count, 0)
-                for name in rows
-            }
-            return state, rows, count + 1
+            put = lambda rows, row: lax.dynamic_update_index_in_dim(rows, row, count, 0)
+            return state, jax.tree.map(put, rows, row), count + 1
 
         start = (state, rows, jnp.zeros((), jnp.int32))
         state, rows, count = lax.while_loop(going, body, start)
@@ -130,7 +127,10 @@ class Steps(NamedTuple):
         if isinstance(self.loss, AbstractSurrogate):
             own_key, memory_key = jr.split(own_key)
             memory = self.loss.update(assembly(values), memory, k, memory_key)
-            _check_memory(self.loss, before.memory, memory)
+            kind = lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf))
+            rule = "a memory of the shapes and dtypes that it was given,"
+            rule = f"{type(self.loss).__name__}.update must return {rule}"
+            _check_kept(kind, before.memory, memory, rule)
             arguments = (memory,)
 
         def of(values, key):
@@ -138,27 +138,23 @@ class Steps(NamedTuple):
 
         value, slope = self.gradient(of, values, own_key)
         cost, metrics = cost_and_metrics(value, _WHERE)
-        _check_gradient(slope, values)
-        slope = jax.tree.map(lambda g, v: g.astype(v.dtype), slope, values)
+        rule = "gradient must return (value, gradient) with a gradient like the values"
+        _check_kept(jnp.shape, values, slope, rule)
+        # A key in the state of an optimiser cannot be cast, and need not be.
+        cast = lambda x, old: x if x.dtype == old.dtype else x.astype(old.dtype)
+        slope = jax.tree.map(cast, slope, values)
         if taken := sorted(set(metrics) & set(COLUMNS)):
             raise ValueError(
                 f"{_WHERE}: metrics must not be called {', '.join(COLUMNS)}; got "
                 f"{taken[0]!r}."
             )
-        updates, after = optax.with_extra_args_support(self.optimiser).update(
-            slope,
-            before.optimiser,
-            values,
-            value=cost,
-            grad=slope,
-            value_fn=lambda v: cost_and_metrics(of(v, own_key), _WHERE)[0],
-        )
+        # Line searches of Optax take the loss too.
+        value_of = lambda v: cost_and_metrics(of(v, own_key), _WHERE)[0]
+        given: Any = dict(value=cost, grad=slope, value_fn=value_of)
+        update = optax.with_extra_args_support(self.optimiser).update
+        updates, after = update(slope, before.optimiser, values, **given)
         # Kept in the precision that it began with, or the loop would not close.
-        after = jax.tree.map(
-            lambda new, old: new if new.dtype == old.dtype else new.astype(old.dtype),
-            after,
-            before.optimiser,
-        )
+        after = jax.tree.map(cast, after, before.optimiser)
         moved = optax.apply_updates(values, updates)
         norm = _norm(slope)
         faulty = ~jnp.stack([*map(_is_finite, (cost, norm, moved))])
@@ -166,11 +162,8 @@ class Steps(NamedTuple):
         # A seed that failed stays as it was while the others go on.
         if self.seeds is not None:
             fault = jnp.where(before.fault == 0, fault, before.fault)
-        stepped: Any = jax.tree.map(
-            lambda new, old: jnp.where(fault == 0, new, old),
-            (moved, after, memory),
-            before[:3],
-        )
+        kept = lambda new, old: jnp.where(fault == 0, new, old)
+        stepped: Any = jax.tree.map(kept, (moved, after, memory), before[:3])
         row = {"loss": strong(cost), "gradient_norm": norm, **metrics}
         return State(*stepped, order=order, fault=fault), row
 
@@ -200,35 +193,16 @@ def _finished(
     return _over_seeds(loss.finished, seeds)(model, memory)
 
 
-def _over_seeds(
-    function: Callable[..., Any], seeds: int | None, last: int | None = 0
-) -> Callable[..., Any]:
-    """`function` over a leading axis of every argument, or as it is for one seed.
-
-    `last` is `None` if the last argument does not have that axis.
-    """
-    if seeds is None:
-        return function
-    first = eqx.if_array(0)
-
-    def mapped(*arguments):
-        axes = [first] * (len(arguments) - 1) + [None if last is None else first]
-        return eqx.filter_vmap(function, in_axes=tuple(axes))(*arguments)
-
-    return mapped
+def _over_seeds(function: Callable[..., Any], seeds: int | None) -> Callable[..., Any]:
+    """`function` over a leading axis of every argument, or as it is for one seed."""
+    return function if seeds is None else eqx.filter_vmap(function)
 
 
-def _check_memory(loss: AbstractSurrogate, old: PyTree, new: PyTree) -> None:
-    """Raise unless an update keeps the structure, shapes and dtypes of a memory."""
-    shapes = [
-        jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf)), memory)
-        for memory in (old, new)
-    ]
-    if shapes[0] != shapes[1]:
-        raise ValueError(
-            f"{_WHERE}: {type(loss).__name__}.update must return a memory of the "
-            f"shapes and dtypes that it was given, {shapes[0]}, got {shapes[1]}."
-        )
+def _check_kept(kind: Callable[[Any], Any], old: Any, new: Any, rule: str) -> None:
+    """Raise unless `new` has the structure of `old`, and leaves of its kinds."""
+    expected, got = (jax.tree.map(kind, tree) for tree in (old, new))
+    if expected != got:
+        raise ValueError(f"{_WHERE}: {rule} {expected}, got {got}.")
 
 
 def _drawn_rows(
@@ -238,13 +212,12 @@ def _drawn_rows(
     rows, last_pass = order
     batches = rows.shape[0] // batch_size
     this_pass = k // batches
-    rows = lax.cond(
-        this_pass == last_pass,
-        lambda: rows,
-        lambda: jr.permutation(jr.fold_in(key, this_pass), rows.shape[0]).astype(
-            jnp.int32
-        ),
-    )
+
+    def redrawn():
+        own_key = jr.fold_in(key, this_pass)
+        return jr.permutation(own_key, rows.size).astype(rows.dtype)
+
+    rows = lax.cond(this_pass == last_pass, lambda: rows, redrawn)
     start = (k % batches) * batch_size
     return lax.dynamic_slice(rows, (start,), (batch_size,)), (rows, this_pass)
 
@@ -256,16 +229,5 @@ def _norm(tree: PyTree) -> Array:
 
 
 def _is_finite(tree: PyTree) -> Array:
-    return jnp.all(
-        jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)])
-    )
-
-
-def _check_gradient(gradient: PyTree, values: Values) -> None:
-    """Raise unless an estimator's gradient has the structure and shapes of `values`."""
-    expected, got = (jax.tree.map(jnp.shape, tree) for tree in (values, gradient))
-    if expected != got:
-        raise ValueError(
-            f"{_WHERE}: gradient must return (value, gradient) with a gradient like "
-            f"the values {expected}, got {got}."
-        )
+    leaves = jax.tree.leaves(tree)
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))

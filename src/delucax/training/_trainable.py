@@ -45,10 +45,7 @@ def partition_trainable(
     model: PyTree, trainable: Any, where: str
 ) -> tuple[Assembly, dict[str, Array]]:
     """`model` as its unconstrained trainable values, by path, and all the rest."""
-    entries = [
-        (path_string(path), leaf, role, constraint)
-        for path, leaf, role, constraint in marked_leaves(model)
-    ]
+    entries = [(path_string(path), *marks) for path, *marks in marked_leaves(model)]
     given: Mapping[str, AbstractConstraint | None] = {}
     if trainable is None:
         chosen = [role == "weight" and is_float(leaf) for _, leaf, role, _ in entries]
@@ -67,11 +64,9 @@ def partition_trainable(
             f"floating-point arrays that could be are {_listed(floats)}."
         )
     leaves, holes, constraints, values = [], [], {}, {}
-    for index, ((path, leaf, _, constraint), moves) in enumerate(
-        zip(entries, chosen, strict=True)
-    ):
-        leaves.append(None if moves else leaf)
-        if not moves:
+    for index, (path, leaf, _, constraint) in enumerate(entries):
+        leaves.append(None if chosen[index] else leaf)
+        if not chosen[index]:
             continue
         name = path or "the model"
         check_finite(leaf, name, where)
@@ -86,8 +81,8 @@ def partition_trainable(
             value = constraint.unconstrain(value)
         values[path] = value
         holes.append((index, path, leaf.weak_type))
-    structure = jax.tree.structure(model)
-    return Assembly(leaves, structure, tuple(holes), constraints), values
+    assembly = Assembly(leaves, jax.tree.structure(model), tuple(holes), constraints)
+    return assembly, values
 
 
 def weights_of(model: PyTree) -> tuple[PyTree, PyTree]:
@@ -135,13 +130,11 @@ def _as_paths(
 ) -> Mapping[str, AbstractConstraint | None] | None:
     """From path to constraint, or `None` if `trainable` does not name paths."""
     if isinstance(trainable, str):
-        trainable = [trainable]
-    listed = isinstance(trainable, tuple | list | set | frozenset)
-    if not (listed or isinstance(trainable, Mapping)):
+        return {trainable: None}
+    several = isinstance(trainable, tuple | list | set | frozenset | Mapping)
+    if not several or not all(isinstance(path, str) for path in trainable):
         return None
-    if not all(isinstance(path, str) for path in trainable):
-        return None
-    if listed:
+    if not isinstance(trainable, Mapping):
         return dict.fromkeys(trainable)
     given = [c for c in trainable.values() if c is not None]
     named = [isinstance(c, AbstractConstraint) for c in given]
@@ -158,24 +151,24 @@ def _is_under(path: str, prefix: str) -> bool:
 
 
 def _chosen_by_path(model, entries, paths, where) -> list[bool]:
+    chosen = set()
     for prefix in paths:
         try:
             node = get_path(model, prefix)
         except ValueError as error:
             raise ValueError(f"{where}: trainable: {error}") from None
-        if not any(
-            _is_under(path, prefix) and is_float(leaf) for path, leaf, _, _ in entries
-        ):
+        under = [
+            p for p, leaf, *_ in entries if _is_under(p, prefix) and is_float(leaf)
+        ]
+        chosen.update(under)
+        if not under:
             got = f"dtype {node.dtype}" if eqx.is_array(node) else shortened(node)
             raise ValueError(
                 f"{where}: trainable: {prefix!r} must be a floating-point array, or "
                 f"hold some, got {got}. A number becomes one where its field is "
                 "declared with delucax.parameter() or delucax.weight()."
             )
-    return [
-        is_float(leaf) and any(_is_under(path, prefix) for prefix in paths)
-        for path, leaf, _, _ in entries
-    ]
+    return [path in chosen for path, *_ in entries]
 
 
 def _chosen_by_filter(model, entries, trainable, where) -> list[bool]:

@@ -18,11 +18,11 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from jaxtyping import Array
 
-from ..._check import LARGEST
 from ..._typing import PRNGKey, State
 from ...environments import Environment
-from .. import _adapter as adapter
-from .._adapter import EpisodeState
+from .. import _episode as episodes
+from .._episode import EpisodeState, Outcome
+from .._spaces import action_ends, observation_ends
 
 
 def read_options(options: Any, names: tuple[str, ...], where: str) -> list[Any]:
@@ -39,41 +39,13 @@ def read_options(options: Any, names: tuple[str, ...], where: str) -> list[Any]:
     return values
 
 
-def action_space(env: Environment, discrete: bool) -> Box | Discrete:
-    """Indices into the table of actions, or controls."""
-    if discrete:
-        assert env.actions is not None
-        return Discrete(len(env.actions))
-    return _box(env.control_bounds, env.control_size, adapter.LARGEST_ACTION)
-
-
-def observation_space(env: Environment) -> Box:
-    """What `encode` returns."""
-    bounds = env.observation_bounds
+def spaces(env: Environment, discrete: bool) -> tuple[Box | Discrete, Box]:
+    """The actions, indices into their table or controls, and what `encode` returns."""
+    box = lambda ends: Box(*(np.asarray(end, np.float32) for end in ends))
+    actions: Any = env.actions
     # Gymnasium's own spaces are infinite where bounds are.
-    ends = (-LARGEST, LARGEST) if bounds is None else bounds
-    return _box(ends, env.feature_size, np.inf)
-
-
-def _box(bounds: Any, size: int, largest: float) -> Box:
-    ends = adapter.finite_ends(bounds, size, largest)
-    low, high = (np.asarray(end, np.float32) for end in ends)
-    return Box(low, high, dtype=np.float32)
-
-
-class Layout(NamedTuple):
-    """Where things are in the packed array."""
-
-    states: int
-    features: int
-
-    @property
-    def observation(self) -> slice:
-        return slice(self.states, self.states + self.features)
-
-    @property
-    def size(self) -> int:
-        return self.states + self.features + 5
+    observations = box(observation_ends(env, np.inf))
+    return Discrete(len(actions)) if discrete else box(action_ends(env)), observations
 
 
 REWARD, TERMINATED, TRUNCATED, FAILED, STEP = range(-5, 0)
@@ -88,12 +60,14 @@ class Program(NamedTuple):
     step: Any  # (packed and action, signals if there are any) -> packed
     start_batch: Any
     step_batch: Any
-    layout: Layout
+    states: slice  # where they are in the packed array
+    observation: slice
+    size: int
 
 
 def program(env: Environment, discrete: bool, truncate: bool = True) -> Program:
     """The program of an environment; one that is the same compiles no more."""
-    return _compiled(adapter.ByValue(env), discrete, truncate)
+    return _compiled(episodes.ByValue(env), discrete, truncate)
 
 
 def shared(size: int, dtype: Any) -> tuple[np.ndarray, jax.Array]:
@@ -116,51 +90,43 @@ def draw_key(generator: np.random.Generator) -> PRNGKey:
 
 
 @functools.lru_cache(maxsize=64)
-def _compiled(same: adapter.ByValue, discrete: bool, truncate: bool) -> Program:
-    env = same.env
-    layout = Layout(env.state_size, env.feature_size)
+def _compiled(same: episodes.ByValue, discrete: bool, truncate: bool) -> Program:
+    env, n = same.env, same.env.state_size
+    end = n + env.feature_size
+    size = end - REWARD
+
+    def start(key: PRNGKey, state: State | None) -> tuple[Array, episodes.Signals]:
+        if episodes.has_signals(env):
+            episode = episodes.begin(env, key, state)
+        else:
+            # A key that is not split saves a batch a third of the time of a reset.
+            x = env.reset(key) if state is None else state
+            episode = EpisodeState(x, jnp.zeros((), int))
+        no = jnp.zeros((), bool)
+        outcome = Outcome(jnp.zeros((), episode.state.dtype), no, no, no)
+        return _packed(env, episode, outcome), episode.signals
 
     def step(packed, action, signals):
         action = action[0].astype(int) if discrete else action
-        x, k = packed[: layout.states], packed[STEP].astype(int)
-        now = EpisodeState(x, k, signals)
-        return _packed(env, *adapter.step(env, now, action, truncate))
+        now = EpisodeState(packed[:n], packed[STEP].astype(int), signals)
+        return _packed(env, *episodes.step(env, now, action, truncate))
 
-    def step_in_place(given, signals=adapter.NO_SIGNALS):
-        return step(given[: layout.size], given[layout.size :], signals)
+    def step_in_place(given, signals=episodes.NO_SIGNALS):
+        return step(given[:size], given[size:], signals)
 
-    start = functools.partial(_start, env)
     start_batch = jax.vmap(start)
     step_batch = functools.partial(_step_batch, step, start_batch)
-    return Program(
-        jax.jit(start),
-        jax.jit(step_in_place),
-        jax.jit(start_batch),
-        jax.jit(step_batch, static_argnums=0),
-        layout,
-    )
+    compiled = map(jax.jit, (start, step_in_place, start_batch))
+    step_batch = jax.jit(step_batch, static_argnums=0)
+    return Program(*compiled, step_batch, slice(n), slice(n, end), size)
 
 
-def _packed(env: Environment, episode: EpisodeState, outcome: adapter.Outcome) -> Array:
-    x, (reward, terminated, truncated, failed) = episode.state, outcome
+def _packed(env: Environment, episode: EpisodeState, outcome: Outcome) -> Array:
+    x, (reward, *ends, failed) = episode.state, outcome
     failed = failed | ~jnp.all(jnp.isfinite(x)) | ~jnp.isfinite(reward)
-    rest = (reward, terminated, truncated, failed, episode.time)
+    rest = (reward, *ends, failed, episode.time)
     rest = jnp.stack([jnp.asarray(part, x.dtype) for part in rest])
-    return jnp.concatenate([x, adapter.observe(env, episode).astype(x.dtype), rest])
-
-
-def _start(
-    env: Environment, key: PRNGKey, state: State | None
-) -> tuple[Array, adapter.Signals]:
-    if adapter.has_signals(env):
-        episode = adapter.begin(env, key, state)
-    else:
-        # A key that is not split saves a batch a third of the time of a reset.
-        x = env.reset(key) if state is None else state
-        episode = EpisodeState(x, jnp.zeros((), int))
-    no = jnp.zeros((), bool)
-    outcome = adapter.Outcome(jnp.zeros((), episode.state.dtype), no, no, no)
-    return _packed(env, episode, outcome), episode.signals
+    return jnp.concatenate([x, episodes.observe(env, episode).astype(x.dtype), rest])
 
 
 def _step_batch(step, start_batch, mode, packed, actions, signals, key):

@@ -9,7 +9,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from ..._check import check_count
 from ...environments import default_horizon, Environment, make as make_task
-from .._adapter import has_signals, reads_first_argument
+from .._episode import has_signals, reads_first_argument
 from ._single_env import GymnasiumEnv
 from ._vector_env import GymnasiumVectorEnv
 
@@ -47,7 +47,7 @@ _THRESHOLDS = {
 _DRAWN = {"lds": ("A", "B", "system", "key"), "neural": ("system", "key")}
 
 
-def _task(task: str, kwargs: dict[str, Any]) -> Environment:
+def _made(task: str, kwargs: dict[str, Any]) -> Environment:
     if task in _DRAWN and not any(name in kwargs for name in _DRAWN[task]):
         kwargs = kwargs | {"key": jax.random.key(0)}
     return make_task(task, **kwargs)
@@ -85,7 +85,7 @@ def make(
         env.reset(seed=0)
         ```
     """
-    env = _task(task, kwargs)
+    env = _made(task, kwargs)
     return GymnasiumEnv(env, discrete=discrete, render_mode=render_mode)
 
 
@@ -97,11 +97,11 @@ def make_registered(task: str, **kwargs: Any) -> GymnasiumEnv:
     that is given and charges a final state.
     """
     own = {k: kwargs.pop(k) for k in ("discrete", "render_mode") if k in kwargs}
-    env = _task(task, kwargs)
-    final = lambda x: kwargs["cost"].final(0.0, x)
-    given = kwargs.get("cost") is not None
-    has_final = given and reads_first_argument(final, jnp.zeros(env.state_size))
-    ends = "horizon" in kwargs or has_signals(env) or has_final
+    env = _made(task, kwargs)
+    ends = "horizon" in kwargs or has_signals(env)
+    if kwargs.get("cost") is not None:
+        final = lambda x: env.cost.final(0.0, x)
+        ends = ends or reads_first_argument(final, jnp.zeros(env.state_size))
     return GymnasiumEnv(env, truncate=ends, **own)
 
 
@@ -152,40 +152,20 @@ def make_vector(
     if max_episode_steps not in (None, -1):  # -1 is Gymnasium's word for none
         steps = check_count(max_episode_steps, "max_episode_steps", where)
         kwargs["horizon"] = min(steps, kwargs.get("horizon", steps))
-    env = _task(task, kwargs)
     num_envs = check_count(num_envs, "num_envs", where)
-    return GymnasiumVectorEnv(
-        env, num_envs, discrete=discrete, autoreset_mode=autoreset_mode
+    options: Any = dict(discrete=discrete, autoreset_mode=autoreset_mode)
+    return GymnasiumVectorEnv(_made(task, kwargs), num_envs, **options)
+
+
+for _name, (_task, _discrete) in _IDS.items():
+    _spec = EnvSpec(
+        id=f"delucax/{_name}",
+        entry_point=f"{__name__}:make_registered",
+        vector_entry_point=f"{__package__}:make_vector",
+        max_episode_steps=default_horizon(_task),
+        reward_threshold=_THRESHOLDS.get(_name),
+        # Orders are checked by the environment itself.
+        order_enforce=False,
+        kwargs={"task": _task, "discrete": _discrete},
     )
-
-
-def register_ids() -> tuple[str, ...]:
-    """Tell Gymnasium of the tasks, as `delucax/Pendulum-v1` and so on.
-
-    Importing `delucax.interop.gymnasium` does it; to do it again changes nothing.
-
-    **Returns:** the ids.
-
-    !!! example
-
-        ```python
-        from delucax.interop.gymnasium import register_ids
-
-        register_ids()
-        ```
-    """
-    ids = []
-    for name, (task, discrete) in _IDS.items():
-        spec = EnvSpec(
-            id=f"delucax/{name}",
-            entry_point=f"{__name__}:make_registered",
-            vector_entry_point=f"{__package__}:make_vector",
-            max_episode_steps=default_horizon(task),
-            reward_threshold=_THRESHOLDS.get(name),
-            # Orders are checked by the environment itself.
-            order_enforce=False,
-            kwargs={"task": task, "discrete": discrete},
-        )
-        gymnasium.registry.setdefault(spec.id, spec)
-        ids.append(spec.id)
-    return tuple(ids)
+    gymnasium.registry.setdefault(_spec.id, _spec)

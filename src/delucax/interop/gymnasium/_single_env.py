@@ -12,7 +12,8 @@ from gymnasium.error import InvalidAction, ResetNeeded
 from ..._check import as_vector, check_bool, check_finite, check_instance
 from ..._message import shortened
 from ...environments import Environment
-from .._adapter import has_discrete_actions, has_signals
+from .._episode import has_signals
+from .._spaces import has_discrete_actions
 from . import _program as programs
 
 
@@ -85,12 +86,10 @@ class GymnasiumEnv(gymnasium.Env):
         self.render_mode = render_mode
         fps = int(np.clip(np.round(1 / float(env.dt)), 1, 60))
         self.metadata = type(self).metadata | {"render_fps": fps}
-        self.action_space = programs.action_space(env, self.discrete)
-        self.observation_space = programs.observation_space(env)
+        self.action_space, self.observation_space = programs.spaces(env, self.discrete)
         self._program = programs.program(env, self.discrete, self.truncate)
         self._table = np.asarray(env.actions) if self.discrete else np.zeros((0, 1))
-        self._count = len(self._table)
-        self._shape = (env.control_size,)
+        self._count, self._shape = len(self._table), (env.control_size,)
         self._buffer: Any = None
         self._ended = True
         self._picture: Any = None
@@ -100,7 +99,7 @@ class GymnasiumEnv(gymnasium.Env):
         """The state, shape `(state_size,)`."""
         if self._buffer is None:
             raise ResetNeeded("GymnasiumEnv: there is no state before reset().")
-        return self._buffer[: self._program.layout.states].copy()
+        return self._buffer[self._program.states].copy()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -131,16 +130,16 @@ class GymnasiumEnv(gymnasium.Env):
         self._ended, self._stepped = False, False
         if self.render_mode == "human":
             self.render()
-        return packed[self._program.layout.observation].astype(np.float32), {}
+        return packed[self._program.observation].astype(np.float32), {}
 
     def _allocate(self, dtype: Any) -> None:
         """Make the arrays that steps are taken in."""
-        layout, actions = self._program.layout, self.action_space.shape or (1,)
+        size, actions = self._program.size, self.action_space.shape or (1,)
         # The packed array with the action after it, and views of its parts.
-        self._buffer, self._shared = programs.shared(layout.size + actions[0], dtype)
-        self._packed, self._action = np.split(self._buffer, [layout.size])
+        self._buffer, self._shared = programs.shared(size + actions[0], dtype)
+        self._packed, self._action = np.split(self._buffer, [size])
         self._outcome = self._packed[programs.REWARD :]
-        view, single = self._packed[layout.observation], np.float32
+        view, single = self._packed[self._program.observation], np.float32
         copy = functools.partial(view.astype, single)
         self._observation = view.copy if view.dtype == single else copy
 
@@ -176,9 +175,9 @@ class GymnasiumEnv(gymnasium.Env):
         """
         # Little Python: each line counts for about as much as the arithmetic.
         if self._ended:
+            what = "not begun" if self._buffer is None else "ended"
             raise ResetNeeded(
-                "GymnasiumEnv: call reset() before step(): the episode has "
-                + ("not begun." if self._buffer is None else "ended.")
+                f"GymnasiumEnv: call reset() before step(): the episode has {what}."
             )
         if self.discrete:
             try:
@@ -200,10 +199,8 @@ class GymnasiumEnv(gymnasium.Env):
         reward, terminated, truncated, failed, _ = self._outcome.tolist()
         if failed:
             self._fail(action)
-        self._last = after
-        if terminated or truncated:
-            self._ended = True
-        self._stepped = True
+        self._last, self._stepped = after, True
+        self._ended = bool(terminated or truncated)
         if self.render_mode == "human":
             self.render()
         return self._observation(), reward, terminated > 0, truncated > 0, {}

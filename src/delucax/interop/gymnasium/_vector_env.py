@@ -19,7 +19,7 @@ from ..._message import shortened
 from ..._module import as_float_array
 from ..._typing import PRNGKey
 from ...environments import Environment
-from .._adapter import has_discrete_actions
+from .._spaces import has_discrete_actions
 from . import _program as programs
 
 
@@ -84,10 +84,10 @@ class GymnasiumVectorEnv(VectorEnv):
         self.num_envs = check_count(num_envs, "num_envs", where)
         self.discrete = has_discrete_actions(env, discrete, where)
         self.metadata = {"autoreset_mode": self._mode, "render_modes": []}
-        self.single_action_space = programs.action_space(env, self.discrete)
-        self.single_observation_space = programs.observation_space(env)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        spaces = programs.spaces(env, self.discrete)
+        self.single_action_space, self.single_observation_space = spaces
+        batched = (batch_space(space, num_envs) for space in spaces)
+        self.action_space, self.observation_space = batched
         self._program = programs.program(env, self.discrete)
         self._packed: Any = None
         self._signals: Any = None
@@ -98,7 +98,7 @@ class GymnasiumVectorEnv(VectorEnv):
         """The states, shape `(num_envs, state_size)`."""
         if self._packed is None:
             raise ResetNeeded("GymnasiumVectorEnv: there is no state before reset().")
-        return np.array(self._packed)[:, : self._program.layout.states]
+        return np.array(self._packed)[:, self._program.states]
 
     def reset(
         self,
@@ -198,10 +198,8 @@ class GymnasiumVectorEnv(VectorEnv):
                 "the reward is not finite, or the solver did not converge. Call "
                 "reset()."
             )
-        terminations, truncations = (
-            packed[:, programs.TERMINATED] > 0,
-            packed[:, programs.TRUNCATED] > 0,
-        )
+        terminations = packed[:, programs.TERMINATED] > 0
+        truncations = packed[:, programs.TRUNCATED] > 0
         info: dict[str, Any] = {}
         ended = terminations | truncations
         if self._mode is AutoresetMode.SAME_STEP and ended.any():
@@ -215,7 +213,7 @@ class GymnasiumVectorEnv(VectorEnv):
         return self._observations(packed), rewards, terminations, truncations, info
 
     def _observations(self, packed: np.ndarray) -> np.ndarray:
-        return packed[:, self._program.layout.observation].astype(np.float32)
+        return packed[:, self._program.observation].astype(np.float32)
 
     def _as_actions(self, actions: Any) -> np.ndarray:
         """Actions as the program takes them, or an error."""

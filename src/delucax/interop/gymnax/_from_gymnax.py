@@ -31,7 +31,7 @@ from ..._typing import (
 from ...costs import AbstractCost
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
-from .._adapter import reads_first_argument
+from .._episode import reads_first_argument
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +145,7 @@ class GymnaxDynamics(AbstractDynamics):
                 f"{where}: the action space must be a Box or Discrete, got {space!r}."
             )
         self.action_shape = () if self.discrete else tuple(space.shape)
-        size = int(np.prod(self.action_shape))
+        size = math.prod(self.action_shape)
         several = tuple(f"action[{i}]" for i in range(size))
         self.control_names = ("action",) if size == 1 else several
         key = jr.key(0)
@@ -263,8 +263,7 @@ class _Observation(eqx.Module):
         env, state = self.dynamics.env, self.dynamics.unravel(x)
         known = dict(key=jr.key(0), state=state, action=None)
         known["params"] = self.dynamics.params
-        function = _observer(env)
-        assert function is not None
+        function: Any = _observer(env)
         takes = inspect.signature(function).parameters
         parts = function(**{name: known[name] for name in known if name in takes})
         leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(parts)]
@@ -346,15 +345,15 @@ def from_gymnax(
             "observe nor get_obs."
         )
     dynamics = GymnaxDynamics(env, params, dt)
-    env = dynamics.env
-    space = env.action_space(params)
+    space = dynamics.env.action_space(params)
     if dynamics.discrete:
         bounds = (0.0, float(space.n - 1))
         actions = jnp.arange(float(space.n))[:, None]
     else:
-        ends = (jnp.asarray(end, float) for end in (space.low, space.high))
-        shape = dynamics.action_shape
-        bounds = tuple(jnp.broadcast_to(end, shape).ravel() for end in ends)
+        bounds = tuple(
+            jnp.broadcast_to(jnp.asarray(end, float), dynamics.action_shape).ravel()
+            for end in (space.low, space.high)
+        )
         actions = None
     defaults: dict[str, Any] = dict(
         dynamics=dynamics,

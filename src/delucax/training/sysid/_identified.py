@@ -1,6 +1,6 @@
 """What was identified, how well, and what the data do not tell."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -103,28 +103,20 @@ class Identified(eqx.Module):
         and gives no intervals.
         """
         lines = [f"{'parameter':<24}{'estimate':>12}{'low':>12}{'high':>12}"]
-        shape = self.estimate.shape
-        for index in np.ndindex(shape):
-            name = self.names[index[-1]]
-            label = name if len(shape) == 1 else f"output {index[0]}: {name}"
-            ends = [float(a[index]) for a in (self.estimate, self.low, self.high)]
+        for *output, index in np.ndindex(self.estimate.shape):
+            label = "".join(f"output {i}: " for i in output) + self.names[index]
+            columns = (self.estimate, self.low, self.high)
+            ends = [float(column[*output, index]) for column in columns]
             lines.append(f"{label:<24}" + "".join(f"{end:>12.5g}" for end in ends))
         failed = self.result != RESULTS.successful
         if failed and self.result != RESULTS.unexciting:
-            lines.append(
-                f"the fit failed, and has no intervals: {RESULTS[self.result]}"
-            )
+            why = RESULTS[self.result]
+            lines.append(f"the fit failed, and has no intervals: {why}")
             return "\n".join(lines)
-        for row, known in zip(
-            np.asarray(self.directions), np.asarray(self.identifiable), strict=True
-        ):
-            if not known:
-                parts = [
-                    f"{share:+.2f} {name}"
-                    for share, name in zip(row, self.names, strict=True)
-                    if abs(share) > _LOADS
-                ]
-                lines.append("not identifiable: " + " ".join(parts))
+        for row in np.asarray(self.directions)[~np.asarray(self.identifiable)]:
+            shares = zip(row, self.names, strict=True)
+            parts = [f"{share:+.2f} {n}" for share, n in shares if abs(share) > _LOADS]
+            lines.append("not identifiable: " + " ".join(parts))
         if np.all(self.identifiable):
             lines.append("all directions are identifiable")
         if self.correlation is not None and self.correlation > CORRELATED:
@@ -151,13 +143,13 @@ def checked(fit: Identified, throw: bool) -> Identified:
     return result.error_if(fit, result != RESULTS.successful) if throw else fit
 
 
-class Certainty(eqx.Module):
+class Certainty(NamedTuple):
     """How certain an estimate is, from the sensitivity of the data to it."""
 
-    directions: Array
-    spread: Array
-    identifiable: Array
-    std: Array
+    directions: Float[Array, "p p"]
+    spread: Float[Array, " p"]
+    identifiable: Bool[Array, " p"]
+    std: Float[Array, "*outputs p"]
 
     @staticmethod
     def of(sensitivity: Array, sigma: Array, worst: Any) -> "Certainty":
@@ -166,30 +158,29 @@ class Certainty(eqx.Module):
         `worst` is the spread from which on a direction counts as unknown.
         """
         rows, p = sensitivity.shape
+        # With fewer rows than parameters the rest of the directions has no size.
         if rows < p:
             sensitivity = jnp.pad(sensitivity, ((0, p - rows), (0, 0)))
+        # S = U diag(size) V': along v_i the estimate has the standard deviation
+        # sigma / size_i, as its covariance is sigma^2 (S' S)^-1. A size below the
+        # rounding of S is none.
         _, size, directions = jnp.linalg.svd(sensitivity, full_matrices=False)
         eps = jnp.finfo(sensitivity.dtype).eps
         sensitive = size > 10 * max(rows, p) * eps * size[0]
         spread = jnp.where(sensitive, sigma / jnp.where(sensitive, size, 1), jnp.inf)
         known = sensitive & (spread < worst)
         share = jnp.abs(directions)
-        each = jnp.where(
-            known[:, None],
-            (share * jnp.where(known, spread, 0)[:, None]) ** 2,
-            jnp.where(share > _LOADS, jnp.inf, 0),
-        )
-        # A sign for each direction, so that it is the same whatever the solver.
-        largest = jnp.argmax(
-            share > 0.9 * jnp.max(share, axis=1, keepdims=True), axis=1
-        )
-        sign = jnp.sign(jnp.take_along_axis(directions, largest[:, None], axis=1))
-        return Certainty(
-            (directions * sign)[::-1],
-            spread[::-1],
-            known[::-1],
-            jnp.sqrt(jnp.sum(each, axis=0)),
-        )
+        # The variance of a parameter is the sum of what the directions add to it.
+        added = (share * jnp.where(known, spread, 0)[:, None]) ** 2
+        unknown = jnp.where(share > _LOADS, jnp.inf, 0)
+        variance = jnp.sum(jnp.where(known[:, None], added, unknown), axis=0)
+        # A sign for each direction, so that it is the same whatever the solver: the
+        # first of the entries that are about the largest is positive.
+        is_large = share > 0.9 * jnp.max(share, axis=1, keepdims=True)
+        first = jnp.argmax(is_large, axis=1)[:, None]
+        directions = directions * jnp.sign(jnp.take_along_axis(directions, first, 1))
+        least_known_first = (a[::-1] for a in (directions, spread, known))
+        return Certainty(*least_known_first, std=jnp.sqrt(variance))
 
 
 def quantile(level: Any, where: str) -> Array:

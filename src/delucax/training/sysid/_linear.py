@@ -195,11 +195,10 @@ def _least_squares(
     scale = jnp.where(size > 0, size, 1)
     scaled = regressors / scale
     operator = lx.MatrixLinearOperator(scaled)
+    # The solution of least norm where the data do not tell all, by the same measure of
+    # rounding as `Certainty.of`.
     solver = lx.SVD(rcond=10 * max(rows, p) * float(jnp.finfo(scaled.dtype).eps))
-
-    def one(target):
-        return lx.linear_solve(operator, target, solver, throw=False).value
-
+    one = lambda target: lx.linear_solve(operator, target, solver, throw=False).value
     estimate = jax.vmap(one, in_axes=1)(targets)
     rest = targets - scaled @ estimate.T
     noise = jnp.sqrt(jnp.sum(rest**2, axis=0) / max(rows - p, 1))
@@ -227,17 +226,14 @@ def _fitted(
     rows = jnp.concatenate(regressors, axis=2).reshape(-1, len(names))
     targets = targets.reshape(-1, targets.shape[2])
     estimate, std, noise, certainty = _least_squares(rows, targets)
-    interval = reach * std
+    enough = certainty.identifiable & (len(rows) >= len(names))
     fit = Identified(
         model=model_of(estimate),
         names=tuple(names),
         estimate=estimate,
-        std=std,
-        low=estimate - interval,
-        high=estimate + interval,
-        directions=certainty.directions,
-        spread=certainty.spread,
-        identifiable=certainty.identifiable & (len(rows) >= len(names)),
+        low=estimate - reach * std,
+        high=estimate + reach * std,
+        **certainty._replace(std=std, identifiable=enough)._asdict(),
         noise=noise,
         correlation=None,
         x0=None,
@@ -248,8 +244,11 @@ def _fitted(
 
 def _realised(estimate, p, m, a, b, delay, dt) -> LinearDynamics:
     """The dynamics whose state is the past that the estimate looks back on."""
+    # u_{k-1}, ..., u_{k-held}; the control itself is the input.
     held = b + delay - 2
     n = a * p + held * m
+    # A is a block companion matrix: the first rows predict, the others move the past on
+    # by a step.
     # The coefficients of u_{k-1}, u_{k-2}, ..., of which the first is not in the state.
     of_controls = jnp.pad(estimate[:, a * p :], ((0, 0), ((delay - 1) * m, 0)))
     rows = [

@@ -18,7 +18,7 @@ from ..._check import (
     check_positive,
     check_step,
 )
-from ..._module import as_module, names_of, parameter, positive, weight
+from ..._module import mlp, names_of, parameter, positive, weight
 from ..._results import Result, RESULTS
 from ..._typing import PRNGKey, RealScalar
 from ...dynamics import AbstractDynamics
@@ -92,15 +92,9 @@ class NeuralDynamics(AbstractDynamics):
         self.state_names = names_of(states, "x", "states", where)
         self.control_names = names_of(controls, "u", "controls", where)
         n, m = len(self.state_names), len(self.control_names)
-        self.network = eqx.nn.MLP(
-            n + m,
-            n,
-            check_count(width, "width", where),
-            check_count(depth, "depth", where, least=0),
-            as_module(activation),
-            as_module(jax.nn.identity),
-            key=key,
-        )
+        width = check_count(width, "width", where)
+        depth = check_count(depth, "depth", where, least=0)
+        self.network = mlp(n + m, n, width, depth, activation, key=key)
         self.dt, self.x_mean, self.x_scale = dt, x_mean, x_scale
         self.u_scale, self.step_scale = u_scale, step_scale
 
@@ -126,8 +120,7 @@ class NeuralDynamics(AbstractDynamics):
     ) -> tuple[Float[Array, " n"], Result]:
         z = jnp.concatenate([(x - self.x_mean) / self.x_scale, u / self.u_scale])
         x_next = x + self.step_scale * self.network(z)
-        if w is not None:
-            x_next = x_next + w
+        x_next = x_next if w is None else x_next + w
         return x_next.astype(x.dtype), RESULTS.successful
 
 

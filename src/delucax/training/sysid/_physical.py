@@ -27,7 +27,6 @@ from ._multiple_shooting import (
     flat_legal,
     per_relative_change,
     relative_unit,
-    Solution,
     solve,
 )
 
@@ -167,28 +166,33 @@ def physical(
     unknown = len(names) + runs * count * n
     few = size * runs * (count * window + 1) <= unknown
     solution = fit(values, window)
-    if x0 is None and not few and window > _SHORT_WINDOW and _is_doubtful(solution):
+    # That the iteration did not converge, or that it ended where what remains is
+    # correlated from step to step, as the noise is not, must be known now.
+    retries = x0 is None and not few and window > _SHORT_WINDOW
+    failed = solution.result != RESULTS.successful
+    is_known = is_concrete(solution.correlation)
+    if retries and is_known and (failed | (solution.correlation > CORRELATED)):
         # On short windows nothing grows, so that a worse guess does, and there are
         # fewer minima that are not the least.
         again = fit(fit(values, _SHORT_WINDOW).values, window)
-        failed = solution.result != RESULTS.successful
         if again.result == RESULTS.successful:
             if failed or jnp.prod(again.noise) < jnp.prod(solution.noise):
                 solution = again
     values, legal, certainty = solution.values, solution.legal, solution.certainty
     std = certainty.std
+    known = certainty._replace(
+        std=std * jnp.abs(relative_unit(legal)),
+        identifiable=certainty.identifiable & (not few),
+    )
     ends = [_ends(assembly, values, sign * reach * std) for sign in (-1, 1)]
     starts = solution.starts.reshape(runs, count, n)[:, 0]
     fitted = Identified(
         model=assembly(values),
         names=tuple(names),
         estimate=legal,
-        std=std * jnp.abs(relative_unit(legal)),
         low=jnp.minimum(*ends),
         high=jnp.maximum(*ends),
-        directions=certainty.directions,
-        spread=certainty.spread,
-        identifiable=certainty.identifiable & (not few),
+        **known._asdict(),
         noise=solution.noise,
         correlation=solution.correlation,
         x0=starts if is_batch else starts[0],
@@ -197,15 +201,6 @@ def physical(
         result=RESULTS.successful if few else solution.result,
     )
     return checked(fitted, throw)
-
-
-def _is_doubtful(solution: Solution) -> bool:
-    """Whether it is known now that the iteration did not converge, or that it ended
-    where what remains is correlated from step to step, as the noise is not."""
-    if not is_concrete(solution.correlation):
-        return False
-    failed = solution.result != RESULTS.successful
-    return bool(failed | (solution.correlation > CORRELATED))
 
 
 def _ends(

@@ -1,4 +1,4 @@
-"""What every adapter of an environment needs: an episode step by step, and spaces."""
+"""An episode of an environment step by step, as other libraries take it."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,7 +10,6 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import check_bool, is_concrete
 from .._results import RESULTS
 from .._typing import BoolScalar, PRNGKey, Scalar, State
 from ..disturbances import Zero
@@ -27,7 +26,9 @@ class ByValue:
         self.env = env
         arrays, static = eqx.partition(env, eqx.is_array)
         leaves, treedef = jax.tree.flatten(arrays)
-        values = [(a.shape, str(a.dtype), _bytes(a)) for a in leaves]
+        is_key = lambda a: jnp.issubdtype(a.dtype, jax.dtypes.prng_key)
+        raw = lambda a: np.asarray(jr.key_data(a) if is_key(a) else a)
+        values = [(a.shape, str(a.dtype), raw(a).tobytes()) for a in leaves]
         self.value = (*values, treedef, static)
         self._hash = hash(self.value)
 
@@ -36,12 +37,6 @@ class ByValue:
 
     def __eq__(self, other):
         return isinstance(other, ByValue) and self.value == other.value
-
-
-def _bytes(array):
-    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
-        array = jr.key_data(array)
-    return np.asarray(array).tobytes()
 
 
 class Signals(NamedTuple):
@@ -63,15 +58,6 @@ class EpisodeState(eqx.Module):
     - `time`: steps since it began.
     - `signals`: the disturbances and the noise of the whole episode, drawn when it
         began; none by default.
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax.interop.gymnax import EpisodeState
-
-        EpisodeState(jnp.array([0.5, 0.0]), jnp.asarray(0))
-        ```
     """
 
     state: Array
@@ -145,30 +131,3 @@ def reads_first_argument(function: Callable[..., Any], *args: Any) -> bool:
     """Whether anything is computed of the first of `args`, an array."""
     jaxpr = jax.make_jaxpr(function)(*args).jaxpr
     return any(jaxpr.invars[0] is v for e in jaxpr.eqns for v in e.invars)
-
-
-# Samples are drawn of an action space.
-LARGEST_ACTION = 1e3
-
-
-def has_discrete_actions(env: Environment, discrete: bool | None, where: str) -> bool:
-    """Whether actions are indices into the table of `actions`: by default if there is
-    one."""
-    if discrete is None:
-        return env.actions is not None
-    if check_bool(discrete, "discrete", where) and env.actions is None:
-        raise ValueError(
-            f"{where}: discrete needs a table of actions in the environment, which has "
-            "none."
-        )
-    return bool(discrete)
-
-
-def finite_ends(bounds: Any, size: int, largest: float) -> tuple[Any, Any]:
-    """`(low, high)` of a box, of NumPy where they are known. A side without a bound
-    ends at the largest number."""
-    low, high = (-np.inf, np.inf) if bounds is None else bounds
-    numpy = np if is_concrete(low) and is_concrete(high) else jnp
-    finite = lambda end: numpy.nan_to_num(end, posinf=largest, neginf=-largest)
-    low, high = (numpy.broadcast_to(finite(end), (size,)) for end in (low, high))
-    return low, high
