@@ -201,7 +201,14 @@ def from_control(
     if system.nstates == 0:
         raise ValueError(f"{where}: system must have states, got none.")
     labels = list(system.input_labels)
-    chosen = [_index(d, labels, where) for d in disturbances]
+    for d in disturbances:
+        known = isinstance(d, str | int) and d in (*labels, *range(len(labels)))
+        if not known:
+            raise ValueError(
+                f"{where}: disturbances must be among the inputs {labels}, by name or "
+                f"index, got {d!r}."
+            )
+    chosen = [labels.index(d) if isinstance(d, str) else d for d in disturbances]
     if len(set(chosen)) != len(chosen):
         raise ValueError(
             f"{where}: disturbances must be different inputs, got {disturbances!r}."
@@ -217,17 +224,6 @@ def from_control(
         float(system.dt),
         state_names=tuple(system.state_labels),
         control_names=tuple(labels[i] for i in rest),
-    )
-
-
-def _index(disturbance: Any, labels: list[str], where: str) -> int:
-    if isinstance(disturbance, str) and disturbance in labels:
-        return labels.index(disturbance)
-    if isinstance(disturbance, int) and disturbance in range(len(labels)):
-        return disturbance
-    raise ValueError(
-        f"{where}: disturbances must be among the inputs {labels}, by name or index, "
-        f"got {disturbance!r}."
     )
 
 

@@ -13,7 +13,7 @@ from ._gradient_estimators import (
     EvolutionStrategies as EvolutionStrategies,
     LikelihoodRatio as LikelihoodRatio,
 )
-from ._loss import AbstractSurrogate as AbstractSurrogate
 from ._ppo import PPO as PPO
 from ._record import History as History
 from ._shac import SHAC as SHAC
+from ._steps import AbstractSurrogate as AbstractSurrogate

@@ -24,7 +24,7 @@ from ..controllers import Categorical, MLP, mlp_policy, Standardise
 from ..environments import Environment
 from ..simulation import rollout
 from ._costs import nan_if_failed
-from ._loss import AbstractSurrogate
+from ._steps import AbstractSurrogate
 
 
 class ActorCritic(eqx.Module):
@@ -268,18 +268,9 @@ class AbstractActorCriticLoss(AbstractSurrogate):
 
         zero = jnp.zeros((), errors.dtype)
         _, advantages = lax.scan(backward, zero, (errors, continues), reverse=True)
-        return Episodes(
-            times=run.times[:-1],
-            observations=run.observations,
-            controls=run.controls,
-            costs=costs,
-            valid=valid,
-            continues=continues,
-            following=following,
-            advantages=advantages,
-            targets=advantages + values,
-            total_cost=run.total_cost,
-        )
+        record = run.times[:-1], run.observations, run.controls, costs
+        record = *record, valid, continues, following
+        return Episodes(*record, advantages, run.total_cost, advantages + values)
 
 
 class Moments(NamedTuple):

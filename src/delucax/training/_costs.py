@@ -114,15 +114,15 @@ def expected_cost(
     where = "expected_cost"
     check_instance(environment, Environment, "environment", where)
     check_choice(checkpoint, ("step", "sqrt", None), "checkpoint", where)
-    decay = as_float_array(as_number(gradient_decay, "gradient_decay", where))
-    # A decay of 1 is known to leave the gradient alone, and compiles nothing.
+    decay = as_number(gradient_decay, "gradient_decay", where)
+    # A number 1 is known to leave the gradient alone, and compiles nothing.
     is_one = isinstance(gradient_decay, int | float) and gradient_decay == 1
+    decay = 1.0 if is_one else as_float_array(decay)
     horizon = environment.horizon if horizon is None else horizon
     batch = check_count(batch, "batch", where)
     horizon = check_count(horizon, "horizon", where)
     if truncate is not None:
         truncate = check_count(truncate, "truncate", where)
-    decay = 1.0 if is_one else decay
     return _ExpectedCost(environment, decay, batch, horizon, checkpoint, truncate)
 
 

@@ -18,9 +18,8 @@ from .._check import check_at_most, check_count, check_key, is_concrete
 from .._results import choose, Result, RESULTS
 from .._typing import PRNGKey
 from ._gradient_estimators import analytic
-from ._loss import AbstractSurrogate
 from ._record import Checkpoint, checkpoint_path, COLUMNS, describe_run, History
-from ._steps import CAPACITY, FAULTS, State, Steps
+from ._steps import AbstractSurrogate, CAPACITY, FAULTS, State, Steps
 from ._trainable import partition_trainable
 
 

@@ -1,7 +1,7 @@
 """Proximal policy optimisation."""
 
 from dataclasses import KW_ONLY
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,12 +17,7 @@ from .._check import (
     check_positive,
     check_range,
 )
-from .._controller import (
-    AbstractStochasticPolicy,
-    check_stochastic,
-    initial_state,
-    replay,
-)
+from .._controller import check_stochastic, initial_state, replay
 from .._module import parameter
 from .._typing import PRNGKey, RealScalar
 from ..controllers import Gaussian
@@ -128,7 +123,7 @@ class PPO(AbstractActorCriticLoss):
 
     def init(self, model: ActorCritic, key: PRNGKey) -> _Memory:
         check_instance(model, ActorCritic, "model", "PPO")
-        policy = _policy_of(model)
+        policy = check_stochastic(model.policy, "policy", "PPO")
         unbounded = isinstance(policy, Gaussian) and policy.bounds is None
         if unbounded and self.environment.control_bounds is not None:
             raise ValueError(
@@ -175,7 +170,7 @@ class PPO(AbstractActorCriticLoss):
         start = memory.part % self.minibatches * size
         chosen = lax.dynamic_slice(memory.order, (start,), (size,))
         rows = jax.tree.map(lambda leaf: leaf[chosen], memory.rows)
-        log_prob, entropy = _scores(model, rows)
+        log_prob, entropy = _scores(model.policy, rows)
         weights = rows.valid / jnp.maximum(jnp.sum(rows.valid), 1)
         mean = lambda values: jnp.sum(jnp.where(rows.valid, values, 0) * weights)
         change = jnp.where(rows.valid, log_prob - rows.log_prob, 0)
@@ -201,7 +196,8 @@ class PPO(AbstractActorCriticLoss):
     def _rows(self, model: ActorCritic, key: PRNGKey) -> tuple[Episodes, Array]:
         """The rows of a fresh batch, and its mean cost."""
         runs = self._episodes(model, key)
-        log_prob, _ = _scores(model, runs)
+        policy: Any = model.policy
+        log_prob, _ = _scores(policy, runs)
         count = jnp.maximum(jnp.sum(runs.valid), 1)
         mean = jnp.sum(jnp.where(runs.valid, runs.advantages, 0)) / count
         squares = jnp.where(runs.valid, (runs.advantages - mean) ** 2, 0)
@@ -213,22 +209,16 @@ class PPO(AbstractActorCriticLoss):
             following=None,
             total_cost=None,
         )
-        if not _policy_of(model).has_memory:
+        if not policy.has_memory:
             rows = jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[2:]), rows)
         return jax.tree.map(lax.stop_gradient, rows), jnp.mean(runs.total_cost)
 
 
-def _policy_of(model: ActorCritic) -> AbstractStochasticPolicy:
-    """The policy of a model, which must know the probability of what it draws."""
-    return check_stochastic(model.policy, "policy", "PPO")
-
-
-def _scores(model: ActorCritic, rows: Episodes) -> tuple[Array, Array]:
+def _scores(policy: Any, rows: Episodes) -> tuple[Array, Array]:
     """The log-probability and the entropy at each step of rows.
 
     With a memory, a row is an episode from its beginning.
     """
-    policy = _policy_of(model)
 
     def score(t, y, state, u):
         log_prob, entropy = policy.log_prob(t, y, state, u), policy.entropy(t, y, state)

@@ -1,5 +1,6 @@
-"""The steps of [`delucax.training.fit`][], compiled in blocks."""
+"""Steps of [`delucax.training.fit`][] in compiled blocks; losses with a memory."""
 
+import abc
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ import optax
 from jaxtyping import Array, Int, PyTree
 
 from .._typing import PRNGKey
-from ._loss import AbstractSurrogate, cost_and_metrics
+from ._gradient_estimators import cost_and_metrics
 from ._record import COLUMNS
 from ._trainable import Assembly, strong
 
@@ -41,6 +42,88 @@ class State(NamedTuple):
     order: tuple[Array, Array] | None
     """The rows of the data in the order of a pass, and the number of the pass."""
     fault: Int[Array, "*seeds"]
+
+
+class AbstractSurrogate(eqx.Module):
+    """A loss that is made of what happens on the way: it has a memory.
+
+    [`delucax.training.fit`][] makes the calls: `init` once; then at each step `update`,
+    which may run the model, and the loss `surrogate(model, memory, key)` of what is
+    remembered, whose gradient any estimator takes; in the end `finished`. All are pure,
+    so that the whole runs in the one loop, is `vmap`ped over seeds, and goes on from a
+    checkpoint. [`delucax.training.PPO`][] and [`delucax.training.SHAC`][] are two.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+        import optax
+
+        class Steadied(dlx.training.AbstractSurrogate):
+            "Descend to 1, but never far from a running mean."
+
+            def init(self, model, key):
+                return model.K
+
+            def update(self, model, memory, step, key):
+                return 0.9 * memory + 0.1 * model.K
+
+            def __call__(self, model, memory, key):
+                return jnp.sum((model.K - 1) ** 2 + (model.K - memory) ** 2)
+
+        controller = dlx.controllers.Linear(jnp.zeros((1, 2)))
+        key = jax.random.key(0)
+        fitted = dlx.training.fit(Steadied(), controller, optax.adam(0.1), 10, key=key)
+        ```
+    """
+
+    @abc.abstractmethod
+    def init(self, model: PyTree, key: PRNGKey) -> PyTree:
+        """The memory before the first step.
+
+        **Arguments:** `model`: the model. `key`: a random key.
+
+        **Returns:** a pytree of arrays.
+        """
+
+    @abc.abstractmethod
+    def update(self, model: PyTree, memory: PyTree, step: Any, key: PRNGKey) -> PyTree:
+        """The memory for a step; no gradient is taken through it.
+
+        **Arguments:**
+
+        - `model`: the model before the step.
+        - `memory`: that of the step before.
+        - `step`: the number of the step, from 0.
+        - `key`: a random key.
+
+        **Returns:** a pytree of the same structure, shapes and dtypes.
+        """
+
+    @abc.abstractmethod
+    def __call__(self, model: PyTree, memory: PyTree, key: PRNGKey) -> Any:
+        """The loss.
+
+        **Arguments:**
+
+        - `model`: the model.
+        - `memory`: that of the step.
+        - `key`: a random key.
+
+        **Returns:** a scalar, or a scalar and a dictionary of scalar metrics.
+        """
+
+    def finished(self, model: PyTree, memory: PyTree) -> PyTree:
+        """The model with what was learned beside its weights; as it is by default.
+
+        **Arguments:** `model`: the model. `memory`: that of the last step.
+
+        **Returns:** the model.
+        """
+        del memory
+        return model
 
 
 class Steps(NamedTuple):

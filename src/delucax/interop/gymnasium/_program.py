@@ -11,6 +11,7 @@ import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -18,6 +19,9 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from jaxtyping import Array
 
+from ..._check import check_finite, check_real
+from ..._message import shortened
+from ..._module import as_float_array
 from ..._typing import PRNGKey, State
 from ...environments import Environment
 from .. import _episode as episodes
@@ -37,6 +41,24 @@ def read_options(options: Any, names: tuple[str, ...], where: str) -> list[Any]:
             f"{', '.join(map(repr, options))}."
         )
     return values
+
+
+def as_start(
+    state: Any, env: Environment, where: str, count: int | None = None
+) -> jax.Array | None:
+    """The state to begin at, or of each of `count`, if one is given, or an error."""
+    if state is None:
+        return None
+    shape = (env.state_size,)
+    each = shape if count is None else (count, *shape)
+    state = as_float_array(state)
+    if not eqx.is_inexact_array(state) or state.shape not in (shape, each):
+        shapes = shape if count is None else f"{shape}, or {each} for one each"
+        got = f"shape {state.shape}" if eqx.is_array(state) else shortened(state)
+        raise ValueError(f"{where}: state must have shape {shapes}, got {got}.")
+    check_real(state, "state", where)
+    check_finite(state, "state", where)
+    return jnp.broadcast_to(state.astype(float), each)
 
 
 def spaces(env: Environment, discrete: bool) -> tuple[Box | Discrete, Box]:

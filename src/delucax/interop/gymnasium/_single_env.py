@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from gymnasium.error import InvalidAction, ResetNeeded
 
-from ..._check import as_vector, check_bool, check_finite, check_instance
+from ..._check import check_bool, check_choice, check_instance
 from ..._message import shortened
 from ...environments import Environment
 from .._episode import has_signals
@@ -70,11 +70,7 @@ class GymnasiumEnv(gymnasium.Env):
     ):
         where = "GymnasiumEnv"
         check_instance(env, Environment, "env", where)
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ValueError(
-                f"{where}: render_mode must be one of {RENDER_MODES} or None, got "
-                f"{render_mode!r}."
-            )
+        check_choice(render_mode, (*RENDER_MODES, None), "render_mode", where)
         if not check_bool(truncate, "truncate", where) and has_signals(env):
             raise ValueError(
                 f"{where}: truncate must be True where there are disturbances or "
@@ -116,10 +112,7 @@ class GymnasiumEnv(gymnasium.Env):
         super().reset(seed=seed)
         where = "GymnasiumEnv"
         (state,) = programs.read_options(options, ("state",), where)
-        if state is not None:
-            state = as_vector(state, self.environment.state_size, "state", where)
-            check_finite(state, "state", where)
-            state = state.astype(float)
+        state = programs.as_start(state, self.environment, where)
         packed, signals = self._program.start(programs.draw_key(self.np_random), state)
         packed = np.asarray(packed)
         if self._buffer is None or self._buffer.dtype != packed.dtype:

@@ -4,7 +4,6 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,9 +13,8 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ..._check import check_count, check_finite, check_instance, check_real
+from ..._check import check_count, check_instance
 from ..._message import shortened
-from ..._module import as_float_array
 from ..._typing import PRNGKey
 from ...environments import Environment
 from .._spaces import has_discrete_actions
@@ -120,7 +118,7 @@ class GymnasiumVectorEnv(VectorEnv):
         """
         where = "GymnasiumVectorEnv"
         state, mask = programs.read_options(options, ("state", "reset_mask"), where)
-        state = self._as_states(state)
+        state = programs.as_start(state, self.environment, where, self.num_envs)
         keys = self._start_keys(seed)
         packed, signals = self._program.start_batch(keys, state)
         if mask is not None:
@@ -137,23 +135,6 @@ class GymnasiumVectorEnv(VectorEnv):
             packed, signals = jax.tree.map(select, (packed, signals), current)
         self._packed, self._signals = packed, signals
         return self._observations(np.asarray(packed)), {}
-
-    def _as_states(self, state: Any) -> jax.Array | None:
-        """A state for each, if any is given."""
-        if state is None:
-            return None
-        where, shape = "GymnasiumVectorEnv", (self.environment.state_size,)
-        each = (self.num_envs, *shape)
-        state = as_float_array(state)
-        if not eqx.is_inexact_array(state) or state.shape not in (shape, each):
-            got = f"shape {state.shape}" if eqx.is_array(state) else shortened(state)
-            raise ValueError(
-                f"{where}: state must have shape {shape}, or {each} for one each, got "
-                f"{got}."
-            )
-        check_real(state, "state", where)
-        check_finite(state, "state", where)
-        return jnp.broadcast_to(state.astype(float), each)
 
     def _start_keys(self, seed: Any) -> PRNGKey:
         """A key for the start of each, and `_key` for what starts later."""

@@ -18,16 +18,7 @@ from jaxtyping import Array
 from ..._check import check_keywords, check_step
 from ..._module import as_float_array, parameter
 from ..._results import Result, RESULTS
-from ..._typing import (
-    BoolScalar,
-    Control,
-    Disturbance,
-    PRNGKey,
-    RealScalar,
-    Scalar,
-    State,
-    Vector,
-)
+from ..._typing import Control, Disturbance, PRNGKey, RealScalar, Scalar, State
 from ...costs import AbstractCost
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
@@ -50,23 +41,21 @@ class _Layout:
         """The shape of array `i` in the vector."""
         return self.shapes[i] + (2,) * (self.dtypes[i] == jnp.uint32)
 
-    def ravel(self, arrays: Sequence[Any]) -> Vector:
+    def ravel(self, arrays: Sequence[Any]) -> State:
         """The vector of some arrays."""
-        parts = [
-            lax.bitcast_convert_type(jnp.asarray(array, dtype), jnp.uint16)
-            if dtype == jnp.uint32
-            else array
-            for array, dtype in zip(arrays, self.dtypes, strict=True)
-        ]
-        return jnp.concatenate([jnp.ravel(part).astype(self.dtype) for part in parts])
+        parts = []
+        for array, dtype in zip(arrays, self.dtypes, strict=True):
+            if dtype == jnp.uint32:
+                array = lax.bitcast_convert_type(jnp.asarray(array, dtype), jnp.uint16)
+            parts.append(jnp.ravel(array).astype(self.dtype))
+        return jnp.concatenate(parts)
 
-    def unravel(self, x: Vector) -> list[Array]:
+    def unravel(self, x: State) -> list[Array]:
         """The arrays in a vector."""
         shapes = [self.stored_shape(i) for i in range(len(self.shapes))]
-        ends = np.cumsum([math.prod(shape) for shape in shapes])
+        parts = jnp.split(x, np.cumsum([math.prod(shape) for shape in shapes])[:-1])
         arrays = []
-        parts = zip(jnp.split(x, ends[:-1]), shapes, self.dtypes, strict=True)
-        for part, shape, dtype in parts:
+        for part, shape, dtype in zip(parts, shapes, self.dtypes, strict=True):
             part = part.reshape(shape)
             if dtype == jnp.uint32:
                 halves = jnp.round(part).astype(jnp.uint16)
@@ -175,7 +164,7 @@ class GymnaxDynamics(AbstractDynamics):
             for index in np.ndindex(self.layout.stored_shape(i))
         )
 
-    def ravel(self, state: Any, key: PRNGKey | None = None) -> Vector:
+    def ravel(self, state: Any, key: PRNGKey | None = None) -> State:
         """The vector of a state, such as `x0` of `delucax.rollout`.
 
         **Arguments:**
@@ -189,7 +178,7 @@ class GymnaxDynamics(AbstractDynamics):
         words = jr.bits(jr.key(0) if key is None else key, (2,), jnp.uint32)
         return self._ravel(state, words, False)
 
-    def _ravel(self, state: Any, words: Any, done: Any) -> Vector:
+    def _ravel(self, state: Any, words: Any, done: Any) -> State:
         leaves, structure = jax.tree.flatten(state)
         shapes = tuple(jnp.shape(leaf) for leaf in leaves)
         expected = self.layout.shapes[: self.structure.num_leaves]
@@ -259,7 +248,7 @@ class _Observation(eqx.Module):
 
     dynamics: GymnaxDynamics
 
-    def __call__(self, x: State) -> Vector:
+    def __call__(self, x: State) -> Array:
         env, state = self.dynamics.env, self.dynamics.unravel(x)
         known = dict(key=jr.key(0), state=state, action=None)
         known["params"] = self.dynamics.params
@@ -274,7 +263,7 @@ def _observer(env: Any) -> Callable | None:
     return getattr(env, "observe", None) or getattr(env, "get_obs", None)
 
 
-def _is_done(t: RealScalar, x: State) -> BoolScalar:
+def _is_done(t: RealScalar, x: State) -> Array:
     return x[-1] > 0.5
 
 

@@ -2,7 +2,7 @@
 
 import functools
 import sys
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -57,6 +57,10 @@ class GymnaxParams(eqx.Module):
     def max_steps_in_episode(self) -> int:
         """The horizon."""
         return self.environment.horizon
+
+
+Params: TypeAlias = GymnaxParams | None
+"""`default_params` by default."""
 
 
 class GymnaxEnv:
@@ -140,9 +144,7 @@ class GymnaxEnv:
         return len(env.actions) if self.discrete else env.control_size
 
     @functools.partial(jax.jit, static_argnames=("self",))
-    def reset(
-        self, key: PRNGKey, params: GymnaxParams | None = None
-    ) -> tuple[Array, EpisodeState]:
+    def reset(self, key: PRNGKey, params: Params = None) -> tuple[Array, EpisodeState]:
         """Begin an episode, the one of `delucax.rollout` with the same key.
 
         **Arguments:**
@@ -157,11 +159,7 @@ class GymnaxEnv:
         return self.reset_env(key, params)
 
     def step(
-        self,
-        key: PRNGKey,
-        state: EpisodeState,
-        action: Any,
-        params: GymnaxParams | None = None,
+        self, key: PRNGKey, state: EpisodeState, action: Any, params: Params = None
     ) -> tuple[Any, ...]:
         """One step; at the end of the episode, the first state of the next.
 
@@ -197,7 +195,7 @@ class GymnaxEnv:
         return observation, after, reward, *ends, info
 
     def reset_env(
-        self, key: PRNGKey, params: GymnaxParams | None = None
+        self, key: PRNGKey, params: Params = None
     ) -> tuple[Array, EpisodeState]:
         """`reset`, not compiled.
 
@@ -210,11 +208,7 @@ class GymnaxEnv:
         return self.get_obs(state, params), state
 
     def step_env(
-        self,
-        key: PRNGKey,
-        state: EpisodeState,
-        action: Any,
-        params: GymnaxParams | None = None,
+        self, key: PRNGKey, state: EpisodeState, action: Any, params: Params = None
     ) -> tuple[Any, ...]:
         """One step, without a reset and not compiled.
 
@@ -241,7 +235,7 @@ class GymnaxEnv:
         return episodes.observe(env, after), after, outcome.reward, done, info
 
     def get_obs(
-        self, state: EpisodeState, params: GymnaxParams | None = None, key: Any = None
+        self, state: EpisodeState, params: Params = None, key: Any = None
     ) -> Array:
         """What is observed of a state.
 
@@ -252,9 +246,7 @@ class GymnaxEnv:
         del key
         return episodes.observe(self._environment(params), state)
 
-    def is_terminal(
-        self, state: EpisodeState, params: GymnaxParams | None = None
-    ) -> Array:
+    def is_terminal(self, state: EpisodeState, params: Params = None) -> Array:
         """Whether the episode ends at a state, by itself or at the horizon.
 
         **Arguments:** `state`, `params`: of `step`.
@@ -267,7 +259,7 @@ class GymnaxEnv:
             return truncated
         return env.terminated(episodes.time_of(env, state), state.state) | truncated
 
-    def action_space(self, params: GymnaxParams | None = None) -> Any:
+    def action_space(self, params: Params = None) -> Any:
         """The actions.
 
         **Arguments:** `params`: `default_params` by default.
@@ -278,7 +270,7 @@ class GymnaxEnv:
         ends = action_ends(self._environment(params))
         return gymnax_space(self.num_actions if self.discrete else ends)
 
-    def observation_space(self, params: GymnaxParams | None = None) -> Any:
+    def observation_space(self, params: Params = None) -> Any:
         """The observations.
 
         **Arguments:** `params`: `default_params` by default.
@@ -287,7 +279,7 @@ class GymnaxEnv:
         """
         return gymnax_space(observation_ends(self._environment(params)))
 
-    def _environment(self, params: GymnaxParams | None) -> Environment:
+    def _environment(self, params: Params) -> Environment:
         if params is None:
             return self._made.env
         hint = ", such as default_params"
