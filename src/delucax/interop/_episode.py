@@ -1,4 +1,4 @@
-"""An episode of an environment step by step, as other libraries take it."""
+"""Reset and step of an environment, shared by the adapters to other libraries."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,9 +17,9 @@ from ..environments import Environment
 
 
 class ByValue:
-    """An environment that equals another if all of their numbers do.
+    """A hashable environment, equal to another if all of their numbers are.
 
-    A function that was compiled with the numbers as constants is looked up by it.
+    It is the key of a cache of functions that have the numbers as constants.
     """
 
     def __init__(self, env: Environment):
@@ -50,7 +50,7 @@ NO_SIGNALS = Signals()
 
 
 class EpisodeState(eqx.Module):
-    """Where an episode is.
+    """The state of an episode: of the plant, the step count and the drawn signals.
 
     **Arguments:**
 
@@ -66,7 +66,7 @@ class EpisodeState(eqx.Module):
 
 
 class Outcome(NamedTuple):
-    """What a step says of itself."""
+    """The reward and the flags of one step."""
 
     reward: Scalar
     terminated: BoolScalar
@@ -103,7 +103,7 @@ def time_of(env: Environment, episode: EpisodeState) -> Scalar:
 
 
 def observe(env: Environment, episode: EpisodeState) -> Float[Array, " features"]:
-    """What a network is given."""
+    """The encoded observation, with sensor noise."""
     x, noise = episode.state, episode.signals.noise
     y = env.dynamics.observe(time_of(env, episode), x)
     return env.encode(y if noise is None else (y + noise[episode.time]).astype(x.dtype))
@@ -112,8 +112,7 @@ def observe(env: Environment, episode: EpisodeState) -> Float[Array, " features"
 def step(
     env: Environment, episode: EpisodeState, action: Array, truncate: bool = True
 ) -> tuple[EpisodeState, Outcome]:
-    """One step; the final cost is charged with the last, which is at the horizon if
-    episodes are to be truncated there."""
+    """One step. The last one, at the horizon if `truncate`, adds the final cost."""
     x, w = episode.state, episode.signals.disturbances
     w = None if w is None else w[episode.time]
     transition = env.step(time_of(env, episode), x, action, w)

@@ -27,8 +27,8 @@ def has_discrete_actions(env: Environment, discrete: bool | None, where: str) ->
 
 
 def action_ends(env: Environment) -> tuple[Any, Any]:
-    """`(low, high)` of the controls. Samples are drawn between them, so that a side
-    without a bound ends at 1000."""
+    """`(low, high)` of the controls. An infinite side ends at 1000, because samples are
+    drawn from the space."""
     return _finite_ends(env.control_bounds, env.control_size, 1e3)
 
 
@@ -41,7 +41,7 @@ def observation_ends(env: Environment, largest: float = LARGEST) -> tuple[Any, A
 
 
 def _finite_ends(bounds: Any, size: int, largest: float) -> tuple[Any, Any]:
-    """Of NumPy where they are known."""
+    """Finite bounds of shape `(size,)`, NumPy arrays unless they are traced."""
     low, high = (-np.inf, np.inf) if bounds is None else bounds
     numpy = np if is_concrete(low) and is_concrete(high) else jnp
     finite = lambda end: numpy.nan_to_num(end, posinf=largest, neginf=-largest)
@@ -87,14 +87,15 @@ class Discrete:
 
 
 def gymnax_space(space: int | tuple[Any, Any]) -> Any:
-    """The whole numbers below one, or the vectors between two ends.
+    """A `Discrete` of that size, or a `Box` between two ends.
 
-    It is gymnax's own where gymnax is in use, for its clients ask for the class.
+    If gymnax has been imported, these are its own classes, because its clients call
+    `isinstance`.
     """
     classes: Any = sys.modules.get("gymnax.environments.spaces", sys.modules[__name__])
     if isinstance(space, int):
         return classes.Discrete(space)
-    # Networks want what has a hash: a float if all entries are one.
+    # A float if all entries are equal, so that the space is hashable; rejax needs that.
     is_number = lambda end: is_concrete(end) and np.all(end == end[0])
     low, high = (float(e[0]) if is_number(e) else jnp.asarray(e) for e in space)
     return classes.Box(low, high, space[0].shape, jnp.zeros(()).dtype)

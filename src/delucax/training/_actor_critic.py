@@ -109,8 +109,8 @@ def actor_critic(
 
     Both are given `environment.encode(y)`, standardised by what training sees. The last
     layers begin a hundred times smaller than usual: that of the policy near the middle
-    of the bounds, and that of the critic flat, because the slope of an
-    estimate that has learned nothing would lead a policy that follows it astray.
+    of the bounds, and that of the critic flat, because the gradient of an untrained
+    critic is misleading.
 
     **Arguments:**
 
@@ -178,15 +178,15 @@ class Episodes(NamedTuple):
     controls: Float[Array, "*batch steps m"]
     costs: Float[Array, "*batch steps"]
     valid: Bool[Array, "*batch steps"]
-    """Whether each step was before the end of its episode."""
+    """True for the steps before the end of the episode."""
     continues: Any
-    """Whether something follows each step."""
+    """False for the last step of an episode."""
     following: Any
     """The cost to go after each step: V there, or the final cost of its episode."""
     advantages: Float[Array, "*batch steps"]
     total_cost: Any
     targets: Float[Array, "*batch steps"]
-    """What V should be at each observation."""
+    """The regression targets of V."""
     log_prob: Any = None
 
 
@@ -231,7 +231,7 @@ class AbstractActorCriticLoss(AbstractSurrogate):
     def _value_errors(
         self, model: ActorCritic, runs: Episodes
     ) -> Float[Array, "*batch steps"]:
-        """How far the critic's output is from what it should be, in its own scale."""
+        """The errors of the critic's raw output."""
         raw = jax.vmap(jax.vmap(model.raw))(runs.times, runs.observations)
         return raw - (runs.targets - model.shift) / model.scale
 
@@ -282,12 +282,12 @@ class Moments(NamedTuple):
 
     @staticmethod
     def empty(like: Array) -> "Moments":
-        """Of no vectors yet."""
+        """The moments of no vectors."""
         zero = jnp.zeros_like(like)
         return Moments(jnp.zeros((), like.dtype), zero, zero)
 
     def joined(self, values: Array, valid: Array) -> "Moments":
-        """With more rows, of which some count."""
+        """The moments with more rows, those that are `valid`."""
         known = valid.reshape(-1, *(1,) * (values.ndim - 1))
         n = jnp.sum(valid).astype(self.count.dtype)
         mean = jnp.sum(jnp.where(known, values, 0), 0) / jnp.maximum(n, 1)
@@ -318,12 +318,12 @@ class Statistics(NamedTuple):
 
     @staticmethod
     def empty(model: ActorCritic, dtype: Any) -> "Statistics":
-        """Of no observations yet."""
+        """The statistics of no observations."""
         features = [Moments.empty(one.mean) for one in parts_of(model, Standardise)]
         return Statistics(features, Moments.empty(jnp.zeros((), dtype)))
 
     def updated(self, model: ActorCritic, runs: Episodes) -> "Statistics":
-        """With the valid ones of more observations and targets."""
+        """The statistics with the valid observations and targets of more episodes."""
         rows = runs.observations.reshape(-1, runs.observations.shape[-1])
         valid, targets = runs.valid.reshape(-1), runs.targets.reshape(-1)
         parts = zip(parts_of(model, Standardise), self.features, strict=True)

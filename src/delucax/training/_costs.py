@@ -1,4 +1,4 @@
-"""The cost of closed loops: expected and scored, to train on, and at worst."""
+"""Losses from rollouts: expected cost, score-function cost, worst case."""
 
 from typing import Any, NamedTuple
 
@@ -78,7 +78,7 @@ def expected_cost(
 
     - `environment`: the environment.
     - `batch`: the number B of rollouts, all at once under `jax.vmap`.
-    - `horizon`: steps a rollout; the environment's own by default.
+    - `horizon`: steps per rollout; the environment's own by default.
     - `checkpoint`: what the gradient stores, as in [`delucax.rollout`][]; `"step"` by
         default.
     - `gradient_decay`: damping of the gradient through time, as in
@@ -144,7 +144,6 @@ class _ScoredCost(eqx.Module):
         # its memory may depend on the weights, and keeps its gradient; the
         # observations, the controls and the costs do not.
         def act(t, y, state, applied, valid):
-            del applied
             u, after = controller(t, y, state)
             log_prob = controller.log_prob(t, y, state, lax.stop_gradient(u))
             return jnp.where(valid, log_prob, 0), after
@@ -235,7 +234,7 @@ def worst_case(
     iterations: int = 20,
     starts: int = 8,
 ) -> _Attack:
-    r"""Bounded disturbances that cost a controller as much as a local search can find,
+    r"""Worst-case bounded disturbances of a closed loop, by local search,
 
     `max over w of the total cost, with |w_t| <= bound for each t`.
 
@@ -249,8 +248,8 @@ def worst_case(
     **Arguments:**
 
     - `environment`: the environment; its own disturbance is not used.
-    - `controller`: the controller under attack. A learner is attacked with all that it
-        would learn.
+    - `controller`: the controller under attack. The attack accounts for the adaptation
+        of a learner.
     - `key`: a random key, for the start of the search, of the rollout and of the
         controller.
     - `bound`: of the Euclidean norm of each `w_t`, a positive number.

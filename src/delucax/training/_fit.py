@@ -33,7 +33,7 @@ _WHERE = "fit"
 
 
 class Fitted(eqx.Module):
-    """What training leaves behind.
+    """The result of `fit`.
 
     **Attributes:**
 
@@ -87,9 +87,9 @@ def fit(
     """Train a model: one loop for policies, identification and learned simulators.
 
     At step k, with `key_k = fold_in(key, k)`: take the loss and its gradient with
-    respect to the trainable values, update them with the optimiser. What has a
-    constraint is moved in its unconstrained value, `z = unconstrain(value)`, and the
-    model sees `constrain(z)`, so that no step leaves the legal set.
+    respect to the trainable values, update them with the optimiser. Constrained values
+    are optimised in the unconstrained space, `z = unconstrain(value)`, and the model
+    gets `constrain(z)`, so that no step leaves the valid set.
 
     The steps run in compiled blocks, as one loop on the device. The result does not
     depend on the size of the block, and a run that was cut off and resumed from its
@@ -131,14 +131,14 @@ def fit(
     - `progress`: whether to show a bar with the loss; true by default.
     - `callbacks`: functions `(step, metrics)` called after each block, with the number
         of steps done and a dictionary of the last step's numbers (their mean over a
-        batch); none by default. The way to TensorBoard and the like.
+        batch), for example to log them to TensorBoard; none by default.
     - `checkpoint`: the path of a file to write the run to; none by default. If it is
         there, the run goes on from it.
     - `checkpoint_every`: steps between checkpoints, rounded up to whole blocks; 10
         blocks by default. The end of the run is always written.
     - `throw`: raise if the loss, its gradient or an update is NaN or infinite
-        (default); if false, stop there and look at `fitted.result`. One of a batch
-        stays as it was, while the others go on.
+        (default); if false, stop there and set `fitted.result`. In a batch only the
+        seed that failed is frozen.
 
     **Returns:** a [`delucax.training.Fitted`][]; of a batch, every array of the model,
     every column of the history but `step` and `seconds`, and the result have its axis.
@@ -265,7 +265,7 @@ def fit(
 
 
 def _failure(faults: np.ndarray, rows: dict[str, np.ndarray], done: int) -> str:
-    """What failed, in words."""
+    """The message of a failure."""
     remedy = "Pass throw=False to get the model as it was before that step."
     if faults.ndim:
         seed = int(np.argmax(faults > 0))

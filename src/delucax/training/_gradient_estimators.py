@@ -69,7 +69,7 @@ def analytic(
 def gradient_of_weights(
     loss: Callable[[PyTree], tuple[Array, Any]], model: PyTree
 ) -> tuple[Any, PyTree]:
-    """What `loss(model)` returns beside its scalar, and the gradient of that."""
+    """The auxiliary value of `loss(model)`, and the gradient of its scalar."""
     weights, rest = weights_of(model)
     of = lambda weights: loss(eqx.combine(weights, rest))
     (_, value), gradient = eqx.filter_value_and_grad(of, has_aux=True)(weights)

@@ -50,8 +50,8 @@ class PPO(AbstractActorCriticLoss):
     [`delucax.training.ActorCritic`][] whose policy draws, and the trained controller is
     `fitted.model.policy` (or `.policy.base`, without the noise).
 
-    An episode that its horizon cuts off is no end: the estimated cost to go stands for
-    what would follow. On termination nothing follows but the final cost. Each
+    Truncation at the horizon is not termination: the critic's estimate replaces the
+    cost of what would follow. On termination nothing follows but the final cost. Each
     [`delucax.controllers.Standardise`][] of the model, and the scale of the critic, are
     set by the batches before, so that the ratio begins at 1; one batch is
     run before the first step for them. A policy with a memory is trained on whole
@@ -66,7 +66,7 @@ class PPO(AbstractActorCriticLoss):
 
     - `environment`: the environment.
     - `batch`: episodes in a batch.
-    - `horizon`: steps an episode; the environment's own by default.
+    - `horizon`: steps per episode; the environment's own by default.
     - `discount`: of the cost to go, 0.99 by default.
     - `decay`: lambda of the advantage estimate, 0.95 by default.
     - `clip`: 0.2 by default.
@@ -74,8 +74,8 @@ class PPO(AbstractActorCriticLoss):
     - `minibatches`: in one pass, 8 by default; what does not fill the last is left out.
     - `value_weight`: 0.5 by default.
     - `entropy_weight`: 0 by default.
-    - `bootstrap`: whether the horizon is a cut (default); if false it is the end, and
-        the final cost is charged there.
+    - `bootstrap`: whether the horizon truncates (default); if false it terminates the
+        episode, with the final cost.
 
     **Raises:** `ValueError` on an argument of the wrong kind or range; when it is
     trained, if the model is not an `ActorCritic`, its policy does not draw, or a
@@ -164,7 +164,6 @@ class PPO(AbstractActorCriticLoss):
     def __call__(
         self, model: ActorCritic, memory: _Memory, key: PRNGKey
     ) -> tuple[Array, dict[str, Array]]:
-        del key
         model = memory.statistics.applied_to(model)
         size = memory.order.shape[0] // self.minibatches
         start = memory.part % self.minibatches * size

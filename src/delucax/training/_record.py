@@ -24,7 +24,7 @@ _FORMAT = "delucax.training.fit 2"
 
 
 class History(eqx.Module):
-    """What was measured at each step, in NumPy arrays of one entry a step.
+    """The measurements of a training run, NumPy arrays with an entry per step.
 
     **Attributes:**
 
@@ -89,7 +89,7 @@ class History(eqx.Module):
 
 
 class Checkpoint(NamedTuple):
-    """Where a run is saved, and the description that distinguishes it from others."""
+    """The file of a run, and the description that identifies the run."""
 
     path: Path
     run: dict[str, Any]
@@ -138,7 +138,7 @@ class Checkpoint(NamedTuple):
     def check_replay(
         self, saved: dict[str, np.ndarray], rows: dict[str, np.ndarray]
     ) -> None:
-        """Raise unless `rows`, the first steps taken again, are those that were saved.
+        """Raise unless `rows`, the first steps taken again, match those saved.
 
         A loss, a learning rate and the contents of data have no name to compare, but
         another one shows in the first steps.
@@ -192,7 +192,7 @@ def describe_run(
     memory: PyTree,
     **options: Any,
 ) -> dict[str, Any]:
-    """What distinguishes a run from another, by its name in an error message.
+    """The description that identifies a run, by the names used in error messages.
 
     The arrays that the run starts from are compared by their fingerprints.
     """

@@ -46,23 +46,23 @@ class SHAC(AbstractActorCriticLoss):
     `total_cost` and `value_loss`.
 
     Horizon, termination and `bootstrap` are as in [`delucax.training.PPO`][]. The
-    windows are those of whole episodes of the present policy, rather than one window a
-    step of episodes that an older one began: its clock, its disturbances and its memory
-    are those of the environment.
+    windows are those of whole episodes of the present policy, and not one window per
+    step of episodes that an older policy began, so that time, disturbances and the
+    memory of the policy are consistent within an episode.
 
     **Arguments:**
 
     - `environment`: the environment.
     - `batch`: episodes in a batch.
-    - `horizon`: steps an episode; the environment's own by default.
+    - `horizon`: steps per episode; the environment's own by default.
     - `window`: steps of a window, 16 by default; the last of an episode may be shorter.
     - `discount`: of the cost to go, 0.99 by default.
     - `decay`: lambda of the target, 0.95 by default.
     - `rate`: at which the target network follows, 0.2 by default; 1 for none.
     - `value_weight`: 1 by default.
     - `refresh`: steps between two batches that set the scales, 10 by default.
-    - `bootstrap`: whether the horizon is a cut (default); if false it is the end, and
-        the final cost is charged there.
+    - `bootstrap`: whether the horizon truncates (default); if false it terminates the
+        episode, with the final cost.
 
     **Raises:** `ValueError` on an argument of the wrong kind or range; when it is
     trained, if the model is not an `ActorCritic`.

@@ -27,25 +27,25 @@ _ORDER = 2**32 - 1
 _MEMORY = 2**32 - 2
 CAPACITY = 1000
 """The most steps in a block. It is the size of the buffers whatever the block, so that
-the compiled program, and with it every last bit, is the same for all."""
+results are bitwise independent of `block`."""
 FAULTS = ("nothing", "loss", "gradient", "update")
-"""What is not finite, by the number that a block returns."""
+"""The name of the value that is not finite, by the number that a block returns."""
 
 
 class State(NamedTuple):
-    """What a step changes; of each seed, if there are several."""
+    """The state of the training loop; with an axis of seeds, if there are several."""
 
     values: Values
     optimiser: PyTree
     memory: PyTree
-    """That of a surrogate."""
+    """The memory of a surrogate."""
     order: tuple[Array, Array] | None
     """The rows of the data in the order of a pass, and the number of the pass."""
     fault: Int[Array, "*seeds"]
 
 
 class AbstractSurrogate(eqx.Module):
-    """A loss that is made of what happens on the way: it has a memory.
+    """A surrogate loss with a memory, such as that of PPO.
 
     [`delucax.training.fit`][] makes the calls: `init` once; then at each step `update`,
     which may run the model, and the loss `surrogate(model, memory, key)` of what is
@@ -122,12 +122,11 @@ class AbstractSurrogate(eqx.Module):
 
         **Returns:** the model.
         """
-        del memory
         return model
 
 
 class Steps(NamedTuple):
-    """What all steps of a run share."""
+    """The constants of a run."""
 
     loss: Callable[..., Any]
     gradient: Callable[..., Any]
@@ -155,8 +154,10 @@ class Steps(NamedTuple):
     def block(
         self, state: State, first: int, stop: int
     ) -> tuple[State, dict[str, np.ndarray]]:
-        """The steps from `first` up to `stop`, at most `CAPACITY` of them: the state
-        after them, and of each a row of metrics."""
+        """Take the steps from `first` up to `stop`, at most `CAPACITY`.
+
+        **Returns:** the state after them, and the metrics by name, an entry per step.
+        """
         state, outcome = self._compiled(state, jnp.asarray([first, stop], jnp.int32))
         rows, count = jax.device_get(outcome)
         return state, {name: column[:count] for name, column in rows.items()}
@@ -236,13 +237,13 @@ class Steps(NamedTuple):
         given: Any = dict(value=cost, grad=slope, value_fn=value_of)
         update = optax.with_extra_args_support(self.optimiser).update
         updates, after = update(slope, before.optimiser, values, **given)
-        # Kept in the precision that it began with, or the loop would not close.
+        # The carry of a while loop must keep its dtypes.
         after = jax.tree.map(cast, after, before.optimiser)
         moved = optax.apply_updates(values, updates)
         norm = _norm(slope)
         faulty = ~jnp.stack([*map(_is_finite, (cost, norm, moved))])
         fault = jnp.where(jnp.any(faulty), 1 + jnp.argmax(faulty), 0).astype(jnp.int32)
-        # A seed that failed stays as it was while the others go on.
+        # A seed that failed is frozen while the others go on.
         if self.seeds is not None:
             fault = jnp.where(before.fault == 0, fault, before.fault)
         kept = lambda new, old: jnp.where(fault == 0, new, old)

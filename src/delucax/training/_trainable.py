@@ -1,4 +1,4 @@
-"""Which leaves of a model move, and how the rest and their limits are kept."""
+"""Partition of a model into its trainable, unconstrained values and the rest."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -16,9 +16,9 @@ from .._module import AbstractConstraint, get_path, marked_leaves, path_string
 
 
 class Assembly(eqx.Module):
-    """A model with holes where its trainable leaves go.
+    """A model without its trainable leaves.
 
-    Calling it with the unconstrained values fills the holes with legal ones.
+    A call with the unconstrained values rebuilds the model.
     """
 
     leaves: list[Any]
@@ -27,18 +27,16 @@ class Assembly(eqx.Module):
     constraints: dict[str, AbstractConstraint]
 
     def __call__(self, values: dict[str, Array]) -> Any:
-        legal, leaves = self.constrained(values), list(self.leaves)
+        constrained, leaves = self.constrained(values), list(self.leaves)
         for index, path, is_weak in self.holes:
-            leaves[index] = _weak(legal[path]) if is_weak else legal[path]
+            value = constrained[path]
+            leaves[index] = _weak(value) if is_weak else value
         return jax.tree.unflatten(self.structure, leaves)
 
     def constrained(self, values: dict[str, Array]) -> dict[str, Array]:
-        """The legal values."""
-        limits = self.constraints
-        return {
-            path: limits[path].constrain(value) if path in limits else value
-            for path, value in values.items()
-        }
+        """The values that the model gets."""
+        limits = self.constraints.items()
+        return values | {path: limit.constrain(values[path]) for path, limit in limits}
 
 
 def partition_trainable(

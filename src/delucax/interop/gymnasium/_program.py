@@ -121,7 +121,7 @@ def _compiled(same: episodes.ByValue, discrete: bool, truncate: bool) -> Program
         if episodes.has_signals(env):
             episode = episodes.begin(env, key, state)
         else:
-            # A key that is not split saves a batch a third of the time of a reset.
+            # Not splitting the key saves a third of the time of a batched reset.
             x = env.reset(key) if state is None else state
             episode = EpisodeState(x, jnp.zeros((), int))
         no = jnp.zeros((), bool)
@@ -152,10 +152,10 @@ def _packed(env: Environment, episode: EpisodeState, outcome: Outcome) -> Array:
 
 
 def _step_batch(step, start_batch, mode, packed, actions, signals, key):
-    """A step of each; those that have ended begin anew as `mode` says.
+    """A step of each environment; ended episodes are reset as `mode` says.
 
-    **Returns:** the packed arrays, those of the last step of what has ended, the
-    signals and a key.
+    **Returns:** the packed arrays, the packed arrays before the resets, the signals and
+    a key.
     """
     ended = (packed[:, TERMINATED] + packed[:, TRUNCATED]) > 0
     last = jax.vmap(step)(packed, actions.astype(packed.dtype), signals)
@@ -166,7 +166,7 @@ def _step_batch(step, start_batch, mode, packed, actions, signals, key):
     if mode == "SameStep":
         ended = (last[:, TERMINATED] + last[:, TRUNCATED]) > 0
 
-    # A few at a time, for most steps end few episodes.
+    # A few resets at a time, because most steps end few episodes.
     count = len(packed)
     few = min(count, max(16, count // 16))
 
@@ -175,7 +175,7 @@ def _step_batch(step, start_batch, mode, packed, actions, signals, key):
         which = jnp.flatnonzero(ended, size=few, fill_value=count)
         use, key = jr.split(key)
         first, drawn = start_batch(jr.split(use, few), None)
-        if mode == "SameStep":  # the reward and the end are those of the old episode
+        if mode == "SameStep":  # the reward and the flags are those of the old episode
             outcome = slice(REWARD, STEP)
             first = first.at[:, outcome].set(last[which, outcome])
         put = lambda new, old: old.at[which].set(new, mode="drop")

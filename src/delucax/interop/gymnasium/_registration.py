@@ -1,5 +1,6 @@
 """The tasks under Gymnasium's own `make`."""
 
+import inspect
 from typing import Any
 
 import gymnasium
@@ -7,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from gymnasium.envs.registration import EnvSpec
 
+from ... import environments, lung
 from ..._check import check_count
-from ...environments import default_horizon, Environment, make as make_task
+from ...environments import Environment, make as make_task
 from .._episode import has_signals, reads_first_argument
 from ._single_env import GymnasiumEnv
 from ._vector_env import GymnasiumVectorEnv
@@ -20,26 +22,18 @@ _PLAIN = """
     permanent_magnet_motor planar_quadrotor quadrotor reacher single_compartment
     two_tank van_der_pol
 """.split()
-# The name of a task, and whether its actions are whole numbers.
+# The name of a task, whether its actions are whole numbers, and Gymnasium's threshold
+# of the mean return from which it counts as solved.
 _IDS = {f"{name.title().replace('_', '')}-v1": (name, False) for name in _PLAIN} | {
-    "Acrobot-v1": ("acrobot", True),
+    "Acrobot-v1": ("acrobot", True, -100.0),
     "AcrobotContinuous-v1": ("acrobot", False),
-    "CartPole-v1": ("cartpole", True),
+    "CartPole-v1": ("cartpole", True, 475.0),
     "CartPoleContinuous-v1": ("cartpole", False),
     "CartPoleLinear-v1": ("cartpole_linear", False),
     "CSTR-v1": ("cstr", False),
     "LDS-v1": ("lds", False),
-    "MountainCar-v0": ("mountain_car_discrete", True),
-    "MountainCarContinuous-v0": ("mountain_car", False),
-}
-
-
-# The mean return at which Gymnasium takes a task to be solved.
-_THRESHOLDS = {
-    "Acrobot-v1": -100.0,
-    "CartPole-v1": 475.0,
-    "MountainCar-v0": -110.0,
-    "MountainCarContinuous-v0": 90.0,
+    "MountainCar-v0": ("mountain_car_discrete", True, -110.0),
+    "MountainCarContinuous-v0": ("mountain_car", False, 90.0),
 }
 
 
@@ -70,8 +64,9 @@ def make(
 
     - `task`: a name that [`delucax.make`][] knows.
     - `discrete`, `render_mode`: of [`delucax.interop.gymnasium.GymnasiumEnv`][].
-    - `**kwargs`: passed to the task. Plants that are drawn at random are drawn with
-        `jax.random.key(0)` unless a `key` or a plant is given.
+    - `**kwargs`: passed to the task. The random plants of `lds` and `neural` are drawn
+        with the fixed key `jax.random.key(0)` unless a `key` or a plant is given; so
+        does `gymnasium.make`.
 
     **Returns:** a [`delucax.interop.gymnasium.GymnasiumEnv`][].
 
@@ -92,9 +87,9 @@ def make(
 def make_registered(task: str, **kwargs: Any) -> GymnasiumEnv:
     """The entry point of all ids, whose episodes Gymnasium's time limit ends.
 
-    What has to know when that is ends at its own horizon: a task with a horizon that is
-    given, with disturbances or noise, which are drawn for all of it, or with a cost
-    that is given and charges a final state.
+    Tasks that need a fixed length end at their own horizon instead: those with an
+    explicit horizon, with disturbances or noise, which are drawn for all of it, or with
+    an explicit cost that has a final cost.
     """
     own = {k: kwargs.pop(k) for k in ("discrete", "render_mode") if k in kwargs}
     env = _made(task, kwargs)
@@ -157,13 +152,15 @@ def make_vector(
     return GymnasiumVectorEnv(_made(task, kwargs), num_envs, **options)
 
 
-for _name, (_task, _discrete) in _IDS.items():
+_FUNCTIONS = vars(lung) | vars(environments)
+for _name, (_task, _discrete, *_threshold) in _IDS.items():
+    _arguments = inspect.signature(_FUNCTIONS[_task]).parameters
     _spec = EnvSpec(
         id=f"delucax/{_name}",
         entry_point=f"{__name__}:make_registered",
         vector_entry_point=f"{__package__}:make_vector",
-        max_episode_steps=default_horizon(_task),
-        reward_threshold=_THRESHOLDS.get(_name),
+        max_episode_steps=_arguments["horizon"].default,
+        reward_threshold=_threshold[0] if _threshold else None,
         # Orders are checked by the environment itself.
         order_enforce=False,
         kwargs={"task": _task, "discrete": _discrete},

@@ -86,6 +86,7 @@ class GymnasiumEnv(gymnasium.Env):
         self._program = programs.program(env, self.discrete, self.truncate)
         self._table = np.asarray(env.actions) if self.discrete else np.zeros((0, 1))
         self._count, self._shape = len(self._table), (env.control_size,)
+        self._read: Any = operator.index if self.discrete else np.asarray
         self._buffer: Any = None
         self._ended = True
         self._picture: Any = None
@@ -138,13 +139,13 @@ class GymnasiumEnv(gymnasium.Env):
 
     def _continue_from(self, packed: np.ndarray) -> None:
         """Go on from here."""
-        # Whole, for the case that a step fails.
+        # `_last` is restored if a step fails.
         self._packed[...] = self._last = packed
         drawn = (self._signals,) if has_signals(self.environment) else ()
         self._advance = functools.partial(self._program.step, self._shared, *drawn)
 
     def __getstate__(self):
-        """What a copy is made of: all but compiled functions, and views."""
+        """The attributes to copy: all but compiled functions and views."""
         views = "_program _shared _packed _action _outcome _observation _advance"
         state = {k: v for k, v in self.__dict__.items() if k not in views.split()}
         return state | {"_picture": None}
@@ -166,28 +167,23 @@ class GymnasiumEnv(gymnasium.Env):
         **Returns:** observation, reward, terminated, truncated, and an empty
         dictionary.
         """
-        # Little Python: each line counts for about as much as the arithmetic.
+        # Hot path: the overhead of Python is as large as the arithmetic.
         if self._ended:
             what = "not begun" if self._buffer is None else "ended"
             raise ResetNeeded(
                 f"GymnasiumEnv: call reset() before step(): the episode has {what}."
             )
+        try:
+            control = self._read(action)
+        except (TypeError, ValueError):  # not an integer; ragged
+            self._invalid_action(action)
         if self.discrete:
-            try:
-                index = operator.index(action)
-            except TypeError:
-                self._invalid_action(action)
-            if not 0 <= index < self._count:
-                self._invalid_action(action)
-            self._action[0] = index
+            is_valid = 0 <= control < self._count
         else:
-            try:
-                control = np.asarray(action)
-            except ValueError:  # ragged
-                self._invalid_action(action)
-            if control.shape != self._shape or control.dtype.kind not in "iuf":
-                self._invalid_action(action)
-            self._action[...] = control
+            is_valid = control.shape == self._shape and control.dtype.kind in "iuf"
+        if not is_valid:
+            self._invalid_action(action)
+        self._action[...] = control
         self._packed[...] = after = self._advance()
         reward, terminated, truncated, failed, _ = self._outcome.tolist()
         if failed:
@@ -199,7 +195,7 @@ class GymnasiumEnv(gymnasium.Env):
         return self._observation(), reward, terminated > 0, truncated > 0, {}
 
     def _invalid_action(self, action: Any) -> NoReturn:
-        """Say what an action must be."""
+        """Raise the error for an invalid action."""
         if self.discrete:
             raise InvalidAction(
                 f"GymnasiumEnv: action must be a whole number from 0 to "
@@ -212,7 +208,7 @@ class GymnasiumEnv(gymnasium.Env):
         )
 
     def _fail(self, action: Any) -> NoReturn:
-        """Say why a step failed. An illegal action leaves the episode where it was."""
+        """Raise after a failed step. An invalid action leaves the episode unchanged."""
         self._packed[...] = self._last
         if not np.all(np.isfinite(action)):
             raise InvalidAction(f"GymnasiumEnv: action must be finite, got {action}.")

@@ -41,7 +41,7 @@ class GymnasiumVectorEnv(VectorEnv):
 
     `reset(options={"state": x})` starts all at the state `x`, or each at its own if `x`
     has shape `(num_envs, state_size)`; with `options={"reset_mask": mask}` only some
-    are reset. Pictures are of one: [`delucax.interop.gymnasium.GymnasiumEnv`][].
+    are reset. Only [`delucax.interop.gymnasium.GymnasiumEnv`][] renders.
 
     **Raises:** `ValueError` on a wrong argument. `step` raises
     `gymnasium.error.ResetNeeded` before `reset`, `gymnasium.error.InvalidAction` on
@@ -88,8 +88,6 @@ class GymnasiumVectorEnv(VectorEnv):
         self.action_space, self.observation_space = batched
         self._program = programs.program(env, self.discrete)
         self._packed: Any = None
-        self._signals: Any = None
-        self._key: Any = None
 
     @property
     def states(self) -> np.ndarray:
@@ -137,12 +135,12 @@ class GymnasiumVectorEnv(VectorEnv):
         return self._observations(np.asarray(packed)), {}
 
     def _start_keys(self, seed: Any) -> PRNGKey:
-        """A key for the start of each, and `_key` for what starts later."""
+        """The keys of this reset; sets `_key`, the key of later automatic resets."""
         own: dict[int, int] = {}
         if isinstance(seed, Sequence | np.ndarray):
             integer = lambda one: isinstance(one, int | np.integer) and one >= 0
-            legal = [one is None or integer(one) for one in seed]
-            if len(legal) != self.num_envs or not all(legal):
+            valid = [one is None or integer(one) for one in seed]
+            if len(valid) != self.num_envs or not all(valid):
                 raise ValueError(
                     f"GymnasiumVectorEnv: seed must be {self.num_envs} whole numbers "
                     f"from 0, one for each, or one for all, got {shortened(seed)}."
@@ -197,7 +195,7 @@ class GymnasiumVectorEnv(VectorEnv):
         return packed[:, self._program.observation].astype(np.float32)
 
     def _as_actions(self, actions: Any) -> np.ndarray:
-        """Actions as the program takes them, or an error."""
+        """The actions as an array for the compiled step; raises if they are invalid."""
         where, space = "GymnasiumVectorEnv", self.single_action_space
         try:
             actions = np.asarray(actions)

@@ -1,4 +1,4 @@
-"""An environment in gymnax's protocol as one of ours."""
+"""Conversion of a gymnax environment to an `Environment`."""
 
 import dataclasses
 import inspect
@@ -27,7 +27,7 @@ from .._episode import reads_first_argument
 
 @dataclasses.dataclass(frozen=True)
 class _Layout:
-    """How arrays lie one after the other in a vector of floats.
+    """The layout of several arrays in one vector of floats.
 
     Whole numbers and booleans are floats there (exact up to 2^24 in float32). The 32
     bits of an unsigned number, such as a word of a random key, are two of 16.
@@ -70,8 +70,8 @@ def _check_protocol(env: Any, where: str) -> None:
     for name in ("reset_env", "step_env", "action_space"):
         if not callable(getattr(env, name, None)):
             raise ValueError(
-                f"{where}: env must speak gymnax's protocol, but {type(env).__name__} "
-                f"has no {name}."
+                f"{where}: env must implement gymnax's protocol, but "
+                f"{type(env).__name__} has no {name}."
             )
 
 
@@ -92,8 +92,8 @@ class GymnaxDynamics(AbstractDynamics):
     - `params`: its parameters.
     - `dt`: the time of a step, 1 by default.
 
-    **Raises:** `ValueError` if the environment does not speak the protocol, or `dt` is
-    not positive.
+    **Raises:** `ValueError` if the environment does not implement the protocol, or `dt`
+    is not positive.
 
     !!! example
 
@@ -244,7 +244,7 @@ class _Start(eqx.Module):
 
 
 class _Observation(eqx.Module):
-    """What gymnax's users observe, as a vector."""
+    """gymnax's own observation as a vector."""
 
     dynamics: GymnaxDynamics
 
@@ -283,8 +283,8 @@ def from_gymnax(
     The random key of `step_env` is drawn at the start of an episode, from the key of
     the rollout, and is carried in the state if a step uses it at all.
 
-    A reward may hang on the next state, so that a step of the environment is computed
-    for the dynamics and for the cost. Both hold the parameters: to change them, or to
+    The reward may depend on the next state, so that `step_env` is evaluated twice, for
+    the dynamics and for the cost. Both hold the parameters: to change them, or to
     differentiate with respect to them, make the environment anew. Gradients pass where
     the environment lets them: of gymnax 1.0, `with_transition_gradients` is used where
     there is one; before, and elsewhere, gymnax's own environments stop them.
@@ -299,7 +299,7 @@ def from_gymnax(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if the environment does not speak the protocol, if its
+    **Raises:** `ValueError` if the environment does not implement the protocol, if its
     action space is neither a box nor discrete, if a state changes its shape in a step,
     or without a horizon or an observation.
 

@@ -1,4 +1,4 @@
-"""One of our environments in gymnax's protocol."""
+"""Conversion of an `Environment` to gymnax's protocol."""
 
 import functools
 import sys
@@ -79,8 +79,8 @@ class GymnaxEnv:
         [`delucax.interop.gymnax.to_gymnax`][] says.
 
     **Raises:** `ValueError` on a wrong argument; in a step, on an action of the wrong
-    size or kind, or one that is not in the table. One that is being traced cannot be
-    looked at: its fraction is cut off, and it is clamped to the table.
+    size or kind, or one that is not in the table. Traced actions are truncated to whole
+    numbers and clamped to the table.
 
     !!! example
 
@@ -217,7 +217,6 @@ class GymnaxEnv:
         **Returns:** observation, state, reward, done (`terminated` alone with
         `separate_ends`) and a dictionary.
         """
-        del key
         env, given = self._environment(params), self._check_action(action)
         if self.discrete:
             u = jnp.clip(given.reshape(()).astype(int), 0, self.num_actions - 1)
@@ -237,13 +236,12 @@ class GymnaxEnv:
     def get_obs(
         self, state: EpisodeState, params: Params = None, key: Any = None
     ) -> Array:
-        """What is observed of a state.
+        """The observation of a state.
 
         **Arguments:** `state`, `params`: of `step`. `key`: not used.
 
         **Returns:** the observation.
         """
-        del key
         return episodes.observe(self._environment(params), state)
 
     def is_terminal(self, state: EpisodeState, params: Params = None) -> Array:

@@ -1,4 +1,4 @@
-"""What was identified, how well, and what the data do not tell."""
+"""The result of an identification, with its uncertainty and identifiability."""
 
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from ..._results import choose, first_failure, promote, Result, RESULTS
 
 
 CORRELATED = 4.0
-"""The standard deviations by which white noise hardly ever seems correlated."""
+"""The threshold of the whiteness test, in standard deviations."""
 
 _LOADS = 0.02
 """The share of an unknown direction in a parameter that makes the parameter unknown."""
@@ -38,16 +38,16 @@ class Identified(eqx.Module):
     - `std`: their standard deviations, of the same shape; infinite for what is not
         identifiable, NaN where the fit did not converge.
     - `low`, `high`: the ends of their confidence intervals, of the same shape; those of
-        all legal values, such as 0 and infinity, for what is not identifiable; NaN
+        all valid values, such as 0 and infinity, for what is not identifiable; NaN
         where the fit did not converge.
     - `directions`: shape `(p, p)`, a unit vector in each row, least known first.
     - `spread`: the standard deviation along each, shape `(p,)`; NaN where the fit did
         not converge.
     - `identifiable`: of each direction, shape `(p,)`; false where the fit did not
         converge.
-    - `noise`: the standard deviation of what remains of each output.
-    - `correlation`: of what remains from one step to the next, `sqrt(N) r`, with r the
-        correlation coefficient over N steps, that of the output where it is largest;
+    - `noise`: the standard deviation of the residuals of each output.
+    - `correlation`: of the residuals at lag one, `sqrt(N) r`, with r the correlation
+        coefficient over N steps, that of the output where it is largest;
         `None` in linear fits. In white noise it is about normal with variance 1. Above
         4 the model misses something or the noise is correlated; either way the
         intervals are too narrow, and the report says so. 0 where what remains is less
@@ -97,7 +97,7 @@ class Identified(eqx.Module):
 
     def report(self) -> str:
         """A table of the parameters, with what is not identifiable in words, and
-        whether what remains is correlated.
+        whether the residuals are correlated.
 
         **Returns:** text of several lines. Where the fit did not converge it says why,
         and gives no intervals.
@@ -121,8 +121,8 @@ class Identified(eqx.Module):
             lines.append("all directions are identifiable")
         if self.correlation is not None and self.correlation > CORRELATED:
             lines.append(
-                "what remains is correlated from step to step: the model may be wrong, "
-                "and the intervals are too narrow"
+                "the residuals are correlated from step to step: the model may be "
+                "wrong, and the intervals are too narrow"
             )
         return "\n".join(lines)
 
@@ -144,7 +144,7 @@ def checked(fit: Identified, throw: bool) -> Identified:
 
 
 class Certainty(NamedTuple):
-    """How certain an estimate is, from the sensitivity of the data to it."""
+    """The uncertainty of an estimate, from the sensitivity of the data to it."""
 
     directions: Float[Array, "p p"]
     spread: Float[Array, " p"]
@@ -153,7 +153,7 @@ class Certainty(NamedTuple):
 
     @staticmethod
     def of(sensitivity: Array, sigma: Array, worst: Any) -> "Certainty":
-        """Of scaled residuals with a standard deviation `sigma`.
+        """From scaled residuals with a standard deviation `sigma`.
 
         `worst` is the spread from which on a direction counts as unknown.
         """
@@ -184,6 +184,6 @@ class Certainty(NamedTuple):
 
 
 def quantile(level: Any, where: str) -> Array:
-    """How many standard deviations a confidence interval reaches to either side."""
+    """The half-width of a confidence interval in standard deviations."""
     check_range(level, "level", where, 0, 1)
     return ndtri((1 + as_float_array(level)) / 2)

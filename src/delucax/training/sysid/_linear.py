@@ -30,8 +30,8 @@ def linear(
 
     `min over A, B, c of sum_k |x_{k+1} - A x_k - B u_k - c|^2`.
 
-    The estimate is that of an errors-free state: noise in the recorded states biases
-    it. Intervals take what remains for independent noise, equal in all steps.
+    The recorded states are assumed to be free of noise, which would bias the estimate.
+    Intervals assume independent, identically distributed residuals.
 
     **Arguments:**
 
@@ -162,7 +162,7 @@ def arx(
 
 
 def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, Array]:
-    """Both with an axis of runs in front, checked."""
+    """Both as arrays with an axis of runs in front; raises if they do not fit."""
     outputs, controls = as_float_array(outputs), as_float_array(controls)
     for what, array in ((name, outputs), ("controls", controls)):
         if not eqx.is_inexact_array(array) or array.ndim not in (2, 3):
@@ -188,7 +188,7 @@ def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, 
 def _least_squares(
     regressors: Float[Array, "rows p"], targets: Float[Array, "rows outputs"]
 ) -> tuple[Float[Array, "outputs p"], Float[Array, "outputs p"], Array, Certainty]:
-    """The estimate of each output, its standard deviation, that of what remains, and
+    """The estimate of each output, its standard deviation, that of the residuals, and
     what the data tell of the output with the largest relative noise."""
     rows, p = regressors.shape
     size = jnp.sqrt(jnp.mean(regressors**2, axis=0))
@@ -222,7 +222,7 @@ def _fitted(
     reach: Array,
     throw: bool,
 ) -> Identified:
-    """The linear model of `targets` by `regressors`, each with a row a step."""
+    """The linear model of `targets` by `regressors`, each with a row per step."""
     rows = jnp.concatenate(regressors, axis=2).reshape(-1, len(names))
     targets = targets.reshape(-1, targets.shape[2])
     estimate, std, noise, certainty = _least_squares(rows, targets)

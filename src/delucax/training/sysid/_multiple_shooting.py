@@ -42,11 +42,11 @@ class _Point(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """What the least squares came to."""
+    """The least-squares estimate and its uncertainty."""
 
     values: dict[str, Array]
     starts: Float[Array, "windows n"]
-    legal: Float[Array, " p"]
+    estimate: Float[Array, " p"]
     certainty: Certainty
     noise: Float[Array, " y"]
     correlation: Float[Array, ""]
@@ -156,9 +156,9 @@ def solve(
     result = choose(count <= max_steps, RESULTS.no_descent, RESULTS.not_converged)
     result = choose(settled, RESULTS.successful, result)
     result = choose(jnp.isfinite(cost), result, RESULTS.diverged)
-    legal = flat_legal(assembly, values)
+    estimate = flat_constrained(assembly, values)
     noise = jnp.where(jnp.isfinite(cost), noise, jnp.nan).astype(dtype)
-    return Solution(values, starts, legal, certainty, noise, correlation, result)
+    return Solution(values, starts, estimate, certainty, noise, correlation, result)
 
 
 def _levenberg_marquardt(
@@ -229,7 +229,7 @@ def _scaled(point: _Point, largest: Any) -> tuple[Array, Array, Any, Any]:
 
 
 def _projected(by_theta: Array, by_start: Array, damping: Any) -> tuple[Array, ...]:
-    """First on the states at the beginnings of the windows, then on the rest."""
+    """Eliminate the states at the beginnings of the windows, then the parameters."""
     p = by_theta.shape[2] - 1
     eliminate = jax.vmap(_eliminate, in_axes=(0, 0, None))
     R_x, on_starts, left = eliminate(by_start, by_theta, damping)
@@ -241,7 +241,7 @@ def _projected(by_theta: Array, by_start: Array, damping: Any) -> tuple[Array, .
 def _eliminate(A: Array, B: Array, damping: Any) -> tuple[Array, Array, Array]:
     """Least squares `min |A z - b|^2 + damping |z|^2` for the columns b of B.
 
-    `(R, C, left)`: `R z = C`, and what is left of B, with a row more for each z.
+    `(R, C, residual)`: `R z = C`, and the residual of B, one row longer per entry of z.
     """
     # By QR of [A; sqrt(damping) I], whose condition number is that of A, and not of
     # the normal equations A' A.
@@ -253,14 +253,16 @@ def _eliminate(A: Array, B: Array, damping: Any) -> tuple[Array, Array, Array]:
     return R, C, B - Q @ C
 
 
-def flat_legal(assembly: Assembly, values: dict[str, Array]) -> Float[Array, " p"]:
-    """The legal values in one vector."""
+def flat_constrained(
+    assembly: Assembly, values: dict[str, Array]
+) -> Float[Array, " p"]:
+    """The constrained values in one vector."""
     return jax.flatten_util.ravel_pytree(assembly.constrained(values))[0]
 
 
-def relative_unit(legal: Float[Array, " p"]) -> Float[Array, " p"]:
-    """What a relative change of 1 of each legal value amounts to."""
-    return jnp.where(legal == 0, 1, legal)
+def relative_unit(estimate: Float[Array, " p"]) -> Float[Array, " p"]:
+    """The unit of a relative change of each constrained value: itself, or 1 for 0."""
+    return jnp.where(estimate == 0, 1, estimate)
 
 
 def per_relative_change(
@@ -268,6 +270,6 @@ def per_relative_change(
 ) -> Float[Array, " p"]:
     """The change of each unconstrained value that makes a relative change of 1."""
     tangent = jax.tree.map(jnp.ones_like, values)
-    flat = lambda values: flat_legal(assembly, values)
-    legal, rate = jax.jvp(flat, (values,), (tangent,))
-    return relative_unit(legal) / rate
+    flat = lambda values: flat_constrained(assembly, values)
+    estimate, rate = jax.jvp(flat, (values,), (tangent,))
+    return relative_unit(estimate) / rate

@@ -177,8 +177,8 @@ class PredictionError(eqx.Module):
     `1 / (N steps) sum over stretches and steps of |(x_k - xhat_k) / scale|^2`,
 
     with `xhat` what the recorded controls lead to from the first state of a stretch, by
-    the model alone. A stretch of one step is a one-step fit; longer ones make the model
-    answer for its own errors. Angles are compared by `model.difference`.
+    the model alone. A stretch of one step is a one-step fit; longer ones penalise
+    errors that accumulate. Angles are compared by `model.difference`.
 
     **Arguments:** `scale`: of each state, a number or shape `(n,)`; 1 by default.
 
@@ -226,7 +226,6 @@ class PredictionError(eqx.Module):
 
         **Returns:** a scalar.
         """
-        del key
         check_instance(model, AbstractDynamics, "model", "PredictionError")
 
         def stretch(t, states, controls):
