@@ -16,7 +16,7 @@ from ..disturbances import Zero
 from ..environments import Environment
 
 
-class ByValue:
+class HashableEnvironment:
     """A hashable environment, equal to another if all of their numbers are.
 
     It is the key of a cache of functions that have the numbers as constants.
@@ -36,7 +36,7 @@ class ByValue:
         return self._hash
 
     def __eq__(self, other):
-        return isinstance(other, ByValue) and self.value == other.value
+        return isinstance(other, HashableEnvironment) and self.value == other.value
 
 
 class Signals(NamedTuple):
@@ -65,7 +65,7 @@ class EpisodeState(eqx.Module):
     signals: Signals = NO_SIGNALS
 
 
-class Outcome(NamedTuple):
+class StepOutcome(NamedTuple):
     """The reward and the flags of one step."""
 
     reward: Scalar
@@ -111,7 +111,7 @@ def observe(env: Environment, episode: EpisodeState) -> Float[Array, " features"
 
 def step(
     env: Environment, episode: EpisodeState, action: Array, truncate: bool = True
-) -> tuple[EpisodeState, Outcome]:
+) -> tuple[EpisodeState, StepOutcome]:
     """One step. The last one, at the horizon if `truncate`, adds the final cost."""
     x, w = episode.state, episode.signals.disturbances
     w = None if w is None else w[episode.time]
@@ -123,7 +123,7 @@ def step(
     final = jnp.where(terminated | truncated, final, 0)
     finite = jnp.all(jnp.isfinite(action)) & jnp.all(jnp.isfinite(x_next))
     failed = (transition.result != RESULTS.successful) | ~finite
-    return after, Outcome(-(transition.cost + final), terminated, truncated, failed)
+    return after, StepOutcome(-(transition.cost + final), terminated, truncated, failed)
 
 
 def reads_first_argument(function: Callable[..., Any], *args: Any) -> bool:

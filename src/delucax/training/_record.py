@@ -203,12 +203,11 @@ def describe_run(
             options[f"{name} {place}"] = _kind(leaf)
     for place, leaf in _placed(model):
         if is_float(leaf):
-            # On a fixed pattern of signs and sizes, which a change of few entries moves
-            # as well. Bounds may be infinite.
-            values = np.nan_to_num(np.asarray(leaf, float).ravel(), posinf=1, neginf=-1)
-            projection = float(values @ np.cos(np.arange(values.size)))
+            # Bounds may be infinite.
+            flat = np.nan_to_num(np.asarray(leaf, float).ravel(), posinf=1, neginf=-1)
+            projection = float(flat @ np.cos(np.arange(flat.size)))
             what = f"(projection, norm) of model{place} at the start"
-            options[what] = projection, float(np.linalg.norm(values))
+            options[what] = projection, float(np.linalg.norm(flat))
     return options
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Int, PyTree
 from .._typing import PRNGKey
 from ._gradient_estimators import cost_and_metrics
 from ._record import COLUMNS
-from ._trainable import Assembly, strong
+from ._trainable import Assembly, strip_weak_type
 
 
 Values = dict[str, Array]
@@ -149,7 +149,7 @@ class Steps(NamedTuple):
             no_pass = jnp.full(shape, -1, jnp.int32)
             order = jnp.zeros((*shape, size), jnp.int32), no_pass
         fault = jnp.zeros(shape, jnp.int32)
-        return State(values, jax.tree.map(strong, state), memory, order, fault)
+        return State(values, jax.tree.map(strip_weak_type, state), memory, order, fault)
 
     def block(
         self, state: State, first: int, stop: int
@@ -174,7 +174,7 @@ class Steps(NamedTuple):
         self, state: State, span: Int[Array, "2"]
     ) -> tuple[State, tuple[dict[str, Array], Array]]:
         def step_of_all(state, k):
-            step = lambda *of_seed: self._step(*of_seed, k)
+            step = lambda model, key, state: self._step(model, key, state, k)
             return _over_seeds(step, self.seeds)(self.assembly, self.key, state)
 
         first, stop = span[0], span[1]
@@ -248,7 +248,7 @@ class Steps(NamedTuple):
             fault = jnp.where(before.fault == 0, fault, before.fault)
         kept = lambda new, old: jnp.where(fault == 0, new, old)
         stepped: Any = jax.tree.map(kept, (moved, after, memory), before[:3])
-        row = {"loss": strong(cost), "gradient_norm": norm, **metrics}
+        row = {"loss": strip_weak_type(cost), "gradient_norm": norm, **metrics}
         return State(*stepped, order=order, fault=fault), row
 
 
@@ -265,7 +265,7 @@ def _first_memory(
                 f"{_WHERE}: the memory of {type(loss).__name__} must be a pytree of "
                 f"arrays, got {memory!r}."
             )
-        return jax.tree.map(strong, memory)
+        return jax.tree.map(strip_weak_type, memory)
 
     return _over_seeds(begin, seeds)(model, key)
 

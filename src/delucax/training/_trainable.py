@@ -30,7 +30,7 @@ class Assembly(eqx.Module):
         constrained, leaves = self.constrained(values), list(self.leaves)
         for index, path, is_weak in self.holes:
             value = constrained[path]
-            leaves[index] = _weak(value) if is_weak else value
+            leaves[index] = _with_weak_type(value) if is_weak else value
         return jax.tree.unflatten(self.structure, leaves)
 
     def constrained(self, values: dict[str, Array]) -> dict[str, Array]:
@@ -43,7 +43,8 @@ def partition_trainable(
     model: PyTree, trainable: Any, where: str
 ) -> tuple[Assembly, dict[str, Array]]:
     """`model` as its unconstrained trainable values, by path, and all the rest."""
-    entries = [(path_string(path), *marks) for path, *marks in marked_leaves(model)]
+    leaves_of = marked_leaves(model)
+    entries: list[Any] = [(path_string(path), *marks) for path, *marks in leaves_of]
     given: Mapping[str, AbstractConstraint | None] = {}
     if trainable is None:
         chosen = [role == "weight" and is_float(leaf) for _, leaf, role, _ in entries]
@@ -71,7 +72,7 @@ def partition_trainable(
         for prefix, other in given.items():
             if other is not None and _is_under(path, prefix):
                 constraint = other
-        value = strong(leaf)
+        value = strip_weak_type(leaf)
         if constraint is not None:
             if not np.all(constraint.holds(leaf)):
                 raise ValueError(f"{where}: {name} must be {constraint}, got {leaf}.")
@@ -102,16 +103,16 @@ def is_float(leaf: Any) -> bool:
     return eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
-def strong(leaf: Any) -> Any:
+def strip_weak_type(leaf: Any) -> Any:
     """An array without its weak type; anything else as it is.
 
-    An optimiser turns weak types strong after its first step, which would compile the
+    An optimiser returns strong types from its first step on, which would compile the
     loop again.
     """
     return lax.convert_element_type(leaf, leaf.dtype) if is_float(leaf) else leaf
 
 
-def _weak(value: Array) -> Array:
+def _with_weak_type(value: Array) -> Array:
     """`value` with a weak type, so that the model sees the kind of leaf that it had."""
     like = jnp.asarray(0.0)
     if value.dtype != like.dtype:

@@ -25,7 +25,7 @@ from ..._module import as_float_array
 from ..._typing import PRNGKey, State
 from ...environments import Environment
 from .. import _episode as episodes
-from .._episode import EpisodeState, Outcome
+from .._episode import EpisodeState, HashableEnvironment, StepOutcome
 from .._spaces import action_ends, observation_ends
 
 
@@ -63,7 +63,7 @@ def as_start(
 
 def spaces(env: Environment, discrete: bool) -> tuple[Box | Discrete, Box]:
     """The actions, indices into their table or controls, and what `encode` returns."""
-    box = lambda ends: Box(*(np.asarray(end, np.float32) for end in ends))
+    box = lambda ends: Box(ends[0].astype(np.float32), ends[1].astype(np.float32))
     actions: Any = env.actions
     # Gymnasium's own spaces are infinite where bounds are.
     observations = box(observation_ends(env, np.inf))
@@ -89,7 +89,7 @@ class Program(NamedTuple):
 
 def program(env: Environment, discrete: bool, truncate: bool = True) -> Program:
     """The program of an environment; one that is the same compiles no more."""
-    return _compiled(episodes.ByValue(env), discrete, truncate)
+    return _compiled(HashableEnvironment(env), discrete, truncate)
 
 
 def shared(size: int, dtype: Any) -> tuple[np.ndarray, jax.Array]:
@@ -112,7 +112,7 @@ def draw_key(generator: np.random.Generator) -> PRNGKey:
 
 
 @functools.lru_cache(maxsize=64)
-def _compiled(same: episodes.ByValue, discrete: bool, truncate: bool) -> Program:
+def _compiled(same: HashableEnvironment, discrete: bool, truncate: bool) -> Program:
     env, n = same.env, same.env.state_size
     end = n + env.feature_size
     size = end - REWARD
@@ -125,7 +125,7 @@ def _compiled(same: episodes.ByValue, discrete: bool, truncate: bool) -> Program
             x = env.reset(key) if state is None else state
             episode = EpisodeState(x, jnp.zeros((), int))
         no = jnp.zeros((), bool)
-        outcome = Outcome(jnp.zeros((), episode.state.dtype), no, no, no)
+        outcome = StepOutcome(jnp.zeros((), episode.state.dtype), no, no, no)
         return _packed(env, episode, outcome), episode.signals
 
     def step(packed, action, signals):
@@ -138,12 +138,12 @@ def _compiled(same: episodes.ByValue, discrete: bool, truncate: bool) -> Program
 
     start_batch = jax.vmap(start)
     step_batch = functools.partial(_step_batch, step, start_batch)
-    compiled = map(jax.jit, (start, step_in_place, start_batch))
+    compiled = jax.jit(start), jax.jit(step_in_place), jax.jit(start_batch)
     step_batch = jax.jit(step_batch, static_argnums=0)
     return Program(*compiled, step_batch, slice(n), slice(n, end), size)
 
 
-def _packed(env: Environment, episode: EpisodeState, outcome: Outcome) -> Array:
+def _packed(env: Environment, episode: EpisodeState, outcome: StepOutcome) -> Array:
     x, (reward, *ends, failed) = episode.state, outcome
     failed = failed | ~jnp.all(jnp.isfinite(x)) | ~jnp.isfinite(reward)
     rest = (reward, *ends, failed, episode.time)

@@ -139,7 +139,7 @@ class GymnaxDynamics(AbstractDynamics):
         self.control_names = ("action",) if size == 1 else several
         key = jr.key(0)
         reset = jax.eval_shape(lambda key: env.reset_env(key, params)[1], key)
-        leaves, structure = jax.tree_util.tree_flatten_with_path(reset)
+        leaves, self.structure = jax.tree_util.tree_flatten_with_path(reset)
         for path, leaf in leaves:
             if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
                 raise ValueError(
@@ -147,7 +147,6 @@ class GymnaxDynamics(AbstractDynamics):
                     f"{jax.tree_util.keystr(path)}, where a raw one "
                     "(`jax.random.PRNGKey`) is expected."
                 )
-        self.structure = structure
         action = jnp.zeros(self.action_shape, int if self.discrete else float)
         step = lambda key, *args: env.step_env(key, *args, params)
         self.draws = reads_first_argument(step, key, reset, action)

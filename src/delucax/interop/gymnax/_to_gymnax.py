@@ -117,7 +117,7 @@ class GymnaxEnv:
             since_1 = hasattr(getattr(theirs, "Environment", None), "is_truncated")
             separate_ends = since_1 and "rejax" not in sys.modules
         self.separate_ends = check_bool(separate_ends, "separate_ends", where)
-        self._made = episodes.ByValue(env)
+        self._made = episodes.HashableEnvironment(env)
         self._identity = (self._made, self.discrete, self.separate_ends)
 
     def __hash__(self):
