@@ -232,6 +232,8 @@ class AbstractActorCriticLoss(AbstractSurrogate):
         self, model: ActorCritic, runs: Episodes
     ) -> Float[Array, "*batch steps"]:
         """The errors of the critic's raw output."""
+        # In the scale of the network's own output, so that the learning rate does not
+        # depend on that of the cost.
         raw = jax.vmap(jax.vmap(model.raw))(runs.times, runs.observations)
         return raw - (runs.targets - model.shift) / model.scale
 
@@ -249,6 +251,7 @@ class AbstractActorCriticLoss(AbstractSurrogate):
         observed = observed + jnp.concatenate([noise, jnp.zeros_like(noise[:1])])
         values = jax.vmap(model.value)(run.times, observed)
         following, values = values[1:], values[:-1]
+        # Nothing follows an end but the final cost; beyond a cut V stands for the rest.
         if not self.bootstrap:
             following = following.at[-1].set(run.final_cost)
         following = jnp.where(run.terminated, run.final_cost, following)

@@ -148,11 +148,13 @@ class EvolutionStrategies(eqx.Module):
         noise = optax.tree.random_like(noise_key, weights, draw)
         # The unperturbed weights come first, so that the loss is traced once.
         sides = 2 if self.antithetic else 1
+        # theta, theta + sigma e_1, ..., and if antithetic theta - sigma e_1, ...
         ones, every = jnp.ones(n), jnp.arange(n)
         signs = jnp.concatenate([jnp.zeros(1), ones, -ones][: 1 + sides])
         directions = jnp.concatenate([jnp.zeros(1, int), *[every] * sides])
         keys = None
         if self.antithetic:
+            # Both of a pair share a key, so that the noise of the loss cancels.
             pairs = jr.split(pair_key, n)
             keys = jnp.concatenate([loss_key[None], pairs, pairs])
 
@@ -253,6 +255,7 @@ class LikelihoodRatio(eqx.Module):
                 excess = (costs - jnp.mean(costs)) * (self.samples / (self.samples - 1))
             means = {name: jnp.mean(metric) for name, metric in metrics.items()}
             value = (jnp.mean(costs), lax.stop_gradient(means))
+            # Its gradient is the estimate; its own value means nothing.
             return jnp.mean(excess * metrics["log_prob"]), value
 
         return gradient_of_weights(surrogate, model)

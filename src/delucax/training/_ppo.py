@@ -201,6 +201,8 @@ class PPO(AbstractActorCriticLoss):
         mean = jnp.sum(jnp.where(runs.valid, runs.advantages, 0)) / count
         squares = jnp.where(runs.valid, (runs.advantages - mean) ** 2, 0)
         deviation = jnp.sqrt(jnp.sum(squares) / count)
+        # To unit variance, so that the step does not depend on the scale of the cost;
+        # 1e-8 is for batches without variance.
         rows = runs._replace(
             advantages=(runs.advantages - mean) / (deviation + 1e-8),
             log_prob=log_prob,
@@ -208,6 +210,7 @@ class PPO(AbstractActorCriticLoss):
             following=None,
             total_cost=None,
         )
+        # Without a memory each step is a row of its own, `(batch * horizon, 1, ...)`.
         if not policy.has_memory:
             rows = jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[2:]), rows)
         return jax.tree.map(lax.stop_gradient, rows), jnp.mean(runs.total_cost)

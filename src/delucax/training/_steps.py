@@ -142,10 +142,11 @@ class Steps(NamedTuple):
         state = _over_seeds(self.optimiser.init, self.seeds)(values)
         memory = order = None
         if isinstance(self.loss, AbstractSurrogate):
-            memory = _first_memory(self.loss, model, self.key, self.seeds)
+            begin = jax.tree_util.Partial(_first_memory, self.loss)
+            memory = _compiled_over_seeds(begin, self.seeds, model, self.key)
         shape = () if self.seeds is None else (self.seeds,)
         if self.batch_size is not None:
-            size = jax.tree.leaves(self.data)[0].shape[0]
+            size = len(jax.tree.leaves(self.data)[0])
             no_pass = jnp.full(shape, -1, jnp.int32)
             order = jnp.zeros((*shape, size), jnp.int32), no_pass
         fault = jnp.zeros(shape, jnp.int32)
@@ -167,7 +168,8 @@ class Steps(NamedTuple):
         model = self.assembly(state.values)
         if not isinstance(self.loss, AbstractSurrogate):
             return model
-        return _finished(self.loss, model, state.memory, self.seeds)
+        finished: Any = self.loss.finished
+        return _compiled_over_seeds(finished, self.seeds, model, state.memory)
 
     @eqx.filter_jit
     def _compiled(
@@ -252,29 +254,21 @@ class Steps(NamedTuple):
         return State(*stepped, order=order, fault=fault), row
 
 
-@eqx.filter_jit
-def _first_memory(
-    loss: AbstractSurrogate, model: PyTree, key: PRNGKey, seeds: int | None
-) -> PyTree:
+def _first_memory(loss: AbstractSurrogate, model: PyTree, key: PRNGKey) -> PyTree:
     """The memory of a surrogate before the first step."""
-
-    def begin(model, key):
-        memory = loss.init(model, jr.fold_in(key, _MEMORY))
-        if not all(eqx.is_array(leaf) for leaf in jax.tree.leaves(memory)):
-            raise ValueError(
-                f"{_WHERE}: the memory of {type(loss).__name__} must be a pytree of "
-                f"arrays, got {memory!r}."
-            )
-        return jax.tree.map(strip_weak_type, memory)
-
-    return _over_seeds(begin, seeds)(model, key)
+    memory = loss.init(model, jr.fold_in(key, _MEMORY))
+    if not all(eqx.is_array(leaf) for leaf in jax.tree.leaves(memory)):
+        raise ValueError(
+            f"{_WHERE}: the memory of {type(loss).__name__} must be a pytree of "
+            f"arrays, got {memory!r}."
+        )
+    return jax.tree.map(strip_weak_type, memory)
 
 
 @eqx.filter_jit
-def _finished(
-    loss: AbstractSurrogate, model: PyTree, memory: PyTree, seeds: int | None
-) -> PyTree:
-    return _over_seeds(loss.finished, seeds)(model, memory)
+def _compiled_over_seeds(function: Any, seeds: int | None, *arguments: PyTree) -> Any:
+    """A call of a pytree that is a function, compiled once for all of its structure."""
+    return _over_seeds(function, seeds)(*arguments)
 
 
 def _over_seeds(function: Callable[..., Any], seeds: int | None) -> Callable[..., Any]:

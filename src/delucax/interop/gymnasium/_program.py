@@ -29,26 +29,23 @@ from .._episode import EpisodeState, HashableEnvironment, StepOutcome
 from .._spaces import action_ends, observation_ends
 
 
-def read_options(options: Any, names: tuple[str, ...], where: str) -> list[Any]:
-    """The options of a reset, none for those that are left out."""
+def read_options(
+    options: Any, env: Environment, where: str, count: int | None = None
+) -> tuple[jax.Array | None, Any]:
+    """The options of a reset: the state to begin at, or of each of `count`, and which
+    of these are reset; `None` for what is left out."""
+    names = ("state",) if count is None else ("state", "reset_mask")
     if options is not None and not isinstance(options, Mapping):
         raise ValueError(f"{where}: options must be a dictionary, got {options!r}.")
     options = dict(options or {})
-    values = [options.pop(name, None) for name in names]
-    if options:
+    if unknown := [repr(name) for name in options if name not in names]:
         raise ValueError(
             f"{where}: options takes {' and '.join(map(repr, names))} alone, got "
-            f"{', '.join(map(repr, options))}."
+            f"{', '.join(unknown)}."
         )
-    return values
-
-
-def as_start(
-    state: Any, env: Environment, where: str, count: int | None = None
-) -> jax.Array | None:
-    """The state to begin at, or of each of `count`, if one is given, or an error."""
+    state, mask = options.get("state"), options.get("reset_mask")
     if state is None:
-        return None
+        return None, mask
     shape = (env.state_size,)
     each = shape if count is None else (count, *shape)
     state = as_float_array(state)
@@ -58,7 +55,7 @@ def as_start(
         raise ValueError(f"{where}: state must have shape {shapes}, got {got}.")
     check_real(state, "state", where)
     check_finite(state, "state", where)
-    return jnp.broadcast_to(state.astype(float), each)
+    return jnp.broadcast_to(state.astype(float), each), mask
 
 
 def spaces(env: Environment, discrete: bool) -> tuple[Box | Discrete, Box]:

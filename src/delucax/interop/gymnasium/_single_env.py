@@ -111,9 +111,7 @@ class GymnasiumEnv(gymnasium.Env):
         **Returns:** the observation, and an empty dictionary.
         """
         super().reset(seed=seed)
-        where = "GymnasiumEnv"
-        (state,) = programs.read_options(options, ("state",), where)
-        state = programs.as_start(state, self.environment, where)
+        state, _ = programs.read_options(options, self.environment, "GymnasiumEnv")
         packed, signals = self._program.start(programs.draw_key(self.np_random), state)
         packed = np.asarray(packed)
         if self._buffer is None or self._buffer.dtype != packed.dtype:

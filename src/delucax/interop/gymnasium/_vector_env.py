@@ -115,8 +115,8 @@ class GymnasiumVectorEnv(VectorEnv):
         **Returns:** the observations, and an empty dictionary.
         """
         where = "GymnasiumVectorEnv"
-        state, mask = programs.read_options(options, ("state", "reset_mask"), where)
-        state = programs.as_start(state, self.environment, where, self.num_envs)
+        plant, count = self.environment, self.num_envs
+        state, mask = programs.read_options(options, plant, where, count)
         keys = self._start_keys(seed)
         packed, signals = self._program.start_batch(keys, state)
         if mask is not None:

@@ -191,6 +191,7 @@ def _least_squares(
     """The estimate of each output, its standard deviation, that of the residuals, and
     what the data tell of the output with the largest relative noise."""
     rows, p = regressors.shape
+    # In units of the regressors' size, so that the rank does not depend on units.
     size = jnp.sqrt(jnp.mean(regressors**2, axis=0))
     scale = jnp.where(size > 0, size, 1)
     scaled = regressors / scale
@@ -207,7 +208,8 @@ def _least_squares(
     typical = jnp.where(typical > 0, typical, 1)
     worst = jnp.max(noise / typical)
     certainty = Certainty.of(scaled, worst, 1.0)
-    # All outputs share the regressors, and differ in their noise alone.
+    # The covariance of output i is noise_i^2 (R' R)^-1: all outputs share the
+    # regressors R, and differ in their noise alone.
     unit = certainty.std / jnp.where(worst > 0, worst, 1)
     std = noise[:, None] * unit / scale
     std = jnp.where(jnp.isinf(certainty.std), jnp.inf, jnp.where(worst > 0, std, 0))

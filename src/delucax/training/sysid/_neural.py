@@ -118,6 +118,7 @@ class NeuralDynamics(AbstractDynamics):
         u: Float[Array, " m"],
         w: Float[Array, " n"] | None,
     ) -> tuple[Float[Array, " n"], Result]:
+        # The network learns the step and not the next state, which is nearly x itself.
         z = jnp.concatenate([(x - self.x_mean) / self.x_scale, u / self.u_scale])
         x_next = x + self.step_scale * self.network(z)
         x_next = x_next if w is None else x_next + w
@@ -235,6 +236,7 @@ class PredictionError(eqx.Module):
                 error = model.difference(x_next, recorded) / self.scale
                 return x_next.astype(x.dtype), jnp.sum(error**2)
 
+            # Recomputed in the backward pass, so that memory holds the states alone.
             inputs = (jnp.arange(controls.shape[0]), controls, states[1:])
             return jnp.mean(lax.scan(jax.checkpoint(step), states[0], inputs)[1])
 
