@@ -310,7 +310,8 @@ class Moments(NamedTuple):
         """The standard deviation, 1 where it is negligible."""
         variance = self.squares / jnp.maximum(self.count, 1)
         # A feature that does not move is left as it is, and not blown up.
-        return jnp.sqrt(jnp.where(variance > 1e-8, variance, 1))
+        some = variance > 1e-8
+        return jnp.where(some, jnp.sqrt(jnp.where(some, variance, 1)), 1)
 
 
 class Statistics(NamedTuple):
