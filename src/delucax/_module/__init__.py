@@ -9,6 +9,7 @@ from ._fields import (
     check_parameters as check_parameters,
     function_field as function_field,
     marked_leaves as marked_leaves,
+    mlp as mlp,
     parameter as parameter,
     parts_of as parts_of,
     path_string as path_string,
