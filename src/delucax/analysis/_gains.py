@@ -50,6 +50,7 @@ def frequency_response(
     """
     where = "frequency_response"
     system = state_space(model, inputs, where)
+    # Infinite frequencies are refused: the response there is D alone.
     array = as_float_array(omega)
     real = eqx.is_inexact_array(array) and not jnp.iscomplexobj(array)
     if not real or is_concrete(array) and not bool(jnp.all(jnp.isfinite(array))):
@@ -107,6 +108,7 @@ def dcgain(
 
 @eqx.filter_jit
 def _dcgain(system: StateSpace) -> tuple[Float[Array, "p m"], BoolScalar]:
+    # A pole at frequency zero makes this matrix singular, up to rounding.
     matrix = system.eye - system.A if system.is_discrete else -system.A
     values = jnp.linalg.svd(jax.lax.stop_gradient(matrix), compute_uv=False)
     eps = jnp.finfo(values.dtype).eps
@@ -189,6 +191,7 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
 def _h2_norm(system: StateSpace) -> Scalar:
     stable = system.is_stable()
     W = stable_gramian(system.stable_or_placeholder(stable))
+    # The square root has no derivative at zero: the branch not taken is that of 1.
     square = jnp.trace(system.C @ W @ system.C.T)
     positive = square > 0
     norm = jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
@@ -254,6 +257,8 @@ def peak_gain(system: StateSpace) -> PeakGain:
     growth = system.growth(poles)
     stable = jnp.all(growth < 0)
     safe = system.stable_or_placeholder(stable)
+    # The search is not differentiated: the peak is stationary in the frequency, so that
+    # the gain's derivatives are those at a fixed frequency (the envelope theorem).
     frozen = lax.stop_gradient(safe)
     start, ended = _search(frozen)
     top, curvature, moves = _climb(frozen, start)
@@ -265,6 +270,7 @@ def peak_gain(system: StateSpace) -> PeakGain:
     step = -rise / curvature
     gain = gain + step * slope + step**2 * curvature / 2
     gain, frequency = jnp.where(finite, gain, largest_gain(safe.D)), top + step
+    # An unstable model has no peak: the frequency is that of its least stable pole.
     least = poles[jnp.argmax(growth)]
     if system.dt is None:
         at_pole = jnp.abs(jnp.imag(least))
@@ -302,11 +308,13 @@ def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScala
         usable = (
             finite & (curvature < 0) & jnp.isfinite(slope) & jnp.isfinite(curvature)
         )
+        # Newton's step on the slope goes up only where the curvature is negative.
         curvature = jnp.where(usable, curvature, -1)
         # Near the peak gains differ by rounding alone, and the slope decides.
         up = usable & (gain >= best) & (jnp.abs(slope) < flattest) & (trial >= 0)
         top = jnp.where(up, trial, top)
         return (
+            # Less its rounding: the next gain may be equal in exact arithmetic.
             jnp.where(up, gain * (1 - rounding), best),
             jnp.where(up, jnp.abs(slope), flattest),
             top,
@@ -323,6 +331,7 @@ def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScala
 
 def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
     """The frequency of the largest gain, and whether the search converged."""
+    # In discrete time the bilinear transform maps the unit circle to the axis.
     axis = system.bilinear_transform() if system.is_discrete else system
     A, B, C, D, _ = axis
     n = A.shape[0]
@@ -338,6 +347,7 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
         gain_now = jnp.where(better, gains[k], gain_now)
         return gain_now, jnp.where(better, omegas[k], omega_now)
 
+    # Resonances are near the poles. The sweep guards against a flat start.
     poles = jnp.linalg.eigvals(A)
     at_poles = jnp.concatenate([jnp.abs(poles), jnp.abs(jnp.imag(poles))])
     low, high = jnp.log(jnp.min(at_poles[:n]) / 100), jnp.log(jnp.max(at_poles) * 100)
@@ -352,6 +362,7 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
         Those of all eigenvalues: off the axis they are no crossings, but evaluating the
         gain there as well is cheap and harmless.
         """
+        # A singular value of G(j omega) is `level` where j omega is an eigenvalue of H.
         m, p = D.shape[1], D.shape[0]
         R = level**2 * jnp.eye(m, dtype=D.dtype) - D.T @ D
         S = level**2 * jnp.eye(p, dtype=D.dtype) - D @ D.T
@@ -371,6 +382,7 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
         gain_now, omega_now, _, k = carry
         # At the level of D the Hamiltonian is not finite, and close to it not accurate.
         is_close = gain_now < (1 + eps**0.375) * at_infinity
+        # A smaller step would lose the crossings next to the peak in rounding.
         step = jnp.where(is_close, eps**0.375, eps**0.625)
         level = (1 + step) * jnp.where(gain_now > 0, gain_now, 1)
         nodes = crossings(level)

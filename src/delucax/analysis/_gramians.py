@@ -193,7 +193,8 @@ def _gramian_over(system: StateSpace, horizon: int | Scalar) -> Float[Array, "n 
     A, Q = system.A, system.B @ system.B.T
     if not isinstance(horizon, int):
         return gramian_over(A, Q, horizon)
-    # By doubling, W_2k = W_k + A^k W_k (A^k)', along the bits of the number of steps.
+    # By doubling, W_2k = W_k + A^k W_k (A^k)', along the bits of the number of steps:
+    # logarithmic work, and no assumption of stability.
     W, power = jnp.zeros_like(Q), system.eye
     for bit in bin(horizon)[2:]:
         W, power = W + power @ W @ power.T, power @ power

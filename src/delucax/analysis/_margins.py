@@ -111,6 +111,7 @@ def disk_of(loop: StateSpace, skew: Scalar, channel: int | None) -> DiskMargin:
     """The disk margin of a loop, or of one of its channels."""
     A, B, C, *_ = loop
     if channel is not None:
+        # The other channels are closed by u = -y before the loop is opened at this one.
         others = [i for i in range(B.shape[1]) if i != channel]
         A = A - B[:, jnp.array(others)] @ C[jnp.array(others)] if others else A
         B, C = B[:, channel, None], C[channel, None]
@@ -119,9 +120,11 @@ def disk_of(loop: StateSpace, skew: Scalar, channel: int | None) -> DiskMargin:
     closed = StateSpace(A - B @ C, B, -C, (1 + skew) / 2 * eye, loop.dt)
     peak = peak_gain(closed)
     # Finite values in the branches that are not taken keep their gradients finite.
+    # The gain is zero, and the margin infinite, where there is no loop at all.
     stable = jnp.isfinite(peak.gain)
     usual = stable & (peak.gain > 0)
     alpha = 1 / jnp.where(usual, peak.gain, 1)
+    # The extreme real factors are those at delta = -alpha and alpha.
     up, down = 2 - alpha * (1 + skew), 2 + alpha * (1 + skew)
     low = (2 - alpha * (1 - skew)) / down
     bounded = up > 0
@@ -261,9 +264,11 @@ def _margins(loop: StateSpace) -> Margins:
     values = jax.vmap(jax.vmap(lambda w: _scalar(frozen, w)))(omegas)
 
     # Where the loop is real and negative, and where it is 1 in size.
+    # A loop gain above `huge` is at a pole on the axis, no crossing.
     real = jnp.real(values[0])
     huge = jnp.finfo(real.dtype).eps ** -0.75
     negative = crosses[0] & (real < 0) & (real > -huge)
+    # Times these factors the loop gain is -1, and so it is after these turns and lags.
     factors = -1 / jnp.where(negative, real, -1)
     turns = jnp.angle(-values[1])
     lags = jnp.mod(turns, 2 * jnp.pi) / jnp.where(crosses[1], omegas[1], 1)
@@ -275,6 +280,7 @@ def _margins(loop: StateSpace) -> Margins:
             jnp.where(crosses[1], lags, jnp.inf),
         ]
     )
+    # The kind of crossing of each margin: gain margins at phase crossings.
     kinds = jnp.array([0, 0, 1, 1])
     nearest = jnp.argmin(candidates, axis=1)
     exists = jnp.isfinite(jnp.min(candidates, axis=1))
@@ -322,6 +328,8 @@ def _follow(
     Two Newton steps from a converged point: their values change nothing but rounding,
     and their derivatives are those of the crossing to third order.
     """
+    # At zero and at the Nyquist frequency a loop is real whatever its parameters: these
+    # crossings do not move, but that pi / dt moves with the step.
     dt = loop.dt
     at_nyquist = jnp.asarray(False)
     if dt is not None:
@@ -353,6 +361,8 @@ def _crossings(
         # A pole at z = -1 would map to infinity: it is perturbed to stay finite.
         axis = loop._replace(A=loop.A * (1 - 10 * eps)).bilinear_transform()
     else:
+        # Frequencies in units of the closed loop's poles: then the angles below, the
+        # arc tangents of frequencies, are well spread.
         sizes = jnp.abs(jnp.linalg.eigvals(A - B @ C))
         scale = jnp.exp(jnp.mean(jnp.log(jnp.where(sizes > 0, sizes, 1))))
         axis = StateSpace(A / scale, B / scale, C, D, None)
@@ -377,6 +387,7 @@ def _crossings(
     signs = values(between)
     # Sign changes below rounding error are ignored.
     is_reliable = jnp.isfinite(signs) & (jnp.abs(signs) > eps**0.5)
+    # Each midpoint is compared with the last reliable one before it.
     indices = jnp.arange(signs.shape[1])
     last = lax.cummax(jnp.where(is_reliable, indices, -1), axis=1)[:, :-1]
     low, high = jnp.take_along_axis(between, last, axis=1), between[:, 1:]
@@ -389,6 +400,7 @@ def _crossings(
         before = jnp.sign(values(middle)) == low_sign
         return jnp.where(before, middle, low), jnp.where(before, high, middle)
 
+    # Bisection, as it cannot leave the bracket: Newton's method follows in `_follow`.
     low, high = lax.fori_loop(0, _HALVINGS, halve, (low, high))
     phi = (low + high) / 2
     # At a pole or a zero on the axis the sign jumps without a root.
@@ -422,6 +434,7 @@ def _real_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
 def _unit_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
     """Zeros of `1 - L(-s) L(s)`: eigenvalues of a Hamiltonian."""
     A, B, C, D, _ = loop
+    # R = I - D'D of the Hamiltonian at level 1, perturbed where it is singular.
     remainder = 1 - D[0, 0] ** 2
     remainder = jnp.where(remainder == 0, jnp.finfo(A.dtype).eps, remainder)
     F = A + B @ C * D[0, 0] / remainder

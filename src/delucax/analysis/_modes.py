@@ -39,7 +39,7 @@ class ModalTest(eqx.Module):
         A = jnp.array([[1.1, 0.0], [0.0, 0.5]])
         dynamics = dlx.LinearDynamics(A, jnp.array([[0.0], [1.0]]))
         test = dlx.analysis.modal_controllability(dynamics)
-        test.out_of_reach, test.worst  # the mode 1.1
+        test.rank_deficient, test.worst  # the mode 1.1
         ```
     """
 
@@ -49,8 +49,9 @@ class ModalTest(eqx.Module):
     tolerance: Scalar
 
     @property
-    def out_of_reach(self) -> Bool[Array, " n"]:
-        """Which modes are uncontrollable (unobservable)."""
+    def rank_deficient(self) -> Bool[Array, " n"]:
+        """Which modes are uncontrollable (unobservable): the matrix of the test loses
+        rank there."""
         # Negated, so that a NaN counts as one of them.
         return ~(self.distances > self.tolerance)
 
@@ -152,7 +153,7 @@ def is_controllable(
         ```
     """
     test = modal_controllability(model, inputs=inputs, tolerance=tolerance)
-    return ~jnp.any(test.out_of_reach)
+    return ~jnp.any(test.rank_deficient)
 
 
 def is_stabilizable(
@@ -180,7 +181,7 @@ def is_stabilizable(
         ```
     """
     test = modal_controllability(model, inputs=inputs, tolerance=tolerance)
-    return ~jnp.any(test.out_of_reach & test.unstable)
+    return ~jnp.any(test.rank_deficient & test.unstable)
 
 
 def is_observable(
@@ -204,7 +205,7 @@ def is_observable(
         assert dlx.analysis.is_observable(upright)
         ```
     """
-    return ~jnp.any(modal_observability(model, tolerance=tolerance).out_of_reach)
+    return ~jnp.any(modal_observability(model, tolerance=tolerance).rank_deficient)
 
 
 def is_detectable(
@@ -231,7 +232,7 @@ def is_detectable(
         ```
     """
     test = modal_observability(model, tolerance=tolerance)
-    return ~jnp.any(test.out_of_reach & test.unstable)
+    return ~jnp.any(test.rank_deficient & test.unstable)
 
 
 def poles(model: LinearModel) -> Complex[Array, " n"]:
@@ -274,6 +275,7 @@ def _modal_test(
 def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
     system = lax.stop_gradient(system)
     eps = jnp.finfo(system.A.dtype).eps
+    # Scaled, so that a distance is relative to each of the matrices.
     scale_A, scale_B = (
         jnp.where(norm > 0, norm, 1)
         for norm in (jnp.linalg.norm(system.A), jnp.linalg.norm(system.B))
@@ -294,6 +296,7 @@ def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
         first, better = distance(eigenvalue)
         mode, least = eigenvalue, first
         for _ in range(_SEARCHES):
+            # The improved mode stays within the error of the eigenvalue.
             step = better - eigenvalue
             length = jnp.abs(step)
             step = step * jnp.minimum(1, radius / jnp.where(length > 0, length, 1))
@@ -347,6 +350,7 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
             "jax.vmap or jax.grad); how many zeros there are depends on its values."
         )
     A, B, C, D = (np.asarray(M) for M in (system.A, system.B, system.C, system.D))
+    # NumPy: the sizes of the reduced systems depend on ranks.
     total = np.linalg.norm(np.block([[A, B], [C, D]]))
     tolerance = 10 * sum(A.shape) * np.finfo(A.dtype).eps * total
     A, B, C, D = _hidden_part(A, B, C, D, tolerance)

@@ -100,6 +100,7 @@ def state_space(model: Any, inputs: str, where: str) -> StateSpace:
 
 def frobenius_norm(M: Inexact[Array, "..."]) -> Scalar:
     """The norm of all entries, complex or real, with gradient 0 at 0."""
+    # As one real array: the modulus of a complex zero has no derivative.
     parts = jnp.stack([jnp.real(M), jnp.imag(M)]) if jnp.iscomplexobj(M) else M
     return safe_norm(parts, axis=None)
 
@@ -118,6 +119,7 @@ def largest_gain(G: Inexact[Array, "p m"]) -> Scalar:
     # First-order perturbation theory of the top singular vector.
     squares, vectors = jnp.linalg.eigh(frozen.conj().T @ frozen)
     gaps = squares[-1] - squares
+    # Across a closed gap any combination of the two vectors is a singular vector.
     open_gaps = gaps > jnp.finfo(gaps.dtype).eps ** 0.5 * squares[-1]
     weights = jnp.where(open_gaps, 1 / jnp.where(open_gaps, gaps, 1), 0)
     top = vectors[:, -1]

@@ -26,6 +26,7 @@ def product(
     It is accurate even under cancellation. The bounds count all rounding, but no
     underflow.
     """
+    # Static sizes decide: one of the two is compiled.
     if left.size * right.shape[1] > _SMALL:
         return _by_slices(left, right, *added)
     return _term_by_term(left, right, *added)
@@ -71,6 +72,7 @@ def _by_slices(left, right, *added):
     eps, digits = jnp.finfo(dtype).eps, jnp.finfo(dtype).nmant + 1
     count = 1 if digits > 50 else 2
     bits = int((digits - math.log2(count * k)) / 2)
+    # k products of two slices of so many bits sum up without rounding.
     both = jnp.concatenate([left, right.T])
     # Scaled so that the k-th column and the k-th row have like size.
     across, down = (jnp.max(jnp.abs(M), axis=0) for M in (both[:n], both[n:]))
@@ -103,7 +105,7 @@ def _by_slices(left, right, *added):
     return total, lost + eps * jnp.abs(total)
 
 
-def in_parts(
+def product_in_parts(
     left: Float[Array, "n k"], right: Float[Array, "k m"]
 ) -> tuple[Float[Array, "n m"], int]:
     """The product of two matrices, and its error bound, in units of rounding of the

@@ -55,6 +55,7 @@ def wrap(angle: ArrayLike) -> Array:
 
 def _sine(x: Array, halves: Array, odd: Array) -> Array:
     """`sin(x - halves pi / 2)` to float32 accuracy, negated where `odd`."""
+    # Part by part: no digit of x cancels before the small parts are subtracted.
     r = x
     for part in _PI:
         r = r - halves * np.float32(part / 2)
@@ -69,6 +70,7 @@ def _sine(x: Array, halves: Array, odd: Array) -> Array:
 
 @jax.custom_jvp
 def _sin32(x: Array) -> Array:
+    # The nearest multiple of pi: sin(x) = +/- sin(x - quotient pi).
     quotient = jnp.round(x * np.float32(1 / np.pi))
     return _sine(x, 2 * quotient, quotient.astype(jnp.int32) & 1)
 

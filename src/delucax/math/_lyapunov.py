@@ -133,10 +133,12 @@ def gramian_over(A: Square, Q: Square, time: Scalar) -> Square:
     doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(fastest, 1))), 0, MAX_DOUBLINGS)
     short = time * 0.5**doublings
     block = jnp.block([[-A, Q], [jnp.zeros_like(A), A.T]]) * short
+    # exp([[-A, Q], [0, A']] t) = [[exp(-A t), exp(-A t) W], [0, exp(A' t)]].
     exponential = jsl.expm(block)
     power = exponential[n:, n:].T
     W = power @ exponential[:n, n:]
 
+    # W(2t) = W(t) + exp(A t) W(t) exp(A' t); of fixed length, which reverse mode needs.
     def double(carry, k):
         W, power = carry
         more = k < doublings

@@ -34,6 +34,7 @@ def safe_norm(x: ArrayLike, axis: int | None = -1, keepdims: bool = False) -> Ar
     """
     x = jnp.asarray(x)
     squared = jnp.sum(x * x, axis=axis, keepdims=keepdims)
+    # The square root of a masked one: its gradient is finite where it is not taken.
     at_zero = squared == 0
     return jnp.where(at_zero, 0.0, jnp.sqrt(jnp.where(at_zero, 1.0, squared)))
 
@@ -42,6 +43,7 @@ def within_ball(x: Array, radius: ArrayLike) -> Array:
     """The nearest point of a ball in the Euclidean (Frobenius) norm, with a finite
     gradient everywhere."""
     norm = safe_norm(x, axis=None)
+    # Inside, the factor is exactly 1, and so is its derivative of `x`.
     over = norm > radius
     return jnp.where(over, radius / jnp.where(over, norm, 1), 1).astype(x.dtype) * x
 
@@ -139,5 +141,6 @@ def units_of(z: Array) -> Array:
     entry, at most 1, and 1 if all are zero."""
     size = jnp.abs(z)
     largest = jnp.max(size, initial=0)
+    # A state at rest at zero still needs a unit in which its drift is judged.
     floor = jnp.where(largest > 0, jnp.minimum(largest, 1), 1)
     return jnp.where(size > 100 * jnp.finfo(z.dtype).eps * floor, size, floor)

@@ -95,6 +95,7 @@ def step_between(times: Array, where: str) -> Any:
     check_steps(times.shape[0], times.dtype, "the horizon", where)
     if times.shape[0] == 1:
         return None
+    # The rounding of late times is spread over all steps by the average.
     average = (times[-1] - times[0]) / (times.shape[0] - 1)
     dt = jnp.where(times[0] == 0, times[1], average)
     last = jnp.maximum(jnp.abs(times[0]), jnp.abs(times[-1]))

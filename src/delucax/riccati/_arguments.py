@@ -46,6 +46,7 @@ def hermitian_matrix(value: Any, name: str, where: str) -> Array:
     """
     matrix = square_matrix(value, name, where)
     transposed = matrix.conj().T
+    # As large as products such as C'WC may leave by rounding.
     slack = 100 * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
     wrong = jnp.max(jnp.abs(matrix - transposed)) > slack
     if is_concrete(wrong) and wrong:
@@ -132,7 +133,7 @@ _AXES = dict(A="nn", B="nm", D="nk", Q="nn", R="mm", S="nm", d="n", q="n", r="m"
 """The axes of each argument, an axis being named by its size."""
 
 
-def in_time(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
+def stage_arguments(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
     """Each argument with a leading time axis, in one precision. What is `None` is zero.
 
     The sizes are those of the first argument that has them.
@@ -155,6 +156,7 @@ def in_time(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
         if array.ndim > ndim:
             steps[name] = array.shape[0]
     T, dtype = _length(where, horizon, steps), _real_dtype(where, arrays)
+    # Constant arguments are repeated: one scan serves both kinds.
     zero = jnp.zeros((), dtype)
     shape = lambda name: (T, *(sizes[axis] for axis in _AXES[name]))
     return {

@@ -11,7 +11,7 @@ from ..math._linear_solve import factorised, solve, symmetric
 from ..math._lyapunov import MAX_DOUBLINGS
 from ..math._norms import one_if_zero, relative_and_total_size, size
 from ._arguments import RiccatiData
-from ._recursion import Element, joined, without_cross_weight
+from ._recursion import composed, Element, without_cross_weight
 
 
 _SIGN_STEPS = 60
@@ -101,6 +101,8 @@ def _by_doubling(A, G, Q, wanted):
     left = solve(moved, G)
     mixed = moved.T + Q @ left
     right = solve(mixed.T, jnp.concatenate([mixed.T + shift, left.T], axis=1))
+    # With A_c = A - cI and W = A_c' + Q A_c^-1 G: A = I + 2c W^-T, G = 2c A_c^-1 G W^-1
+    # and H = 2c W^-1 Q A_c^-1, the element to be doubled.
     H = solve(mixed, solve(moved.T, Q).T)
     H, G = symmetric(shift @ H), symmetric(shift @ right[:, n:])
     return double((right[:, :n], G, H), jnp.zeros_like(H), wanted)
@@ -122,13 +124,14 @@ def double(
 
     def body(carry):
         before, _, k = carry
-        after = joined(before, before)
+        after = composed(before, before)
         finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in after]))
         # An overflow ends the iteration at the last finite step, whose closed loop is
         # not stable, which the caller checks.
         A, _, J = after = jax.tree.map(
             lambda new, old: jnp.where(finite, new, old), after, before
         )
+        # In units of X = X0 + J, of which J may be a small part.
         changes = jnp.stack([J - before[2], J])
         (change, whole), _ = relative_and_total_size(changes, (X0 + J)[None])
         # The next change is at most |A|^2 |J|.

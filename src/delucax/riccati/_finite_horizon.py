@@ -13,8 +13,8 @@ from ..math._linear_solve import full_precision, solve
 from ._arguments import (
     constant_matrices,
     final_weight,
-    in_time,
     increasing_times,
+    stage_arguments,
     where_solved,
 )
 from ._recursion import (
@@ -140,10 +140,11 @@ def dre(
         ```
     """
     where = "dre"
-    stage = in_time(where, horizon, A=A, B=B, Q=Q, R=R, S=S, d=d, q=q, r=r)
+    stage = stage_arguments(where, horizon, A=A, B=B, Q=Q, R=R, S=S, d=d, q=q, r=r)
     A = stage["A"]
     final, n = final_weight(final, A, where), A.shape[-1]
     is_affine = any(v is not None for v in (d, q, r, final_q))
+    # Without linear terms p, s and k are zero, and are not computed.
     final_q = jnp.zeros(n) if final_q is None else final_q
     final_q = as_vector(final_q, n, "final_q", where).astype(A.dtype)
     solution = _discrete_solution(
@@ -212,7 +213,7 @@ def cre(
 
     It is exact but for rounding, however stiff the equation and coarse the grid: the
     flow is linear in `[I; X]`, so that it is known over a short time, and intervals are
-    joined, doubling their length each time, in a form that does not grow. It is
+    composed, doubling their length each time, in a form that does not grow. It is
     differentiable to any order, in either mode.
 
     **Arguments:**
@@ -263,6 +264,7 @@ def cre(
 @eqx.filter_jit
 @full_precision
 def _continuous_solution(A, B, Q, R, S, final, times):
+    # Without a definite R the Hamiltonian has no minimum, whatever X is.
     definite = is_clearly_definite(R)
     safe = jnp.where(definite, R, jnp.eye(R.shape[0], dtype=R.dtype))
     X = flow_values(*without_cross_weight(A, B, Q, safe, S), final, times, False)

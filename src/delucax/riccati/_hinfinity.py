@@ -39,7 +39,7 @@ from ._recursion import (
     short_element,
     without_cross_weight,
 )
-from ._residual import polish, riccati_residual, stationary
+from ._residual import newton_refine, riccati_residual, stationary
 from ._spectrum import spectral_abscissa, spectral_radius
 from ._stabilising import is_semidefinite, left_side, shifted
 
@@ -203,6 +203,7 @@ def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
     # A little below the least level the equation nearly has a solution.
     near = game.residual < 100 * _rounding(len(X), X.dtype)
     failure = choose(game.holds & near, RESULTS.not_converged, RESULTS.infeasible)
+    # Without a disturbance it is the control problem: no level is to blame.
     failure = choose(end.solvable, failure, RESULTS.not_stabilising)
     bound = masked(bound(lax.stop_gradient(loop)))
     return GameSolution(
@@ -249,8 +250,8 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
     # Doubling of the equation of X - X0, from below the solution, to which it rises.
     element, unit = _element(discrete, data, problem, gamma, X0)
     J, iterations = double(element, X0 / unit)
-    X, left = polish(
-        lambda X, _: riccati_residual(discrete, data, X, False, players=D.shape[1]),
+    X, left = newton_refine(
+        lambda X, _: riccati_residual(discrete, data, X, False, maximisers=D.shape[1]),
         functools.partial(_correction, discrete),
         X0 + unit * J,
         units=1,
@@ -281,6 +282,7 @@ def _element(discrete, data, problem, gamma, X0):
         moved, cross, weight = stationary(True, data, X0)
         linear = moved @ A - X0
         return without_cross_weight(A, data.B, linear, weight, cross, Q), 1.0
+    # In continuous time a step is the flow over a short interval.
     G = symmetric(B @ solve(R, B.T) - D @ D.T / gamma**2)
     # The flow of the correction, in the unit that makes its parts alike.
     moved = X0 @ A
@@ -299,6 +301,8 @@ def _correction(discrete, X, loop, error):
     if discrete:
         return lyapunov(True, loop, error)
     eye = shifted(1, X)
+    # With X = root root', loop and error become root' loop root'^-1, root^-1 error
+    # root'^-1; a singular X is shifted by its rounding.
     slack = jnp.finfo(X.dtype).eps * one_if_zero(size(X))
     root = lax.stop_gradient(jnp.linalg.cholesky(X + slack * eye))
     root = jnp.where(jnp.all(jnp.isfinite(root)), root, eye)

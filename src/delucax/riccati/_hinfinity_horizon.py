@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from .._results import choose, RESULTS
 from ..math._linear_solve import full_precision, solve, symmetric
-from ._arguments import final_weight, in_time, increasing_times, where_solved
+from ._arguments import final_weight, increasing_times, stage_arguments, where_solved
 from ._hinfinity import checked_game
 from ._level import (
     at_level,
@@ -19,7 +19,7 @@ from ._level import (
     inverse_margins,
     joint,
     joint_gain,
-    players,
+    joint_inputs,
 )
 from ._recursion import flow_values, gain, is_clearly_definite, values
 from ._stabilising import shifted
@@ -29,11 +29,12 @@ def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
     """`X` at the steps or times of the game `(A, B, D, Q, R, final, *times)`."""
     A, B, D, Q, R, final, *times = problem
     if discrete:
-        both, weight = players(B, D, R, gamma)
+        both, weight = joint_inputs(B, D, R, gamma)
         S = jnp.zeros_like(both)
         return values(A, both, Q, weight, S, final, D.shape[-1], False)
     definite = is_clearly_definite(R)
     safe = jnp.where(definite, R, shifted(1, R))
+    # The quadratic term of both players, which flows like that of control alone.
     G = symmetric(B @ solve(safe, B.T) - D @ D.T / gamma**2)
     X = flow_values(A, G, Q, final, *times, True)
     return jnp.where(definite, X, jnp.nan)
@@ -105,7 +106,7 @@ def hinf_dre(
     A = jnp.asarray(A) if isinstance(A, list | tuple) else A
     if D is None and eqx.is_array_like(A) and jnp.ndim(A) in (2, 3):
         D = jnp.eye(jnp.shape(A)[-1], dtype=jnp.result_type(A, jnp.float32))
-    stage = in_time(where, horizon, A=A, B=B, D=D, Q=Q, R=R)
+    stage = stage_arguments(where, horizon, A=A, B=B, D=D, Q=Q, R=R)
     final = final_weight(final, stage["A"], where)
     problem = (*stage.values(), final)
     return at_level(_solution, where, True, problem, gamma, tolerance, throw)
@@ -201,7 +202,7 @@ def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
     if discrete:
         # X[t+1] decides the gains of step t, which exist where X[t] does.
         good = good[:-1]
-        both, weight = players(B, D, R, level)
+        both, weight = joint_inputs(B, D, R, level)
         (A, both, after), weight = where_solved(good, (A, both, X[1:]), weight)
         K, _ = jax.vmap(gain)(A, both, weight, jnp.zeros_like(both), after)
         B = both[..., :m]

@@ -87,10 +87,11 @@ class GameSolution(eqx.Module):
     spectral_abscissa: Array | None = None
 
 
-def players(B, D, R, gamma) -> tuple[Array, Array]:
+def joint_inputs(B, D, R, gamma) -> tuple[Array, Array]:
     """`[B D]`, and the weight of the joint control `[u; w]`."""
     m, k = B.shape[-1], D.shape[-1]
     weight = jnp.zeros((*R.shape[:-2], m + k, m + k), R.dtype)
+    # gamma^2 w'w is subtracted from the cost.
     worth = -(gamma**2) * jnp.eye(k, dtype=R.dtype)
     weight = weight.at[..., :m, :m].set(R).at[..., m:, m:].set(worth)
     return jnp.concatenate([B, D], axis=-1), weight
@@ -99,7 +100,7 @@ def players(B, D, R, gamma) -> tuple[Array, Array]:
 def joint(problem: tuple, gamma: Scalar) -> RiccatiData:
     """The equation of the game `(A, B, D, Q, R)`."""
     A, B, D, Q, R = problem
-    both, weight = players(B, D, R, gamma)
+    both, weight = joint_inputs(B, D, R, gamma)
     return RiccatiData(A, both, Q, weight, jnp.zeros_like(both), None)
 
 
@@ -178,6 +179,7 @@ def bisect_level(
     def more(now):
         if gamma is not None:
             return (now.trials == 0) | (now.solvable & (now.trials < 2))
+        # Until both ends are known the bracket grows, within limits; then it shrinks.
         open_end = jnp.isinf(now.high) | (now.low == 0)
         wide = now.high > now.low * (1 + tolerance)
         near = (now.low < _WIDEST * now.start) & (now.high > now.start / _WIDEST)
@@ -215,6 +217,7 @@ def bisect_level(
         # Between neighbouring floating-point numbers the bracket closes.
         stuck = (trial <= now.low) | (trial >= now.high)
         better = good & ~stuck
+        # Of a search the best game is kept, at a given level the one that was solved.
         keep = better if gamma is None else jnp.ones((), bool)
         later = now._replace(
             low=jnp.where(stuck, now.high, jnp.where(good, now.low, trial)),
@@ -275,8 +278,9 @@ def _with_derivative_jvp(barrier, primals, tangents):
     # By implicit differentiation of barrier(problem, gamma) = constant a little above
     # the level: at it both slopes are infinite, and their quotient has a limit.
     problem, level = primals
-    level = once(level)
-    problem = jax.tree.map(once, problem)
+    level = once_differentiable(level)
+    problem = jax.tree.map(once_differentiable, problem)
+    # d gamma = -(d barrier / d problem) / (d barrier / d gamma), at some distances.
     still = jax.tree.map(jnp.zeros_like, problem)
     attained = level > 0
     safe = jnp.where(attained, level, 1)
@@ -295,7 +299,7 @@ def _with_derivative_jvp(barrier, primals, tangents):
 
 
 @jax.custom_jvp
-def once(x: Array) -> Array:
+def once_differentiable(x: Array) -> Array:
     """`x`, which cannot be differentiated twice.
 
     The slope of the barrier diverges in the limit: its own derivative would be rounding
@@ -304,8 +308,8 @@ def once(x: Array) -> Array:
     return x
 
 
-@once.defjvp
-def _once_jvp(primals, tangents):
+@once_differentiable.defjvp
+def _once_differentiable_jvp(primals, tangents):
     raise NotImplementedError(
         "The least attainable gamma has first derivatives only. Give gamma as an "
         "argument for higher ones."
@@ -319,4 +323,5 @@ def inverse_margins(
     eye = jnp.eye(D.shape[-1], dtype=D.dtype)
     margins = gamma**2 * eye - jnp.swapaxes(D, 1, 2) @ X @ D
     inverses = jax.vmap(lambda M: jnp.trace(solve(M, eye)))(margins)
+    # In the unit of X, so that the sum may be added to its trace.
     return lax.stop_gradient(gamma**2 * jnp.linalg.norm(X)) * jnp.sum(inverses)

@@ -231,6 +231,7 @@ def _solution(discrete, A, B, C) -> MatrixSolution:
     if complex_data:
         A, B, C = jax.tree.map(real_form, (A, B, C))
     solution = _solved(discrete, A, B, C)
+    # A dense solve fails only if the equation is singular.
     failure = RESULTS.ill_posed if C.size <= _DENSE else RESULTS.not_separated
     result = choose(solution.solved, RESULTS.successful, failure)
     return MatrixSolution(
@@ -265,7 +266,7 @@ def _solved(discrete, A, B, C) -> _Candidate:
         plain, shifted = kind == _PLAIN, kind == _SHIFTED
         X, iterations = _separated(discrete, A, B, C, plain, shifted)
         if last == _DENSELY:
-            X = _densely(discrete, A, B, C, X, kind == _DENSELY)
+            X = _dense_solution(discrete, A, B, C, X, kind == _DENSELY)
         residual = linear_residual(discrete, A, A.T if B is None else B, C, X)
         # For a linear equation a small residual is a small backward error: enough.
         better = (residual < before.residual) | plain
@@ -287,7 +288,7 @@ def _separated(discrete, A, B, C, plain, shifted):
     """The solution if the spectra are separated, as they are or by a shift."""
     if discrete:
         # An inactive kind gets a trivial problem, which takes one step.
-        X, steps = smith(*_wanted(plain, A, B, C))
+        X, steps = smith(*_or_trivial(plain, A, B, C))
         # Where both spectra are outside the circle, the Cayley transform puts them to
         # the right of the axis.
         eye_A, eye_B = (jnp.eye(size, dtype=C.dtype) for size in C.shape)
@@ -320,11 +321,11 @@ def _one_side(A, B, C, sign, shift, wanted):
     A = sign * (A - shift * jnp.eye(A.shape[0], dtype=A.dtype))
     if B is not None:
         B = sign * (B + shift * jnp.eye(B.shape[0], dtype=B.dtype))
-    A, B, C = _wanted(wanted, A, B, sign * C, -1)
+    A, B, C = _or_trivial(wanted, A, B, sign * C, -1)
     return stable_sylvester(A, B, C)
 
 
-def _wanted(wanted, A, B, C, scale=0):
+def _or_trivial(wanted, A, B, C, scale=0):
     """The problem if it is wanted; else a trivial one."""
     A = jnp.where(wanted, A, scale * jnp.eye(A.shape[0], dtype=A.dtype))
     if B is not None:
@@ -332,7 +333,7 @@ def _wanted(wanted, A, B, C, scale=0):
     return A, B, jnp.where(wanted, C, 0)
 
 
-def _densely(discrete, A, B, C, X, wanted):
+def _dense_solution(discrete, A, B, C, X, wanted):
     """The solution as that of one linear system, if it is wanted, else `X`."""
 
     def dense(_):
@@ -358,6 +359,7 @@ def _solved_jvp(discrete, primals, tangents):
     # Masked at input and output, so that a failed member's NaN does not spread.
     dA, dB, dC = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents)
     X = jnp.where(ok, solution.X, 0)
+    # -I/2 for what was not solved: a trivial problem in both times.
     half = functools.partial(jnp.where, ok)
     A, B = jax.tree.map(lambda M: half(M, -jnp.eye(len(M), dtype=M.dtype) / 2), (A, B))
     other, d_other = (A.T, dA.T) if B is None else (B, dB)

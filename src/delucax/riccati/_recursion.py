@@ -33,18 +33,18 @@ def is_clearly_definite(M: Square) -> BoolScalar:
     return jnp.all(jnp.diagonal(L) ** 2 > least)
 
 
-def is_saddle(M: Float[Array, "k k"], players: int) -> BoolScalar:
+def is_saddle(M: Float[Array, "k k"], maximisers: int) -> BoolScalar:
     """Whether `[u; w]' M [u; w]` has a minimum over `u` of its maximum over `w`.
 
-    `w` is the last `players` entries, and may be empty.
+    `w` is the last `maximisers` entries, and may be empty.
     """
-    m = M.shape[0] - players
-    if players == 0:
+    m = M.shape[0] - maximisers
+    if maximisers == 0:
         return is_clearly_definite(M)
     # Concave in w, and then convex in u once w is at its best: the Schur complement.
     U, C, W = M[:m, :m], M[:m, m:], -M[m:, m:]
     concave = is_clearly_definite(W)
-    safe = jnp.where(concave, W, jnp.eye(players, dtype=M.dtype))
+    safe = jnp.where(concave, W, jnp.eye(maximisers, dtype=M.dtype))
     return concave & is_clearly_definite(symmetric(U + C @ solve(safe, C.T)))
 
 
@@ -55,6 +55,7 @@ def failed_step(X: Float[Array, "T n n"]) -> int:
 
 def gain(A, B, R, S, X):
     """The stationary `K = (R + B'XB)^-1 (B'XA + S')`, and the loop `A - B K`."""
+    # By LU, not Cholesky: in a game the weight is indefinite.
     K = solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
     return K, A - B @ K
 
@@ -70,11 +71,11 @@ def one_step(A, B, Q, R, S, K, X):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(6, 7))
-def values(A, B, Q, R, S, final, players: int, parallel: bool):
+def values(A, B, Q, R, S, final, maximisers: int, parallel: bool):
     """`X` at steps 0 to T of the recursion from `final`, shape `(T+1, n, n)`.
 
-    The last `players` controls maximise. NaN at a step, and at all before it, that has
-    no saddle point.
+    The last `maximisers` controls maximise. It is NaN at a step without a saddle point,
+    and at all before it.
     """
     if parallel:
         X = _in_parallel(A, B, Q, R, S, final)
@@ -87,7 +88,7 @@ def values(A, B, Q, R, S, final, players: int, parallel: bool):
         X = backwards(back, final, (A, B, Q, R, S))
         X = jnp.concatenate([X, final[None]])
     pivot = R + jnp.swapaxes(B, 1, 2) @ X[1:] @ B
-    good = jax.vmap(lambda M: is_saddle(M, players))(symmetric(pivot))
+    good = jax.vmap(lambda M: is_saddle(M, maximisers))(symmetric(pivot))
     good &= jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
     # A step without a minimum leaves none to all the steps before it.
     good = lax.cummin(good.astype(jnp.int32), reverse=True).astype(bool)
@@ -120,7 +121,7 @@ def _in_parallel(A, B, Q, R, S, final):
 
     def combine(later, earlier):
         # The scan runs backwards, so that the later of two comes first.
-        return jax.vmap(joined)(earlier, later)
+        return jax.vmap(composed)(earlier, later)
 
     steps = jax.vmap(element)(A, B, Q, R, S)
     nothing = jnp.zeros((1, n, n), A.dtype)
@@ -149,7 +150,7 @@ def without_cross_weight(A, B, Q, R, S, added=None) -> Element:
     return closed_loop, G, symmetric(Q if added is None else Q + added)
 
 
-def joined(first: Element, second: Element) -> Element:
+def composed(first: Element, second: Element) -> Element:
     """The element of two intervals, one after the other.
 
     Source: Sarkka and Garcia-Fernandez, 2023.
@@ -176,6 +177,7 @@ def linear_recursion(loop, added, final, parallel: bool, product):
         Z = backwards(back, final, (loop, added))
         return jnp.concatenate([Z, final[None]])
 
+    # The pair (loop, added) is an affine map; composition of such maps is associative.
     def combine(later, earlier):
         (later_loop, later_added), (loop, added) = later, earlier
         moved = jax.vmap(product)(loop, later_added)
@@ -188,9 +190,9 @@ def linear_recursion(loop, added, final, parallel: bool, product):
 
 @values.defjvp
 @full_precision
-def _values_jvp(players, parallel, primals, tangents):
+def _values_jvp(maximisers, parallel, primals, tangents):
     *matrices, _ = primals
-    X = values(*primals, players, parallel)  # pyright: ignore[reportCallIssue]
+    X = values(*primals, maximisers, parallel)  # pyright: ignore[reportCallIssue]
     good = jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
     A, B, Q, R, S = matrices
     (A, B, Q, S, after), R = where_solved(good, (A, B, Q, S, X[1:]), R)
@@ -209,6 +211,7 @@ def _values_jvp(players, parallel, primals, tangents):
 
 def scale_of(G: Array, Q: Array) -> Array:
     """The size of `X` at which `X G X` is as large as `Q`; 1 if that is no size."""
+    # |G| x^2 = |Q|; its derivative cancels from the result, as any unit will do.
     quadratic, constant = jnp.linalg.norm(G), jnp.linalg.norm(Q)
     usual = (quadratic > 0) & (constant > 0)
     ratio = jnp.where(usual, constant, 1) / jnp.where(usual, quadratic, 1)
@@ -233,6 +236,7 @@ def short_element(H: Float[Array, "_ _"], time: Array) -> tuple[Array, Array, Ar
     # The denominator of the approximant is its numerator at -Z.
     flow = solve(even - odd, even + odd)
     # Backwards over the time: [U; V] = flow [I; X] and V U^-1 is X before it.
+    # That is J + A' X (I + C X)^-1 A with the three solved for here.
     first, second = flow[:n, :n], flow[:n, n:]
     eye = jnp.eye(n, dtype=H.dtype)
     solved = solve(first, jnp.concatenate([eye, second], axis=1))
@@ -254,7 +258,7 @@ def _short_elements(A, G, Q, times):
     return unit, count, jax.vmap(lambda time: short_element(H, time))(short)
 
 
-def is_within_reach(C: Array, X: Array, is_game: bool) -> Array:
+def has_solution(C: Array, X: Array, is_game: bool) -> Array:
     """Whether the equation has a solution over an interval, back from `X`.
 
     It has while `I + C X` is not singular, `C` being that of the time passed so far. As
@@ -282,13 +286,13 @@ def flow_values(A, G, Q, final, times, is_game: bool):
     NaN at a time, and at all before it, from which there is no solution to the end.
     """
     unit, count, short = _short_elements(A, G, Q, times)
-    reach = lambda C, J: is_within_reach(C, J, is_game)
+    reach = lambda C, J: has_solution(C, J, is_game)
 
     def twice(_, carry):
         element, good = carry
         # The equation from X = 0 may have a solution over each half and none over both.
         good &= jax.vmap(reach)(element[1], element[2])
-        return jax.vmap(joined)(element, element), good
+        return jax.vmap(composed)(element, element), good
 
     start = (short, jnp.ones(len(times) - 1, bool))
     parts, possible = lax.fori_loop(0, count, twice, start)
@@ -296,7 +300,8 @@ def flow_values(A, G, Q, final, times, is_game: bool):
     def back(carry, here):
         X, good = carry
         element, possible = here
-        good &= possible & is_within_reach(element[1], X, is_game)
+        # A finite escape time in the interval: the formula below would step over it.
+        good &= possible & has_solution(element[1], X, is_game)
         X = passed(element, X)
         good &= jnp.all(jnp.isfinite(X))
         return (X, good), jnp.where(good, X, jnp.nan)
@@ -312,10 +317,10 @@ def _to_differentiate(A, G, Q, final, times):
     unit, count, short = _short_elements(A, G, Q, times)
 
     def twice(element, k):
-        # After the last doubling zero elements are joined, which is harmless.
+        # After the last doubling zero elements are composed, which is harmless.
         going = k < count
         tried = jax.tree.map(lambda M: jnp.where(going, M, 0), element)
-        after = jax.vmap(joined)(tried, tried)
+        after = jax.vmap(composed)(tried, tried)
         kept = jax.tree.map(lambda a, b: jnp.where(going, a, b), after, element)
         return kept, None
 

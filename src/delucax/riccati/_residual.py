@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._typing import BoolScalar, Scalar, Square
-from ..math._accurate import in_parts, product
+from ..math._accurate import product, product_in_parts
 from ..math._linear_solve import solve, symmetric
 from ..math._norms import relative_and_total_size
 from ._arguments import RiccatiData
@@ -52,7 +52,7 @@ def riccati_residual(
     X: Square,
     accurately: BoolScalar | bool,
     *others: Float[Array, " n"],
-    players: int = 0,
+    maximisers: int = 0,
 ) -> Residual:
     r"""The residual of the Riccati equation at `X`.
 
@@ -66,7 +66,7 @@ def riccati_residual(
     square. The rounding of each product is bounded by the product of the absolute
     values of its factors. Where this bound is too wide they are evaluated `accurately`.
 
-    The last `players` controls are those of a maximising player, whose terms are
+    The last `maximisers` controls are those of a maximising player, whose terms are
     counted separately. `others` are other units of the states, in which rows and
     columns of the equation are multiplied by these.
     """
@@ -80,12 +80,12 @@ def riccati_residual(
     K, inverse = solved[:, :n], jnp.abs(solved[:, n:])
     # The terms of the equation, for their norms. A game's two quadratic terms have
     # opposite signs: their sum would hide how large they are.
-    first = m - players
+    first = m - maximisers
     moved = moved @ A
     if discrete and E is not None:
         weighted = weighted @ E
     terms = [moved, weighted if discrete else moved, Q, cross[:, :first] @ K[:first]]
-    if players:
+    if maximisers:
         terms.append(cross[:, first:] @ K[first:])
 
     working, left = _evaluated(discrete, *data, X, K)
@@ -160,25 +160,26 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
     # for M, `from_L` is what an error of L does to XL.
     unit = jnp.finfo(A.dtype).eps / 2
     size_B, size_S, size_X, size_N = (jnp.abs(M) for M in (B, S, X, K))
+    # From here on the rounded gain -N is taken for exact: any gain gives a valid bound.
     N = -K
-    BN, units_BN = in_parts(B, N)
+    BN, units_BN = product_in_parts(B, N)
     L, T = A + BN, S.T + R @ N
     lost_L = (units_BN + 1) * unit * (jnp.abs(A) + size_B @ size_N)
     lost_T = (m + 1) * unit * (size_S.T + jnp.abs(R) @ size_N)
     most_L, size_T = jnp.abs(L) + lost_L, jnp.abs(T)
     Z, lost_Z = X, jnp.zeros_like(X)
     if E is not None:
-        Z, units = in_parts(X, E)
+        Z, units = product_in_parts(X, E)
         lost_Z = units * unit * (size_X @ jnp.abs(E))
     if discrete:
-        Y, units = in_parts(X, L)
+        Y, units = product_in_parts(X, L)
         lost_Y, from_L = units * unit * (size_X @ most_L), size_X @ lost_L
         subtracted = Z if E is None else E.T @ Z
     else:
         Y, lost_Y, from_L = Z, lost_Z, jnp.zeros_like(X)
         subtracted = jnp.zeros_like(X)
     size_Y = jnp.abs(Y)
-    square, units = in_parts(L.T, Y)
+    square, units = product_in_parts(L.T, Y)
     SN, NT = S @ N, N.T @ T
     lost = most_L.T @ (units * unit * size_Y + lost_Y)
     # In discrete time an error of L is in both factors, as the second one is XL.
@@ -246,6 +247,7 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
         lost += most_L.T @ from_L
     gap_lost = jnp.abs(B.T) @ around + most_T + (n + 4) * eps * jnp.abs(T)
     lost = symmetric(lost)
+    # Where nothing cancels the first bound may be the sharper one.
     sharper = lost < wide.lost
     return _Left(
         jnp.where(sharper, symmetric(error), wide.error),
@@ -281,7 +283,7 @@ def linear_residual(discrete, A, B, C, X) -> Array:
     return jnp.where(jnp.isfinite(relative), relative, jnp.inf)
 
 
-def polish(
+def newton_refine(
     residual: Callable[[Array, Array], Residual],
     correction: Callable[[Array, Array, Array], Array],
     X: Square,

@@ -43,8 +43,8 @@ _NEXT = (
     # PERTURBED: the solution is confirmed, or marginal. That may be due to bad scaling;
     # if not, the question is whether the pair is stabilisable.
     (DONE, BALANCED, UNIT),
-    # UNIT: a stabilisable pair may have its closed loop on the boundary; without one
-    # there is nothing more to find out.
+    # UNIT: of a stabilisable pair the closed loop may be on the boundary. If that is
+    # known already, or the pair is not stabilisable, there is nothing more to find out.
     (REGULARISED, DONE, DONE),
     # REGULARISED: the last question.
     (DONE, DONE, DONE),
@@ -85,11 +85,11 @@ class SearchResult(NamedTuple):
     best: Candidate
     solved: BoolScalar
     stable: BoolScalar
-    fragile: BoolScalar  # whether rounding of the data changes or removes the solution
+    marginal: BoolScalar  # whether rounding of the data changes or removes the solution
     stabilisable: BoolScalar
-    on_edge: BoolScalar
+    on_boundary: BoolScalar
     balanced: BoolScalar
-    posed: BoolScalar
+    well_posed: BoolScalar
     iterations: Int[Array, ""]
 
     @property
@@ -98,30 +98,30 @@ class SearchResult(NamedTuple):
 
     @property
     def differentiable(self) -> BoolScalar:
-        return self.stable & jnp.all(jnp.isfinite(self.X)) & self.posed
+        return self.stable & jnp.all(jnp.isfinite(self.X)) & self.well_posed
 
     @property
     def result(self) -> Result:
         """The status."""
-        good = self.solved & ~self.fragile
+        good = self.solved & ~self.marginal
         close = self.stable & (self.best.residual <= tolerance(self.X.dtype) ** 0.5)
         result = choose(close, RESULTS.not_converged, RESULTS.not_stabilising)
-        result = choose(self.fragile | self.on_edge, RESULTS.on_boundary, result)
+        result = choose(self.marginal | self.on_boundary, RESULTS.on_boundary, result)
         result = choose(self.stabilisable, result, RESULTS.not_stabilisable)
         result = choose(good, RESULTS.successful, result)
-        return choose(self.posed, result, RESULTS.ill_posed)
+        return choose(self.well_posed, result, RESULTS.ill_posed)
 
 
 def search(
     attempt: Callable[[Int[Array, ""], BoolScalar], Attempt],
     X: Square,
-    posed: BoolScalar,
-    apart: BoolScalar,
+    well_posed: BoolScalar,
+    badly_scaled: BoolScalar,
 ) -> SearchResult:
     """Make attempts of the kinds above, as few as are needed.
 
-    `attempt(kind, balanced)` is in balanced or in the user's units, which `apart` tells
-    to be badly scaled. Most problems are solved by the first attempt. In a batch, the
+    `attempt(kind, balanced)` is in balanced or in the user's units, which may be
+    `badly_scaled`. Most problems are solved by the first attempt. In a batch, the
     others are made if any member needs them.
     """
     dtype = X.dtype
@@ -140,7 +140,7 @@ def search(
         # tolerance is accepted then.
         enough = jnp.clip(new.attainable, close, 100 * close)
         # With bad scaling a wrong X can have a small balanced residual.
-        unfit = apart & ~balanced
+        unfit = badly_scaled & ~balanced
         solved = stable & (at.residual <= enough) & (~unfit | (at.unscaled <= close))
         unchanged = kind <= SECOND  # the user's problem, not a perturbed one
         # Between two solutions the smaller residual decides. Between two failures the
@@ -156,8 +156,8 @@ def search(
         # The gap of a robust solution hardly changes with Q; that of a marginal one
         # changes by as much as itself.
         same = jnp.abs(at.gap - best.gap) <= _ALIKE * best.gap
-        fragile = before.fragile & ~(unchanged & solved)
-        fragile = jnp.where(kind == PERTURBED, ~(survives & same), fragile)
+        marginal = before.marginal & ~(unchanged & solved)
+        marginal = jnp.where(kind == PERTURBED, ~(survives & same), marginal)
         unit = kind == UNIT
         solved_now, stable_now, kept = jax.tree.map(
             lambda now, then: jnp.where(take, now, then),
@@ -165,19 +165,20 @@ def search(
             (before.solved, before.stable, best),
         )
         stabilisable = survives | undecided | stable_now
-        on_edge = jnp.where(kind == REGULARISED, survives & new.around, before.on_edge)
+        near_it = survives & new.around
+        on_boundary = jnp.where(kind == REGULARISED, near_it, before.on_boundary)
         after = before._replace(
             best=kept,
             solved=solved_now,
             stable=stable_now,
-            fragile=fragile,
+            marginal=marginal,
             stabilisable=jnp.where(unit, stabilisable, before.stabilisable),
-            on_edge=jnp.where(unit, undecided, on_edge),
+            on_boundary=jnp.where(unit, undecided, on_boundary),
             balanced=balanced,
             iterations=before.iterations + jnp.where(unchanged, new.iterations, 0),
         )
         # The column of the table.
-        success = jnp.where(unchanged, solved, ~fragile & (~unit | survives))
+        success = jnp.where(unchanged, solved, ~marginal & (~unit | survives))
         outcome = jnp.where(success, 0, jnp.where(unfit, 1, 2))
         # No index from outside: nothing is clipped, which compiles sooner.
         following = jnp.asarray(_NEXT).at[kind, outcome].get(mode="promise_in_bounds")
@@ -185,15 +186,15 @@ def search(
         return jnp.where(over, DONE, following), after
 
     most, no = jnp.asarray(jnp.inf, dtype), jnp.asarray(False)
-    flags = "solved", "stable", "fragile", "on_edge", "balanced"
+    flags = "solved", "stable", "marginal", "on_boundary", "balanced"
     nothing = SearchResult(
         Candidate(X, residual=most, unscaled=most, bound=most, gap=-most),
         **dict.fromkeys(flags, no),
         stabilisable=jnp.asarray(True),
-        posed=posed,
+        well_posed=well_posed,
         iterations=jnp.asarray(0),
     )
-    start = jnp.where(posed, FIRST, DONE)
+    start = jnp.where(well_posed, FIRST, DONE)
     return lax.while_loop(lambda carry: carry[0] != DONE, body, (start, nothing))[1]
 
 
@@ -268,8 +269,8 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
     if E is not None:
         f = -jnp.max(logarithm(jnp.abs(E)) - d, axis=1)
     both = jnp.stack([d, f])
-    apart = jnp.any(jnp.max(both, axis=1) - jnp.min(both, axis=1) > _APART)
-    both = jnp.where(apart, both, 0)
+    badly_scaled = jnp.any(jnp.max(both, axis=1) - jnp.min(both, axis=1) > _APART)
+    both = jnp.where(badly_scaled, both, 0)
     return power_of_two(jnp.exp2(both))
 
 

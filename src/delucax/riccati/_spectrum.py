@@ -27,6 +27,7 @@ def spectral_radius(A: Square) -> Scalar:
     `log(cond) / N`, with `cond` the condition of the eigenvectors. Of a large matrix a
     few squarings leave only few directions; the rest is done in their span.
     """
+    # In the span of the remaining directions the products are of small matrices.
     logarithm, is_narrow, span, _ = _growth(A, A.shape[0] > _LARGE)
     if A.shape[0] > _LARGE:
         within, *_ = _growth(span.T @ A @ span, False)
@@ -138,6 +139,7 @@ def balanced(A: Square) -> Square:
         scale = scale * ratio**0.25
         return scale / jnp.exp2(jnp.round(jnp.mean(jnp.log2(scale))))
 
+    # A fixed number of sweeps: balancing need not be exact.
     scale = lax.fori_loop(0, 24, sweep, jnp.ones(A.shape[0], A.dtype))
     usable = jnp.isfinite(scale) & (scale > 0)
     scale = power_of_two(jnp.where(usable, scale, 1))

@@ -28,7 +28,7 @@ from ._arguments import (
     where_solved,
 )
 from ._doubling import continuous_start, discrete_start
-from ._residual import polish, riccati_residual, stationary
+from ._residual import newton_refine, riccati_residual, stationary
 from ._search import (
     Attempt,
     Candidate,
@@ -121,6 +121,8 @@ def stabilising_solution(
 def _as_complex(solution: RiccatiSolution, discrete: bool, data: RiccatiData):
     """The solution in complex form, with a new residual bound: rounding may have left
     an `X` that is not exactly a real form."""
+    # The real form solves the real equation of twice the size, whose solution has the
+    # same structure, gain and closed loop included.
     solution = eqx.tree_at(
         lambda s: (s.X, s.K, s.closed_loop), solution, replace_fn=complex_form
     )
@@ -140,6 +142,7 @@ def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
     # The gain is a formula in X and the data, whose derivatives are then its own.
     K, closed_loop = _feedback(discrete, solution.differentiable, data, solution.X)
     residual, bound = lax.stop_gradient((solution.best.unscaled, solution.best.bound))
+    # Back to the user's units, by powers of two: without rounding.
     return RiccatiSolution(
         X=solution.X * (f[:, None] * f),
         K=K * d,
@@ -163,11 +166,11 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
         solved = factorised(E)
         explicit = RiccatiData(solved(A), solved(B), Q, R, S, None)
     # In discrete time R + B'XB is inverted, in continuous time R alone.
-    posed = (
+    well_posed = (
         is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
     )
     for M in explicit[:5]:
-        posed = posed & jnp.all(jnp.isfinite(M))
+        well_posed = well_posed & jnp.all(jnp.isfinite(M))
     magnified = 1 if E is None else size(E) ** 2
 
     def attempt(kind: Array, balanced: Array) -> Attempt:
@@ -179,6 +182,8 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             # Without E the rows have the units of the states.
             plain = in_units(jnp.stack([state, state]), explicit)
             start = here._replace(A=plain.A, B=plain.B)
+        # Discrete time restarts from a higher point, continuous time by doubling in
+        # place of the sign iteration.
         second = kind == SECOND
         if discrete:
             height = size_Q * jnp.where(second, _SECOND_START, 1)
@@ -186,7 +191,8 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             size_G = jnp.zeros_like(size_Q)  # needed in continuous time alone
         else:
             X, size_G, iterations = continuous_start(start, second)
-        X, left = polish(
+        # Residuals in the attempt's, the user's and the balanced units.
+        X, left = newton_refine(
             lambda *at: riccati_residual(discrete, here, *at, by[0] * state, state),
             lambda _, *at: _correction(discrete, here.E, *at),
             _outside(here.E, X),
@@ -225,7 +231,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             iterations=iterations,
         )
 
-    return search(attempt, jnp.full_like(Q, jnp.nan), posed, jnp.any(by != 1))
+    return search(attempt, jnp.full_like(Q, jnp.nan), well_posed, jnp.any(by != 1))
 
 
 @_certified.defjvp
@@ -242,6 +248,7 @@ def _certified_jvp(discrete, primals, tangents):
     # dX solves a Lyapunov equation whose constant is the derivative in the data.
     equation = functools.partial(left_side, discrete, X)
     _, error, loop = jax.jvp(equation, (safe,), (tangent,), has_aux=True)
+    # -I/2 is stable in both times, and its Lyapunov equation converges fast.
     loop = jnp.where(ok, loop, shifted(-0.5, loop))
     change = _correction(discrete, data.E, loop, jnp.where(ok, error, 0))
     still = no_tangent(solution)
@@ -253,6 +260,7 @@ def left_side(discrete: bool, X: Array, data: RiccatiData) -> tuple[Array, Array
     """The left side of the equation at `X`, and the closed loop; for derivatives."""
     A, _, Q, *_, E = data
     moved, cross, K, closed_loop = _terms(discrete, data, X)
+    # With the gain eliminated: its derivative in X is then the Lyapunov operator.
     linear = moved @ A
     if discrete:
         linear = linear - (X if E is None else E.T @ X @ E)
