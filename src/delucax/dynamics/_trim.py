@@ -113,7 +113,7 @@ def trim(
 
 
 def _fixed(model: Any, fix: Any, where: str) -> dict[int, Any]:
-    """From the index of each state and control that is held to its value, if given."""
+    """The index of each state and control that is held, with its value if given."""
     if isinstance(fix, str):
         fix = (fix,)
     names = (*model.state_names, *model.control_names)

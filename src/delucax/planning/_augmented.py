@@ -28,7 +28,7 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         return optimise(problem, start, options)
     T, m = controls_of(start).shape
     n, dtype = problem.x0.shape[0], problem.x0.dtype
-    # Beyond it rounding of the squares exceeds what the tolerances ask for.
+    # At a larger weight rounding of the squares exceeds the tolerances.
     most_rho = 1 / jnp.finfo(dtype).eps ** 0.6
 
     def body(carry):

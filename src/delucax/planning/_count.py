@@ -17,7 +17,7 @@ from ..dynamics import AbstractDynamics, AbstractWrapper
 
 
 class Evaluations(NamedTuple):
-    """How often dynamics were evaluated, by what was asked of them."""
+    """The numbers of calls of dynamics, and of products with their Jacobian."""
 
     primal: int
     tangent: int

@@ -221,7 +221,7 @@ def _learned(
     t0, bounds = plan.t0.astype(x0.dtype), None
     if plan.low is not None and plan.high is not None:
         bounds = plan.low, plan.high
-    # The model knows nothing of `w`: it is what the plant has and the model lacks.
+    # The model has no disturbance: `w` is part of the model mismatch.
     true = Problem(plant, cost, x0, t0, w, bounds, plan.difference)
     known = dataclasses.replace(true, dynamics=model, w=None)
     rates = as_float_array(step), as_float_array(rate)

@@ -30,7 +30,7 @@ from ._start import operating_point, Start
 
 
 def checked_plan(plan: Plan, where: str, throw: bool = True) -> Plan:
-    """Raise if asked to, unless the plan is a solution."""
+    """The plan; if `throw`, raise unless it is a solution."""
     facts = lambda: (
         f"After {int(plan.iterations)} iterations the cost is {float(plan.cost):.6g} "
         f"and the residual {float(plan.residual):.2g}."

@@ -186,7 +186,7 @@ class Problem(eqx.Module):
         return jnp.minimum(jnp.maximum(u, low), high)
 
     def room(self, controls: Array) -> tuple[Array, Array] | None:
-        """The bounds of a change of each control, if there are any."""
+        """The bounds of a change of each of `controls`, if there are any."""
         if self.bounds is None:
             return None
         low, high = self.bounds
@@ -200,29 +200,29 @@ class Problem(eqx.Module):
         return self.dynamics.advance(t, x, u, w)[0].astype(x.dtype)
 
     def stage_constraints(self, t: Array, x: Array, u: Array) -> Values:
-        """The values of the constraints of a step."""
+        """The values of the constraints of a step, at `t`, `x`, `u`."""
         assert self.constraints is not None
         functions = self.constraints.inequality, self.constraints.equality
         return values_of(functions, (t, x, u), x.dtype)
 
     def final_constraints(self, t: Array, x: Array) -> Values:
-        """The values of the constraints at the end."""
+        """The values of the constraints at the end, at `t`, `x`."""
         assert self.constraints is not None
         functions = self.constraints.final_inequality, self.constraints.final_equality
         return values_of(functions, (t, x), x.dtype)
 
     def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
-        """The values of the constraints of all steps, and at the end."""
+        """Their values at all steps of `states` and `controls`, and at the end."""
         times = self.times(controls.shape[0])
         stage = jax.vmap(self.stage_constraints)(times[:-1], states[:-1], controls)
         return stage, self.final_constraints(times[-1], states[-1])
 
     def with_multipliers(self, multipliers: Multipliers | None) -> "Problem":
-        """The problem whose cost is the augmented Lagrangian with these, if any."""
+        """The problem whose cost is the augmented Lagrangian with `multipliers`."""
         return dataclasses.replace(self, multipliers=multipliers)
 
     def stage_cost(self, t: Array, x: Array, u: Array, y: Array | None) -> Array:
-        """The cost of a step, and what the constraints add to it."""
+        """The cost of a step at `t`, `x`, `u`, with the penalty by multipliers `y`."""
         cost = self.cost(t, x, u)
         if self.multipliers is None or y is None:
             return cost + 0.0  # an integer cost has a gradient then
@@ -230,7 +230,7 @@ class Problem(eqx.Module):
         return cost + augmented(c, y, self.multipliers.rho, equal)
 
     def final_cost(self, t: Array, x: Array) -> Array:
-        """The cost at the end, and what the constraints add to it."""
+        """The cost at the end, at `t`, `x`, with the penalty of the constraints."""
         cost = self.cost.final(t, x)
         if self.multipliers is None:
             return cost
@@ -316,7 +316,7 @@ def roll_out(
     """The trajectory under `u - length k - K (x - x_planned)`, and its cost.
 
     Each of `K` and `k` may be left out. `1 - length` of each defect is left.
-    The cost is infinite if anything goes wrong.
+    The cost is infinite if a step fails or a number is not finite.
     """
     size = problem.x0.shape[0]
 

@@ -21,7 +21,7 @@ from ._problem import Problem
 
 
 class Start(eqx.Module):
-    """Where a planner starts: the trajectory that the model takes under
+    """A start of a planner: the trajectory of the model under
 
     `u_k = controls[k] - gains[k] (x_k - states[k])`,
 
@@ -242,7 +242,7 @@ def _both(point, regulator, controls, T):
     K = jnp.zeros((u.shape[0], x.shape[0]), x.dtype)
     if regulator is not None:
         solution, posed = regulator
-        # A gain that stabilises will do, whatever its residual.
+        # Any stabilising gain is a valid start, also one of large residual.
         stable = posed & (solution.spectral_radius < 1)
         stable = stable & jnp.all(jnp.isfinite(solution.K))
         K = jnp.where(stable, solution.K, K)

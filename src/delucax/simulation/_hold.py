@@ -54,7 +54,7 @@ class Inputs(eqx.Module):
         return evaluate_field(self.system, t, x, u, w).astype(x.dtype)
 
     def act(self, s: Array, x: Array, memory: Any) -> tuple[Array, Any]:
-        """A held controller's answer at a switch, and its state after it."""
+        """The control of a held controller at a switch, and its state after it."""
         t = self.start.t + s
         state = eqx.combine(memory, eqx.filter(self.memory, eqx.is_array, inverse=True))
         u, after = call_controller(self.source, t, self.system.observe(t, x), state)

@@ -116,7 +116,7 @@ def simulate(
         if false, look at `trajectory.result`.
 
     **Returns:** a [`delucax.Trajectory`][] whose `times` are those saved at. Its
-    `controls` and `disturbances` are those in force just before each time but the first
+    `controls` and `disturbances` are those acting just before each time but the first
     (with `hold=None`, the control just after each time but the last), `observations`
     are what the sensor reads at each time but the last.
 
@@ -174,8 +174,8 @@ def simulate(
     source = controller_or_controls
     if isinstance(source, AbstractController) and source.learns_from_cost:
         raise ValueError(
-            f"{where}: {type(source).__name__} learns from the cost of each step, of "
-            "which one solve knows nothing; use `delucax.rollout`."
+            f"{where}: {type(source).__name__} learns from the cost of each step, but "
+            "simulate has no cost; use `delucax.rollout`."
         )
     if not callable(source):
         name = "controller_or_controls"
@@ -243,14 +243,14 @@ def _simulate(
     sampled = hold == "zero" and isinstance(source, AbstractController)
     args = _inputs(system, source, w, x0, t0, switches, key, hold)
     if sampled:
-        # The control in force at the start; the first step asks again, from the same
-        # state, because it is the first of its interval.
+        # The control at the start. The first step calls the controller again, in the
+        # same state, because it is the first of its interval.
         u, _ = args.act(grid[0], x0, eqx.filter(args.memory, eqx.is_array))
         args = eqx.tree_at(lambda a: a.u, args, u, is_leaf=lambda leaf: leaf is None)
     start = TimeOffset(t0, lambda t: args.field(t, x0))
     args = eqx.tree_at(lambda a: a.start, args, start)
 
-    # Either the ends of the intervals, or what is asked for and the end of the horizon.
+    # Either the ends of the intervals, or the times in `ts` and the end of the horizon.
     saved: Any = dict(t0=True, ts=saves[1:]) if ts is None else dict(t1=True, ts=saves)
     if sampled:
         saved["fn"] = save_fn
@@ -288,7 +288,7 @@ def _simulate(
     finite = jnp.all(jnp.isfinite(final_state))
     result = solve_result(solution, options["stepsize_controller"], dtype)
     result = first_failure(result, choose(finite, RESULTS.successful, RESULTS.diverged))
-    # At the last time asked for: what is saved at the end itself knows nothing of it.
+    # At the last save time. The record at `t1` is made with the first state's counters.
     last = {name: totals[count - 1] for name, totals in counts.items()}
     incidents = {n: at[1:count] > at[: count - 1] for n, at in counts.items()}
     result = first_failure(result, controller_result(last, tallies(args.memory)))

@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 class Trajectory(eqx.Module):
     """The record of a closed loop: `T` steps from `T + 1` states.
 
-    What was not asked for with `keep=` is `None`. Under `jax.vmap` every array has a
+    Arrays that `keep=` leaves out are `None`. Under `jax.vmap` every array has a
     leading batch axis.
 
     **Attributes:**
 
     - `times`: shape `(T + 1,)`.
     - `states`: shape `(T + 1, n)`.
-    - `observations`: what the controller was given, shape `(T, p)`.
+    - `observations`: those given to the controller, shape `(T, p)`.
     - `controls`: what was applied, after the bounds, shape `(T, m)`.
     - `disturbances`: shape `(T, k)`.
     - `costs`: stage costs, shape `(T,)`; 0 after termination.
@@ -111,7 +111,7 @@ class Trajectory(eqx.Module):
 
     @property
     def observations(self) -> Array | None:
-        """What the controller was given, shape `(T, p)`."""
+        """The observations given to the controller, shape `(T, p)`."""
         if self.recorded_observations is None and "observations" in self.keep:
             return None if self.states is None else self.states[..., :-1, :]
         return self.recorded_observations
@@ -306,7 +306,7 @@ class Trajectory(eqx.Module):
     def summary(self) -> "pandas.DataFrame":
         """One row for a trajectory, one a member for a batch: cost, length, outcome.
 
-        Columns: `total_cost`, `final_cost`, `mean_cost` (a step), `length`,
+        Columns: `total_cost`, `final_cost`, `mean_cost` (per step), `length`,
         `terminated`, `result`; and for each kind of incident that happened, such as
         `failed_plan`, the number of steps `failed_plan_count` and the time of the
         first, `failed_plan_time`.
