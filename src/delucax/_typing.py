@@ -1,7 +1,7 @@
 """Array aliases shared by every signature."""
 
 from collections.abc import Callable
-from typing import Any, Literal, TYPE_CHECKING, TypeAlias
+from typing import Any, Generic, Literal, TYPE_CHECKING, TypeAlias, TypeVar
 
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, Num, UInt32
 
@@ -13,6 +13,8 @@ Vector: TypeAlias = Float[Array, "_"]  # noqa: F821
 """A rank-1 floating-point array."""
 Matrix: TypeAlias = Float[Array, "_ _"]
 """A rank-2 floating-point array."""
+Square: TypeAlias = Float[Array, "n n"]
+"""A square matrix; all in one signature have the same size."""
 State: TypeAlias = Float[Array, "states"]  # noqa: F821
 Control: TypeAlias = Float[Array, "controls"]  # noqa: F821
 Disturbance: TypeAlias = Float[Array, "disturbances"] | None  # noqa: F821
@@ -30,15 +32,23 @@ Checkpoint: TypeAlias = Literal["step", "sqrt"] | None
 
 
 if TYPE_CHECKING:
+    _Read = TypeVar("_Read")
+    _Given = TypeVar("_Given")
 
-    class Real:
-        """A field that is set to a number or an array, and is an array to its readers.
+    class _Converted(Generic[_Read, _Given]):
+        """A field whose readers have another type than its constructor takes.
 
         A static checker reads off `__set__` what the constructor takes.
         """
 
-        def __get__(self, instance: Any, owner: Any = None) -> Array: ...
-        def __set__(self, instance: Any, value: ArrayLike) -> None: ...
+        def __get__(self, instance: Any, owner: Any = None) -> _Read: ...
+        def __set__(self, instance: Any, value: _Given) -> None: ...
 
+    _Numbers: TypeAlias = ArrayLike | list[Any] | tuple[Any, ...]
+    Real: TypeAlias = _Converted[Array, _Numbers]
+    RealOrNone: TypeAlias = _Converted[Array | None, _Numbers | None]
+    BoundsOrNone: TypeAlias = _Converted[
+        Bounds | None, tuple[ArrayLike, ArrayLike] | None
+    ]
 else:
-    Real = Array
+    Real, RealOrNone, BoundsOrNone = Array, Array | None, Bounds | None

@@ -645,15 +645,15 @@ def test_noise_that_a_hand_made_wrapper_would_lose_is_an_error():
     make = lambda dynamics: dlx.Environment(dynamics, cost)
     with user_error(match="increments must be at least 1.*AbstractWrapper"):
         make(Says(noisy))
-    hidden = "Environment: ByHand hides the Brownian noise of the {} that it.*"
-    hidden += "AbstractWrapper, or give ByHand `noise`"
+    hidden = "Environment: ByHand does not forward `noise` of the {} that it.*"
+    hidden += "AbstractWrapper, or define `noise` in ByHand"
     with user_error(match=hidden.format("Discretized")):
         make(ByHand(noisy))
     with user_error(match=hidden.format("Delayed")):
         make(ByHand(dlx.dynamics.Delayed(noisy)))
     with user_error(match=hidden.format("Discretized")):
         make(Weak(Forwards(ByHand(noisy))))
-    with user_error(match="Euler hides the Brownian noise of the Shaky"):
+    with user_error(match="Euler does not forward `noise` of the Shaky"):
         make(Euler({"system": [Shaky()]}))
     with user_error(match=hidden.format("Discretized")):
         dlx.replace(make(calm), {"dynamics": ByHand(noisy)})

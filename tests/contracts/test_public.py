@@ -127,9 +127,9 @@ LONG = {
     environments.cartpole environments.cartpole_linear studies.reproduce
     studies.train_swing_up lung.explore lung.fit_lungs lung.LearnedLung
     lung.least_error lung.pid_grid lung.ShootingMPC lung.train_controllers
-    lung.write_example planning.Constraints planning.ilqr planning.Plan
+    planning.Constraints planning.ilqr planning.Plan
     plotting.phase_portrait randomise
-    riccati.ContinuousHorizonSolution riccati.dre riccati.hinf_care riccati.hinf_cre
+    riccati.dre riccati.hinf_care riccati.hinf_cre
     riccati.hinf_dre simulate training.analytic training.EvolutionStrategies
     training.expected_cost training.fit training.PPO training.scored_cost
     training.SHAC training.sysid.arx training.sysid.Identified

@@ -147,7 +147,7 @@ def test_more_steps_than_single_precision_tells_apart():
             sequence(disturbance, jnp.arange(MOST + 1), jnp.asarray(0.01))
         late = 1e6 + 0.01 * jnp.arange(9)
         with user_error(
-            match=f"{name}: times in float32 do not tell steps of .* apart"
+            match=f"{name}: times in float32 are too coarse for steps of .*"
         ):
             disturbance.sequence(None, late)
         # In a compiled program times are not known.

@@ -9,7 +9,7 @@ import pytest
 from helpers import dtype, tolerance
 
 from delucax.math._accurate import in_parts, product
-from delucax.math._size import power_of_two
+from delucax.math._norms import power_of_two
 
 
 def exact(left, right, *added):

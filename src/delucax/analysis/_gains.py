@@ -69,7 +69,7 @@ def _responses(
 def dcgain(
     model: LinearModel, *, inputs: str = "controls", throw: bool = True
 ) -> Float[Array, "p m"]:
-    """What constant inputs make of the outputs in the end,
+    """The steady-state (DC) gain from inputs to outputs,
 
     `-C A^-1 B`, or in discrete time `C (I - A)^-1 B`.
 
@@ -78,8 +78,8 @@ def dcgain(
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][]. It need not be stable.
     - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
-    - `throw`: raise if a pole at frequency zero, an integrator, leaves no such gain
-        (default); if false, return infinity there.
+    - `throw`: raise if there is a pole at frequency zero, an integrator (default); if
+        false, return infinity there.
 
     **Returns:** shape `(p, m)`.
 
@@ -99,8 +99,8 @@ def dcgain(
     """
     gain, has_integrator = _dcgain(state_space(model, inputs, "dcgain"))
     message = (
-        "dcgain: a pole is at frequency zero (an integrator), so that constant inputs "
-        "come to no constant outputs. Pass throw=False for infinity."
+        "dcgain: a pole is at frequency zero (an integrator), so the DC gain is "
+        "infinite. Pass throw=False to return infinity."
     )
     return raise_if(has_integrator, gain, message) if throw else gain
 
@@ -188,7 +188,7 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
 @eqx.filter_jit
 def _h2_norm(system: StateSpace) -> Scalar:
     stable = system.is_stable()
-    W = stable_gramian(system.stable_or_harmless(stable))
+    W = stable_gramian(system.stable_or_placeholder(stable))
     square = jnp.trace(system.C @ W @ system.C.T)
     positive = square > 0
     norm = jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
@@ -203,20 +203,22 @@ def hinf_norm(
     `max over omega of sigma_max(C (s I - A)^-1 B)`, at `s = j omega`, or in discrete
     time at `exp(j omega dt)`.
 
-    A level just above the largest gain so far is crossed at frequencies that are
-    eigenvalues of a Hamiltonian matrix; between two of them the gain is looked at
-    again, until nothing is above the level, and Newton steps find the top. Infinite if
-    a pole is on or outside the boundary of stability.
+    The frequencies at which the gain crosses a level just above the largest one so far
+    are eigenvalues of a Hamiltonian matrix. The gain is evaluated again at their
+    midpoints until no crossing remains, and Newton steps refine the peak. Infinite if a
+    pole is on or outside the boundary of stability.
 
-    It has first and second derivatives, in either mode, where one frequency and one
-    direction alone attain the maximum; elsewhere it has those of one that does.
+    It has first and second derivatives, in either mode, where the maximum is attained
+    at one frequency in one direction alone; elsewhere the derivatives of one maximiser
+    are returned.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
     - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
-    - `throw`: raise if the search does not end (default); if false, look at `result`.
+    - `throw`: raise if the search does not converge (default); if false, check
+        `result`.
 
     **Returns:** a [`delucax.analysis.PeakGain`][].
 
@@ -251,10 +253,18 @@ def peak_gain(system: StateSpace) -> PeakGain:
     poles = jnp.linalg.eigvals(lax.stop_gradient(system.A))
     growth = system.growth(poles)
     stable = jnp.all(growth < 0)
-    safe = system.stable_or_harmless(stable)
+    safe = system.stable_or_placeholder(stable)
     frozen = lax.stop_gradient(safe)
     start, ended = _search(frozen)
-    gain, frequency = _at_top(safe, *_climb(frozen, start))
+    top, curvature, moves = _climb(frozen, start)
+    finite = jnp.isfinite(top)
+    gain, slope = _with_slope(safe, jnp.where(finite, top, 1))
+    rise = jnp.where(moves, slope - lax.stop_gradient(slope), 0)
+    # One Newton step, numerically zero: it carries the implicit derivative of the
+    # maximiser.
+    step = -rise / curvature
+    gain = gain + step * slope + step**2 * curvature / 2
+    gain, frequency = jnp.where(finite, gain, largest_gain(safe.D)), top + step
     least = poles[jnp.argmax(growth)]
     if system.dt is None:
         at_pole = jnp.abs(jnp.imag(least))
@@ -274,16 +284,16 @@ def _with_slope(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScalar]:
-    """The top by Newton steps for as long as they go up.
+    """The peak, refined by Newton steps while the gain rises.
 
-    **Returns:** its frequency, the curvature of the gain there, and whether it is a top
-    that moves with the plant; at the ends of the axis it rests.
+    **Returns:** its frequency, the curvature of the gain there, and whether its
+    frequency depends on the plant, which at the ends of the axis it does not.
     """
     rounding = 100 * jnp.finfo(omega.dtype).eps
 
     def step(_, carry):
         best, flattest, top, top_curvature, moves, trial = carry
-        # An infinite frequency is a point like any other that has no slope.
+        # At an infinite frequency there is no slope: the placeholder 1 is not used.
         finite = jnp.isfinite(trial)
         at = jnp.where(finite, trial, 1)
         (gain, slope), (_, curvature) = jax.jvp(
@@ -293,7 +303,7 @@ def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScala
             finite & (curvature < 0) & jnp.isfinite(slope) & jnp.isfinite(curvature)
         )
         curvature = jnp.where(usable, curvature, -1)
-        # Near the top the gain is level but for rounding, and its slope decides.
+        # Near the peak gains differ by rounding alone, and the slope decides.
         up = usable & (gain >= best) & (jnp.abs(slope) < flattest) & (trial >= 0)
         top = jnp.where(up, trial, top)
         return (
@@ -311,24 +321,10 @@ def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScala
     return top, curvature, moves
 
 
-def _at_top(
-    system: StateSpace, omega: Scalar, curvature: Scalar, moves: BoolScalar
-) -> tuple[Scalar, Scalar]:
-    """The gain at the top, and its frequency, which move with the plant as they do."""
-    finite = jnp.isfinite(omega)
-    gain, slope = _with_slope(system, jnp.where(finite, omega, 1))
-    rise = jnp.where(moves, slope - lax.stop_gradient(slope), 0)
-    # Zero, but not its derivatives: the step that Newton's method would take next.
-    step = -rise / curvature
-    gain = gain + step * slope + step**2 * curvature / 2
-    at_infinity = largest_gain(system.D)
-    return jnp.where(finite, gain, at_infinity), omega + step
-
-
 def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
-    """The frequency of the largest gain, and whether the search came to its end."""
-    axis = system.on_the_axis() if system.is_discrete else system
-    A, B, C, D = axis.A, axis.B, axis.C, axis.D
+    """The frequency of the largest gain, and whether the search converged."""
+    axis = system.bilinear_transform() if system.is_discrete else system
+    A, B, C, D, _ = axis
     n = A.shape[0]
     gain = lambda w: largest_gain(axis.response(w))
     eps = jnp.finfo(A.dtype).eps
@@ -353,8 +349,8 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
     def crossings(level):
         """Frequencies of the eigenvalues of the Hamiltonian at a level.
 
-        All of them: those that are off the axis by more than rounding are no
-        crossings, but to look at the gain there costs little and harms nothing.
+        Those of all eigenvalues: off the axis they are no crossings, but evaluating the
+        gain there as well is cheap and harmless.
         """
         m, p = D.shape[1], D.shape[0]
         R = level**2 * jnp.eye(m, dtype=D.dtype) - D.T @ D
@@ -363,7 +359,7 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
         F = A + B @ solved[:, :n]
         upper, lower = level * B @ solved[:, n:], level * C.T @ lu_solve(S, C)
         H = jnp.block([[F, upper], [-lower, -F.T]])
-        # They come in pairs, s and -s.
+        # Eigenvalues come in pairs, s and -s.
         omegas = jnp.sort(jnp.abs(jnp.imag(jnp.linalg.eigvals(H))))[::2]
         return jnp.concatenate([jnp.zeros(1, A.dtype), omegas])
 

@@ -26,7 +26,7 @@ from .._typing import Control, Difference, Observation, PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
-from ..planning import AbstractPlanner, Constraints, default_start, ILQR, Start
+from ..planning import AbstractPlanner, Constraints, ILQR, Start
 from ._operating_point import check_state, deviation
 
 
@@ -58,7 +58,7 @@ class MPC(AbstractController):
     The second one keeps an unstable plant near the point of linearisation, and a plan
     of [`delucax.planning.ILQR`][] without constraints costs at most as much as each of
     them. It is computed when the controller is made, about the point that
-    [`delucax.planning.default_start`][] chooses: the targets of the cost, or the
+    [`delucax.planning.Start.default`][] chooses: the targets of the cost, or the
     equilibrium of the dynamics, or zero where neither defines one, as with
     [`delucax.costs.Function`][] or [`delucax.costs.Tracking`][] over dynamics of your
     own. An unstable plant needs a `start` where it is to be held far from that point,
@@ -92,7 +92,7 @@ class MPC(AbstractController):
     - `bounds`: `(low, high)` of the controls, each a number or of shape `(m,)`; none by
         default.
     - `start`: what each plan may start from besides the last one:
-        [`delucax.planning.default_start`][] by default, the second and third above;
+        [`delucax.planning.Start.default`][] by default, the second and third above;
         controls in place of the third, shape `(T, m)`; or a
         [`delucax.planning.Start`][] in place of both, such as another stabilising law,
         or controls alone.
@@ -166,7 +166,7 @@ class MPC(AbstractController):
             if start is not None:
                 start = as_rows(start, m, "start", where, horizon)
                 check_finite(start, "start", where)
-            start = default_start(dynamics, cost, horizon, controls=start)
+            start = Start.default(dynamics, cost, horizon, controls=start)
         self.dynamics, self.cost = dynamics, cost
         self.start = _stacked(start, dynamics.state_size)
         self.planner = ILQR() if planner is None else planner

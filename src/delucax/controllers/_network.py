@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -22,7 +21,7 @@ from .._check import (
     is_concrete,
 )
 from .._controller import AbstractController, wrong_observation
-from .._module import as_float_array, as_module, function_field, parameter, weight
+from .._module import as_float_array, function_field, mlp, parameter, weight
 from .._typing import PRNGKey, Real
 from ..environments import Environment
 from ._stochastic import Gaussian
@@ -95,13 +94,12 @@ class MLP(AbstractController):
                 f"{activation!r}."
             )
         check_key(key, where)
-        self.network = eqx.nn.MLP(
+        self.network = mlp(
             check_count(in_size, "in_size", where),
             check_count(out_size, "out_size", where),
             check_count(width, "width", where),
             check_count(depth, "depth", where, least=0),
-            as_module(activation),
-            as_module(jax.nn.identity),
+            activation,
             key=key,
         )
         self.features = features

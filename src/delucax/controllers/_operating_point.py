@@ -12,7 +12,7 @@ from .._check import check_instance, check_time_invariant, is_concrete
 from .._controller import AbstractController, wrong_observation
 from .._typing import Difference
 from ..dynamics import LinearDynamics, linearize, OperatingPoint
-from ..math._drift import relative_drift
+from ..math._norms import relative_drift
 from ..systems import LinearSystem
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Array
 from .._check import as_matrix, check_instance, check_positive, symmetric_matrix
 from .._typing import Difference
 from ..dynamics import c2d, linearize, OperatingPoint
-from ..math._gramian import gramian_over
+from ..math._lyapunov import gramian_over
 from ..systems import AbstractSystem, LinearSystem
 from ._lqr import LQR
 from ._operating_point import linear_at

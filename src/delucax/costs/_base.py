@@ -54,7 +54,7 @@ class AbstractCost(eqx.Module):
         none; `None` alone, as by default, for a cost without a fixed target.
 
         A cost made of others has the first target of each that they have. Planners use
-        it for their default start; see [`delucax.planning.default_start`][].
+        it for their default start; see [`delucax.planning.Start.default`][].
         """
         named = [part.targets for part in parts_of(self, AbstractCost)]
         pairs = [pair for pair in named if pair is not None]

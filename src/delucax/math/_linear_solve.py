@@ -1,4 +1,4 @@
-"""Linear solves: one door, with eliminations written out for small matrices."""
+"""Linear solves, with unrolled elimination for small matrices."""
 
 import functools
 from collections.abc import Callable
@@ -8,7 +8,9 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float, Inexact
+from jaxtyping import Array, Float, Inexact
+
+from .._typing import BoolScalar, Square
 
 
 SMALL = 5
@@ -33,9 +35,7 @@ def full_precision(function: Callable) -> Callable:
     return wrapped
 
 
-def solve(
-    matrix: Float[Array, "n n"], right: Float[Array, "n k"]
-) -> Float[Array, "n k"]:
+def solve(matrix: Square, right: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """`matrix^-1 right`; not finite where `matrix` is singular."""
     return factorised(matrix)(right)
 
@@ -65,8 +65,8 @@ def factorised(
 class _Elimination(lx.AbstractLinearSolver):
     """Gaussian elimination with partial pivoting, unrolled, for a matrix and a vector.
 
-    Rows are exchanged by selects, not by indexing, so that each member of a batch has
-    its own pivots at no cost in gathers.
+    Rows are exchanged by selects instead of gathers, which vectorise under `jax.vmap`
+    although each member of a batch has its own pivots.
     """
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
@@ -110,8 +110,8 @@ class _Elimination(lx.AbstractLinearSolver):
 
 
 def _apart(tree):
-    """The same values, made before they are used: compilers that fuse all that follows
-    into one loop make them again for each use, and their number doubles with each
+    """The same values, materialised before use: a compiler that fuses the whole
+    elimination recomputes them for each use, and their number doubles with each
     pivot."""
     return lax.optimization_barrier(tree)
 
@@ -145,7 +145,7 @@ def _factor(matrix):
     return _apart(rows), pivots
 
 
-def is_definite(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
+def is_definite(matrix: Square) -> BoolScalar:
     """Whether all pivots of a symmetric matrix are positive."""
     n = matrix.shape[0]
     if n > SMALL:
@@ -167,7 +167,7 @@ def symmetric(X: Float[Array, "*T n n"]) -> Float[Array, "*T n n"]:
 
 
 def no_tangent(tree: Any) -> Any:
-    """The zero tangent of measurements: of whole numbers and flags too."""
+    """The zero tangent of a tree, integers and flags included."""
 
     def zero(x):
         if jnp.issubdtype(x.dtype, jnp.inexact):

@@ -1,4 +1,4 @@
-"""What a closed loop leaves behind."""
+"""The trajectory of a closed loop."""
 
 import dataclasses
 from typing import Any, TYPE_CHECKING
@@ -33,7 +33,7 @@ class Trajectory(eqx.Module):
     - `controls`: what was applied, after the bounds, shape `(T, m)`.
     - `disturbances`: shape `(T, k)`.
     - `costs`: stage costs, shape `(T,)`; 0 after termination.
-    - `terminated`: whether step k ended the episode, or found it ended, shape `(T,)`.
+    - `terminated`: whether the episode had terminated after step k, shape `(T,)`.
     - `final_state`: shape `(n,)`.
     - `final_cost`: a scalar, charged once.
     - `total_cost`: the sum of the stage costs and the final cost.
@@ -79,8 +79,8 @@ class Trajectory(eqx.Module):
     ended: Array
     result: Result
     dt: Array
-    # What follows from the rest is not stored but made on demand: writing it out would
-    # cost a batch more than the simulation does.
+    # Arrays that follow from others are computed lazily: to write them out would cost a
+    # batch more than the simulation does.
     recorded_times: Array | None
     recorded_observations: Array | None
     recorded_disturbances: Array | None
@@ -126,15 +126,15 @@ class Trajectory(eqx.Module):
 
     @property
     def terminated(self) -> Array | None:
-        """Whether step k ended the episode, or found it ended, shape `(T,)`."""
+        """Whether the episode had terminated after step k, shape `(T,)`."""
         if self.recorded_terminated is None and "terminated" in self.keep:
             return jnp.zeros((*self.batch_shape, self.steps), bool)
         return self.recorded_terminated
 
     @property
     def failed(self) -> Array:
-        """Whether a step failed, the run diverged or a learner refused an update. A
-        failed plan, which `result` names too, is no failure of the run."""
+        """Whether `result` is neither `successful` nor `plan_failed`: a step failed,
+        the run diverged, or a learner refused an update."""
         planned = self.result == RESULTS.plan_failed
         return (self.result != RESULTS.successful) & ~planned
 
@@ -193,11 +193,15 @@ class Trajectory(eqx.Module):
                 "Trajectory: states and costs must be kept to slice in time; got "
                 "keep= without them."
             )
-
         ends = lambda tree: jax.tree.map(lambda leaf: leaf[start : stop + 1], tree)
         steps = lambda tree: jax.tree.map(lambda leaf: leaf[start:stop], tree)
         costs, incidents = steps(self.costs), steps(self.incidents)
-        is_end = stop == self.steps
+        # A failure by incidents is dropped if none of them is in the slice.
+        result, is_end = self.result, stop == self.steps
+        for name, kind in INCIDENTS.items():
+            if incidents is not None and name in incidents:
+                elsewhere = (result == kind) & ~jnp.any(incidents[name])
+                result = choose(elsewhere, RESULTS.successful, result)
         final_cost = self.final_cost if is_end else jnp.zeros_like(self.final_cost)
         return dataclasses.replace(
             self,
@@ -209,7 +213,7 @@ class Trajectory(eqx.Module):
             total_cost=final_cost if costs is None else jnp.sum(costs) + final_cost,
             length=jnp.clip(self.length - start, 0, stop - start),
             ended=self.ended & (self.length <= stop),
-            result=_result_of(self.result, incidents),
+            result=result,
             recorded_times=ends(self.times),
             recorded_observations=steps(self.recorded_observations),
             recorded_disturbances=steps(self.recorded_disturbances),
@@ -313,16 +317,12 @@ class Trajectory(eqx.Module):
         """
         pd = extra("pandas", "tables")
 
-        total = np.ravel(self.total_cost)
-        length = np.ravel(self.length)
-        final = np.ravel(self.final_cost)
-        ok = np.ravel(np.asarray(self.result == RESULTS.successful))
-        ok = np.broadcast_to(ok, total.shape)
+        given = self.total_cost, self.length, self.final_cost
+        total, length, final = map(np.ravel, given)
+        # A result that is statically a success has no batch axis, but broadcasts.
         codes = np.broadcast_to(np.ravel(jax.tree.leaves(self.result)[0]), total.shape)
-        words = [
-            "successful" if fine else _message(code)
-            for fine, code in zip(ok, codes, strict=True)
-        ]
+        result_of = lambda c: jax.tree.map(lambda _: np.asarray(c), RESULTS.successful)
+        words = [RESULTS[result_of(code)] or "successful" for code in codes]
         columns = {
             "total_cost": total,
             "final_cost": final,
@@ -337,15 +337,6 @@ class Trajectory(eqx.Module):
                 columns[f"{name}_count"] = count
                 columns[f"{name}_time"] = np.ravel(self.incident_times[name])
         return pd.DataFrame(columns)
-
-
-def _result_of(result: Result, incidents: dict[str, Array] | None) -> Result:
-    """The result of a stretch in which the incidents that it speaks of may not be."""
-    for name, kind in INCIDENTS.items():
-        if incidents is not None and name in incidents:
-            elsewhere = (result == kind) & ~jnp.any(incidents[name])
-            result = choose(elsewhere, RESULTS.successful, result)
-    return result
 
 
 def plant_fields(plant: AbstractPlant) -> dict[str, Any]:
@@ -374,7 +365,3 @@ def checked(trajectory: Trajectory, where: str) -> Trajectory:
                 )
         raise RuntimeError(message + " Pass throw=False to look at the trajectory.")
     return trajectory
-
-
-def _message(code: Any) -> str:
-    return RESULTS[jax.tree.map(lambda _: np.asarray(code), RESULTS.successful)]

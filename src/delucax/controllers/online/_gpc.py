@@ -6,8 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array
@@ -15,7 +13,7 @@ from jaxtyping import Array
 from ..._check import check_bool, check_count, check_key, check_positive
 from ..._controller import AbstractController
 from ..._message import shortened
-from ..._module import as_module
+from ..._module import mlp
 from ..._typing import PRNGKey
 from ...dynamics import AbstractDynamics
 from ._closed_loop import ClosedLoop
@@ -342,17 +340,10 @@ def neural_gpc(
     loop = ClosedLoop(dynamics, base, horizon, where, memory=memory)
     check_key(key, where)
     check_positive(learning_rate, "learning_rate", where)
-    network = eqx.nn.MLP(
-        loop.feature_size,
-        dynamics.control_size,
-        check_count(width, "width", where),
-        check_count(depth, "depth", where),
-        as_module(jnp.tanh),
-        as_module(jax.nn.identity),
-        dtype=loop.dtype,
-        key=key,
-    )
-    # Zero weights in the last layer alone: it adds nothing at first, and learns.
+    width = check_count(width, "width", where)
+    depth = check_count(depth, "depth", where)
+    sizes = loop.feature_size, dynamics.control_size, width, depth
+    network = mlp(*sizes, dtype=loop.dtype, key=key)
     last = lambda net: [net.layers[-1].weight, net.layers[-1].bias]
     network = eqx.tree_at(last, network, [0 * leaf for leaf in last(network)])
     optimiser = adagrad_norm() if optimiser is None else optimiser

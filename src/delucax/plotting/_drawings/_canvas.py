@@ -1,4 +1,4 @@
-"""What a drawing is made of: the episode, the canvas with its shapes, and the view."""
+"""The building blocks of drawings: the episode, the canvas with shapes, the view."""
 
 import dataclasses
 import functools
@@ -121,9 +121,16 @@ class Canvas:
         self.circle(at, radius, fill=False, edgecolor=self.GOAL, lw=2, zorder=1)
         self.disc(at, 0.3 * radius, self.GOAL, zorder=1)
 
-    def reach(self, radius: Number) -> None:
-        """The circle about the origin that a tip goes round."""
+    def reach(self, radius: Number, room: Number = 1.2) -> None:
+        """The circle about the origin that a tip goes round, and the view of it."""
         self.circle((0, 0), radius, fill=False, color=self.NEUTRAL, alpha=0.25, lw=1)
+        self.view((0.0, 0.0), (room * radius, room * radius))
+
+    def view(self, centre: Point, half: Point) -> "View":
+        """Set the limits to a part of the plane, of this centre and half extent."""
+        view = View(np.asarray(centre, float), np.asarray(half, float))
+        view.show(self.ax)
+        return view
 
     def ground(self) -> None:
         """The ground at height 0, across the whole view."""
@@ -159,11 +166,19 @@ class Canvas:
         if length < 0.01 * full:
             return
         width, head = 0.11 * full, min(0.35 * full, 0.6 * length)
-        reach, neck = width * (0.4 + 1.6 * head / full), length - head
-        barb = reach + 0.2 * width
+        barb, neck = width * (0.6 + 1.6 * head / full), length - head
         upper = np.array([[0, width / 2], [neck, width / 2], [neck, barb]])
         corners = np.concatenate([upper, [[length, 0]], upper[::-1] * [1, -1]])
         self.polygon(corners, start, math.atan2(y, x), color, zorder=zorder)
+
+    def push(
+        self, at: Point, gap: Number, full: Number, share: Number, angle: Number = 0.0
+    ) -> None:
+        """A force on what lies `gap` around a point, by its share of the largest, which
+        is `full` long: from the side that it leads to, along or against an angle."""
+        along = rotation(angle)[:, 0]
+        start = np.asarray(at, float) + math.copysign(gap, share) * along
+        self.force(start, full * share * along, full)
 
 
 class View(NamedTuple):
@@ -223,11 +238,10 @@ class Episode:
 
     @functools.cached_property
     def target(self) -> Vector | None:
-        """The state that the cost draws to, the origin if it names none; or nothing."""
-        targets = self.environment.cost.targets
-        if targets is None:
+        """The target state of the cost, by default the origin; `None` without any."""
+        if self.environment.cost.targets is None:
             return None
-        x, _ = targets
+        x, _ = self.environment.cost.targets
         zero = np.zeros(self.environment.state_size)
         return zero if x is None else np.asarray(x, float)
 
@@ -240,13 +254,11 @@ class Episode:
 
     @functools.cached_property
     def largest_controls(self) -> Vector:
-        """What a full arrow stands for, one a control: its bound if it has one, else
-        the largest that was applied, else 1."""
-        bounds = self.environment.control_bounds
-        largest = np.zeros(self.environment.control_size)
-        if bounds is not None:
-            low, high = (np.abs(np.asarray(end, float)) for end in bounds)
-            largest = np.broadcast_to(np.maximum(low, high), largest.shape)
+        """The magnitude of a full arrow, per control: its bound if it has one, else the
+        largest that was applied, else 1."""
+        bounds = self.environment.control_bounds or (0.0, 0.0)
+        low, high = (np.abs(np.asarray(end, float)) for end in bounds)
+        largest = np.broadcast_to(np.maximum(low, high), self.environment.control_size)
         applied = np.abs(np.asarray(self.trajectory.controls, float))
         applied = np.where(np.isfinite(applied), applied, 0.0).max(axis=0, initial=0.0)
         largest = np.where(np.isfinite(largest) & (largest > 0), largest, applied)
@@ -258,7 +270,7 @@ class Episode:
 
 
 Setup: TypeAlias = Callable[[Canvas, Episode], Drawing]
-"""Draws what stays, sets the limits of the axes, and returns what draws the rest."""
+"""Draws static artists, sets the limits of the axes, and returns the `Drawing`."""
 
 
 def layers(environment: Environment) -> list[Any]:
