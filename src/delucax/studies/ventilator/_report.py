@@ -83,8 +83,10 @@ def rows_of(
 def save_controllers(
     folder: Path, contenders: list[Contender], names: list[str], rows: Rows
 ) -> list[str]:
-    """Each as a controller of both valves, ready for a task; returned are the names of
-    those that are not saved, for a pressure of theirs passed the abort limit."""
+    """Save each as a controller of both valves, ready for a task.
+
+    Returns the names of those that are not saved, as a pressure passed the abort limit.
+    """
     unsafe = []
     for label, seed, controllers, shared in contenders:
         if label in FLOORS:
@@ -116,7 +118,7 @@ def mean_error(rows: Rows, label: str, split: str, lung: str | None = None) -> f
 def best_of(
     rows: Rows, labels: Iterable[str], split: str, lung: str | None = None
 ) -> tuple[float, str]:
-    """The least error of some controllers, and whose it is; NaN if none was run."""
+    """The least error of some controllers, and its label; NaN if none was run."""
     errors = {label: mean_error(rows, label, split, lung) for label in labels}
     known = ((e, label) for label, e in errors.items() if not np.isnan(e))
     return min(known, default=(float("nan"), ""))
@@ -134,7 +136,7 @@ def _by_kind(table: Rows, column: str) -> dict[str, dict[str, float]]:
 def summarise(
     rows: Rows, table: Rows, seconds: dict[str, float], judge: str, unsafe: list[str]
 ) -> dict[str, Any]:
-    """The figures that the study is about, and sentences of them.
+    """The key figures of the study, and sentences about them.
 
     `judge` says what the controllers were run in, and `unsafe` names those that were
     not saved."""

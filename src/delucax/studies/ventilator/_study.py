@@ -31,8 +31,8 @@ def lung_study(
     say: Callable[[str], Any] = print,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
-    """Learn simulators of lungs from breaths, and controllers in the simulators; show
-    how they do at the lungs themselves, beside the best PIDs.
+    """Learn simulators of lungs from breaths, and controllers in the simulators;
+    evaluate them on the lungs themselves, beside the best PIDs.
 
     The lungs are those of the task `lung/double_compartment`, with the nine resistances
     and compliances of the public data set: valves that lag, a sensor that is two
