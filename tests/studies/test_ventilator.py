@@ -135,7 +135,7 @@ def test_what_passed_the_limit_is_not_saved(tmp_path):
         dict(controller="A", seed=seed, lung="x", highest=value)
         for seed, value in enumerate(highest)
     ]
-    unsafe = save_controllers(tmp_path, contenders, ["x"], waveform, rows)
+    unsafe = save_controllers(tmp_path, contenders, ["x"], rows)
     assert unsafe == ["a_1", "a_2"]
     assert [path.name for path in tmp_path.iterdir()] == ["a_0.dlx"]
 

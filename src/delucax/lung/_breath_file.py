@@ -160,7 +160,7 @@ def _breaths(
 
 
 def _table(path: Path) -> dict[str, np.ndarray]:
-    """The columns by name, as numbers, and of each row its `line` in the file."""
+    """The columns by name, as numbers, and the `line` of each row in the file."""
     # Bytes that are not text are rejected later, as values that are not numbers.
     with open(path, newline="", encoding="utf-8-sig", errors="replace") as file:
         reader = csv.reader(file)

@@ -175,7 +175,7 @@ class LearnedLung(AbstractDynamics):
         return jnp.reshape(self.pressure(x), (1,)).astype(x.dtype)
 
     def _linearised(self, controls: Array) -> Array:
-        """Controls as the network of the later steps is given them."""
+        """The controls, with the curve of the valve linearised."""
         return controls if self.published else controls + jax.vmap(self.valve)(controls)
 
     def _later_step(self, linearised: Array, pressures: Array) -> Array:
@@ -188,7 +188,7 @@ class LearnedLung(AbstractDynamics):
     def _first_step(
         self, history: Array, late: Any, hidden: Array, output: Array
     ) -> Array:
-        """The next pressure in one of the first steps; `late` is that afterwards."""
+        """The next pressure in a first step; `late` is that of `_later_step`."""
         own = output @ jnp.tanh(hidden @ history)
         return own if self.published else own + late
 
@@ -233,8 +233,8 @@ class LearnedLung(AbstractDynamics):
         return self._predicted(u_in, (pressure - self.p_mean) / self.p_std)
 
     def _predicted(self, u_in: Array, recorded: Array | None) -> Array:
-        """As `advance` would, but all that is known before is computed at once: the
-        windows of controls, which network a step takes, and with records every step."""
+        """The same as by `advance`, but what needs no prediction is computed for all
+        steps at once: the windows of controls, and with records the whole."""
         n, last = self.window, u_in.shape[0] - 1
         first = min(self.hidden.shape[0], last)
         x0 = self.resting().astype(u_in.dtype)
@@ -287,8 +287,7 @@ def tanh_network(
 
 
 def _windows(values: Array, size: int) -> Array:
-    """The last so many values at each of the times that have as many before them,
-    newest first."""
+    """The last `size` values at each time that has as many, newest first."""
     count = values.shape[0] - size + 1
     shifts = [values[size - 1 - i : size - 1 - i + count] for i in range(size)]
     return jnp.stack(shifts, axis=1)

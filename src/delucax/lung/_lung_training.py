@@ -65,7 +65,7 @@ def fit_lungs(
     progress: bool = False,
     checkpoint: Any = None,
 ) -> Fitted:
-    """Fit lungs to breaths, each to its own: many at once.
+    """Fit lungs to breaths, each to its own, all at once.
 
     First, where the model can (a [`delucax.lung.LearnedLung`][]), each pressure is
     predicted from the recorded ones before it, as published; then the whole breath from
@@ -226,7 +226,7 @@ class _TrackingError(eqx.Module):
     throw: bool = eqx.field(static=True)
 
     def _counted(self, errors: Array) -> Array:
-        """Errors, 0 for those that are not finite and are not to raise."""
+        """Errors; unless `throw`, 0 for those that are not finite."""
         return errors if self.throw else jnp.where(jnp.isfinite(errors), errors, 0)
 
     def __call__(self, controllers: Any, key: PRNGKey) -> Array:

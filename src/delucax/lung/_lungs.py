@@ -73,9 +73,8 @@ class AbstractLung(AbstractSystem):
 
 
 class _AbstractRigidPipe(AbstractLung):
-    """A lung whose airway holds no air: the flows of the valves and of the lung balance
-    there, `p` being what makes them. The state begins with the inflow and the opening.
-    """
+    """A lung behind a rigid airway, whose pressure balances the flows of the valves and
+    of the lung. The state begins with the inflow and the opening."""
 
     if TYPE_CHECKING:  # pyright takes an AbstractVar for the first argument
         resistance: ClassVar[Any]
@@ -223,8 +222,8 @@ class DoubleCompartment(_AbstractRigidPipe):
     state_units: ClassVar = ("L/s", "", "L", "L")
 
     def _parts(self, x: State) -> tuple[Array, Array, Array, Array, Array]:
-        """The conductances of both ways, the pressures at their ends, and the pressure
-        of the one compartment that they are to the airway."""
+        """The conductances of both ways, the pressures in both compartments, and the
+        pressure in the equivalent single compartment."""
         # R_1 and R_2 of `1 / (1 / R_1 + 1 / R_2) = parallel` and `R_2 = imbalance R_1`.
         parallel = (1 - self.central) * self.resistance
         fast = self.imbalance / ((1 + self.imbalance) * parallel)
@@ -251,8 +250,8 @@ class DoubleCompartment(_AbstractRigidPipe):
 
 
 def balloon_pressure(volume: Array, rest: Array, stiffness: Array) -> Array:
-    """The pressure in a balloon, `stiffness (1 - (r0 / r)^6) / (r0^2 r)`, its radius
-    being that of a sphere of its volume; held below a tenth of the volume at rest."""
+    """The pressure in a balloon, `stiffness (1 - (r0 / r)^6) / (r0^2 r)`, with the
+    radius of a sphere of its volume; constant below a tenth of the volume at rest."""
     # Towards an empty balloon the pressure and its slope go to minus infinity.
     volume = jnp.maximum(volume, 0.1 * rest)
     radius = (3 * volume / (4 * jnp.pi)) ** (1 / 3)

@@ -17,7 +17,7 @@ from ..environments import Environment
 
 
 ABORT = 60.0
-"""The pressure at which a run is given up [cmH2O]."""
+"""The pressure at which a run is aborted [cmH2O]."""
 
 
 _step = eqx.filter_jit(Environment.step)
@@ -67,7 +67,7 @@ class Runner(Protocol):
 
     @abc.abstractmethod
     def should_abort(self, pressure: float) -> bool:
-        """Whether to give the run up.
+        """Whether to abort the run.
 
         **Arguments:** `pressure`: what was read last [cmH2O].
         """
@@ -84,7 +84,7 @@ class SimulatedRunner:
 
     - `environment`: a task of a lung.
     - `key`: a random key, for the noise of the sensor.
-    - `abort`: the pressure at which the run is given up [cmH2O], 60 by default.
+    - `abort`: the pressure at which the run is aborted [cmH2O], 60 by default.
     - `real_time`: whether `wait` waits, as at a machine; false by default.
 
     **Raises:** `ValueError` if it is no task of a lung, or `abort` is not positive.
@@ -187,7 +187,7 @@ class Recording(NamedTuple):
     **Attributes:**
 
     - `times` [s], `pressure` [cmH2O], `u_in` [%], `u_out`: an entry per step.
-    - `aborted`: whether the run was given up; the last entry is then the reading that
+    - `aborted`: whether the run was aborted; the last entry is then the reading that
         was too high, and the controls of the clean-up.
     """
 
@@ -219,9 +219,9 @@ def run_breaths(
     - `key`: a random key for the controller; none by default.
 
     **Returns:** a named tuple of NumPy arrays with an entry per step, `times` [s],
-        `pressure` [cmH2O], `u_in` [%] and `u_out`; and `aborted`, whether the run was
-        given up: the last entry is then the reading that was too high, and the controls
-        of the clean-up.
+        `pressure` [cmH2O], `u_in` [%] and `u_out`; and `aborted`: whether the run
+        was aborted. The last entry is then the reading that was too high, and the
+        controls of the clean-up.
 
     **Raises:** `ValueError` if what is given is no runner or no controller, or a
         control is not finite.

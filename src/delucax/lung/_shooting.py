@@ -102,7 +102,7 @@ class ShootingMPC(AbstractController):
 def least_error(
     env: Environment, *, pips: Any = PIPS, steps: int = 600, horizon: int = LENGTH
 ) -> Array:
-    """About the least error that any control of the inspiratory valve could have.
+    """Estimate the least error that any control of the inspiratory valve can reach.
 
     The controls of each breath are found by gradient descent with full knowledge of the
     true lung and without noise: a bound on all controllers, to the accuracy of the

@@ -41,7 +41,7 @@ def demo(
     say: Callable[[str], Any] = print,
 ) -> Any:
     """Design, train, compare and show controllers for Gym's pendulum; then the studies
-    of the Deluca paper, small, with what holds of its claims.
+    of the Deluca paper, small, and whether its claims hold.
 
     Takes the pendulum's ODE; designs an LQR about the upright; trains the linear policy
     of the Deluca paper (Section 4) and an MLP by differentiating the rollout; runs them

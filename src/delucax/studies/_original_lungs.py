@@ -94,7 +94,7 @@ class OriginalBalloonLung(_AbstractOriginalLung):
 
 
 class OriginalDelayLung(_AbstractOriginalLung):
-    r"""The delay lung of the original, with the delay that it was to have:
+    r"""The delay lung of the original, with the delay that its code left out:
 
     `v_next = max(v + dt p / resistance, rest)`,
     `pipe_next = inertia pipe + gain u_in[k + 1 - delay]`, times 0.995 if

@@ -49,7 +49,7 @@ class EnergyPumping(AbstractController):
 
 
 class Unsuitable(Exception):
-    """A controller is not made for such a task."""
+    """A method does not apply to a task."""
 
 
 @functools.cache
@@ -232,9 +232,8 @@ PUMPED = ("mountain_car", "mountain_car_discrete")
 
 
 def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
-    """The controls that iLQR finds for a run whose start and disturbances it knows,
-    from no control and from what each of the guides does, if they cost less than that.
-    """
+    """The best controls of iLQR for a known start and known disturbances, from zero
+    control and from each of the guides; or those of a guide, if they cost less."""
     best, least = None, np.inf
     for agent in (Zero(env.control_size), *guides):
         run: Any = rollout(env, agent, key=key, throw=False)

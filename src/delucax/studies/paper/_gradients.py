@@ -108,7 +108,7 @@ def train_linear(
 
 
 def descent_claim(first: int | None, faster: int | None) -> Claim:
-    """Judged at the paper's rate; what twice the rate brings is said beside it."""
+    """The claim at the paper's rate, with the result at twice the rate beside it."""
     return Claim(
         "Gradient descent through the rollout reaches cost 2.0 within 120 rollouts",
         f"{first or 'Never, in'} rollouts at the paper's rate {RATE} "

@@ -79,7 +79,7 @@ def _draw_bars(ax: Axes, bars: dict[str, Any], colors: dict[str, str]) -> None:
 
 
 def _color(label: str, index: int) -> str:
-    """The same for a controller in all parts of the figure."""
+    """The colour of a controller, the same in all parts of the figure."""
     return color_of(_ORDER.index(label) if label in _ORDER else index)
 
 

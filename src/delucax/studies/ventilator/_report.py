@@ -19,6 +19,8 @@ from ._stages import ABORT, BREATH, SEEN, SHOWN, UNSEEN
 
 
 Rows = list[dict[str, Any]]
+Lungs = tuple[Environment, list[str]]
+"""Tasks that are stacked, and their names."""
 Which = tuple[str, int]
 """The label of a controller, and its seed."""
 WRONG = ("single compartment", "balloon")
@@ -34,11 +36,7 @@ LEARNED = ("MLP", "MLP for all", "CNN", "PID + MLP", "GPC", "MPC")
 
 
 def error_rows(
-    contenders: list[Contender],
-    envs: Environment,
-    names: list[str],
-    keys: PRNGKey,
-    between: tuple[Environment, list[str]] | None,
+    contenders: list[Contender], lungs: Lungs, between: Lungs | None, keys: PRNGKey
 ) -> tuple[Rows, dict[str, Any]]:
     """The error of each controller in each lung, averaged over noise and pressures; and
     by label a breath of the first seed in each, at the pressure `SHOWN`.
@@ -46,7 +44,7 @@ def error_rows(
     `between` are other lungs, as many as the first, and the names of those that count:
     controllers that are the same for all lungs are run in them too.
     """
-    rows, runs = [], {}
+    (envs, names), rows, runs = lungs, [], {}
     pips, count = jnp.asarray(SEEN + UNSEEN), len(names)
     waveforms = envs.cost.waveform  # pyright: ignore[reportAttributeAccessIssue]
     place = (SEEN + UNSEEN).index(SHOWN)
@@ -83,14 +81,12 @@ def rows_of(
 
 
 def save_controllers(
-    folder: Path,
-    contenders: list[Contender],
-    names: list[str],
-    waveform: Any,
-    rows: Rows,
+    folder: Path, contenders: list[Contender], names: list[str], rows: Rows
 ) -> list[str]:
-    """Each as a controller of both valves, ready for a task; returned are the names of
-    those that are not saved, for a pressure of theirs passed the abort limit."""
+    """Save each as a controller of both valves, ready for a task.
+
+    Returns the names of those that are not saved, as a pressure passed the abort limit.
+    """
     unsafe = []
     for label, seed, controllers, shared in contenders:
         if label in FLOORS:
@@ -104,7 +100,7 @@ def save_controllers(
             reached = [r["highest"] for r in runs if name in (None, r["lung"])]
             # NaN is not below the limit.
             if np.max(reached) <= ABORT:
-                save(file, lung.Breathing(controller, waveform))
+                save(file, lung.Breathing(controller, lung.BreathWaveform()))
             else:
                 file.unlink(missing_ok=True)
                 unsafe.append(file.stem)
@@ -122,7 +118,7 @@ def mean_error(rows: Rows, label: str, split: str, lung: str | None = None) -> f
 def best_of(
     rows: Rows, labels: Iterable[str], split: str, lung: str | None = None
 ) -> tuple[float, str]:
-    """The least error of some controllers, and whose it is; NaN if none was run."""
+    """The least error of some controllers, and its label; NaN if none was run."""
     errors = {label: mean_error(rows, label, split, lung) for label in labels}
     known = ((e, label) for label, e in errors.items() if not np.isnan(e))
     return min(known, default=(float("nan"), ""))
@@ -140,7 +136,7 @@ def _by_kind(table: Rows, column: str) -> dict[str, dict[str, float]]:
 def summarise(
     rows: Rows, table: Rows, seconds: dict[str, float], judge: str, unsafe: list[str]
 ) -> dict[str, Any]:
-    """The figures that the study is about, and sentences of them.
+    """The key figures of the study, and sentences about them.
 
     `judge` says what the controllers were run in, and `unsafe` names those that were
     not saved."""

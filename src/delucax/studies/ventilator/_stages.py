@@ -1,4 +1,4 @@
-"""A study in stages: its size, and what of it is done."""
+"""The sizes of a study, and the folder that keeps its finished stages."""
 
 import csv
 import io
@@ -90,7 +90,7 @@ SMALL = Size(
 
 @dataclass(frozen=True)
 class Stages:
-    """A folder that a study is written to, and how far it is.
+    """The folder of a study, which keeps its finished stages.
 
     **Arguments:**
 

@@ -31,8 +31,8 @@ def lung_study(
     say: Callable[[str], Any] = print,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
-    """Learn simulators of lungs from breaths, and controllers in the simulators; show
-    how they do at the lungs themselves, beside the best PIDs.
+    """Learn simulators of lungs from breaths, and controllers in the simulators;
+    evaluate them on the lungs themselves, beside the best PIDs.
 
     The lungs are those of the task `lung/double_compartment`, with the nine resistances
     and compliances of the public data set: valves that lag, a sensor that is two
@@ -142,7 +142,7 @@ def lung_study(
             row["closed_loop_mae"] = float(errors[names.index(row["lung"])])
     stages.write_table("simulators.csv", table)
     keys = jr.split(jr.fold_in(key, 99), size.noises)
-    rows, runs = _report.error_rows(contenders, envs, names, keys, between)
+    rows, runs = _report.error_rows(contenders, (envs, names), between, keys)
     if size.bound_steps:
         pips = jnp.asarray(SEEN + UNSEEN)
         of = lambda env: lung.least_error(env, pips=pips, steps=size.bound_steps)
@@ -151,7 +151,7 @@ def lung_study(
         rows += _report.rows_of(names, ("least error", 0), np.asarray(bound))
     stages.write_table("report.csv", rows)
     place = stages.out / "controllers"
-    unsafe = _report.save_controllers(place, contenders, names, waveform, rows)
+    unsafe = _report.save_controllers(place, contenders, names, rows)
     summary = _report.summarise(rows, table, stages.seconds, judge, unsafe)
     stages.write("summary.json", json.dumps(summary, indent=1) + "\n")
     for line in summary["words"]:
