@@ -7,24 +7,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
-import numpy as np
 
 from .._check import check_choice, check_function
 from .._message import did_you_mean
 from .._provenance import version
-from ._axes import Axis, axis_of, Param, selector, words
+from ._cases import as_seeds, Axis, axis_of, Case, Mark, Param, selector, words
 from ._fingerprint import fingerprint
 from ._store import RESERVED
 
 
-@dataclasses.dataclass(frozen=True)
-class Mark:
-    """A label of a case, such as `experiment.mark.skip("does not converge")`: `slow`,
-    `skip` and `xfail` have a meaning, other names are there to select by."""
-
-    name: str
-    reason: str = ""
-
+class _MarkDecorator(Mark):
     def __call__(self, what: Any) -> Any:
         """The mark with the reason `what`, or the experiment `what` with the mark."""
         if isinstance(what, str):
@@ -36,10 +28,10 @@ class Mark:
 class Marks:
     """`experiment.mark.slow`, and any other name."""
 
-    def __getattr__(self, name: str) -> Mark:
+    def __getattr__(self, name: str) -> _MarkDecorator:
         if name.startswith("_"):
             raise AttributeError(name)
-        return Mark(name)
+        return _MarkDecorator(name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,42 +41,6 @@ class Fixture:
     function: Callable
     scope: str
     axis: Axis | None
-
-
-@dataclasses.dataclass(frozen=True)
-class Case:
-    """One call of an experiment: a value of each axis, for all seeds."""
-
-    experiment: str
-    id: str
-    index: tuple[int, ...]
-    shown: Mapping[str, Any]
-    marks: tuple[Mark, ...]
-    hash: str
-
-    @property
-    def key(self) -> tuple[str, str]:
-        """Its key in the results store."""
-        return self.experiment, self.id
-
-    @property
-    def described(self) -> dict[str, Any]:
-        """Its columns in a line of the store."""
-        return {
-            "experiment": self.experiment,
-            "case": self.id,
-            "order": self.index,
-            "hash": self.hash,
-            "parameters": self.shown,
-        }
-
-    def mark(self, name: str) -> Mark | None:
-        """The mark of that name, if it has it."""
-        return next((mark for mark in self.marks if mark.name == name), None)
-
-    def matches(self, word: str) -> bool:
-        """Whether a word is in its name, whatever its case."""
-        return word.lower() in self.id.lower()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -425,18 +381,3 @@ def as_experiment(what: Any) -> Experiment:
 def arguments_of(function: Callable) -> Mapping[str, inspect.Parameter]:
     """The arguments of a function by name."""
     return inspect.signature(function).parameters
-
-
-def as_seeds(seeds: Any, where: str) -> tuple[int, ...]:
-    """Seeds from 0 on, or those given."""
-    is_whole = lambda s: isinstance(s, int | np.integer) and not isinstance(s, bool)
-    several = range(seeds) if is_whole(seeds) else seeds
-    chosen = tuple(several) if isinstance(several, Iterable) else ()
-    if not chosen or not all(is_whole(seed) and 0 <= seed < 2**31 for seed in chosen):
-        raise ValueError(
-            f"{where}: seeds must be how many, at least 1, or whole numbers from 0 to "
-            f"2**31 - 1, got {seeds!r}."
-        )
-    if len(set(chosen)) < len(chosen):
-        raise ValueError(f"{where}: seeds must differ, got {seeds!r}.")
-    return tuple(int(s) for s in chosen)

@@ -11,7 +11,7 @@ from .._check import as_path
 from .._extras import extra
 from .._files import replaced
 from .._page import as_text, FORMS
-from ._experiment import Case
+from ._cases import Case
 from ._store import CASE_COLUMNS, FAILED, RUN_COLUMNS, Store
 
 

@@ -20,8 +20,9 @@ import jax
 from .._check import check_choice, check_count
 from .._extras import extra
 from .._provenance import provenance
+from ._cases import as_seeds, Case
 from ._execute import Outcome, Runner
-from ._experiment import as_experiment, as_seeds, Case, Experiment
+from ._experiment import as_experiment, Experiment
 from ._results import Results
 from ._store import FAILED, Store
 

@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from .._page import as_text, Page
-from ._axes import selector
+from ._cases import selector
 from ._experiment import Experiment
 from ._report import by_experiment, diff, DIFFERENCES, page_of, summary
 from ._results import Results

@@ -1,4 +1,4 @@
-"""Parameters, with ids and marks, and which cases of them an expression selects."""
+"""Cases: products of parameters with ids and marks; expressions that select them."""
 
 import dataclasses
 import re
@@ -12,12 +12,21 @@ from ._fingerprint import fingerprint
 
 
 @dataclasses.dataclass(frozen=True)
+class Mark:
+    """A label of a case, such as `experiment.mark.skip("does not converge")`: `slow`,
+    `skip` and `xfail` have a meaning, other names are there to select by."""
+
+    name: str
+    reason: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
 class Param:
     """A value of each name of an axis, with an id and marks of its own."""
 
     values: tuple
     id: str | None = None
-    marks: tuple = ()
+    marks: tuple[Mark, ...] = ()
 
 
 class Choice(NamedTuple):
@@ -58,6 +67,42 @@ class Axis:
         if isinstance(value, _SIMPLE):
             return value
         return (_label(value) if len(self.names) > 1 else None) or param.id
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One call of an experiment: a value of each axis, for all seeds."""
+
+    experiment: str
+    id: str
+    index: tuple[int, ...]
+    shown: Mapping[str, Any]
+    marks: tuple[Mark, ...]
+    hash: str
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Its key in the results store."""
+        return self.experiment, self.id
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """Its columns in a line of the store."""
+        return {
+            "experiment": self.experiment,
+            "case": self.id,
+            "order": self.index,
+            "hash": self.hash,
+            "parameters": self.shown,
+        }
+
+    def mark(self, name: str) -> Mark | None:
+        """The mark of that name, if it has it."""
+        return next((mark for mark in self.marks if mark.name == name), None)
+
+    def matches(self, word: str) -> bool:
+        """Whether a word is in its name, whatever its case."""
+        return word.lower() in self.id.lower()
 
 
 def axis_of(names: Any, values: Any, ids: Any) -> Axis:
@@ -136,6 +181,21 @@ def _label(value: Any) -> str | None:
         return str(value)
     label = getattr(value, "__name__", None)
     return label if isinstance(label, str) and label != "<lambda>" else None
+
+
+def as_seeds(seeds: Any, where: str) -> tuple[int, ...]:
+    """Seeds from 0 on, or those given."""
+    is_whole = lambda s: isinstance(s, int | np.integer) and not isinstance(s, bool)
+    several = range(seeds) if is_whole(seeds) else seeds
+    chosen = tuple(several) if isinstance(several, Iterable) else ()
+    if not chosen or not all(is_whole(seed) and 0 <= seed < 2**31 for seed in chosen):
+        raise ValueError(
+            f"{where}: seeds must be how many, at least 1, or whole numbers from 0 to "
+            f"2**31 - 1, got {seeds!r}."
+        )
+    if len(set(chosen)) < len(chosen):
+        raise ValueError(f"{where}: seeds must differ, got {seeds!r}.")
+    return tuple(int(s) for s in chosen)
 
 
 _OPERATORS = ("and", "or", "not")
