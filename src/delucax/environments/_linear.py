@@ -94,7 +94,7 @@ def cartpole_linear(
     A = jnp.eye(4) + dt * jnp.array(rate)
     B = dt * jnp.array([[zero], [zero], [1 / M], [1 / (M * l)]])
     states = ("position", "angle", "velocity", "spin")
-    names = dict(state_names=states, control_names=("force",))
+    names: Fields = dict(state_names=states, control_names=("force",))
     fields: Fields = dict(
         dynamics=LinearDynamics(A, B, dt=dt, **names),
         cost=Quadratic(jnp.ones(4), jnp.ones(1)),

@@ -308,7 +308,7 @@ class _ReacherFeatures(eqx.Module):
 
 @task(Reacher, dt=0.01, horizon=200, solver=diffrax.Euler())
 def reacher(
-    system: Reacher, *, goal: ArrayLike | Sequence[float] = (0.0, 1.8)
+    system: Reacher, *, goal: ArrayLike | tuple[float, float] = (0.0, 1.8)
 ) -> Fields:
     """Bring the tip of an arm of two links to a goal.
 

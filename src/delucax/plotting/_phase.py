@@ -75,7 +75,7 @@ def phase_portrait(
                 f"{where}: trajectories have states {names}, but the system has "
                 f"{system.state_names}."
             )
-    x, v = np.linspace(*limits.T, GRID).T
+    x, v = (np.linspace(low, high, GRID) for low, high in limits)
     states = jnp.stack(jnp.meshgrid(jnp.asarray(x), jnp.asarray(v)), axis=-1)
     field = np.asarray(_field(system, control, states.reshape(-1, 2), where))
     field = field.reshape(GRID, GRID, 2)

@@ -69,13 +69,8 @@ class LinearSystem(AbstractSystem):
     x_ref: Vector = parameter(None)
     u_ref: Vector = parameter(None)
     dx_ref: Vector = parameter(None)
-    # Converters let None through to `__post_init__`.
-    state_names: tuple[str, ...] = eqx.field(
-        static=True, default=None, converter=lambda names: names
-    )
-    control_names: tuple[str, ...] = eqx.field(
-        static=True, default=None, converter=lambda names: names
-    )
+    state_names: tuple[str, ...] = eqx.field(static=True, default=None)
+    control_names: tuple[str, ...] = eqx.field(static=True, default=None)
 
     def __post_init__(self):
         where = "LinearSystem"

@@ -90,17 +90,12 @@ class Canvas:
         self.ax.add_artist(Rectangle(corner, width, height, **style))
 
     def polygon(
-        self,
-        corners: Points,
-        at: Point = (0.0, 0.0),
-        angle: Number = 0.0,
-        color: str = BODY,
-        **style: Any,
+        self, corners: Points, at: Point = (0, 0), angle: Number = 0.0, **style: Any
     ) -> None:
         """A filled shape, turned about its origin and put somewhere."""
         points = np.asarray(at, float) + corners @ rotation(angle).T
-        style = {"lw": 0, "zorder": 2} | style
-        self.ax.add_artist(Polygon(points, color=color, **style))
+        style = {"color": self.BODY, "lw": 0, "zorder": 2} | style
+        self.ax.add_artist(Polygon(points, **style))
 
     def link(self, start: Point, end: Point, width: Number = 9, **style: Any) -> None:
         """A rod with round ends, of a width in points."""
@@ -128,8 +123,9 @@ class Canvas:
 
     def view(self, centre: Point, half: Point) -> "View":
         """Set the limits to a part of the plane, of this centre and half extent."""
-        view = View(np.asarray(centre, float), np.asarray(half, float))
-        view.show(self.ax)
+        view = View(self, np.asarray(centre, float), np.asarray(half, float))
+        (left, low), (right, high) = view.centre - view.half, view.centre + view.half
+        self.ax.set(xlim=(left, right), ylim=(low, high))
         return view
 
     def ground(self) -> None:
@@ -151,14 +147,7 @@ class Canvas:
             arrow = arc_arrow(radius, start, FULL_TURN * share, slimness)
             self.polygon(arrow, at, color=color, zorder=3)
 
-    def force(
-        self,
-        start: Point,
-        vector: Point,
-        full: Number,
-        color: str = ACTION,
-        zorder: int = 3,
-    ) -> None:
+    def force(self, start: Point, vector: Point, full: Number, **style: Any) -> None:
         """A force: a straight arrow along `vector`, its width that of one whose largest
         length is `full`."""
         x, y = (float(part) for part in vector)
@@ -169,7 +158,8 @@ class Canvas:
         barb, neck = width * (0.6 + 1.6 * head / full), length - head
         upper = np.array([[0, width / 2], [neck, width / 2], [neck, barb]])
         corners = np.concatenate([upper, [[length, 0]], upper[::-1] * [1, -1]])
-        self.polygon(corners, start, math.atan2(y, x), color, zorder=zorder)
+        style = {"color": self.ACTION, "zorder": 3} | style
+        self.polygon(corners, start, math.atan2(y, x), **style)
 
     def push(
         self, at: Point, gap: Number, full: Number, share: Number, angle: Number = 0.0
@@ -184,20 +174,16 @@ class Canvas:
 class View(NamedTuple):
     """A part of the plane: `centre` and half of its extent, `half`, each `(2,)`."""
 
+    canvas: Canvas
     centre: Float[np.ndarray, "2"]
     half: Float[np.ndarray, "2"]
 
-    def show(self, ax: Axes) -> None:
-        """Set the limits to this part."""
-        low, high = self.centre - self.half, self.centre + self.half
-        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-
-    def follow(self, ax: Axes, at: Point, room: Number) -> None:
+    def follow(self, at: Point, room: Number) -> None:
         """Set the limits to this part, moved only as far as keeps `at` inside, `room`
         from the edge."""
         inner = np.maximum(self.half - room, 0.0)
         shift = at - np.clip(at, self.centre - inner, self.centre + inner)
-        View(self.centre + shift, self.half).show(ax)
+        self.canvas.view(self.centre + shift, self.half)
 
 
 Vector: TypeAlias = Float[np.ndarray, "_"]  # noqa: F821

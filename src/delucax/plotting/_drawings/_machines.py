@@ -50,8 +50,8 @@ def lung(canvas: Canvas, episode: Episode) -> Drawing:
         for start, length, color in flows:  # arrows to the right, above the lung
             if length > 0.005:
                 arrow = {"arrowstyle": "-|>", "color": color, "lw": 3}
-                ends = (start + length, 1.5), (start, 1.5)
-                canvas.ax.annotate("", *ends, arrowprops=arrow, zorder=4)
+                xy, tail = (start + length, 1.5), (start, 1.5)
+                canvas.ax.annotate("", xy, tail, arrowprops=arrow, zorder=4)
 
     return Drawing(draw)
 
@@ -86,7 +86,7 @@ def motor(canvas: Canvas, episode: Episode) -> Drawing:
         share = float(np.clip(x[2] / fastest, -1, 1))
         canvas.torque((0, 0), SPEED, math.pi / 2, share, canvas.BODY, slimness=2.5)
         canvas.force((0, 0), 0.6 * episode.shares(u), 0.6, zorder=2)
-        canvas.force((0, 0), 0.6 * x[:2] / largest, 0.6, CURRENT, zorder=3)
+        canvas.force((0, 0), 0.6 * x[:2] / largest, 0.6, color=CURRENT)
         canvas.joint((0, 0), 0.06)
 
     return Drawing(draw)

@@ -85,17 +85,13 @@ def reacher(canvas: Canvas, episode: Episode) -> Drawing:
     goal = getattr(episode.environment.cost, "goal", None)
     if goal is not None:
         canvas.goal(np.asarray(goal), 0.06 * reach)
-
     points = functools.partial(arm_points, lengths=lengths, zero=np.pi / 2)
 
     def draw(x: Vector, u: Vector) -> None:
         joints = points(x)
         _draw_arm(canvas, joints, reach, 0.045)
-        outward = np.cumsum(x[:2])
-        for joint, start, share in zip(
-            joints, outward, episode.shares(u), strict=False
-        ):
-            canvas.torque(joint, 0.16 * reach, start, float(share))
+        for i, share in enumerate(episode.shares(u)):
+            canvas.torque(joints[i], 0.16 * reach, x[: i + 1].sum(), float(share))
 
     return Drawing(draw, lambda states: points(states)[:, 2])
 
@@ -145,7 +141,7 @@ def _cart_pole(
         canvas.joint(hinge, 0.045 * length)
         share, gap = float(episode.shares(u)[0]), width / 2 + 0.04 * length
         canvas.push((position, middle), gap, 0.6 * length, share)
-        view.follow(canvas.ax, (position, view.centre[1]), 0.5 * width)
+        view.follow((position, view.centre[1]), 0.5 * width)
         if bob:
             canvas.disc(tip, bob * length, canvas.SECOND, zorder=3)
 
@@ -194,7 +190,7 @@ def double_integrator(canvas: Canvas, episode: Episode) -> Drawing:
     def draw(x: Vector, u: Vector) -> None:
         place = float(x[0])
         _draw_mass(canvas, place, side, float(episode.shares(u)[0]))
-        view.follow(canvas.ax, (place, view.centre[1]), side)
+        view.follow((place, view.centre[1]), side)
 
     return Drawing(draw)
 
@@ -295,7 +291,7 @@ def mountain_car(canvas: Canvas, episode: Episode) -> Drawing:
         canvas.polygon(box(CAR_LENGTH, CAR_HEIGHT, 0.02), middle, angle)
         cabin = np.array([[-0.4, 0], [0.3, 0], [0.15, 1], [-0.28, 1]])
         roof = cabin * [CAR_LENGTH, 0.75 * CAR_HEIGHT] + [0.0, CAR_HEIGHT / 2]
-        canvas.polygon(roof, middle, angle, canvas.SECOND)
+        canvas.polygon(roof, middle, angle, color=canvas.SECOND)
         share = float(episode.shares(u)[0])
         canvas.push(middle, CAR_LENGTH / 2 + 0.015, 0.22, share, angle)
 

@@ -36,23 +36,25 @@ def car(canvas: Canvas, episode: Episode) -> Drawing:
     hood, boot = front + 0.3 * base, -rear - 0.28 * base
     chassis = box(hood - boot, 0.88 * width, 0.16 * base)
     tyre = box(0.26 * base, 0.1 * base, 0.03 * base)
+    rubber: dict[str, Any] = {"color": canvas.DARK, "zorder": 3}
+    shine: dict[str, Any] = {"color": "white", "alpha": 0.55, "zorder": 4}
 
     def draw(x: Vector, u: Vector) -> None:
         place, heading = np.asarray(x[:2], float), float(x[2])
         turned = rotation(heading)
         middle = place[0] + 0.6 * base
-        canvas.view((middle, 0.0), half).follow(ax, (middle, place[1]), base)
+        canvas.view((middle, 0.0), half).follow((middle, place[1]), base)
         _draw_dashes(canvas, middle, half[0], base)
         axis = place + turned @ ((hood + boot) / 2, 0.0)
         for along, steering in ((front, float(u[1])), (-rear, 0.0)):
             for side in (-0.48, 0.48):
                 at = place + turned @ (along, side * width)
-                canvas.polygon(tyre, at, heading + steering, canvas.DARK, zorder=3)
+                canvas.polygon(tyre, at, heading + steering, **rubber)
         canvas.polygon(chassis, axis, heading)
         for near, far, inner in ((0.28, 0.02, 0.3), (-0.62, -0.5, 0.32)):
             corners = [(near, -0.36), (far, -inner), (far, inner), (near, 0.36)]
             glass = np.array(corners) * [base, width]
-            canvas.polygon(glass, axis, heading, "white", alpha=0.55, zorder=4)
+            canvas.polygon(glass, axis, heading, **shine)
         canvas.disc(place, 0.05 * base, "white", zorder=4)
         gap, share = (hood - boot) / 2 + 0.12 * base, float(episode.shares(u)[0])
         canvas.push(axis, gap, 1.2 * base, share, heading)
@@ -105,7 +107,7 @@ def planar_quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
             canvas.link(foot, hub, width=2, color=canvas.DARK)
             canvas.link(hub - blade, hub + blade, width=3.5, color=canvas.SECOND)
             canvas.force(hub + up, turned @ (0.0, 1.5 * arm * share), 1.5 * arm)
-        view.follow(canvas.ax, centre, 1.5 * arm)
+        view.follow(centre, 1.5 * arm)
 
     return Drawing(draw, lambda states: states[:, :2])
 
@@ -196,6 +198,6 @@ def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
         for foot, thrust in thrusts:
             start, along = projected(foot + 0.2 * arm * up), projected(thrust * up)
             canvas.force(start, along, 2 * arm)
-        view.follow(canvas.ax, projected(place), 1.5 * arm)
+        view.follow(projected(place), 1.5 * arm)
 
     return Drawing(draw, lambda states: projected(states[:, :3]))
