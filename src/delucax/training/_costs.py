@@ -153,8 +153,7 @@ class _ScoredCost(eqx.Module):
         *_, controller_key = self.environment.split_key(key)
         state = initial_state(controller, controller_key)
         scores = replay(controller, state, lax.stop_gradient((*record, valid)), act)
-        cost = nan_if_failed(run, run.total_cost)
-        return cost, {"log_prob": jnp.sum(scores)}
+        return nan_if_failed(run, run.total_cost), {"log_prob": jnp.sum(scores)}
 
 
 def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:

@@ -54,13 +54,15 @@ def partition_trainable(
     else:
         chosen = _chosen_by_filter(model, entries, trainable, where)
     if not any(chosen):
-        floats = [path for path, leaf, _, _ in entries if is_float(leaf)]
+        floats = [repr(path) for path, leaf, _, _ in entries if is_float(leaf)]
+        named = ", ".join(floats[:8]) or "none"
+        more = f" and {len(floats) - 8} more" if len(floats) > 8 else ""
         reason = "no field is marked weight()"
         if trainable is not None:
             reason = f"trainable={shortened(trainable)} picks no leaf"
         raise ValueError(
             f"{where}: nothing in {type(model).__name__} is trainable: {reason}. The "
-            f"floating-point arrays that could be are {_listed(floats)}."
+            f"floating-point arrays that could be are {named}{more}."
         )
     leaves, holes, constraints, values = [], [], {}, {}
     for index, (path, leaf, _, constraint) in enumerate(entries):
@@ -195,8 +197,3 @@ def _chosen_by_filter(model, entries, trainable, where) -> list[bool]:
                 f"array: {shortened(leaf)}."
             )
     return [bool(moves) for moves in chosen]
-
-
-def _listed(paths: list[str], most: int = 8) -> str:
-    named = ", ".join(repr(path) for path in paths[:most]) or "none"
-    return named if len(paths) <= most else f"{named} and {len(paths) - most} more"

@@ -143,8 +143,8 @@ def _compiled(same: HashableEnvironment, discrete: bool, truncate: bool) -> Prog
 def _packed(env: Environment, episode: EpisodeState, outcome: StepOutcome) -> Array:
     x, (reward, *ends, failed) = episode.state, outcome
     failed = failed | ~jnp.all(jnp.isfinite(x)) | ~jnp.isfinite(reward)
-    rest = (reward, *ends, failed, episode.time)
-    rest = jnp.stack([jnp.asarray(part, x.dtype) for part in rest])
+    parts = reward, *ends, failed, episode.time
+    rest = jnp.stack([jnp.asarray(part, x.dtype) for part in parts])
     return jnp.concatenate([x, episodes.observe(env, episode).astype(x.dtype), rest])
 
 

@@ -248,10 +248,9 @@ class _Observation(eqx.Module):
     dynamics: GymnaxDynamics
 
     def __call__(self, x: State) -> Array:
-        env, state = self.dynamics.env, self.dynamics.unravel(x)
-        known = dict(key=jr.key(0), state=state, action=None)
-        known["params"] = self.dynamics.params
-        function: Any = _observer(env)
+        state, params = self.dynamics.unravel(x), self.dynamics.params
+        known = dict(key=jr.key(0), state=state, action=None, params=params)
+        function: Any = _observer(self.dynamics.env)
         takes = inspect.signature(function).parameters
         parts = function(**{name: known[name] for name in known if name in takes})
         leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(parts)]

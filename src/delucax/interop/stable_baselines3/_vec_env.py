@@ -61,8 +61,7 @@ class SB3VecEnv(VecEnv):
         """
         states = [options["state"] for options in self._options if options]
         options = {"state": np.stack(states)} if states else None
-        seeds = None if all(seed is None for seed in self._seeds) else self._seeds
-        observations, _ = self.vector.reset(seed=seeds, options=options)
+        observations, _ = self.vector.reset(seed=self._seeds, options=options)
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
