@@ -211,7 +211,7 @@ def _tumbling(system, t, x):
     spin = inertia * x[10:]
     energy = 0.5 * jnp.dot(x[10:], spin) + 0.5 * system.mass * jnp.dot(x[7:10], x[7:10])
     energy = energy + system.mass * system.gravity * x[2]
-    rotation = dlx.environments.quadrotor_features(x)[3:12].reshape(3, 3)
+    rotation = system.rotation(x).reshape(3, 3)
     return jnp.concatenate([energy[None], 100 * rotation @ spin])
 
 

@@ -117,7 +117,7 @@ THINGS = {
         jnp.linalg.norm,
         np.tanh,
         jnp.float32,
-        dlx.environments.pendulum_features,
+        dlx.math.wrap,
     ],
     "sentinels": lambda: (frozenset([lx.symmetric_tag]), diffrax.Kvaerno5()),
     "numbers": lambda: (1, -0.0, 1e-320, 2**70, True, None, "é\n", 1 - 2j, [1.5, ()]),

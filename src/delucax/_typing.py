@@ -1,6 +1,7 @@
 """Array aliases shared by every signature."""
 
-from typing import Any, Literal, TYPE_CHECKING, TypeAlias
+from collections.abc import Callable
+from typing import Any, Generic, Literal, TYPE_CHECKING, TypeAlias, TypeVar
 
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, Num, UInt32
 
@@ -24,20 +25,30 @@ Bounds: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."]]
 BoolScalar: TypeAlias = Bool[Array, ""]
 PRNGKey: TypeAlias = Key[Array, "..."] | UInt32[Array, "... 2"]
 """A key from `jax.random.key` (or the older `jax.random.PRNGKey`)."""
+Difference: TypeAlias = Callable[[Array, Array], Array]
+"""`(x, x_ref) -> deviation`, as a system measures it; it wraps angles."""
 Checkpoint: TypeAlias = Literal["step", "sqrt"] | None
 """What the gradient of a rollout stores."""
 
 
 if TYPE_CHECKING:
+    _Read = TypeVar("_Read")
+    _Given = TypeVar("_Given")
 
-    class Real:
-        """A field that is set to a number or an array, and is an array to its readers.
+    class _Converted(Generic[_Read, _Given]):
+        """A field whose readers have another type than its constructor takes.
 
         A static checker reads off `__set__` what the constructor takes.
         """
 
-        def __get__(self, instance: Any, owner: Any = None) -> Array: ...
-        def __set__(self, instance: Any, value: ArrayLike) -> None: ...
+        def __get__(self, instance: Any, owner: Any = None) -> _Read: ...
+        def __set__(self, instance: Any, value: _Given) -> None: ...
 
+    _Numbers: TypeAlias = ArrayLike | list[Any] | tuple[Any, ...]
+    Real: TypeAlias = _Converted[Array, _Numbers]
+    RealOrNone: TypeAlias = _Converted[Array | None, _Numbers | None]
+    BoundsOrNone: TypeAlias = _Converted[
+        Bounds | None, tuple[ArrayLike, ArrayLike] | None
+    ]
 else:
-    Real = Array
+    Real, RealOrNone, BoundsOrNone = Array, Array | None, Bounds | None

@@ -272,7 +272,7 @@ def gaussian(k, dt, rng):
 
 def window_of_uniform(k, dt, rng):
     uniform = dlx.disturbances.Uniform(-0.3, 0.3, size=k)
-    return dlx.disturbances.Window(uniform, 2 * dt, 6 * dt), None
+    return uniform.between(2 * dt, 6 * dt), None
 
 
 def default(k, dt, rng):
@@ -645,15 +645,15 @@ def test_noise_that_a_hand_made_wrapper_would_lose_is_an_error():
     make = lambda dynamics: dlx.Environment(dynamics, cost)
     with user_error(match="increments must be at least 1.*AbstractWrapper"):
         make(Says(noisy))
-    hidden = "Environment: ByHand hides the Brownian noise of the {} that it.*"
-    hidden += "AbstractWrapper, or give ByHand `noise`"
+    hidden = "Environment: ByHand does not forward `noise` of the {} that it.*"
+    hidden += "AbstractWrapper, or define `noise` in ByHand"
     with user_error(match=hidden.format("Discretized")):
         make(ByHand(noisy))
     with user_error(match=hidden.format("Delayed")):
         make(ByHand(dlx.dynamics.Delayed(noisy)))
     with user_error(match=hidden.format("Discretized")):
         make(Weak(Forwards(ByHand(noisy))))
-    with user_error(match="Euler hides the Brownian noise of the Shaky"):
+    with user_error(match="Euler does not forward `noise` of the Shaky"):
         make(Euler({"system": [Shaky()]}))
     with user_error(match=hidden.format("Discretized")):
         dlx.replace(make(calm), {"dynamics": ByHand(noisy)})

@@ -251,11 +251,11 @@ def test_a_smooth_acrobot_has_gradients(key):
         ),
         (
             lambda: dlx.make("acrobot", solver=diffrax.Heun(), max_velocity_1=1.0),
-            "acrobot: max_velocity_1 is of Gym's arithmetic.*one of max_velocity_1 and",
+            "acrobot: max_velocity_1 applies to Gym's.*one of max_velocity_1 and",
         ),
         (
             lambda: dlx.make("cartpole", solver=diffrax.Heun(), semi_implicit=True),
-            "cartpole: semi_implicit is of Gym's arithmetic",
+            "cartpole: semi_implicit applies to Gym's integrator",
         ),
         (lambda: dlx.make("cartpole", semi_implicit=1), "must be True or False, got 1"),
         (lambda: dlx.make("cartpole", half_length=0.0), "half_length must be positive"),

@@ -236,12 +236,15 @@ def test_all_names_of_a_task_are_known():
 
 @once
 def test_the_signature_of_a_task_has_its_options():
-    names = list(inspect.signature(dlx.environments.planar_quadrotor).parameters)
+    parameters = inspect.signature(dlx.environments.planar_quadrotor).parameters
     options = ["wind", "wind_strength", "dt", "horizon", "solver", "substeps"]
-    assert names == ["system", *options, "others"]
-    assert dlx.environments.default_horizon("planar_quadrotor") == 100
-    with user_error(match="default_horizon: no task is called 'planar'; did you mean"):
-        dlx.environments.default_horizon("planar")
+    assert list(parameters) == ["system", *options, "others"]
+    assert parameters["horizon"].default == 100
+    documented = inspect.getdoc(dlx.environments.planar_quadrotor)
+    assert "`horizon`: steps per episode, 100 by default." in documented
+    assert "solver, `diffrax.Euler()` by default." in documented
+    with user_error(match="make: no task is called 'planar'; did you mean"):
+        dlx.make("planar")
 
 
 @once

@@ -17,8 +17,8 @@ from PIL import Image
 
 import delucax as dlx
 from delucax.plotting._animate import Scene
-from delucax.plotting._drawings._arms import pendulum
 from delucax.plotting._drawings._canvas import arc_arrow, Canvas, Episode
+from delucax.plotting._drawings._mechanics import pendulum
 from delucax.plotting._drawings._registry import _BY_TYPE, drawing_for
 from delucax.plotting._export import compressed, expanded
 from delucax.plotting._runs import as_runs
@@ -328,7 +328,7 @@ def test_drawings_are_found_by_type(env):
 
     kept = dict(_BY_TYPE)
     try:
-        dlx.plotting.register_drawing(dlx.environments.GymPendulum, draw)
+        dlx.plotting.register_drawing(type(env.dynamics), draw)
         assert drawing_for(env) is pendulum
         dlx.plotting.register_drawing(dlx.systems.Pendulum, draw)
         assert drawing_for(env) is _BY_TYPE[dlx.systems.Pendulum] is not pendulum

@@ -11,10 +11,8 @@ from systems_catalogue import SYSTEMS
 
 import delucax as dlx
 from delucax.plotting._animate import Scene
-from delucax.plotting._drawings._arms import arm_points
-from delucax.plotting._drawings._carts import zigzag
+from delucax.plotting._drawings._mechanics import arm_points, zigzag
 from delucax.plotting._drawings._registry import _BY_TYPE, drawing_for
-from delucax.plotting._drawings._vehicles import attitude
 from delucax.plotting._runs import as_runs
 
 
@@ -136,15 +134,6 @@ def test_poles_lean_to_their_sides_and_have_their_lengths():
     lean = pole(env, np.array([0.3, 0.1, 0.0, 0.0]))
     expected = 0.8 * np.array([-np.sin(0.1), np.cos(0.1)])
     np.testing.assert_allclose(lean, expected, rtol=1e-5)
-
-
-def test_quadrotor_turns_as_its_quaternion_says():
-    x = np.zeros(13)
-    x[3:7] = np.array([0.8, 0.1, -0.5, 0.2])
-    unit = x.copy()
-    unit[3:7] /= np.linalg.norm(x[3:7])
-    rotation = dlx.environments.quadrotor_features(jnp.asarray(unit))[3:12]
-    np.testing.assert_allclose(attitude(x).ravel(), rotation, atol=1e-6)
 
 
 def test_arrows_point_the_way_of_the_force():

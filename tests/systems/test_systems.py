@@ -67,7 +67,7 @@ def test_sizes_and_defaults():
     x = jnp.array([1.0, 2.0])
     assert spring.observe(0.0, x) is x and spring.project(x) is x
     assert_close(spring.difference(x, x), [0, 0])
-    with user_error(match="names no equilibrium"):
+    with user_error(match="defines no equilibrium"):
         spring.equilibrium()
 
 

@@ -131,8 +131,11 @@ def test_an_attitude_has_two_quaternions():
     x, _ = quadrotor.equilibrium()
     turned = x.at[3:7].set(-x[3:7]).at[0].set(1.0)
     assert_close(quadrotor.difference(turned, x), jnp.zeros(13).at[0].set(1.0))
-    features = dlx.environments.quadrotor_features
+    features = dlx.make("quadrotor").encode
     assert_close(features(turned)[1:], features(x)[1:])
+    left = x.at[3].set(np.sqrt(0.5)).at[6].set(np.sqrt(0.5))
+    quarter = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    assert_close(quadrotor.rotation(left), quarter, atol=1e-6)
     long = quadrotor.project(x.at[3:7].set(jnp.array([3.0, 0.0, 4.0, 0.0])))
     assert_close(long[3:7], [0.6, 0.0, 0.8, 0.0], rtol=1e-6)
     gradient = jax.jacobian(quadrotor.project)(jnp.zeros(13))

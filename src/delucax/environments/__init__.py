@@ -1,43 +1,16 @@
 """Environments, and the named tasks."""
 
-from ._arms import (
-    acrobot as acrobot,
-    acrobot_features as acrobot_features,
-    reacher as reacher,
-    ReacherCost as ReacherCost,
-)
 from ._classic_control import (
+    acrobot as acrobot,
     cartpole as cartpole,
     mountain_car as mountain_car,
     mountain_car_discrete as mountain_car_discrete,
     pendulum as pendulum,
-    pendulum_features as pendulum_features,
 )
 from ._environment import Environment as Environment, Step as Step
-from ._gym import (
-    GymAcrobot as GymAcrobot,
-    GymCartPole as GymCartPole,
-    GymMountainCar as GymMountainCar,
-    GymPendulum as GymPendulum,
-)
-from ._lane import (
-    bicycle_features as bicycle_features,
-    dynamic_bicycle as dynamic_bicycle,
-    kinematic_bicycle as kinematic_bicycle,
-)
 from ._linear import cartpole_linear as cartpole_linear, lds as lds
-from ._quadrotors import (
-    planar_quadrotor as planar_quadrotor,
-    quadrotor as quadrotor,
-    quadrotor_features as quadrotor_features,
-)
 from ._randomise import randomise as randomise
-from ._registry import (
-    default_horizon as default_horizon,
-    make as make,
-    register as register,
-    registered as registered,
-)
+from ._registry import make as make, register as register, registered as registered
 from ._regulation import (
     cstr as cstr,
     double_integrator as double_integrator,
@@ -47,5 +20,12 @@ from ._regulation import (
     permanent_magnet_motor as permanent_magnet_motor,
     two_tank as two_tank,
     van_der_pol as van_der_pol,
+)
+from ._robots import (
+    dynamic_bicycle as dynamic_bicycle,
+    kinematic_bicycle as kinematic_bicycle,
+    planar_quadrotor as planar_quadrotor,
+    quadrotor as quadrotor,
+    reacher as reacher,
 )
 from ._task import UniformState as UniformState

@@ -1,4 +1,4 @@
-"""The closed world that a controller acts in."""
+"""Environments: dynamics, a cost, disturbances, bounds and an initial state."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -29,30 +29,43 @@ from .._module import (
     check_parameters,
     function_field,
     parameter,
+    parts_of,
 )
 from .._results import Result
-from .._typing import Control, Disturbance, Observation, PRNGKey, State, Time, Vector
+from .._typing import (
+    BoolScalar,
+    BoundsOrNone,
+    Control,
+    Disturbance,
+    Observation,
+    PRNGKey,
+    RealOrNone,
+    Scalar,
+    State,
+    Time,
+    Vector,
+)
 from ..costs import AbstractCost
 from ..disturbances import AbstractDisturbance, Brownian, Zero
 from ..dynamics import AbstractDynamics, OperatingPoint, trim
 from ..math import clip
-from ._noise import check_noise
+from ..systems import AbstractPlant
 
 
 class Step(NamedTuple):
-    """What one step of an environment returns.
+    """The outcome of one step of an environment.
 
     - `state`: the next state.
     - `control`: the control that was applied, after the bounds.
     - `cost`: the stage cost at the current state and the applied control.
     - `terminated`: whether the next state ends the episode.
-    - `result`: what became of the step, one of `delucax.RESULTS`.
+    - `result`: the status of the step, one of `delucax.RESULTS`.
     """
 
-    state: Array
-    control: Array
-    cost: Array
-    terminated: Array
+    state: State
+    control: Control
+    cost: Scalar
+    terminated: BoolScalar
     result: Result
 
 
@@ -65,11 +78,8 @@ def _as_horizon(value: Any) -> int:
 
 
 class Environment(eqx.Module):
-    """Dynamics, a cost, and what else makes a task of them.
-
-    `jax.jit(env.step)` raises "unhashable", as it does for a method of any module that
-    holds arrays: use `eqx.filter_jit(env.step)`, or pass the environment as an
-    argument, `jax.jit(Environment.step)(env, ...)`. `vmap` and `scan` work as they are.
+    """A control task: dynamics, a cost, disturbances, bounds, an initial state and a
+    condition of termination.
 
     **Arguments:**
 
@@ -81,18 +91,24 @@ class Environment(eqx.Module):
     - `initial_state`: a vector, or a function of a key to one; zero by default.
     - `control_bounds`: `(low, high)`, each a number or a vector; controls are clipped
         to them. None by default.
-    - `horizon`: steps an episode, 200 by default.
+    - `horizon`: steps per episode, 200 by default.
     - `terminated`: `(t, x) -> bool`; never by default.
     - `actions`: the table behind integer actions, shape `(actions, m)`; none by
         default.
-    - `encode`: what a network or a Gymnasium user sees of an observation (cosine and
+    - `encode`: features of an observation for networks and Gymnasium users (cosine and
         sine of an angle, for example): a function of a vector to a vector; the identity
         by default. Controllers are given the observation itself.
-    - `observation_bounds`: `(low, high)`, each a number or a vector, between which what
-        `encode` returns lies: the observation space of a Gymnasium user. It is said,
-        not enforced. None by default.
+    - `observation_bounds`: `(low, high)`, each a number or a vector: bounds of
+        `encode(y)`, the observation space of a Gymnasium user. Informational only: they
+        are not enforced. None by default.
 
     **Raises:** `ValueError` if sizes do not fit each other or bounds cross.
+
+    !!! note
+
+        `jax.jit(env.step)` raises "unhashable", as does a method of any module that
+        holds arrays: use `eqx.filter_jit(env.step)`, or pass the environment as an
+        argument, `jax.jit(Environment.step)(env, ...)`. `vmap` and `scan` need neither.
 
     !!! example
 
@@ -113,14 +129,14 @@ class Environment(eqx.Module):
     disturbance: AbstractDisturbance | None = eqx.field(default=None)
     sensor_noise: AbstractDisturbance | None = None
     initial_state: Any = eqx.field(default=None, converter=_as_start)
-    control_bounds: tuple[Any, Any] | None = bounds_field(
+    control_bounds: BoundsOrNone = bounds_field(
         "Environment", "control_bounds", default=None
     )
     horizon: int = eqx.field(static=True, default=200, converter=_as_horizon)
     terminated: Callable[[Time, State], Array] | None = function_field(None)
-    actions: Any = parameter(None)
+    actions: RealOrNone = parameter(None)
     encode: Callable[[Observation], Vector] = function_field(None)
-    observation_bounds: tuple[Any, Any] | None = bounds_field(
+    observation_bounds: BoundsOrNone = bounds_field(
         "Environment", "observation_bounds", default=None
     )
 
@@ -136,7 +152,7 @@ class Environment(eqx.Module):
     def __check_init__(self):
         where, dynamics = "Environment", self.dynamics
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
-        check_noise(dynamics, where)
+        _check_noise(dynamics, where)
         n, m = dynamics.state_size, dynamics.control_size
         check_instance(self.cost, AbstractCost, "cost", where)
         check_cost_sizes(self.cost, (n, m), "cost", where)
@@ -158,7 +174,7 @@ class Environment(eqx.Module):
             )
 
     def __replaced__(self, before: "Environment") -> dict[str, Any]:
-        """What `before` had by default of its dynamics, by default of the new ones."""
+        """New defaults in place of those that `before` had from its dynamics."""
         old, new, x0 = before.dynamics, self.dynamics, before.initial_state
         if not isinstance(new, AbstractDynamics):
             return {}
@@ -193,12 +209,12 @@ class Environment(eqx.Module):
 
     @property
     def observation_size(self) -> int:
-        """The size of what a controller is given."""
+        """The size of the observation that a controller is given."""
         return self.dynamics.observation_size
 
     @property
     def feature_size(self) -> int:
-        """The size of what `encode` returns."""
+        """The size of `encode(y)`."""
         shape = jnp.shape(output_of(self.encode, (self.observation_size,)))
         if len(shape) != 1:
             raise ValueError(
@@ -209,14 +225,14 @@ class Environment(eqx.Module):
 
     def trim(self, *, fix: Any = (), throw: bool = True) -> OperatingPoint:
         """The operating point of the task: that of [`delucax.trim`][] from the
-        `targets` of its cost where they name both a state and a control, else from the
-        equilibrium of its dynamics, else from the target that is named and zeros.
+        `targets` of its cost if they give both a state and a control, else from the
+        equilibrium of its dynamics, else from the target that is given and zeros.
 
         **Arguments:** `fix`, `throw`: as in [`delucax.trim`][].
 
         **Returns:** [`delucax.dynamics.OperatingPoint`][].
 
-        **Raises:** `ValueError` if neither cost nor dynamics name a point, and as
+        **Raises:** `ValueError` if neither cost nor dynamics define a point, and as
         [`delucax.trim`][] does.
 
         !!! example
@@ -233,8 +249,8 @@ class Environment(eqx.Module):
         point = self.cost.set_point(self.dynamics)
         if point is None:
             raise ValueError(
-                "Environment: trim needs a cost with targets or dynamics that name an "
-                "equilibrium; use `delucax.trim(env.dynamics, x=..., u=...)`."
+                "Environment: trim needs a cost with targets or dynamics that define "
+                "an equilibrium; use `delucax.trim(env.dynamics, x=..., u=...)`."
             )
         x, u = point
         return trim(self.dynamics, x=x, u=u, fix=fix, throw=throw)
@@ -266,7 +282,7 @@ class Environment(eqx.Module):
         return self.initial_state
 
     def saturate(self, u: ArrayLike) -> Array:
-        """The control that is applied when `u` is asked for.
+        """Clip a control to `control_bounds`, or look up an integer action.
 
         **Arguments:** `u`: a control, shape `(m,)`; or an integer action, a scalar,
             where there is a table of `actions`.
@@ -314,7 +330,7 @@ class Environment(eqx.Module):
         A step does not check its numbers, and `result` is that of the solver alone: NaN
         in the state or the control gives NaN, and a state that is finite but huge may
         overflow to infinity or NaN, while `result` is a success.
-        [`delucax.rollout`][] and whatever else takes steps check for that.
+        [`delucax.rollout`][], losses and adapters check for states that are not finite.
 
         **Returns:** a [`delucax.environments.Step`][].
 
@@ -368,3 +384,30 @@ def _check_signal(signal: Any, size: int, name: str) -> None:
 def _default_disturbance(dynamics: AbstractDynamics) -> AbstractDisturbance:
     k, count = dynamics.disturbance_size, dynamics.increments
     return Brownian(k // count, substeps=count) if count else Zero(k)
+
+
+def _check_noise(plant: AbstractPlant, where: str) -> None:
+    """Raise unless `plant`, and each plant that it wraps, forwards the Brownian noise
+    of the plants inside."""
+    name, noise = type(plant).__name__, plant.noise
+    if isinstance(plant, AbstractDynamics):
+        if (plant.increments > 0) != (noise == "brownian"):
+            raise ValueError(
+                f"{where}: {name} has noise = {noise!r} and increments = "
+                f"{plant.increments}, but increments must be at least 1 where w is "
+                "Brownian, and 0 where it is not. A subclass of "
+                "delucax.dynamics.AbstractWrapper forwards both."
+            )
+    for part in parts_of(plant, AbstractPlant):
+        _check_noise(part, where)
+        try:
+            is_brownian = part.noise == "brownian"
+        except (TypeError, ValueError):  # a batch; a plant without noise does not fail
+            is_brownian = True
+        if is_brownian and not plant.declares_noise():
+            raise ValueError(
+                f"{where}: {name} does not forward `noise` of the "
+                f"{type(part).__name__} that it wraps. Derive it from "
+                f"delucax.dynamics.AbstractWrapper, or define `noise` in {name}: that "
+                "of the wrapped plant, or None if w is not Brownian."
+            )

@@ -21,7 +21,8 @@ from ..costs import Quadratic
 from ..dynamics import c2d, LinearDynamics
 from ..systems import LinearSystem
 from ._environment import Environment
-from ._task import UniformState
+from ._registry import register
+from ._task import Fields, UniformState
 
 
 def cartpole_linear(
@@ -53,7 +54,7 @@ def cartpole_linear(
     - `length`: l, of the rod [m], 1 by default.
     - `gravity`: g [m/s^2], 9.81 by default.
     - `dt`: the step, 0.02 by default.
-    - `horizon`: steps an episode, 200 by default: 4 s, where the paper's code stops
+    - `horizon`: steps per episode, 200 by default: 4 s, where the paper's code stops
         after 10 steps.
     - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
@@ -78,9 +79,9 @@ def cartpole_linear(
     """
     where = "cartpole_linear"
     check_keywords(others, where, cartpole_linear, Environment)
-    check_positive(cart_mass, "cart_mass", where)
-    check_positive(pole_mass, "pole_mass", where)
-    check_positive(length, "length", where)
+    positive = dict(cart_mass=cart_mass, pole_mass=pole_mass, length=length)
+    for name, value in positive.items():
+        check_positive(value, name, where)
     check_step(dt, where)
     M, m, l, g = (as_float_array(v) for v in (cart_mass, pole_mass, length, gravity))
     zero, one = jnp.zeros_like(M), jnp.ones_like(M)
@@ -92,15 +93,10 @@ def cartpole_linear(
     ]
     A = jnp.eye(4) + dt * jnp.array(rate)
     B = dt * jnp.array([[zero], [zero], [1 / M], [1 / (M * l)]])
-    dynamics = LinearDynamics(
-        A,
-        B,
-        dt=dt,
-        state_names=("position", "angle", "velocity", "spin"),
-        control_names=("force",),
-    )
-    fields: dict[str, Any] = dict(
-        dynamics=dynamics,
+    states = ("position", "angle", "velocity", "spin")
+    names: Fields = dict(state_names=states, control_names=("force",))
+    fields: Fields = dict(
+        dynamics=LinearDynamics(A, B, dt=dt, **names),
         cost=Quadratic(jnp.ones(4), jnp.ones(1)),
         initial_state=UniformState([-0.05] * 4, [0.05] * 4),
         horizon=horizon,
@@ -140,7 +136,7 @@ def lds(
     - `states`, `controls`: sizes of random matrices, 2 and 1 by default.
     - `observations`: rows of a random `C`; the identity by default.
     - `spectral_radius`: of the random `A`, 0.9 by default; below 1 is stable.
-    - `horizon`: steps an episode, 200 by default.
+    - `horizon`: steps per episode, 200 by default.
     - `**others`: arguments of [`delucax.Environment`][], such as `cost` and
         `disturbance`.
 
@@ -174,19 +170,21 @@ def lds(
             raise ValueError(
                 f"lds: {missing} must be given with {other}, or neither of them."
             )
+        if A is None and C is not None:
+            raise ValueError("lds: C needs A and B; for a random C give observations.")
         if A is None:
-            if C is not None:
-                raise ValueError(
-                    "lds: C needs A and B; for a random C give observations."
-                )
             A, B, C = _random(key, states, controls, observations, spectral_radius)
         elif key is not None:
             raise ValueError("lds: give A and B, or a key to draw them with, not both.")
         dynamics = LinearDynamics(A, B, C, dt=1.0 if dt is None else dt)
     n, m = dynamics.state_size, dynamics.control_size
     cost = Quadratic(jnp.ones(n), jnp.ones(m))
-    fields: dict[str, Any] = dict(dynamics=dynamics, cost=cost, horizon=horizon)
+    fields: Fields = dict(dynamics=dynamics, cost=cost, horizon=horizon)
     return Environment(**(fields | others))
+
+
+for _name in ("cartpole_linear", "lds"):
+    register(_name, f"{__package__}:{_name}")
 
 
 def _sampled(system: Any, dt: Any) -> LinearDynamics:

@@ -19,9 +19,9 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
     """A copy with the named parameters drawn at random: domain randomisation.
 
     Under `jax.vmap` over keys it makes a batch of plants that compiles once. There the
-    values drawn cannot be looked at, so the ends of the ranges are: each with the
-    others at their lower, and at their upper ends. What a function draws is checked
-    where it is known, outside of `jax.vmap` and `jax.jit`.
+    ends of the ranges are validated in place of the draws: each with the others at
+    their lower, and at their upper ends. Draws by a function are validated only outside
+    of `jax.vmap` and `jax.jit`.
 
     **Arguments:**
 
@@ -33,7 +33,7 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
     **Returns:** the copy.
 
     **Raises:** `ValueError` if a path is not there or is part of another one, a range
-    is not a finite pair or a function, or a range holds values that are not legal.
+    is not a finite pair or a function, or a range holds values that are not valid.
 
     !!! example
 
@@ -59,15 +59,14 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
             f"{{'dynamics.system.length': (0.8, 1.2)}}, got {ranges!r}."
         )
     check_paths(ranges, "randomise")
-    changes, ends = {}, {}
-    for (path, given), one in zip(
-        ranges.items(), jr.split(key, len(ranges)), strict=True
-    ):
+    changes, ends, keys = {}, {}, jr.split(key, len(ranges))
+    for (path, given), one in zip(ranges.items(), keys, strict=True):
         old = get_path(tree, path)
         if callable(given):
             changes[path] = given(one)
         elif isinstance(given, tuple | list) and len(given) == 2:
-            low, high = (as_float_array(end) for end in given)
+            with jax.ensure_compile_time_eval():  # so that jit does not hide numbers
+                low, high = (as_float_array(end) for end in given)
             if not (eqx.is_inexact_array(low) and eqx.is_inexact_array(high)):
                 raise ValueError(
                     f"randomise: the range of {path!r} must be of numbers, got "
@@ -75,10 +74,8 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
                 )
             shape: Any = jnp.broadcast_shapes(jnp.shape(old), low.shape, high.shape)
             dtype = jnp.result_type(old, low, high)
-            with jax.ensure_compile_time_eval():  # so that jit does not hide numbers
-                known = [as_float_array(end) for end in given]
-            if all(map(is_concrete, known)):
-                least, most = (np.asarray(end, dtype) for end in known)
+            if is_concrete(low) and is_concrete(high):
+                least, most = np.asarray(low, dtype), np.asarray(high, dtype)
                 if not np.all((least <= most) & np.isfinite(most - least)):
                     raise ValueError(
                         f"randomise: the range of {path!r} must be finite and have "
@@ -97,8 +94,8 @@ def randomise(tree: Any, key: PRNGKey, ranges: dict[str, Any]) -> Any:
 
 
 def _inner_ends(low: Any, high: Any, shape: tuple[int, ...]) -> tuple[Any, Any]:
-    """The ends of a range, moved inside by a rounding: an end that is itself not legal,
-    such as 0 for what is positive, is as good as never drawn."""
+    """The ends of a range, moved inside by a rounding, so that an open interval may be
+    given by its end points, such as 0 for a positive parameter."""
     small = np.finfo(low.dtype).eps * (high - low)
     first = np.maximum(np.nextafter(low, high), low + small)
     last = np.minimum(np.nextafter(high, low), high - small)
@@ -106,11 +103,10 @@ def _inner_ends(low: Any, high: Any, shape: tuple[int, ...]) -> tuple[Any, Any]:
 
 
 def _check_ends(tree: Any, changes: dict[str, Any], ends: dict[str, Any]) -> None:
-    """Raise where a range holds what is not legal, which under `jax.vmap` and `jax.jit`
-    a draw cannot show.
+    """Raise if a range holds invalid values, which traced draws cannot show.
 
-    All values are set to the ends of their ranges, on one side but for one of them or
-    none. All that is tried may be drawn, so that ranges which fit together pass.
+    All values are set to the same end of their ranges, or all but one. Each of these
+    combinations may be drawn, so that no valid ranges are refused.
     """
     count = len(ends)
     sides = {

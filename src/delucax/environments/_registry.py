@@ -1,7 +1,6 @@
 """Tasks by name."""
 
 import importlib
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -9,21 +8,14 @@ from .._message import did_you_mean
 from ._environment import Environment
 
 
-_ENVIRONMENTS = """
-    acrobot cartpole cartpole_linear cstr double_integrator dynamic_bicycle
-    kinematic_bicycle lds lorenz mass_spring_damper mountain_car mountain_car_discrete
-    neural pendulum permanent_magnet_motor planar_quadrotor quadrotor reacher two_tank
-    van_der_pol
-""".split()
 _LUNGS = """
     balloon_lung delay_lung double_compartment learned_lung single_compartment
 """.split()
 # The names of the paper.
 _CLASSIC = "acrobot cartpole mountain_car pendulum planar_quadrotor reacher".split()
 
-# The entry points. A task of ours is called like the function that makes it.
+# The entry points. The tasks of this package register themselves.
 _REGISTRY: dict[str, str] = {
-    **{name: f"delucax.environments:{name}" for name in _ENVIRONMENTS},
     **{f"classic/{name}": f"delucax.environments:{name}" for name in _CLASSIC},
     **{name: f"delucax.lung:{name}" for name in _LUNGS},
     **{f"lung/{name}": f"delucax.lung:{name}" for name in _LUNGS},
@@ -31,7 +23,7 @@ _REGISTRY: dict[str, str] = {
 
 
 def make(name: str, **kwargs: Any) -> Environment:
-    """The task of that name.
+    """Create a registered environment by its name.
 
     **Arguments:**
 
@@ -40,8 +32,8 @@ def make(name: str, **kwargs: Any) -> Environment:
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on an unknown name, with the close ones, or if what was
-    registered makes no environment.
+    **Raises:** `ValueError` on an unknown name, with similar ones, or if the function
+    does not return an environment.
 
     !!! example
 
@@ -51,7 +43,7 @@ def make(name: str, **kwargs: Any) -> Environment:
         env = dlx.make("pendulum", length=1.2)
         ```
     """
-    env = _task(name, "make")(**kwargs)
+    env = _function_of(name)(**kwargs)
     if not isinstance(env, Environment):
         raise ValueError(
             f"make: {name!r} must be an Environment, but {_REGISTRY[name]!r} returned "
@@ -60,33 +52,12 @@ def make(name: str, **kwargs: Any) -> Environment:
     return env
 
 
-def default_horizon(name: str) -> int:
-    """The horizon of a task if no other is given, without making it.
-
-    **Arguments:** `name`: of a task of delucax, as in [`delucax.make`][].
-
-    **Returns:** steps an episode.
-
-    **Raises:** `ValueError` on an unknown name, with the close ones.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-
-        dlx.environments.default_horizon("pendulum")
-        ```
-    """
-    signature = inspect.signature(_task(name, "default_horizon"))
-    return signature.parameters["horizon"].default
-
-
-def _task(name: str, where: str) -> Callable[..., Any]:
+def _function_of(name: str) -> Callable[..., Any]:
     """The function that makes a task."""
     if not isinstance(name, str) or name not in _REGISTRY:
         names = sorted(_REGISTRY)
         raise ValueError(
-            f"{where}: no task is called {name!r}; "
+            f"make: no task is called {name!r}; "
             f"{did_you_mean(str(name), names, cutoff=0.4)} "
             f"All names: {', '.join(names)}."
         )
@@ -95,7 +66,7 @@ def _task(name: str, where: str) -> Callable[..., Any]:
         return getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
         raise ValueError(
-            f"{where}: {name!r} is registered as {_REGISTRY[name]!r}, which cannot be "
+            f"make: {name!r} is registered as {_REGISTRY[name]!r}, which cannot be "
             f"imported: {error}."
         ) from error
 

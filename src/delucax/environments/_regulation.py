@@ -1,10 +1,11 @@
-"""Tasks in which a plant is brought to a point and held there, at quadratic cost."""
+"""Set-point regulation tasks with a quadratic cost."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
-from .._check import check_number, check_positive, check_range
 from .._typing import PRNGKey
 from ..costs import Quadratic
 from ..systems import (
@@ -18,30 +19,34 @@ from ..systems import (
     TwoTank,
     VanDerPol,
 )
-from ._task import Fields, task, UniformState
+from ._task import Fields, Limit, Number, Positive, task, UniformState
+
+
+def _regulation(
+    cost: Quadratic,
+    spread: Array | Sequence[float],
+    bounds: tuple[Limit, Limit],
+    centre: Array | float = 0.0,
+) -> Fields:
+    """A start within `spread` of `centre`, and bounds of the controls."""
+    spread = jnp.asarray(spread)
+    return dict(
+        cost=cost,
+        initial_state=UniformState(centre - spread, centre + spread),
+        control_bounds=bounds,
+    )
 
 
 @task(DoubleIntegrator, dt=0.1, horizon=100)
-def double_integrator(system: DoubleIntegrator, *, max_force: Any = 1.0) -> Fields:
+def double_integrator(system: DoubleIntegrator, *, max_force: Limit = 1.0) -> Fields:
     """Bring a mass on a line to rest at the origin.
 
     State (position, velocity); control (force). Starts with the position uniform in
-    +-2 and the velocity in +-1. Cost `|x|^2 + 0.1 force^2` a step. Never terminates.
+    +-2 and the velocity in +-1. Cost `|x|^2 + 0.1 force^2` per step. Never terminates.
 
     **Arguments:**
 
-    - `system`: a [`delucax.systems.DoubleIntegrator`][]; made of `others` by default.
     - `max_force`: 1 by default.
-    - `dt`: the control interval, 0.1 by default.
-    - `horizon`: steps an episode, 100 by default.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 1 by default.
-    - `**others`: arguments of [`delucax.systems.DoubleIntegrator`][] or
-        [`delucax.Environment`][], such as `disturbance`.
-
-    **Returns:** an [`delucax.Environment`][].
-
-    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Åström and Murray, 2008.
 
@@ -53,35 +58,20 @@ def double_integrator(system: DoubleIntegrator, *, max_force: Any = 1.0) -> Fiel
         env = dlx.make("double_integrator", mass=2.0)
         ```
     """
-    check_range(max_force, "max_force", "double_integrator")
-    return dict(
-        cost=Quadratic([1.0, 1.0], [0.1]),
-        initial_state=UniformState([-2.0, -1.0], [2.0, 1.0]),
-        control_bounds=(-max_force, max_force),
-    )
+    cost = Quadratic([1.0, 1.0], [0.1])
+    return _regulation(cost, [2.0, 1.0], (-max_force, max_force))
 
 
 @task(MassSpringDamper, dt=0.1, horizon=200)
-def mass_spring_damper(system: MassSpringDamper, *, max_force: Any = 1.0) -> Fields:
+def mass_spring_damper(system: MassSpringDamper, *, max_force: Limit = 1.0) -> Fields:
     """Bring a mass on a spring, or a chain of them, to rest by a force on the last.
 
     State (positions, velocities); control (force). Starts with each state uniform in
-    +-1. Cost `|x|^2 + 0.1 force^2` a step. Never terminates.
+    +-1. Cost `|x|^2 + 0.1 force^2` per step. Never terminates.
 
     **Arguments:**
 
-    - `system`: a [`delucax.systems.MassSpringDamper`][]; made of `others` by default.
     - `max_force`: 1 by default.
-    - `dt`: the control interval, 0.1 by default.
-    - `horizon`: steps an episode, 200 by default.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 1 by default.
-    - `**others`: arguments of [`delucax.systems.MassSpringDamper`][] or
-        [`delucax.Environment`][], such as `disturbance`.
-
-    **Returns:** an [`delucax.Environment`][].
-
-    **Raises:** `ValueError` on illegal numbers, or if there are not as many as masses.
 
     Source: Åström and Murray, 2008.
 
@@ -93,36 +83,20 @@ def mass_spring_damper(system: MassSpringDamper, *, max_force: Any = 1.0) -> Fie
         env = dlx.make("mass_spring_damper", masses=3)
         ```
     """
-    check_range(max_force, "max_force", "mass_spring_damper")
-    corner = jnp.ones(system.state_size)
-    return dict(
-        cost=Quadratic(corner, [0.1]),
-        initial_state=UniformState(-corner, corner),
-        control_bounds=(-max_force, max_force),
-    )
+    ones = jnp.ones(system.state_size)
+    return _regulation(Quadratic(ones, [0.1]), ones, (-max_force, max_force))
 
 
 @task(VanDerPol, dt=0.05, horizon=200)
-def van_der_pol(system: VanDerPol, *, max_control: Any = 3.0) -> Fields:
+def van_der_pol(system: VanDerPol, *, max_control: Limit = 3.0) -> Fields:
     """Bring van der Pol's oscillator from its limit cycle to rest.
 
     State (x, v); control (u). Starts with each state uniform in +-2. Cost
-    `|x|^2 + 0.1 u^2` a step. Never terminates.
+    `|x|^2 + 0.1 u^2` per step. Never terminates.
 
     **Arguments:**
 
-    - `system`: a [`delucax.systems.VanDerPol`][]; made of `others` by default.
     - `max_control`: 3 by default.
-    - `dt`: the control interval, 0.05 by default.
-    - `horizon`: steps an episode, 200 by default.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 1 by default.
-    - `**others`: arguments of [`delucax.systems.VanDerPol`][] or
-        [`delucax.Environment`][], such as `disturbance`.
-
-    **Returns:** an [`delucax.Environment`][].
-
-    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: van der Pol, 1926.
 
@@ -134,35 +108,20 @@ def van_der_pol(system: VanDerPol, *, max_control: Any = 3.0) -> Fields:
         env = dlx.make("van_der_pol", mu=2.0)
         ```
     """
-    check_range(max_control, "max_control", "van_der_pol")
-    return dict(
-        cost=Quadratic([1.0, 1.0], [0.1]),
-        initial_state=UniformState([-2.0, -2.0], [2.0, 2.0]),
-        control_bounds=(-max_control, max_control),
-    )
+    cost = Quadratic([1.0, 1.0], [0.1])
+    return _regulation(cost, [2.0, 2.0], (-max_control, max_control))
 
 
 @task(Lorenz, dt=0.01, horizon=500)
-def lorenz(system: Lorenz, *, max_control: Any = 50.0) -> Fields:
+def lorenz(system: Lorenz, *, max_control: Limit = 50.0) -> Fields:
     """Hold Lorenz's chaotic system at the centre of its right wing.
 
     State (x, y, z); control (u). Starts with x and y uniform in +-20 and z in [10, 40].
-    Cost `|x - x*|^2 + 0.001 u^2` a step, x* being the equilibrium. Never terminates.
+    Cost `|x - x*|^2 + 0.001 u^2` per step, x* being the equilibrium. Never terminates.
 
     **Arguments:**
 
-    - `system`: a [`delucax.systems.Lorenz`][]; made of `others` by default.
     - `max_control`: 50 by default.
-    - `dt`: the control interval, 0.01 by default.
-    - `horizon`: steps an episode, 500 by default.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 1 by default.
-    - `**others`: arguments of [`delucax.systems.Lorenz`][] or
-        [`delucax.Environment`][], such as `disturbance`.
-
-    **Returns:** an [`delucax.Environment`][].
-
-    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Lorenz, 1963; Kaiser, Kutz and Brunton, 2018.
 
@@ -174,38 +133,24 @@ def lorenz(system: Lorenz, *, max_control: Any = 50.0) -> Fields:
         env = dlx.make("lorenz", rho=24.0)
         ```
     """
-    check_range(max_control, "max_control", "lorenz")
-    centre, _ = system.equilibrium()
-    return dict(
-        cost=Quadratic([1.0, 1.0, 1.0], [0.001], state_target=centre),
-        initial_state=UniformState([-20.0, -20.0, 10.0], [20.0, 20.0, 40.0]),
-        control_bounds=(-max_control, max_control),
-    )
+    wing, _ = system.equilibrium()
+    cost = Quadratic([1.0, 1.0, 1.0], [0.001], state_target=wing)
+    middle = jnp.array([0.0, 0.0, 25.0])
+    return _regulation(cost, [20.0, 20.0, 15.0], (-max_control, max_control), middle)
 
 
 @task(TwoTank, dt=2.0, horizon=200)
-def two_tank(system: TwoTank, *, level: Any = 10.0, max_flow: Any = 30.0) -> Fields:
+def two_tank(system: TwoTank, *, level: Limit = 10.0, max_flow: Limit = 30.0) -> Fields:
     """Hold the lower of two tanks at a level.
 
     State (upper, lower) [cm]; control (flow) [cm^3/s], not negative. Starts with the
-    levels uniform in [0, 20]. Cost `(lower - level)^2 + 0.01 (flow - flow*)^2` a step,
-    flow* being what holds the level. Never terminates.
+    levels uniform in [0, 20]. Cost `(lower - level)^2 + 0.01 (flow - flow*)^2` per
+    step, where flow* holds the level. Never terminates.
 
     **Arguments:**
 
-    - `system`: a [`delucax.systems.TwoTank`][]; made of `others` by default.
     - `level`: to hold [cm], 10 by default.
     - `max_flow`: of the pump, 30 by default.
-    - `dt`: the control interval, 2 by default.
-    - `horizon`: steps an episode, 200 by default.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 1 by default.
-    - `**others`: arguments of [`delucax.systems.TwoTank`][] or
-        [`delucax.Environment`][], such as `disturbance`.
-
-    **Returns:** an [`delucax.Environment`][].
-
-    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Johansson, 2000.
 
@@ -217,46 +162,30 @@ def two_tank(system: TwoTank, *, level: Any = 10.0, max_flow: Any = 30.0) -> Fie
         env = dlx.make("two_tank", level=12.0)
         ```
     """
-    check_range(max_flow, "max_flow", "two_tank")
-    check_range(level, "level", "two_tank")
     x, u = system.equilibrium(level)
-    return dict(
-        cost=Quadratic([0.0, 1.0], [0.01], state_target=x, control_target=u),
-        initial_state=UniformState([0.0, 0.0], [20.0, 20.0]),
-        control_bounds=(0.0, max_flow),
-    )
+    cost = Quadratic([0.0, 1.0], [0.01], state_target=x, control_target=u)
+    return _regulation(cost, [10.0, 10.0], (0.0, max_flow), 10.0)
 
 
 @task(CSTR, dt=0.05, horizon=100, substeps=4)
 def cstr(
     system: CSTR,
     *,
-    concentration: Any = 0.5,
-    min_coolant: Any = 280.0,
-    max_coolant: Any = 320.0,
+    concentration: Positive = 0.5,
+    min_coolant: Limit = 280.0,
+    max_coolant: Limit = 320.0,
 ) -> Fields:
     """Hold a stirred-tank reactor at its unstable equilibrium.
 
     State (concentration [mol/l], temperature [K]); control (coolant [K]). Starts within
     0.05 mol/l and 3 K of the equilibrium. Cost
-    `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` a step, with the
-    equilibrium at the concentration. Never terminates. The time is in minutes.
+    `10 (c - c*)^2 + 0.01 (T - T*)^2 + 0.01 (T_coolant - T_coolant*)^2` per step, with
+    the equilibrium at the concentration. Never terminates. The time is in minutes.
 
     **Arguments:**
 
-    - `system`: a [`delucax.systems.CSTR`][]; made of `others` by default.
     - `concentration`: to hold [mol/l], below that of the feed; 0.5 by default.
     - `min_coolant`, `max_coolant`: what the jacket can do [K], 280 and 320 by default.
-    - `dt`: the control interval [min], 0.05 by default.
-    - `horizon`: steps an episode, 100 by default.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 4 by default.
-    - `**others`: arguments of [`delucax.systems.CSTR`][] or [`delucax.Environment`][],
-        such as `disturbance`.
-
-    **Returns:** an [`delucax.Environment`][].
-
-    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Henson and Seborg, 1997.
 
@@ -269,45 +198,26 @@ def cstr(
         mpc = dlx.controllers.MPC(env.dynamics, env.cost, 20, bounds=(280.0, 320.0))
         ```
     """
-    check_positive(concentration, "concentration", "cstr")
-    check_range(min_coolant, "min_coolant", "cstr")
-    check_range(max_coolant, "max_coolant", "cstr")
     x, u = system.equilibrium(concentration)
-    about = jnp.array([0.05, 3.0])
-    return dict(
-        cost=Quadratic([10.0, 0.01], [0.01], state_target=x, control_target=u),
-        initial_state=UniformState(x - about, x + about),
-        control_bounds=(min_coolant, max_coolant),
-    )
+    cost = Quadratic([10.0, 0.01], [0.01], state_target=x, control_target=u)
+    return _regulation(cost, [0.05, 3.0], (min_coolant, max_coolant), x)
 
 
 @task(PermanentMagnetMotor, dt=0.0005, horizon=200)
 def permanent_magnet_motor(
-    system: PermanentMagnetMotor, *, speed: Any = 100.0, max_voltage: Any = 150.0
+    system: PermanentMagnetMotor, *, speed: Number = 100.0, max_voltage: Limit = 150.0
 ) -> Fields:
     """Bring a synchronous motor to a speed and hold it.
 
     State (i_d, i_q, speed); control (v_d, v_q), each within +-max_voltage; disturbance
     (load). Starts with the currents uniform in +-1 A and the speed in +-50 rad/s. Cost
-    `0.01 (di_d^2 + di_q^2) + 0.001 dspeed^2 + 1e-5 |dv|^2` a step, each measured from
+    `0.01 (di_d^2 + di_q^2) + 0.001 dspeed^2 + 1e-5 |dv|^2` per step, each measured from
     what holds the speed without load. Never terminates.
 
     **Arguments:**
 
-    - `system`: a [`delucax.systems.PermanentMagnetMotor`][]; made of `others` by
-        default.
     - `speed`: to hold [rad/s], 100 by default.
     - `max_voltage`: 150 by default.
-    - `dt`: the control interval, 0.0005 by default.
-    - `horizon`: steps an episode, 200 by default.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 1 by default.
-    - `**others`: arguments of [`delucax.systems.PermanentMagnetMotor`][] or
-        [`delucax.Environment`][], such as `disturbance`.
-
-    **Returns:** an [`delucax.Environment`][].
-
-    **Raises:** `ValueError` on illegal numbers, or on arguments of a system beside one.
 
     Source: Krause, Wasynczuk and Sudhoff, 2002.
 
@@ -321,15 +231,10 @@ def permanent_magnet_motor(
         env = dlx.make("permanent_magnet_motor", speed=80.0, disturbance=load)
         ```
     """
-    check_number(speed, "speed", "permanent_magnet_motor")
-    check_range(max_voltage, "max_voltage", "permanent_magnet_motor")
     x, u = system.equilibrium(speed)
     Q, R = [0.01, 0.01, 0.001], [1e-5, 1e-5]
-    return dict(
-        cost=Quadratic(Q, R, state_target=x, control_target=u),
-        initial_state=UniformState([-1.0, -1.0, -50.0], [1.0, 1.0, 50.0]),
-        control_bounds=(-max_voltage, max_voltage),
-    )
+    cost = Quadratic(Q, R, state_target=x, control_target=u)
+    return _regulation(cost, [1.0, 1.0, 50.0], (-max_voltage, max_voltage))
 
 
 def _drawn(
@@ -345,31 +250,19 @@ def _drawn(
 
 
 @task(NeuralSystem, dt=0.05, horizon=100, arguments=_drawn, accepts=AbstractSystem)
-def neural(system: AbstractSystem, *, max_control: Any = 1.0) -> Fields:
+def neural(system: AbstractSystem, *, max_control: Limit = 1.0) -> Fields:
     """Bring the state of a learned vector field to the origin.
 
-    Starts with each state uniform in +-1. Cost `|x|^2 + 0.1 |u|^2` a step. Never
+    Starts with each state uniform in +-1. Cost `|x|^2 + 0.1 |u|^2` per step. Never
     terminates.
 
     **Arguments:**
 
-    - `system`: a [`delucax.systems.NeuralSystem`][], such as one that was fitted to
-        data, or any other system. One with random weights by default.
-    - `key`: a random key, for random weights.
+    - `key`: a random key, for random weights if no `system` is given, which may be a
+        network that was fitted to data, or any other system.
     - `states`, `controls`, `width`: of a network with random weights, 2, 1 and 32 by
         default; see [`delucax.systems.NeuralSystem`][].
     - `max_control`: of each control, to either side; 1 by default.
-    - `dt`: the control interval, 0.05 by default.
-    - `horizon`: steps an episode, 100 by default.
-    - `solver`: a Diffrax solver, [`delucax.dynamics.RK4`][] by default.
-    - `substeps`: solver steps an interval, 1 by default.
-    - `**others`: arguments of [`delucax.Environment`][], such as `disturbance`, or,
-        without a `system`, of [`delucax.systems.NeuralSystem`][].
-
-    **Returns:** an [`delucax.Environment`][].
-
-    **Raises:** `ValueError` on illegal numbers, without a system and a key, or with a
-        system and arguments of another.
 
     Source: Chen, Rubanova, Bettencourt and Duvenaud, 2018.
 
@@ -383,10 +276,6 @@ def neural(system: AbstractSystem, *, max_control: Any = 1.0) -> Fields:
         again = dlx.make("neural", system=env.dynamics.system)
         ```
     """
-    check_range(max_control, "max_control", "neural")
-    corner = jnp.ones(system.state_size)
-    return dict(
-        cost=Quadratic(corner, 0.1 * jnp.ones(system.control_size)),
-        initial_state=UniformState(-corner, corner),
-        control_bounds=(-max_control, max_control),
-    )
+    ones = jnp.ones(system.state_size)
+    cost = Quadratic(ones, 0.1 * jnp.ones(system.control_size))
+    return _regulation(cost, ones, (-max_control, max_control))

@@ -1,9 +1,9 @@
-"""What the tasks share: their arguments, dynamics and solver, and where they start."""
+"""The decorator that makes environments of systems, and uniform initial states."""
 
 import functools
 import inspect
 from collections.abc import Callable, Iterable
-from typing import Any, TypeAlias
+from typing import Annotated, Any, get_args, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -16,14 +16,18 @@ from .._check import (
     check_instance,
     check_key,
     check_keywords,
+    check_number,
+    check_positive,
+    check_range,
     check_step,
     keywords_of,
 )
 from .._module import parameter
-from .._typing import PRNGKey
+from .._typing import PRNGKey, Real
 from ..dynamics import AbstractDynamics, Discretized
 from ..systems import AbstractSystem
 from ._environment import Environment
+from ._registry import register
 
 
 class UniformState(eqx.Module):
@@ -45,12 +49,8 @@ class UniformState(eqx.Module):
         ```
     """
 
-    low: Array = parameter()
-    high: Array = parameter()
-
-    def __init__(self, low: Any, high: Any):
-        self.low = low
-        self.high = high
+    low: Real = parameter()
+    high: Real = parameter()
 
     def __check_init__(self):
         size = np.size(self.low)
@@ -66,12 +66,15 @@ class UniformState(eqx.Module):
 _CHANGES_OBSERVATIONS = frozenset(
     "disturbance dynamics encode initial_state sensor_noise terminated".split()
 )
-"""Arguments of `Environment` with which the task's bounds of observations may not
-hold."""
+"""Arguments of `Environment` that can invalidate the task's bounds of observations."""
 
 
 Fields: TypeAlias = dict[str, Any]
 """Arguments of `Environment`, by name."""
+# An option of a task, which `task` checks.
+Number: TypeAlias = Annotated[Array | float | int, check_number]
+Positive: TypeAlias = Annotated[Array | float | int, check_positive]
+Limit: TypeAlias = Annotated[Array | float | int, check_range]
 
 
 def task(
@@ -85,30 +88,44 @@ def task(
     arguments: Callable[..., dict[str, Any]] = lambda: {},
     accepts: type[AbstractSystem] | None = None,
 ) -> Callable[[Callable[..., Fields]], Callable[..., Environment]]:
-    """A decorator that makes a task of what the task adds to a system.
+    """A decorator that turns a function into a task, which returns an `Environment`,
+    and registers it.
 
-    It decorates a function of the system (with `gym`, of the dynamics) and of options
-    to arguments of `Environment`. The task takes a system or the arguments of one, the
-    options, `dt`, `horizon`, `solver` and `substeps`, the arguments of `gym`, and those
-    of `Environment`, which hold instead of what the function returns.
+    The decorated function maps the system (with `gym`, the dynamics) and options to
+    arguments of `Environment`. The task takes a system or its arguments, the options,
+    which it checks as their annotations say, `dt`, `horizon`, `solver` and `substeps`,
+    the arguments of `gym`, and those of `Environment`, which take precedence over the
+    function's. It adds the documentation of these to the function's docstring.
 
     **Arguments:**
 
     - `kind`: the class of the system, if none is given.
     - `dt`, `horizon`, `solver`, `substeps`: defaults of the task.
-    - `gym`: Gym's arithmetic, of a system, `dt` and limits, for which a solver can be
-        given instead.
-    - `arguments`: makes arguments of the system of others, by keywords.
-    - `accepts`: what a system may be; of that `kind` by default.
+    - `gym`: the dynamics by Gym's integrator, a function of a system, `dt` and limits;
+        used unless a solver is given.
+    - `arguments`: derives arguments of the system from options of the task.
+    - `accepts`: the class of systems that are accepted; `kind` by default.
     """
     default_solver, accepts = solver, accepts or kind
     arithmetic = () if gym is None else (gym,)
     derived = inspect.signature(arguments).parameters
+    default_name = "[`delucax.dynamics.RK4`][] by default"
+    if gym is not None:
+        default_name = "in place of Gym's integrator, whose limits it does not have"
+    elif solver is not None:
+        default_name = f"`diffrax.{type(solver).__name__}()` by default"
 
     def decorate(added: Callable[..., Fields]) -> Callable[..., Environment]:
         where = added.__name__
-        # The first parameter is the system or the dynamics, the others are options.
+        # The first parameter is the system or the dynamics, the others are options,
+        # each with the check that its annotation holds (alone, or in a union).
         _, *options = inspect.signature(added).parameters.values()
+        checks = [
+            (option.name, check, option.default)
+            for option in options
+            for part in (option.annotation, *get_args(option.annotation))
+            for check in getattr(part, "__metadata__", ())
+        ]
 
         def make(
             system: Any = None,
@@ -119,6 +136,19 @@ def task(
             substeps: int = substeps,
             **others: Any,
         ) -> Environment:
+            """- `system`: a [`delucax.systems.{kind}`][]; made of `others` by default.
+            - `dt`: the control interval{unit}, {dt} by default.
+            - `horizon`: steps per episode, {horizon} by default.
+            - `solver`: a Diffrax solver, {solver}.
+            - `substeps`: solver steps per interval, {substeps} by default.
+            - `**others`: arguments of [`delucax.systems.{kind}`][] or
+                [`delucax.Environment`][], such as `disturbance`.
+
+            **Returns:** an [`delucax.Environment`][].
+
+            **Raises:** `ValueError` on invalid numbers, on arguments of a system beside
+            one, and on Gym's limits beside a solver or `substeps` without one.
+            """
             check_keywords(others, where, make, kind, *arithmetic, Environment)
             check_step(dt, where)
             # Each takes its own of the other arguments; those of Environment are left.
@@ -138,8 +168,8 @@ def task(
             if gym is None or solver is not None:
                 for name in limits:
                     raise ValueError(
-                        f"{where}: {name} is of Gym's arithmetic, and no solver has "
-                        f"the like; give one of {name} and solver."
+                        f"{where}: {name} applies to Gym's integrator alone; give one "
+                        f"of {name} and solver, not both."
                     )
                 dynamics = Discretized(system, dt, solver or default_solver, substeps)
             elif substeps != 1:
@@ -147,6 +177,9 @@ def task(
             else:
                 dynamics = gym(system, dt, **limits)
 
+            for name, check, default in checks:
+                if (value := chosen.get(name, default)) is not default:
+                    check(value, name, where)
             fields: Fields = dict(dynamics=dynamics, horizon=horizon)
             fields |= added(system if gym is None else dynamics, **chosen)
             # Bounds of observations are those of the task as it is.
@@ -160,13 +193,21 @@ def task(
         system, *rest = signature.parameters.values()
         system = system.replace(annotation=accepts | None)
         parameters = [system, *options, *derived.values(), *rest]
+        numbers = dict(dt=dt, horizon=horizon, substeps=substeps)
+        unit = f" [{kind.time_unit}]" if kind.time_unit else ""
+        names = dict(kind=kind.__name__, unit=unit, solver=default_name)
+        shared = (inspect.getdoc(make) or "").format(**numbers, **names)
         functools.update_wrapper(make, added)
+        # They follow the options, and end where the source is named.
+        own, source, rest = (inspect.getdoc(added) or "").partition("\n\nSource:")
+        make.__doc__ = f"{own}\n{shared}{source}{rest}"
         vars(make)["__signature__"] = signature.replace(parameters=parameters)
+        register(where, f"{__package__}:{where}")
         return make
 
     return decorate
 
 
 def _taken(arguments: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
-    """Those of `arguments` that are called so, which they no longer hold then."""
+    """Pop the arguments of these `names`."""
     return {name: arguments.pop(name) for name in names if name in arguments}

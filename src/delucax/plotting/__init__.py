@@ -12,7 +12,7 @@ except ImportError as error:
         'pip install "delucax[plot]"'
     ) from error
 
-from ._animate import animate as animate, Animation as Animation
+from ._animate import animate as animate
 from ._drawings._registry import register_drawing as register_drawing
 from ._phase import phase_portrait as phase_portrait
 from ._plot import plot as plot

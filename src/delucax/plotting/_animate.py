@@ -1,4 +1,4 @@
-"""A trajectory as a moving picture, whose figure is drawn once and its frames after."""
+"""Animations of trajectories."""
 
 import dataclasses
 import functools
@@ -53,8 +53,7 @@ class Scene:
         grid = self.figure.add_gridspec(1, 2 if traces else 1)
         self.lines: list[tuple[Line2D, Any]] = []
         if traces:
-            stack = grid[0, 1].subgridspec(len(panels), 1)
-            self.lines = self._panels(panels, stack)
+            self.lines = self._panels(panels, grid[0, 1].subgridspec(len(panels), 1))
         ax = self.figure.add_subplot(grid[0, 0])
         episode = Episode(environment, run.trajectory)
         visited = self.states[: int(run.last[0]) + 1]
@@ -72,8 +71,7 @@ class Scene:
             self.figure.text(x / width, at, "", va="top", fontsize=SIZE + 1)
             for x in (0.2, 2.0)
         ]
-        lines = [line for line, _ in self.lines]
-        self.moving = [self.plant.ax, *self.texts, *lines]
+        self.moving = [self.plant.ax, *self.texts, *(line for line, _ in self.lines)]
         for artist in self.moving:
             artist.set_animated(True)
         self.canvas.draw()
@@ -115,12 +113,10 @@ class Scene:
             costs = self.run.series["costs"][0, :, 0]
             self.texts[1].set_text(f"cost so far {np.nansum(costs[:k]):.4g}")
         for line, values in self.lines:
-            if line.get_marker() == "o":
-                # Costs have no value at the end; their dot stays at the last one.
-                i = k - 1 if k and np.isnan(values[k]) else k
-                line.set_data(times[i : i + 1], values[i : i + 1])
-            else:
-                line.set_data(times[: k + 1], values[: k + 1])
+            # Costs have no value at the end; their dot stays at the last one.
+            last = max(k - 1, 0) if np.isnan(values[k]) else k
+            start = last if line.get_marker() == "o" else 0
+            line.set_data(times[start : k + 1], values[start : k + 1])
         self.plant.draw(*self._moment(k), self.states[: k + 1])
         self.canvas.restore_region(self.background)
         renderer = self.canvas.get_renderer()
@@ -134,31 +130,8 @@ FASTEST, SLOWEST = 30.0, 5.0
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Animation:
-    """A moving picture, made by [`delucax.animate`][]. A notebook plays it.
-
-    `len(animation)` is the number of frames.
-
-    **Attributes:**
-
-    - `environment`, `trajectory`: what it shows.
-    - `indices`: the step of the trajectory that each frame shows.
-    - `fps`: frames a second.
-    - `dpi`: pixels an inch.
-    - `traces`: whether states, controls and costs are drawn beside the plant.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-
-        env = dlx.make("pendulum")
-        zero = dlx.controllers.Zero(1)
-        trajectory = dlx.rollout(env, zero, key=jax.random.key(0), horizon=20)
-        animation = dlx.animate(env, trajectory)
-        len(animation), animation.fps
-        ```
-    """
+    """An animation: its frames show the steps `indices` of the trajectory. They are
+    drawn when they are first asked for."""
 
     environment: Environment
     trajectory: Trajectory
@@ -180,14 +153,7 @@ class Animation:
         return compressed(scene.frame(k) for k in self.indices)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the animation to a file.
-
-        **Arguments:** `path`: where to; the ending chooses the form: `.gif`, `.html` (a
-            page that needs nothing else) or `.mp4` (needs ffmpeg).
-
-        **Raises:** `ValueError` if the ending is another, if the folder is not there or
-        cannot be written to, or if there is no ffmpeg for an `.mp4`.
-        """
+        """Write the animation to a `.gif`, `.html` or `.mp4` file."""
         target = check_path(path, "Animation.save")
         write(target, self._frames, self.fps)
 
@@ -205,34 +171,36 @@ def animate(
     dpi: float | int = 60,
     traces: bool = True,
 ) -> Animation:
-    """A moving picture of a trajectory: the plant, and its states, controls and costs.
+    """An animation of a trajectory: the plant, and its states, controls and costs.
 
-    How the plant looks is found by the type of its system; every system of the library
-    has a drawing, and [`delucax.plotting.register_drawing`][] gives one to yours. One
-    that has none is shown as a dot in the plane of its two states, or, if it has more
-    or fewer, as bars. It ends where the episode ends.
+    The drawing is chosen by the type of the system; every system of the library has
+    one, and [`delucax.plotting.register_drawing`][] gives one to yours. A system
+    without one is shown as a dot in the plane of its two states, or, if it has more or
+    fewer, as bars. The animation ends where the episode ends.
 
     **Arguments:**
 
     - `environment`: the environment that was run.
     - `trajectory`: one trajectory with its states and controls.
-    - `path`: a file to save it to at once, ending in `.gif`, `.html` or `.mp4`. None by
-        default.
-    - `fps`: frames a second. By default it plays in real time, but with at least 5
-        frames a second: a longer run plays faster than it was.
+    - `path`: a file to save it to at once, ending in `.gif`, `.html` (a page that needs
+        nothing else) or `.mp4` (needs ffmpeg). None by default.
+    - `fps`: frames per second. By default it plays in real time, but with at least 5
+        frames per second: a longer run plays faster than real time.
     - `max_frames`: the most frames, 100 by default; they are spread evenly over the
         steps.
-    - `dpi`: pixels an inch, 60 by default: a picture 600 pixels wide, or half of that
+    - `dpi`: pixels per inch, 60 by default: a picture 600 pixels wide, or half of that
         without `traces`.
     - `traces`: whether to draw states, controls and costs beside the plant, True by
         default.
 
-    **Returns:** an [`delucax.plotting.Animation`][], which a notebook plays, and which
-    has `save(path)`.
+    **Returns:** an animation, which a notebook plays. `animation.save(path)` writes it
+    to a file, as `path` does here; `len(animation)` is the number of frames, and
+    `animation.indices` has the step that each shows; `animation.fps`.
 
     **Raises:** `ValueError` if the trajectory is a batch, holds no states or controls,
-    or is not of this environment; if a number is not positive; or if `path` cannot be
-    written.
+    or is not of this environment; if a number is not positive; if the ending of `path`
+    is another, its folder does not exist or cannot be written to, or there is no ffmpeg
+    for an `.mp4`.
 
     !!! example
 
@@ -273,7 +241,7 @@ def animate(
     duration = float(run.times[0, last] - run.times[0, 0])
     frames = min(max_frames, last + 1)
     if fps is None and duration > 0:
-        # Real time; no more frames than it takes, and no slide show of a long run.
+        # Real time: cap the frames, but play at least 5 per second.
         frames = min(frames, max(2, round(FASTEST * duration) + 1))
         fps = min(max((frames - 1) / duration, SLOWEST), FASTEST)
     indices = np.unique(np.round(np.linspace(0, last, frames)).astype(int))

@@ -26,7 +26,7 @@ Indices: TypeAlias = Int[np.ndarray, "..."]
 Palette: TypeAlias = UInt8[np.ndarray, "_ 3"]
 
 TRANSPARENT = 63  # the palette's index that stands for "as in the first frame"
-# Its script waits a moment: some notebooks run it before the rest is on the page.
+# The script is deferred: some notebooks run it before the page's elements exist.
 PLAYER = string.Template(Path(__file__).with_name("_player.html").read_text("utf-8"))
 
 
@@ -61,13 +61,12 @@ def reduced_palette(
 ) -> tuple[Indices, Palette]:
     """A palette of at most `most` colours, and the entry in it for each of `colours`.
 
-    The most frequent are kept as they are: a tint where something was in the frame
-    before would be a ghost of it.
+    The most frequent are kept exactly, which avoids ghosts of earlier frames by
+    quantisation.
     """
     if len(colours) <= most:
         return np.arange(len(colours)), colours
-    order = np.argsort(-counts, kind="stable")
-    common, rest = order[: most // 2], order[most // 2 :]
+    common, rest = np.split(np.argsort(-counts, kind="stable"), [most // 2])
     image = quantised(Image.fromarray(colours[rest][None]), most - len(common))
     entries = np.empty(len(colours), int)
     entries[common] = np.arange(len(common))
@@ -143,15 +142,9 @@ def _write_gif(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
     for entry, table in zip(entries[1:], shared[which[1:]], strict=True):
         entry = np.where(entry == TRANSPARENT, first, table[entry])
         images.append(_image(entry, palette))
-    images[0].save(
-        path,
-        save_all=True,
-        append_images=images[1:],
-        # The format counts in hundredths of a second; browsers take less than 2 for 10.
-        duration=max(20, 10 * round(100 / fps)),
-        loop=0,
-        optimize=True,
-    )
+    # The format counts in hundredths of a second; browsers take less than 2 for 10.
+    options = {"duration": max(20, 10 * round(100 / fps)), "loop": 0, "optimize": True}
+    images[0].save(path, save_all=True, append_images=images[1:], **options)
 
 
 def _write_html(path: Path, frames: Sequence[Image.Image], fps: float) -> None:

@@ -1,6 +1,5 @@
 """The phase portrait of a planar system."""
 
-from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import jax
@@ -12,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from .._check import as_vector, check_instance
-from .._module import as_float_array
 from ..systems import AbstractSystem
 from . import figures
 from ._runs import as_runs, Trajectories
@@ -87,16 +85,12 @@ def phase_portrait(
     figures.style_axes(ax, size=SIZE, ticks=(8, 6))
     ax.grid(False)
     # Speed as seen in the picture, so that neither axis outweighs the other.
-    extent = np.array([high - low for low, high in limits])
-    speed = np.linalg.norm(field / extent, axis=-1)
+    speed = np.linalg.norm(field / (limits[:, 1] - limits[:, 0]), axis=-1)
     top = np.nanmax(np.where(np.isfinite(speed), speed, 0.0), initial=0.0) or 1.0
     if np.any(speed > 0):
         width = 0.5 + 0.9 * np.sqrt(speed / top)
-        style: dict[str, Any] = {
-            "color": to_rgba(figures.NEUTRAL, 0.6),
-            "arrowsize": 0.8,
-        }
-        style |= {"linewidth": width, "density": 1.3, "zorder": 1}
+        style: dict[str, Any] = {"density": 1.3, "arrowsize": 0.8, "zorder": 1}
+        style |= {"linewidth": width, "color": to_rgba(figures.NEUTRAL, 0.6)}
         ax.streamplot(x, v, field[..., 0], field[..., 1], **style)
     entries = []
     for i, run in enumerate(runs):
@@ -140,13 +134,11 @@ def _field(
 ) -> Float[Array, "n 2"]:
     """dx/dt at each row of `states`."""
     size = system.control_size
-    law: Callable[[Any], Any]
-    if control is None:
-        law = lambda x: jnp.zeros(size, x.dtype)
-    elif callable(control):
+    if callable(control):
         law = lambda x: as_vector(control(x), size, "what control returns", where)
     else:
-        constant = as_vector(as_float_array(control), size, "control", where)
+        given = np.zeros(size) if control is None else control
+        constant = as_vector(given, size, "control", where)
         law = lambda x: constant
     w = jnp.zeros(system.disturbance_size) if system.disturbance_names else None
     return jax.vmap(lambda x: system.vector_field(0.0, x, law(x), w))(states)
@@ -156,10 +148,9 @@ def _turns(
     system: AbstractSystem, path: Float[np.ndarray, "times 2"], limits: Limits
 ) -> list[np.ndarray]:
     """The shifts by whole turns of its angles that bring `path` into the limits."""
-    turns = [np.zeros(2)]
+    turns, zero = [np.zeros(2)], jnp.zeros(2)
     for i, (low, high) in enumerate(limits):
         full = 2 * np.pi * np.eye(2)[i]
-        zero = jnp.zeros(2)
         away = np.asarray(system.difference(zero + full, zero))
         if np.max(np.abs(away)) > 1e-3 or not np.any(np.isfinite(path[:, i])):
             continue

@@ -26,7 +26,7 @@ SIZE = 9.0
 # Of a legend beside a panel.
 COMPACT: dict[str, Any] = {"handlelength": 1.4, "handletextpad": 0.5}
 COMPACT |= {"labelspacing": 0.3, "borderaxespad": 0.3}
-# What a member of a run may have done in the end.
+# Markers at the end of a member of a run.
 END_MARKS: dict[str, dict[str, Any]] = {
     "failed": {"marker": "x"},
     "terminated": {"marker": "o", "markerfacecolor": "none"},
@@ -50,7 +50,7 @@ def plot(
     marks each step at which something went wrong in the controller, such as a failed
     plan, or, of one trajectory, at which the bounds clipped the control.
 
-    The figure belongs to nobody: pyplot does not know it, a notebook shows it, and
+    The figure is not registered with pyplot: a notebook shows it, and
     `figure.savefig("run.pdf")` writes it.
 
     **Arguments:**
@@ -96,12 +96,10 @@ def plot(
                 f"{', '.join(sorted(missing))}, which the first trajectory does; keep "
                 "them in both rollouts."
             )
-    bounds = None
-    if environment is not None:
-        bounds = control_bounds(environment, runs[0], "plot")
+    env = environment
+    bounds = None if env is None else control_bounds(env, runs[0], "plot")
 
-    columns = 1 if len(panels) <= 5 else 2 if len(panels) <= 10 else 3
-    columns = columns if compared else 1
+    columns = min(math.ceil(len(panels) / 5), 3) if compared else 1
     rows = math.ceil(len(panels) / columns)
     size = WIDTH + 1.5 * (columns - 1), PANEL_HEIGHT * rows + 0.7
     figure = figures.NotebookFigure(figsize=size, layout="constrained")
@@ -186,10 +184,8 @@ def draw_panel(
 
 def _label(ax: Axes, panel: Panel, width: int, size: float) -> None:
     joined = ", ".join(panel.names)
-    if (
-        len(panel.names) > 1
-        and len(figures.with_unit(joined, panel.unit)) > 2.5 * width
-    ):
+    length = len(figures.with_unit(joined, panel.unit))
+    if len(panel.names) > 1 and length > 2.5 * width:
         # The names are in the legend; here the kind and the unit say enough.
         joined = panel.kind
     text = figures.wrapped(figures.with_unit(joined, panel.unit), width)
@@ -212,7 +208,11 @@ def _draw_series(
     held = kind in HELD
     style = style | {"drawstyle": "steps-post" if held else "default"}
     if run.as_band:
-        low, middle, high = _quartiles(values)
+        # Quartiles over the members that have not ended.
+        low, middle, high = np.full((3, values.shape[1]), np.nan)
+        some = np.any(np.isfinite(values), axis=0)
+        quartiles = np.nanquantile(values[:, some], [0.25, 0.5, 0.75], axis=0)
+        low[some], middle[some], high[some] = quartiles
         band = {"color": style["color"], "alpha": 0.2, "linewidth": 0}
         step = "post" if held else None
         ax.fill_between(run.times[0], low, high, step=step, **band)
@@ -223,14 +223,6 @@ def _draw_series(
     alpha = faint * (1.0 if members == 1 else max(0.15, 0.75 - 0.05 * members))
     for t, v in zip(run.times, values, strict=True):
         ax.plot(t, v, linewidth=width, alpha=alpha, **style)
-
-
-def _quartiles(values: Values) -> Float[np.ndarray, "3 times"]:
-    """Quartiles over the members that have not ended."""
-    result = np.full((3, values.shape[1]), np.nan)
-    some = np.any(np.isfinite(values), axis=0)
-    result[:, some] = np.nanquantile(values[:, some], [0.25, 0.5, 0.75], axis=0)
-    return result
 
 
 def _mark_ends(ax: Axes, run: Run, values: Values, color: str) -> None:
@@ -268,13 +260,12 @@ def _mark_incidents(ax: Axes, runs: Sequence[Run]) -> None:
 def _incident_colors(runs: Sequence[Run]) -> dict[str, str]:
     """The kinds of incident that happened in any run, and their colours. Where runs are
     compared, those of the controllers alone: every one of them may be clipped."""
-    names = sorted({name for run in runs for name in run.incidents})
-    colors = {name: figures.color_of(3) for name in names}
+    colors = {name: figures.color_of(3) for run in runs for name in run.incidents}
     if "clipped_control" in colors:
         colors["clipped_control"] = figures.NEUTRAL
         if len(runs) > 1:
             del colors["clipped_control"]
-    return colors
+    return dict(sorted(colors.items()))
 
 
 def _incident_label(name: str, runs: Sequence[Run]) -> str:

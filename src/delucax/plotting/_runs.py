@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .._check import check_instance, is_concrete
+from .._module import indexed_names
 from ..simulation import Trajectory
 
 
@@ -63,18 +64,13 @@ class Run:
 
     def names_and_units(self, kind: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Those of a kind of series; `""` for a unit that is not known."""
-        trajectory = self.trajectory
-        size = self.series[kind].shape[-1]
-        units: tuple[str, ...] = ()
-        if kind == "states":
-            names, units = trajectory.state_names, trajectory.state_units
-        elif kind == "controls":
-            names, units = trajectory.control_names, trajectory.control_units
-        elif kind == "costs":
-            names = ("cost",)
-        else:
-            letter = "w" if kind == "disturbances" else "y"
-            names = tuple(f"{letter}{i}" for i in range(size))
+        run, size = self.trajectory, self.series[kind].shape[-1]
+        letter = "w" if kind == "disturbances" else "y"
+        names, units = {
+            "states": (run.state_names, run.state_units),
+            "controls": (run.control_names, run.control_units),
+            "costs": (("cost",), ()),
+        }.get(kind, (indexed_names(letter, size), ()))
         return tuple(names), tuple(units) if len(units) == size else ("",) * size
 
 
@@ -158,14 +154,14 @@ def _run(label: str, trajectory: Trajectory, what: str, where: str) -> Run:
             array = flat(array)
             array = array[..., None] if kind == "costs" else array
             series[kind] = _until(array, ends, steps, kind)
-    incidents = trajectory.incidents or {}
+    incidents = (trajectory.incidents or {}).items()
     return Run(
         label=label,
         times=flat(np.broadcast_to(trajectory.times, (*batch, steps + 1))),
         series=series,
         failed=failed,
         terminated=flat(np.broadcast_to(trajectory.ended, batch)) & ~failed,
-        incidents={name: flat(at) for name, at in incidents.items() if np.any(at)},
+        incidents={name: flat(at) for name, at in incidents if np.any(at)},
         total_costs=flat(trajectory.total_cost),
         trajectory=trajectory,
     )
@@ -178,13 +174,12 @@ def _until(
     array = np.where(np.isfinite(array), array, np.nan).astype(float)
     index = np.arange(steps + 1)[None, :, None]
     ends = ends[:, None, None]
-    if kind == "states":
-        return np.where(index <= ends, array, np.nan)
-    array = np.pad(array, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+    if kind != "states":
+        array = np.pad(array, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
     if kind in HELD and steps:
         array[:, 1:] = np.where(index[:, 1:] == ends, array[:, :-1], array[:, 1:])
-        return np.where(index <= ends, array, np.nan)
-    return np.where(index < ends, array, np.nan)
+    has_end = kind == "states" or kind in HELD and steps
+    return np.where(index <= ends if has_end else index < ends, array, np.nan)
 
 
 def panels_of(run: Run, show: Any, *, grouped: bool, where: str) -> list[Panel]:
@@ -210,8 +205,7 @@ def panels_of(run: Run, show: Any, *, grouped: bool, where: str) -> list[Panel]:
                 f"{where}: show must be among {', '.join(dict.fromkeys(names))} (what "
                 f"the trajectory kept), got {name!r}."
             )
-        column = kept[kind][0].index(name)
-        columns = chosen.setdefault(kind, [])
+        column, columns = kept[kind][0].index(name), chosen.setdefault(kind, [])
         if column not in columns:
             columns.append(column)
     panels = []
@@ -221,9 +215,8 @@ def panels_of(run: Run, show: Any, *, grouped: bool, where: str) -> list[Panel]:
         for column in columns:
             groups.setdefault(units[column] if grouped else column, []).append(column)
         for group in groups.values():
-            count = -(-len(group) // MOST_LINES)
-            for part in np.array_split(group, count):
+            for part in np.array_split(group, -(-len(group) // MOST_LINES)):
+                part = tuple(part.tolist())
                 chosen_names = tuple(names[i] for i in part)
-                unit = units[part[0]]
-                panels.append(Panel(kind, tuple(part.tolist()), chosen_names, unit))
+                panels.append(Panel(kind, part, chosen_names, units[part[0]]))
     return panels

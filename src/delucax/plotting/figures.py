@@ -41,7 +41,7 @@ def quantised(image: Image.Image, colours: int) -> Image.Image:
 
 
 def color_of(index: int) -> str:
-    """The colour of line `index`; they come round again after six."""
+    """The colour of line `index`; the palette repeats after six."""
     return PALETTE[index % len(PALETTE)]
 
 

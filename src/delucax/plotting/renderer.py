@@ -85,9 +85,9 @@ class Renderer:
         else:
             self.figure = Figure(_INCHES, _DPI, layout="constrained")
             FigureCanvasAgg(self.figure)
-        # A run that says how far things move.
-        idle, key = Zero(environment.control_size), jax.random.key(0)
-        trajectory = rollout(environment, idle, key=key, throw=False)
+        # A reference rollout, which sets the limits of the axes.
+        idle = Zero(environment.control_size)
+        trajectory = rollout(environment, idle, key=jax.random.key(0), throw=False)
         states = np.asarray(trajectory.states, float)
         moments = zip(states, np.asarray(trajectory.controls, float), strict=False)
         ax = self.figure.add_subplot()

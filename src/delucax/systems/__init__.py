@@ -1,18 +1,15 @@
-"""Vector fields `dx/dt = f(t, x, u, w)`. They know of no step, cost or solver."""
+"""Vector fields `dx/dt = f(t, x, u, w)`. Independent of steps, costs and solvers."""
 
-from ._arms import Acrobot as Acrobot, Reacher as Reacher
 from ._base import AbstractPlant as AbstractPlant, AbstractSystem as AbstractSystem
-from ._bicycles import (
-    DynamicBicycle as DynamicBicycle,
-    KinematicBicycle as KinematicBicycle,
-)
 from ._classic_control import (
+    Acrobot as Acrobot,
     CartPole as CartPole,
     MountainCar as MountainCar,
     Pendulum as Pendulum,
 )
-from ._function import (
+from ._general import (
     FunctionSystem as FunctionSystem,
+    LinearSystem as LinearSystem,
     NeuralSystem as NeuralSystem,
     system as system,
 )
@@ -21,16 +18,21 @@ from ._industrial import (
     PermanentMagnetMotor as PermanentMagnetMotor,
     TwoTank as TwoTank,
 )
-from ._linear import LinearSystem as LinearSystem
 from ._oscillators import (
     DoubleIntegrator as DoubleIntegrator,
     Lorenz as Lorenz,
     MassSpringDamper as MassSpringDamper,
     VanDerPol as VanDerPol,
 )
-from ._quadrotors import PlanarQuadrotor as PlanarQuadrotor, Quadrotor as Quadrotor
-from ._winds import (
+from ._quadrotors import (
     ConstantWind as ConstantWind,
     DissipativeWind as DissipativeWind,
+    PlanarQuadrotor as PlanarQuadrotor,
+    Quadrotor as Quadrotor,
     VortexWind as VortexWind,
+)
+from ._robots import (
+    DynamicBicycle as DynamicBicycle,
+    KinematicBicycle as KinematicBicycle,
+    Reacher as Reacher,
 )

@@ -18,7 +18,7 @@ Noise = Literal["additive", "brownian"] | None
 
 
 class AbstractPlant(eqx.Module):
-    """The names and sizes of a plant, what its sensor reads, and where it rests.
+    """The names and sizes of a plant, its sensor and its equilibrium.
 
     [`delucax.AbstractSystem`][] adds a vector field to it, and
     [`delucax.AbstractDynamics`][] a step.
@@ -73,7 +73,7 @@ class AbstractPlant(eqx.Module):
 
     @classmethod
     def declares_noise(cls) -> bool:
-        """Whether the class itself says how `w` acts, by a `noise` of its own."""
+        """Whether the class overrides `noise`."""
         return cls.noise is not AbstractPlant.noise
 
     @property
@@ -90,14 +90,14 @@ class AbstractPlant(eqx.Module):
 
     @property
     def observes_state(self) -> bool:
-        """Whether what `observe` returns is the state itself, as its program shows."""
+        """True if `observe` returns the state itself, which tracing it shows."""
         shapes = (), (self.state_size,)
         t, x = (jax.ShapeDtypeStruct(s, jnp.result_type(float)) for s in shapes)
         traced = jax.make_jaxpr(self.observe)(t, x).jaxpr
         return list(traced.outvars) == [traced.invars[1]]
 
     def observe(self, t: Time, x: State) -> Observation:
-        """What the plant's sensor reads; the state by default.
+        """The reading of the plant's sensor; the state by default.
 
         **Arguments:** `t`: time. `x`: state.
 
@@ -125,10 +125,10 @@ class AbstractPlant(eqx.Module):
 
         **Returns:** `(x, u)`.
 
-        **Raises:** `ValueError` if none is named.
+        **Raises:** `ValueError` if none is defined.
         """
         raise ValueError(
-            f"{type(self).__name__} names no equilibrium: override `equilibrium`, or "
+            f"{type(self).__name__} defines no equilibrium: override `equilibrium`, or "
             "give the state and control yourself."
         )
 
@@ -153,7 +153,7 @@ class AbstractSystem(AbstractPlant):
     `equilibrium`, `diffusion`.
 
     **Raises:** `ValueError` at construction if a [`delucax.parameter`][] is not finite
-    or not legal, or if the names are missing.
+    or not valid, or if the names are missing.
 
     !!! example
 
@@ -195,9 +195,14 @@ class AbstractSystem(AbstractPlant):
 
     @classmethod
     def declares_noise(cls) -> bool:
-        """Whether the class has a `noise` or a `diffusion` of its own."""
+        """Whether the class overrides `noise` or `diffusion`."""
         own_diffusion = cls.diffusion is not AbstractSystem.diffusion
         return own_diffusion or cls.noise is not AbstractSystem.noise
+
+    @property
+    def projects_state(self) -> bool:
+        """Whether the class has a `project` of its own."""
+        return type(self).project is not AbstractSystem.project
 
     @property
     def noise(self) -> Noise:
@@ -240,20 +245,20 @@ class AbstractSystem(AbstractPlant):
     def diffusion(self, t: Time, x: State, u: Control) -> Array | None:
         """The matrix g of `dx = f dt + g dB`; none by default.
 
-        If it is given then `w` holds the increments of its k Brownian motions over the
-        step, which `disturbance_names` names if it is given too.
+        With a diffusion `w` holds the increments of its k Brownian motions over the
+        step, whose names `disturbance_names` may give.
 
         **Arguments:** `t`: time. `x`: state. `u`: control.
 
         **Returns:** shape `(state_size, k)`, or `(state_size,)` for a diagonal (k is
-        then the number of states); or `None` for a system without noise inside.
+        then the number of states); or `None` for a deterministic system.
         """
         del t, x, u
         return None
 
 
 def _brownian_size(system: AbstractSystem) -> int | None:
-    """The number of Brownian motions of `system`; `None` if it has no noise inside."""
+    """The number of Brownian motions of `system`; `None` without a diffusion."""
     if not system.declares_noise():
         return None
     name, n, names = type(system).__name__, system.state_size, system.disturbance_names

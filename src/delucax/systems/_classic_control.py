@@ -1,13 +1,13 @@
-"""Classic control: the pendulum, the cart-pole and the mountain car of Gym."""
+"""Classic control: Gym's pendulum, cart-pole, mountain car and acrobot."""
 
-from typing import ClassVar
-
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
+from .._check import check_choice
 from .._module import parameter, positive
-from .._typing import Control, Disturbance, State, Time
+from .._typing import Control, Disturbance, Real, State, Time
 from ..math import cos, sin
 from ._base import AbstractSystem
 
@@ -43,16 +43,14 @@ class Pendulum(AbstractSystem):
         ```
     """
 
-    mass: Array = parameter(1.0, constraint=positive)
-    length: Array = parameter(1.0, constraint=positive)
-    gravity: Array = parameter(10.0)
-    damping: Array = parameter(0.0)
+    mass: Real = parameter(1.0, constraint=positive)
+    length: Real = parameter(1.0, constraint=positive)
+    gravity: Real = parameter(10.0)
+    damping: Real = parameter(0.0)
 
-    state_names: ClassVar = ("angle", "velocity")
-    angle_names: ClassVar = ("angle",)
-    control_names: ClassVar = ("torque",)
-    state_units: ClassVar = ("rad", "rad/s")
-    control_units: ClassVar = ("N m",)
+    state_names, state_units = ("angle", "velocity"), ("rad", "rad/s")
+    control_names, control_units = ("torque",), ("N m",)
+    angle_names = ("angle",)
 
     def acceleration(self, angle: Array, velocity: Array, torque: Array) -> Array:
         """The angular acceleration.
@@ -111,16 +109,15 @@ class CartPole(AbstractSystem):
         ```
     """
 
-    cart_mass: Array = parameter(1.0, constraint=positive)
-    pole_mass: Array = parameter(0.1, constraint=positive)
-    half_length: Array = parameter(0.5, constraint=positive)
-    gravity: Array = parameter(9.8)
+    cart_mass: Real = parameter(1.0, constraint=positive)
+    pole_mass: Real = parameter(0.1, constraint=positive)
+    half_length: Real = parameter(0.5, constraint=positive)
+    gravity: Real = parameter(9.8)
 
-    state_names: ClassVar = ("position", "velocity", "angle", "spin")
-    angle_names: ClassVar = ("angle",)
-    control_names: ClassVar = ("force",)
-    state_units: ClassVar = ("m", "m/s", "rad", "rad/s")
-    control_units: ClassVar = ("N",)
+    state_names = ("position", "velocity", "angle", "spin")
+    state_units = ("m", "m/s", "rad", "rad/s")
+    control_names, control_units = ("force",), ("N",)
+    angle_names = ("angle",)
 
     def accelerations(
         self, angle: Array, spin: Array, force: Array
@@ -135,6 +132,7 @@ class CartPole(AbstractSystem):
         moment = self.pole_mass * self.half_length
         lean, upright = sin(angle), cos(angle)
         push = (force + moment * (spin * spin) * lean) / total
+        # 4/3: of a uniform rod of half-length l about its end, over m l.
         inertia = 4 / 3 - self.pole_mass * (upright * upright) / total
         turn = (self.gravity * lean - upright * push) / (self.half_length * inertia)
         return push - moment * turn * upright / total, turn
@@ -180,14 +178,12 @@ class MountainCar(AbstractSystem):
         ```
     """
 
-    power: Array = parameter(0.0015)
-    gravity: Array = parameter(0.0025)
+    power: Real = parameter(0.0015)
+    gravity: Real = parameter(0.0025)
 
-    state_names: ClassVar = ("position", "velocity")
-    control_names: ClassVar = ("push",)
-    state_units: ClassVar = ("", "1/step")
-    time_unit: ClassVar = "steps"
-    control_units: ClassVar = ("",)
+    state_names, state_units = ("position", "velocity"), ("", "1/step")
+    control_names, control_units = ("push",), ("",)
+    time_unit = "steps"
 
     def acceleration(self, position: Array, push: Array) -> Array:
         """The acceleration.
@@ -196,6 +192,7 @@ class MountainCar(AbstractSystem):
 
         **Returns:** d(velocity)/dt, a step being the unit of time.
         """
+        # The slope of `height` over 1.35: gravity acts as if the track were flat.
         return self.power * push - self.gravity * cos(3 * position)
 
     def height(self, position: ArrayLike) -> Array:
@@ -212,3 +209,98 @@ class MountainCar(AbstractSystem):
 
     def equilibrium(self) -> tuple[State, Control]:
         return jnp.array([-np.pi / 6, 0.0]), jnp.zeros(1)
+
+
+class Acrobot(AbstractSystem):
+    r"""Two links that hang in a chain, with a torque at the joint between them:
+
+    ```
+    d1 = m1 c1^2 + m2 (l1^2 + c2^2 + 2 l1 c2 cos(angle_2)) + I1 + I2
+    d2 = m2 (c2^2 + l1 c2 cos(angle_2)) + I2
+    phi2 = m2 c2 g sin(angle_1 + angle_2)
+    phi1 = -m2 l1 c2 (velocity_2^2 + 2 velocity_1 velocity_2) sin(angle_2)
+           + (m1 c1 + m2 l1) g sin(angle_1) + phi2
+    d(velocity_2)/dt = (torque + d2/d1 phi1 - m2 l1 c2 velocity_1^2 sin(angle_2) - phi2)
+                       / (m2 c2^2 + I2 - d2^2/d1)
+    d(velocity_1)/dt = -(d2 d(velocity_2)/dt + phi1) / d1
+    ```
+
+    The state is (angle_1 [rad], angle_2 [rad], velocity_1 [rad/s], velocity_2 [rad/s]),
+    the control is (torque [N m]), to which the disturbance w, (push [N m]), is added.
+    `angle_1 = 0` hangs down; `angle_2` is measured from the line of the first link. The
+    vector field is smooth. The equilibrium that it names is the upright one,
+    `angle_1 = pi`.
+
+    **Arguments:**
+
+    - `mass_1`, `mass_2`: of the links [kg], 1 by default.
+    - `length_1`: of the first link [m], 1 by default. That of the second plays no part.
+    - `center_1`, `center_2`: c1 and c2, from a link's joint to its center of mass [m],
+        0.5 by default.
+    - `inertia_1`, `inertia_2`: of a link about its center of mass [kg m^2], 1 by
+        default.
+    - `gravity`: g [m/s^2], 9.8 by default.
+    - `form`: `"book"` (default), the equations of motion; or `"nips"`, those printed in
+        the paper, which lack the term in `velocity_1^2` and do not conserve energy.
+
+    **Raises:** `ValueError` if a mass, length or inertia is not positive, a number is
+    not finite, or `form` is neither.
+
+    Source: Sutton, 1996 (`"nips"`); Sutton and Barto, 2018 (`"book"`); Gymnasium
+    (Towers et al., 2023), `Acrobot-v1`.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        acrobot = dlx.systems.Acrobot(mass_2=1.2)
+        acrobot.vector_field(0.0, jnp.array([0.1, 0.0, 0.0, 0.0]), jnp.ones(1), None)
+        ```
+    """
+
+    mass_1: Real = parameter(1.0, constraint=positive)
+    mass_2: Real = parameter(1.0, constraint=positive)
+    length_1: Real = parameter(1.0, constraint=positive)
+    center_1: Real = parameter(0.5, constraint=positive)
+    center_2: Real = parameter(0.5, constraint=positive)
+    inertia_1: Real = parameter(1.0, constraint=positive)
+    inertia_2: Real = parameter(1.0, constraint=positive)
+    gravity: Real = parameter(9.8)
+    form: str = eqx.field(static=True, default="book")
+
+    state_names = ("angle_1", "angle_2", "velocity_1", "velocity_2")
+    state_units = ("rad", "rad", "rad/s", "rad/s")
+    control_names, control_units = ("torque",), ("N m",)
+    angle_names = ("angle_1", "angle_2")
+    disturbance_names = ("push",)
+
+    def __check_init__(self):
+        check_choice(self.form, ("book", "nips"), "form", "Acrobot")
+
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        m1, m2, l1 = self.mass_1, self.mass_2, self.length_1
+        c1, c2, g = self.center_1, self.center_2, self.gravity
+        angle_1, angle_2, velocity_1, velocity_2 = x[0], x[1], x[2], x[3]
+        bend, straight = sin(angle_2), cos(angle_2)
+        own = m2 * c2**2 + self.inertia_2
+        # The inertia about the first joint, and how it couples to the second.
+        d1 = m1 * c1**2 + m2 * (l1**2 + c2**2 + 2 * l1 * c2 * straight)
+        d1 = d1 + self.inertia_1 + self.inertia_2
+        d2 = m2 * (c2**2 + l1 * c2 * straight) + self.inertia_2
+        # Gravity about the second joint; gravity and Coriolis forces about the first.
+        phi2 = m2 * c2 * g * sin(angle_1 + angle_2)
+        swing = velocity_2 * velocity_2 + 2 * velocity_1 * velocity_2
+        phi1 = (m1 * c1 + m2 * l1) * g * sin(angle_1) + phi2
+        phi1 = phi1 - m2 * l1 * c2 * swing * bend
+        torque = u[0] if w is None else u[0] + w[0]
+        push = torque + d2 / d1 * phi1 - phi2  # acceleration_1 is eliminated
+        if self.form == "book":
+            push = push - m2 * l1 * c2 * velocity_1 * velocity_1 * bend
+        acceleration_2 = push / (own - d2 * d2 / d1)
+        acceleration_1 = -(d2 * acceleration_2 + phi1) / d1
+        return jnp.stack([velocity_1, velocity_2, acceleration_1, acceleration_2])
+
+    def equilibrium(self) -> tuple[State, Control]:
+        return jnp.array([np.pi, 0.0, 0.0, 0.0]), jnp.zeros(1)

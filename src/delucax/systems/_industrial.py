@@ -1,15 +1,14 @@
-"""Plants of industry: a reactor, a pair of tanks and a motor."""
+"""Process control and drives: a stirred-tank reactor, two tanks, a motor."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from .._check import is_concrete
 from .._message import shortened
 from .._module import parameter, positive
-from .._typing import Control, Disturbance, Scalar, State, Time
+from .._typing import Control, Disturbance, Real, Scalar, State, Time
 from ._base import AbstractSystem
 
 
@@ -37,8 +36,8 @@ class CSTR(AbstractSystem):
     - `rate`: k0, of the reaction at infinite temperature [1/min], 7.2e10 by default.
     - `activation`: the activation energy over the gas constant, E/R [K], 8750 by
         default.
-    - `heat`: by how much the tank warms a mole that reacts in a litre [K l/mol], 209.2
-        by default.
+    - `heat`: the temperature rise per concentration that reacts, -dH / (rho c_p)
+        [K l/mol], 209.2 by default.
     - `cooling`: heat conducted to the jacket, over the capacity of the tank [1/min],
         2.092 by default.
 
@@ -57,30 +56,28 @@ class CSTR(AbstractSystem):
         ```
     """
 
-    flow: Array = parameter(1.0, constraint=positive)
-    feed_concentration: Array = parameter(1.0, constraint=positive)
-    feed_temperature: Array = parameter(350.0, constraint=positive)
-    rate: Array = parameter(7.2e10, constraint=positive)
-    activation: Array = parameter(8750.0, constraint=positive)
-    heat: Array = parameter(209.2, constraint=positive)
-    cooling: Array = parameter(2.092, constraint=positive)
+    flow: Real = parameter(1.0, constraint=positive)
+    feed_concentration: Real = parameter(1.0, constraint=positive)
+    feed_temperature: Real = parameter(350.0, constraint=positive)
+    rate: Real = parameter(7.2e10, constraint=positive)
+    activation: Real = parameter(8750.0, constraint=positive)
+    heat: Real = parameter(209.2, constraint=positive)
+    cooling: Real = parameter(2.092, constraint=positive)
 
-    state_names: ClassVar = ("concentration", "temperature")
-    control_names: ClassVar = ("coolant",)
-    state_units: ClassVar = ("mol/l", "K")
-    time_unit: ClassVar = "min"
-    control_units: ClassVar = ("K",)
+    state_names, state_units = ("concentration", "temperature"), ("mol/l", "K")
+    control_names, control_units = ("coolant",), ("K",)
+    time_unit = "min"
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         c, T = x[0], x[1]
-        # Nothing reacts near absolute zero, below which a solver's stage may be.
+        # A stage of a solver may have T <= 0, where the exponential would overflow.
         reaction = self.rate * jnp.exp(-self.activation / jnp.maximum(T, 1.0)) * c
         dc = self.flow * (self.feed_concentration - c) - reaction
         warming = self.flow * (self.feed_temperature - T) + self.heat * reaction
         return jnp.stack([dc, warming + self.cooling * (u[0] - T)])
 
     def equilibrium(self, concentration: Any = 0.5) -> tuple[State, Control]:
-        """Where the coolant holds the tank at a concentration.
+        """The equilibrium at a concentration.
 
         **Arguments:** `concentration`: of the reactant, between 0 and that of the feed
         [mol/l]; 0.5 by default.
@@ -91,12 +88,12 @@ class CSTR(AbstractSystem):
         """
         c, feed = jnp.asarray(concentration, float), self.feed_concentration
         if is_concrete(c) and is_concrete(feed):
-            at, most = np.asarray(c), np.asarray(feed)
-            if not np.all((at > 0) & (at < most)):
+            if not np.all((0 < np.asarray(c)) & (np.asarray(c) < np.asarray(feed))):
                 raise ValueError(
                     "CSTR: concentration must be above 0 and below feed_concentration, "
-                    f"{shortened(most)}, got {shortened(at)}."
+                    f"{shortened(feed)}, got {shortened(c)}."
                 )
+        # All that flows in reacts: this gives the rate, and the rate the temperature.
         reaction = self.flow * (feed - c)
         T = self.activation / jnp.log(self.rate * c / reaction)
         warming = self.flow * (self.feed_temperature - T) + self.heat * reaction
@@ -140,19 +137,17 @@ class TwoTank(AbstractSystem):
         ```
     """
 
-    upper_area: Array = parameter(28.0, constraint=positive)
-    lower_area: Array = parameter(28.0, constraint=positive)
-    upper_outlet: Array = parameter(0.071, constraint=positive)
-    lower_outlet: Array = parameter(0.071, constraint=positive)
-    gravity: Array = parameter(981.0, constraint=positive)
-    smoothing: Array = parameter(0.01, constraint=positive)
+    upper_area: Real = parameter(28.0, constraint=positive)
+    lower_area: Real = parameter(28.0, constraint=positive)
+    upper_outlet: Real = parameter(0.071, constraint=positive)
+    lower_outlet: Real = parameter(0.071, constraint=positive)
+    gravity: Real = parameter(981.0, constraint=positive)
+    smoothing: Real = parameter(0.01, constraint=positive)
 
-    state_names: ClassVar = ("upper", "lower")
-    control_names: ClassVar = ("flow",)
-    state_units: ClassVar = ("cm", "cm")
-    control_units: ClassVar = ("cm^3/s",)
+    state_names, state_units = ("upper", "lower"), ("cm", "cm")
+    control_names, control_units = ("flow",), ("cm^3/s",)
 
-    def _outflow(self, outlet: Array, level: Array) -> Array:
+    def _outflow(self, outlet: Scalar, level: Scalar) -> Scalar:
         root = level * (level * level + self.smoothing**2) ** -0.25
         return outlet * (2 * self.gravity) ** 0.5 * root
 
@@ -163,7 +158,7 @@ class TwoTank(AbstractSystem):
         return jnp.stack([filling, (upper - lower) / self.lower_area])
 
     def equilibrium(self, level: Any = 10.0) -> tuple[State, Control]:
-        """Where the pump holds the lower tank at a level.
+        """The equilibrium at a level of the lower tank.
 
         **Arguments:** `level`: of the lower tank, not negative [cm]; 10 by default.
 
@@ -215,22 +210,20 @@ class PermanentMagnetMotor(AbstractSystem):
         ```
     """
 
-    resistance: Array = parameter(2.875)
-    d_inductance: Array = parameter(0.0085, constraint=positive)
-    q_inductance: Array = parameter(0.0085, constraint=positive)
-    flux: Array = parameter(0.175, constraint=positive)
-    inertia: Array = parameter(0.0008, constraint=positive)
-    friction: Array = parameter(0.001)
-    pole_pairs: Array = parameter(4.0, constraint=positive)
+    resistance: Real = parameter(2.875)
+    d_inductance: Real = parameter(0.0085, constraint=positive)
+    q_inductance: Real = parameter(0.0085, constraint=positive)
+    flux: Real = parameter(0.175, constraint=positive)
+    inertia: Real = parameter(0.0008, constraint=positive)
+    friction: Real = parameter(0.001)
+    pole_pairs: Real = parameter(4.0, constraint=positive)
 
-    state_names: ClassVar = ("i_d", "i_q", "speed")
-    control_names: ClassVar = ("v_d", "v_q")
-    disturbance_names: ClassVar = ("load",)
-    state_units: ClassVar = ("A", "A", "rad/s")
-    control_units: ClassVar = ("V", "V")
+    state_names, state_units = ("i_d", "i_q", "speed"), ("A", "A", "rad/s")
+    control_names, control_units = ("v_d", "v_q"), ("V", "V")
+    disturbance_names = ("load",)
 
     def torque(self, x: State) -> Scalar:
-        """What the currents do to the shaft.
+        """The torque of the currents on the shaft.
 
         **Arguments:** `x`: state.
 
@@ -240,7 +233,7 @@ class PermanentMagnetMotor(AbstractSystem):
         return 1.5 * self.pole_pairs * (self.flux * x[1] + saliency * x[0] * x[1])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
-        electrical = self.pole_pairs * x[2]
+        electrical = self.pole_pairs * x[2]  # the speed at which d and q turn
         d_flux = self.d_inductance * x[0] + self.flux
         q_flux = self.q_inductance * x[1]
         d_voltage = u[0] - self.resistance * x[0] + electrical * q_flux
@@ -249,13 +242,9 @@ class PermanentMagnetMotor(AbstractSystem):
         if w is not None:
             torque = torque - w[0]
         # Loops compute the reciprocals once.
-        return jnp.stack(
-            [
-                d_voltage * (1 / self.d_inductance),
-                q_voltage * (1 / self.q_inductance),
-                torque * (1 / self.inertia),
-            ]
-        )
+        d_slope = d_voltage * (1 / self.d_inductance)
+        q_slope = q_voltage * (1 / self.q_inductance)
+        return jnp.stack([d_slope, q_slope, torque * (1 / self.inertia)])
 
     def equilibrium(self, speed: Any = 0.0) -> tuple[State, Control]:
         """Turning at a speed without load, with no current along the magnets.

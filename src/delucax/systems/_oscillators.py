@@ -1,11 +1,10 @@
 """Masses on springs, and oscillators whose equations are not linear."""
 
 from dataclasses import KW_ONLY
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from .._check import check_count
 from .._module import parameter, positive
@@ -39,12 +38,10 @@ class DoubleIntegrator(AbstractSystem):
         ```
     """
 
-    mass: Array = parameter(1.0, constraint=positive)
+    mass: Real = parameter(1.0, constraint=positive)
 
-    state_names: ClassVar = ("position", "velocity")
-    control_names: ClassVar = ("force",)
-    state_units: ClassVar = ("m", "m/s")
-    control_units: ClassVar = ("N",)
+    state_names, state_units = ("position", "velocity"), ("m", "m/s")
+    control_names, control_units = ("force",), ("N",)
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         return jnp.stack([x[1], u[0] / self.mass])
@@ -95,8 +92,7 @@ class MassSpringDamper(AbstractSystem):
     _: KW_ONLY
     masses: int = eqx.field(static=True, default=1, converter=_as_count)
 
-    control_names: ClassVar = ("force",)
-    control_units: ClassVar = ("N",)
+    control_names, control_units = ("force",), ("N",)
 
     def __check_init__(self):
         for name in ("mass", "stiffness", "damping"):
@@ -145,7 +141,8 @@ class VanDerPol(AbstractSystem):
 
     `dx/dt = v`, `dv/dt = mu (1 - x^2) v - x + u`.
 
-    Without control every motion but rest goes to one limit cycle, of amplitude near 2.
+    Without control all trajectories but the origin converge to one limit cycle, of
+    amplitude near 2.
     Smooth; stiff for large mu. The numbers have no units.
 
     **Arguments:**
@@ -167,10 +164,9 @@ class VanDerPol(AbstractSystem):
         ```
     """
 
-    mu: Array = parameter(1.0)
+    mu: Real = parameter(1.0)
 
-    state_names: ClassVar = ("x", "v")
-    control_names: ClassVar = ("u",)
+    state_names, control_names, time_unit = ("x", "v"), ("u",), ""
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         damping = self.mu * (1 - x[0] * x[0])
@@ -209,21 +205,16 @@ class Lorenz(AbstractSystem):
         ```
     """
 
-    sigma: Array = parameter(10.0)
-    rho: Array = parameter(28.0)
-    beta: Array = parameter(8.0 / 3.0)
+    sigma: Real = parameter(10.0)
+    rho: Real = parameter(28.0)
+    beta: Real = parameter(8.0 / 3.0)
 
-    state_names: ClassVar = ("x", "y", "z")
-    control_names: ClassVar = ("u",)
+    state_names, control_names, time_unit = ("x", "y", "z"), ("u",), ""
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
-        return jnp.stack(
-            [
-                self.sigma * (x[1] - x[0]) + u[0],
-                x[0] * (self.rho - x[2]) - x[1],
-                x[0] * x[1] - self.beta * x[2],
-            ]
-        )
+        dx = self.sigma * (x[1] - x[0]) + u[0]
+        dy = x[0] * (self.rho - x[2]) - x[1]
+        return jnp.stack([dx, dy, x[0] * x[1] - self.beta * x[2]])
 
     def equilibrium(self) -> tuple[State, Control]:
         """The centre of the right wing, `x = y = sqrt(beta (rho - 1))`, `z = rho - 1`;
@@ -232,6 +223,7 @@ class Lorenz(AbstractSystem):
         **Returns:** the state, and no control.
         """
         winged = (self.rho > 1) & (self.beta > 0)
+        # The root of 1 where there are no wings: that of 0 has no gradient.
         height = jnp.where(winged, self.rho - 1, 0.0)
         square = jnp.where(winged, self.beta * height, 1.0)
         wing = jnp.where(winged, jnp.sqrt(square), 0.0)

@@ -1,17 +1,18 @@
-"""Quadrotors, in a vertical plane and in space."""
+"""Quadrotors, in a vertical plane and in space, and the winds that push them."""
 
+import abc
 from collections.abc import Callable
-from typing import ClassVar, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from .._check import check_choice
-from .._module import function_field, parameter, positive
-from .._typing import Control, Disturbance, State, Time
+from .._module import check_parameters, function_field, parameter, positive
+from .._typing import Control, Disturbance, Real, State, Time, Vector
 from ..math import cos, sin
-from ..math._attitude import attitude_difference, unit_attitude
 from ._base import AbstractSystem
 
 
@@ -39,8 +40,7 @@ class PlanarQuadrotor(AbstractSystem):
     **Raises:** `ValueError` if a mass or length is not positive, a number is not finite
     or the wind is no function.
 
-    Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
-    2021 (Deluca).
+    Source: Gradu et al., 2021 (Deluca).
 
     !!! example
 
@@ -54,31 +54,29 @@ class PlanarQuadrotor(AbstractSystem):
         ```
     """
 
-    mass: Array = parameter(0.1, constraint=positive)
-    length: Array = parameter(0.2, constraint=positive)
-    gravity: Array = parameter(9.81)
+    mass: Real = parameter(0.1, constraint=positive)
+    length: Real = parameter(0.2, constraint=positive)
+    gravity: Real = parameter(9.81)
     wind: Callable[..., Array] | None = function_field(None)
 
-    state_names: ClassVar = ("x", "y", "angle", "vx", "vy", "rate")
-    angle_names: ClassVar = ("angle",)
-    control_names: ClassVar = ("left", "right")
-    disturbance_names: ClassVar = ("force_x", "force_y")
-    state_units: ClassVar = ("m", "m", "rad", "m/s", "m/s", "rad/s")
-    control_units: ClassVar = ("N", "N")
+    state_names = ("x", "y", "angle", "vx", "vy", "rate")
+    state_units = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+    control_names, control_units = ("left", "right"), ("N", "N")
+    angle_names = ("angle",)
+    disturbance_names = ("force_x", "force_y")
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         thrust, lean = (u[0] + u[1]) / self.mass, x[2]
         ax, ay = -thrust * sin(lean), thrust * cos(lean) - self.gravity
-        if self.wind is not None:
-            force = self.wind(t, x)
-            if jnp.shape(force) != (2,):
-                raise ValueError(
-                    "PlanarQuadrotor: wind must return a force of shape (2,), got "
-                    f"shape {jnp.shape(force)}."
-                )
-            ax, ay = ax + force[0] / self.mass, ay + force[1] / self.mass
-        if w is not None:
-            ax, ay = ax + w[0] / self.mass, ay + w[1] / self.mass
+        wind = None if self.wind is None else self.wind(t, x)
+        if wind is not None and jnp.shape(wind) != (2,):
+            raise ValueError(
+                "PlanarQuadrotor: wind must return a force of shape (2,), got shape "
+                f"{jnp.shape(wind)}."
+            )
+        for force in (wind, w):
+            if force is not None:
+                ax, ay = ax + force[0] / self.mass, ay + force[1] / self.mass
         turn = (u[1] - u[0]) / (self.mass * self.length)
         return jnp.stack([x[3], x[4], x[5], ax, ay, turn])
 
@@ -121,9 +119,9 @@ class Quadrotor(AbstractSystem):
     `project` puts the quaternion back on the unit sphere after each control interval,
     and `difference` takes that one of q and -q which is closer to the reference. Design
     a regulator on the linearisation of [`delucax.Discretized`][], which projects, and
-    give it this `difference`: of the 13 coordinates the length of the quaternion is not
-    controllable, and is at rest after one step. In the linearisation of the system
-    itself it stays as it is for ever, and no regulator exists.
+    give it this `difference`. The length of the quaternion is not controllable: the
+    projection makes it 1 after one step, while in the linearisation of the system
+    itself it is a marginal mode, for which no regulator exists.
 
     **Arguments:**
 
@@ -153,25 +151,25 @@ class Quadrotor(AbstractSystem):
         ```
     """
 
-    mass: Array = parameter(0.716, constraint=positive)
-    arm: Array = parameter(0.17, constraint=positive)
-    inertia_x: Array = parameter(0.007, constraint=positive)
-    inertia_y: Array = parameter(0.007, constraint=positive)
-    inertia_z: Array = parameter(0.012, constraint=positive)
-    moment: Array = parameter(0.016, constraint=positive)
-    drag: Array = parameter(0.0)
-    gravity: Array = parameter(9.81)
+    mass: Real = parameter(0.716, constraint=positive)
+    arm: Real = parameter(0.17, constraint=positive)
+    inertia_x: Real = parameter(0.007, constraint=positive)
+    inertia_y: Real = parameter(0.007, constraint=positive)
+    inertia_z: Real = parameter(0.012, constraint=positive)
+    moment: Real = parameter(0.016, constraint=positive)
+    drag: Real = parameter(0.0)
+    gravity: Real = parameter(9.81)
     inputs: Literal["rotors", "wrench"] = eqx.field(static=True, default="rotors")
 
-    state_names: ClassVar = (
+    state_names = (
         *("px", "py", "pz", "qw", "qx", "qy", "qz"),
         *("vx", "vy", "vz", "rate_x", "rate_y", "rate_z"),
     )
-    disturbance_names: ClassVar = ("force_x", "force_y", "force_z")
-    state_units: ClassVar = (
+    state_units = (
         *("m", "m", "m", "1", "1", "1", "1"),
         *("m/s", "m/s", "m/s", "rad/s", "rad/s", "rad/s"),
     )
+    disturbance_names = ("force_x", "force_y", "force_z")
 
     def __check_init__(self):
         check_choice(self.inputs, ("rotors", "wrench"), "inputs", "Quadrotor")
@@ -189,7 +187,7 @@ class Quadrotor(AbstractSystem):
         return ("N",) * 4 if self.inputs == "rotors" else ("N", "N m", "N m", "N m")
 
     def wrench(self, u: Control) -> Control:
-        """What the rotors do to the body.
+        """The thrust and torque of the rotors on the body.
 
         **Arguments:** `u`: control.
 
@@ -198,20 +196,18 @@ class Quadrotor(AbstractSystem):
         if self.inputs == "wrench":
             return u
         front, left, back, right = u[0], u[1], u[2], u[3]
-        return jnp.stack(
-            [
-                front + left + back + right,
-                self.arm * (left - right),
-                self.arm * (back - front),
-                self.moment * (left + right - front - back),
-            ]
-        )
+        thrust = front + left + back + right
+        roll, pitch = self.arm * (left - right), self.arm * (back - front)
+        # Left and right turn one way, front and back the other.
+        yaw = self.moment * (left + right - front - back)
+        return jnp.stack([thrust, roll, pitch, yaw])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         qw, qx, qy, qz = x[3], x[4], x[5], x[6]
         a, b, c = x[10], x[11], x[12]
         wrench = self.wrench(u)
         lift, pull = wrench[0] / self.mass, self.drag / self.mass
+        # The third column of R(q), along which the rotors push.
         ax = 2 * (qx * qz + qw * qy) * lift - pull * x[7]
         ay = 2 * (qy * qz - qw * qx) * lift - pull * x[8]
         az = (1 - 2 * (qx * qx + qy * qy)) * lift - pull * x[9] - self.gravity
@@ -219,6 +215,7 @@ class Quadrotor(AbstractSystem):
             push = 1 / self.mass
             ax, ay, az = ax + push * w[0], ay + push * w[1], az + push * w[2]
         jx, jy, jz = self.inertia_x, self.inertia_y, self.inertia_z
+        # q (0, omega) / 2, and Euler's equations.
         turning = [
             -0.5 * (qx * a + qy * b + qz * c),
             0.5 * (qw * a + qy * c - qz * b),
@@ -232,11 +229,50 @@ class Quadrotor(AbstractSystem):
         ]
         return jnp.stack([x[7], x[8], x[9], *turning, ax, ay, az, *spin])
 
-    def project(self, x: State) -> State:
-        return unit_attitude(x)
+    @staticmethod
+    def project(x: State) -> State:
+        """`x` with a quaternion of length 1.
 
-    def difference(self, x: State, x_ref: State) -> State:
-        return attitude_difference(x, x_ref)
+        **Arguments:** `x`: state.
+
+        **Returns:** the projected state.
+        """
+        square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5] + x[6] * x[6]
+        # A quaternion of zeros has no direction; it is left, not turned into NaN.
+        scale = jnp.where(square > 0, square, 1.0) ** -0.5
+        q = [scale * x[i] for i in range(3, 7)]
+        return jnp.stack([x[0], x[1], x[2], *q, *(x[i] for i in range(7, 13))])
+
+    @staticmethod
+    def difference(x: State, x_ref: State) -> State:
+        """`x - x_ref`, with q or -q, which represent the same rotation, whichever is
+        closer to the quaternion of `x_ref`.
+
+        **Arguments:** `x`: state. `x_ref`: the state to measure from.
+
+        **Returns:** the deviation, a vector.
+        """
+        along = sum(x[i] * x_ref[i] for i in range(3, 7))
+        sign = jnp.where(along < 0, -1.0, 1.0).astype(x.dtype)
+        q = [sign * x[i] - x_ref[i] for i in range(3, 7)]
+        d = x - x_ref
+        return jnp.stack([d[0], d[1], d[2], *q, *(d[i] for i in range(7, 13))])
+
+    @staticmethod
+    def rotation(x: State) -> Vector:
+        """The rotation matrix from body to world.
+
+        **Arguments:** `x`: state, with a quaternion of length 1.
+
+        **Returns:** its entries row by row, shape `(9,)`.
+        """
+        w, a, b, c = x[3], x[4], x[5], x[6]
+        entries = [
+            *(1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b)),
+            *(2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a)),
+            *(2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b)),
+        ]
+        return jnp.stack(entries)
 
     def equilibrium(self) -> tuple[State, Control]:
         """Hovering at the origin.
@@ -249,3 +285,129 @@ class Quadrotor(AbstractSystem):
         if self.inputs == "rotors":
             return x, jnp.stack([weight / 4] * 4)
         return x, jnp.stack([weight, *[jnp.zeros_like(weight)] * 3])
+
+
+class _AbstractWind(eqx.Module):
+    """A force in the plane, a function of time and the state."""
+
+    def __check_init__(self):
+        check_parameters(self)
+
+    @abc.abstractmethod
+    def __call__(self, t: Time, x: State) -> Vector:
+        """The force.
+
+        **Arguments:** `t`: time. `x`: a state whose first two entries are the position.
+
+        **Returns:** shape `(2,)`.
+        """
+
+
+class DissipativeWind(_AbstractWind):
+    """The force `strength (x, y)`.
+
+    The name is the paper's. Despite it, a positive strength destabilises: the force
+    points away from the origin and grows with the distance.
+
+    **Arguments:**
+
+    - `strength`: [N/m], 0.1 by default.
+
+    **Raises:** `ValueError` if the strength is not finite.
+
+    Source: Gradu et al., 2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.systems.DissipativeWind(0.4)(0.0, jnp.array([1.0, 2.0]))
+        ```
+    """
+
+    strength: Real = parameter(0.1)
+
+    def __call__(self, t: Time, x: State) -> Vector:
+        return jnp.stack([self.strength * x[0], self.strength * x[1]])
+
+
+class ConstantWind(_AbstractWind):
+    """The force `strength (cos(direction), sin(direction))`.
+
+    **Arguments:**
+
+    - `strength`: [N], 0.1 by default.
+    - `direction`: [rad], pi / 4 by default.
+
+    **Raises:** `ValueError` if a number is not finite.
+
+    Source: Gradu et al., 2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.systems.ConstantWind(0.4)(0.0, jnp.zeros(6))
+        ```
+    """
+
+    strength: Real = parameter(0.1)
+    direction: Real = parameter(np.pi / 4)
+
+    def __call__(self, t: Time, x: State) -> Vector:
+        along, across = jnp.cos(self.direction), jnp.sin(self.direction)
+        return jnp.stack([self.strength * along, self.strength * across])
+
+
+class VortexWind(_AbstractWind):
+    """The force of vortices that turn counter-clockwise about their centres c,
+
+    `strength sum_c 2 core turn(p - c) / (|p - c|^2 + core^2)`, `turn(x, y) = (-y, x)`.
+
+    One vortex is strongest, `strength`, at the distance `core` from its centre, rotates
+    as a solid inside and dies out as 1 / distance outside. Smooth everywhere.
+
+    **Arguments:**
+
+    - `strength`: [N], 0.1 by default.
+    - `core`: the radius of the core [m], 0.25 by default.
+    - `centres`: shape `(n, 2)` [m]; (1, 0), (0.5, 0.5) and (0, 1) by default.
+
+    **Raises:** `ValueError` if a number is not finite, the core is not positive or the
+        centres are not pairs.
+
+    Source: Gradu et al., 2021 (Deluca), for the centres; Scully, 1975, for the profile.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.systems.VortexWind(0.4)(0.0, jnp.array([1.0, 2.0]))
+        ```
+    """
+
+    strength: Real = parameter(0.1)
+    core: Real = parameter(0.25, constraint=positive)
+    centres: Real = parameter(((1.0, 0.0), (0.5, 0.5), (0.0, 1.0)))
+
+    def __check_init__(self):
+        check_parameters(self)
+        if self.centres.ndim != 2 or self.centres.shape[1] != 2:
+            raise ValueError(
+                f"VortexWind: centres must have shape (n, 2), got {self.centres.shape}."
+            )
+
+    def __call__(self, t: Time, x: State) -> Vector:
+        centres = self.centres.astype(x.dtype)
+        across, along = jnp.zeros((), x.dtype), jnp.zeros((), x.dtype)
+        for i in range(centres.shape[0]):
+            dx, dy = x[0] - centres[i, 0], x[1] - centres[i, 1]
+            size = 2 * self.core / (dx * dx + dy * dy + self.core**2)
+            across, along = across - size * dy, along + size * dx
+        return jnp.stack([self.strength * across, self.strength * along])

@@ -1,4 +1,4 @@
-"""What a drawing is made of: the episode, the canvas with its shapes, and the view."""
+"""The building blocks of drawings: the episode, the canvas with shapes, the view."""
 
 import dataclasses
 import functools
@@ -90,17 +90,12 @@ class Canvas:
         self.ax.add_artist(Rectangle(corner, width, height, **style))
 
     def polygon(
-        self,
-        corners: Points,
-        at: Point = (0.0, 0.0),
-        angle: Number = 0.0,
-        color: str = BODY,
-        **style: Any,
+        self, corners: Points, at: Point = (0, 0), angle: Number = 0.0, **style: Any
     ) -> None:
         """A filled shape, turned about its origin and put somewhere."""
         points = np.asarray(at, float) + corners @ rotation(angle).T
-        style = {"lw": 0, "zorder": 2} | style
-        self.ax.add_artist(Polygon(points, color=color, **style))
+        style = {"color": self.BODY, "lw": 0, "zorder": 2} | style
+        self.ax.add_artist(Polygon(points, **style))
 
     def link(self, start: Point, end: Point, width: Number = 9, **style: Any) -> None:
         """A rod with round ends, of a width in points."""
@@ -121,9 +116,17 @@ class Canvas:
         self.circle(at, radius, fill=False, edgecolor=self.GOAL, lw=2, zorder=1)
         self.disc(at, 0.3 * radius, self.GOAL, zorder=1)
 
-    def reach(self, radius: Number) -> None:
-        """The circle about the origin that a tip goes round."""
+    def reach(self, radius: Number, room: Number = 1.2) -> None:
+        """The circle about the origin that a tip goes round, and the view of it."""
         self.circle((0, 0), radius, fill=False, color=self.NEUTRAL, alpha=0.25, lw=1)
+        self.view((0.0, 0.0), (room * radius, room * radius))
+
+    def view(self, centre: Point, half: Point) -> "View":
+        """Set the limits to a part of the plane, of this centre and half extent."""
+        view = View(self, np.asarray(centre, float), np.asarray(half, float))
+        (left, low), (right, high) = view.centre - view.half, view.centre + view.half
+        self.ax.set(xlim=(left, right), ylim=(low, high))
+        return view
 
     def ground(self) -> None:
         """The ground at height 0, across the whole view."""
@@ -144,14 +147,7 @@ class Canvas:
             arrow = arc_arrow(radius, start, FULL_TURN * share, slimness)
             self.polygon(arrow, at, color=color, zorder=3)
 
-    def force(
-        self,
-        start: Point,
-        vector: Point,
-        full: Number,
-        color: str = ACTION,
-        zorder: int = 3,
-    ) -> None:
+    def force(self, start: Point, vector: Point, full: Number, **style: Any) -> None:
         """A force: a straight arrow along `vector`, its width that of one whose largest
         length is `full`."""
         x, y = (float(part) for part in vector)
@@ -159,30 +155,35 @@ class Canvas:
         if length < 0.01 * full:
             return
         width, head = 0.11 * full, min(0.35 * full, 0.6 * length)
-        reach, neck = width * (0.4 + 1.6 * head / full), length - head
-        barb = reach + 0.2 * width
+        barb, neck = width * (0.6 + 1.6 * head / full), length - head
         upper = np.array([[0, width / 2], [neck, width / 2], [neck, barb]])
         corners = np.concatenate([upper, [[length, 0]], upper[::-1] * [1, -1]])
-        self.polygon(corners, start, math.atan2(y, x), color, zorder=zorder)
+        style = {"color": self.ACTION, "zorder": 3} | style
+        self.polygon(corners, start, math.atan2(y, x), **style)
+
+    def push(
+        self, at: Point, gap: Number, full: Number, share: Number, angle: Number = 0.0
+    ) -> None:
+        """A force on what lies `gap` around a point, by its share of the largest, which
+        is `full` long: from the side that it leads to, along or against an angle."""
+        along = rotation(angle)[:, 0]
+        start = np.asarray(at, float) + math.copysign(gap, share) * along
+        self.force(start, full * share * along, full)
 
 
 class View(NamedTuple):
     """A part of the plane: `centre` and half of its extent, `half`, each `(2,)`."""
 
+    canvas: Canvas
     centre: Float[np.ndarray, "2"]
     half: Float[np.ndarray, "2"]
 
-    def show(self, ax: Axes) -> None:
-        """Set the limits to this part."""
-        low, high = self.centre - self.half, self.centre + self.half
-        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-
-    def follow(self, ax: Axes, at: Point, room: Number) -> None:
+    def follow(self, at: Point, room: Number) -> None:
         """Set the limits to this part, moved only as far as keeps `at` inside, `room`
         from the edge."""
         inner = np.maximum(self.half - room, 0.0)
         shift = at - np.clip(at, self.centre - inner, self.centre + inner)
-        View(self.centre + shift, self.half).show(ax)
+        self.canvas.view(self.centre + shift, self.half)
 
 
 Vector: TypeAlias = Float[np.ndarray, "_"]  # noqa: F821
@@ -223,11 +224,10 @@ class Episode:
 
     @functools.cached_property
     def target(self) -> Vector | None:
-        """The state that the cost draws to, the origin if it names none; or nothing."""
-        targets = self.environment.cost.targets
-        if targets is None:
+        """The target state of the cost, by default the origin; `None` without any."""
+        if self.environment.cost.targets is None:
             return None
-        x, _ = targets
+        x, _ = self.environment.cost.targets
         zero = np.zeros(self.environment.state_size)
         return zero if x is None else np.asarray(x, float)
 
@@ -240,13 +240,11 @@ class Episode:
 
     @functools.cached_property
     def largest_controls(self) -> Vector:
-        """What a full arrow stands for, one a control: its bound if it has one, else
-        the largest that was applied, else 1."""
-        bounds = self.environment.control_bounds
-        largest = np.zeros(self.environment.control_size)
-        if bounds is not None:
-            low, high = (np.abs(np.asarray(end, float)) for end in bounds)
-            largest = np.broadcast_to(np.maximum(low, high), largest.shape)
+        """The magnitude of a full arrow, per control: its bound if it has one, else the
+        largest that was applied, else 1."""
+        bounds = self.environment.control_bounds or (0.0, 0.0)
+        low, high = (np.abs(np.asarray(end, float)) for end in bounds)
+        largest = np.broadcast_to(np.maximum(low, high), self.environment.control_size)
         applied = np.abs(np.asarray(self.trajectory.controls, float))
         applied = np.where(np.isfinite(applied), applied, 0.0).max(axis=0, initial=0.0)
         largest = np.where(np.isfinite(largest) & (largest > 0), largest, applied)
@@ -258,7 +256,7 @@ class Episode:
 
 
 Setup: TypeAlias = Callable[[Canvas, Episode], Drawing]
-"""Draws what stays, sets the limits of the axes, and returns what draws the rest."""
+"""Draws static artists, sets the limits of the axes, and returns the `Drawing`."""
 
 
 def layers(environment: Environment) -> list[Any]:

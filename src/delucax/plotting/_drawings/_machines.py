@@ -6,30 +6,17 @@ import numpy as np
 from matplotlib.patches import Wedge
 
 from ..figures import color_of
-from ._canvas import Canvas, Drawing, Episode, FULL_TURN, Vector
+from ._canvas import Canvas, Drawing, Episode, FULL_TURN, rotation, Vector
 
 
 _VOLUMES = ("volume", "fast", "slow")
 _PRESSURES = ("sensed pressure", "pipe", "pressure")
 _SCALE = 60.0  # cmH2O at the top of the gauge
-_WINDOW = 6  # that of a learned lung, unless another is given
-# What the states of a lung may be called, which says that it is one.
-LUNG_STATES = (
-    ("inflow", "opening", "volume"),
-    ("inflow", "opening", "fast", "slow"),
-    ("inflow", "opening", "pipe", "volume"),
-    (
-        *(f"u_in[-{i + 1}]" for i in range(_WINDOW)),
-        "pressure",
-        *(f"pressure[-{i}]" for i in range(1, _WINDOW)),
-        "step",
-    ),
-)
 
 
 def lung(canvas: Canvas, episode: Episode) -> Drawing:
-    """The lung as it is full, the gauge of the pressure with the levels asked for, and
-    how far the valves are open."""
+    """A lung drawn by its fill level, a pressure gauge with the target levels, and the
+    opening of the valves."""
     environment, states = episode.environment, episode.states
     names = list(environment.dynamics.state_names)
     pressure = next((names.index(name) for name in _PRESSURES if name in names), 0)
@@ -58,22 +45,15 @@ def lung(canvas: Canvas, episode: Episode) -> Drawing:
             canvas.disc(centre, largest * (0.6 + 0.4 * share), color)
         level = 2.3 * float(np.clip(x[pressure] / _SCALE, 0, 1)) - 0.9
         canvas.bar((1.36, -0.9), 0.22, level, color=canvas.BODY, alpha=0.75)
-        inflow = 0.6 * float(np.clip(u[0] / 100, 0, 1)) if len(u) else 0.0
-        out = 0.6 * float(np.clip(u[1], 0, 1)) if len(u) > 1 else 0.0
-        if inflow > 0.005:
-            _draw_flow(canvas, -0.85, inflow - 0.85, canvas.ACTION)
-        if out > 0.005:
-            _draw_flow(canvas, 0.85 - out, 0.85, canvas.NEUTRAL)
+        inflow, out = 0.6 * np.clip(u / [100, 1], 0, 1)
+        flows = (-0.85, inflow, canvas.ACTION), (0.85 - out, out, canvas.NEUTRAL)
+        for start, length, color in flows:  # arrows to the right, above the lung
+            if length > 0.005:
+                arrow = {"arrowstyle": "-|>", "color": color, "lw": 3}
+                xy, tail = (start + length, 1.5), (start, 1.5)
+                canvas.ax.annotate("", xy, tail, arrowprops=arrow, zorder=4)
 
     return Drawing(draw)
-
-
-def _draw_flow(canvas: Canvas, start: float, end: float, color: str) -> None:
-    """An arrow to the right, above the lung."""
-    arrow = {"arrowstyle": "-|>", "color": color, "lw": 3}
-    canvas.ax.annotate(
-        "", xy=(end, 1.5), xytext=(start, 1.5), arrowprops=arrow, zorder=4
-    )
 
 
 ROTOR, GAP, STATOR, SPEED = 0.68, 0.76, 1.0, 1.16
@@ -91,24 +71,22 @@ def motor(canvas: Canvas, episode: Episode) -> Drawing:
     for start, color in ((-50, canvas.BODY), (130, canvas.SECOND)):
         style = {"width": 0.13, "color": color, "alpha": 0.8}
         ax.add_artist(Wedge((0, 0), ROTOR, start, start + 100, **style))
-    for name, x, y in (("d", 1.0, 0.0), ("q", 0.0, 1.0)):
-        ends = [(-0.5 * x, -0.5 * y), (0.5 * x, 0.5 * y)]
-        canvas.line(ends, color=canvas.NEUTRAL, lw=1, alpha=0.5)
-        style = {"size": 12, "ha": "center", "va": "center", "color": "0.25"}
-        ax.text(0.88 * x, 0.88 * y, name, **style)
+    style = {"size": 12, "ha": "center", "va": "center", "color": "0.25"}
+    for name, axis in zip("dq", np.eye(2), strict=True):
+        canvas.line([-0.5 * axis, 0.5 * axis], color=canvas.NEUTRAL, lw=1, alpha=0.5)
+        ax.text(*0.88 * axis, name, **style)
     largest = float(np.linalg.norm(states[:, :2], axis=1).max(initial=0.0)) or 1.0
     fastest = float(np.abs(episode.visited((2,))).max()) or 1.0
     if target is not None:
         angle = math.pi / 2 + FULL_TURN * float(target[2]) / fastest
-        ray = np.array([math.cos(angle), math.sin(angle)])
-        ends = [(SPEED - 0.12) * ray, (SPEED + 0.12) * ray]
+        ends = np.outer([SPEED - 0.12, SPEED + 0.12], rotation(angle)[:, 0])
         canvas.line(ends, color=canvas.GOAL, lw=3, zorder=4)
 
     def draw(x: Vector, u: Vector) -> None:
         share = float(np.clip(x[2] / fastest, -1, 1))
         canvas.torque((0, 0), SPEED, math.pi / 2, share, canvas.BODY, slimness=2.5)
         canvas.force((0, 0), 0.6 * episode.shares(u), 0.6, zorder=2)
-        canvas.force((0, 0), 0.6 * x[:2] / largest, 0.6, CURRENT, zorder=3)
+        canvas.force((0, 0), 0.6 * x[:2] / largest, 0.6, color=CURRENT)
         canvas.joint((0, 0), 0.06)
 
     return Drawing(draw)
@@ -130,15 +108,14 @@ def two_tank(canvas: Canvas, episode: Episode) -> Drawing:
     tallest = max(float(episode.states.max(initial=0.0)), 1e-6)
     if target is not None:
         tallest = max(tallest, 1.5 * float(target[1]))
+        height, edge = HEIGHT * float(target[1]) / tallest, 0.5 * widths[1] + 0.14
+        ends = [(-edge, height), (edge, height)]
+        canvas.line(ends, color=canvas.GOAL, lw=2, ls=canvas.LONG_DASHES, zorder=4)
     for bottom, width, hole in zip(BOTTOMS, widths, holes, strict=True):
         for side, gap in ((-width / 2, -hole / 2), (width / 2, hole / 2)):
             walls = [(side, HEIGHT * 1.12), (side, 0), (gap, 0), (gap, -0.07)]
             style = {"lw": 2.5, "solid_joinstyle": "round", "zorder": 3}
             canvas.line(np.array(walls) + [0, bottom], color=canvas.NEUTRAL, **style)
-    if target is not None:
-        height, edge = HEIGHT * float(target[1]) / tallest, 0.5 * widths[1] + 0.14
-        ends = [(-edge, height), (edge, height)]
-        canvas.line(ends, color=canvas.GOAL, lw=2, ls=canvas.LONG_DASHES, zorder=4)
     pipe = [(-0.75, TOP + 0.3), (0, TOP + 0.3), (0, TOP + 0.16)]
     canvas.line(pipe, color=canvas.NEUTRAL, lw=9, solid_capstyle="butt", zorder=3)
     canvas.ax.set(xlim=(-1.15, 1.15), ylim=(-0.5, TOP + 0.4))

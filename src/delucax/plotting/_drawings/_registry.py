@@ -1,40 +1,142 @@
-"""Which drawing belongs to which plant."""
+"""The drawing of each plant, and those of states without a picture: a plane or bars."""
 
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
 from ... import systems
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
 from ...systems import AbstractSystem
-from . import _arms, _carts, _machines, _state_space, _vehicles
-from ._canvas import Canvas, Drawing, Episode, layers, Setup
+from ..figures import style_axes, with_unit, wrapped
+from . import _machines, _mechanics, _vehicles
+from ._canvas import Canvas, Drawing, Episode, layers, Setup, Vector, View
+
+
+SIZE = 11.0
+ARROWS = 15
+MOST_NAMES = 16
+
+
+def state_space(canvas: Canvas, episode: Episode) -> Drawing:
+    """A plane if there are two states, else bars."""
+    planar = episode.environment.state_size == 2
+    return plane(canvas, episode) if planar else bars(canvas, episode)
+
+
+def plane(
+    canvas: Canvas, episode: Episode, columns: tuple[int, int] = (0, 1)
+) -> Drawing:
+    """A dot in the plane of two states, with the goal, and with the flow where there
+    are but two; the view grows where the dot would leave it."""
+    ax, dynamics, target = canvas.ax, episode.environment.dynamics, episode.target
+    units = dynamics.state_units or ("",) * dynamics.state_size
+    ax.set_axis_on()
+    ax.set_aspect("auto")
+    style_axes(ax, size=SIZE, ticks=(6, 6))
+    names = [wrapped(with_unit(dynamics.state_names[c], units[c]), 40) for c in columns]
+    ax.set_xlabel(names[0], size=SIZE)
+    ax.set_ylabel(names[1], size=SIZE)
+    points = episode.visited(columns)
+    if target is not None:
+        ax.plot(*target[list(columns)], "o", ms=13, mfc="none", mec=canvas.GOAL, mew=2)
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = np.where(high > low, 0.09 * (high - low), 1.0)
+    view = canvas.view((low + high) / 2, (high - low) / 2 + margin)
+    if dynamics.state_size == 2:
+        ax.grid(False)
+        _draw_flow(canvas, episode, view)
+
+    def draw(x: Vector, u: Vector) -> None:
+        del u
+        at = x[list(columns)]
+        ax.plot(*at, "o", color=canvas.ACTION, markersize=9, zorder=4)
+        away = np.abs(at - view.centre) / view.half
+        canvas.view(view.centre, view.half * np.maximum(1.0, 1.05 * away))
+
+    return Drawing(draw, lambda states: states[:, columns])
+
+
+def _draw_flow(canvas: Canvas, episode: Episode, view: View) -> None:
+    """Faint arrows along which the states go, all of one length: under the control of
+    the equilibrium, or without control if none is named."""
+    ends = view.centre - view.half, view.centre + view.half
+    sides = np.linspace(*ends, ARROWS + 2)[1:-1].T
+    places = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+    system = episode.system
+    try:
+        u = episode.environment.dynamics.equilibrium()[1]
+    except ValueError:
+        u = jnp.zeros(system.control_size)
+    if isinstance(system, AbstractSystem):
+        w = jnp.zeros(system.disturbance_size) if system.disturbance_names else None
+        field = lambda x: system.vector_field(0.0, x, u, w)
+    else:
+        field = lambda x: system(0.0, x, u) - x
+    ways = np.asarray(jax.vmap(field)(jnp.asarray(places)), float) / view.half
+    ways = ways / np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-12)
+    style = {"color": canvas.NEUTRAL, "alpha": 0.4, "zorder": 0, "width": 0.004}
+    canvas.ax.quiver(*places.T, *ways.T, pivot="middle", scale=1.6 * ARROWS, **style)
+
+
+def bars(canvas: Canvas, episode: Episode) -> Drawing:
+    """States in blue and controls in orange, each as a bar from zero, named beneath,
+    with the range that the state goes through."""
+    ax, dynamics, states = canvas.ax, episode.environment.dynamics, episode.states
+    n, m = dynamics.state_size, dynamics.control_size
+    largest = np.abs(states).max(axis=0, initial=0.0)
+    # States of one unit are drawn to one scale.
+    units = np.array(dynamics.state_units or ("",) * n)
+    scale = np.array([largest[units == unit].max() for unit in units])
+    scale = np.where(scale > 0, scale, 1.0)
+    places = np.append(np.arange(n), n + 0.6 + np.arange(m))
+    ax.set_aspect("auto")
+    ax.axhline(0, color=canvas.NEUTRAL, lw=1.5, zorder=3)
+    low, high = states.min(axis=0) / scale, states.max(axis=0) / scale
+    ax.bar(places[:n], high - low, 0.8, bottom=low, color=canvas.BODY, alpha=0.12)
+    ax.bar(places[n:], 2.0, 0.8, bottom=-1.0, color=canvas.ACTION, alpha=0.1)
+    names = [*dynamics.state_names, *dynamics.control_names]
+    if len(names) <= MOST_NAMES:
+        upright = max(map(len, names)) * len(names) > 36
+        style = {"size": SIZE, "ha": "center", "va": "top"}
+        for place, name in zip(places, names, strict=True):
+            ax.text(float(place), -1.1, name, rotation=90 * upright, **style)
+    ax.set(xlim=(-0.7, places[-1] + 0.7), ylim=(-1.35, 1.1))
+    scale = np.append(scale, episode.largest_controls)
+    colors = [canvas.BODY] * n + [canvas.ACTION] * m
+
+    def draw(x: Vector, u: Vector) -> None:
+        heights = np.clip(np.append(x, u) / scale, -1, 1)
+        ax.bar(places, heights, 0.8, color=colors, zorder=2)
+
+    return Drawing(draw)
 
 
 _BY_TYPE: dict[type, Setup] = {
-    systems.Acrobot: _arms.acrobot,
-    systems.CartPole: _carts.cart_pole,
-    systems.DoubleIntegrator: _carts.double_integrator,
+    systems.Acrobot: _mechanics.acrobot,
+    systems.CartPole: _mechanics.cart_pole,
+    systems.DoubleIntegrator: _mechanics.double_integrator,
     systems.DynamicBicycle: _vehicles.car,
     systems.KinematicBicycle: _vehicles.car,
-    systems.Lorenz: _state_space.butterfly,
-    systems.MassSpringDamper: _carts.mass_spring_damper,
-    systems.MountainCar: _carts.mountain_car,
-    systems.Pendulum: _arms.pendulum,
+    # The plane of x and z, in which the wings are seen.
+    systems.Lorenz: functools.partial(plane, columns=(0, 2)),
+    systems.MassSpringDamper: _mechanics.mass_spring_damper,
+    systems.MountainCar: _mechanics.mountain_car,
+    systems.Pendulum: _mechanics.pendulum,
     systems.PermanentMagnetMotor: _machines.motor,
     systems.PlanarQuadrotor: _vehicles.planar_quadrotor,
     systems.Quadrotor: _vehicles.quadrotor,
-    systems.Reacher: _arms.reacher,
+    systems.Reacher: _mechanics.reacher,
     systems.TwoTank: _machines.two_tank,
-    AbstractDynamics: _state_space.state_space,  # what has no drawing of its own
+    AbstractDynamics: state_space,  # what has no drawing of its own
 }
+# Lungs, and linear models, which keep the names of the plant that they approximate.
 _LUNG_CONTROLS = ("u_in", "u_out")
-# A linear model keeps the names of what it was made of, and no more.
-_BY_NAMES: dict[tuple[tuple[str, ...], tuple[str, ...]], Setup] = {
-    (("position", "angle", "velocity", "spin"), ("force",)): _carts.linear_cart_pole,
-    **{(names, _LUNG_CONTROLS): _machines.lung for names in _machines.LUNG_STATES},
-}
+_LINEAR_CART_POLE = ("position", "angle", "velocity", "spin"), ("force",)
 
 
 def register_drawing(
@@ -117,10 +219,14 @@ def drawing_for(environment: Environment) -> Setup:
     Looks at the dynamics and at what they wrap, the innermost system first. What has no
     drawing of its own has that of all dynamics.
     """
-    wrapped = layers(environment)
-    for layer in reversed(wrapped):
+    inner, *outer = reversed(layers(environment))
+    for layer in (inner, *outer):
         for cls in type(layer).__mro__:
             if cls in _BY_TYPE and cls is not AbstractDynamics:
                 return _BY_TYPE[cls]
-    names = tuple(wrapped[-1].state_names), tuple(wrapped[-1].control_names)
-    return _BY_NAMES.get(names, _BY_TYPE[AbstractDynamics])
+    states, controls = tuple(inner.state_names), tuple(inner.control_names)
+    if controls == _LUNG_CONTROLS:
+        return _machines.lung
+    if (states, controls) == _LINEAR_CART_POLE:
+        return _mechanics.linear_cart_pole
+    return _BY_TYPE[AbstractDynamics]

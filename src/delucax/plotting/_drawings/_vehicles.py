@@ -1,15 +1,15 @@
 """Vehicles that a camera follows: cars from above, and quadrotors."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from matplotlib.collections import LineCollection
 
-from ...systems import PlanarQuadrotor
 from ..figures import color_of
 from ._canvas import box, Canvas, Drawing, Episode, rotation, Vector, View
 
@@ -23,43 +23,41 @@ def car(canvas: Canvas, episode: Episode) -> Drawing:
     ax, system = canvas.ax, episode.system
     front, rear = float(system.front), float(system.rear)
     base = front + rear
-    lane = 1.25 * base
-    edge = LANES * lane / 2
+    edge = LANES * 1.25 * base / 2
     ax.axhspan(-edge, edge, color=canvas.NEUTRAL, alpha=0.13, lw=0)
     for side in (-edge, edge):
         ax.axhline(side, color=canvas.NEUTRAL, lw=2)
     ax.axhline(0, color=canvas.GOAL, lw=1.5, alpha=0.7, zorder=0)
-    ys = episode.states[:, 1]
-    reach = float(np.clip(np.abs(ys).max(initial=0.0) + base, 1.25 * edge, 3 * edge))
-    half = np.array([4.2 * base, reach])
-    View(np.zeros(2), half).show(ax)
+    aside = np.abs(episode.states[:, 1]).max(initial=0.0)
+    half = 4.2 * base, float(np.clip(aside + base, 1.25 * edge, 3 * edge))
+    canvas.view((0.0, 0.0), half)
 
     width = 0.64 * base
     hood, boot = front + 0.3 * base, -rear - 0.28 * base
     chassis = box(hood - boot, 0.88 * width, 0.16 * base)
     tyre = box(0.26 * base, 0.1 * base, 0.03 * base)
+    rubber: dict[str, Any] = {"color": canvas.DARK, "zorder": 3}
+    shine: dict[str, Any] = {"color": "white", "alpha": 0.55, "zorder": 4}
 
     def draw(x: Vector, u: Vector) -> None:
         place, heading = np.asarray(x[:2], float), float(x[2])
         turned = rotation(heading)
         middle = place[0] + 0.6 * base
-        View(np.array([middle, 0.0]), half).follow(ax, (middle, place[1]), base)
-        _draw_dashes(canvas, middle, float(half[0]), base)
+        canvas.view((middle, 0.0), half).follow((middle, place[1]), base)
+        _draw_dashes(canvas, middle, half[0], base)
         axis = place + turned @ ((hood + boot) / 2, 0.0)
         for along, steering in ((front, float(u[1])), (-rear, 0.0)):
             for side in (-0.48, 0.48):
                 at = place + turned @ (along, side * width)
-                canvas.polygon(tyre, at, heading + steering, canvas.DARK, zorder=3)
+                canvas.polygon(tyre, at, heading + steering, **rubber)
         canvas.polygon(chassis, axis, heading)
         for near, far, inner in ((0.28, 0.02, 0.3), (-0.62, -0.5, 0.32)):
             corners = [(near, -0.36), (far, -inner), (far, inner), (near, 0.36)]
             glass = np.array(corners) * [base, width]
-            canvas.polygon(glass, axis, heading, "white", alpha=0.55, zorder=4)
+            canvas.polygon(glass, axis, heading, **shine)
         canvas.disc(place, 0.05 * base, "white", zorder=4)
-        share = float(episode.shares(u)[0])
-        start = place + turned @ ((hood if share > 0 else boot), 0.0)
-        ahead = turned @ (math.copysign(0.12 * base, share), 0)
-        canvas.force(start + ahead, turned @ (1.2 * base * share, 0), 1.2 * base)
+        gap, share = (hood - boot) / 2 + 0.12 * base, float(episode.shares(u)[0])
+        canvas.push(axis, gap, 1.2 * base, share, heading)
 
     return Drawing(draw, lambda states: states[:, :2])
 
@@ -72,8 +70,7 @@ def _draw_dashes(canvas: Canvas, middle: float, half: float, base: float) -> Non
     starts = pitch * np.arange(first, last + 1)
     dash = np.stack([starts, starts + 0.45 * pitch, np.full_like(starts, np.nan)], -1)
     for k in range(1, LANES):
-        height = (k - LANES / 2) * 1.25 * base
-        heights = np.full(dash.size, height)
+        heights = np.full(dash.size, (k - LANES / 2) * 1.25 * base)
         canvas.ax.plot(dash.ravel(), heights, color="white", lw=2.5)
 
 
@@ -88,15 +85,14 @@ def planar_quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
     # About all of it; of what is too large, about its end.
     centre = (low + high) / 2 if half <= 20 * length else visited[-1]
     half = np.full(2, min(max(half, 4 * length), 20 * length))
-    view = View(centre, half)
+    view = canvas.view(centre, half)
     arm = max(length, 0.16 * float(half[0]))  # in a wide view it is drawn larger
     if target is not None:
         canvas.goal(target[:2], 0.3 * arm)
     if system.wind is not None:
-        _draw_wind(canvas, system, view)
+        _draw_wind(canvas, system.wind, view)
     weight = float(system.mass * system.gravity)
     largest = np.maximum(episode.largest_controls, 0.5 * weight)
-    view.show(canvas.ax)
 
     def draw(x: Vector, u: Vector) -> None:
         centre, angle = np.asarray(x[:2], float), float(x[2])
@@ -111,15 +107,13 @@ def planar_quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
             canvas.link(foot, hub, width=2, color=canvas.DARK)
             canvas.link(hub - blade, hub + blade, width=3.5, color=canvas.SECOND)
             canvas.force(hub + up, turned @ (0.0, 1.5 * arm * share), 1.5 * arm)
-        view.follow(canvas.ax, centre, 1.5 * arm)
+        view.follow(centre, 1.5 * arm)
 
     return Drawing(draw, lambda states: states[:, :2])
 
 
-def _draw_wind(canvas: Canvas, system: PlanarQuadrotor, view: View) -> None:
+def _draw_wind(canvas: Canvas, wind: Callable[..., Array], view: View) -> None:
     """Arrows of the force that the wind has at time 0 on what is at rest."""
-    assert system.wind is not None
-    wind = system.wind
     side = np.linspace(-0.9, 0.9, 9) * view.half[0]
     places = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2) + view.centre
     states = jnp.zeros((len(places), 6)).at[:, :2].set(places)
@@ -147,18 +141,6 @@ RIM = np.array(
 def projected(points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
     """Points in space as they lie in the picture."""
     return points @ SCREEN.T
-
-
-def attitude(x: Vector) -> Float[np.ndarray, "3 3"]:
-    """The rotation matrix from body to world of a state."""
-    w, a, b, c = x[3:7] / (np.linalg.norm(x[3:7]) or 1.0)
-    return np.array(
-        [
-            [1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b)],
-            [2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a)],
-            [2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b)],
-        ]
-    )
 
 
 def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
@@ -189,11 +171,12 @@ def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
     near = np.clip(visited, centre - half, centre + half)
     corners = np.concatenate([*lines, projected(near) + [0, 2.5 * arm]])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    view = View((low + high) / 2, 0.52 * (high - low))
-    view.show(canvas.ax)
+    view = canvas.view((low + high) / 2, 0.52 * (high - low))
 
     def draw(x: Vector, u: Vector) -> None:
-        place, turned = np.asarray(x[:3], float), attitude(x)
+        place = np.asarray(x[:3], float)
+        turned = system.rotation(system.project(jnp.asarray(x)))
+        turned = np.asarray(turned, float).reshape(3, 3)
         hubs = place + arm * ARMS @ turned.T
         discs = [hub + 0.48 * arm * (RIM + [0, 0, 0.3]) @ turned.T for hub in hubs]
         for rotor in (*discs, place + 0.3 * arm * RIM @ turned.T):
@@ -209,13 +192,12 @@ def quadrotor(canvas: Canvas, episode: Episode) -> Drawing:
             color = FRONT if i == 0 else canvas.SECOND
             canvas.polygon(projected(discs[i]), color=color, alpha=0.65)
         up, shares = turned[:, 2], episode.shares(u)
-        if system.inputs == "rotors":
-            thrusts = [(hubs[i], 2.8 * arm * shares[i]) for i in order]
-        else:
+        thrusts = [(hubs[i], 2.8 * arm * shares[i]) for i in order]
+        if system.inputs == "wrench":
             thrusts = [(place, 3 * arm * shares[0])]
         for foot, thrust in thrusts:
             start, along = projected(foot + 0.2 * arm * up), projected(thrust * up)
             canvas.force(start, along, 2 * arm)
-        view.follow(canvas.ax, projected(place), 1.5 * arm)
+        view.follow(projected(place), 1.5 * arm)
 
     return Drawing(draw, lambda states: projected(states[:, :3]))

@@ -1,11 +1,99 @@
-"""Carts and masses on a track, and the car in its valley."""
+"""Mechanical plants: links on hinges, carts and masses, and a car in a valley."""
 
+import functools
 import math
 from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Float
 
-from ._canvas import box, Canvas, Drawing, Episode, Points, rotation, Vector, View
+from ._canvas import box, Canvas, Drawing, Episode, Points, rotation, Vector
+
+
+def pendulum(canvas: Canvas, episode: Episode) -> Drawing:
+    """A rod of length 1 with a bob, hinged at the origin, angle 0 upright and growing
+    anticlockwise; the torque is an arc of up to 240 degrees about the hinge."""
+    canvas.reach(1, room=1.25)
+    canvas.line([(0, 1.06), (0, 1.16)], color=canvas.NEUTRAL, linewidth=2)
+
+    def draw(x: Vector, u: Vector) -> None:
+        angle = float(x[0])
+        tip = np.array([-np.sin(angle), np.cos(angle)])
+        canvas.link((0, 0), tip)
+        canvas.disc(tip, 0.11)
+        share = float(episode.shares(u)[0])
+        canvas.torque((0, 0), 0.36, angle + np.pi / 2, share)
+        canvas.joint((0, 0), 0.055)
+
+    return Drawing(draw)
+
+
+def arm_points(
+    x: Float[np.ndarray, "*times states"],
+    lengths: tuple[float, float],
+    zero: float = 0.0,
+) -> Float[np.ndarray, "*times 3 2"]:
+    """The hinge, the elbow and the tip of two links, which are `zero` from hanging at
+    angle 0."""
+    first = x[..., 0] + zero
+    both = first + x[..., 1]
+    elbow = lengths[0] * np.stack([np.sin(first), -np.cos(first)], axis=-1)
+    tip = elbow + lengths[1] * np.stack([np.sin(both), -np.cos(both)], axis=-1)
+    return np.stack([np.zeros_like(elbow), elbow, tip], axis=-2)
+
+
+def _draw_arm(canvas: Canvas, points: Points, reach: float, bob: float = 0.0) -> None:
+    """Two links through three points, with bobs on the last two."""
+    canvas.link(points[1], points[2], color=canvas.SECOND)
+    canvas.link(points[0], points[1])
+    if bob:
+        canvas.disc(points[2], bob * reach, canvas.SECOND)
+        canvas.disc(points[1], bob * reach, canvas.BODY)
+    for point in points[:2]:
+        canvas.joint(point, 0.028 * reach)
+
+
+def acrobot(canvas: Canvas, episode: Episode) -> Drawing:
+    """Two links that hang at angle 0, with the torque as an arc about the elbow, and
+    the line above which the tip is to come."""
+    system = episode.system
+    # The second link has no length: its centre of mass is taken for its middle.
+    lengths = float(system.length_1), 2 * float(system.center_2)
+    reach = sum(lengths)
+    canvas.reach(reach)
+    height = getattr(episode.environment.terminated, "goal_height", None)
+    if height is not None:
+        ends = [(-1.2 * reach, float(height)), (1.2 * reach, float(height))]
+        canvas.line(ends, color=canvas.GOAL, lw=2, ls=canvas.LONG_DASHES)
+
+    def draw(x: Vector, u: Vector) -> None:
+        points = arm_points(x, lengths)
+        _draw_arm(canvas, points, reach)
+        share, outward = float(episode.shares(u)[0]), x[0] + x[1] - np.pi / 2
+        canvas.torque(points[1], 0.16 * reach, outward, share)
+
+    return Drawing(draw)
+
+
+def reacher(canvas: Canvas, episode: Episode) -> Drawing:
+    """Two links along x at angle 0, with masses at their ends, and a torque as an arc
+    about each joint; the hand leaves a path."""
+    system = episode.system
+    lengths = float(system.length_1), float(system.length_2)
+    reach = sum(lengths)
+    canvas.reach(reach)
+    goal = getattr(episode.environment.cost, "goal", None)
+    if goal is not None:
+        canvas.goal(np.asarray(goal), 0.06 * reach)
+    points = functools.partial(arm_points, lengths=lengths, zero=np.pi / 2)
+
+    def draw(x: Vector, u: Vector) -> None:
+        joints = points(x)
+        _draw_arm(canvas, joints, reach, 0.045)
+        for i, share in enumerate(episode.shares(u)):
+            canvas.torque(joints[i], 0.16 * reach, x[: i + 1].sum(), float(share))
+
+    return Drawing(draw, lambda states: points(states)[:, 2])
 
 
 # Of the cart under a pole, in lengths of the pole.
@@ -36,9 +124,8 @@ def _cart_pole(
             canvas.line(ends, color=canvas.NEUTRAL, lw=2)
     low = HINGE - 1.2 if hangs else -0.3
     low, high = low * length, (HINGE + 1.2) * length
-    half = np.array([reach + 0.5 * WIDTH * length, (high - low) / 2])
-    view = View(np.array([0.0, (high + low) / 2]), half)
-    view.show(canvas.ax)
+    half = reach + 0.5 * WIDTH * length, (high - low) / 2
+    view = canvas.view((0.0, (high + low) / 2), half)
     width, radius = WIDTH * length, WHEEL * length
     middle = radius + HEIGHT * length / 2
 
@@ -52,10 +139,9 @@ def _cart_pole(
         tip = hinge + length * np.array([math.sin(angle), math.cos(angle)])
         canvas.link(hinge, tip, width=7, color=canvas.SECOND, zorder=3)
         canvas.joint(hinge, 0.045 * length)
-        share = float(episode.shares(u)[0])
-        side = position + math.copysign(width / 2 + 0.04 * length, share)
-        canvas.force((side, middle), (0.6 * length * share, 0.0), 0.6 * length)
-        view.follow(canvas.ax, (position, view.centre[1]), 0.5 * width)
+        share, gap = float(episode.shares(u)[0]), width / 2 + 0.04 * length
+        canvas.push((position, middle), gap, 0.6 * length, share)
+        view.follow((position, view.centre[1]), 0.5 * width)
         if bob:
             canvas.disc(tip, bob * length, canvas.SECOND, zorder=3)
 
@@ -83,18 +169,13 @@ def linear_cart_pole(canvas: Canvas, episode: Episode) -> Drawing:
 COILS = 6
 
 
-def _draw_mass(canvas: Canvas, at: float, side: float) -> None:
-    """A block on two rollers."""
+def _draw_mass(canvas: Canvas, at: float, side: float, share: float = 0.0) -> None:
+    """A block on two rollers, and the force on it."""
     block = box(side, 0.9 * side, 0.08 * side)
     canvas.polygon(block, (at, 0.65 * side))
     for place in (-0.28, 0.28):
         canvas.wheel((at + place * side, 0.1 * side), 0.1 * side)
-
-
-def _draw_force(canvas: Canvas, at: float, side: float, share: float) -> None:
-    """The force on a mass, at its side."""
-    start = at + math.copysign(0.58 * side, share)
-    canvas.force((start, 0.65 * side), (1.5 * side * share, 0.0), 1.5 * side)
+    canvas.push((at, 0.65 * side), 0.58 * side, 1.5 * side, share)
 
 
 def double_integrator(canvas: Canvas, episode: Episode) -> Drawing:
@@ -104,15 +185,12 @@ def double_integrator(canvas: Canvas, episode: Episode) -> Drawing:
     side = 0.3 * reach
     canvas.ground()
     canvas.ax.plot([0], [-0.25 * side], marker="^", color=canvas.GOAL, markersize=11)
-    half = np.array([1.35 * reach + side, 1.2 * side])
-    view = View(np.array([0.0, 0.5 * side]), half)
-    view.show(canvas.ax)
+    view = canvas.view((0.0, 0.5 * side), (1.35 * reach + side, 1.2 * side))
 
     def draw(x: Vector, u: Vector) -> None:
         place = float(x[0])
-        _draw_mass(canvas, place, side)
-        _draw_force(canvas, place, side, float(episode.shares(u)[0]))
-        view.follow(canvas.ax, (place, view.centre[1]), side)
+        _draw_mass(canvas, place, side, float(episode.shares(u)[0]))
+        view.follow((place, view.centre[1]), side)
 
     return Drawing(draw)
 
@@ -138,15 +216,15 @@ def mass_spring_damper(canvas: Canvas, episode: Episode) -> Drawing:
     canvas.ax.set(xlim=(-0.4 * side, right), ylim=(-0.7 * side, 1.7 * side))
 
     def draw(x: Vector, u: Vector) -> None:
-        left, place = 0.0, 0.0
-        for place in map(float, rest + x[:count]):
+        left = 0.0
+        shares = [*[0.0] * (count - 1), float(episode.shares(u)[0])]
+        for place, share in zip(rest + x[:count], shares, strict=True):
             right = place - side / 2
             spring = zigzag(left, right, 0.85 * side, 0.14 * side)
             canvas.line(spring, color=canvas.DARK, lw=1.8, zorder=1)
             _draw_damper(canvas, left, right, 0.42 * side, gap, 0.12 * side)
-            _draw_mass(canvas, place, side)
+            _draw_mass(canvas, place, side, share)
             left = place + side / 2
-        _draw_force(canvas, place, side, float(episode.shares(u)[0]))
 
     return Drawing(draw)
 
@@ -155,8 +233,7 @@ def zigzag(start: float, end: float, height: float, swing: float) -> Points:
     """The corners of a spring between two places on a line."""
     lead = 0.12 * (end - start)
     xs = np.linspace(start + lead, end - lead, 2 * COILS + 1)
-    ys = height + swing * np.array([0, *[1, -1] * COILS])[: 2 * COILS + 1]
-    ys[-1] = height
+    ys = height + swing * np.array([0, *[1, -1] * (COILS - 1), 1, 0])
     return np.array([[start, height], *zip(xs, ys, strict=True), [end, height]])
 
 
@@ -214,9 +291,8 @@ def mountain_car(canvas: Canvas, episode: Episode) -> Drawing:
         canvas.polygon(box(CAR_LENGTH, CAR_HEIGHT, 0.02), middle, angle)
         cabin = np.array([[-0.4, 0], [0.3, 0], [0.15, 1], [-0.28, 1]])
         roof = cabin * [CAR_LENGTH, 0.75 * CAR_HEIGHT] + [0.0, CAR_HEIGHT / 2]
-        canvas.polygon(roof, middle, angle, canvas.SECOND)
+        canvas.polygon(roof, middle, angle, color=canvas.SECOND)
         share = float(episode.shares(u)[0])
-        end = turned @ (math.copysign(CAR_LENGTH / 2 + 0.015, share), 0.0)
-        canvas.force(middle + end, turned @ (0.22 * share, 0.0), 0.22)
+        canvas.push(middle, CAR_LENGTH / 2 + 0.015, 0.22, share, angle)
 
     return Drawing(draw)

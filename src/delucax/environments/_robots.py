@@ -1,0 +1,350 @@
+"""Tasks of robots: keep a car in its lane, fly a quadrotor to a point, reach a goal."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from .._check import as_vector, check_finite, LARGEST
+from .._module import as_float_array, parameter
+from .._typing import Control, PRNGKey, Real, Scalar, State, Time, Vector
+from ..costs import AbstractCost, Quadratic
+from ..math import cos, sin, wrap
+from ..systems import (
+    ConstantWind,
+    DissipativeWind,
+    DynamicBicycle,
+    KinematicBicycle,
+    PlanarQuadrotor,
+    Quadrotor,
+    Reacher,
+    VortexWind,
+)
+from ._task import Fields, Limit, Number, task, UniformState
+
+
+def bicycle_features(x: State) -> Vector:
+    """The state of a car with the cosine and sine of the heading in its place."""
+    turned = jnp.stack([x[0], x[1], cos(x[2]), sin(x[2])])
+    return jnp.concatenate([turned, x[3:]])
+
+
+def heading_difference(x: State, x_ref: State) -> State:
+    """`x - x_ref` with the heading wrapped."""
+    d = x - x_ref
+    rest = [d[i] for i in range(3, x.shape[0])]
+    return jnp.stack([d[0], d[1], wrap(d[2]), *rest])
+
+
+def _lane_keeping(
+    spread: Sequence[float],
+    speed: Number,
+    max_acceleration: Limit,
+    max_steering: Limit,
+) -> Fields:
+    """The common part of the bicycles' tasks, which start within `spread` of driving
+    along the lane.
+
+    The cost is `y^2 + heading^2 + 0.1 (speed - speed*)^2`, 0.1 times the squares of
+    what else moves, and `0.1 acceleration^2 + steering^2`. Of the features the cosine
+    and the sine of the heading are bounded.
+    """
+    states = len(spread)
+    target = jnp.zeros(states).at[3].set(speed)
+    corner = jnp.array(spread)
+    limit = jnp.stack([jnp.asarray(max_acceleration), jnp.asarray(max_steering)])
+    feature_bound = jnp.full(states + 1, LARGEST).at[2:4].set(1.0)
+    # Where the car is along the lane costs nothing.
+    weights = [0.0, 1.0, 1.0] + [0.1] * (states - 3)
+    cost = Quadratic(
+        weights, [0.1, 1.0], state_target=target, difference=heading_difference
+    )
+    return dict(
+        cost=cost,
+        initial_state=UniformState(target - corner, target + corner),
+        control_bounds=(-limit, limit),
+        encode=bicycle_features,
+        observation_bounds=(-feature_bound, feature_bound),
+    )
+
+
+@task(KinematicBicycle, dt=0.05, horizon=100)
+def kinematic_bicycle(
+    system: KinematicBicycle,
+    *,
+    speed: Number = 10.0,
+    max_acceleration: Limit = 3.0,
+    max_steering: Limit = 0.5,
+) -> Fields:
+    """Bring a car that rolls without slip to the lane y = 0, and to a speed.
+
+    State (x, y, heading, speed); control (acceleration, steering). Starts at x = 0 with
+    y uniform in +-2 m, the heading in +-0.3 rad and the speed within 3 m/s of the one
+    to hold. Cost
+    `y^2 + heading^2 + 0.1 (speed - speed*)^2 + 0.1 acceleration^2 + steering^2` per
+    step, the heading wrapped. `encode` gives its cosine and sine. Never terminates.
+
+    **Arguments:**
+
+    - `speed`: to hold [m/s], 10 by default.
+    - `max_acceleration`: in either direction [m/s^2], 3 by default.
+    - `max_steering`: to either side [rad], 0.5 by default.
+
+    Source: Kong, Pfeiffer, Schildbach and Borrelli, 2015.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("kinematic_bicycle", speed=5.0)
+        ```
+    """
+    spread = [0.0, 2.0, 0.3, 3.0]
+    return _lane_keeping(spread, speed, max_acceleration, max_steering)
+
+
+@task(DynamicBicycle, dt=0.05, horizon=100, substeps=5)
+def dynamic_bicycle(
+    system: DynamicBicycle,
+    *,
+    speed: Number = 20.0,
+    max_acceleration: Limit = 5.0,
+    max_steering: Limit = 0.2,
+) -> Fields:
+    """Bring a fast car on tyres to the lane y = 0, and to a speed.
+
+    State (x, y, heading, vx, vy, rate); control (acceleration, steering). Starts at
+    x = 0 with y uniform in +-2 m, the heading in +-0.1 rad, vx within 5 m/s of the
+    speed to hold, vy in +-0.5 m/s and the rate in +-0.2 rad/s. Cost
+    `y^2 + heading^2 + 0.1 ((vx - speed*)^2 + vy^2 + rate^2) + 0.1 acceleration^2 +
+    steering^2` per step, the heading wrapped. `encode` gives its cosine and sine. Never
+    terminates.
+
+    **Arguments:**
+
+    - `speed`: to hold [m/s], 20 by default.
+    - `max_acceleration`: in either direction [m/s^2], 5 by default.
+    - `max_steering`: to either side [rad], 0.2 by default.
+
+    Source: Rajamani, 2012.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        icy = dlx.make("dynamic_bicycle", front_stiffness=3e4, rear_stiffness=3e4)
+        ```
+    """
+    spread = [0.0, 2.0, 0.1, 5.0, 0.5, 0.2]
+    return _lane_keeping(spread, speed, max_acceleration, max_steering)
+
+
+_WINDS: dict[str, Callable[..., Any]] = {
+    "dissipative": DissipativeWind,
+    "constant": ConstantWind,
+    "vortices": VortexWind,
+}
+
+
+def _wind(
+    *, wind: str | Callable[..., Array] | None = None, wind_strength: Any = None
+) -> dict[str, Any]:
+    """The wind of a system, by its name or as it is."""
+    where = "planar_quadrotor"
+    if not isinstance(wind, str):
+        if wind_strength is not None:
+            raise ValueError(
+                f"{where}: wind_strength needs a wind that is named, such as "
+                f"'dissipative', got wind={wind!r}."
+            )
+        return dict(wind=wind)
+    if wind not in _WINDS:
+        raise ValueError(
+            f"{where}: wind must be one of {', '.join(map(repr, _WINDS))}, a "
+            f"function (t, x) -> force, or None, got {wind!r}."
+        )
+    return dict(wind=_WINDS[wind](0.1 if wind_strength is None else wind_strength))
+
+
+@task(PlanarQuadrotor, dt=0.05, horizon=100, solver=diffrax.Euler(), arguments=_wind)
+def planar_quadrotor(system: PlanarQuadrotor) -> Fields:
+    """Fly a planar quadrotor to the origin and hover there.
+
+    State (x, y, angle, vx, vy, rate); control (left, right), the thrusts, without
+    bounds; disturbance (force_x, force_y). Starts at rest at (1, 1). Cost
+    `|x|^2 + 0.1 |u - u_hover|^2` per step, u_hover being half of the weight, whatever
+    the wind. Explicit Euler, as in the paper. Never terminates.
+
+    **Arguments:**
+
+    - `wind`: `"dissipative"`, `"constant"`, `"vortices"`, or any function
+        `(t, x) -> force`; none by default. What the names stand for is said at
+        [`delucax.systems.DissipativeWind`][], [`delucax.systems.ConstantWind`][] and
+        [`delucax.systems.VortexWind`][].
+    - `wind_strength`: of a wind that is named, 0.1 by default.
+
+    Source: Gradu et al., 2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("planar_quadrotor", wind="dissipative", wind_strength=0.4)
+        ```
+    """
+    windless = PlanarQuadrotor(system.mass, system.length, system.gravity)
+    _, hover = windless.equilibrium()
+    return dict(
+        cost=Quadratic(jnp.ones(6), 0.1 * jnp.ones(2), control_target=hover),
+        initial_state=jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0]),
+    )
+
+
+# The entries of a rotation matrix, with room for what rounding adds.
+_ROTATION = 1.00001
+
+
+class _Start(eqx.Module):
+    """A state from a box, its quaternion of length 1."""
+
+    box: UniformState
+
+    def __call__(self, key: PRNGKey) -> Array:
+        return Quadrotor.project(self.box(key))
+
+
+def quadrotor_features(x: State) -> Vector:
+    """The state with the rotation matrix in place of the quaternion: q and -q, which
+    are one attitude, look the same."""
+    return jnp.concatenate([x[:3], Quadrotor.rotation(x), x[7:]])
+
+
+@task(Quadrotor, dt=0.02, horizon=250)
+def quadrotor(system: Quadrotor, *, max_thrust: Limit = 6.0) -> Fields:
+    """Fly a quadrotor to the origin and hover there.
+
+    State (position, quaternion, velocity, body rates), 13 entries; control (front,
+    left, back, right), the thrusts, or (thrust, torque); disturbance, a force. Starts
+    with the position uniform in +-1 m, the velocity in +-0.5 m/s, the rates in +-0.5
+    rad/s and the attitude up to about 40 degrees from level. Cost per step: the squares
+    of position and of the quaternion's deviation, 0.1 times those of the velocities,
+    and 0.1 times those of the control's deviation from hovering. Never terminates.
+
+    `encode` gives (position, rotation matrix from body to world row by row, velocity,
+    body rates), shape `(18,)`: q and -q, which are one attitude, look the same.
+
+    **Arguments:**
+
+    - `max_thrust`: of a rotor, 6 by default; none is negative. A wrench is bounded by
+        the largest that the rotors give on each axis.
+
+    Source: Mahony, Kumar and Corke, 2012; Furrer, Burri, Achtelik and Siegwart, 2016.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        env = dlx.make("quadrotor", mass=0.8)
+        ```
+    """
+    x, hover = system.equilibrium()
+    low, high = 0.0, as_float_array(max_thrust)
+    if system.inputs == "wrench":
+        turn, yaw = system.arm * high, 2 * system.moment * high
+        high = jnp.stack([4 * high, turn, turn, yaw])
+        low = -high.at[0].set(0.0)
+    feature_bound = jnp.full(18, LARGEST).at[3:12].set(_ROTATION)
+    corner = jnp.array([1.0] * 3 + [0.0] + [0.2] * 3 + [0.5] * 6)
+    weights = jnp.array([1.0] * 7 + [0.1] * 6), 0.1 * jnp.ones(4)
+    target = dict(state_target=x, control_target=hover)
+    return dict(
+        cost=Quadratic(*weights, difference=Quadrotor.difference, **target),
+        initial_state=_Start(UniformState(x - corner, x + corner)),
+        control_bounds=(low, high),
+        encode=quadrotor_features,
+        observation_bounds=(-feature_bound, feature_bound),
+    )
+
+
+class ReacherCost(AbstractCost):
+    """`|tip - goal|^2 + torque_weight |torques|^2`."""
+
+    system: Reacher
+    goal: Real = parameter()
+    torque_weight: Real = parameter(0.1)
+
+    def __check_init__(self):
+        as_vector(self.goal, 2, "goal", "ReacherCost")
+        check_finite(self.goal, "goal", "ReacherCost")
+
+    def offset(self, x: State) -> Vector:
+        """The position of the tip relative to the goal."""
+        return self.system.tip(x) - self.goal.astype(x.dtype)
+
+    def __call__(self, t: Time, x: State, u: Control) -> Scalar:
+        offset = self.offset(x)
+        effort = self.torque_weight * (u[0] * u[0] + u[1] * u[1])
+        return offset[0] * offset[0] + offset[1] * offset[1] + effort
+
+
+class _ReacherFeatures(eqx.Module):
+    """Cosines and sines of the angles, the rates, and the offset of the tip."""
+
+    cost: ReacherCost
+
+    def __call__(self, x: State) -> Vector:
+        offset = self.cost.offset(x)
+        angles = [cos(x[0]), sin(x[0]), cos(x[1]), sin(x[1])]
+        return jnp.stack([*angles, x[2], x[3], offset[0], offset[1]])
+
+
+@task(Reacher, dt=0.01, horizon=200, solver=diffrax.Euler())
+def reacher(
+    system: Reacher, *, goal: ArrayLike | tuple[float, float] = (0.0, 1.8)
+) -> Fields:
+    """Bring the tip of an arm of two links to a goal.
+
+    State (shoulder, elbow, shoulder_rate, elbow_rate); control (shoulder_torque,
+    elbow_torque), without bounds. Starts at rest at the angles (pi/4, pi/2). Cost
+    `|tip - goal|^2 + 0.1 |torques|^2` per step. `encode` gives cosines and sines of the
+    angles, the rates and `tip - goal`. Explicit Euler, as in the paper. Never
+    terminates.
+
+    The cost and `encode` hold the arm too: for arms of other lengths call this again,
+    under `jax.vmap` for many, where `delucax.replace` would change one of the three.
+
+    **Arguments:**
+
+    - `goal`: shape `(2,)` [m]; (0, 1.8) by default.
+
+    Source: Gradu et al., 2021 (Deluca).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+
+        model = dlx.make("reacher")
+        plant = dlx.make("reacher", gravity=-10.0)
+        ```
+    """
+    cost = ReacherCost(system, goal)
+    reach = system.length_1 + system.length_2
+    low, high = (
+        jnp.array([sign] * 4 + [sign * LARGEST] * 2 + [*(sign * reach - cost.goal)])
+        for sign in (-1.0, 1.0)
+    )
+    return dict(
+        cost=cost,
+        initial_state=jnp.array([np.pi / 4, np.pi / 2, 0.0, 0.0]),
+        encode=_ReacherFeatures(cost),
+        observation_bounds=(low, high),
+    )
