@@ -249,6 +249,7 @@ class Discretized(AbstractDiscretization):
             return split_state(x_next.astype(x.dtype)), or_none(result)
 
         xs = jnp.arange(self.substeps), increments
+        # The first failure of a substep is that of the interval.
         parts, results = lax.scan(body, split_state(x), xs)
         return join_state(parts, x.shape[0]), first_of(results)
 
@@ -282,7 +283,8 @@ def _apply(g: Array, dB: Array) -> Array:
 
 
 class _BrownianTerm(diffrax.AbstractTerm):
-    """`g dB` with the increment of this step given."""
+    """`g dB` with the increment of this step given, where Diffrax's own term would
+    evaluate a path: increments are data here, to be given, kept and differentiated."""
 
     diffusion: Any
     increment: Array
@@ -311,6 +313,7 @@ def _solver_step(solver, term, s, x, h, args):
     """One Diffrax step of `h` from `s` after the start of the interval. It starts
     afresh, as it must after a switch of the control.
     """
+    # In local time, so that t1 - t0 is h to rounding, however late the interval is.
     t0 = jnp.asarray(s, x.dtype)
     t1 = t0 + h
     state = solver.init(term, t0, t1, x, args)
