@@ -48,7 +48,8 @@ class Discretized(AbstractDiscretization):
 
     `x_next = x + integral over [t, t + dt] of f(s, x(s), u, w) ds`, the control (and a
     disturbance that enters the field) held over the interval; then the system's
-    `project`; then, where the system names no disturbances, `+ w`.
+    `project`; then, where the system names no disturbances, `+ w`, which may take the
+    state off the manifold of `project` until the next step.
 
     With a fixed step (the default) `dt` is cut into `substeps` equal steps of `solver`:
     explicit Runge-Kutta methods are written out stage by stage, diagonally implicit
