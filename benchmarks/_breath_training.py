@@ -87,7 +87,7 @@ class Told(dlx.AbstractController):
         return self.policy.init(key=key)
 
     def __call__(self, t, y, state):
-        return lung.at_pip(self.policy, y[1])(t, y[:1], state)
+        return lung.BreathWaveform.at_pip(self.policy, y[1])(t, y[:1], state)
 
     def applied(self, u, cost, state):
         return self.policy.applied(u, cost, state)
@@ -182,7 +182,7 @@ def _by_ppo(error: Error, keys: Any, times: float) -> Any:
 def _curve(way: Any, seeds: int, *options: Any) -> dict[str, Any]:
     """The error of a way over the steps of the simulator, some of them."""
     model: Any = lung.learned_lung().dynamics.dynamics
-    error = Error(lung.lung_environment(model, noise=NOISE))
+    error = Error(lung.learned_lung(model, noise=NOISE, horizon=LENGTH))
     keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
     steps, errors = way(error, keys, *options)
     keep = np.unique(np.geomspace(1, len(steps), 60).round().astype(int)) - 1

@@ -10,6 +10,7 @@ import optax
 
 import delucax as dlx
 from delucax import lung
+from delucax._module import stack, unstack
 from delucax.studies.ventilator._simulators import divided, explored
 from delucax.studies.ventilator._stages import FULL, INSPIRATION as LENGTH
 
@@ -42,11 +43,11 @@ def _as_published(seed: int) -> dict[str, float]:
     keys = jr.split(jr.fold_in(fit_key, 2), len(FULL.lungs))
     models = [
         lung.LearnedLung(part, 10, 4, published=True, key=own, **SIZES)
-        for part, own in zip(lung.unstack(train), keys, strict=True)
+        for part, own in zip(unstack(train), keys, strict=True)
     ]
     steps = EPOCHS * -(-train.pressure.shape[1] // BATCH)
     fitted = lung.fit_lungs(
-        lung.stack(models),
+        stack(models),
         train,
         key=fit_key,
         teacher_steps=steps,
@@ -57,7 +58,7 @@ def _as_published(seed: int) -> dict[str, float]:
         batch_size=BATCH,
         progress=True,
     )
-    errors = eqx.filter_vmap(lung.open_loop_error)(fitted.model, test)
+    errors = eqx.filter_vmap(lung.Breaths.open_loop_error)(test, fitted.model)
     names = [f"R{R:g}C{C:g}" for R, C in FULL.lungs]
     return dict(zip(names, np.asarray(errors).tolist(), strict=True))
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks._machine import describe
-from delucax.experiments import experiment, Results
+from delucax.experiments import experiment, Results, run
 from delucax.experiments._results import TIMES
 
 
@@ -55,11 +55,11 @@ def overhead(quick: bool) -> dict[str, Any]:
             made = _trivial(name, cases)
             store = Path(folder, name)
             begin = time.perf_counter()
-            results = made.run(store=store, progress=False)
+            results = run(made, store=store, progress=False)
             total = time.perf_counter() - begin
             own = sum(r["compile_seconds"] + r["run_seconds"] for r in results.rows)
             begin = time.perf_counter()
-            made.run(store=store, progress=False)
+            run(made, store=store, progress=False)
             found[name] = {
                 "ms_a_case": 1e3 * total / cases,
                 "ms_a_case_beyond_the_call": 1e3 * (total - own) / cases,
@@ -120,7 +120,7 @@ def store(quick: bool) -> dict[str, Any]:
 KILLED = """
 import sys, time
 import jax
-from delucax.experiments import experiment
+from delucax.experiments import experiment, run
 
 @experiment.parametrize("x", [float(k) for k in range(int(sys.argv[2]))])
 @experiment.seeds(3)
@@ -128,7 +128,7 @@ def slow(x, key):
     return {"a": x * jax.random.normal(key), "b": jax.random.uniform(key, (2,))}
 
 if __name__ == "__main__":
-    slow.run(store=sys.argv[1], progress=False)
+    run(slow, store=sys.argv[1], progress=False)
 """
 
 
@@ -219,12 +219,13 @@ def workers(quick: bool) -> dict[str, Any]:
     script = (
         "import sys, time\n"
         "from benchmarks.experiments import busy\n"
+        "from delucax.experiments import run\n"
         "if __name__ == '__main__':\n"
         "    count = int(sys.argv[1])\n"
         "    warm = dict(workers=count, progress=False, select='0 or 1')\n"
-        "    busy.run(**warm)\n"
+        "    run(busy, **warm)\n"
         "    begin = time.perf_counter()\n"
-        "    results = busy.run(workers=count, progress=False)\n"
+        "    results = run(busy, workers=count, progress=False)\n"
         "    print(time.perf_counter() - begin)\n"
         "    print(sum(r['run_seconds'] for r in results.rows) / len(results.rows))\n"
     )
@@ -263,7 +264,7 @@ def workers(quick: bool) -> dict[str, Any]:
 DASK = """
 import os, random, signal, sys, threading, time
 from dask.distributed import Client, LocalCluster
-from delucax.experiments import experiment
+from delucax.experiments import experiment, run
 
 @experiment.parametrize("n", range(int(sys.argv[1])))
 def case(n):
@@ -286,8 +287,8 @@ if __name__ == "__main__":
                     killed.append(1)
         thread = threading.Thread(target=kill, daemon=True)
         thread.start()
-        found = case.run(
-            store="dask.jsonl", workers=2, backend="dask", progress=False
+        found = run(
+            case, store="dask.jsonl", workers=2, backend="dask", progress=False
         )
         over.set()
         thread.join()

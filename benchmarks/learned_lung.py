@@ -40,9 +40,9 @@ def main() -> None:
     model = lung.fit_lungs(model, train, key=jax.random.key(2), **steps).model
     seconds = time.perf_counter() - begin
     shipped: Any = lung.learned_lung().dynamics.dynamics  # pyright: ignore
-    error = eqx.filter_jit(lung.open_loop_error)
-    print(f"learned here, in {seconds:.0f} s: {error(model, test):.4f} cmH2O")
-    print(f"that of the library: {error(shipped, test):.4f} cmH2O")
+    error = eqx.filter_jit(test.open_loop_error)
+    print(f"learned here, in {seconds:.0f} s: {error(model):.4f} cmH2O")
+    print(f"that of the library: {error(shipped):.4f} cmH2O")
     dlx.save(out, model)
     print(f"written: {out}")
 

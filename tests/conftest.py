@@ -19,10 +19,10 @@ gc.set_threshold(200_000, 50, 100)
 def released_programs():
     """Thousands of programs are compiled."""
     # Not before the tests' import hook is there.
-    from delucax.experiments._execute import release_programs
+    from delucax.experiments._execute import clear_programs
 
     yield
-    release_programs()
+    clear_programs()
 
 
 @pytest.fixture

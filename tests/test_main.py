@@ -36,7 +36,9 @@ def test_without_a_command_help_is_shown(capsys):
 
 
 def test_version_of_the_command_line(capsys):
-    assert main(["--version"]) == 0
+    with pytest.raises(SystemExit) as left:
+        main(["--version"])
+    assert left.value.code == 0
     assert capsys.readouterr().out == f"delucax {dlx.__version__}\n"
 
 

@@ -106,7 +106,7 @@ def test_what_the_constructor_refuses(make, changes, match):
     "make, changes",
     [
         (lambda: d.Uniform(-1.0, 1.0, size=2), {"low": 3.0, "high": 5.0}),
-        (lambda: d.Window(d.Constant(1.0, size=1), 0.0, 1.0), {"stop": 8, "start": 5}),
+        (lambda: d.Constant(1.0, size=1).between(0.0, 1.0), {"stop": 8, "start": 5}),
         (lambda: dlx.environments.UniformState([0.0], [1.0]), {"low": 2, "high": 3}),
         (split, {"gains.0.a": 0.4, "gains.1.a": 0.3}),
         (split, {"gains.0.a": 0.4, "base": dlx.controllers.Linear([[1.0]]),
@@ -164,7 +164,7 @@ def test_a_changed_number_adds_nothing_to_the_program():
 
 @once
 def test_a_random_window_crosses_the_old_one(key):
-    window = d.Window(d.Constant(1.0, size=1), 0.0, 1.0)
+    window = d.Constant(1.0, size=1).between(0.0, 1.0)
     ranges = {"start": (5.0, 6.0), "stop": (7.0, 8.0)}
     draw = lambda key: dlx.randomise(window, key, ranges)
     for one in (draw(key), jax.jit(draw)(key)):
@@ -305,7 +305,7 @@ def test_ranges_are_checked_by_their_ends(how, key):
 
         return draw
 
-    window = lambda x: d.Window(d.Constant(1.0 * x, size=1), 0.0, 1.0)
+    window = lambda x: d.Constant(1.0 * x, size=1).between(0.0, 1.0)
     for ranges in LEGAL:
         under(how, draw(ranges, window), key)
     for ranges in CROSSED:
@@ -350,7 +350,7 @@ def test_bounds_become_arrays():
             dlx.replace(controller, {"bounds.0": 3.0})
     wide = dlx.replace(pid, {"kp": [1.0, 2.0]})
     assert wide.loops == 2 and wide.init().integral.shape == (2,)
-    with user_error(match="one entry a loop"):
+    with user_error(match="one entry per loop"):
         dlx.replace(wide, {"ki": [1.0, 2.0, 3.0]})
 
 

@@ -83,7 +83,7 @@ _LAZY = """
 
 
 def __getattr__(name: str):
-    """What the core does not need, imported when it is first asked for."""
+    """Packages beyond the core, imported at first use."""
     if name in ("animate", "plot"):
         return getattr(_import_module(".plotting", __name__), name)
     if name == "__version__":

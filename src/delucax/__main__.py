@@ -11,10 +11,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from ._extras import extra
+
 
 _COMMANDS: list[tuple[Callable, str, str, tuple]] = []
-"""What is called with the options, its help, more of it, and what options it has; in
-the order in which they are shown."""
+"""The commands in display order: function, help, epilog, options."""
 
 
 def _command(help: str, *options: tuple, more: str = "") -> Callable:
@@ -27,10 +28,15 @@ def _command(help: str, *options: tuple, more: str = "") -> Callable:
     return register
 
 
-def _option(name: str, help: str, **settings: Any) -> tuple[str, dict[str, Any]]:
-    """What `add_argument` is given; the help shows the default, if there is one."""
-    shown = " (default: %(default)s)" if settings.get("default") else ""
-    return name, {"help": help + shown, **settings}
+def _option(
+    name: str, help: str, default: Any = None, **settings: Any
+) -> tuple[str, dict[str, Any]]:
+    """The arguments of `add_argument`. A default is shown in the help, and determines
+    the type."""
+    if default is not None:
+        settings |= {"default": default, "type": type(default)}
+        help += " (default: %(default)s)"
+    return name, {"help": help, **settings}
 
 
 def _flag(name: str, help: str) -> tuple[str, dict[str, Any]]:
@@ -39,24 +45,16 @@ def _flag(name: str, help: str) -> tuple[str, dict[str, Any]]:
 
 def _expression(flag: str, name: str, help: str) -> tuple[str, dict[str, Any]]:
     """The option of an expression that selects cases."""
-    settings = {"dest": name, "default": "", "metavar": "EXPR"}
-    return _option(flag, f"{help} (default: all)", **settings)
+    settings = {"help": f"{help} (default: all)", "default": ""}
+    return flag, {"dest": name, "metavar": "EXPR", **settings}
 
 
 def main(arguments: list[str] | None = None) -> int:
     """The command line; the exit status is 1 if cases failed, 2 on wrong arguments."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    options = vars(_parser().parse_args(arguments))
+    call = options.pop("call")
     try:
-        if options.version:
-            print(f"delucax {version('delucax')}")
-            return 0
-        if options.command is None:
-            parser.print_help()
-            return 0
-        names = ("version", "command", "call")
-        given = {k: v for k, v in vars(options).items() if k not in names}
-        return options.call(**given) or 0
+        return call(**options) or 0
     except (OSError, ValueError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -70,10 +68,12 @@ def _parser() -> argparse.ArgumentParser:
         description="Differentiable control in JAX.",
         epilog=f"{prog} COMMAND --help shows the options of a command.",
     )
-    parser.add_argument("--version", action="store_true", help="show the version")
-    commands = parser.add_subparsers(
-        title="commands", dest="command", metavar="COMMAND"
+    shown = f"delucax {version('delucax')}"
+    parser.add_argument(
+        "--version", action="version", version=shown, help="show the version"
     )
+    parser.set_defaults(call=parser.print_help)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for call, help, more, command_options in _COMMANDS:
         added = commands.add_parser(
             call.__name__.removeprefix("_"),
@@ -96,9 +96,9 @@ _CASES = (
 
 
 @_command(
-    "swing the pendulum up, then the paper in small; in about two minutes",
+    "swing a pendulum up, then reproduce the paper with fewer seeds (two minutes)",
     _option("--out", "folder to write to", default="demo"),
-    _option("--seeds", "how many MLPs to train", type=int, default=2),
+    _option("--seeds", "how many MLPs to train", default=2),
 )
 def _demo(out: str, seeds: int) -> None:
     from .studies import demo
@@ -129,20 +129,9 @@ def _reproduce(name: list[str], out: str, small: bool) -> int:
     "learn lungs from breaths, and controllers of a ventilator in them",
     _option("--out", "folder to write to, or go on in", default="lung"),
     _flag("--small", "two lungs, in a minute"),
-    _option(
-        "--data", "breaths, as a CSV file of the public data set (default: simulated)"
-    ),
-    _option(
-        "--seeds",
-        "how many controllers of each kind to train (default: 3, or 1 if --small)",
-        type=int,
-    ),
-    _option(
-        "--sensor-delay",
-        "how late the sensor reads, in samples; holds for DATA too",
-        type=int,
-        default=2,
-    ),
+    _option("--data", "breaths of the public data set, as CSV (default: simulated)"),
+    _option("--seeds", "networks of each kind (default: 3, or 1 if --small)", type=int),
+    _option("--sensor-delay", "of how many samples; holds for DATA too", default=2),
 )
 def _lung(out: str, **options: Any) -> None:
     from .studies import lung_study
@@ -156,13 +145,13 @@ def _lung(out: str, **options: Any) -> None:
     *_CASES,
 )
 def _list(file: str | None, select: str, marks: str) -> int | None:
-    from .studies._listing import list_names, SUITES
+    from .studies.listing import list_names, SUITES
 
     if file is None:
         return list_names()
-    from .experiments._commands import list_cases
+    from .experiments.commands import list_cases
 
-    return list_cases(file, SUITES, select, marks)
+    list_cases(file, SUITES, select, marks)
 
 
 @_command(
@@ -171,10 +160,10 @@ def _list(file: str | None, select: str, marks: str) -> int | None:
     *_CASES,
     _flag("--slow", "also cases marked slow"),
     _option("--seeds", "how many seeds (default: as FILE says)", type=int),
-    _option("--workers", "processes; -1 is one for each core", type=int, default=1),
+    _option("--workers", "processes; -1 is one for each core", default=1),
     _option("--dask", "run on the Dask cluster of this scheduler", metavar="ADDRESS"),
     _option("--store", "results file (default: results/FILE.jsonl)"),
-    _option("--html", "write a report too", metavar="PAGE"),
+    _option("--html", "write a report with tables and figures", metavar="PAGE"),
     _flag("--fresh", "run also what is stored"),
     _flag("--retry", "run again what failed"),
     _option("--quiet", "show no progress", dest="progress", action="store_false"),
@@ -191,13 +180,13 @@ def _list(file: str | None, select: str, marks: str) -> int | None:
 def _run(
     file: str, store: str | None, html: str | None, dask: str | None, **options: Any
 ) -> int:
-    from .experiments._commands import run_file
-    from .experiments._workers import dask_client
-    from .studies._listing import SUITES
+    from .experiments.commands import run_file
+    from .studies.listing import SUITES
 
     with contextlib.ExitStack() as stack:
         if dask is not None:
-            stack.enter_context(dask_client(dask))
+            distributed = extra("distributed", "dask")
+            stack.enter_context(distributed.Client(dask, timeout=20))
             options["backend"] = "dask"
         return run_file(file, SUITES, store, html, options)
 
@@ -206,11 +195,11 @@ def _run(
     "show a results file, or what differs between two",
     _option("results", "results file", nargs="+", metavar="RESULTS"),
     _flag("--diff", "compare two, with paired 95%% intervals"),
-    _option("--html", "write a page of tables, figures", metavar="PAGE"),
+    _option("--html", "write a report with tables and figures", metavar="PAGE"),
     _option(
         "--export",
         "write all rows to a .csv, .parquet, .md or .tex file",
-        **{"action": "append", "default": [], "metavar": "TABLE"},
+        **{"action": "append", "metavar": "TABLE"},
     ),
     _expression("-k", "select", "only these cases"),
     more="""
@@ -221,12 +210,12 @@ def _run(
         """,
 )
 def _report(
-    results: list[str], diff: bool, html: str | None, export: list[str], select: str
-) -> int:
-    from .experiments._commands import report_diff, report_file
+    results: list[str], diff: bool, html: str | None, export: list | None, select: str
+) -> None:
+    from .experiments.commands import report_diff, report_file
 
     report = report_diff if diff else report_file
-    return report(results, select, html, export)
+    report(results, select, html, export or [])
 
 
 @_command(
@@ -236,10 +225,7 @@ def _report(
 def _bench(name: str | None) -> int:
     sys.path.insert(0, str(Path.cwd()))
     if importlib.util.find_spec("benchmarks") is None:
-        raise ValueError(
-            "bench: the benchmarks are in the repository and not in the package: run "
-            "this in a checkout of it."
-        )
+        raise ValueError("bench: the benchmarks are in the repository: run this there.")
     module = "benchmarks" if name is None else f"benchmarks.{name}"
     if importlib.util.find_spec(module) is None:
         raise ValueError(f"bench: there is no benchmark called {name!r}.")

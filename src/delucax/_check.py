@@ -1,4 +1,8 @@
-"""Checks of arguments, with errors that name the argument and what was expected."""
+"""Checks of arguments.
+
+A function `as_...` converts and checks, one `check_...` checks alone. Both raise a
+`ValueError` that names the argument and what was expected.
+"""
 
 import functools
 import inspect
@@ -14,7 +18,11 @@ from jaxtyping import Array
 
 from ._files import as_path as as_path
 from ._message import did_you_mean, shortened
-from ._module import as_float_array, indexed_names
+from ._module import (
+    as_float_array,
+    check_function as check_function,
+    indexed_names,
+)
 from ._typing import Bounds
 
 
@@ -22,7 +30,7 @@ Shape = tuple[int, ...]
 
 
 def is_concrete(x: Any) -> bool:
-    """Whether the value of `x` can be looked at now (it is not being traced)."""
+    """Whether `x` has a value now, and is not being traced."""
     return not isinstance(x, Tracer)
 
 
@@ -35,7 +43,10 @@ def output_of(function: Any, *shapes: tuple[int, ...]) -> Any:
     try:
         hash(structure)
         arrays = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
-    except (TypeError, AttributeError):  # a field without a hash, a leaf that is none
+    except (
+        TypeError,
+        AttributeError,
+    ):  # an unhashable field, or a leaf that is no array
         return eqx.filter_eval_shape(function, *inputs)
     return _traced(structure, arrays, tuple(inputs))
 
@@ -60,8 +71,8 @@ _HOW_TO_GET = {
 def check_instance(
     value: Any, kind: type, name: str, where: str, hint: str | None = None
 ) -> None:
-    """Raise unless `value` is of a class. `hint` says how to get one, if it is not how
-    one usually does."""
+    """Raise unless `isinstance(value, kind)`. `hint` replaces the default hint of the
+    message, which says how to make one."""
     if not isinstance(value, kind):
         called = kind.__name__
         article = "an" if called[0] in "AEIOU" else "a"
@@ -73,7 +84,7 @@ def check_instance(
 
 
 def check_key(key: Any, where: str) -> Any:
-    """`key`, if it is one random key, or an error."""
+    """`key`, if it is one random key."""
     if eqx.is_array(key):
         if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ():
             return key
@@ -87,23 +98,45 @@ def check_key(key: Any, where: str) -> Any:
     )
 
 
+def _error(value: Any, name: str, where: str, rule: str) -> ValueError:
+    """The error that shows a value which is not as it must be."""
+    return ValueError(f"{where}: {name} must {rule}, got {shortened(value)}.")
+
+
 def _as_array(
     value: Any, name: str, where: str, rule: str, fits: Callable[[Shape], bool]
 ) -> Array:
-    """`value` as a floating-point array of a shape that fits, or an error."""
+    """`value` as a floating-point array whose shape fits, as `rule` says."""
     array = as_float_array(value)
     if not eqx.is_inexact_array(array) or not fits(array.shape):
-        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
-        raise ValueError(f"{where}: {name} must {rule}, got {got}.")
+        if not eqx.is_array(array):
+            raise _error(value, name, where, rule)
+        raise ValueError(f"{where}: {name} must {rule}, got shape {array.shape}.")
     return array
 
 
 def as_vector(value: Any, size: int, name: str, where: str) -> Array:
-    """`value` as a real floating-point vector of `size` entries, or an error."""
+    """`value` as a real floating-point vector of `size` entries."""
     rule = f"have shape ({size},)"
     array = _as_array(value, name, where, rule, lambda shape: shape == (size,))
     check_real(array, name, where)
     return array
+
+
+def as_entries(
+    value: Any, size: int | None, name: str, where: str, each: str = "entry"
+) -> Array:
+    """`value`, a number for all or a vector with one for `each`, as a floating-point
+    array. The vector has `size` entries; any number of them if that is `None`."""
+    rule = f"be a number or have shape ({size},)"
+    if size is None:
+        rule = f"be a number or a vector with an entry for each {each}"
+    return _as_array(value, name, where, rule, _fits(size))
+
+
+def _fits(size: int | None) -> Callable[[Shape], bool]:
+    """Whether a shape is that of a number, or of a vector of `size`, if it is given."""
+    return lambda shape: len(shape) <= 1 and (size is None or shape in ((), (size,)))
 
 
 def check_real(array: Array, name: str, where: str) -> None:
@@ -115,14 +148,11 @@ def check_real(array: Array, name: str, where: str) -> None:
 def as_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
     """`value` as a floating-point array of `ndim` axes with finite entries."""
     fits = lambda shape: len(shape) == ndim
-    array = _as_array(value, name, where, "be a matrix", fits)
-    check_finite(array, name, where)
-    return array
+    return as_finite(value, name, where, "be a matrix", fits)
 
 
 def symmetric_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Array:
-    """`value` as a symmetric matrix of finite entries (or with `ndim` 3 a stack of
-    them), or an error.
+    """`value` as a symmetric matrix of finite entries, or a stack of them (`ndim=3`).
 
     An asymmetry of the size of rounding is averaged away.
     """
@@ -134,34 +164,26 @@ def symmetric_matrix(value: Any, name: str, where: str, *, ndim: int = 2) -> Arr
         largest = functools.partial(np.max, axis=(-2, -1), initial=0.0)
         slack = 100 * np.finfo(array.dtype).eps * largest(np.abs(array))
         if np.any(largest(np.abs(array - np.swapaxes(array, -2, -1))) > slack):
-            raise ValueError(
-                f"{where}: {name} must be symmetric, got {shortened(array)}."
-            )
+            raise _error(array, name, where, "be symmetric")
     return (matrix + matrix.mT) / 2
 
 
 def as_bounds(
     value: Any, where: str, name: str = "bounds", size: int | None = None
 ) -> Bounds | None:
-    """`value` as `(low, high)`, each a number or a vector (of `size`, if it is given),
-    or an error."""
+    """`value` as `(low, high)`, each a number or a vector (of `size`, if given)."""
     if value is None:
         return None
     if not isinstance(value, tuple | list) or len(value) != 2:
-        raise ValueError(
-            f"{where}: {name} must be a pair (low, high), got {shortened(value)}."
-        )
+        raise _error(value, name, where, "be a pair (low, high)")
     low, high = (as_float_array(end) for end in value)
     if size is not None:
-        rule, shapes = f"be numbers or have shape ({size},)", ((), (size,))
+        rule, fits = f"be numbers or have shape ({size},)", _fits(size)
         for end in (low, high):
-            _as_array(end, name, where, rule, lambda shape: shape in shapes)
+            _as_array(end, name, where, rule, fits)
     fit = all(eqx.is_inexact_array(end) and end.ndim <= 1 for end in (low, high))
     if not fit or low.ndim == high.ndim == 1 and low.shape != high.shape:
-        raise ValueError(
-            f"{where}: {name} must be numbers or vectors of one size, "
-            f"got {shortened(value)}."
-        )
+        raise _error(value, name, where, "be numbers or vectors of one size")
     if is_concrete(low) and is_concrete(high):
         if not np.all(np.asarray(low) <= np.asarray(high)):
             raise ValueError(
@@ -171,7 +193,7 @@ def as_bounds(
 
 
 def check_control_bounds(value: Any, size: int, where: str) -> Bounds | None:
-    """`value` as bounds of `size` controls, or an error."""
+    """`value` as bounds of `size` controls."""
     bounds = as_bounds(value, where)
     for end in bounds or ():
         if end.shape not in ((), (size,)):
@@ -193,65 +215,58 @@ def check_finite(array: Any, name: str, where: str) -> None:
     """Raise if a concrete `array` holds NaN or infinity."""
     if eqx.is_inexact_array(array) and is_concrete(array):
         if not np.all(np.isfinite(np.asarray(array))):
-            raise ValueError(f"{where}: {name} must be finite, got {shortened(array)}.")
+            raise _error(array, name, where, "be finite")
 
 
 def _check_entries(
     value: Any, name: str, where: str, rule: str, holds: Callable[[Any], Any]
 ) -> None:
-    """Raise unless all entries of a number or an array are as they must be, where
-    they are concrete."""
+    """Raise if a concrete entry violates `rule`; traced values are skipped."""
     array = as_float_array(value)
     if eqx.is_inexact_array(array):
         if not is_concrete(array) or np.all(holds(np.asarray(array))):
             return
         value = np.asarray(array)
-    raise ValueError(f"{where}: {name} must be {rule}, got {shortened(value)}.")
+    raise _error(value, name, where, f"be {rule}")
 
 
 def check_positive(value: Any, name: str, where: str) -> None:
-    """Raise unless numbers are finite and above zero, where they are concrete."""
+    """Raise unless numbers are positive and finite; traced values are skipped."""
     holds = lambda at: np.isfinite(at) & (at > 0)
     _check_entries(value, name, where, "positive and finite", holds)
 
 
 def check_step(dt: Any, where: str, name: str = "dt") -> None:
-    """Raise unless `dt`, or what has another name, is one positive number."""
+    """Raise unless `dt`, called `name` in the message, is a positive scalar."""
     check_positive(dt, name, where)
     if np.shape(dt) != ():
         raise ValueError(f"{where}: {name} must be a number, got shape {np.shape(dt)}.")
 
 
 def check_number(value: Any, name: str, where: str) -> None:
-    """Raise unless `value` is one finite real number, where they are concrete."""
+    """Raise unless `value` is a finite real scalar; traced values are not inspected."""
     array = _as_array(value, name, where, "be a number", lambda shape: shape == ())
     check_real(array, name, where)
     check_finite(array, name, where)
 
 
 def as_number(value: Any, name: str, where: str) -> Any:
-    """`value` as a scalar: a Python number if it is known, so that it stays known
-    while other things are being traced.
-    """
+    """`value` as a scalar: a Python number if it is concrete, so that it stays concrete
+    while other things are traced."""
     if isinstance(value, Tracer):
-        array = as_float_array(value)
-        if array.shape != ():
-            raise ValueError(
-                f"{where}: {name} must be a number, got shape {array.shape}."
-            )
-        return array
+        return _as_array(value, name, where, "be a number", lambda shape: shape == ())
     number = np.asarray(value)
     if number.shape != () or number.dtype.kind not in "iuf":
-        raise ValueError(f"{where}: {name} must be a number, got {shortened(value)}.")
+        raise _error(value, name, where, "be a number")
     if not np.isfinite(number):
-        raise ValueError(f"{where}: {name} must be finite, got {shortened(value)}.")
+        raise _error(value, name, where, "be finite")
     return float(number)
 
 
 def check_range(
     value: Any, name: str, where: str, low: Any = 0, high: float | int = np.inf
 ) -> None:
-    """Raise unless numbers lie between `low` and `high`, where they are concrete."""
+    """Raise unless numbers are in `[low, high]`; traced values are skipped."""
     least = as_float_array(low)
 
     def holds(at):
@@ -267,18 +282,14 @@ def check_choice(value: Any, choices: tuple[Any, ...], name: str, where: str) ->
     """Raise unless `value` is one of `choices`."""
     if value not in choices:
         words = [repr(choice) for choice in choices]
-        expected = (
-            " or ".join(words) if len(words) == 2 else f"one of {', '.join(words)}"
-        )
-        raise ValueError(f"{where}: {name} must be {expected}, got {value!r}.")
+        rule = " or ".join(words) if len(words) == 2 else f"one of {', '.join(words)}"
+        raise ValueError(f"{where}: {name} must be {rule}, got {value!r}.")
 
 
 def check_bool(value: Any, name: str, where: str) -> bool:
-    """`value`, if it is True or False, or an error."""
+    """`value` as a bool, if it is True or False."""
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(
-            f"{where}: {name} must be True or False, got {shortened(value)}."
-        )
+        raise _error(value, name, where, "be True or False")
     return bool(value)
 
 
@@ -286,17 +297,14 @@ def check_count(value: Any, name: str, where: str, least: int = 1) -> int:
     """`value` as an int of at least `least`."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not whole or value < least:
-        raise ValueError(
-            f"{where}: {name} must be a whole number of at least {least}, got "
-            f"{shortened(value)}."
-        )
+        raise _error(value, name, where, f"be a whole number of at least {least}")
     return int(value)
 
 
 def check_at_most(
     value: int, most: int, name: str, where: str, of: str | None = None
 ) -> None:
-    """Raise unless a count is at most `most`, the number `of` something."""
+    """Raise if a count exceeds `most`, which is the number `of` something."""
     if value > most:
         limit = most if of is None else f"the {most} {of}"
         raise ValueError(f"{where}: {name} must be at most {limit}, got {value}.")
@@ -305,17 +313,12 @@ def check_at_most(
 def as_rows(
     value: Any, size: int, name: str, where: str, steps: int | None = None
 ) -> Array:
-    """`value` as a real array of a row of `size` entries for each step (of `steps`, if
-    it is given), or an error."""
-    array = as_float_array(value)
-    fits = eqx.is_inexact_array(array) and array.ndim == 2 and array.shape[1] == size
-    if not fits or steps not in (None, array.shape[0]):
-        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
-        rows = "steps" if steps is None else steps
-        raise ValueError(
-            f"{where}: {name} must have shape ({rows}, {size}), a row for each step, "
-            f"got {got}."
-        )
+    """`value` as a real array of shape `(steps, size)`; `steps` is any number if it is
+    `None`."""
+    rows = "steps" if steps is None else steps
+    rule = f"have shape ({rows}, {size}), a row for each step"
+    fits = lambda s: len(s) == 2 and s[1] == size and steps in (None, s[0])
+    array = _as_array(value, name, where, rule, fits)
     if array.shape[0] == 0:
         raise ValueError(f"{where}: {name} must have at least one step.")
     check_real(array, name, where)
@@ -342,7 +345,7 @@ def check_keywords(
 
 
 LARGEST = float(np.finfo(np.float32).max)
-"""Ends a space where there is no bound, because Gymnasium advises against infinity."""
+"""Replaces an infinite bound of a space, as Gymnasium advises."""
 
 
 def check_cost_sizes(cost: Any, sizes: tuple[int, int], name: str, where: str) -> None:
@@ -351,7 +354,7 @@ def check_cost_sizes(cost: Any, sizes: tuple[int, int], name: str, where: str) -
     try:
         output_of(cost, (), (n,), (m,))
         output_of(cost.final, (), (n,))
-    except _UNTRACEABLE:  # it may still be called, one step after the other
+    except jax.errors.JAXTypeError:  # not traceable: it still works outside of jit
         return
     except (TypeError, ValueError) as error:
         raise ValueError(
@@ -360,17 +363,10 @@ def check_cost_sizes(cost: Any, sizes: tuple[int, int], name: str, where: str) -
         ) from error
 
 
-_UNTRACEABLE = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-)
-
-
 def checked_names(
     names: Sequence[str] | None, letter: str, size: int, argument: str, where: str
 ) -> tuple[str, ...]:
-    """`names` as a tuple of `size`, indexed if there are none, or an error."""
+    """`names` as a tuple of `size`; indexed names if there are none."""
     if names is None:
         return indexed_names(letter, size)
     if isinstance(names, str) or len(names) != size:
@@ -381,7 +377,7 @@ def checked_names(
 def check_matrices(
     A: Any, B: Any, C: Any, E: Any, where: str
 ) -> tuple[Array, Array, Any, Any]:
-    """`A`, `B`, `C`, `E` as matrices of fitting shapes, or an error that names one."""
+    """`A`, `B`, `C`, `E` as matrices whose shapes fit."""
     A = as_matrix(A, "A", where)
     n = A.shape[0]
     if A.shape != (n, n) or n == 0:
@@ -414,9 +410,8 @@ def check_time_invariant(model: Any, name: str, where: str) -> None:
 
 def check_vector(value: Any, name: str, where: str) -> None:
     """Raise unless `value` is an array of one axis with finite entries."""
-    if not eqx.is_inexact_array(value) or value.ndim != 1:
-        raise ValueError(f"{where}: {name} must be a vector, got {shortened(value)}.")
-    check_finite(value, name, where)
+    array = _as_array(value, name, where, "be a vector", lambda s: len(s) == 1)
+    check_finite(array, name, where)
 
 
 def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
@@ -426,6 +421,8 @@ def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
         return
     array = np.asarray(R)
     least, *_ = eigenvalues = np.linalg.eigvalsh(array)
+    # Eigenvalues of a symmetric matrix are off by a few eps times the largest (Weyl). A
+    # semidefinite matrix made as a product C'C is off by more, the more rows it has.
     rounding = np.finfo(array.dtype).eps * np.max(np.abs(eigenvalues))
     slack = -rounding if definite else 100 * len(array) * rounding
     if least < -slack or definite and least <= 0:
@@ -434,3 +431,29 @@ def check_definite(R: Array, name: str, where: str, definite: bool) -> None:
             f"{where}: {name} must be positive {kind}, got {array}, whose least "
             f"eigenvalue is {least:.3g}."
         )
+
+
+def as_finite(
+    value: Any, name: str, where: str, rule: str, fits: Callable[[Shape], bool]
+) -> Array:
+    """`value` as a floating-point array of finite entries whose shape fits, as the
+    `rule` says, or an error."""
+    array = _as_array(value, name, where, rule, fits)
+    check_finite(array, name, where)
+    return array
+
+
+def finite_vector(value: Any, size: int, name: str, where: str) -> Array:
+    """`value` as a real vector of `size` finite entries, or an error."""
+    vector = as_vector(value, size, name, where)
+    check_finite(vector, name, where)
+    return vector
+
+
+def finite_rows(
+    value: Any, size: int, name: str, where: str, steps: int | None = None
+) -> Array:
+    """`value` as `as_rows` has it, with finite entries, or an error."""
+    rows = as_rows(value, size, name, where, steps)
+    check_finite(rows, name, where)
+    return rows

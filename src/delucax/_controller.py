@@ -1,4 +1,4 @@
-"""What a controller is; the protocols alone."""
+"""The protocols of controllers, the counter of incidents, and how to call both."""
 
 import abc
 from collections.abc import Callable
@@ -8,13 +8,12 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.random as jr
 import numpy as np
 from jaxtyping import Array, PyTree
 
 from ._check import check_instance
 from ._message import shortened
-from ._module import check_parameters
+from ._module import check_parameters, parts_of
 from ._typing import PRNGKey, RealScalar
 
 
@@ -22,10 +21,12 @@ class AbstractController(eqx.Module):
     """A feedback law with a state of its own.
 
     [`delucax.rollout`][] makes the calls, in this order at each step: `__call__` acts
-    on the observation; the environment saturates and steps; `applied` tells the
-    controller the control that was really applied, and its cost. Trained weights are
-    fields; what is learned or remembered along the way lives in the state, a pytree of
-    arrays.
+    on the observation; the environment saturates and steps; `applied` gets the control
+    that was really applied, and its cost. Trained weights are fields; what is learned
+    or remembered along the way lives in the state, a pytree of arrays.
+
+    A controller that draws at each step keeps a random key in its state: `init` puts
+    it there, and each call splits it. A wrapper gives each part a key of its own.
 
     !!! example
 
@@ -41,6 +42,23 @@ class AbstractController(eqx.Module):
 
         import jax
         dlx.rollout(dlx.make("pendulum"), Damper(), key=jax.random.key(0)).total_cost
+        ```
+
+    !!! example "One that draws"
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        class Dither(dlx.AbstractController):
+            def init(self, *, key=None):
+                return key
+
+            def __call__(self, t, y, state):
+                state, now = jax.random.split(state)
+                return jax.random.normal(now, (1,), y.dtype), state
+
+        dlx.rollout(dlx.make("pendulum"), Dither(), key=jax.random.key(0)).total_cost
         ```
     """
 
@@ -71,12 +89,13 @@ class AbstractController(eqx.Module):
         """
 
     def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
-        """Told what was really applied, after saturation; ignored by default.
+        """The state after the step, given the saturated control and its cost; by
+        default the state as it is.
 
         **Arguments:**
 
         - `u`: the control that was applied.
-        - `cost`: the stage cost that it was charged.
+        - `cost`: its stage cost.
         - `state`: the controller's state.
 
         **Returns:** the new state.
@@ -84,11 +103,18 @@ class AbstractController(eqx.Module):
         del u, cost
         return state
 
+    @property
+    def learns_from_cost(self) -> bool:
+        """Whether `applied` learns from the cost, which [`delucax.simulate`][] does not
+        know; by default whether a controller among its fields does."""
+        return any(p.learns_from_cost for p in parts_of(self, AbstractController))
+
 
 class AbstractLearner(AbstractController):
-    """A controller that learns online by what it would have been charged.
+    """A controller that learns online from a counterfactual loss.
 
-    `loss` and `fresh` are all that a wrapper such as an adaptive meta-controller needs.
+    `loss` and `fresh` are for meta-controllers such as
+    [`delucax.controllers.Adaptive`][]; [`delucax.rollout`][] does not call them.
 
     !!! example
 
@@ -133,7 +159,7 @@ class AbstractLearner(AbstractController):
 
 
 class AbstractStochasticPolicy(AbstractController):
-    """A controller that draws its controls, with a probability that it can tell.
+    """A stochastic policy whose log-probability can be computed.
 
     [`delucax.training.PPO`][], [`delucax.training.LikelihoodRatio`][] and
     [`delucax.training.scored_cost`][] train such controllers.
@@ -146,22 +172,21 @@ class AbstractStochasticPolicy(AbstractController):
         import jax.numpy as jnp
         from jaxtyping import Array
 
-        class Dithered(dlx.AbstractStochasticPolicy):
-            gain: Array = dlx.weight(20.0)
+        class Coin(dlx.AbstractStochasticPolicy):
+            logit: Array = dlx.weight(0.0)
 
             def init(self, *, key=None):
                 return key
 
-            def __call__(self, t, y, state):
-                state, now = jax.random.split(state)
-                return -self.gain * y[:1] + jax.random.normal(now, (1,), y.dtype), state
+            def __call__(self, t, y, key):
+                key, now = jax.random.split(key)
+                heads = jax.random.bernoulli(now, jax.nn.sigmoid(self.logit))
+                return jnp.where(heads, jnp.ones(1), -jnp.ones(1)), key
 
-            def log_prob(self, t, y, state, u):
-                return -0.5 * jnp.sum((u + self.gain * y[:1]) ** 2)
+            def log_prob(self, t, y, key, u):
+                return jax.nn.log_sigmoid(self.logit * u[0])
 
-        policy = Dithered()
-        state = policy.init(key=jax.random.key(0))
-        policy.log_prob(0.0, jnp.zeros(2), state, jnp.ones(1))
+        Coin().log_prob(0.0, jnp.zeros(2), None, jnp.ones(1))
         ```
     """
 
@@ -188,8 +213,8 @@ class AbstractStochasticPolicy(AbstractController):
         - `y`: observation, a vector.
         - `state`: the controller's state, before the call.
 
-        **Returns:** a scalar; `None` (the default) where there is no closed form, and
-        `-log_prob` of what was drawn is the estimate.
+        **Returns:** a scalar; or `None` (the default) where there is no closed form.
+        Callers then take `-log_prob` of the control that was drawn.
         """
         del t, y, state
         return None
@@ -204,8 +229,8 @@ class Tally(eqx.Module):
     """How often something went wrong in a controller, kept in the controller's state.
 
     [`delucax.rollout`][] reads every tally in the state, however deep, after each step:
-    the steps at which one rose are in `trajectory.incidents`. So a wrapper has nothing
-    to pass on.
+    the steps at which one rose are in `trajectory.incidents`. Wrappers need not forward
+    them.
 
     **Attributes:**
 
@@ -244,8 +269,7 @@ class Tally(eqx.Module):
                 "Tally: name must not be 'clipped_control', which a rollout counts "
                 "itself."
             )
-        self.name = name
-        self.count = jnp.zeros((), jnp.int32)
+        self.name, self.count = name, jnp.zeros((), jnp.int32)
 
     def __repr__(self):
         return f"Tally({self.name!r}, count={shortened(self.count)})"
@@ -269,23 +293,17 @@ def initial_state(controller: AbstractController, key: PRNGKey | None) -> PyTree
     return jax.tree.map(as_array, controller.init(key=key))
 
 
-def has_state(controller: AbstractController) -> bool:
-    """Whether a controller carries arrays from one step to the next."""
-    start = lambda: eqx.filter(initial_state(controller, jr.key(0)), eqx.is_array)
-    return bool(jax.tree.leaves(jax.eval_shape(start)))
-
-
 def replay(
     controller: AbstractController,
     state: PyTree,
     record: tuple[Array, ...],
     act: Callable[..., tuple[PyTree, PyTree]],
 ) -> PyTree:
-    """What `act` measures at each step of a recorded run.
+    """The measurements of `act` at each step of a recorded run.
 
     `measured, state = act(t, y, state, u, ...)` calls the controller, from `state` on
     and along `record`: the times, observations, applied controls and costs, and what
-    else `act` takes. Then the controller is told the control and the cost.
+    else `act` takes. Then its `applied` is called with the control and the cost.
     """
     state, static = eqx.partition(state, eqx.is_array)
 
@@ -300,16 +318,14 @@ def replay(
 
 def tallies(state: PyTree) -> dict[str, Array]:
     """The sum of the tallies of each name in a controller's state."""
-    is_tally = lambda node: isinstance(node, Tally)
     counts: dict[str, Any] = {}
-    for node in jax.tree.leaves(state, is_leaf=is_tally):
-        if is_tally(node):
-            counts[node.name] = counts.get(node.name, 0) + jnp.sum(node.count)
+    for tally in parts_of([state], Tally):
+        counts[tally.name] = counts.get(tally.name, 0) + jnp.sum(tally.count)
     return counts
 
 
 def wrong_observation(controller: Any, expected: int, y: Array) -> ValueError:
-    """The error for an observation that a controller was not made for."""
+    """The error for an observation of the wrong size."""
     return ValueError(
         f"{type(controller).__name__}: expects an observation of size {expected}, got "
         f"size {y.shape[0] if y.ndim else 0}. If it was made for the encoded "

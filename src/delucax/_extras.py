@@ -1,4 +1,4 @@
-"""Packages that only some users need."""
+"""Import of optional dependencies."""
 
 import importlib
 from typing import Any

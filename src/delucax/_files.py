@@ -1,4 +1,4 @@
-"""Paths of files, and files that appear whole or not at all."""
+"""Checks of paths, and atomic writes."""
 
 import contextlib
 import os
@@ -11,7 +11,7 @@ from ._message import shortened
 
 
 def as_path(value: Any, name: str, where: str) -> Path:
-    """`value` as a path, or an error."""
+    """`value` as a path; raises `ValueError` if it is none."""
     if not isinstance(value, str | os.PathLike):
         raise ValueError(
             f"{where}: {name} must be the path of a file, got {shortened(value)}."
@@ -21,11 +21,11 @@ def as_path(value: Any, name: str, where: str) -> Path:
 
 @contextlib.contextmanager
 def replaced(path: Path) -> Iterator[BinaryIO]:
-    """A new file beside `path`, which takes its place at the end of the block.
+    """A temporary file beside `path`, which replaces it at the end of the block.
 
-    Where the block raises, `path` stays as it was. What was written is on the disk
-    before the name is, so that a machine that stops leaves one or the other. A device,
-    such as `/dev/stdout`, is written to as it is.
+    If the block raises, `path` is unchanged. The content is on the disk before the file
+    is renamed, so that a crash leaves the old file or the new one. A device, such as
+    `/dev/stdout`, is written to directly.
 
     **Raises:** `OSError` if the file cannot be written.
     """

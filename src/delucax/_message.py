@@ -1,4 +1,4 @@
-"""What error messages say of values."""
+"""Values and names as error messages show them."""
 
 import difflib
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ _MOST = 120
 
 
 def shortened(value: Any) -> str:
-    """A value as an error message shows it: in a line or two, whatever it is."""
+    """A value as an error message shows it, in a line or two."""
     if hasattr(value, "to_numpy"):  # tables and their columns
         return f"a {type(value).__name__}; `.to_numpy()` makes it an array"
     is_array = isinstance(value, np.ndarray | jax.Array)
@@ -27,7 +27,7 @@ def shortened(value: Any) -> str:
 
 
 def did_you_mean(name: str, names: Iterable[str], cutoff: float = 0.6) -> str:
-    """The question that an error about an unknown name ends with."""
+    """The ending `did you mean ...?` of an error about an unknown name."""
     names = list(names)
     close = difflib.get_close_matches(name, names, n=3, cutoff=cutoff) or names
     return f"did you mean {' or '.join(map(repr, close)) or 'none'}?"

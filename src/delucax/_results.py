@@ -1,4 +1,4 @@
-"""Outcomes of a solve, in one enumeration with Diffrax's and Lineax's own."""
+"""Status codes, in one enumeration with those of Diffrax, Optimistix and Lineax."""
 
 from collections.abc import Callable
 from typing import Any, TYPE_CHECKING, TypeAlias, TypeVar
@@ -12,11 +12,11 @@ from jaxtyping import Array, Bool
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """What became of a computation.
+    """Status of a computation.
 
     Extends `diffrax.RESULTS` (which extends those of Optimistix and Lineax), so that
-    a failure deep inside a solve surfaces with its own words. `RESULTS[result]` is the
-    message; `result == RESULTS.successful` tells whether all went well.
+    the message of a nested failure is kept. `RESULTS[result]` is the
+    message; `result == RESULTS.successful` tells whether it succeeded.
     """
 
     diverged = "The states or costs became NaN or infinite."
@@ -25,35 +25,36 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "smaller dt, or give its root finder other tolerances or more steps."
     )
     beyond_precision = (
-        "The solver ran out of steps. Its rtol is below the precision of the state, so "
-        "more steps may not help: give a larger rtol, or compute in float64."
+        "The solver reached max_steps. Its rtol is below the precision of the state, "
+        "so more steps may not help: increase rtol, or compute in float64."
     )
     not_stabilisable = (
-        "The pair (A, B) is not stabilisable: no control moves some mode that does not "
-        "decay, or so weakly that rounding of the data hides it."
+        "The pair (A, B) is not stabilisable: a mode that does not decay is "
+        "uncontrollable, or controllable only below the rounding of the data."
     )
     not_stabilising = (
-        "There is no stabilising solution: the cost may not see an unstable mode, or "
-        "have no minimum."
+        "There is no stabilising solution: an unstable mode may be undetectable in the "
+        "cost, or the cost may be unbounded below."
     )
     on_boundary = (
         "The closed loop is on the boundary of stability, up to rounding: a mode there "
-        "is not seen by the cost, or a slightly smaller weight would leave the cost "
-        "without a minimum, or the precision is too low to tell."
+        "is undetectable in the cost, or a slightly smaller weight would make the cost "
+        "unbounded below, or the precision is too low to tell."
     )
     ill_posed = (
         "The data are not those of a well-posed problem: not finite, a weight that is "
         "not definite, a singular descriptor matrix, or a singular equation."
     )
     not_separated = (
-        "The spectra are not on two sides of a line (of a circle about 0, in discrete "
-        "time), and the equation is too large to be solved as one linear system."
+        "The spectra of the coefficients cannot be separated by a vertical line (in "
+        "discrete time, by a circle about 0), and the equation is too large to be "
+        "solved as one linear system."
     )
     not_converged = "The iteration did not converge within its step limit."
     unexciting = (
-        "The data are too few, or excite too little, to tell all parameters: some "
+        "The data are too few, or excite too little, to identify all parameters: some "
         "direction among them is not identifiable. With throw=False the fit is "
-        "returned, and says which."
+        "returned, and names it."
     )
     no_descent = (
         "No step lowered the cost, although the gradient is not zero: the problem may "
@@ -90,14 +91,12 @@ INCIDENTS = {
     "refused_update": RESULTS.update_refused,
     "failed_plan": RESULTS.plan_failed,
 }
-"""What a run becomes by what a controller counts."""
+"""The status of a rollout in which a controller counted an incident of this name."""
 
 
 def promote(result: Result) -> Result:
     """A result of Diffrax, Optimistix or Lineax, as one of `RESULTS`."""
-    if isinstance(result, RESULTS):
-        return result
-    return RESULTS.promote(result)
+    return result if isinstance(result, RESULTS) else RESULTS.promote(result)
 
 
 def choose(condition: Array, first: Any, second: Any) -> Result:
@@ -118,15 +117,16 @@ def first_failure(first: Result, second: Result) -> Result:
 
 
 def first_of(results: Result | None) -> Result:
-    """The first failure among stacked results; success if there is none to look at."""
+    """The first failure along the leading axis; success if there is none."""
     if results is None:
         return RESULTS.successful
+    # argmax of booleans is the first that holds, and the first entry if none does.
     failed = results != RESULTS.successful
     return jax.tree.map(lambda r: r[jnp.argmax(failed)], results)
 
 
 def or_none(result: Result) -> Result | None:
-    """`None` for what is statically a success, so that loops need not carry it."""
+    """`None` if the result is statically a success, so that loops need not carry it."""
     return None if result is RESULTS.successful else result
 
 
@@ -134,12 +134,8 @@ _T = TypeVar("_T")
 
 
 def raise_if(failed: Bool[Array, ""], value: _T, message: str) -> _T:
-    """`value`, or an error: now if it is concrete, else at run time."""
-    if isinstance(failed, Tracer):
-        return eqx.error_if(value, failed, message)
-    if failed:
-        raise RuntimeError(message)
-    return value
+    """`value`, or raise if `failed`, now if that is concrete, else at run time."""
+    return eqx.error_if(value, failed, message)
 
 
 def raise_on_failure(
@@ -149,10 +145,10 @@ def raise_on_failure(
     it: str = "the solution",
     facts: Callable[[], str] = lambda: "",
 ) -> Any:
-    """`solution`, or an error if its `result` is a failure and `throw` holds: now if
-    it is concrete, else at run time.
+    """`solution`; if `throw`, raise when its `result` is a failure, now if that is
+    concrete, else at run time.
 
-    `it` names the solution in the error; `facts` says more of a concrete failure.
+    `it` names the solution in the error; `facts` adds detail when it is concrete.
     """
     if not throw:
         return solution

@@ -1,5 +1,6 @@
 """Array aliases shared by every signature."""
 
+from collections.abc import Callable
 from typing import Any, Generic, Literal, TYPE_CHECKING, TypeAlias, TypeVar
 
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, Num, UInt32
@@ -12,6 +13,8 @@ Vector: TypeAlias = Float[Array, "_"]  # noqa: F821
 """A rank-1 floating-point array."""
 Matrix: TypeAlias = Float[Array, "_ _"]
 """A rank-2 floating-point array."""
+Square: TypeAlias = Float[Array, "n n"]
+"""A square matrix; all in one signature have the same size."""
 State: TypeAlias = Float[Array, "states"]  # noqa: F821
 Control: TypeAlias = Float[Array, "controls"]  # noqa: F821
 Disturbance: TypeAlias = Float[Array, "disturbances"] | None  # noqa: F821
@@ -22,6 +25,8 @@ Bounds: TypeAlias = tuple[Float[Array, "..."], Float[Array, "..."]]
 BoolScalar: TypeAlias = Bool[Array, ""]
 PRNGKey: TypeAlias = Key[Array, "..."] | UInt32[Array, "... 2"]
 """A key from `jax.random.key` (or the older `jax.random.PRNGKey`)."""
+Difference: TypeAlias = Callable[[Array, Array], Array]
+"""`(x, x_ref) -> deviation`, as a system measures it; it wraps angles."""
 Checkpoint: TypeAlias = Literal["step", "sqrt"] | None
 """What the gradient of a rollout stores."""
 

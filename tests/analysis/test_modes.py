@@ -55,7 +55,7 @@ def test_unreached_modes_are_named(discrete):
         mode, distance = test.worst
         assert_close(mode, modes[missing], atol=tolerance(1e-5, 1e-12))
         assert distance < test.tolerance
-        assert int(jnp.sum(test.out_of_reach)) == 1
+        assert int(jnp.sum(test.rank_deficient)) == 1
         if grows:
             assert_close(test.worst_unstable[0], mode)
         dual = make(A.T, np.eye(4), C=B.T)
@@ -72,7 +72,7 @@ def test_a_stable_model_has_no_worst_unstable_mode():
     test = an.modal_controllability(LinearSystem(-jnp.eye(2), jnp.ones((2, 1))))
     assert jnp.isinf(test.worst_unstable[1])
     # One input cannot reach both of two equal modes.
-    assert jnp.all(test.out_of_reach) and an.is_stabilizable(
+    assert jnp.all(test.rank_deficient) and an.is_stabilizable(
         LinearSystem(-jnp.eye(2), jnp.ones((2, 1)))
     )
 

@@ -272,7 +272,7 @@ def gaussian(k, dt, rng):
 
 def window_of_uniform(k, dt, rng):
     uniform = dlx.disturbances.Uniform(-0.3, 0.3, size=k)
-    return dlx.disturbances.Window(uniform, 2 * dt, 6 * dt), None
+    return uniform.between(2 * dt, 6 * dt), None
 
 
 def default(k, dt, rng):

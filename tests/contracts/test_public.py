@@ -115,11 +115,11 @@ LONG = {
     analysis.Margins analysis.margins c2d controllers.Adaptive
     controllers.best_in_hindsight controllers.BPC controllers.Categorical
     controllers.drc controllers.Explore estimators.ExtendedKalmanFilter
-    estimators.Filtered controllers.FiniteHorizonLQR controllers.FixedPolicy
-    controllers.Gaussian controllers.gpc controllers.Hindsight controllers.HInfinity
+    controllers.FiniteHorizonLQR
+    controllers.Gaussian controllers.gpc controllers.HInfinity
     estimators.KalmanFilter controllers.Linear
     controllers.LQG controllers.LQI controllers.LQR controllers.lqrd controllers.MLP
-    controllers.MPC controllers.MPCState controllers.online_newton
+    controllers.MPC controllers.online_newton
     controllers.OutputFeedback controllers.regret estimators.run_filter
     controllers.Scheduled estimators.smooth controllers.Standardise
     estimators.UnscentedKalmanFilter d2c Discretized dynamics.OperatingPoint
@@ -127,9 +127,9 @@ LONG = {
     environments.cartpole environments.cartpole_linear studies.reproduce
     studies.train_swing_up lung.explore lung.fit_lungs lung.LearnedLung
     lung.least_error lung.pid_grid lung.ShootingMPC lung.train_controllers
-    lung.write_example planning.Constraints planning.ilqr planning.Plan
+    planning.Constraints planning.ilqr planning.Plan
     plotting.phase_portrait randomise
-    riccati.ContinuousHorizonSolution riccati.dre riccati.hinf_care riccati.hinf_cre
+    riccati.dre riccati.hinf_care riccati.hinf_cre
     riccati.hinf_dre simulate training.analytic training.EvolutionStrategies
     training.expected_cost training.fit training.PPO training.scored_cost
     training.SHAC training.sysid.arx training.sysid.Identified

@@ -53,7 +53,7 @@ CASES = {
     "Constant": Case(lambda: d.Constant([0.1, 0.2])),
     "Sinusoid": Case(lambda: d.Sinusoid([0.1, 0.2], 1.0)),
     "Square": Case(lambda: d.Square([0.1, 0.2], 1.0)),
-    "Window": Case(lambda: d.Window(d.Constant(0.1, size=2), 0.0, 1.0)),
+    "between": Case(lambda: d.Constant(0.1, size=2).between(0.0, 1.0)),
     "FromArray": Case(lambda: d.FromArray(A)),
     "Sequence of a reference": Case(lambda: dlx.references.Sequence(A, 0.1)),
     "UniformState": Case(lambda: dlx.environments.UniformState([0.0, 1.0], [2.0, 3.0])),

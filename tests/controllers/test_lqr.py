@@ -143,9 +143,9 @@ def test_wrong_arguments():
         LQR(dlx.LinearDynamics(A, B, jnp.array([[1.0, 0.0]])), Q, R)
     with user_error(match="must observe their state"):
         LQR(dlx.LinearDynamics(A, B, 2 * jnp.eye(2)), Q, R)
-    with user_error(match=r"LQR: Q must have shape \(2, 2\)"):
+    with user_error(match=r"dare: Q must have shape \(2, 2\)"):
         LQR(dynamics, jnp.eye(3), R)
-    with user_error(match=r"LQR: Q must be a matrix, got shape \(2,\)"):
+    with user_error(match=r"dare: Q must be a matrix, got shape \(2,\)"):
         LQR(dynamics, jnp.ones(2), R)
     with user_error(match="expects an observation of size 2, got size 3"):
         LQR(dynamics, Q, R)(0.0, jnp.zeros(3), None)

@@ -53,14 +53,14 @@ def test_a_plan_starts_from_the_last_one():
     step = jax.jit(lambda t, y, state: mpc(t, y, state))
     x, state = env.initial_state, mpc.init()
     for k in range(3):
-        last = dlx.planning.Start(state.controls, state.states, state.gains)
+        last = state.last
         plan = dlx.planning.ilqr(env.dynamics, env.cost, x, last, bounds=(-2.0, 2.0))
         u, state = step(0.1 * k, x, state)
         assert_close(u, plan.controls[0], atol=1e-9)
         later = jnp.concatenate([plan.controls[1:], plan.controls[-1:]])
-        assert_close(state.controls, later, atol=1e-9)
-        assert_close(state.states[:-1], plan.states[1:], atol=1e-9)
-        assert_close(state.gains[:-1], plan.gains[1:], atol=1e-9)
+        assert_close(state.last.controls, later, atol=1e-9)
+        assert_close(state.last.states[:-1], plan.states[1:], atol=1e-9)
+        assert_close(state.last.gains[:-1], plan.gains[1:], atol=1e-9)
         assert state.iterations <= plan.iterations and state.failures.count == 0
         x = env.dynamics(0.1 * k, x, u)
     # Where the model is right it does what it planned, and finds nothing to change.
@@ -114,15 +114,16 @@ def test_a_plan_that_fails_is_seen():
     step = jax.jit(lambda y, state: mpc(0.0, y, state))
     u, state = step(jnp.array([0.1]), mpc.init())
     assert state.failures.count == 0 and state.result == dlx.RESULTS.successful
-    last = state
+    last = state.last
     u, state = step(jnp.array([9.0]), state)
     assert state.failures.count == 1 and state.result == dlx.RESULTS.diverged
     # The last plan is followed, under its gains; after that the regulator.
     followed = last.controls[0] - last.gains[0] @ (9.0 - last.states[0])
     assert followed < -1
     assert_close(u, [-1.0])
-    assert_close(state.controls, mpc.start.controls[0])
-    assert jnp.all(state.gains == mpc.start.gains[0]) and jnp.all(state.gains > 0)
+    assert_close(state.last.controls, mpc.start.controls[0])
+    assert jnp.all(state.last.gains == mpc.start.gains[0])
+    assert jnp.all(state.last.gains > 0)
     u, state = step(jnp.array([4.0]), state)
     assert state.failures.count == 2 and u == -1
     u, state = step(jnp.array([jnp.nan]), state)
@@ -166,9 +167,9 @@ def first_costs():
     @jax.jit
     def costs(x0, controls):
         state = mpc.init()
-        state = state._replace(controls=state.controls + controls)
-        u, state = mpc(0.0, x0, state)
-        U = jnp.concatenate([u[None], state.controls[:-1]])
+        last = dlx.replace(state.last, {"controls": state.last.controls + controls})
+        u, state = mpc(0.0, x0, state._replace(last=last))
+        U = jnp.concatenate([u[None], state.last.controls[:-1]])
         followed = dlx.controllers.OpenLoop(U)
         run = lambda c: dlx.rollout(short, c, key=KEY, x0=x0).total_cost
         return run(followed), run(lqr), state.failures.count

@@ -415,7 +415,7 @@ def test_projection_holds():
 def test_spectral_filters():
     """Few of them hold all that fades quickly enough."""
     memory, count, margin = 30, 8, 0.2
-    bank = dlx.controllers.online._spectral.spectral_filters(memory, count, margin)
+    bank = dlx.controllers.online._gpc.spectral_filters(memory, count, margin)
     k = np.arange(1, memory + 1)
     H = (1 - margin) ** (k[:, None] + k - 1) / (k[:, None] + k - 1)
     norms = np.linalg.norm(bank, axis=1)

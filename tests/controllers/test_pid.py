@@ -184,9 +184,9 @@ def test_leaky_pid_on_the_original_lung():
 @once
 @pytest.mark.parametrize("kind", [PID, LeakyPID])
 def test_wrong_arguments(kind):
-    with user_error(match="one entry a loop; got kp of size 2, kd of size 3"):
+    with user_error(match="one entry per loop; got kp of size 2, kd of size 3"):
         kind(jnp.ones(2), 0.0, jnp.ones(3), dt=DT)
-    with user_error(match="one entry a loop.*output of size 1"):
+    with user_error(match="one entry per loop.*output of size 1"):
         kind(jnp.ones(2), dt=DT, output=0)
     with user_error(match="kp must be a number or a vector"):
         kind(jnp.ones((2, 2)), dt=DT)

@@ -21,7 +21,7 @@ ALL = {
     "walk": d.RandomWalk(size=2),
     "brownian": d.Brownian(1, dt=0.1, substeps=2),
     "sum": d.Gaussian(0.1, size=2) + d.Constant(1.0, size=2),
-    "window": d.Window(d.Gaussian(0.1, size=2), 1.0, 2.0),
+    "window": d.Gaussian(0.1, size=2).between(1.0, 2.0),
     "shock": d.shock(jnp.array([0.0, 1.0]), start=5.0, duration=0.5),
 }
 
@@ -85,7 +85,7 @@ RANDOM = {
     "walk": lambda n: d.RandomWalk(size=n),
     "brownian": lambda n: d.Brownian(n, dt=0.1),
     "sum": lambda n: d.Gaussian(0.1, size=n) + d.Uniform(-1.0, 1.0, size=n),
-    "window": lambda n: d.Window(d.Gaussian(0.1, size=n), 1.0, 20.0),
+    "window": lambda n: d.Gaussian(0.1, size=n).between(1.0, 20.0),
 }
 
 
@@ -107,7 +107,7 @@ def test_a_short_horizon_is_the_beginning_of_a_long_one(name, size, key):
 def test_recorded_steps():
     recorded = d.FromArray(jnp.ones((5, 1)))
     assert recorded.recorded_steps == 5
-    assert d.Window(recorded, 0.0, 1.0).recorded_steps == 5
+    assert recorded.between(0.0, 1.0).recorded_steps == 5
     longer = d.FromArray(jnp.ones((7, 1)))
     assert (d.Gaussian(0.1, size=1) + longer + recorded).recorded_steps == 5
     assert ALL["gaussian"].recorded_steps is None
@@ -186,8 +186,7 @@ def test_ends_that_meet_are_legal(key):
         (lambda: d.Square(1.0, 1.0, duty=2, size=1), "duty must be between 0 and 1"),
         (lambda: d.shock(1.0, 1.0, duration=-1, size=1), "duration must be at least 0"),
         (lambda: d.shock(1.0, 1.0, "long", size=1), "at least 0, got 'long'"),
-        (lambda: d.Window(3.0, 1.0, 2.0), "disturbance must be an .*got float"),
-        (lambda: d.Window(d.Zero(1), 3.0, 2.0), "stop must be at least 3.0, got 2"),
+        (lambda: d.Zero(1).between(3.0, 2.0), "stop must be at least 3.0, got 2"),
         (lambda: d.Sum(d.Zero(1), 1.0), "every term must be an .*got float"),
         (lambda: d.Brownian(1, dt="x"), "dt must be positive and finite, got 'x'"),
     ],

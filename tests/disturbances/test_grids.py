@@ -38,7 +38,7 @@ def pulse(start, stop, first, last, dt):
     """Whether a window acts from step `first` to before `last`, of those around."""
     near = np.concatenate([c + np.arange(-4, 5) for c in (first, last)])
     k = padded(np.unique(np.clip([0, 1, *near], 0, MOST)), PULSE)
-    window = d.Window(d.Constant(1.0, size=1), start, stop)
+    window = d.Constant(1.0, size=1).between(start, stop)
     w = sequence(window, jnp.asarray(k), jnp.asarray(dt))
     np.testing.assert_array_equal(w, (k >= first) & (k < last))
 
@@ -57,7 +57,7 @@ def test_shocks_on_a_thousand_grids():
     @eqx.filter_jit
     @eqx.filter_vmap
     def acts(k, dt, start, stop):
-        push = d.Window(d.Constant(1.0, size=1), start, stop)
+        push = d.Constant(1.0, size=1).between(start, stop)
         return push.sequence(None, (k * dt).astype(dt.dtype))[:, 0]
 
     w = acts(*(jnp.asarray(a) for a in (k, dt, first * dt, last * dt)))
@@ -124,7 +124,7 @@ def test_a_horizon_that_does_not_begin_at_zero(dt, begin, first):
 
 def test_a_single_time():
     single = eqx.filter_jit(lambda d, t: d.sequence(None, t))
-    push = d.Window(d.Constant(1.0, size=1), 1.0, 2.0)
+    push = d.Constant(1.0, size=1).between(1.0, 2.0)
     wave = d.Square(1.0, period=3.0, size=1)
     for t, inside, high in ((0.0, 0, 1), (1.0, 1, 1), (1.9, 1, -1), (2.0, 0, -1)):
         times = jnp.array([t])
@@ -142,12 +142,12 @@ def test_every_step_of_a_long_horizon():
 def test_more_steps_than_single_precision_tells_apart():
     push = d.shock(1.0, start=1.0, duration=1.0, size=1)
     wave = d.Square(1.0, period=1.0, size=1)
-    for name, disturbance in (("Window", push), ("Square", wave)):
+    for name, disturbance in (("between", push), ("Square", wave)):
         with user_error(match=f"{name}: the horizon has 4194305 steps.*JAX_ENABLE_X64"):
             sequence(disturbance, jnp.arange(MOST + 1), jnp.asarray(0.01))
         late = 1e6 + 0.01 * jnp.arange(9)
         with user_error(
-            match=f"{name}: times in float32 do not tell steps of .* apart"
+            match=f"{name}: times in float32 are too coarse for steps of .*"
         ):
             disturbance.sequence(None, late)
         # In a compiled program times are not known.

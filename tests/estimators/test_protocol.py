@@ -39,6 +39,21 @@ def test_a_window_in_a_closed_loop(key):
         assert_close(run.controls[k], -K @ jnp.mean(y[k : k + 3], axis=0), rtol=1e-5)
 
 
+class Doubtful(Window):
+    def status(self, state):
+        _, count = state
+        return dlx.RESULTS.where(
+            count == 2, dlx.RESULTS.diverged, dlx.RESULTS.successful
+        )
+
+
+def test_an_estimate_that_fails_is_an_incident(key):
+    controller = dlx.controllers.OutputFeedback(dlx.controllers.Zero(1), Doubtful())
+    run = dlx.rollout(dlx.make("pendulum"), controller, key=key, horizon=4)
+    # The prediction of step 1, and the update of step 2.
+    assert run.incidents["failed_estimate"].tolist() == [False, True, True, False]
+
+
 def test_the_default_status(key):
     window = Window()
     state = window.update(0.0, jnp.ones(2), window.init())

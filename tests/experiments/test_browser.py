@@ -9,6 +9,7 @@ import subprocess
 import pytest
 from helpers import once
 
+from delucax import experiments
 from delucax.experiments import experiment
 
 
@@ -32,7 +33,7 @@ def sweep(kind, size, seed):
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
     path = tmp_path_factory.mktemp("report") / "report.html"
-    sweep.run(progress=False).report(path, title="A <sweep>")
+    experiments.report(experiments.run(sweep, progress=False), path, title="A <sweep>")
     return path
 
 

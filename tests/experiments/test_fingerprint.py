@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers import once, thorough
 
+from delucax import experiments
 from delucax.experiments import experiment
 from delucax.experiments._fingerprint import fingerprint
 
@@ -177,7 +178,7 @@ def test_a_method_that_changed_is_run_again(module, tmp_path):
         def cost(policy):
             return policy.act()
 
-        found = cost.run(store=tmp_path / "results.jsonl", progress=False)
+        found = experiments.run(cost, store=tmp_path / "results.jsonl", progress=False)
         return [row["value"] for row in found.rows]
 
     text = BODIES["a plain class"]

@@ -3,6 +3,7 @@
 import pytest
 from helpers import once, user_error
 
+from delucax import experiments
 from delucax.experiments import experiment, Results
 
 
@@ -24,7 +25,7 @@ def square(path, *marks, **options):
             raise ValueError("two")
         return x**2
 
-    return squared.run(store=path, progress=False, **options)
+    return experiments.run(squared, store=path, progress=False, **options)
 
 
 def states(results):
@@ -61,7 +62,7 @@ def test_a_pass_is_judged_again_for_the_seeds_that_are_there(tmp_path):
             return {"y": [x, seed]}
 
         path = tmp_path / "results.jsonl"
-        return same.run(store=path, progress=False, **options)
+        return experiments.run(same, store=path, progress=False, **options)
 
     run()
     more = run(mark.xfail, seeds=3)
@@ -78,7 +79,7 @@ def test_what_is_skipped_has_a_row_and_no_line(tmp_path):
     assert skipped.rows[3]["x"] == 2 and skipped.rows[3]["seed"] == 1
     assert "skipped" in skipped.export("markdown") and skipped.failed == []
     assert states(Results.read(path)) == ["passed"] * 2
-    skipped.report(tmp_path / "page.html")
+    experiments.report(skipped, tmp_path / "page.html")
     assert "1 passed, 1 skipped" in (tmp_path / "page.html").read_text()
 
 
@@ -95,9 +96,18 @@ def test_an_id_that_is_given_twice(values):
         experiment.parametrize("x", values)
 
 
+def test_a_mark_of_a_whole_experiment():
+    @mark.skip("all of it")
+    @experiment.parametrize("x", [1, 2])
+    def never(x):
+        raise AssertionError
+
+    assert states(experiments.run(never, progress=False)) == ["skipped"] * 2
+
+
 def test_an_experiment_that_takes_any_argument():
     @experiment.parametrize("a, b", [(1, 2)])
     def total(**values):
         return sum(values.values())
 
-    assert [row["value"] for row in total.run(progress=False).rows] == [3]
+    assert [row["value"] for row in experiments.run(total, progress=False).rows] == [3]

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import pytest
 from helpers import once
 
-from delucax.experiments import _execute, experiment
-from delucax.experiments._execute import release_programs
+from delucax.experiments import _execute, experiment, run
+from delucax.experiments._execute import clear_programs
 
 
 pytestmark = [
@@ -22,28 +22,28 @@ def test_programs_go_when_they_take_too_much():
     for program in programs:
         program(0.0)
     taken = len(_execute._IN_USE.read_bytes().splitlines())
-    assert not release_programs() and programs[1]._cache_size() == 1
-    assert release_programs(limit=1) and programs[1]._cache_size() == 0
+    assert not clear_programs() and programs[1]._cache_size() == 1
+    assert clear_programs(limit=1) and programs[1]._cache_size() == 0
     assert len(_execute._IN_USE.read_bytes().splitlines()) < taken
     assert programs[1](0.0) == 1.0
 
 
 def test_elsewhere_nothing_is_done(monkeypatch, tmp_path):
     monkeypatch.setattr(_execute, "_IN_USE", tmp_path / "none")
-    assert not release_programs(limit=1)
+    assert not clear_programs(limit=1)
 
 
 def test_a_sweep_forgets_programs_and_keeps_its_results(monkeypatch):
     """Every case that compiled may be the one that leaves too little."""
     seen = []
-    release = lambda: seen.append(release_programs(limit=1))
-    monkeypatch.setattr(_execute, "release_programs", release)
+    release = lambda: seen.append(clear_programs(limit=1))
+    monkeypatch.setattr(_execute, "clear_programs", release)
 
     @experiment.parametrize("n", [2, 3, 4])
     @experiment.seeds(2)
     def total(n, key):
         return jnp.sum(jnp.arange(n)) + 0 * jax.random.normal(key)
 
-    results = total.run(progress=False)
+    results = run(total, progress=False)
     assert [row["value"] for row in results.rows] == [1, 1, 3, 3, 6, 6]
     assert seen and all(seen)

@@ -5,7 +5,7 @@ import subprocess
 import pytest
 from helpers import once
 
-from delucax.experiments._fingerprint import provenance
+from delucax._provenance import provenance
 
 
 pytestmark = once

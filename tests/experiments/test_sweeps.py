@@ -103,7 +103,7 @@ def test_fixtures_of_workers_are_let_go_with_the_run(tmp_path):
         return os.getpid()
 
     for _ in range(2):  # and the next run finds workers again
-        found = look.run(workers=2, progress=False)
+        found = experiments.run(look, workers=2, progress=False)
         gone = {path.name: int(path.read_text()) for path in tmp_path.iterdir()}
         assert gone == {row["place"]: row["value"] for row in found.rows}
         assert os.getpid() not in gone.values()
@@ -117,7 +117,7 @@ def test_what_cannot_be_sent_is_an_error():
         return lock and x
 
     with user_error(match="locked cannot be sent to another process"):
-        locked.run(workers=2, progress=False)
+        experiments.run(locked, workers=2, progress=False)
 
 
 class Tables(HTMLParser):
@@ -184,6 +184,7 @@ SHARDED = """
 import jax, jax.numpy as jnp, numpy as np, equinox as eqx
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 import delucax as dlx
+from delucax import experiments
 from delucax.experiments import experiment
 
 assert jax.device_count() == 8
@@ -208,7 +209,8 @@ for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(eight), strict=True):
 def cost(key):
     return dlx.rollout(env, controller, key=key, horizon=20).total_cost
 
-a, b = cost.run(progress=False), cost.run(progress=False, mesh=mesh)
+a = experiments.run(cost, progress=False)
+b = experiments.run(cost, progress=False, mesh=mesh)
 np.testing.assert_allclose(
     [row["value"] for row in a.rows], [row["value"] for row in b.rows], rtol=1e-5
 )
@@ -308,7 +310,7 @@ if __name__ == "__main__":
             os.kill(victim, signal.SIGKILL)
         threading.Thread(target=kill, daemon=True).start()
         options = dict(workers=2, backend="dask", progress=False)
-        found = work.run(store="dask.jsonl", **options)
+        found = experiments.run(work, store="dask.jsonl", **options)
         assert list(Path().glob("* let go"))
     assert [row["value"] for row in found.rows] == [n * n for n in range(60)]
     lines = open("dask.jsonl").read().count('"kind":"case"')

@@ -36,7 +36,7 @@ def timeless(results):
 
 
 def quiet(made, **options):
-    return made.run(progress=False, **options)
+    return experiments.run(made, progress=False, **options)
 
 
 # What is parametrized
@@ -383,7 +383,7 @@ def test_a_device_is_no_store():
         return n
 
     with user_error(match="no regular file"):
-        one.run(store="/dev/zero", progress=False)
+        experiments.run(one, store="/dev/zero", progress=False)
 
 
 def test_a_full_disk_keeps_what_was_done(tmp_path, monkeypatch):
@@ -508,6 +508,30 @@ WRONG = {
         "scope must be 'case' or 'process'",
     ),
     "no function": (lambda: experiment(3), "function must be a function"),
+    "key and seed": (
+        lambda: quiet(experiment(lambda key, seed: seed)),
+        "the function takes both 'key' and 'seed'",
+    ),
+    "fixtures in a circle": (
+        lambda: quiet(
+            experiment.use(
+                hen=experiment.fixture(lambda egg: egg),
+                egg=experiment.fixture(lambda hen: hen),
+            )(lambda hen: hen)
+        ),
+        "fixtures need each other: hen -> egg -> hen",
+    ),
+    "a fixture by seed": (
+        lambda: quiet(experiment.use(x=experiment.fixture(lambda key: key))(use_x)),
+        "fixture x cannot take 'key': it is made once for all seeds",
+    ),
+    "no expression": (lambda: quiet(stored, select=3), "select must be a string"),
+    "confidence": (
+        lambda: experiments.compare(
+            quiet(stored), by="x", baseline=1.0, metric="y", confidence=95
+        ),
+        "confidence must be between 0 and 1",
+    ),
     "workers": (lambda: quiet(stored, workers=0), "workers"),
     "mesh": (
         lambda: quiet(stored, mesh=jax.make_mesh((jax.device_count(),), ("seeds",))),
@@ -517,7 +541,10 @@ WRONG = {
         lambda: quiet(stored, backend="mpi"),
         "backend must be .loky. or .dask.",
     ),
-    "no experiment": (lambda: experiments.run(), "experiments must be one at least"),
+    "no experiment": (
+        lambda: experiments.run(),
+        "at least one experiment must be given",
+    ),
     "one name": (
         lambda: experiments.run(stored, stored),
         "must have different names",
@@ -591,7 +618,7 @@ def test_interquartile_mean():
     # Of five, the second and fourth count by three quarters.
     expected = (0.75 * 2 + 3 + 0.75 * 4) / 2.5
     assert experiments.interquartile_mean([1, 2, 3, 4, np.inf]) == expected
-    with user_error(match="one at least"):
+    with user_error(match="at least one entry"):
         experiments.interquartile_mean([])
 
 

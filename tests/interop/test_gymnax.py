@@ -1,5 +1,6 @@
 """gymnax's protocol, both ways; gymnax itself is not needed."""
 
+import dataclasses
 import inspect
 import re
 import sys
@@ -35,6 +36,12 @@ def run_example(value):
     namespace = {"__name__": "example"}
     exec(compile(textwrap.dedent(code), value.__name__, "exec"), namespace)
     return namespace
+
+
+def at(env, x, time=0):
+    """An episode that is at `x`."""
+    _, state = env.reset(KEY)
+    return dataclasses.replace(state, state=x, time=jnp.asarray(time))
 
 
 class TestToGymnax:
@@ -81,13 +88,13 @@ class TestToGymnax:
         task = dlx.make("cartpole")
         env = to_gymnax(task, separate_ends=True)
         assert env.num_actions == 2 and env.action_space().n == 2
-        edge = interop.EpisodeState(jnp.array([2.39, 2.0, 0.0, 0.0]), jnp.asarray(7))
+        edge = at(env, jnp.array([2.39, 2.0, 0.0, 0.0]), 7)
         _, state, reward, terminated, truncated, info = env.step(KEY, edge, 1)
         assert terminated and not truncated and info["discount"] == 0
         assert reward == 1 and state.time == 0
         pushed = info["final_observation"]
         assert_close(pushed, task.step(0.0, edge.state, task.actions[1]).state)
-        assert env.is_terminal(interop.EpisodeState(pushed, jnp.asarray(8)))
+        assert env.is_terminal(at(env, pushed, 8))
         assert not env.is_terminal(edge)
         assert to_gymnax(task, discrete=False).num_actions == 1
 
@@ -110,7 +117,7 @@ class TestToGymnax:
         )
         keys = jr.split(KEY, 3)
         params = jax.vmap(draw)(keys)
-        start = interop.EpisodeState(jnp.array([0.5, 0.0]), jnp.asarray(0))
+        start = at(env, jnp.array([0.5, 0.0]))
         one = lambda params: env.step_env(KEY, start, 0.0, params)[1]
         states = jax.jit(jax.vmap(one))(params)
         lengths = params.environment.dynamics.system.length
@@ -138,7 +145,7 @@ class TestToGymnax:
 
     def test_actions_that_are_traced_are_clamped(self):
         env = to_gymnax(dlx.make("cartpole"))
-        state = interop.EpisodeState(jnp.zeros(4), jnp.asarray(0))
+        state = at(env, jnp.zeros(4))
         step = jax.jit(lambda u: env.step_env(KEY, state, u)[1].state)
         pushed = [step(u) for u in (jnp.asarray(9), jnp.asarray(1), jnp.asarray(-3))]
         assert_close(pushed[0], pushed[1])
@@ -152,7 +159,7 @@ class TestToGymnax:
             (bad, 0.0, True),
             (good, np.nan, True),
         ):
-            state = interop.EpisodeState(x, jnp.asarray(0))
+            state = at(env, x)
             assert env.step_env(KEY, state, u)[-1]["failed"] == failed
 
     def test_ends_are_those_of_the_gymnax_that_is_there(self, monkeypatch):
@@ -398,7 +405,7 @@ class TestFromGymnax:
             from_gymnax(Growing(), horizon=3)
 
 
-EXAMPLES = ("GymnaxDynamics", "GymnaxEnv", "GymnaxParams", "EpisodeState", "to_gymnax")
+EXAMPLES = ("GymnaxDynamics", "GymnaxEnv", "GymnaxParams", "to_gymnax")
 
 
 @once

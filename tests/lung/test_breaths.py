@@ -40,23 +40,23 @@ def test_segments_are_inspirations():
     lengths = [(10, 30), (33, 20), (29, 5), (28, 5)]
     u_out = np.concatenate([[1.0] * 3] + [[0.0] * a + [1.0] * b for a, b in lengths])
     pressure = rng.normal(size=u_out.size)
-    found = lung.segment(0 * u_out, u_out, pressure, dt=0.03)
+    found = lung.Breaths.from_recording(0 * u_out, u_out, pressure, dt=0.03)
     assert found.pressure.shape == (2, 29) and np.all(found.u_out == 0)
     assert_close(found.pressure[0], pressure[43:72], rtol=1e-6)
     assert_close(found.pressure[1], pressure[96:125], rtol=1e-6)
     with user_error(match="longest inspiration of 4 has 33"):
-        lung.segment(0 * u_out, u_out, pressure, dt=0.03, length=40)
+        lung.Breaths.from_recording(0 * u_out, u_out, pressure, dt=0.03, length=40)
     with user_error(match="must be vectors of one size"):
-        lung.segment(u_out[1:], u_out, pressure, dt=0.03)
+        lung.Breaths.from_recording(u_out[1:], u_out, pressure, dt=0.03)
 
 
 def test_split(breaths):
-    train, test = lung.split(breaths, 0.25, key=KEY)
+    train, test = breaths.split(0.25, key=KEY)
     assert (len(train), len(test)) == (9, 3)
     rows = jnp.concatenate([train.pressure, test.pressure])
     assert_close(jnp.sort(rows[:, 5]), jnp.sort(breaths.pressure[:, 5]))
     with user_error(match="must leave breaths on both sides"):
-        lung.split(breaths, 0.01, key=KEY)
+        breaths.split(0.01, key=KEY)
 
 
 def test_breaths_of_wrong_shapes():

@@ -9,6 +9,7 @@ from helpers import assert_close, tolerance, user_error
 
 import delucax as dlx
 from delucax import lung
+from delucax._module import stack
 
 
 KEY = jax.random.key(0)
@@ -19,9 +20,10 @@ MODEL = lung.LungModel(lung.SingleCompartment())
 
 
 def trained(**options):
-    forward = lung.stack([lung.stack([lung.FeedForward(WAVEFORM)])])
-    envs = lung.stack([lung.lung_environment(MODEL)])
-    return lung.train_controllers(envs, forward, key=KEY, steps=1, **options)
+    policy = lung.BreathPolicy(WAVEFORM, 0.03, width=1, depth=1, key=KEY)
+    policies = stack([stack([policy])])
+    envs = stack([lung.learned_lung(MODEL, noise=0.2)])
+    return lung.train_controllers(envs, policies, key=KEY, steps=1, **options)
 
 
 WITH_PIPS = {
@@ -46,16 +48,16 @@ def test_wrong_peak_pressures_are_named(name):
 
 
 def test_the_peep_of_every_waveform_counts():
-    high = lung.at_pip(lung.BreathWaveform(peep=12.0), 30.0)
+    high = lung.BreathWaveform.at_pip(lung.BreathWaveform(peep=12.0), 30.0)
     pid = dlx.controllers.LeakyPID(0.5, 1.0, dt=ENV.dt, reference=high)
     with user_error(match="breath_error: pips must be at least peep = 12.0, got .*10"):
         lung.breath_error(ENV, pid, key=KEY, pips=[10.0])
     other = lung.single_compartment(waveform=high)
     with user_error(match="pid_grid: pips must be at least peep = 12.0, got .*10"):
-        lung.pid_grid(lung.stack([ENV, other]), key=KEY, pips=[10.0])
+        lung.pid_grid(stack([ENV, other]), key=KEY, pips=[10.0])
     for pip in (np.nan, "high"):
         with user_error(match="at_pip: pip must be"):
-            lung.at_pip(ENV, pip)
+            lung.BreathWaveform.at_pip(ENV, pip)
 
 
 @pytest.mark.parametrize("task", ["single_compartment", "delay_lung"])
@@ -82,15 +84,15 @@ def test_traced_waveforms_are_taken():
 
 def test_grid_of_a_single_task():
     few = dict(key=KEY, kp=[0.0, 1.0], ki=[1.0], pips=[20.0])
-    one = lung.pid_grid(ENV, **few)
-    both = lung.pid_grid(lung.stack([ENV]), **few)
-    assert one.errors.shape == (1, 2) and one.best().shape == (1, 3)
-    assert_close(one.errors, both.errors)
-    assert one.gains.tolist() == [[0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]
+    gains, errors = lung.pid_grid(ENV, **few)
+    _, stacked = lung.pid_grid(stack([ENV]), **few)
+    assert errors.shape == (1, 2)
+    assert_close(errors, stacked)
+    assert gains.tolist() == [[0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]
 
 
 def test_a_stack_is_not_one_task():
-    envs = lung.stack([ENV, ENV])
+    envs = stack([ENV, ENV])
     for name, call in {
         "breath_error": lambda: lung.breath_error(envs, PID, key=KEY),
         "least_error": lambda: lung.least_error(envs),
@@ -104,12 +106,11 @@ def test_a_stack_is_not_one_task():
     "kind, make",
     {
         "BangBang": lung.BangBang,
-        "FeedForward": lung.FeedForward,
         "BreathCost": lambda w: lung.BreathCost(w, index=0),
         "Breathing": lambda w: lung.Breathing(PID, w),
         "Explorer": lambda w: lung.Explorer(dt=0.03, waveform=w),
         "BreathPolicy": lambda w: lung.BreathPolicy(w, 0.03, key=KEY),
-        "BreathCost: ": lambda w: lung.lung_environment(MODEL, w),
+        "BreathCost: ": lambda w: lung.learned_lung(MODEL, waveform=w),
         "BreathCost:": lambda w: lung.single_compartment(waveform=w),
     }.items(),
 )
@@ -128,22 +129,23 @@ def test_wrong_numbers_are_named():
     with user_error(match="ki must be numbers, got .."):
         lung.pid_grid(ENV, key=KEY, ki=[])
     with user_error(match="noise must be at least 0, got -1"):
-        lung.lung_environment(MODEL, noise=-1.0)
+        lung.learned_lung(MODEL, noise=-1.0)
     with user_error(match="limit must be positive and finite, got -1"):
-        lung.lung_environment(MODEL, limit=-1.0)
+        lung.learned_lung(MODEL, limit=-1.0)
     with user_error(match="sensor_delay must be a whole number of at least 0, got -1"):
         lung.single_compartment(sensor_delay=-1)
     with user_error(match="'sensor_dely'; did you mean 'sensor_delay'"):
         lung.single_compartment(sensor_dely=1)
     for env in (MODEL, ENV):
-        with user_error(match="envs must be tasks of lungs that .*stack made one of"):
+        with user_error(match="envs must be tasks of lungs that are stacked"):
             lung.train_controllers(env, PID, key=KEY)
     with user_error(match="breath_error: controller must be an AbstractController"):
         lung.breath_error(ENV, print, key=KEY)
     with user_error(match="breath_error: env must be a task with a breath waveform"):
         lung.breath_error(dlx.make("pendulum"), PID, key=KEY)
     zeros = np.zeros(40)
+    u_out = np.where(np.arange(40) == 9, np.nan, 0)
     with user_error(match="u_out must be finite"):
-        lung.segment(zeros, np.where(np.arange(40) == 9, np.nan, 0), zeros, dt=0.03)
+        lung.Breaths.from_recording(zeros, u_out, zeros, dt=0.03)
     with user_error(match="dt must be positive"):
         lung.Breaths(zeros[None], zeros[None], zeros[None], dt=-1.0)

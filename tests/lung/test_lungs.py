@@ -12,6 +12,11 @@ from hypothesis import given, settings, strategies as st
 import delucax as dlx
 from delucax import lung
 from delucax.controllers import LeakyPID
+from delucax.studies._original_lungs import (
+    OriginalBalloonLung,
+    OriginalDelayLung,
+    OriginalSingleCompartment,
+)
 
 
 pytestmark = needs_x64
@@ -26,7 +31,7 @@ LUNGS = {
 
 
 def test_total_of_the_original_notebook():
-    dynamics = lung.OriginalBalloonLung()
+    dynamics = OriginalBalloonLung()
     waveform = lung.BreathWaveform(
         keypoints=(0, 1e-8 / 3, 1 / 3, 0.5, 1), levels=(0, 1, 1, 0, 0)
     )
@@ -46,32 +51,32 @@ def test_total_of_the_original_notebook():
 
 ORIGINALS = {
     "balloon": (
-        lung.OriginalBalloonLung(),
+        OriginalBalloonLung(),
         [1.5, 0.0],
         [21.738, 4.137, 2.597, 3.997, 6.760],
     ),
     "balloon, gain 1": (
-        lung.OriginalBalloonLung(gain=1.0),
+        OriginalBalloonLung(gain=1.0),
         [1.5, 0.0],
         [22.449, 4.896, 4.710, 2.885, 6.513],
     ),
     "balloon, rest 6, gain 1": (
-        lung.OriginalBalloonLung(gain=1.0, rest=6.0),
+        OriginalBalloonLung(gain=1.0, rest=6.0),
         [6.0, 0.0],
         [22.497, 17.356, 17.824, 17.358, 18.207],
     ),
     "delay, 25 steps": (
-        lung.OriginalDelayLung(),
+        OriginalDelayLung(),
         [1.5] + [0.0] * 50,
         [22.500, 21.857, 22.029, 21.857, 22.263],
     ),
     "delay, 10 steps": (
-        lung.OriginalDelayLung(delay=10),
+        OriginalDelayLung(delay=10),
         [1.5] + [0.0] * 20,
         [22.500, 14.849, 14.634, 14.821, 15.868],
     ),
     "single compartment": (
-        lung.OriginalSingleCompartment(),
+        OriginalSingleCompartment(),
         [0.2, 0.2 / 50 + 10],
         [12.489, 10.808, 8.267, 9.003, 5.023],
     ),
@@ -86,7 +91,7 @@ def test_scores_of_the_original(name):
 
     @jax.jit
     def score(kind, gains, pip):
-        waveform = lung.at_pip(lung.BreathWaveform(), pip)
+        waveform = lung.BreathWaveform.at_pip(lung.BreathWaveform(), pip)
         pid = LeakyPID(*gains, dt=DT, reference=waveform, bounds=(0, 100))
         bang = lung.BangBang(waveform)
 
@@ -249,7 +254,7 @@ def test_valve_is_closed_and_fully_open_at_its_ends():
 def test_sensor_is_late():
     plant = lung.SingleCompartment()
     dynamics = dlx.Discretized(plant, dt=DT)
-    env = lung.ventilation(dynamics, rest=plant.resting(5.0), sensor_delay=2)
+    env = lung.ventilation(dynamics, resting_state=plant.resting(5.0), sensor_delay=2)
     controls = jnp.array([[30.0, 0.0]] * 6)
     states = dlx.open_loop(env.dynamics, env.initial_state, controls)
     now = states[:, env.cost.index]
@@ -290,9 +295,9 @@ def test_wrong_waveforms_are_named():
     with user_error(match="inspiration must be between 0 and 1"):
         lung.BreathWaveform(inspiration=1.5)
     with user_error(match="there is no BreathWaveform in"):
-        lung.at_pip(lung.SingleCompartment(), 20.0)
+        lung.BreathWaveform.at_pip(lung.SingleCompartment(), 20.0)
     with user_error(match="at_pip: pip must be at least peep"):
-        lung.at_pip(lung.BreathWaveform(), 2.0)
+        lung.BreathWaveform.at_pip(lung.BreathWaveform(), 2.0)
 
 
 def test_delayed_controls_and_sensor():

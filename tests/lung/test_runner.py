@@ -116,7 +116,7 @@ def test_every_breath_begins_alike():
     first, second = run.controls[:34], run.controls[100:]
     assert_close(first[0], second[0], atol=0.1)
     assert np.all(run.controls[34:100, 0] == 0) and np.all(run.controls[34:100, 1] == 1)
-    held = dlx.replace(breathing(0.5), {"hold": 5.0})
+    held = dlx.replace(breathing(0.5), {"expiratory_opening": 5.0})
     run = dlx.rollout(ENV, held, key=KEY, horizon=100)
     times = np.arange(50, 100) * 0.03
     assert_close(run.controls[50:, 0], 5 * (1 - np.exp(5 * (1.5 - times))), atol=1e-3)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from helpers import assert_close, needs_x64, once, thorough, user_error
 
 import delucax as dlx
-from delucax.planning import count_evaluations
-from delucax.planning._problem import model, Problem
+from delucax.planning import count_evaluations, Problem
+from delucax.planning._lq import model
 
 
 T = 30
@@ -88,7 +88,7 @@ def test_modes_and_batches():
 
 @needs_x64
 def test_differences_and_second_order():
-    with user_error(match="finite_difference goes without second_order"):
+    with user_error(match="finite_difference is incompatible with second_order"):
         dlx.planning.ILQR(finite_difference=1e-2, second_order=True)
     with user_error(match="finite_difference must be positive"):
         dlx.planning.ILQR(finite_difference=0.0)

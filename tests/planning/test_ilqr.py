@@ -261,9 +261,9 @@ def test_a_bound_that_is_far_is_not_taken_for_met():
 
 @needs_x64
 @thorough
-def test_the_box_minimum():
+def test_the_solve_box_qp():
     """Of a few controls: the Karush-Kuhn-Tucker conditions."""
-    from delucax.planning._lq import box_minimum
+    from delucax.planning._lq import solve_box_qp
 
     @jax.vmap
     def check(key):
@@ -273,7 +273,7 @@ def test_the_box_minimum():
         g = 3 * jax.random.normal(keys[1], (4,))
         low = -jax.random.uniform(keys[2], (4,))
         high = low + 1.0
-        u, free = box_minimum(H, g, low, high)
+        u, free = solve_box_qp(H, g, low, high)
         slope = g + H @ u
         step = jnp.clip(u - slope, low, high) - u
         return jnp.max(jnp.abs(step)), jnp.max(jnp.abs(jnp.where(free, slope, 0)))

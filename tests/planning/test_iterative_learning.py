@@ -8,8 +8,8 @@ import pytest
 from helpers import assert_close, needs_x64, original_ilqr, thorough, user_error
 
 import delucax as dlx
-from delucax.planning._lq import in_sequence
-from delucax.planning._problem import model, Problem, roll_out
+from delucax.planning._lq import in_sequence, model
+from delucax.planning._problem import Problem, roll_out
 
 
 pytestmark = needs_x64

@@ -159,7 +159,7 @@ def test_the_operating_point(monkeypatch):
     bare = dlx.Discretized(dlx.system(no_point, states=2, controls=1), dt=0.1)
     weights = [1.0, 1.0], [1.0]
     target = dict(state_target=[0.0, 0.0], control_target=[0.5])
-    default = dlx.planning.default_start
+    default = dlx.planning.Start.default
     # Dynamics that name a point; a cost that does; neither, but for zero; and neither.
     start = default(named, dlx.costs.PendulumCost(), 5)
     assert start.controls.shape == (2, 5, 1) and jnp.all(start.gains[0] != 0)
@@ -204,7 +204,7 @@ def test_no_regulator_where_the_origin_is_singular():
         dlx.system(lambda t, x, u, w: x / jnp.abs(x) + u, states=1, controls=1), dt=0.1
     )
     cost = dlx.costs.Function(lambda t, x, u: x @ x + u @ u)
-    start = dlx.planning.default_start(dynamics, cost, 5)
+    start = dlx.planning.Start.default(dynamics, cost, 5)
     assert jnp.all(start.gains == 0) and jnp.all(start.controls == 0)
 
 
@@ -226,7 +226,7 @@ def test_without_a_regulator_the_control_is_held():
         (UNSTABLE, concave),
         (rough, CHEAP),
     ):
-        start = dlx.planning.default_start(dynamics, charged, 3)
+        start = dlx.planning.Start.default(dynamics, charged, 3)
         assert jnp.all(start.gains == 0) and jnp.all(jnp.isfinite(start.controls))
 
 
@@ -272,8 +272,8 @@ def test_bad_starts():
     with user_error(match="states go with an array of controls or a number of steps"):
         dlx.planning.ILQR(states=jnp.zeros((9, 1)))(UNSTABLE, CHEAP, x0, law(1.0))
     with user_error(match="horizon must be a whole number"):
-        dlx.planning.default_start(UNSTABLE, CHEAP, 2.0)
-    with user_error(match="default_start: dynamics must be an AbstractDynamics"):
-        dlx.planning.default_start(3, CHEAP, 5)
-    with user_error(match="default_start: cost must be an AbstractCost"):
-        dlx.planning.default_start(UNSTABLE, 3, 5)
+        dlx.planning.Start.default(UNSTABLE, CHEAP, 2.0)
+    with user_error(match="Start.default: dynamics must be an AbstractDynamics"):
+        dlx.planning.Start.default(3, CHEAP, 5)
+    with user_error(match="Start.default: cost must be an AbstractCost"):
+        dlx.planning.Start.default(UNSTABLE, 3, 5)

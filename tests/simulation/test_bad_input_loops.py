@@ -79,6 +79,15 @@ def test_continuous_feedback_without_its_state():
         simulate(Slip("alone"), hold=None)
 
 
+def test_one_solve_refuses_to_teach_by_costs():
+    class Bandit(dlx.controllers.Zero):
+        learns_from_cost = True
+
+    pendulum, x0 = dlx.systems.Pendulum(), jnp.zeros(2)
+    with user_error(match="simulate: Bandit learns from the cost.*rollout"):
+        dlx.simulate(pendulum, Bandit(1), 0.0, 1.0, x0, dt=0.1)
+
+
 @pytest.mark.parametrize("run", [rollout, simulate])
 def test_states_that_are_well_made(run):
     assert run(Rise()).states.shape == (4, 2)

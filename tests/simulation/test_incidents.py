@@ -235,6 +235,11 @@ def test_one_solve_counts_too(key):
     assert 0 < fast.sum() < 20
     np.testing.assert_array_equal(run.incidents["failed_plan"], fast)
     assert run.result == dlx.RESULTS.plan_failed and not run.failed
+    ts = jnp.array([0.0, 0.5, 0.95])
+    some = dlx.simulate(
+        pendulum, Cautious("failed_plan"), 0.0, 1.0, UPRIGHT, ts=ts, **options
+    )
+    assert some.result == dlx.RESULTS.plan_failed and not some.failed
     slope = jax.grad(
         lambda x0: dlx.simulate(
             pendulum, Cautious("failed_plan"), 0.0, 1.0, x0, **options

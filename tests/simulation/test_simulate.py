@@ -408,15 +408,15 @@ U, X = jnp.zeros((4, 1)), jnp.zeros(2)
         ({"solver": diffrax.ReversibleHeun()}, "does not fit fixed steps"),
         (
             {"solver": dlx.dynamics.RK4(), "stepsize_controller": PID},
-            "RK4 estimates no error",
+            "RK4 has no error estimate",
         ),
         (
             {"solver": diffrax.Euler(), "stepsize_controller": PID},
-            "Euler estimates no error",
+            "Euler has no error estimate",
         ),
         (
             {"solver": diffrax.LeapfrogMidpoint(), "stepsize_controller": PID},
-            "LeapfrogMidpoint estimates no error",
+            "LeapfrogMidpoint has no error estimate",
         ),
         (
             {"stepsize_controller": diffrax.ConstantStepSize()},
@@ -443,7 +443,7 @@ U, X = jnp.zeros((4, 1)), jnp.zeros(2)
                 "adjoint": diffrax.BacksolveAdjoint(solver=diffrax.Euler()),
                 "stepsize_controller": PID,
             },
-            "BacksolveAdjoint: solver Euler estimates no error",
+            "BacksolveAdjoint: solver Euler has no error estimate",
         ),
         (
             {

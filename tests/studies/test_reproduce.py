@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from delucax import studies
 from delucax.studies.paper import (
-    _policy_gradient,
+    _gradients,
     _reproduce,
     _wall_clock,
 )
@@ -80,11 +80,11 @@ def test_unknown_studies_are_named(tmp_path):
 
 
 def test_the_paper_is_judged_at_its_own_rate():
-    claim = _policy_gradient.descent_claim(182, 108)
+    claim = _gradients.descent_claim(182, 108)
     assert not claim.holds
     assert claim.measured == "182 rollouts at the paper's rate 0.01 (108 at 0.02)"
-    assert _policy_gradient.descent_claim(120, None).holds
-    assert not _policy_gradient.descent_claim(None, 90).holds
+    assert _gradients.descent_claim(120, None).holds
+    assert not _gradients.descent_claim(None, 90).holds
 
 
 def test_a_load_that_comes_and_goes_meets_all_simulators(monkeypatch):
@@ -101,6 +101,6 @@ def test_a_load_that_comes_and_goes_meets_all_simulators(monkeypatch):
 
     turns = 0
     monkeypatch.setattr(_wall_clock.time, "perf_counter", lambda: now)
-    seconds = _wall_clock._take_turns([taking(0.01), taking(1.0)], 6)
+    seconds = _wall_clock.take_turns([taking(0.01), taking(1.0)], 6)
     assert seconds.shape == (6, 2) and seconds.std(axis=0).min() > 0
     np.testing.assert_allclose(seconds[:, 1] / seconds[:, 0], 100)

@@ -72,7 +72,7 @@ def tableau_of(solver: diffrax.AbstractSolver) -> diffrax.ButcherTableau | None:
     """The tableau of an explicit Runge-Kutta solver; `None` for any other."""
     if type(solver) is diffrax.Euler:
         return _EULER
-    # A wrapped solver passes for the one inside, but has no tableau of its own.
+    # `isinstance` is true of wrapped solvers, too, but they have no tableau.
     is_wrapped = isinstance(solver, diffrax.AbstractWrappedSolver)
     if is_wrapped or not isinstance(solver, diffrax.AbstractERK):
         return None
@@ -88,6 +88,8 @@ def runge_kutta_step(
     h: RealScalar,
 ) -> Array:
     """One explicit step of size `h` of `dx/dt = field(t, x)`."""
+    # Stages that the solution does not use belong to the error estimate, or are the
+    # slope at the end, with which the next step would begin.
     used = max(np.flatnonzero(tableau.b_sol)) + 1
     rows = [(), *(tuple(map(float, row)) for row in tableau.a_lower)][:used]
     nodes = [0.0, *map(float, tableau.c)][:used]
@@ -97,7 +99,9 @@ def runge_kutta_step(
     slopes: list[Sequence[Array]] = []
     for row, node in zip(rows, nodes, strict=True):
         stage = join_state(_combine(base, row, slopes, h), size)
+        # A time without a sum is exact, and known to be the start of the interval.
         slope = field(t + node * h if node else t, stage)
+        # Every component of the next stage needs the whole slope: it is stored once.
         slopes.append(fence(*slope) if size <= COMPONENTS_UP_TO else (slope,))
     return join_state(_combine(base, weights, slopes, h), size).astype(x.dtype)
 
@@ -109,6 +113,7 @@ def _combine(base, weights, slopes, h):
         return base
     combined = []
     for j, start in enumerate(base):
+        # The sum before the product with h, so that one rounding of h is enough.
         total = terms[0][0] * terms[0][1][j]
         for a, k in terms[1:]:
             total = total + a * k[j]

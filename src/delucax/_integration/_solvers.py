@@ -46,7 +46,7 @@ def check_method(
     *,
     with_diffusion: bool = False,
 ) -> None:
-    """Raise unless `solver` takes the steps that the other arguments ask for."""
+    """Raise if the solver is incompatible with the fixed or adaptive steps."""
     check_kind(solver, "solver", where)
     if stepsize_controller is not None:
         check_kind(stepsize_controller, "stepsize_controller", where)
@@ -74,14 +74,14 @@ def check_method(
 
 
 def check_adaptive(solver: diffrax.AbstractSolver, where: str) -> None:
-    """Raise unless a step-size controller can steer `solver`."""
+    """Raise unless `solver` has an error estimate for a step-size controller."""
     name = type(solver).__name__
     tableau = tableau_of(solver)
     no_error = tableau is not None and not tableau.b_error.any()
     if no_error or not isinstance(solver, diffrax.AbstractAdaptiveSolver):
         raise ValueError(
-            f"{where}: solver {name} estimates no error, so a stepsize_controller "
-            "cannot steer it; use diffrax.Tsit5(), or wrap it: "
+            f"{where}: solver {name} has no error estimate and cannot be used with a "
+            "stepsize_controller; use diffrax.Tsit5(), or wrap it: "
             f"diffrax.HalfSolver({name}())."
         )
     if isinstance(solver, diffrax.AbstractImplicitSolver):
@@ -97,20 +97,21 @@ def _check_implicit(solver: diffrax.AbstractSolver, where: str) -> None:
         )
     if isinstance(solver, diffrax.AbstractWrappedSolver):
         raise ValueError(
-            f"{where}: solver {type(solver).__name__} hides the root finder of the "
-            "implicit solver that it wraps; use that one by itself."
+            f"{where}: solver {type(solver).__name__} wraps an implicit solver, whose "
+            "root finder cannot be reached; pass the inner solver itself."
         )
 
 
 def solve_result(solution: diffrax.Solution, controller: Any, dtype: Any) -> Result:
     """The result of a solve with a step-size controller, or without one (`None`).
 
-    Where the steps ran out, and the tolerance is finer than rounding of the state, the
-    tolerance is to blame.
+    If the maximal number of steps is reached and `rtol` is below the precision of the
+    state, it is `beyond_precision`.
     """
     result = promote(solution.result)
     if controller is None:
         return result
+    # A tolerance that is a Python number is known now, and most are far from rounding.
     is_fine = controller.rtol < 4 * float(jnp.finfo(dtype).eps)
     if is_fine is False:
         return result
@@ -122,50 +123,42 @@ def _forwarded(name: str) -> Any:
     return property(lambda self: getattr(self.solver, name))
 
 
-class AbstractTransparentSolver(diffrax.AbstractWrappedSolver):
-    """A solver around another, with the attributes of that one."""
+class AbstractForwardingSolver(diffrax.AbstractWrappedSolver):
+    """A wrapper that forwards attributes and methods to the solver inside."""
 
     solver: eqx.AbstractVar[diffrax.AbstractSolver]
 
     term_structure = _forwarded("term_structure")
     term_compatible_contr_kwargs = _forwarded("term_compatible_contr_kwargs")
     interpolation_cls = _forwarded("interpolation_cls")
-    # Diffrax looks for these on what passes for an implicit or Runge-Kutta solver.
+    # Diffrax reads these after instance checks that a wrapper satisfies, too.
     root_finder = _forwarded("root_finder")
     root_find_max_steps = _forwarded("root_find_max_steps")
     scan_kind = _forwarded("scan_kind")
-
-    def order(self, terms):
-        return self.solver.order(terms)
-
-    def strong_order(self, terms):
-        return self.solver.strong_order(terms)
-
-    def error_order(self, terms):
-        return self.solver.error_order(terms)
-
-    def init(self, terms, t0, t1, y0, args):
-        return self.solver.init(terms, t0, t1, y0, args)
-
-    def func(self, terms, t0, y0, args):
-        return self.solver.func(terms, t0, y0, args)
+    order = _forwarded("order")
+    strong_order = _forwarded("strong_order")
+    error_order = _forwarded("error_order")
+    init = _forwarded("init")
+    func = _forwarded("func")
 
 
 class _Chord(diffrax.VeryChord):
     """Diffrax's chord method, which iterates until it has converged.
 
-    Diffrax's own gives up after two iterations, for a step-size controller to take a
-    shorter step. Fixed steps have none, so this one goes on while it contracts.
+    Diffrax's own stops after two iterations, for a step-size controller to take a
+    shorter step. Fixed steps have none, so this one iterates until convergence.
     """
 
     atol: Any  # one for each entry, where Diffrax has a number for all
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
+        # Changes that shrink by `rate` are a geometric series, whose rest is the
+        # distance to the root (Hairer and Wanner, 1996, IV.8).
         size = state.diffsize  # of the last change, in units of the tolerance
         rate = size / state.diffsize_prev
-        left = size * rate / (1 - rate)  # the distance to the root at this rate
-        enough = state.step >= 2
+        left = size * rate / (1 - rate)
+        enough = state.step >= 2  # two changes, or there is no rate
         # Close to the root rounding takes over, and the rate says nothing.
         converged = enough & ((size < 0.1) | (rate < 1) & (left < 0.01))
         diverged = enough & ~converged & (~jnp.isfinite(size) | (rate > 2))
@@ -177,7 +170,7 @@ class _Chord(diffrax.VeryChord):
         return failed | converged | diverged, result
 
 
-class _FixedStep(AbstractTransparentSolver):
+class _FixedStep(AbstractForwardingSolver):
     """An implicit solver that needs no step-size controller for its tolerances.
 
     What is solved for is a slope, or its product with the step. Where the field is
@@ -192,24 +185,24 @@ class _FixedStep(AbstractTransparentSolver):
         return self._with_tolerances(1e-3, 1.0).root_finder
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        # Some four digits above rounding, far below the error of any sensible step.
         is_double = y0.dtype == jnp.float64
         rtol, atol = (1e-10, 1e-12) if is_double else (1e-5, 1e-6)
+        # A tolerance decides how many iterations there are, and has no derivative.
         scale = lax.stop_gradient(atol + rtol * jnp.abs(y0))
         solver: Any = self.solver
-        is_runge_kutta = isinstance(self.solver, diffrax.AbstractDIRK)
-        if is_runge_kutta and solver.tableau.fsal:
-            # Then Diffrax solves for the slope.
+        if isinstance(self.solver, diffrax.AbstractDIRK) and solver.tableau.fsal:
+            # Then Diffrax solves for the slope, and else for its product with the step.
             scale = scale / lax.stop_gradient(t1 - t0)
         solver = self._with_tolerances(rtol, scale)
         return solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
 
     def _with_tolerances(self, rtol: float, atol: Any) -> Any:
         finder = self.solver.root_finder  # pyright: ignore
-        if isinstance(finder, diffrax.VeryChord | optx.Chord):
-            finder = _Chord(
-                rtol, atol, optx.rms_norm, linear_solver=finder.linear_solver
-            )
+        # Only tolerances that the user left to a step-size controller are set.
         values = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
+        if isinstance(finder, diffrax.VeryChord | optx.Chord):
+            finder = _Chord(**values, linear_solver=finder.linear_solver)
         for name in _unset(finder):
             get = operator.attrgetter(name)
             finder = eqx.tree_at(get, finder, values[name])
@@ -217,8 +210,8 @@ class _FixedStep(AbstractTransparentSolver):
 
 
 _Unset = type(diffrax.with_stepsize_controller_tols(optx.Newton)().rtol)
-"""What Diffrax puts in the place of a tolerance that a step-size controller sets. The
-class itself has no public name."""
+"""Diffrax's placeholder for a tolerance that a step-size controller sets. The class has
+no public name."""
 
 
 def _unset(finder: optx.AbstractRootFinder) -> list[str]:
@@ -227,17 +220,19 @@ def _unset(finder: optx.AbstractRootFinder) -> list[str]:
     return [name for name in names if isinstance(getattr(finder, name), _Unset)]
 
 
-def for_fixed_steps(solver: Any) -> Any:
+def as_fixed_step_solver(solver: Any) -> Any:
     """An implicit solver that works without a step-size controller and outside of
-    `diffeqsolve`, and can be differentiated both ways there.
+    `diffeqsolve`, and there supports forward- and reverse-mode differentiation.
     """
+    # Diffrax's default loop over the stages is one that `diffeqsolve` sets for itself;
+    # this one has a reverse mode outside of it, too.
     if isinstance(solver, diffrax.AbstractDIRK) and solver.scan_kind is None:
         is_none = lambda leaf: leaf is None
         solver = eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=is_none)
     return _FixedStep(solver) if _unset(solver.root_finder) else solver
 
 
-def raise_on_failure(adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractAdjoint:
+def throwing_adjoint(adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractAdjoint:
     """An adjoint that raises where a solve of its own fails.
 
     The backward solve of `BacksolveAdjoint` takes over `throw` from the forward one,

@@ -1,10 +1,13 @@
-"""Programs that work on the components of small vectors, not on the vectors.
+"""Small vectors as scalars: a transformation of jaxprs, for speed on CPU.
 
 A user writes `x[0]` and `jnp.stack([...])`. Left as they are, their gradient pads each
 component back to a vector and adds the vectors up, which XLA does not undo, and which
 costs a batch more than the physics. Here a function is traced, and replayed with every
 small vector held as its components: taking an entry of a stack is then no operation at
 all, forward or backward. The numbers are the same.
+
+A loop carries the state in the same way: each component of a batch is then a vector of
+its own that stays in registers.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,12 +17,16 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 from jax.extend.core import Literal
+from jaxtyping import Array
 
-from ._fence import fence
+from ._batches import fence
 
 
-LARGEST = 16
+COMPONENTS_UP_TO = 16
 """Vectors with more entries are left whole, to keep programs short."""
+
+_STACKED_FIRST_UP_TO = 6
+"""Trajectories of more components are extended before they are stacked."""
 
 _ELEMENTWISE = frozenset(
     "abs add and atan2 ceil clamp convert_element_type cos copy cosh div eq erf exp"
@@ -69,6 +76,7 @@ def _replay(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]
 def _apply(equation: Any, values: list[Any]) -> Sequence[Any]:
     """The outputs of one equation."""
     primitive, params = equation.primitive, equation.params
+    # An inner `jit` would take and return whole vectors, so it is replayed as well.
     if primitive.name in ("jit", "pjit"):
         inner = params["jaxpr"]
         return _replay(inner.jaxpr, inner.consts, values)
@@ -99,11 +107,17 @@ def _on_components(
     if name in ("broadcast_in_dim", "reshape") and not others and shape == (1,):
         if not split[0] and jnp.shape(first) == ():
             return [_Components([first])]
-    if name == "concatenate" and size is not None and size <= LARGEST and all(split):
+    if (
+        name == "concatenate"
+        and size is not None
+        and size <= COMPONENTS_UP_TO
+        and all(split)
+    ):
         return [_Components([entry for v in values for entry in v.entries])]
-    if name == "stack" and shape == (len(values),) and len(values) <= LARGEST:
+    if name == "stack" and shape == (len(values),) and len(values) <= COMPONENTS_UP_TO:
         return [_Components(values)]
     if name in _ELEMENTWISE and size is not None and any(split):
+        # Elementwise primitives have no axes in `params`, so an entry takes the same.
         columns = [_entries(value, size) for value in values]
         if any(column is None for column in columns):
             return None
@@ -119,6 +133,7 @@ def _on_components(
         ends = params["start_indices"] + params["limit_indices"]
         taken = first.entries[slice(*ends, *(params["strides"] or ()))]
         return [_Components(taken)] if taken else None
+    # `x[-1]` and the like: the start is a number, which JAX clamps to the vector.
     if name == "dynamic_slice" and not isinstance(others[0], Tracer):
         (count,) = params["slice_sizes"]
         start = min(max(int(others[0]), 0), len(first.entries) - count)
@@ -137,3 +152,37 @@ def _entries(value: Any, size: int) -> Sequence[Any] | None:
 
 def _whole(value: Any) -> Any:
     return jnp.stack(value.entries) if isinstance(value, _Components) else value
+
+
+def split_state(x: Array) -> tuple[Array, ...]:
+    """A small state as its components, which is how loops carry it."""
+    return tuple(x) if x.shape[0] <= COMPONENTS_UP_TO else (x,)
+
+
+def join_state(parts: tuple[Array, ...], size: int) -> Array:
+    """The inverse of `split_state`."""
+    return jnp.stack(parts) if size <= COMPONENTS_UP_TO else parts[0]
+
+
+def stack_steps(
+    parts: tuple[Array, ...], size: int, last: tuple[Array, ...] = ()
+) -> Array:
+    """Vectors over time, shape `(T, size)`, from the components of each step.
+
+    `last` is put behind them: of a few components when they are one array, of more
+    one by one, which is what a batch on CPU transposes fastest. (And a loop that keeps
+    the state before each step, not the one after it, keeps XLA from computing the
+    step twice, once to carry it and once to keep it.)
+    """
+    if size <= _STACKED_FIRST_UP_TO:
+        # A reshape of one component is free, where a stack would copy it.
+        steps = parts[0][:, None] if size == 1 else jnp.stack(parts, axis=1)
+        if last:
+            steps = jnp.concatenate([steps, jnp.stack(last)[None].astype(steps.dtype)])
+        return steps
+    if last:
+        parts = tuple(
+            jnp.concatenate([a, b[None].astype(a.dtype)])
+            for a, b in zip(parts, last, strict=True)
+        )
+    return jnp.stack(parts, axis=1) if size <= COMPONENTS_UP_TO else parts[0]

@@ -1,17 +1,21 @@
-"""Derivatives of programs that may have none in one of the two modes."""
+"""Derivatives in the mode that solvers support, and NaN tangents of failed solves."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
-from jax.interpreters import partial_eval
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir, partial_eval
+from jaxtyping import Array
 
 
 def first_possible(*derivatives: Callable[..., Any]) -> Callable[..., Any]:
-    """The first of some ways to take a derivative that the solvers inside have.
+    """Try several ways to differentiate; use the first that the solvers inside support.
 
-    Some have none in reverse, others none forward. If no way is possible the error is
-    that of the first, and so is one that has nothing to do with derivatives.
+    Some solvers have no reverse mode, others no forward mode. If all ways fail, the
+    error of the first is raised, and so is any error of the program itself.
     """
 
     def evaluate(*args):
@@ -36,6 +40,46 @@ def jacobian(
 
 def is_constant(f: Callable[..., Any], *args: Any) -> bool:
     """Whether the array that `f` returns depends on none of its arguments."""
+    # Dead code elimination that keeps the output says which inputs it needs.
     traced = jax.make_jaxpr(f)(*args)
     _, used = partial_eval.dce_jaxpr(traced.jaxpr, [True])
     return not any(used)
+
+
+_nan_tangent = Primitive("nan_tangent")
+
+
+def nan_tangent(tangent: Array, ok: Array) -> Array:
+    """The tangent where `ok` holds; elsewhere NaN, unless the tangent is zero.
+
+    The same in reverse: what does not depend on a failed solve (a masked lane of a
+    batch) keeps its gradient, and the gradient of what does is NaN. A product with NaN
+    would not do, because that of NaN and zero is NaN.
+    """
+    return _nan_tangent.bind(tangent, jnp.broadcast_to(ok, tangent.shape))
+
+
+def _value(tangent, ok):
+    return jnp.where(ok | (tangent == 0), tangent, jnp.nan)
+
+
+def _batch(values, dims):
+    # Elementwise, so a batch is the same on arrays with the batch in front.
+    size = next(v.shape[d] for v, d in zip(values, dims, strict=True) if d is not None)
+    at_front = functools.partial(batching.bdim_at_front, size=size)
+    return _nan_tangent.bind(*map(at_front, values, dims)), 0
+
+
+def _transpose(cotangent, _, ok):
+    # The map is diagonal, and so its own transpose.
+    is_zero = type(cotangent) is ad.Zero
+    return cotangent if is_zero else _nan_tangent.bind(cotangent, ok), None
+
+
+_nan_tangent.def_impl(_value)
+_nan_tangent.def_abstract_eval(lambda tangent, ok: tangent)
+batching.primitive_batchers[_nan_tangent] = _batch
+# Linear in the tangent, so that its own derivative is the same map.
+ad.defjvp(_nan_tangent, lambda change, _, ok: _nan_tangent.bind(change, ok), None)
+ad.primitive_transposes[_nan_tangent] = _transpose
+mlir.register_lowering(_nan_tangent, mlir.lower_fun(_value, multiple_results=False))

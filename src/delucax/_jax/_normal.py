@@ -1,4 +1,4 @@
-"""Normal noise at the price of the random bits.
+"""Fast standard normal numbers on CPU (Box and Muller).
 
 `jax.random.normal` inverts the error function, which on CPU costs a simulated step more
 than its random bits do. The transform of Box and Muller (1958) makes two normal numbers
@@ -17,11 +17,11 @@ from jax.extend.random import threefry_2x32
 from jaxtyping import Array
 
 from .._typing import PRNGKey
-from ..math._trig import cos, sin
+from ..math._angles import cos, sin
 
 
 _PAIRS = 16
-"""Of numbers that are made together: enough to fill the vector registers."""
+"""Pairs of numbers made together: enough to fill the vector registers."""
 
 
 def normal(key: PRNGKey, shape: tuple[int, ...], dtype: Any) -> Array:
@@ -37,7 +37,10 @@ def normal(key: PRNGKey, shape: tuple[int, ...], dtype: Any) -> Array:
     first, second = _pairs(key, -(-size // (2 * _PAIRS)))
     # The middles of 2^24 equal parts of (0, 1): never 0, whose logarithm is infinite.
     unit = (first >> 8).astype(jnp.float32) * np.float32(2.0**-24)
+    # -2 log(u) is exponential with mean 2: the squared length of two normal numbers.
+    # The least u, 2^-25, gives the 5.9 deviations.
     radius = jnp.sqrt(-2 * jnp.log(unit + np.float32(2.0**-25)))
+    # The signed words over 2^31 are in [-1, 1), the angle so in [-pi, pi).
     angle = second.astype(jnp.int32).astype(jnp.float32) * np.float32(np.pi / 2**31)
     both = jnp.concatenate([radius * cos(angle), radius * sin(angle)], axis=1)
     return both.reshape(-1)[:size].reshape(shape)
@@ -47,6 +50,8 @@ def _pairs(key: PRNGKey, blocks: int) -> tuple[Array, Array]:
     """Random words in pairs, shapes `(blocks, _PAIRS)`: both that Threefry makes of a
     number of its own for each pair, where `jax.random.bits` keeps the sum of the two.
     """
+    # A counter of its own for each pair makes the prefix independent of the length; the
+    # words of `jax.random.bits` depend on how many there are.
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     shape = (blocks, _PAIRS)
     if typed and str(jr.key_impl(key)) not in ("threefry2x32", "fry"):

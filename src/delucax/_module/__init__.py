@@ -1,13 +1,15 @@
-"""What the fields of a module are: their kinds, paths, names and files."""
+"""The fields of modules: their kinds, paths, names and files; stacks of modules."""
 
 from ._fields import (
     AbstractConstraint as AbstractConstraint,
     as_float_array as as_float_array,
     as_module as as_module,
     bounded as bounded,
+    check_function as check_function,
     check_parameters as check_parameters,
     function_field as function_field,
     marked_leaves as marked_leaves,
+    mlp as mlp,
     parameter as parameter,
     parts_of as parts_of,
     path_string as path_string,
@@ -22,3 +24,9 @@ from ._paths import (
     replace as replace,
 )
 from ._serialise import load as load, save as save
+from ._stack import (
+    count_of as count_of,
+    stack as stack,
+    taken as taken,
+    unstack as unstack,
+)

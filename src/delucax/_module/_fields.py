@@ -1,10 +1,10 @@
-"""What a field of a module is: a constant of the physics, or a trainable weight."""
+"""Kinds of fields: constants of the physics, trainable weights, functions."""
 
 import abc
 import dataclasses
 import typing
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -22,15 +22,15 @@ _FUNCTION = "delucax_function"
 
 
 class AbstractConstraint(eqx.Module):
-    """A set of legal values, and a smooth map onto it from all real numbers.
+    """A set of valid values, with a smooth bijection to it from the real numbers.
 
-    Training moves the unconstrained value and the model sees the legal one, so that no
-    step of any optimiser can leave the set.
+    Training moves the unconstrained value and the model gets the constrained one, so
+    that no step of any optimiser can leave the set.
     """
 
     @abc.abstractmethod
     def constrain(self, z: Array) -> Array:
-        """The legal value of an unconstrained `z`."""
+        """The valid value of an unconstrained `z`."""
 
     @abc.abstractmethod
     def unconstrain(self, value: Array) -> Array:
@@ -38,7 +38,7 @@ class AbstractConstraint(eqx.Module):
 
     @abc.abstractmethod
     def holds(self, value: Array) -> Array:
-        """Whether each entry of `value` is legal."""
+        """Whether each entry of `value` is valid."""
 
 
 class _Positive(AbstractConstraint):
@@ -54,7 +54,7 @@ class _Positive(AbstractConstraint):
     """
 
     def constrain(self, z: Array) -> Array:
-        return _inside(jnp.exp(z), 0.0, np.inf)
+        return _strictly_inside(jnp.exp(z), 0.0, np.inf)
 
     def unconstrain(self, value: Array) -> Array:
         return jnp.log(value)
@@ -66,12 +66,14 @@ class _Positive(AbstractConstraint):
         return "positive"
 
 
-def _inside(value: Array, low: float, high: float) -> Array:
+def _strictly_inside(value: Array, low: float, high: float) -> Array:
     """`value` off the ends of an open interval, which rounding may put it on."""
+    # exp and the sigmoid round to 0 and to the ends far out, where the logarithm of
+    # `unconstrain` is infinite and the gradient gone for good.
     dtype = jnp.result_type(value)
     tiny, ends = jnp.finfo(dtype).tiny, np.asarray([low, high], dtype)
     inner = np.nextafter(ends, ends[::-1])
-    # Numbers below `tiny` are flushed to zero.
+    # XLA flushes subnormal numbers to zero.
     inner = np.where(np.abs(inner) < tiny, np.copysign(tiny, inner), inner)
     return jnp.clip(value, *map(float, inner))
 
@@ -99,20 +101,20 @@ class bounded(AbstractConstraint):
         ```
     """
 
-    low: float
-    high: float
+    low: float = eqx.field(converter=float)
+    high: float = eqx.field(converter=float)
 
-    def __init__(self, low: float | int, high: float | int):
+    def __check_init__(self):
+        low, high = self.low, self.high
         if not low < high:
             raise ValueError(f"bounded: low must be below high, got {low} and {high}.")
-        self.low = float(low)
-        self.high = float(high)
 
     def constrain(self, z: Array) -> Array:
         value = self.low + (self.high - self.low) * jax.nn.sigmoid(z)
-        return _inside(value, self.low, self.high)
+        return _strictly_inside(value, self.low, self.high)
 
     def unconstrain(self, value: Array) -> Array:
+        # The logit of the part of the way from one end to the other.
         return jnp.log(value - self.low) - jnp.log(self.high - value)
 
     def holds(self, value):
@@ -133,6 +135,7 @@ def as_float_array(value: Any) -> Any:
     if isinstance(value, bool | int | float | np.number) or (
         isinstance(value, np.ndarray) and value.ndim == 0
     ):
+        # Of a Python number, as an array of NumPy would have a strong type.
         return jnp.asarray(float(value))
     if isinstance(value, np.ndarray | list | tuple | jax.Array):
         try:
@@ -155,8 +158,9 @@ def parameter(
 
     **Arguments:**
 
-    - `default`: the default value, a number or an array. No default by default.
-    - `constraint`: the legal values, [`delucax.positive`][] or [`delucax.bounded`][].
+    - `default`: the default value, a number or an array; the field is required if it is
+        left out.
+    - `constraint`: the valid values, [`delucax.positive`][] or [`delucax.bounded`][].
         Checked when a module is made, and kept by `delucax.training.fit`.
 
     **Returns:** a dataclass field.
@@ -189,8 +193,8 @@ def weight(
 
     **Arguments:**
 
-    - `default`: the default value. No default by default.
-    - `constraint`: the legal values, as in [`delucax.parameter`][].
+    - `default`: the default value; the field is required if it is left out.
+    - `constraint`: the valid values, as in [`delucax.parameter`][].
 
     **Returns:** a dataclass field.
 
@@ -245,6 +249,19 @@ def as_module(value: Any) -> Any:
     return StaticFunction(value) if is_plain else value
 
 
+def mlp(
+    inputs: int | Literal["scalar"],
+    outputs: int | Literal["scalar"],
+    width: int,
+    depth: int,
+    activation: Callable = jnp.tanh,
+    **options: Any,
+) -> eqx.nn.MLP:
+    """A fully connected network, linear at its end, that compiled functions take."""
+    functions = as_module(activation), as_module(jax.nn.identity)
+    return eqx.nn.MLP(inputs, outputs, width, depth, *functions, **options)
+
+
 def function_field(default: Any = dataclasses.MISSING) -> Any:
     """A field that holds a function: plain, or a module with a `__call__`."""
     return eqx.field(default=default, converter=as_module, metadata={_FUNCTION: True})
@@ -252,13 +269,12 @@ def function_field(default: Any = dataclasses.MISSING) -> Any:
 
 def fields_of(node: Any) -> dict[str, dataclasses.Field]:
     """The fields of a module, or of another dataclass, by name; none of other nodes."""
-    if not dataclasses.is_dataclass(node):
-        return {}
-    return {field.name: field for field in dataclasses.fields(node)}
+    fields = dataclasses.fields(node) if dataclasses.is_dataclass(node) else ()
+    return {field.name: field for field in fields}
 
 
 def children_of(node: Any) -> dict[str, Any]:
-    """What is inside a node, by the names that paths call it."""
+    """The children of a node, by their names in paths."""
     if isinstance(node, Mapping):
         return {str(key): child for key, child in node.items()}
     if isinstance(node, tuple | list) and not hasattr(node, "_fields"):
@@ -281,7 +297,8 @@ def parts_of(module: Any, kind: type[_Part]) -> list[_Part]:
 def marked_leaves(
     tree: Any,
 ) -> Iterator[tuple[tuple, Any, str | None, AbstractConstraint | None]]:
-    """`(path, leaf, role, constraint)` of every leaf; the innermost mark holds."""
+    """`(path, leaf, role, constraint)` of every leaf, as the innermost `parameter()` or
+    `weight()` declares."""
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         node, role, constraint = tree, None, None
         for key in path:
@@ -301,27 +318,31 @@ def path_string(path: tuple) -> str:
 
 
 def check_parameters(module: eqx.Module) -> None:
-    """Raise unless every `parameter()`, `weight()` and function of `module` is legal.
+    """Raise unless every `parameter()`, `weight()` and function of `module` is valid.
 
-    Traced values cannot be looked at and are let through.
+    Traced values are not inspected.
     """
     for field in dataclasses.fields(module):
         value = getattr(module, field.name, None)
         name = f"{type(module).__name__}: {field.name}"
         if _FUNCTION in field.metadata and value is not None:
-            _check_function(value, name)
+            check_function(value, field.name, type(module).__name__)
         if _ROLE in field.metadata:
             _check_numbers(value, name, field)
 
 
-def _check_function(value: Any, name: str) -> None:
+def check_function(value: Any, name: str, where: str, of: str = "") -> None:
+    """Raise unless `value` is a function. `of` says what its arguments are, such as
+    " of time"."""
     if not callable(value):
-        raise ValueError(f"{name} must be a function, got {shortened(value)}.")
-    inner = value.function if isinstance(value, StaticFunction) else None
+        raise ValueError(
+            f"{where}: {name} must be a function{of}, got {shortened(value)}."
+        )
+    inner = value.function if isinstance(value, StaticFunction) else value
     if isinstance(inner, type):
         raise ValueError(
-            f"{name} must be a function, got the class {inner.__name__} where "
-            f"{inner.__name__}(...) may be meant."
+            f"{where}: {name} must be a function{of}, got the class {inner.__name__} "
+            f"where {inner.__name__}(...) may be meant."
         )
 
 

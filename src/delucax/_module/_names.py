@@ -1,4 +1,4 @@
-"""Names for what has none of its own."""
+"""Default names: x0, x1, ..."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ def indexed_names(letter: str, size: int) -> tuple[str, ...]:
 def names_of(
     given: int | Sequence[str], letter: str, argument: str, where: str
 ) -> tuple[str, ...]:
-    """Names, indexed if it is their number that is given, or an error."""
+    """Names; indexed ones if their number is given. Raises `ValueError` otherwise."""
     if isinstance(given, int) and not isinstance(given, bool) and given >= 0:
         return indexed_names(letter, given)
     if isinstance(given, tuple | list) and all(isinstance(n, str) for n in given):

@@ -23,7 +23,7 @@ from ._fields import (
 _T = TypeVar("_T")
 
 _MOST_MEMBERS = 4096
-"""Of a batch whose members are checked one by one, a millisecond each or less."""
+"""Members of a batch that are checked, a millisecond each or less."""
 
 
 def get_path(tree: PyTree, path: str) -> Any:
@@ -55,14 +55,14 @@ def _nodes_along(tree: Any, path: str) -> list[Any]:
 def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
     """A copy of `tree` with the named leaves replaced.
 
-    Nothing compiles again for it: a number put in the place of a
-    [`delucax.parameter`][] becomes the same kind of leaf as the old one was. All
-    changes are made before any is checked, so values that only fit together are given
-    in one call. What an environment has by default of its dynamics, its disturbance and
-    a first state of zeros, follows new dynamics. Then every module above a change runs
-    the checks of its constructor; in a batch from `jax.vmap` each member does, of more
-    than 4096 those with extreme numbers and others spread evenly, with a warning.
-    Traced values cannot be looked at, only their shapes.
+    Nothing compiles again: a number that replaces a [`delucax.parameter`][] becomes the
+    same kind of leaf. All changes are made before any is checked, so values that only
+    fit together are given in one call. The defaults that an environment derives from
+    its dynamics, its disturbance and an initial state of zeros, follow new dynamics.
+    Then every module above a change runs the checks of its constructor. In a batch from
+    `jax.vmap` every member is checked; of more than 4096 only a sample is, with a
+    warning: those with extreme numbers, and others spread evenly. Of traced values only
+    the shapes are checked.
 
     **Arguments:**
 
@@ -73,7 +73,7 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
     **Returns:** the copy.
 
     **Raises:** `ValueError` if a path is not in the tree or is part of another one, or
-    if the values are not legal where they go.
+    if the values are not valid.
 
     !!! example
 
@@ -93,9 +93,10 @@ def replace(tree: _T, changes: Mapping[str, Any]) -> _T:
     changed = tree
     for path, value in changes.items():
         changed = _with(changed, path, value)
+    # The deepest first: what follows by default is in place when an owner is checked.
     for path in _owners(changes):
         before = get_path(tree, path)
-        changed = _followed(changed, path, before, changes)
+        changed = _with_defaults(changed, path, before, changes)
         _check(get_path(changed, path), before)
     return changed
 
@@ -114,7 +115,7 @@ def check_paths(changes: Mapping[Any, Any], where: str) -> None:
             if above in changes:
                 raise ValueError(
                     f"{where}: paths must not overlap, got {above!r} and {path!r}, "
-                    "which is part of it; put the one into the value of the other."
+                    "which is part of it; make the second change in the first value."
                 )
 
 
@@ -131,21 +132,19 @@ def _with(tree: Any, path: str, value: Any) -> Any:
             )
     *_, parent, old = nodes
     if isinstance(parent, eqx.Module):
-        convert = fields_of(parent)[names[-1]].metadata.get("converter")
-        value = value if convert is None else convert(value)
+        metadata = fields_of(parent)[names[-1]].metadata
+        value = metadata.get("converter", lambda value: value)(value)
     elif eqx.is_inexact_array(old):
         value = as_float_array(value)
-    return eqx.tree_at(
-        lambda tree: get_path(tree, path),
-        tree,
-        value,
-        is_leaf=lambda node: node is None,
-    )
+    at = lambda tree: get_path(tree, path)
+    return eqx.tree_at(at, tree, value, is_leaf=lambda node: node is None)
 
 
-def _followed(tree: Any, path: str, before: Any, changes: Mapping[str, Any]) -> Any:
-    """A copy of `tree` in which what the node at `path` had by default of something
-    that was changed is the default of the new one."""
+def _with_defaults(
+    tree: Any, path: str, before: Any, changes: Mapping[str, Any]
+) -> Any:
+    """A copy of `tree` in which the defaults that the node at `path` derived from a
+    changed part are derived from the new one."""
     node = get_path(tree, path)
     if type(node) is not type(before) or not hasattr(node, "__replaced__"):
         return tree
@@ -162,10 +161,8 @@ def _is_within(path: str, other: str) -> bool:
 
 def _owners(changes: Mapping[str, Any]) -> list[str]:
     """The paths of all nodes above the changes, the deepest first."""
-    owners = set()
-    for path in changes:
-        parts = path.split(".")
-        owners |= {".".join(parts[:end]) for end in range(len(parts))}
+    parts = [path.split(".") for path in changes]
+    owners = {".".join(p[:end]) for p in parts for end in range(len(p))}
     return sorted(owners, key=lambda path: (-len(path.split(".")), not path, path))
 
 
@@ -187,8 +184,8 @@ def _check(module: Any, before: Any) -> None:
 
 
 def _error_of(module: Any) -> Exception | None:
-    """What the checks of a module say against it: a batch from `jax.vmap` has not the
-    shapes of one."""
+    """The validation error of a module, if any. A batch from `jax.vmap` has one, as its
+    shapes are not those of one module."""
     try:
         if isinstance(module, eqx.Module):
             check_module(module)
@@ -198,11 +195,10 @@ def _error_of(module: Any) -> Exception | None:
 
 def _check_members(module: eqx.Module, before: eqx.Module) -> None:
     """Run the checks of the members of a batch, as `before` was."""
-    legal = lambda one: (
-        _error_of(one) is None or any(map(legal, _members(one).values()))
-    )
-    like = next(filter(legal, _members(before).values()), None)
-    if like is None:  # no batch, or one that cannot be looked at
+    # A batch of batches has members that are valid only in their own members.
+    valid = lambda m: _error_of(m) is None or any(map(valid, _members(m).values()))
+    like = next(filter(valid, _members(before).values()), None)
+    if like is None:  # not a batch, or a traced one
         return
     members = _members(module)
     for place, member in members.items():
@@ -225,12 +221,11 @@ def _members(module: eqx.Module) -> dict[int, eqx.Module]:
     the arrays of `module` share no leading axis or are traced."""
     arrays, rest = eqx.partition(module, eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
-    if any(isinstance(leaf, Tracer) for leaf in leaves):
-        return {}
     lengths = {leaf.shape[:1] for leaf in leaves}
-    if len(lengths) != 1 or () in lengths:
+    is_traced = any(isinstance(leaf, Tracer) for leaf in leaves)
+    if len(lengths) != 1 or () in lengths or is_traced:
         return {}
-    (count,) = lengths.pop()
+    ((count,),) = lengths
     places = range(count) if count <= _MOST_MEMBERS else _sampled(leaves, count)
     rows = zip(*(list(leaf[np.asarray(places)]) for leaf in leaves), strict=True)
     member = lambda row: eqx.combine(jax.tree.unflatten(structure, row), rest)
@@ -240,6 +235,7 @@ def _members(module: eqx.Module) -> dict[int, eqx.Module]:
 def _sampled(leaves: list[Any], count: int) -> np.ndarray:
     """The members of a large batch to look at: those with the smallest or the largest
     entry of an array, and others spread evenly."""
+    # A constraint breaks at an extreme first.
     half = _MOST_MEMBERS // 2
     flat = [np.asarray(a).reshape(count, -1) for a in leaves if eqx.is_inexact_array(a)]
     ends = [end for a in flat for end in (np.argmin(a, axis=0), np.argmax(a, axis=0))]

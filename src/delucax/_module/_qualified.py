@@ -1,4 +1,4 @@
-"""Functions and classes by name, `"module:qualified.name"`, and back."""
+"""Functions and classes by their names, `"module:qualified.name"`, and back."""
 
 import importlib
 import sys
@@ -27,8 +27,8 @@ _JAX = (
 )
 
 
-def name_of(thing: Any) -> str | None:
-    """The name that leads to `thing` and nothing else; `None` if there is none.
+def qualified_name(thing: Any) -> str | None:
+    """The importable name of `thing`; `None` if it has none.
 
     A public name is preferred to the module that a thing is defined in, which a later
     version of its library may move.
@@ -37,7 +37,7 @@ def name_of(thing: Any) -> str | None:
     name = getattr(thing, "__qualname__", None) or getattr(thing, "__name__", None)
     if not isinstance(module, str) or not isinstance(name, str):
         module, name = type(thing).__module__, ""
-    places = _places(module)
+    places = _candidate_modules(module)
     for place in places:
         if name and _look_up(place, name) is thing:
             return f"{place}:{name}"
@@ -50,32 +50,29 @@ def name_of(thing: Any) -> str | None:
     return None
 
 
-def thing_of(name: str, trust: tuple[str, ...]) -> Any:
-    """What `name` leads to.
+def import_named(name: str, trust: tuple[str, ...]) -> Any:
+    """Import the function or class called `name`.
 
     **Raises:** `ValueError` if its module is not trusted, or if there is no such thing.
     """
     module, _, path = name.partition(":")
     package = module.partition(".")[0]
     is_asked_for = _is_in(module, trust)
+    fail = lambda why: ValueError(f"it needs {name!r}, {why}")
     if not is_asked_for and package not in (*_TRUSTED, "jax", "numpy", "__main__"):
-        raise ValueError(
-            f"it needs {name!r}, and {package!r} is not a package that is trusted; if "
-            f"you trust it, give trust=({package!r},)."
+        raise fail(
+            f"and {package!r} is not a package that is trusted; if you trust it, give "
+            f"trust=({package!r},)."
         )
     try:
         importlib.import_module(module)
     except ImportError as error:
-        raise ValueError(
-            f"it needs {name!r}, which cannot be imported: {error}."
-        ) from None
+        raise fail(f"which cannot be imported: {error}.") from None
     thing = _look_up(module, path)
     if thing is None:
         hint = " Define it before you load." if package == "__main__" else ""
-        raise ValueError(
-            f"it needs {name!r}, which is not there: it may have been renamed or moved "
-            f"since.{hint}"
-        )
+        moved = "which is not there: it may have been renamed or moved since."
+        raise fail(f"{moved}{hint}")
     origin = getattr(thing, "__module__", None) or type(thing).__module__
     if package == "jax":
         fits = module in _JAX and _is_in(origin, ("jax", "jaxlib"))
@@ -85,10 +82,8 @@ def thing_of(name: str, trust: tuple[str, ...]) -> Any:
         others = _TRUSTED if package in _TRUSTED else ()
         fits = _is_in(origin, (*others, *trust, package))
     if not fits and not is_asked_for:
-        raise ValueError(
-            f"it needs {name!r}, which is not among what is trusted; if you trust it, "
-            f"give trust=({module!r},)."
-        )
+        hint = f"if you trust it, give trust=({module!r},)."
+        raise fail(f"which is not among what is trusted; {hint}")
     return thing
 
 
@@ -96,8 +91,8 @@ def _is_in(module: str, packages: tuple[str, ...]) -> bool:
     return any(f"{module}.".startswith(f"{package}.") for package in packages)
 
 
-def _places(module: str) -> tuple[str, ...]:
-    """Where to look for what says that it is of `module`, the best place first."""
+def _candidate_modules(module: str) -> tuple[str, ...]:
+    """Modules to import an object of `module` from, the preferred one first."""
     if module.partition(".")[0] in ("jax", "jaxlib"):
         return (*_JAX, module)
     public = module.partition("._")[0]

@@ -1,4 +1,4 @@
-"""Modules and trajectories in a file: names, numbers and structure; no code, no pickle.
+"""Modules and trajectories in files, without pickle: names, numbers and structure.
 
 The file is three parts: a line with the format, its version and a SHA-256 of the rest;
 a line of JSON that describes the structure; and the bytes of the arrays.
@@ -24,7 +24,7 @@ from jax.core import Tracer
 
 from .._files import as_path, replaced
 from .._results import Result
-from ._qualified import name_of, thing_of
+from ._qualified import import_named, qualified_name
 
 
 _MAGIC = "delucax-file"
@@ -64,11 +64,9 @@ def save(path: str | os.PathLike, obj: Any) -> None:
     """
     path = _file(path, "save")
     writer = _Writer()
-    header = {"tree": writer.describe(obj, "obj")}
-    header["arrays"] = [
-        {"dtype": array.dtype.name, "shape": list(array.shape)}
-        for array in writer.arrays
-    ]
+    tree = writer.describe(obj, "obj")
+    arrays = [{"dtype": a.dtype.name, "shape": list(a.shape)} for a in writer.arrays]
+    header = {"tree": tree, "arrays": arrays}
     text = json.dumps(header, allow_nan=False, separators=(",", ":"))
     body = b"".join([text.encode(), b"\n", *(a.tobytes() for a in writer.arrays)])
     first = f"{_MAGIC} {_VERSION} {hashlib.sha256(body).hexdigest()}\n"
@@ -84,7 +82,7 @@ def load(path: str | os.PathLike, *, trust: Sequence[str] = ()) -> Any:
 
     Nothing in the file is run: classes and functions are looked up by name, and only in
     packages that are trusted. What was loaded calls the functions that the file names,
-    so use only files from those whom you trust.
+    so only load files from sources that you trust.
 
     **Arguments:**
 
@@ -144,7 +142,7 @@ def _file(path: Any, where: str) -> Path:
 
 
 def _checked(path: Path) -> tuple[bytes, bytes]:
-    """The description, and the bytes of the arrays, of a file that is whole."""
+    """The header and the bytes of the arrays, once the checksum is verified."""
     try:
         first, _, body = path.read_bytes().partition(b"\n")
     except OSError as error:
@@ -170,11 +168,10 @@ def _checked(path: Path) -> tuple[bytes, bytes]:
 def _split(payload: bytes, descriptions: list[dict[str, Any]]) -> list[np.ndarray]:
     arrays, offset = [], 0
     for description in descriptions:
-        dtype, shape = jnp.dtype(description["dtype"]), tuple(description["shape"])
-        end = offset + dtype.itemsize * math.prod(shape)
-        piece = np.frombuffer(payload[offset:end], dtype)
-        arrays.append(piece.reshape(shape).copy())
-        offset = end
+        dtype, shape = jnp.dtype(description["dtype"]), description["shape"]
+        flat = np.frombuffer(payload, dtype, math.prod(shape), offset)
+        arrays.append(flat.reshape(shape).copy())
+        offset += flat.nbytes
     return arrays
 
 
@@ -213,11 +210,9 @@ class _Writer:
             parts["keywords"] = node.keywords
             return {"partial": kind.__name__, **self.fields(parts, path)}
         if isinstance(node, tuple) and hasattr(node, "_fields"):
-            fields: Any = node._asdict()  # pyright: ignore[reportAttributeAccessIssue]
-            return {
-                "namedtuple": self.name(kind, path),
-                "fields": self.fields(fields, path),
-            }
+            names: Any = kind._fields  # pyright: ignore[reportAttributeAccessIssue]
+            fields = self.fields(dict(zip(names, node, strict=True)), path)
+            return {"namedtuple": self.name(kind, path), "fields": fields}
         if kind in _SEQUENCES.values():
             items = sorted(node, key=repr) if kind is frozenset else node
             items = [self.describe(c, f"{path}.{i}") for i, c in enumerate(items)]
@@ -248,9 +243,10 @@ class _Writer:
         return {kind: len(self.arrays) - 1, **extra}
 
     def name(self, thing: Any, path: str) -> str:
-        name = name_of(thing)
+        name = qualified_name(thing)
         if name is not None:
             return name
+        remedy = "Hold numbers, strings, arrays, modules, or functions by name."
         if isinstance(thing, type):
             remedy = "Define the class at the top level of a module."
         elif callable(thing):
@@ -259,8 +255,6 @@ class _Writer:
                 "is defined at the top level of a module, or an eqx.Module with a "
                 "`__call__`."
             )
-        else:
-            remedy = "Hold numbers, strings, arrays, modules, or functions by name."
         raise ValueError(
             f"save: {path} is {thing!r}, which has no name to find it by. {remedy}"
         )
@@ -335,7 +329,7 @@ class _Reader:
         return self.arrays[content][()]
 
     def build_name(self, content, node):
-        return thing_of(content, self.trust)
+        return import_named(content, self.trust)
 
     def build_result(self, content, node):
         enumeration, value = self.build_name(content, node), self.build(node["value"])
@@ -378,24 +372,20 @@ class _Reader:
         return {self.build(key): self.build(value) for key, value in content}
 
     def class_of(self, name: str, base: type, what: str) -> Any:
-        cls = thing_of(name, self.trust)
+        cls = import_named(name, self.trust)
         if not (isinstance(cls, type) and issubclass(cls, base)):
             raise ValueError(f"it needs a {what}, and {name!r} is not one.")
         return cls
 
     def fitted(self, array: np.ndarray) -> np.ndarray:
         """`array` in the precision that JAX has switched on."""
-        dtype = jax.dtypes.canonicalize_dtype(array.dtype)
-        if dtype == array.dtype:
-            return array
-        narrow = array.astype(dtype)
-        if array.dtype.kind in "iu":
-            if not np.array_equal(narrow, array):
-                raise ValueError(
-                    "it holds whole numbers that need 64 bits; set jax_enable_x64."
-                )
-        else:
-            self.narrowed = True
+        narrow = array.astype(jax.dtypes.canonicalize_dtype(array.dtype), copy=False)
+        is_whole = array.dtype.kind in "iu"
+        if is_whole and not np.array_equal(narrow, array):
+            raise ValueError(
+                "it holds whole numbers that need 64 bits; set jax_enable_x64."
+            )
+        self.narrowed |= not is_whole and narrow.dtype != array.dtype
         return narrow
 
 

@@ -1,4 +1,4 @@
-"""What linear models tell of themselves: modes, Gramians, norms, margins."""
+"""Analysis of linear models: poles and zeros, Gramians, norms, margins."""
 
 from ._gains import (
     dcgain as dcgain,

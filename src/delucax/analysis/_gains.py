@@ -50,6 +50,7 @@ def frequency_response(
     """
     where = "frequency_response"
     system = state_space(model, inputs, where)
+    # Infinite frequencies are refused: the response there is D alone.
     array = as_float_array(omega)
     real = eqx.is_inexact_array(array) and not jnp.iscomplexobj(array)
     if not real or is_concrete(array) and not bool(jnp.all(jnp.isfinite(array))):
@@ -69,7 +70,7 @@ def _responses(
 def dcgain(
     model: LinearModel, *, inputs: str = "controls", throw: bool = True
 ) -> Float[Array, "p m"]:
-    """What constant inputs make of the outputs in the end,
+    """The steady-state (DC) gain from inputs to outputs,
 
     `-C A^-1 B`, or in discrete time `C (I - A)^-1 B`.
 
@@ -78,8 +79,8 @@ def dcgain(
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][]. It need not be stable.
     - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
-    - `throw`: raise if a pole at frequency zero, an integrator, leaves no such gain
-        (default); if false, return infinity there.
+    - `throw`: raise if there is a pole at frequency zero, an integrator (default); if
+        false, return infinity there.
 
     **Returns:** shape `(p, m)`.
 
@@ -99,14 +100,15 @@ def dcgain(
     """
     gain, has_integrator = _dcgain(state_space(model, inputs, "dcgain"))
     message = (
-        "dcgain: a pole is at frequency zero (an integrator), so that constant inputs "
-        "come to no constant outputs. Pass throw=False for infinity."
+        "dcgain: a pole is at frequency zero (an integrator), so the DC gain is "
+        "infinite. Pass throw=False to return infinity."
     )
     return raise_if(has_integrator, gain, message) if throw else gain
 
 
 @eqx.filter_jit
 def _dcgain(system: StateSpace) -> tuple[Float[Array, "p m"], BoolScalar]:
+    # A pole at frequency zero makes this matrix singular, up to rounding.
     matrix = system.eye - system.A if system.is_discrete else -system.A
     values = jnp.linalg.svd(jax.lax.stop_gradient(matrix), compute_uv=False)
     eps = jnp.finfo(values.dtype).eps
@@ -188,7 +190,8 @@ def h2_norm(model: LinearModel, *, inputs: str = "controls") -> Scalar:
 @eqx.filter_jit
 def _h2_norm(system: StateSpace) -> Scalar:
     stable = system.is_stable()
-    W = stable_gramian(system.stable_or_harmless(stable))
+    W = stable_gramian(system.stable_or_placeholder(stable))
+    # The square root has no derivative at zero: the branch not taken is that of 1.
     square = jnp.trace(system.C @ W @ system.C.T)
     positive = square > 0
     norm = jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
@@ -203,20 +206,22 @@ def hinf_norm(
     `max over omega of sigma_max(C (s I - A)^-1 B)`, at `s = j omega`, or in discrete
     time at `exp(j omega dt)`.
 
-    A level just above the largest gain so far is crossed at frequencies that are
-    eigenvalues of a Hamiltonian matrix; between two of them the gain is looked at
-    again, until nothing is above the level, and Newton steps find the top. Infinite if
-    a pole is on or outside the boundary of stability.
+    The frequencies at which the gain crosses a level just above the largest one so far
+    are eigenvalues of a Hamiltonian matrix. The gain is evaluated again at their
+    midpoints until no crossing remains, and Newton steps refine the peak. Infinite if a
+    pole is on or outside the boundary of stability.
 
-    It has first and second derivatives, in either mode, where one frequency and one
-    direction alone attain the maximum; elsewhere it has those of one that does.
+    It has first and second derivatives, in either mode, where the maximum is attained
+    at one frequency in one direction alone; elsewhere the derivatives of one maximiser
+    are returned.
 
     **Arguments:**
 
     - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][].
     - `inputs`: `"controls"` (default), or `"disturbances"`: `E` in the place of `B`.
-    - `throw`: raise if the search does not end (default); if false, look at `result`.
+    - `throw`: raise if the search does not converge (default); if false, check
+        `result`.
 
     **Returns:** a [`delucax.analysis.PeakGain`][].
 
@@ -251,10 +256,21 @@ def peak_gain(system: StateSpace) -> PeakGain:
     poles = jnp.linalg.eigvals(lax.stop_gradient(system.A))
     growth = system.growth(poles)
     stable = jnp.all(growth < 0)
-    safe = system.stable_or_harmless(stable)
+    safe = system.stable_or_placeholder(stable)
+    # The search is not differentiated: the peak is stationary in the frequency, so that
+    # the gain's derivatives are those at a fixed frequency (the envelope theorem).
     frozen = lax.stop_gradient(safe)
     start, ended = _search(frozen)
-    gain, frequency = _at_top(safe, *_climb(frozen, start))
+    top, curvature, moves = _climb(frozen, start)
+    finite = jnp.isfinite(top)
+    gain, slope = _with_slope(safe, jnp.where(finite, top, 1))
+    rise = jnp.where(moves, slope - lax.stop_gradient(slope), 0)
+    # One Newton step, numerically zero: it carries the implicit derivative of the
+    # maximiser.
+    step = -rise / curvature
+    gain = gain + step * slope + step**2 * curvature / 2
+    gain, frequency = jnp.where(finite, gain, largest_gain(safe.D)), top + step
+    # An unstable model has no peak: the frequency is that of its least stable pole.
     least = poles[jnp.argmax(growth)]
     if system.dt is None:
         at_pole = jnp.abs(jnp.imag(least))
@@ -274,16 +290,16 @@ def _with_slope(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScalar]:
-    """The top by Newton steps for as long as they go up.
+    """The peak, refined by Newton steps while the gain rises.
 
-    **Returns:** its frequency, the curvature of the gain there, and whether it is a top
-    that moves with the plant; at the ends of the axis it rests.
+    **Returns:** its frequency, the curvature of the gain there, and whether its
+    frequency depends on the plant, which at the ends of the axis it does not.
     """
     rounding = 100 * jnp.finfo(omega.dtype).eps
 
     def step(_, carry):
         best, flattest, top, top_curvature, moves, trial = carry
-        # An infinite frequency is a point like any other that has no slope.
+        # At an infinite frequency there is no slope: the placeholder 1 is not used.
         finite = jnp.isfinite(trial)
         at = jnp.where(finite, trial, 1)
         (gain, slope), (_, curvature) = jax.jvp(
@@ -292,11 +308,13 @@ def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScala
         usable = (
             finite & (curvature < 0) & jnp.isfinite(slope) & jnp.isfinite(curvature)
         )
+        # Newton's step on the slope goes up only where the curvature is negative.
         curvature = jnp.where(usable, curvature, -1)
-        # Near the top the gain is level but for rounding, and its slope decides.
+        # Near the peak gains differ by rounding alone, and the slope decides.
         up = usable & (gain >= best) & (jnp.abs(slope) < flattest) & (trial >= 0)
         top = jnp.where(up, trial, top)
         return (
+            # Less its rounding: the next gain may be equal in exact arithmetic.
             jnp.where(up, gain * (1 - rounding), best),
             jnp.where(up, jnp.abs(slope), flattest),
             top,
@@ -311,24 +329,11 @@ def _climb(system: StateSpace, omega: Scalar) -> tuple[Scalar, Scalar, BoolScala
     return top, curvature, moves
 
 
-def _at_top(
-    system: StateSpace, omega: Scalar, curvature: Scalar, moves: BoolScalar
-) -> tuple[Scalar, Scalar]:
-    """The gain at the top, and its frequency, which move with the plant as they do."""
-    finite = jnp.isfinite(omega)
-    gain, slope = _with_slope(system, jnp.where(finite, omega, 1))
-    rise = jnp.where(moves, slope - lax.stop_gradient(slope), 0)
-    # Zero, but not its derivatives: the step that Newton's method would take next.
-    step = -rise / curvature
-    gain = gain + step * slope + step**2 * curvature / 2
-    at_infinity = largest_gain(system.D)
-    return jnp.where(finite, gain, at_infinity), omega + step
-
-
 def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
-    """The frequency of the largest gain, and whether the search came to its end."""
-    axis = system.on_the_axis() if system.is_discrete else system
-    A, B, C, D = axis.A, axis.B, axis.C, axis.D
+    """The frequency of the largest gain, and whether the search converged."""
+    # In discrete time the bilinear transform maps the unit circle to the axis.
+    axis = system.bilinear_transform() if system.is_discrete else system
+    A, B, C, D, _ = axis
     n = A.shape[0]
     gain = lambda w: largest_gain(axis.response(w))
     eps = jnp.finfo(A.dtype).eps
@@ -342,6 +347,7 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
         gain_now = jnp.where(better, gains[k], gain_now)
         return gain_now, jnp.where(better, omegas[k], omega_now)
 
+    # Resonances are near the poles. The sweep guards against a flat start.
     poles = jnp.linalg.eigvals(A)
     at_poles = jnp.concatenate([jnp.abs(poles), jnp.abs(jnp.imag(poles))])
     low, high = jnp.log(jnp.min(at_poles[:n]) / 100), jnp.log(jnp.max(at_poles) * 100)
@@ -353,9 +359,10 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
     def crossings(level):
         """Frequencies of the eigenvalues of the Hamiltonian at a level.
 
-        All of them: those that are off the axis by more than rounding are no
-        crossings, but to look at the gain there costs little and harms nothing.
+        Those of all eigenvalues: off the axis they are no crossings, but evaluating the
+        gain there as well is cheap and harmless.
         """
+        # A singular value of G(j omega) is `level` where j omega is an eigenvalue of H.
         m, p = D.shape[1], D.shape[0]
         R = level**2 * jnp.eye(m, dtype=D.dtype) - D.T @ D
         S = level**2 * jnp.eye(p, dtype=D.dtype) - D @ D.T
@@ -363,7 +370,7 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
         F = A + B @ solved[:, :n]
         upper, lower = level * B @ solved[:, n:], level * C.T @ lu_solve(S, C)
         H = jnp.block([[F, upper], [-lower, -F.T]])
-        # They come in pairs, s and -s.
+        # Eigenvalues come in pairs, s and -s.
         omegas = jnp.sort(jnp.abs(jnp.imag(jnp.linalg.eigvals(H))))[::2]
         return jnp.concatenate([jnp.zeros(1, A.dtype), omegas])
 
@@ -375,6 +382,7 @@ def _search(system: StateSpace) -> tuple[Scalar, BoolScalar]:
         gain_now, omega_now, _, k = carry
         # At the level of D the Hamiltonian is not finite, and close to it not accurate.
         is_close = gain_now < (1 + eps**0.375) * at_infinity
+        # A smaller step would lose the crossings next to the peak in rounding.
         step = jnp.where(is_close, eps**0.375, eps**0.625)
         level = (1 + step) * jnp.where(gain_now > 0, gain_now, 1)
         nodes = crossings(level)

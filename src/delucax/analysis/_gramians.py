@@ -1,4 +1,4 @@
-"""What inputs reach and outputs show, as matrices."""
+"""Controllability and observability: Krylov matrices and Gramians."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -7,9 +7,8 @@ from jaxtyping import Array, Float
 from .._check import check_count, check_positive
 from .._results import raise_if
 from .._typing import BoolScalar, RealScalar, Scalar
-from ..math._gramian import gramian_over
 from ..math._linear_solve import full_precision, symmetric
-from ..riccati._lyapunov import lyapunov, stein
+from ..math._lyapunov import gramian_over, lyapunov
 from ._state_space import LinearModel, state_space, StateSpace
 
 
@@ -18,8 +17,8 @@ def controllability_matrix(
 ) -> Float[Array, "n nm"]:
     """The Krylov matrix `[B, A B, ..., A^(n-1) B]`.
 
-    Its rank is that of what the inputs reach, but is hard to tell beyond a few states:
-    [`delucax.analysis.is_controllable`][] asks mode by mode instead.
+    Its rank is the dimension of the controllable subspace, but ill-conditioned beyond a
+    few states: [`delucax.analysis.is_controllable`][] tests mode by mode instead.
 
     **Arguments:**
 
@@ -153,11 +152,11 @@ def observability_gramian(
 def _gramian(
     system: StateSpace, horizon: RealScalar | None, throw: bool, where: str
 ) -> Float[Array, "n n"]:
-    if horizon is not None and system.is_discrete:
-        return _gramian_of_steps(system, check_count(horizon, "horizon", where))
     if horizon is not None:
+        if system.is_discrete:
+            return _gramian_over(system, check_count(horizon, "horizon", where))
         check_positive(horizon, "horizon", where)
-        return _gramian_of_time(system, jnp.asarray(horizon, system.A.dtype))
+        return _gramian_over(system, jnp.asarray(horizon, system.A.dtype))
     W, stable = _gramian_of_all_time(system)
     message = (
         f"{where}: the model must be stable for a Gramian over all time. Give a "
@@ -177,31 +176,28 @@ def _krylov(system: StateSpace) -> Float[Array, "n nm"]:
 @eqx.filter_jit
 def _gramian_of_all_time(system: StateSpace) -> tuple[Float[Array, "n n"], BoolScalar]:
     stable = system.is_stable()
-    W = stable_gramian(system.stable_or_harmless(stable))
+    W = stable_gramian(system.stable_or_placeholder(stable))
     return jnp.where(stable, W, jnp.inf), stable
 
 
 @full_precision
 def stable_gramian(system: StateSpace) -> Float[Array, "n n"]:
     """The controllability Gramian over all time of a stable model."""
-    equation = stein if system.is_discrete else lyapunov
-    return symmetric(equation(system.A.T, system.B @ system.B.T))
+    noise = system.B @ system.B.T
+    return symmetric(lyapunov(system.is_discrete, system.A.T, noise))
 
 
 @eqx.filter_jit
 @full_precision
-def _gramian_of_steps(system: StateSpace, steps: int) -> Float[Array, "n n"]:
-    """By doubling: `W_2k = W_k + A^k W_k (A^k)'`, along the bits of `steps`."""
+def _gramian_over(system: StateSpace, horizon: int | Scalar) -> Float[Array, "n n"]:
     A, Q = system.A, system.B @ system.B.T
+    if not isinstance(horizon, int):
+        return gramian_over(A, Q, horizon)
+    # By doubling, W_2k = W_k + A^k W_k (A^k)', along the bits of the number of steps:
+    # logarithmic work, and no assumption of stability.
     W, power = jnp.zeros_like(Q), system.eye
-    for bit in bin(steps)[2:]:
+    for bit in bin(horizon)[2:]:
         W, power = W + power @ W @ power.T, power @ power
         if bit == "1":
             W, power = Q + A @ W @ A.T, A @ power
     return symmetric(W)
-
-
-@eqx.filter_jit
-@full_precision
-def _gramian_of_time(system: StateSpace, horizon: Scalar) -> Float[Array, "n n"]:
-    return gramian_over(system.A, system.B @ system.B.T, horizon)

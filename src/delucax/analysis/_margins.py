@@ -1,4 +1,4 @@
-"""How much a feedback loop stands: gain, phase, delay and disk margins."""
+"""Stability margins of a feedback loop: gain, phase, delay and disk."""
 
 import equinox as eqx
 import jax
@@ -15,14 +15,14 @@ from ._state_space import frobenius_norm, LinearModel, state_space, StateSpace
 
 
 class DiskMargin(eqx.Module):
-    """How large a disk of perturbations, gain and phase at once, a loop stands.
+    """The disk margin of a feedback loop.
 
     **Attributes:**
 
     - `margin`: the radius `alpha` of the disk; zero if the closed loop is not stable.
-    - `frequency`: where it is smallest, in radians per unit of time.
+    - `frequency`: the critical frequency, in radians per unit of time.
     - `gain_low`, `gain_high`: the real factors between which the loop gain may lie.
-    - `phase`: the phase, in radians, that the loop may be turned either way.
+    - `phase`: the phase change, of either sign, that the loop tolerates, in radians.
     - `result`: success, or why not; one of `delucax.RESULTS`.
 
     !!! example
@@ -54,15 +54,15 @@ def disk_margin(
     channel: int | None = None,
     throw: bool = True,
 ) -> DiskMargin:
-    r"""How large a disk of perturbations a loop stands, gain and phase at once,
+    r"""The disk margin: the size of simultaneous gain and phase perturbations,
 
     `alpha = 1 / max over omega of sigma_max(S + (skew - 1)/2 I)`, `S = (I + L)^-1`:
     the closed loop stays stable with the loop gain multiplied by any
     `(2 + (1 - skew) delta) / (2 - (1 + skew) delta)`, `|delta| < alpha`.
 
     The loop `L` is the linear model from `u` to `y`, closed by `u = -y`. Of several
-    channels, all are perturbed at once by one full matrix `delta`: safe for, and in
-    general more than, separate factors in each channel.
+    channels, all are perturbed at once by one full matrix `delta`, which is
+    conservative with respect to independent factors in each channel.
 
     **Arguments:**
 
@@ -70,7 +70,8 @@ def disk_margin(
         [`delucax.LinearDynamics`][], with as many controls as outputs.
     - `skew`: 0 (default) balances `S` and `T`, 1 takes `S` and -1 takes `T`; a number.
     - `channel`: perturb this one alone, the others being closed; all by default.
-    - `throw`: raise if the search does not end (default); if false, look at `result`.
+    - `throw`: raise if the search does not converge (default); if false, check
+        `result`.
 
     **Returns:** a [`delucax.analysis.DiskMargin`][].
 
@@ -108,8 +109,9 @@ def disk_margin(
 @eqx.filter_jit
 def disk_of(loop: StateSpace, skew: Scalar, channel: int | None) -> DiskMargin:
     """The disk margin of a loop, or of one of its channels."""
-    A, B, C = loop.A, loop.B, loop.C
+    A, B, C, *_ = loop
     if channel is not None:
+        # The other channels are closed by u = -y before the loop is opened at this one.
         others = [i for i in range(B.shape[1]) if i != channel]
         A = A - B[:, jnp.array(others)] @ C[jnp.array(others)] if others else A
         B, C = B[:, channel, None], C[channel, None]
@@ -117,10 +119,12 @@ def disk_of(loop: StateSpace, skew: Scalar, channel: int | None) -> DiskMargin:
     # S = I - C (s I - (A - B C))^-1 B.
     closed = StateSpace(A - B @ C, B, -C, (1 + skew) / 2 * eye, loop.dt)
     peak = peak_gain(closed)
-    # Each branch that is not taken has a harmless number, so that its derivative has.
+    # Finite values in the branches that are not taken keep their gradients finite.
+    # The gain is zero, and the margin infinite, where there is no loop at all.
     stable = jnp.isfinite(peak.gain)
     usual = stable & (peak.gain > 0)
     alpha = 1 / jnp.where(usual, peak.gain, 1)
+    # The extreme real factors are those at delta = -alpha and alpha.
     up, down = 2 - alpha * (1 + skew), 2 + alpha * (1 + skew)
     low = (2 - alpha * (1 - skew)) / down
     bounded = up > 0
@@ -154,15 +158,16 @@ class Margins(eqx.Module):
 
     **Attributes:**
 
-    - `gain_margin`: the least factor above 1 on the loop gain that brings a pole to the
-        boundary of stability; infinite if none does.
-    - `gain_reduction`: the largest factor below 1 that does; zero if none does.
-    - `phase_margin`: the least turn, either way, that does, in radians; infinite if
-        none does.
-    - `delay_margin`: the least delay that does, in units of time; infinite if none
-        does.
+    - `gain_margin`: the smallest factor above 1 on the loop gain that brings a pole to
+        the boundary of stability; infinite if there is none.
+    - `gain_reduction`: the largest such factor below 1; zero if there is none.
+    - `phase_margin`: the smallest phase change, of either sign, with that effect, in
+        radians; infinite if there is none.
+    - `delay_margin`: the smallest delay with that effect, in units of time; infinite if
+        there is none.
     - `gain_margin_frequency`, `gain_reduction_frequency`, `phase_margin_frequency`,
-        `delay_margin_frequency`: where, in radians per unit of time; NaN if nowhere.
+        `delay_margin_frequency`: the critical frequencies, in radians per unit of time;
+        NaN if there is none.
     - `disk`, `disk_s`, `disk_t`: the [`delucax.analysis.DiskMargin`][] that balances
         `S` and `T`, that of the sensitivity `S = 1 / (1 + L)`, and that of
         `T = L / (1 + L)`.
@@ -209,15 +214,15 @@ def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
     feedback `u = -K x`, the plant's `A` and `B` with `C = K`.
 
     The frequencies at which `L` is real, and those at which it is 1 in size, are
-    eigenvalues of matrices; between these, signs tell the true crossings apart, and
-    each is refined to rounding. First and second derivatives, in either mode, are those
-    of the crossing that decides.
+    eigenvalues of matrices. Sign changes between these identify the true crossings,
+    and each is refined to rounding. First and second derivatives, in either mode, are
+    those of the critical crossing.
 
     **Arguments:**
 
     - `loop`: a [`delucax.systems.LinearSystem`][], or time-invariant
         [`delucax.LinearDynamics`][], with one control and one output.
-    - `throw`: raise if a search does not end (default); if false, look at `result`.
+    - `throw`: raise if a search does not converge (default); if false, check `result`.
 
     **Returns:** [`delucax.analysis.Margins`][].
 
@@ -251,7 +256,7 @@ def margins(loop: LinearModel, *, throw: bool = True) -> Margins:
 
 @eqx.filter_jit
 def _margins(loop: StateSpace) -> Margins:
-    stable = loop.with_A(loop.A - loop.B @ loop.C).is_stable()
+    stable = loop._replace(A=loop.A - loop.B @ loop.C).is_stable()
     skews = jnp.array([0, 1, -1], loop.A.dtype)
     disks = jax.vmap(lambda skew: disk_of(loop, skew, None))(skews)
     frozen = lax.stop_gradient(loop)
@@ -259,9 +264,11 @@ def _margins(loop: StateSpace) -> Margins:
     values = jax.vmap(jax.vmap(lambda w: _scalar(frozen, w)))(omegas)
 
     # Where the loop is real and negative, and where it is 1 in size.
+    # A loop gain above `huge` is at a pole on the axis, no crossing.
     real = jnp.real(values[0])
     huge = jnp.finfo(real.dtype).eps ** -0.75
     negative = crosses[0] & (real < 0) & (real > -huge)
+    # Times these factors the loop gain is -1, and so it is after these turns and lags.
     factors = -1 / jnp.where(negative, real, -1)
     turns = jnp.angle(-values[1])
     lags = jnp.mod(turns, 2 * jnp.pi) / jnp.where(crosses[1], omegas[1], 1)
@@ -273,13 +280,14 @@ def _margins(loop: StateSpace) -> Margins:
             jnp.where(crosses[1], lags, jnp.inf),
         ]
     )
+    # The kind of crossing of each margin: gain margins at phase crossings.
     kinds = jnp.array([0, 0, 1, 1])
     nearest = jnp.argmin(candidates, axis=1)
     exists = jnp.isfinite(jnp.min(candidates, axis=1))
     followed = jax.vmap(lambda *each: _follow(loop, *each))(
         kinds, omegas[kinds, nearest], exists
     )
-    # Where there is none, a point at which all is finite.
+    # A placeholder where there is no crossing, at which all is finite.
     followed = jnp.where(exists, followed, 1)
     L = jax.vmap(lambda w, ok: jnp.where(ok, _scalar(loop, w), 1))(followed, exists)
     factor = 1 / jax.vmap(frobenius_norm)(L)
@@ -315,11 +323,13 @@ def _crossing(kind: Int[Array, ""] | int, L: Complex[Array, ""]) -> Scalar:
 def _follow(
     loop: StateSpace, kind: Int[Array, ""] | int, omega: Scalar, exists: BoolScalar
 ) -> Scalar:
-    """`omega` itself, which moves with the loop as the crossing does.
+    """The crossing `omega` with its derivatives in the loop.
 
-    Two Newton steps from where it is already: their values change nothing but rounding,
+    Two Newton steps from a converged point: their values change nothing but rounding,
     and their derivatives are those of the crossing to third order.
     """
+    # At zero and at the Nyquist frequency a loop is real whatever its parameters: these
+    # crossings do not move, but that pi / dt moves with the step.
     dt = loop.dt
     at_nyquist = jnp.asarray(False)
     if dt is not None:
@@ -344,23 +354,25 @@ def _crossings(
 
     **Returns:** two rows of frequencies, and which of them are crossings.
     """
-    A, B, C = loop.A, loop.B, loop.C
+    A, B, C, D, _ = loop
     eps = jnp.finfo(A.dtype).eps
     if loop.is_discrete:
         scale = jnp.ones((), A.dtype)
-        # A pole at -1, on the circle, would go to infinity; now it goes far.
-        axis = loop.with_A(loop.A * (1 - 10 * eps)).on_the_axis()
+        # A pole at z = -1 would map to infinity: it is perturbed to stay finite.
+        axis = loop._replace(A=loop.A * (1 - 10 * eps)).bilinear_transform()
     else:
+        # Frequencies in units of the closed loop's poles: then the angles below, the
+        # arc tangents of frequencies, are well spread.
         sizes = jnp.abs(jnp.linalg.eigvals(A - B @ C))
         scale = jnp.exp(jnp.mean(jnp.log(jnp.where(sizes > 0, sizes, 1))))
-        axis = StateSpace(A / scale, B / scale, C, loop.D, None)
+        axis = StateSpace(A / scale, B / scale, C, D, None)
 
     def omega(phi):
-        """The frequency of an angle in `[0, pi/2]`, one for each frequency there is."""
+        """The frequency of an angle in `[0, pi/2]`, which covers the whole axis."""
         return scale * jnp.tan(phi) if loop.dt is None else 2 * phi / loop.dt
 
     def values(phi):
-        """Both functions that change sign at a crossing, at two rows of angles."""
+        """Both crossing functions, at two rows of angles."""
         L = jax.vmap(jax.vmap(lambda phi: _scalar(loop, omega(phi))))(phi)
         return jnp.stack(
             [jax.vmap(lambda L, k=k: _crossing(k, L))(L[k]) for k in (0, 1)]
@@ -373,8 +385,9 @@ def _crossings(
     between = (nodes[1:] + nodes[:-1]) / 2
     between = jnp.stack([between, between])
     signs = values(between)
-    # The sign of what is zero up to rounding is not reliable.
+    # Sign changes below rounding error are ignored.
     is_reliable = jnp.isfinite(signs) & (jnp.abs(signs) > eps**0.5)
+    # Each midpoint is compared with the last reliable one before it.
     indices = jnp.arange(signs.shape[1])
     last = lax.cummax(jnp.where(is_reliable, indices, -1), axis=1)[:, :-1]
     low, high = jnp.take_along_axis(between, last, axis=1), between[:, 1:]
@@ -387,25 +400,28 @@ def _crossings(
         before = jnp.sign(values(middle)) == low_sign
         return jnp.where(before, middle, low), jnp.where(before, high, middle)
 
+    # Bisection, as it cannot leave the bracket: Newton's method follows in `_follow`.
     low, high = lax.fori_loop(0, _HALVINGS, halve, (low, high))
     phi = (low + high) / 2
-    # At a pole or a zero on the axis the sign jumps, and nothing is small.
+    # At a pole or a zero on the axis the sign jumps without a root.
     crosses = crosses & (jnp.abs(values(phi)) < eps**0.25)
-    # At both ends a loop is real, but a strictly proper one at infinity zero.
+    # A loop is real at both ends; a strictly proper one is zero at infinity.
     at_ends = jnp.array([[True, loop.is_discrete], [False, False]])
     phi = jnp.concatenate([phi, jnp.stack([ends, ends])], axis=1)
     return omega(phi), jnp.concatenate([crosses, at_ends], axis=1)
 
 
 def _real_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
-    """Zeros of `L(s) - L(-s)`: eigenvalues, seen from two points of the real axis."""
-    A, B, C = loop.A, loop.B, loop.C
+    """Zeros of `L(s) - L(-s)`: eigenvalues of an inverse system, at two points."""
+    A, B, C, *_ = loop
+    # Where g(s) = L(s) - L(-s) is zero, 1 / g has a pole: an eigenvalue of the inverse
+    # system, which exists in a variable 1 / (point - s), as g(point) is not zero.
     zero = jnp.zeros_like(A)
     both_A = jnp.block([[A, zero], [zero, -A]])
     both_B, both_C = jnp.concatenate([B, B]), jnp.concatenate([C, C], axis=1)
     eye = jnp.eye(both_A.shape[0], dtype=A.dtype)
     frequencies = []
-    # Neither is likely to be a pole, or a zero itself.
+    # Two points, neither of which is likely to be a pole or a zero itself.
     for point in (0.7368, 1.3719):
         right = jnp.concatenate([eye, both_B], axis=1)
         solved = lu_solve(point * eye - both_A, right)
@@ -417,7 +433,8 @@ def _real_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
 
 def _unit_frequencies(loop: StateSpace) -> Float[Array, " nodes"]:
     """Zeros of `1 - L(-s) L(s)`: eigenvalues of a Hamiltonian."""
-    A, B, C, D = loop.A, loop.B, loop.C, loop.D
+    A, B, C, D, _ = loop
+    # R = I - D'D of the Hamiltonian at level 1, perturbed where it is singular.
     remainder = 1 - D[0, 0] ** 2
     remainder = jnp.where(remainder == 0, jnp.finfo(A.dtype).eps, remainder)
     F = A + B @ C * D[0, 0] / remainder

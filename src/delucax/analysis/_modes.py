@@ -1,4 +1,4 @@
-"""Poles and zeros, and which modes the inputs reach and the outputs show."""
+"""Poles, zeros, and tests of modal controllability and observability."""
 
 import equinox as eqx
 import jax
@@ -16,15 +16,15 @@ _SEARCHES = 3
 
 
 class ModalTest(eqx.Module):
-    """How far each mode of a pair of matrices is from being out of reach.
+    """The distance of each mode to uncontrollability (to unobservability).
 
     **Attributes:**
 
     - `modes`: the eigenvalues of `A`, shape `(n,)`, complex.
     - `distances`: for each, the smallest singular value of
         `[(A - mode I) / |A|, B / |B|]` (of `[(A - mode I)' / |A|, C' / |C|]` for
-        observability), shape `(n,)`: zero for a mode out of reach, and otherwise how
-        large a relative change of the matrices would put it there.
+        observability), shape `(n,)`: the relative change of the matrices that makes the
+        mode uncontrollable (unobservable); zero if it is so already.
     - `unstable`: which modes are on or outside the boundary of stability.
     - `tolerance`: distances up to it count as zero.
 
@@ -39,7 +39,7 @@ class ModalTest(eqx.Module):
         A = jnp.array([[1.1, 0.0], [0.0, 0.5]])
         dynamics = dlx.LinearDynamics(A, jnp.array([[0.0], [1.0]]))
         test = dlx.analysis.modal_controllability(dynamics)
-        test.out_of_reach, test.worst  # the mode 1.1
+        test.rank_deficient, test.worst  # the mode 1.1
         ```
     """
 
@@ -49,20 +49,21 @@ class ModalTest(eqx.Module):
     tolerance: Scalar
 
     @property
-    def out_of_reach(self) -> Bool[Array, " n"]:
-        """Which modes are out of reach."""
-        # A NaN compares false, and is not within reach.
+    def rank_deficient(self) -> Bool[Array, " n"]:
+        """Which modes are uncontrollable (unobservable): the matrix of the test loses
+        rank there."""
+        # Negated, so that a NaN counts as one of them.
         return ~(self.distances > self.tolerance)
 
     @property
     def worst(self) -> tuple[Complex[Array, ""], Scalar]:
-        """The mode that is closest to being out of reach, and its distance."""
+        """The least controllable (observable) mode, and its distance."""
         k = jnp.argmin(self.distances)
         return self.modes[k], self.distances[k]
 
     @property
     def worst_unstable(self) -> tuple[Complex[Array, ""], Scalar]:
-        """The same among unstable modes; the distance is infinite if there is none."""
+        """`worst` among the unstable modes; an infinite distance if there is none."""
         distances = jnp.where(self.unstable, self.distances, jnp.inf)
         k = jnp.argmin(distances)
         return self.modes[k], distances[k]
@@ -71,7 +72,7 @@ class ModalTest(eqx.Module):
 def modal_controllability(
     model: LinearModel, *, inputs: str = "controls", tolerance: RealScalar | None = None
 ) -> ModalTest:
-    """Which modes the inputs reach, by the test of Popov, Belevitch and Hautus,
+    """The controllable modes, by the test of Popov, Belevitch and Hautus,
 
     `rank [A - lambda I, B] = n` at each eigenvalue `lambda` of `A`.
 
@@ -83,7 +84,7 @@ def modal_controllability(
     - `tolerance`: relative distances up to it count as zero; `10 n` rounding units by
         default.
 
-    **Returns:** a [`delucax.analysis.ModalTest`][], which names each mode.
+    **Returns:** a [`delucax.analysis.ModalTest`][] of all modes.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying, or `inputs` is
     unknown.
@@ -106,22 +107,16 @@ def modal_controllability(
 def modal_observability(
     model: LinearModel, *, tolerance: RealScalar | None = None
 ) -> ModalTest:
-    """Which modes the outputs show, by the test of Popov, Belevitch and Hautus,
+    """The observable modes, by the same test of the transposed system,
 
     `rank [A' - lambda I, C'] = n` at each eigenvalue `lambda` of `A`.
 
-    **Arguments:**
+    **Arguments:** `model` and `tolerance`: as in
+    [`delucax.analysis.modal_controllability`][].
 
-    - `model`: a [`delucax.systems.LinearSystem`][], or time-invariant
-        [`delucax.LinearDynamics`][].
-    - `tolerance`: relative distances up to it count as zero; `10 n` rounding units by
-        default.
-
-    **Returns:** a [`delucax.analysis.ModalTest`][], which names each mode.
+    **Returns:** a [`delucax.analysis.ModalTest`][] of all modes.
 
     **Raises:** `ValueError` if `model` is not linear or is time-varying.
-
-    Source: Hautus, 1969; Eising, 1984 (the distance).
 
     !!! example
 
@@ -139,10 +134,10 @@ def modal_observability(
 def is_controllable(
     model: LinearModel, *, inputs: str = "controls", tolerance: RealScalar | None = None
 ) -> BoolScalar:
-    """Whether the inputs reach every mode.
+    """Whether every mode is controllable.
 
     **Arguments:** `model`, `inputs` and `tolerance`: as in
-    [`delucax.analysis.modal_controllability`][], which says which mode is out of reach.
+    [`delucax.analysis.modal_controllability`][], which tests each mode.
 
     **Returns:** a boolean scalar.
 
@@ -158,16 +153,16 @@ def is_controllable(
         ```
     """
     test = modal_controllability(model, inputs=inputs, tolerance=tolerance)
-    return ~jnp.any(test.out_of_reach)
+    return ~jnp.any(test.rank_deficient)
 
 
 def is_stabilizable(
     model: LinearModel, *, inputs: str = "controls", tolerance: RealScalar | None = None
 ) -> BoolScalar:
-    """Whether the inputs reach every unstable mode.
+    """Whether every unstable mode is controllable.
 
     **Arguments:** `model`, `inputs` and `tolerance`: as in
-    [`delucax.analysis.modal_controllability`][], which says which mode is out of reach.
+    [`delucax.analysis.modal_controllability`][], which tests each mode.
 
     **Returns:** a boolean scalar.
 
@@ -186,16 +181,16 @@ def is_stabilizable(
         ```
     """
     test = modal_controllability(model, inputs=inputs, tolerance=tolerance)
-    return ~jnp.any(test.out_of_reach & test.unstable)
+    return ~jnp.any(test.rank_deficient & test.unstable)
 
 
 def is_observable(
     model: LinearModel, *, tolerance: RealScalar | None = None
 ) -> BoolScalar:
-    """Whether the outputs show every mode.
+    """Whether every mode is observable.
 
     **Arguments:** `model` and `tolerance`: as in
-    [`delucax.analysis.modal_observability`][], which says which mode is not shown.
+    [`delucax.analysis.modal_observability`][], which tests each mode.
 
     **Returns:** a boolean scalar.
 
@@ -210,16 +205,16 @@ def is_observable(
         assert dlx.analysis.is_observable(upright)
         ```
     """
-    return ~jnp.any(modal_observability(model, tolerance=tolerance).out_of_reach)
+    return ~jnp.any(modal_observability(model, tolerance=tolerance).rank_deficient)
 
 
 def is_detectable(
     model: LinearModel, *, tolerance: RealScalar | None = None
 ) -> BoolScalar:
-    """Whether the outputs show every unstable mode.
+    """Whether every unstable mode is observable.
 
     **Arguments:** `model` and `tolerance`: as in
-    [`delucax.analysis.modal_observability`][], which says which mode is not shown.
+    [`delucax.analysis.modal_observability`][], which tests each mode.
 
     **Returns:** a boolean scalar.
 
@@ -237,7 +232,7 @@ def is_detectable(
         ```
     """
     test = modal_observability(model, tolerance=tolerance)
-    return ~jnp.any(test.out_of_reach & test.unstable)
+    return ~jnp.any(test.rank_deficient & test.unstable)
 
 
 def poles(model: LinearModel) -> Complex[Array, " n"]:
@@ -280,6 +275,7 @@ def _modal_test(
 def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
     system = lax.stop_gradient(system)
     eps = jnp.finfo(system.A.dtype).eps
+    # Scaled, so that a distance is relative to each of the matrices.
     scale_A, scale_B = (
         jnp.where(norm > 0, norm, 1)
         for norm in (jnp.linalg.norm(system.A), jnp.linalg.norm(system.B))
@@ -300,6 +296,7 @@ def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
         first, better = distance(eigenvalue)
         mode, least = eigenvalue, first
         for _ in range(_SEARCHES):
+            # The improved mode stays within the error of the eigenvalue.
             step = better - eigenvalue
             length = jnp.abs(step)
             step = step * jnp.minimum(1, radius / jnp.where(length > 0, length, 1))
@@ -317,9 +314,9 @@ def _tested(system: StateSpace, tolerance: Scalar) -> ModalTest:
 def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " zeros"]:
     """The invariant zeros: where `[[A - z I, B], [C, 0]]` loses rank.
 
-    Each step takes away what the outputs show at once, and then, of the transposed
-    system, what the inputs reach at once, until the zeros are what is left. How many
-    there are depends on the values, which therefore cannot be traced.
+    Each step deflates the directly observable states, and then, in the transposed
+    system, the directly controllable ones, until the zeros remain. Their number depends
+    on the values, which therefore cannot be traced.
 
     **Arguments:**
 
@@ -353,6 +350,7 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
             "jax.vmap or jax.grad); how many zeros there are depends on its values."
         )
     A, B, C, D = (np.asarray(M) for M in (system.A, system.B, system.C, system.D))
+    # NumPy: the sizes of the reduced systems depend on ranks.
     total = np.linalg.norm(np.block([[A, B], [C, D]]))
     tolerance = 10 * sum(A.shape) * np.finfo(A.dtype).eps * total
     A, B, C, D = _hidden_part(A, B, C, D, tolerance)
@@ -360,20 +358,21 @@ def zeros(model: LinearModel, *, inputs: str = "controls") -> Complex[Array, " z
     A, C, B, D = (M.T for M in _hidden_part(A.T, C.T, B.T, D.T, tolerance))
     if not len(A):
         return jnp.zeros(0, complex)
-    # With no input or output left the modes that are left are zeros.
+    # Closed by the input that keeps the outputs zero, the remaining modes are zeros.
     left = A - B @ np.linalg.solve(D, C) if D.size else A
     return jnp.linalg.eigvals(jnp.asarray(left))
 
 
 def _hidden_part(A, B, C, D, tolerance):
-    """What the outputs do not show at once, with the inputs that keep it so."""
+    """The states that the outputs do not observe under some input, by the reduction of
+    Emami-Naeini and Van Dooren."""
     while True:
-        # Outputs that the inputs do not touch: the rest of the rows of D is zero.
+        # Compress the rows of D: the outputs in `free` do not depend on the inputs.
         left, values, _ = np.linalg.svd(D) if D.size else (np.eye(len(C)), [], None)
         rank = int(np.sum(np.asarray(values) > tolerance))
         C, D = left.T @ C, left.T @ D
         free = C[rank:]
-        # States that those show at once.
+        # The states that are observed in these outputs.
         _, values, right = (
             np.linalg.svd(free) if free.size else ([], [], np.eye(len(A)))
         )

@@ -1,14 +1,13 @@
-"""The matrices that every analysis is about."""
+"""The state-space matrices of a linear model."""
 
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
-import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Inexact
 
 from .._check import check_choice, check_time_invariant
-from .._typing import BoolScalar, Scalar
+from .._typing import BoolScalar, Scalar, Square
 from ..dynamics import LinearDynamics
 from ..math import safe_norm
 from ..math._linear_solve import lu_solve
@@ -18,10 +17,10 @@ from ..systems import LinearSystem
 LinearModel: TypeAlias = LinearSystem | LinearDynamics
 
 
-class StateSpace(eqx.Module):
-    """`y = (C (s I - A)^-1 B + D) u`, with `s = z` if it has a step `dt`."""
+class StateSpace(NamedTuple):
+    """`y = (C (s I - A)^-1 B + D) u`, with `s = z` in discrete time, of step `dt`."""
 
-    A: Float[Array, "n n"]
+    A: Square
     B: Float[Array, "n m"]
     C: Float[Array, "p n"]
     D: Float[Array, "p m"]
@@ -32,20 +31,16 @@ class StateSpace(eqx.Module):
         return self.dt is not None
 
     @property
-    def eye(self) -> Float[Array, "n n"]:
+    def eye(self) -> Square:
         return jnp.eye(self.A.shape[0], dtype=self.A.dtype)
 
     @property
     def dual(self) -> "StateSpace":
-        """The transposed system, whose inputs are what this one's outputs are."""
+        """The transposed system, which swaps inputs and outputs."""
         return StateSpace(self.A.T, self.C.T, self.B.T, self.D.T, self.dt)
 
-    def with_A(self, A: Float[Array, "n n"]) -> "StateSpace":
-        """The same system with other dynamics."""
-        return eqx.tree_at(lambda system: system.A, self, A)
-
     def growth(self, poles: Complex[Array, "*poles"]) -> Float[Array, "*poles"]:
-        """Below zero for what decays: the real part, or the modulus less 1."""
+        """The real part of poles, or their modulus less 1: negative where stable."""
         return jnp.abs(poles) - 1 if self.is_discrete else jnp.real(poles)
 
     def is_stable(self) -> BoolScalar:
@@ -53,10 +48,10 @@ class StateSpace(eqx.Module):
         poles = jnp.linalg.eigvals(lax.stop_gradient(self.A))
         return jnp.all(self.growth(poles) < 0)
 
-    def stable_or_harmless(self, stable: BoolScalar) -> "StateSpace":
-        """This system, or a stable one in the place of one that is not, so that what is
-        computed of it and then not taken has finite derivatives."""
-        return self.with_A(jnp.where(stable, self.A, -self.eye / 2))
+    def stable_or_placeholder(self, stable: BoolScalar) -> "StateSpace":
+        """This system, or a stable placeholder for an unstable one, so that results
+        that are then discarded have finite derivatives."""
+        return self._replace(A=jnp.where(stable, self.A, -self.eye / 2))
 
     def response(self, omega: Scalar) -> Complex[Array, "p m"]:
         """The complex gain at one finite frequency: at the point `j omega`, or
@@ -65,14 +60,14 @@ class StateSpace(eqx.Module):
         resolvent = s * self.eye - self.A
         return self.C @ lu_solve(resolvent, self.B.astype(resolvent.dtype)) + self.D
 
-    def on_the_axis(self) -> "StateSpace":
-        """The system in continuous time with the gains of this one in discrete time:
-        with `z = (1 + s) / (1 - s)` the circle becomes the axis."""
-        n, eye = self.A.shape[0], self.eye
-        right = jnp.concatenate([self.A - eye, self.B], axis=1)
-        both = lu_solve(eye + self.A, right)
-        D = self.D - self.C @ both[:, n:]
-        C = 2**0.5 * lu_solve((eye + self.A).T, self.C.T).T
+    def bilinear_transform(self) -> "StateSpace":
+        """The bilinear transform `z = (1 + s) / (1 - s)` of a discrete-time system: a
+        continuous-time one with the same gains."""
+        A, B, C, D, _ = self
+        n = A.shape[0]
+        both = lu_solve(self.eye + A, jnp.concatenate([A - self.eye, B], axis=1))
+        D = D - C @ both[:, n:]
+        C = 2**0.5 * lu_solve((self.eye + A).T, C.T).T
         return StateSpace(both[:, :n], 2**0.5 * both[:, n:], C, D, None)
 
 
@@ -90,8 +85,8 @@ def state_space(model: Any, inputs: str, where: str) -> StateSpace:
         check_time_invariant(model, "model", where)
     if inputs == "disturbances" and model.E is None and dt is None:
         raise ValueError(
-            f"{where}: inputs='disturbances' needs a model with E, which says how "
-            "they enter the vector field, got a LinearSystem whose E is None."
+            f"{where}: inputs='disturbances' needs a model with E, the input matrix "
+            "of disturbances, got a LinearSystem whose E is None."
         )
     eye = jnp.eye(model.A.shape[0], dtype=model.A.dtype)
     B = model.B if inputs == "controls" else model.E
@@ -105,6 +100,7 @@ def state_space(model: Any, inputs: str, where: str) -> StateSpace:
 
 def frobenius_norm(M: Inexact[Array, "..."]) -> Scalar:
     """The norm of all entries, complex or real, with gradient 0 at 0."""
+    # As one real array: the modulus of a complex zero has no derivative.
     parts = jnp.stack([jnp.real(M), jnp.imag(M)]) if jnp.iscomplexobj(M) else M
     return safe_norm(parts, axis=None)
 
@@ -114,14 +110,16 @@ def largest_gain(G: Inexact[Array, "p m"]) -> Scalar:
 
     Those of `jnp.linalg.svd` divide by the gaps between all singular values, which are
     zero as soon as two channels are alike. Here the singular vector follows `G` to
-    first order, across the gaps that are open, and the gain is the length that `G`
-    makes of it, which errs with the square of the vector's error.
+    first order, across the gaps that are open, and the gain is `|G v| / |v|`, which is
+    second-order accurate in the error of `v`.
     """
     if 1 in G.shape:
         return frobenius_norm(G)
     frozen = lax.stop_gradient(G)
+    # First-order perturbation theory of the top singular vector.
     squares, vectors = jnp.linalg.eigh(frozen.conj().T @ frozen)
     gaps = squares[-1] - squares
+    # Across a closed gap any combination of the two vectors is a singular vector.
     open_gaps = gaps > jnp.finfo(gaps.dtype).eps ** 0.5 * squares[-1]
     weights = jnp.where(open_gaps, 1 / jnp.where(open_gaps, gaps, 1), 0)
     top = vectors[:, -1]

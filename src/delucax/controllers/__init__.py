@@ -6,16 +6,15 @@ from ._basic import (
     Linear as Linear,
     OpenLoop as OpenLoop,
     Random as Random,
-    Scheduled as Scheduled,
     Zero as Zero,
 )
+from ._composed import History as History, Scheduled as Scheduled
 from ._finite_horizon import FiniteHorizonLQR as FiniteHorizonLQR
 from ._hinfinity import HInfinity as HInfinity
 from ._lqr import LQI as LQI, LQR as LQR
-from ._mpc import MPC as MPC, MPCState as MPCState
+from ._mpc import MPC as MPC
 from ._network import (
     GRU as GRU,
-    History as History,
     MLP as MLP,
     mlp_policy as mlp_policy,
     Standardise as Standardise,
@@ -23,25 +22,14 @@ from ._network import (
 from ._output_feedback import LQG as LQG, OutputFeedback as OutputFeedback
 from ._pid import LeakyPID as LeakyPID, PID as PID
 from ._sampled import lqrd as lqrd, sampled_weights as sampled_weights
-from ._stochastic import (
-    Categorical as Categorical,
-    Gaussian as Gaussian,
-    Likeliest as Likeliest,
-)
-from .online import (
+from ._stochastic import Categorical as Categorical, Gaussian as Gaussian
+from .online._adaptive import Adaptive as Adaptive
+from .online._bpc import BPC as BPC
+from .online._explore import Explore as Explore
+from .online._gpc import drc as drc, gpc as gpc, neural_gpc as neural_gpc, sfc as sfc
+from .online._hindsight import best_in_hindsight as best_in_hindsight, regret as regret
+from .online._learner import OnlineLearner as OnlineLearner
+from .online._optimisers import (
     adagrad_norm as adagrad_norm,
-    Adaptive as Adaptive,
-    best_in_hindsight as best_in_hindsight,
-    BPC as BPC,
-    drc as drc,
-    dsc as dsc,
-    Explore as Explore,
-    FixedPolicy as FixedPolicy,
-    gpc as gpc,
-    Hindsight as Hindsight,
-    neural_gpc as neural_gpc,
     online_newton as online_newton,
-    OnlineLearner as OnlineLearner,
-    regret as regret,
-    sfc as sfc,
 )

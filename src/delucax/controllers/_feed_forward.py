@@ -1,5 +1,6 @@
-"""Signals known in advance: what to follow, and what will disturb."""
+"""References and disturbances known in advance, and the feed-forward for them."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -11,11 +12,11 @@ from jaxtyping import Array, Float
 
 from .._check import as_vector, output_of
 from .._module import function_field, parameter
-from .._typing import RealScalar
+from .._typing import Difference, RealScalar
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..references import Constant
-from ._operating_point import deviation, Difference
+from ._operating_point import deviation
 
 
 Signal = Callable[[Any], Array]
@@ -25,9 +26,9 @@ class KnownSignals(eqx.Module):
     """A state and control to follow, and a disturbance, each known at every time.
 
     About them the linear dynamics are `e_next = A e + B v + d`, with
-    `e = difference(x, r)`, `v = u - u_r`, and `d[k]` what the reference leaves over:
-    the distance from `r[k+1]` to where the dynamics go from `r[k]` under `u_r[k]` and
-    `w[k]`.
+    `e = difference(x, r)`, `v = u - u_r`, and `d[k]` the residual of the reference: the
+    difference of where the dynamics go from `r[k]` under `u_r[k]` and `w[k]` from
+    `r[k+1]`.
     """
 
     dynamics: LinearDynamics
@@ -35,11 +36,6 @@ class KnownSignals(eqx.Module):
     control_reference: Signal | None = function_field()
     disturbance: Signal | None = function_field()
     difference: Difference | None = function_field()
-
-    def check(self, where: str) -> None:
-        """Raise unless the signals have the sizes of the dynamics."""
-        given = self.reference, self.control_reference, self.disturbance
-        as_signals(self.dynamics, *given, where)
 
     def state(self, t: RealScalar) -> Float[Array, " n"]:
         """`r(t)`."""
@@ -55,6 +51,7 @@ class KnownSignals(eqx.Module):
         """Where the dynamics go from `r(t)` under `u_r(t)` and the disturbance."""
         point = self.dynamics
         here = deviation(self.state(t), point.x_ref, self.difference)
+        # The affine map of the operating point, even where the reference is far away.
         after = point.x_next + matvec(point.A, here)
         after = after + matvec(point.B, self.control(t) - point.u_ref)
         if self.disturbance is None:
@@ -69,22 +66,17 @@ class KnownSignals(eqx.Module):
 
 
 def as_signals(
-    dynamics: LinearDynamics,
-    reference: Any,
-    control_reference: Any,
-    disturbance: Any,
-    where: str,
+    dynamics: LinearDynamics, given: tuple[Any, Any, Any], where: str
 ) -> tuple[Signal | None, Signal | None, Signal | None]:
-    """The signals that were given, checked at time 0."""
-    n, m, k = dynamics.state_size, dynamics.control_size, dynamics.disturbance_size
-    return (
-        as_signal(reference, n, "reference", where),
-        as_signal(control_reference, m, "control_reference", where),
-        as_signal(disturbance, k, "disturbance", where),
-    )
+    """The reference, control reference and disturbance that were given, checked at
+    time 0."""
+    sizes = dynamics.state_size, dynamics.control_size, dynamics.disturbance_size
+    names = "reference", "control_reference", "disturbance"
+    r, u_r, w = map(functools.partial(as_signal, where), given, sizes, names)
+    return r, u_r, w
 
 
-def as_signal(value: Any, size: int, name: str, where: str) -> Any:
+def as_signal(where: str, value: Any, size: int, name: str) -> Any:
     """A vector as a constant signal; a function `t -> vector` with its size checked."""
     if value is None:
         return None
@@ -123,5 +115,6 @@ class Preview(eqx.Module):
         operator = lx.MatrixLinearOperator(eye - loop)
         ahead = lx.linear_solve(operator, pushes[-1], lx.LU()).value
         back = lambda total, push: (push + loop @ total, None)  # noqa: E731
+        # Horner's rule on the powers of the loop, from the last push back to the first.
         ahead, _ = jax.lax.scan(back, ahead, pushes[:-1], reverse=True)
         return -matvec(self.M, ahead)

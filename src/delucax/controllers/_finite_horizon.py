@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from .._check import check_at_most, check_count, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
+from .._typing import Difference
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..math._steps import row_at, step_at
@@ -18,19 +19,18 @@ from ._operating_point import (
     check_linear_state_feedback,
     check_state,
     deviation,
-    Difference,
 )
 
 
 class FiniteHorizonLQR(AbstractController):
     """The linear-quadratic regulator over a finite horizon,
 
-    `u[k] = u_r[k] - K[k] difference(x[k], r[k]) - k[k]`,
+    `u[t] = u_r[t] - K[t] difference(x[t], r[t]) - k[t]`,
 
-    which minimises the sum over `k < T` of `e'Q e + 2 e'S v + v'R v`, and
+    which minimises the sum over steps `t < T` of `e'Q e + 2 e'S v + v'R v`, and
     `e' final e` at the end, with `e = difference(x, r)` and `v = u - u_r`. All of the
     reference and of a known disturbance is taken into account: `k`, the feed-forward,
-    is zero if the dynamics go from each `r[k]` to `r[k+1]` under `u_r[k]`, as along a
+    is zero if the dynamics go from each `r[t]` to `r[t+1]` under `u_r[t]`, as along a
     trajectory that was planned.
 
     **Arguments:**
@@ -51,8 +51,8 @@ class FiniteHorizonLQR(AbstractController):
     - `parallel`: solve the recursion in parallel over time, for accelerators.
 
     **Attributes:** `K`, the gains, trainable, shape `(T, m, n)`; `k`, shape `(T, m)`;
-    `P`, shape `(T+1, n, n)`; `x_ref` and `u_ref`, shapes `(T, n)` and `(T, m)`. From
-    step `T` on the control is NaN, which a rollout reports.
+    `P`, shape `(T+1, n, n)`; `x_ref` and `u_ref`, shapes `(T, n)` and `(T, m)`. Outside
+    of the horizon the control is NaN, so that a rollout fails.
 
     **Raises:** `ValueError` if `dynamics` is not linear or does not observe its state,
     there is no horizon, or a weight or signal does not fit; an error at run time if a
@@ -109,15 +109,15 @@ class FiniteHorizonLQR(AbstractController):
         if steps is not None:
             check_at_most(T, steps, "horizon", where, "steps of dynamics")
         given = reference, control_reference, disturbance
-        signals = as_signals(dynamics, *given, where)
+        signals = as_signals(dynamics, given, where)
 
         def along(t):
             here = KnownSignals(dynamics.at(t), *signals, difference)
             return here.state(t), here.control(t), here.next_state(t)
 
-        times = jnp.arange(T) * dynamics.dt
-        self.x_ref, self.u_ref, x_next = jax.vmap(along)(times)
+        self.x_ref, self.u_ref, x_next = jax.vmap(along)(jnp.arange(T) * dynamics.dt)
         end = T * dynamics.dt
+        # The last step needs the reference one step beyond the horizon.
         if signals[0] is not None:
             last = signals[0](end)
         elif steps == T:
@@ -126,8 +126,9 @@ class FiniteHorizonLQR(AbstractController):
             last = dynamics.at(end).x_ref
         targets = jnp.concatenate([self.x_ref[1:], last[None]])
         d = jax.vmap(lambda a, b: deviation(a, b, difference))(x_next, targets)
-        A, B = dynamics.A, dynamics.B
-        A, B = (A, B) if steps is None else (A[:T], B[:T])
+        A, B = (a if steps is None else a[:T] for a in (dynamics.A, dynamics.B))
+        # With the residual d of the reference the cost to go has a linear term, whose
+        # share of the control is the feed-forward k.
         solution = dre(A, B, Q, R, S, final=final, horizon=T, d=d, parallel=parallel)
         self.K, self.k, self.P = solution.K, solution.k, solution.X
         self.dt, self.difference = dynamics.dt, difference

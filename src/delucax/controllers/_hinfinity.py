@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 from .._check import check_count, check_positive, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
+from .._typing import Difference
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..math._steps import row_at, step_at
@@ -15,7 +16,6 @@ from ._operating_point import (
     check_linear_state_feedback,
     check_state,
     deviation,
-    Difference,
     operating_state,
 )
 
@@ -30,8 +30,8 @@ class HInfinity(AbstractController):
     deviations from the operating point. Over all time, or over a horizon; then the gain
     varies in time, and `dx' final dx` at the end counts too.
 
-    By default `gamma` is the least that is attainable. A larger one trades some of the
-    worst case for the average.
+    By default `gamma` is the least that is attainable. A larger one improves the
+    average at the expense of the worst case.
 
     **Arguments:**
 
@@ -64,16 +64,13 @@ class HInfinity(AbstractController):
 
         ```python
         import delucax as dlx
-        import jax
         import jax.numpy as jnp
 
-        env = dlx.make("pendulum")
-        upright = dlx.linearize(env.dynamics)
-        controller = dlx.controllers.HInfinity(
-            upright, jnp.eye(2), jnp.eye(1), difference=env.dynamics.difference
-        )
-        x0 = jnp.array([0.1, 0.0])
-        dlx.rollout(env, controller, key=jax.random.key(0), x0=x0).total_cost
+        A, B = jnp.array([[1.0, 1.0], [0.0, 1.0]]), jnp.array([[0.0], [1.0]])
+        dynamics, weight = dlx.LinearDynamics(A, B), jnp.eye(2)
+        best = dlx.controllers.HInfinity(dynamics, weight, jnp.eye(1))
+        calm = dlx.controllers.HInfinity(dynamics, weight, jnp.eye(1), gamma=10.0)
+        best.gamma, best.K, calm.K
         ```
     """
 
@@ -113,6 +110,8 @@ class HInfinity(AbstractController):
         else:
             solution = hinf_dare(*matrices, gamma=gamma)
         self.K, self.P, self.L = solution.K, solution.X, solution.L
+        # The sign is that of the Riccati package: u = -K dx minimises, w = +L dx
+        # maximises, and the closed loop of both is A - B K + E L.
         self.gamma, self.dt = solution.gamma, dynamics.dt if is_finite else None
 
     def __check_init__(self):
@@ -126,6 +125,7 @@ class HInfinity(AbstractController):
         if self.dt is not None:
             step = step_at(t, self.dt, len(K), "HInfinity")
             K = row_at(K, step)
+            # Gains may vary about one operating point, or about one at each step.
             if x_ref.ndim == 2:
                 x_ref, u_ref = row_at((x_ref, u_ref), step)
         u = u_ref - matvec(K, deviation(y, x_ref, self.difference))

@@ -10,17 +10,16 @@ from jaxtyping import Array, Float
 from .._check import as_matrix, check_count, check_instance, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
+from .._typing import Difference
 from ..dynamics import AbstractDynamics, LinearDynamics, OperatingPoint
 from ..math import matvec
 from ..math._linear_solve import solve
 from ..riccati import dare
-from ..riccati._arguments import riccati_arguments
 from ._feed_forward import as_signal, as_signals, KnownSignals, Preview
 from ._operating_point import (
     check_linear_state_feedback,
     check_state,
     deviation,
-    Difference,
     linear_at,
     operating_state,
 )
@@ -33,7 +32,7 @@ class LQR(AbstractController):
 
     which minimises the sum over all time of `dx'Q dx + 2 dx'S du + du'R du` on the
     linear dynamics, `dx` and `du` being the deviations from the operating point. The
-    minimum is `dx' P dx`; with unit white noise it is `trace(P)` a step.
+    minimum is `dx' P dx`; with unit white noise it is `trace(P)` per step.
 
     With a `reference` r(t), a `control_reference` u_r(t) or a known `disturbance` w(t),
     the deviations are those from r and u_r, and a feed-forward is added, the best one
@@ -49,10 +48,8 @@ class LQR(AbstractController):
 
     - `dynamics`: time-invariant linear dynamics whose operating point is an equilibrium
         and whose state is observed, of [`delucax.linearize`][] for example; or any
-        dynamics, with a `point`. At an equilibrium what is left to move each state is
-        below 1e-4 of the terms `|A - I| |x_ref| + |B| |u_ref|` that move it, or below
-        the rounding of the state (4 units in the last place). A zero counts there as
-        the largest state or control, at most 1, and as 1 if all are zero.
+        dynamics, with a `point`. The residual of the equilibrium must be below 1e-4 of
+        the terms `|A - I| |x_ref| + |B| |u_ref|`.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `S`: cross weight, shape `(n, m)`; zero by default.
@@ -126,7 +123,8 @@ class LQR(AbstractController):
         check_linear_state_feedback(linear, where, time_invariant=True)
         self.x_ref = operating_state(linear, difference, where)
         self.u_ref, self.difference = linear.u_ref, difference
-        given = as_signals(linear, reference, control_reference, disturbance, where)
+        given = reference, control_reference, disturbance
+        given = as_signals(linear, given, where)
         is_known = any(signal is not None for signal in given)
         preview = check_count(preview, "preview", where, least=0)
         if preview and not is_known:
@@ -134,16 +132,15 @@ class LQR(AbstractController):
                 f"{where}: preview must be 0 without a reference or disturbance that "
                 f"is looked up ahead, got {preview}."
             )
-        A, B = linear.A, linear.B
-        A, B, Q, R, S, _ = riccati_arguments(where, A, B, Q, R, S, None, definite=False)
-        solution = dare(A, B, Q, R, S)
+        solution = dare(linear.A, linear.B, Q, R, S)
         self.K, self.P, self.feed_forward = solution.K, solution.X, None
         if is_known:
             B, P = linear.B, solution.X
+            # (R + B'PB)^-1 B', once: the weight of each control by what it does to the
+            # cost to go.
             M = solve(jnp.asarray(R, P.dtype) + B.T @ P @ B, B.T)
             signals = KnownSignals(linear, *given, difference)
-            known = signals, P, M, solution.closed_loop
-            self.feed_forward = Preview(*known, preview)
+            self.feed_forward = Preview(signals, P, M, solution.closed_loop, preview)
 
     def __check_init__(self):
         if self.feed_forward is None:
@@ -156,7 +153,9 @@ class LQR(AbstractController):
                 f"is, got M of shape {shapes[0]} and dynamics with B of shape "
                 f"{shapes[1]}."
             )
-        self.feed_forward.signals.check("LQR")
+        known = self.feed_forward.signals
+        given = known.reference, known.control_reference, known.disturbance
+        as_signals(known.dynamics, given, "LQR")
 
     def __call__(self, t, y, state):
         check_state(self, y, self.x_ref.shape[0])
@@ -184,8 +183,8 @@ class LQI(AbstractController):
     disturbance. The gains minimise the sum of `v'Q v + 2 v'S du + du'R du`, `v` being
     the deviation of the state and the integral `z`, one under the other.
 
-    Where the control is limited, the integral is set back to the value at which what
-    was really applied would have been asked for, so that it cannot wind up.
+    Where the control is limited, back-calculation sets the integral to the value that
+    would have given the applied control, so that it cannot wind up.
 
     **Arguments:**
 
@@ -265,7 +264,8 @@ class LQI(AbstractController):
         self.x_ref = operating_state(dynamics, difference, where)
         self.u_ref, self.dt, self.difference = dynamics.u_ref, dynamics.dt, difference
         self.output = C.astype(dynamics.A.dtype)
-        self.reference = as_signal(reference, p, "reference", where)
+        self.reference = as_signal(where, reference, p, "reference")
+        # `z_next = z - dt C e`, below the plant: the reference drops out of the design.
         integrals = [-dynamics.dt * C, jnp.eye(p, dtype=C.dtype)]
         A = jnp.block([[dynamics.A, jnp.zeros((n, p), C.dtype)], integrals])
         B = jnp.concatenate([dynamics.B, jnp.zeros((p, m), C.dtype)])
@@ -274,7 +274,7 @@ class LQI(AbstractController):
 
     def __check_init__(self):
         check_step(self.dt, "LQI")
-        as_signal(self.reference, self.Ki.shape[1], "reference", "LQI")
+        as_signal("LQI", self.reference, self.Ki.shape[1], "reference")
 
     def init(self, *, key=None):
         dtype = jnp.result_type(self.K, self.Ki)
@@ -284,6 +284,8 @@ class LQI(AbstractController):
     def __call__(self, t, y, state):
         check_state(self, y, self.x_ref.shape[0])
         dx = deviation(y, self.x_ref, self.difference)
+        # r - C x with x = x_ref + dx; the part of x_ref cancels where no reference is
+        # given.
         error = -matvec(self.output, dx)
         if self.reference is not None:
             error = error + self.reference(t) - matvec(self.output, self.x_ref)
@@ -294,9 +296,11 @@ class LQI(AbstractController):
         return u.astype(y.dtype), after
 
     def applied(self, u, cost, state):
-        # The least change of the integral that would have asked for this control.
+        # The least change `dz` of the integral with `Ki dz = asked - applied`, so that
+        # the law would have given the applied control: back-calculation in one step.
         excess = state.asked - u.astype(state.asked.dtype)
         gain = lx.MatrixLinearOperator(self.Ki)
+        # Where there are fewer outputs than controls, Ki is tall: least squares.
         solver = lx.AutoLinearSolver(well_posed=None)
         change = lx.linear_solve(gain, excess, solver, throw=False).value
         limited = jnp.any(excess != 0)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from .._check import (
     as_rows,
@@ -20,42 +20,20 @@ from .._check import (
     check_key,
 )
 from .._controller import AbstractController, Tally
-from .._module import check_parameters, function_field
+from .._module import function_field
 from .._results import Result, RESULTS
-from .._typing import Control, Observation, PRNGKey
+from .._typing import Control, Difference, Observation, PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
-from ..planning import AbstractPlanner, Constraints, default_start, ILQR, Start
-from ._operating_point import check_state, deviation, Difference
+from ..planning import AbstractPlanner, Constraints, ILQR, Start
+from ._operating_point import check_state, deviation
 
 
 class MPCState(NamedTuple):
-    """What [`delucax.controllers.MPC`][] remembers.
+    """The state of [`delucax.controllers.MPC`][]."""
 
-    **Attributes:** `controls`, shape `(T, m)`, `states`, shape `(T+1, n)`, and `gains`,
-    shape `(T, m, n)`, of the last plan a step later, from which the next one starts;
-    `result`, that of the last plan; `failures`, a [`delucax.controllers.Tally`][] of
-    the plans that did not succeed; `iterations`, how many the last plan took; `key`,
-    for planners that draw.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        dynamics = dlx.LinearDynamics(jnp.eye(1), jnp.eye(1))
-        cost = dlx.costs.Quadratic([1.0], [1.0])
-        mpc = dlx.controllers.MPC(dynamics, cost, 5)
-        u, state = mpc(0.0, jnp.ones(1), mpc.init())
-        state.failures.count
-        ```
-    """
-
-    controls: Float[Array, "T m"]
-    states: Float[Array, "T+1 n"]
-    gains: Float[Array, "T m n"]
+    last: Start
     result: Result
     failures: Tally
     iterations: Int[Array, ""]
@@ -63,8 +41,8 @@ class MPCState(NamedTuple):
 
 
 class MPC(AbstractController):
-    """Model predictive control: plan from where the plant is, apply the first control,
-    and plan again.
+    """Model predictive control (receding horizon): plan from the current state, apply
+    the first control, and plan again.
 
     `u_k` is the first control of the plan over `T` steps from `y_k` at `t_k`. It works
     with every [`delucax.planning.AbstractPlanner`][], and with a cost
@@ -77,26 +55,28 @@ class MPC(AbstractController):
     2. the LQR about an operating point,
     3. the control of that point, held.
 
-    The second one keeps an unstable plant where the model is worth something, and a
-    plan of [`delucax.planning.ILQR`][] without constraints costs at most as much as
-    each of them. It is computed when the controller is made, about the point that
-    [`delucax.planning.default_start`][] chooses: the targets of the cost, or the
-    equilibrium of the dynamics, or zero where neither names one, as with
+    The second one keeps an unstable plant near the point of linearisation, and a plan
+    of [`delucax.planning.ILQR`][] without constraints costs at most as much as each of
+    them. It is computed when the controller is made, about the point that
+    [`delucax.planning.Start.default`][] chooses: the targets of the cost, or the
+    equilibrium of the dynamics, or zero where neither defines one, as with
     [`delucax.costs.Function`][] or [`delucax.costs.Tracking`][] over dynamics of your
     own. An unstable plant needs a `start` where it is to be held far from that point,
     and where there is no LQR: the second derivative of the cost with respect to the
     control is not positive definite there, no gain stabilises the plant, or the
     dynamics cannot be differentiated.
 
-    What became of a plan is in the controller's state: `result`, and how often it was
-    no success, `failures`, which are `incidents["failed_plan"]` of a rollout. A plan
-    that ran out of iterations or found no descent is used as it is, the best so far.
-    Where there is none to use, since every start diverges or the constraints cannot
-    hold, `throw` says what happens.
+    The status of a plan is in the controller's state: `result`, that of the last plan;
+    `iterations`, how many it took; and how often it was no success, `failures`, which
+    are `incidents["failed_plan"]` of a rollout. There too is `last`, a
+    [`delucax.planning.Start`][], the last plan a step later, from which the next one
+    starts. A plan that ran out of iterations or found no descent is used as it is, the
+    best so far. Where there is none to use, since every start diverges or the
+    constraints cannot hold, `throw` says what happens.
 
     Derivatives are those of the planner: of [`delucax.planning.ILQR`][] by the implicit
-    function theorem, NaN where a plan did not converge. Of a planner that samples they
-    go through the start that was taken; which one that is, is held.
+    function theorem, NaN where a plan did not converge. For a planner that samples they
+    go through the chosen start; the choice itself has none.
 
     **Arguments:**
 
@@ -112,12 +92,12 @@ class MPC(AbstractController):
     - `bounds`: `(low, high)` of the controls, each a number or of shape `(m,)`; none by
         default.
     - `start`: what each plan may start from besides the last one:
-        [`delucax.planning.default_start`][] by default, the second and third above;
+        [`delucax.planning.Start.default`][] by default, the second and third above;
         controls in place of the third, shape `(T, m)`; or a
         [`delucax.planning.Start`][] in place of both, such as another stabilising law,
         or controls alone.
     - `throw`: raise at run time where there is no plan to use (default). If false, the
-        last plan is followed for one more step, under its gains, and forgotten; if
+        last plan is used for one more step, under its gains, and then discarded; if
         there is no plan in the next step either, the first one of `start`, by default
         the LQR, is applied.
     - `constraints`: [`delucax.planning.Constraints`][] on states and controls, for
@@ -186,7 +166,7 @@ class MPC(AbstractController):
             if start is not None:
                 start = as_rows(start, m, "start", where, horizon)
                 check_finite(start, "start", where)
-            start = default_start(dynamics, cost, horizon, controls=start)
+            start = Start.default(dynamics, cost, horizon, controls=start)
         self.dynamics, self.cost = dynamics, cost
         self.start = _stacked(start, dynamics.state_size)
         self.planner = ILQR() if planner is None else planner
@@ -200,7 +180,6 @@ class MPC(AbstractController):
         check_instance(self.cost, AbstractCost, "cost", where)
         check_cost_sizes(self.cost, (n, m), "cost", where)
         check_instance(self.planner, AbstractPlanner, "planner", where)
-        check_parameters(self)
         check_instance(self.start, Start, "start", where)
         start = self.start.checked(n, m, "start", where)
         if start.controls.ndim != 3 or start.states is None or start.gains is None:
@@ -214,11 +193,8 @@ class MPC(AbstractController):
         draws = self.planner.is_stochastic
         if draws:
             check_key(key, "MPC.init")
-        first = jax.tree.map(lambda a: a[0], self.start)
         return MPCState(
-            first.controls,
-            first.states,
-            first.gains,
+            last=jax.tree.map(lambda a: a[0], self.start),
             result=jax.tree.map(jnp.asarray, RESULTS.successful),
             failures=Tally("failed_plan"),
             iterations=jnp.zeros((), int),
@@ -230,10 +206,12 @@ class MPC(AbstractController):
         key, draw = state.key, None
         if self.planner.is_stochastic:
             key, draw = jr.split(key)
-        last = Start(state.controls, state.states, state.gains)
-        starts = state.controls
+        last, starts = state.last, state.last.controls
         if not self.planner.starts_from_states:
+            # First, as of starts of equal cost the first is taken.
             join = lambda a, b: jnp.concatenate([a[None], b])
+            # One batch: the planner rolls all of them out together and refines the
+            # best.
             starts = jax.tree.map(join, last, self.start)
         plan = self.planner(
             self.dynamics,
@@ -248,18 +226,21 @@ class MPC(AbstractController):
             key=draw,
             throw=False,
         )
+        # Usable plans include those that ran out of iterations: the best so far beats
+        # the last one, which is a step older.
         lost, u = ~plan.is_usable, plan.controls[0]
         u = jnp.where(lost, self._followed(y, last), u)
         if self.throw:
+            # Hung on the control, which every caller reads: on the state it would be
+            # removed as dead code where nobody does.
             u = plan.result.error_if(u, lost)
+        # The warm start is the plan a step later, its last step held for the new one. A
+        # lost plan is forgotten, or the next one would start from what had failed.
         shift = lambda a: jnp.concatenate([a[1:], a[-1:]])
         later = Start(*(shift(a) for a in (plan.controls, plan.states, plan.gains)))
         renewed = lambda new, old: jnp.where(lost, old[0], new).astype(old.dtype)
-        later = jax.tree.map(renewed, later, self.start)
         after = MPCState(
-            later.controls,
-            later.states,
-            later.gains,
+            last=jax.tree.map(renewed, later, self.start),
             result=plan.result,
             failures=state.failures.add(plan.result != RESULTS.successful),
             iterations=jnp.asarray(plan.iterations, state.iterations.dtype),
@@ -271,6 +252,7 @@ class MPC(AbstractController):
         """The first control of the last plan, under its gains."""
         assert last.states is not None and last.gains is not None
         x, u = last.states[0], last.controls[0]
+        # Gains of a plan that diverged may not be finite: its controls alone, then.
         tried = u - matvec(last.gains[0], deviation(y, x, self.difference))
         u = jnp.where(jnp.isfinite(tried), tried, u)
         if self.bounds is None:
@@ -286,6 +268,7 @@ def _stacked(start: Start, n: int) -> Start:
     controls, states, gains = start.controls, start.states, start.gains
     c, T, m = controls.shape
     if states is None or gains is None:
+        # Zero gains make the states irrelevant; all starts then stack in one shape.
         states = jnp.zeros((c, T + 1, n), controls.dtype)
         gains = jnp.zeros((c, T, m, n), controls.dtype)
     return Start(controls, states, gains)

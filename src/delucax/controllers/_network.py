@@ -1,15 +1,13 @@
-"""Policies that are neural networks, and what they are given."""
+"""Neural network policies, and their features."""
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from .._check import (
     as_bounds,
@@ -22,9 +20,9 @@ from .._check import (
     check_vector,
     is_concrete,
 )
-from .._controller import AbstractController, check_controller, wrong_observation
-from .._module import as_float_array, as_module, function_field, parameter, weight
-from .._typing import PRNGKey
+from .._controller import AbstractController, wrong_observation
+from .._module import as_float_array, function_field, mlp, parameter, weight
+from .._typing import PRNGKey, Real
 from ..environments import Environment
 from ._stochastic import Gaussian
 
@@ -96,13 +94,12 @@ class MLP(AbstractController):
                 f"{activation!r}."
             )
         check_key(key, where)
-        self.network = eqx.nn.MLP(
+        self.network = mlp(
             check_count(in_size, "in_size", where),
             check_count(out_size, "out_size", where),
             check_count(width, "width", where),
             check_count(depth, "depth", where, least=0),
-            as_module(activation),
-            as_module(jax.nn.identity),
+            activation,
             key=key,
         )
         self.features = features
@@ -126,10 +123,11 @@ def features_of(controller: Any, y: Array, size: int) -> Float[Array, " size"]:
 
 
 def squash(u: Array, bounds: tuple[Array, Array] | None) -> Array:
-    """The real line mapped between the bounds."""
+    """`u` squashed between the bounds by `tanh`."""
     if bounds is None:
         return u
     low, high = bounds
+    # Smooth, where clipping has no gradient beyond a bound and learning stalls.
     return (high + low) / 2 + (high - low) / 2 * jnp.tanh(u)
 
 
@@ -200,6 +198,8 @@ def mlp_policy(
     std = jnp.ones(size)
     if bounds is not None:
         std = jnp.broadcast_to((bounds[1] - bounds[0]) / 4, (size,))
+    # The bounds of the environment, infinite ones included: `log_prob` is then that of
+    # what is applied.
     return Gaussian(network, jnp.log(std), bounds=environment.control_bounds)
 
 
@@ -213,14 +213,9 @@ class GRU(AbstractController):
 
     **Arguments:**
 
-    - `in_size`: the size of the features.
-    - `out_size`: the number of controls.
+    - `in_size`, `out_size`, `features`, `bounds`, `key`: as of
+        [`delucax.controllers.MLP`][].
     - `width`: the size of the memory, 32 by default.
-    - `features`: what the network is given of an observation, a function such as
-        `env.encode`; the observation itself by default.
-    - `bounds`: `(low, high)`, each a finite number or vector, that the control is
-        squashed into; none by default.
-    - `key`: a random key, for the first weights.
 
     **Attributes:** `cell`, an `eqx.nn.GRUCell`, and `readout`, an `eqx.nn.Linear`,
     trainable.
@@ -280,92 +275,13 @@ class GRU(AbstractController):
         return squash(self.readout(after), self.bounds).astype(y.dtype), after
 
 
-class _Past(NamedTuple):
-    base: PyTree
-    observations: Array
-    controls: Array
-    started: Array
-
-
-class History(AbstractController):
-    """A controller that is given a window of the past beside the observation,
-
-    `u_t = base(t, (z_t, z_{t-1}, ..., z_{t-n}, u_{t-1}, ..., u_{t-n}))`
-
-    with `z = features(y)` and u the controls that were applied. Before the beginning
-    the controls are zero and the observations the first one.
-
-    **Arguments:**
-
-    - `base`: the controller of the window, which has `size (n + 1) + controls n`
-        entries.
-    - `size`: the size of the features.
-    - `controls`: the number of controls.
-    - `length`: n, the steps of the past, 1 by default.
-    - `features`: of an observation, a function such as `env.encode`; the observation
-        itself by default.
-
-    **Raises:** `ValueError` if `base` is not a controller or a size is below 1; when it
-    is run, if the features have another size.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-
-        env = dlx.make("pendulum")
-        angle = lambda y: env.encode(y)[:2]
-        size = 2 * (3 + 1) + 3
-        base = dlx.controllers.MLP(size, 1, width=8, depth=1, key=jax.random.key(0))
-        blind = dlx.controllers.History(base, 2, 1, length=3, features=angle)
-        dlx.rollout(env, blind, key=jax.random.key(1), horizon=10).total_cost
-        ```
-    """
-
-    base: AbstractController
-    size: int = eqx.field(static=True)
-    controls: int = eqx.field(static=True)
-    length: int = eqx.field(default=1, static=True)
-    _: KW_ONLY
-    features: Callable[[Array], Array] | None = function_field(None)
-
-    def __check_init__(self):
-        check_controller(self.base, "base", "History")
-        for name in ("size", "controls", "length"):
-            check_count(getattr(self, name), name, "History")
-
-    def init(self, *, key=None):
-        return _Past(
-            self.base.init(key=key),
-            jnp.zeros((self.length, self.size)),
-            jnp.zeros((self.length, self.controls)),
-            jnp.zeros((), bool),
-        )
-
-    def __call__(self, t, y, state):
-        z = features_of(self, y, self.size).astype(state.observations.dtype)
-        past = jnp.where(state.started, state.observations, z)
-        window = jnp.concatenate([z, past.ravel(), state.controls.ravel()])
-        u, base = self.base(t, window.astype(y.dtype), state.base)
-        observations = jnp.concatenate([z[None], past[:-1]])
-        return u, _Past(base, observations, state.controls, jnp.ones((), bool))
-
-    def applied(self, u, cost, state):
-        u = u.astype(state.controls.dtype)
-        return state._replace(
-            base=self.base.applied(u, cost, state.base),
-            controls=jnp.concatenate([u[None], state.controls[:-1]]),
-        )
-
-
 class Standardise(eqx.Module):
     """Features shifted and scaled to mean 0 and standard deviation 1,
 
     `clip((features(y) - mean) / std, -10, 10)`: the `features=` of a network.
 
-    [`delucax.training.PPO`][] and [`delucax.training.SHAC`][] set `mean` and `std` by
-    what they see on the way, wherever in their model there is one.
+    [`delucax.training.PPO`][] and [`delucax.training.SHAC`][] set `mean` and `std` of
+    each one in their model from the observations of training.
 
     **Arguments:**
 
@@ -391,21 +307,13 @@ class Standardise(eqx.Module):
     """
 
     mean: Array = parameter()
-    std: Array = parameter()
-    features: Callable[[Array], Array] | None = function_field()
+    std: Real = parameter(1.0)
+    features: Callable[[Array], Array] | None = function_field(None)
 
-    def __init__(
-        self,
-        mean: Any,
-        std: Any = 1.0,
-        features: Callable[[Array], Array] | None = None,
-    ):
-        self.mean = as_float_array(mean)
-        std = as_float_array(std)
-        if eqx.is_inexact_array(self.mean) and jnp.ndim(std) == 0:
-            std = jnp.broadcast_to(std, self.mean.shape).astype(self.mean.dtype)
-        self.std = std
-        self.features = features
+    def __post_init__(self):
+        mean, std = as_float_array(self.mean), as_float_array(self.std)
+        if eqx.is_inexact_array(mean) and jnp.ndim(std) == 0:
+            self.std = jnp.broadcast_to(std, mean.shape).astype(mean.dtype)
 
     def __check_init__(self):
         where, mean = "Standardise", self.mean
@@ -433,4 +341,6 @@ class Standardise(eqx.Module):
 
         **Returns:** a vector.
         """
+        # Ten deviations, as in OpenAI's baselines: an outlier may not saturate the
+        # network.
         return jnp.clip((self.of(y) - self.mean) / self.std, -10, 10)

@@ -1,7 +1,6 @@
-"""What the regulators ask of the linear dynamics that they are designed on."""
+"""Checks of the linear dynamics that a regulator is designed for."""
 
-from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,17 +10,14 @@ from jaxtyping import Array, Float
 
 from .._check import check_instance, check_time_invariant, is_concrete
 from .._controller import AbstractController, wrong_observation
+from .._typing import Difference
 from ..dynamics import LinearDynamics, linearize, OperatingPoint
-from ..math._drift import relative_drift
+from ..math._norms import relative_drift
 from ..systems import LinearSystem
 
 
-Difference: TypeAlias = Callable[[Array, Array], Array]
-"""`(x, x_ref) -> deviation`."""
-
 _RESTS = 1e-4
-"""The share of the terms that move a state which may be left over at an equilibrium,
-which may be written in few digits."""
+"""The relative residual of an equilibrium, which users may give to few digits."""
 
 
 def linear_at(
@@ -38,6 +34,8 @@ def linear_at(
             f"{where}: point must have x of shape {sizes[0]} and u of shape "
             f"{sizes[1]}, got {point.x.shape} and {point.u.shape}."
         )
+    # Linear dynamics have no angles of their own: for them subtraction stays the
+    # default.
     if difference is None and not isinstance(dynamics, LinearDynamics | LinearSystem):
         difference = dynamics.difference
     return linearize(dynamics, x=point), difference
@@ -58,6 +56,7 @@ def check_linear_state_feedback(
     C, n = dynamics.C, dynamics.state_size
     if C is None:
         return
+    # A traced C cannot be inspected: its shape alone decides.
     if C.shape != (n, n) or is_concrete(C) and not np.array_equal(C, np.eye(n)):
         raise ValueError(
             f"{where}: dynamics must observe their state (C the identity), for {where} "
@@ -87,6 +86,7 @@ def operating_state(
         hint = "`delucax.trim(system, x=..., u=...)` computes one that does; "
         drift = deviation(x_next, x_ref, difference)
     moved = _relative_drift(drift, A, B, x, u_ref)
+    # Negated, so that a NaN counts as motion.
     moves = ~(moved <= _RESTS)
     if not is_concrete(moves):
         return eqx.error_if(x_ref, moves, f"{rule}.")
@@ -100,7 +100,8 @@ def operating_state(
 
 @jax.jit
 def _relative_drift(drift, A, B, x, u):
-    """What moves the state, relative to the terms that do."""
+    """The residual of an equilibrium, relative to its terms."""
+    # The derivative of x_next - x: what moves the state is J (x, u).
     J = jnp.concatenate([A - jnp.eye(A.shape[-1], dtype=A.dtype), B], axis=-1)
     return relative_drift(drift, J, x, u, is_map=True)
 

@@ -5,29 +5,32 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._check import check_instance
-from .._controller import AbstractController, check_controller
+from .._controller import AbstractController, check_controller, Tally
 from .._module import parameter
+from .._results import RESULTS
+from .._typing import Difference
 from ..dynamics import LinearDynamics
 from ..estimators import AbstractEstimator, KalmanFilter
 from ._lqr import LQR
-from ._operating_point import Difference
 
 
 class _State(NamedTuple):
     controller: PyTree
     estimator: PyTree
     time: Array
+    failures: Tally
 
 
 class OutputFeedback(AbstractController):
     """Any controller of the state, run on an estimate of it.
 
     At each step the estimator takes in the observation, the controller acts on the mean
-    of its estimate, and the estimator moves on with the control that was really
-    applied, after saturation.
+    of its estimate, and the estimator predicts with the control that was really
+    applied, after saturation. Steps at which its `status` is no success are
+    `incidents["failed_estimate"]` of a rollout.
 
     **Arguments:**
 
@@ -67,20 +70,25 @@ class OutputFeedback(AbstractController):
     def init(self, *, key=None):
         keys = (None, None) if key is None else jax.random.split(key)
         state = self.estimator.init(key=keys[1])
+        # `applied` is told no time, but the prediction needs it.
         time = jnp.zeros((), self.estimator.estimate(state).mean.dtype)
-        return _State(self.controller.init(key=keys[0]), state, time)
+        memory = self.controller.init(key=keys[0])
+        return _State(memory, state, time, Tally("failed_estimate"))
 
     def __call__(self, t, y, state):
         after = self.estimator.update(t, y, state.estimator)
         mean = self.estimator.estimate(after).mean.astype(y.dtype)
         u, memory = self.controller(t, mean, state.controller)
         time = jnp.asarray(t, state.time.dtype)
-        return u, _State(memory, after, time)
+        return u, _State(memory, after, time, self._counted(after, state))
 
     def applied(self, u, cost, state):
         memory = self.controller.applied(u, cost, state.controller)
         after = self.estimator.predict(state.time, u, state.estimator)
-        return _State(memory, after, state.time)
+        return _State(memory, after, state.time, self._counted(after, state))
+
+    def _counted(self, after: PyTree, state: _State) -> Tally:
+        return state.failures.add(self.estimator.status(after) != RESULTS.successful)
 
 
 class LQG(AbstractController):
@@ -88,10 +96,10 @@ class LQG(AbstractController):
 
     `u = u_ref - K (mean - x_ref)`,
 
-    `mean` being the estimate with the current observation in it; it is moved on with
-    the control that was really applied. Of all controllers that see
-    `y = C x + v`, `v ~ N(0, V)`, of `x_next = A x + B u + E w`, `w ~ N(0, W)`, it has
-    the least average cost `dx'Q dx + 2 dx'S du + du'R du`:
+    `mean` being the filtered estimate, the current observation included; the prediction
+    takes the saturated control. Of all controllers that see `y = C x + v`,
+    `v ~ N(0, V)`, of `x_next = A x + B u + E w`, `w ~ N(0, W)`, it has the least
+    average cost `dx'Q dx + 2 dx'S du + du'R du`:
 
     `trace(P E W E') + trace(K' (R + B'PB) K Sigma)`,
 
@@ -164,8 +172,8 @@ class LQG(AbstractController):
         V: Any,
         S: Any = None,
         *,
-        mean: Any = None,
-        covariance: Any = None,
+        mean: ArrayLike | None = None,
+        covariance: ArrayLike | None = None,
         steady_state: bool = True,
         y_ref: Any = None,
         difference: Difference | None = None,
@@ -173,21 +181,18 @@ class LQG(AbstractController):
     ):
         plant: Any = dynamics
         if isinstance(dynamics, LinearDynamics) and dynamics.C is not None:
+            # LQR takes dynamics that observe their state; here the filter supplies it.
             plant = eqx.tree_at(lambda d: d.C, dynamics, None)
         self.regulator = LQR(plant, Q, R, S, difference=difference)
-        self.estimator = KalmanFilter(
-            dynamics,
-            W,
-            V,
-            mean=mean,
-            covariance=covariance,
-            steady_state=steady_state,
-            y_ref=y_ref,
-            observation_difference=observation_difference,
-        )
+        start: Any = dict(mean=mean, covariance=covariance, steady_state=steady_state)
+        sensor: Any = dict(y_ref=y_ref, observation_difference=observation_difference)
+        self.estimator = KalmanFilter(dynamics, W, V, **start, **sensor)
         self.average_cost = None
         covariance = self.estimator.updated_covariance
         if covariance is not None:
+            # Separation: the first term is the cost with the state known, the second
+            # that of the control du = -K (mean - x) which acts on the error of the
+            # estimate.
             noise = self.estimator._noise(dynamics)
             K, P, B = self.regulator.K, self.regulator.P, dynamics.B
             # The weight of an error of the estimate.

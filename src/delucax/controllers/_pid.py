@@ -1,8 +1,9 @@
 """Proportional-integral-derivative control."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY
-from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -48,7 +49,7 @@ class _Project(eqx.Module):
 
 
 def _as_output(output: Any) -> Any:
-    """What the loops follow, as a function of the observation."""
+    """The outputs of the loops, as a function of the observation."""
     if output is None or callable(output):
         return as_module(output)
     if isinstance(output, int | np.integer) and not isinstance(output, bool):
@@ -75,7 +76,7 @@ def _as(after: Any, before: Any) -> Any:
 
 
 class _AbstractPID(AbstractController):
-    """Loops side by side, each of which follows an output."""
+    """Independent loops, each with one output and one control."""
 
     kp: eqx.AbstractVar[Real]
     ki: eqx.AbstractVar[Real]
@@ -84,10 +85,6 @@ class _AbstractPID(AbstractController):
     reference: eqx.AbstractVar[Array | Callable[[Any], Array] | None]
     output: eqx.AbstractVar[Any]
     bounds: eqx.AbstractVar[Bounds | None]
-    if TYPE_CHECKING:  # a static checker would ask for it as an argument
-        _times: ClassVar[tuple[str, ...]]
-    else:
-        _times: eqx.AbstractClassVar[tuple[str, ...]]
 
     def __check_init__(self):
         where = type(self).__name__
@@ -100,12 +97,13 @@ class _AbstractPID(AbstractController):
         """The number of loops: the size that all vectors have; 1 where all are
         numbers."""
         where = type(self).__name__
-        low, high = (None, None) if self.bounds is None else self.bounds
-        vectors = {"low bounds": low, "high bounds": high}
-        vectors |= {name: getattr(self, name) for name in ("kp", "ki", "kd")}
-        vectors |= {name: getattr(self, name) for name in self._times}
-        if not callable(self.reference):
-            vectors["reference"] = self.reference
+        low, high = self.bounds or (None, None)
+        skipped = "output", "bounds", "derivative_on"
+        names = [f.name for f in dataclasses.fields(self) if f.name not in skipped]
+        vectors = {name: getattr(self, name) for name in names}
+        if callable(self.reference):
+            del vectors["reference"]
+        vectors |= {"low bounds": low, "high bounds": high}
         sizes = {}
         for name, value in vectors.items():
             if value is None:
@@ -124,7 +122,7 @@ class _AbstractPID(AbstractController):
             sizes["output"] = self.output.C.shape[0]
         if len(set(sizes.values())) > 1 or 0 in sizes.values():
             got = ", ".join(f"{name} of size {size}" for name, size in sizes.items())
-            raise ValueError(f"{where}: there must be one entry a loop; got {got}.")
+            raise ValueError(f"{where}: there must be one entry per loop; got {got}.")
         return next(iter(sizes.values()), 1)
 
     def _zeros(self) -> Array:
@@ -145,11 +143,10 @@ class _AbstractPID(AbstractController):
         if measured.shape != (loops,):
             what = "the observation has" if output is None else "output gives"
             raise ValueError(
-                f"{name}: expects {loops} outputs, one a loop, but {what} shape "
+                f"{name}: expects {loops} outputs, one per loop, but {what} shape "
                 f"{measured.shape}; choose what each loop follows, such as output=0."
             )
-        given = self.reference
-        reference = given(t) if callable(given) else given
+        reference = self.reference(t) if callable(self.reference) else self.reference
         reference = jnp.asarray(0 if reference is None else reference)
         if reference.shape not in ((), (loops,)):
             raise ValueError(
@@ -171,7 +168,7 @@ class _Memory(NamedTuple):
 
 
 class PID(_AbstractPID):
-    """Proportional, integral and derivative action, one loop a control.
+    """Proportional, integral and derivative action, one loop per control.
 
     With the error `e = r(t) - h(y)`, over a step of `dt`:
 
@@ -180,9 +177,9 @@ class PID(_AbstractPID):
     `D = (T_d D_before + z - z_before) / (T_d + dt)`,
 
     `D` being the derivative of `z = -h(y)` (so that a jump of the reference makes no
-    kick), or of `e`, through a first-order lag; it starts at 0. The integral is a true
-    one. Its second term, back-calculation, keeps it from winding up: `u_applied` is the
-    control that was really applied, so the environment's bounds count as the
+    kick), or of `e`, through a first-order lag; it starts at 0. The integral does not
+    leak. Its second term, back-calculation, keeps it from winding up: `u_applied` is
+    the control that was really applied, so the environment's bounds count as the
     controller's own do. Where `ki` is 0 there is no integral.
 
     **Arguments:**
@@ -233,17 +230,13 @@ class PID(_AbstractPID):
     )
     anti_windup_time: Real | None = parameter(None, constraint=positive)
 
-    _times: ClassVar = ("derivative_time_constant", "anti_windup_time")
-
     def __check_init__(self):
         check_choice(
             self.derivative_on, ("measurement", "error"), "derivative_on", "PID"
         )
         lag, windup, dt = self.derivative_time_constant, self.anti_windup_time, self.dt
-        if lag is not None:
-            check_range(lag, "derivative_time_constant", "PID")
-        if windup is not None:
-            check_range(windup, "anti_windup_time", "PID", dt)
+        check_range(dt if lag is None else lag, "derivative_time_constant", "PID")
+        check_range(dt if windup is None else windup, "anti_windup_time", "PID", dt)
 
     def init(self, *, key=None):
         zeros = self._zeros()
@@ -252,24 +245,35 @@ class PID(_AbstractPID):
     def __call__(self, t, y, state):
         error, measured = self._error(t, y)
         moving = -measured if self.derivative_on == "measurement" else error
+        # No derivative on the first call, which has nothing before it.
         step = jnp.where(state.started, moving - state.previous, 0)
         lag = self.derivative_time_constant
         lag = self.dt if lag is None else lag
+        # Backward Euler on `T_d D' + D = dz/dt`: stable whatever T_d, and with T_d = 0
+        # the plain difference `step / dt`.
         slope = (lag * state.slope + step) / (lag + self.dt)
         asked = self.kp * error + state.integral + self.kd * slope
         integral = state.integral + self.dt * self.ki * error
+        # The integral of this step acts from the next one on, so that `applied`, which
+        # comes in between, corrects what the next control is made of.
         after = _Memory(integral, slope, moving, jnp.ones((), bool), asked)
         return self._clip(asked, y), _as(after, state)
 
     def applied(self, u, cost, state):
+        # Back-calculation: with the bounds of the environment included in u, because
+        # this is told what was applied.
         correction = self.dt * self._windup_rate() * (u - state.asked)
         return _as(state._replace(integral=state.integral + correction), state)
 
     def _windup_rate(self):
         """`1 / T_a`, and 0 where there is no integral to wind up."""
+        # Faster than the sample the correction would overshoot, and oscillate.
         fastest = 1 / self.dt
         if self.anti_windup_time is None:
             no_kp = self.kp == 0
+            # The integral time T_i = kp / ki for T_a, a textbook's choice for PI
+            # (Astrom and Hagglund, 2006). 1 in place of a kp of 0, because `where`
+            # differentiates both of its sides.
             rate = jnp.abs(self.ki / jnp.where(no_kp, 1, self.kp))
             rate = jnp.where(no_kp, fastest, jnp.minimum(rate, fastest))
         else:
@@ -297,14 +301,10 @@ class LeakyPID(_AbstractPID):
 
     **Arguments:**
 
-    - `kp`, `ki`, `kd`: the gains, each a number or a vector with an entry for each
-        loop; 3, 4 and 0 by default. Trainable.
-    - `dt`: the control interval, that of the environment.
+    - `kp`, `ki`, `kd`: the gains, as of [`delucax.controllers.PID`][]; 3, 4 and 0 by
+        default.
+    - `dt`, `reference`, `output`, `bounds`: as there.
     - `time_constant`: T, 0.5 by default.
-    - `reference`: r, a function of time, a vector or a number; 0 by default.
-    - `output`: h, what the loops follow: an index into the observation, a tuple of
-        indices, a matrix, or a function of the observation; all of it by default.
-    - `bounds`: `(low, high)`, each a number or a vector; none by default.
 
     **Raises:** `ValueError` if sizes do not fit, or a time is not positive; when it is
     run, if there are not as many outputs as loops.
@@ -334,14 +334,13 @@ class LeakyPID(_AbstractPID):
     output: Callable[[Array], Array] | int | Sequence[int] | None = _output_field()
     bounds: tuple[Array, Array] | None = bounds_field("LeakyPID", default=None)
 
-    _times: ClassVar = ("time_constant",)
-
     def init(self, *, key=None):
         zeros = self._zeros()
         return _Averages(zeros, zeros, zeros)
 
     def __call__(self, t, y, state):
         error, _ = self._error(t, y)
+        # The low-pass filter dI/dt = (e - I) / T by backward Euler.
         share = self.dt / (self.dt + self.time_constant)
         integral = state.integral + share * (error - state.integral)
         change = error - state.error

@@ -1,4 +1,4 @@
-"""Continuous problems under a control that is held between samples."""
+"""The sampled-data regulator, and the discretisation of quadratic costs."""
 
 from typing import Any
 
@@ -6,17 +6,18 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_matrix, check_instance, check_positive, symmetric_matrix
+from .._typing import Difference
 from ..dynamics import c2d, linearize, OperatingPoint
-from ..math._gramian import gramian_over
+from ..math._lyapunov import gramian_over
 from ..systems import AbstractSystem, LinearSystem
 from ._lqr import LQR
-from ._operating_point import Difference, linear_at
+from ._operating_point import linear_at
 
 
 def sampled_weights(
     system: LinearSystem, Q: Any, R: Any, dt: Any, S: Any = None
 ) -> tuple[Array, Array, Array]:
-    """The weights of the sampled problem that charge what the continuous one does,
+    """The exact discretisation of a continuous quadratic cost under a held control,
 
     `x'Qd x + 2 x'Sd u + u'Rd u`
     `= integral over [0, dt] of x(t)'Q x(t) + 2 x(t)'S u + u'R u`
@@ -63,8 +64,11 @@ def sampled_weights(
                 f"{M.shape}."
             )
     size = n + m
+    # The held control as a state with du/dt = 0: the cost of a step is then a Gramian
+    # of one exponential (Van Loan).
     field = jnp.zeros((size, size), A.dtype).at[:n, :n].set(A).at[:n, n:].set(B)
     charge = jnp.block([[Q, S], [S.T, R]]).astype(A.dtype)
+    # integral of expm(F' s) charge expm(F s) over [0, dt], by blocks: Qd, Sd and Rd.
     total = gramian_over(field.T, charge, jnp.asarray(dt, A.dtype))
     return total[:n, :n], total[n:, n:], total[:n, n:]
 
@@ -89,7 +93,7 @@ def lqrd(
     **Arguments:**
 
     - `system`: a linear system about an equilibrium, or any system, which is linearised
-        at the `point`, or else about the equilibrium it names.
+        at the `point`, or else about the equilibrium it defines.
     - `Q`: state weight, shape `(n, n)`, symmetric.
     - `R`: control weight, shape `(m, m)`, symmetric.
     - `dt`: the step, a positive number.
@@ -101,8 +105,8 @@ def lqrd(
 
     **Returns:** a [`delucax.controllers.LQR`][].
 
-    **Raises:** `ValueError` if `system` is no system or names no equilibrium, a weight
-    does not fit, or `dt` is not positive; an error at run time if there is no
+    **Raises:** `ValueError` if `system` is no system or defines no equilibrium, a
+    weight does not fit, or `dt` is not positive; an error at run time if there is no
     stabilising gain.
 
     Source: Levis, Schlueter and Athans, 1971; Van Loan, 1978.

@@ -1,4 +1,4 @@
-"""Controls that are drawn, around what another controller gives."""
+"""Stochastic policies whose mean or logits another controller gives."""
 
 from dataclasses import KW_ONLY
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from .._controller import (
     AbstractController,
     AbstractStochasticPolicy,
     check_controller,
-    has_state,
+    initial_state,
     replay,
 )
 from .._message import shortened
@@ -46,7 +46,8 @@ class _AroundBase(AbstractStochasticPolicy):
     @property
     def has_memory(self) -> bool:
         """Whether `base` has a state, on which the distribution depends."""
-        return has_state(self.base)
+        start = lambda: eqx.filter(initial_state(self.base, jr.key(0)), eqx.is_array)
+        return bool(jax.tree.leaves(jax.eval_shape(start)))
 
 
 class Gaussian(_AroundBase):
@@ -61,7 +62,7 @@ class Gaussian(_AroundBase):
     The log-probability is that of the control which comes out: its normal density
     between the bounds, and at a bound the probability of all that is clipped to it.
     Given the bounds of the environment, it therefore is the log-probability of the
-    controls that a [`delucax.Trajectory`][] records, and that of a run is had from its
+    controls that a [`delucax.Trajectory`][] records, and that of a run follows from its
     record, without the draws.
 
     **Arguments:**
@@ -100,11 +101,10 @@ class Gaussian(_AroundBase):
     def __check_init__(self):
         where = "Gaussian"
         check_controller(self.base, "base", where)
-        log_std = self.log_std
-        if not eqx.is_inexact_array(log_std) or log_std.ndim > 1:
+        if not eqx.is_inexact_array(self.log_std) or self.log_std.ndim > 1:
             raise ValueError(
                 f"{where}: log_std must be a number or a vector with an entry for each "
-                f"control, got {shortened(log_std)}."
+                f"control, got {shortened(self.log_std)}."
             )
         as_bounds(self.bounds, where)
 
@@ -127,12 +127,8 @@ class Gaussian(_AroundBase):
     def log_prob(self, t: RealScalar, y: Array, state: PyTree, u: Array) -> Array:
         """The log-probability with which `__call__(t, y, state)` gives `u`.
 
-        **Arguments:**
-
-        - `t`: time, a scalar.
-        - `y`: observation, a vector.
-        - `state`: the controller's state, before the call.
-        - `u`: a control, shape `(m,)`; beyond the bounds it counts as clipped to them.
+        **Arguments:** `t`, `y`, `state`: as of a call. `u`: a control, shape `(m,)`;
+            beyond the bounds it counts as clipped to them.
 
         **Returns:** a scalar: a density over the controls that are between their
         bounds, a probability over those that are at one.
@@ -145,11 +141,7 @@ class Gaussian(_AroundBase):
 
         `sum_i log std_i + log(2 pi e) / 2`.
 
-        **Arguments:**
-
-        - `t`: time, a scalar.
-        - `y`: observation, a vector.
-        - `state`: the controller's state, before the call.
+        **Arguments:** `t`, `y`, `state`: as of a call.
 
         **Returns:** a scalar.
         """
@@ -163,12 +155,13 @@ class Gaussian(_AroundBase):
         each = -0.5 * z**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi)
         if self.bounds is not None:
             low, high = self.bounds
-            # Finite stand-ins for what is not reached: an infinity has no gradient,
-            # even where it is not chosen.
+            # The double-where trick: an infinite bound has a NaN gradient even where
+            # `jnp.where` does not choose it.
             near_low = jnp.where(jnp.isinf(low), 0, low)
             near_high = jnp.where(jnp.isinf(high), 0, high)
             below = (near_low - mean) / std
             above = (mean - near_high) / std
+            # A clipped draw has an atom at each bound (Fujita and Maeda, 2018).
             each = jnp.where(u >= high, log_ndtr(above), each)
             each = jnp.where(u <= low, log_ndtr(below), each)
         return jnp.sum(each).astype(mean.dtype)
@@ -180,7 +173,7 @@ class Gaussian(_AroundBase):
 
         The record is data: it is held fixed when this is differentiated with respect to
         the weights, while the state of `base` is followed anew and keeps its gradient.
-        So a stochastic `base` is not followed as it was.
+        A stochastic `base` is not supported: it would draw anew.
 
         **Arguments:** `trajectory`: one run of this controller, with its observations,
             controls and costs; for a batch, use `jax.vmap`. The bounds of this
@@ -210,6 +203,7 @@ class Gaussian(_AroundBase):
             return self._log_prob(mean, u), state
 
         scores = replay(self.base, self.base.init(), record, act)
+        # Steps after termination are padding.
         alive = jnp.arange(trajectory.steps) < trajectory.length
         return jnp.sum(jnp.where(alive, scores, 0))
 
@@ -224,7 +218,7 @@ class Categorical(_AroundBase):
 
     **Arguments:**
 
-    - `base`: a controller whose outputs are the logits, one an action; such as a
+    - `base`: a controller whose outputs are the logits, one per action; such as a
         [`delucax.controllers.MLP`][].
     - `actions`: the table, shape `(actions, m)`, such as `env.actions`.
 
@@ -253,6 +247,11 @@ class Categorical(_AroundBase):
         check_controller(self.base, "base", "Categorical")
         as_matrix(self.actions, "actions", "Categorical")
 
+    @property
+    def greedy(self) -> AbstractController:
+        """The deterministic controller that gives the likeliest of the controls."""
+        return _Greedy(self)
+
     def _logits(self, t, y, state):
         logits, base = self.base(t, y, state.base)
         if logits.shape != self.actions.shape[:1]:
@@ -271,27 +270,21 @@ class Categorical(_AroundBase):
     def log_prob(self, t: RealScalar, y: Array, state: PyTree, u: Array) -> Array:
         """The log-probability with which `__call__(t, y, state)` gives `u`.
 
-        **Arguments:**
-
-        - `t`: time, a scalar.
-        - `y`: observation, a vector.
-        - `state`: the controller's state, before the call.
-        - `u`: a control, shape `(m,)`; it counts as the nearest one of the table.
+        **Arguments:** `t`, `y`, `state`: as of a call. `u`: a control, shape `(m,)`; it
+            counts as the nearest one of the table.
 
         **Returns:** a scalar.
         """
         logits, _ = self._logits(t, y, state)
+        # Controls of a record may be rounded: the nearest row is the one that was
+        # drawn.
         away = jnp.sum((lax.stop_gradient(self.actions) - u) ** 2, axis=1)
         return logits[jnp.argmin(away)]
 
     def entropy(self, t: RealScalar, y: Array, state: PyTree) -> Array:
         """The entropy of the draw, `-sum_i p_i log p_i`.
 
-        **Arguments:**
-
-        - `t`: time, a scalar.
-        - `y`: observation, a vector.
-        - `state`: the controller's state, before the call.
+        **Arguments:** `t`, `y`, `state`: as of a call.
 
         **Returns:** a scalar.
         """
@@ -299,31 +292,13 @@ class Categorical(_AroundBase):
         return -jnp.sum(jnp.exp(logits) * logits)
 
 
-class Likeliest(AbstractController):
-    """The control that a [`delucax.controllers.Categorical`][] gives most often.
-
-    **Arguments:** `policy`: the controller that draws.
-
-    **Raises:** `ValueError` if it is not a `Categorical`.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-
-        logits = dlx.controllers.MLP(2, 3, width=8, depth=1, key=jax.random.key(0))
-        policy = dlx.controllers.Categorical(logits, [[-2.0], [0.0], [2.0]])
-        best = dlx.controllers.Likeliest(policy)
-        env = dlx.make("pendulum")
-        dlx.rollout(env, best, key=jax.random.key(1), horizon=10).controls
-        ```
-    """
+class _Greedy(AbstractController):
+    """The control that a `Categorical` gives most often."""
 
     policy: Categorical
 
     def __check_init__(self):
-        check_instance(self.policy, Categorical, "policy", "Likeliest")
+        check_instance(self.policy, Categorical, "policy", "greedy")
 
     def init(self, *, key=None):
         return self.policy.base.init(key=key)

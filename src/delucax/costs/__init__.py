@@ -1,4 +1,4 @@
-"""Stage and final costs, each minus a reward."""
+"""Stage and final costs; a cost is minus a reward."""
 
 from ._base import (
     AbstractCost as AbstractCost,

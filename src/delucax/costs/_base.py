@@ -18,7 +18,7 @@ from .._module import (
     parameter,
     parts_of,
 )
-from .._typing import Control, RealScalar, State
+from .._typing import Control, Real, RealScalar, State
 from ..systems import AbstractPlant
 
 
@@ -26,8 +26,8 @@ class AbstractCost(eqx.Module):
     """A stage cost `c(t, x, u)` and a final cost.
 
     A cost is minus a reward. The stage cost is charged at the current state and the
-    control that was applied, once a step; the final cost once, at the last state or on
-    entering a terminated one.
+    control that was applied, once per step; the final cost once, at the last state or
+    on entering a terminated one.
 
     Add two with `+`, and multiply one by a number with `*`.
 
@@ -50,28 +50,28 @@ class AbstractCost(eqx.Module):
 
     @property
     def targets(self) -> tuple[Array | None, Array | None] | None:
-        """The state and the control that the cost draws to, each `None` where it is not
-        named; `None` alone, as by default, for a cost that draws to no fixed point.
+        """The target of the state and that of the control, each `None` where there is
+        none; `None` alone, as by default, for a cost without a fixed target.
 
-        A cost made of others has the first state and the first control that they name.
-        Where planners start by default depends on it; see
-        [`delucax.planning.default_start`][].
+        A cost made of others has the first target of each that they have. Planners use
+        it for their default start; see [`delucax.planning.Start.default`][].
         """
         named = [part.targets for part in parts_of(self, AbstractCost)]
         pairs = [pair for pair in named if pair is not None]
         if not pairs:
             return None
+        # The first term that has a target decides, so that a penalty may be added.
         first = lambda values: next((a for a in values if a is not None), None)
         return first(x for x, _ in pairs), first(u for _, u in pairs)
 
     def set_point(self, plant: AbstractPlant) -> tuple[State, Control] | None:
-        """The state and the control to regulate a plant about: the `targets` where they
-        name both, else the equilibrium of the plant, else the one that is named and
+        """The state and the control to regulate a plant about: the `targets` where
+        there are both, else the equilibrium of the plant, else the one there is and
         zeros.
 
         **Arguments:** `plant`: a system or dynamics.
 
-        **Returns:** `(x, u)`; `None` if neither names one, or they do not fit.
+        **Returns:** `(x, u)`; `None` if there is none of them, or they do not fit.
         """
         x, u = targets = self.targets or (None, None)
         if x is None or u is None:
@@ -86,7 +86,7 @@ class AbstractCost(eqx.Module):
                     for at, size in zip(targets, sizes, strict=True)
                 )
         x, u = jnp.asarray(as_float_array(x)), jnp.asarray(as_float_array(u))
-        # What does not fit the plant is an error of what uses the point.
+        # Whoever uses the point reports a size that does not fit.
         fits = x.shape == (plant.state_size,) and u.shape == (plant.control_size,)
         return (x, u) if fits else None
 
@@ -94,8 +94,6 @@ class AbstractCost(eqx.Module):
     __array_ufunc__: ClassVar = None
 
     def __add__(self, other: "AbstractCost") -> "AbstractCost":
-        from ._base import Sum
-
         if not isinstance(other, AbstractCost):
             return NotImplemented
         return Sum(self, other)
@@ -105,8 +103,6 @@ class AbstractCost(eqx.Module):
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
     def __mul__(self, factor: Any) -> "AbstractCost":
-        from ._base import Scaled
-
         if isinstance(factor, AbstractCost):
             return NotImplemented
         return Scaled(self, factor)
@@ -223,7 +219,7 @@ class Scaled(AbstractCost):
     """
 
     cost: AbstractCost
-    factor: Array = parameter()
+    factor: Real = parameter()
 
     def __check_init__(self):
         check_instance(self.cost, AbstractCost, "cost", "Scaled")
@@ -237,13 +233,14 @@ class Scaled(AbstractCost):
 
 
 class Rate(AbstractCost):
-    """A cost a second, charged for a step of `dt`: `c(t, x, u) dt`.
+    """A cost per second, charged for a step of `dt`: `c(t, x, u) dt`.
 
-    The problem then stays the same when `dt` changes. The final cost is unchanged.
+    The sum approximates the integral over time, so that weights need not change with
+    `dt`. The final cost is unchanged.
 
     **Arguments:**
 
-    - `cost`: the cost a second.
+    - `cost`: the cost per second.
     - `dt`: the step.
 
     **Raises:** `ValueError` if `dt` is not positive.
@@ -258,7 +255,7 @@ class Rate(AbstractCost):
     """
 
     cost: AbstractCost
-    dt: Array = parameter()
+    dt: Real = parameter()
 
     def __check_init__(self):
         check_instance(self.cost, AbstractCost, "cost", "Rate")

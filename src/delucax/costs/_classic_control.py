@@ -12,11 +12,11 @@ from ._base import AbstractCost
 
 
 class Arrival(AbstractCost):
-    """`step_cost + control_weight u'u` a step, and `arrival_cost` once, if the last
+    """`step_cost + control_weight u'u` per step, and `arrival_cost` once, if the last
     state is a goal.
 
-    The costs of most Gym tasks. It says nothing of the way to the goal: the gradient
-    with respect to the state is 0 wherever there is one.
+    The costs of most Gym tasks. It is sparse: the gradient with respect to the state is
+    0 almost everywhere.
 
     **Arguments:**
 
@@ -51,6 +51,7 @@ class Arrival(AbstractCost):
     def final(self, t: RealScalar, x: State) -> Scalar:
         if self.reached is None:
             return super().final(t, x)
+        # Once, at the end: the goal terminates the episode.
         return jnp.where(self.reached(t, x), self.arrival_cost, 0.0).astype(x.dtype)
 
 
@@ -76,8 +77,8 @@ class PendulumCost(AbstractCost):
         ```
     """
 
-    velocity_weight: Array = parameter(0.1)
-    torque_weight: Array = parameter(0.001)
+    velocity_weight: Real = parameter(0.1)
+    torque_weight: Real = parameter(0.001)
 
     def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
         angle = wrap(x[0])
@@ -89,7 +90,7 @@ class PendulumCost(AbstractCost):
 
 
 class AcrobotHeight(AbstractCost):
-    """What the tip of the acrobot lacks in height, squared:
+    """The squared height deficit of the tip of the acrobot:
 
     `(2 + cos(angle_1) + cos(angle_1 + angle_2))^2 + velocity_weight (velocity_1^2 +
     velocity_2^2) + torque_weight torque^2`, and at the end `final_weight` times the
@@ -113,9 +114,9 @@ class AcrobotHeight(AbstractCost):
         ```
     """
 
-    velocity_weight: Array = parameter(0.01)
-    torque_weight: Array = parameter(0.01)
-    final_weight: Array = parameter(0.0)
+    velocity_weight: Real = parameter(0.01)
+    torque_weight: Real = parameter(0.01)
+    final_weight: Real = parameter(0.0)
 
     def _state(self, x: State) -> Scalar:
         lack = 2 + cos(x[0]) + cos(x[0] + x[1])

@@ -11,7 +11,7 @@ from jaxtyping import Array
 from .._check import as_vector, check_finite, symmetric_matrix
 from .._message import shortened
 from .._module import function_field, parameter
-from .._typing import Control, Matrix, RealScalar, Scalar, State, Vector
+from .._typing import Control, Difference, Matrix, RealScalar, Scalar, State, Vector
 from ..math import quadratic_form
 from ..math._small import dot
 from ._base import AbstractCost
@@ -38,10 +38,10 @@ class _AbstractQuadratic(AbstractCost):
 
     @abc.abstractmethod
     def _state_error(self, t: RealScalar, x: State) -> Vector:
-        """What `Q` weighs."""
+        """The error that `Q` weighs."""
 
     def _control_error(self, u: Control) -> Control:
-        """What `R` weighs."""
+        """The error that `R` weighs."""
         return u
 
     def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
@@ -64,8 +64,7 @@ class Quadratic(_AbstractQuadratic):
 
     **Arguments:**
 
-    - `Q`: state weight, shape `(n, n)`, symmetric; or its diagonal, shape `(n,)`, which
-        takes n products a step where the matrix takes n^2.
+    - `Q`: state weight, shape `(n, n)`, symmetric; or its diagonal, shape `(n,)`.
     - `R`: control weight, shape `(m, m)`, symmetric; or its diagonal, shape `(m,)`.
     - `final`: final weight Qf, as `Q`; none by default.
     - `state_target`: x*, shape `(n,)`; zero by default.
@@ -93,7 +92,7 @@ class Quadratic(_AbstractQuadratic):
     Qf: Matrix | Vector | None = parameter()
     state_target: Array | None = parameter()
     control_target: Array | None = parameter()
-    difference: Callable[[Array, Array], Array] | None = function_field()
+    difference: Difference | None = function_field()
 
     def __init__(
         self,
@@ -103,14 +102,14 @@ class Quadratic(_AbstractQuadratic):
         state_target: Any = None,
         control_target: Any = None,
         *,
-        difference: Callable[[Array, Array], Array] | None = None,
+        difference: Difference | None = None,
     ):
         self.Q, self.R, self.Qf = Q, R, final
-        self.state_target = state_target
-        self.control_target = control_target
+        self.state_target, self.control_target = state_target, control_target
         self.difference = difference
 
     def __check_init__(self):
+        # A weight that is no array is reported by the base class.
         for name, weight in (("state_target", self.Q), ("control_target", self.R)):
             target = getattr(self, name)
             if target is not None and jnp.ndim(weight) > 0:
@@ -138,7 +137,7 @@ class Quadratic(_AbstractQuadratic):
 class Tracking(_AbstractQuadratic):
     """`e' Q e + u' R u` with `e = h(x) - r(t)`, and `e' Qf e` at the end.
 
-    It names no `targets`, as the reference moves.
+    It has no `targets`, as the reference moves.
 
     **Arguments:**
 
@@ -180,8 +179,7 @@ class Tracking(_AbstractQuadratic):
         output: Callable[[Array], Array] | None = None,
     ):
         self.Q, self.R, self.Qf = Q, R, final
-        self.reference = reference
-        self.output = output
+        self.reference, self.output = reference, output
 
     def __check_init__(self):
         if not callable(self.reference):
@@ -203,6 +201,7 @@ class Tracking(_AbstractQuadratic):
 
 def _form(weight: Matrix | Vector, d: Vector) -> Scalar:
     """`d' weight d`, the weight a matrix or its diagonal."""
+    # Written out for small sizes, which fuses in the loop of a rollout.
     if weight.ndim == 2:
         return quadratic_form(weight, d)
     return dot(weight * d, d)

@@ -4,6 +4,7 @@ from ._base import AbstractDisturbance as AbstractDisturbance, Sum as Sum
 from ._deterministic import (
     Constant as Constant,
     FromArray as FromArray,
+    shock as shock,
     Sinusoid as Sinusoid,
     Square as Square,
     Zero as Zero,
@@ -14,4 +15,3 @@ from ._random import (
     RandomWalk as RandomWalk,
     Uniform as Uniform,
 )
-from ._window import shock as shock, Window as Window

@@ -9,12 +9,13 @@ from typing import Any, ClassVar, TYPE_CHECKING, TypeAlias
 import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from .._check import check_count, check_instance, check_key
+from .._check import check_count, check_instance, check_key, check_range
 from .._message import shortened
-from .._module import as_float_array, check_parameters, parts_of
-from .._typing import PRNGKey, RealScalar, Vector
+from .._module import as_float_array, check_parameters, parameter, parts_of
+from .._typing import PRNGKey, Real, RealScalar, Vector
+from ..math._steps import reached, step_between
 
 
 Rows: TypeAlias = Float[Array, "steps size"]
@@ -24,8 +25,7 @@ Rows: TypeAlias = Float[Array, "steps size"]
 class AbstractDisturbance(eqx.Module):
     """A sequence `w[0], ..., w[T - 1]`, drawn at once for the whole horizon.
 
-    Add two with `+`; confine one to a part of the time with
-    [`delucax.disturbances.Window`][].
+    Add two with `+`; confine one to a part of the time with `between`.
 
     !!! example
 
@@ -35,8 +35,8 @@ class AbstractDisturbance(eqx.Module):
         import jax.numpy as jnp
 
         noise = dlx.disturbances.Gaussian(0.1, size=2)
-        push = dlx.disturbances.shock(jnp.array([0.0, 1.0]), start=2.0, duration=0.5)
-        w = (noise + push).sequence(jax.random.key(0), 0.05 * jnp.arange(100))
+        gust = dlx.disturbances.Sinusoid(0.2, frequency=1.0, size=2).between(3.0, 6.0)
+        w = (noise + gust).sequence(jax.random.key(0), 0.05 * jnp.arange(100))
         ```
     """
 
@@ -63,7 +63,7 @@ class AbstractDisturbance(eqx.Module):
 
         **Arguments:**
 
-        - `key`: a random key; those that draw nothing take `None` too.
+        - `key`: a random key; deterministic disturbances also take `None`.
         - `times`: the start of each step, shape `(T,)`, increasing. A rollout gives
             `0, dt, ...` in the precision of the state, so a time of `k dt` is rounded:
             compare it with another to the nearest step, not exactly.
@@ -78,15 +78,15 @@ class AbstractDisturbance(eqx.Module):
 
         - `key`: of `sequence`.
         - `dt`: the control interval.
-        - `steps`: how many steps.
+        - `steps`: the number of steps.
         - `dtype`: the precision of the times.
 
         **Returns:** shape `(steps, size)`.
 
         **Raises:** `ValueError` if `sequence` returns another shape.
         """
-        # Of two times at least, because Brownian motion reads the interval off them;
-        # but of no more than are recorded.
+        # Two times at least, because Brownian motion infers the interval from them; but
+        # no more than are recorded.
         recorded = self.recorded_steps
         count = max(steps, 2 if recorded is None else min(recorded, 2))
         w = self.sequence(key, (jnp.arange(count) * dt).astype(dtype))
@@ -98,6 +98,21 @@ class AbstractDisturbance(eqx.Module):
                 f"{shape}, got {got}."
             )
         return w[:steps]
+
+    def between(self, start: ArrayLike, stop: ArrayLike) -> "AbstractDisturbance":
+        """The disturbance inside a time window, `start <= t < stop`, and zero outside.
+
+        An end within rounding error of the time of a step is snapped to it, so that a
+        window of 5 steps acts on 5.
+
+        **Arguments:** `start`, `stop`: the ends of the window, in units of time.
+
+        **Returns:** the disturbance.
+
+        **Raises:** `ValueError` if `stop` is before `start`; or for a horizon of more
+        than 2^22 steps in single precision, whose times are too coarse for the steps.
+        """
+        return _Window(self, start, stop)
 
     def __add__(self, other: "AbstractDisturbance") -> "AbstractDisturbance":
         if not isinstance(other, AbstractDisturbance):
@@ -150,9 +165,35 @@ class Sum(AbstractDisturbance):
         n = len(self.terms)
         if key is not None:
             check_key(key, "Sum")
+        # A key for each term: with one key for all, equal terms would draw the same
+        # noise.
         keys = [None] * n if key is None else list(jr.split(key, n))
         drawn = (w.sequence(k, times) for w, k in zip(self.terms, keys, strict=True))
         return functools.reduce(operator.add, drawn)
+
+
+class _Window(AbstractDisturbance):
+    disturbance: AbstractDisturbance
+    start: Real = parameter()
+    stop: Real = parameter()
+
+    def __check_init__(self):
+        check_instance(self.disturbance, AbstractDisturbance, "disturbance", "between")
+        check_range(self.stop, "stop", "between", self.start)
+
+    @property
+    def size(self) -> int:
+        """The size of the disturbance inside."""
+        return self.disturbance.size
+
+    def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
+        w = self.disturbance.sequence(key, times)
+        dt = step_between(times, "between")
+        inside = reached(times, self.start, dt) & ~reached(times, self.stop, dt)
+        w = jnp.where(inside[:, None], w, jnp.zeros((), w.dtype))
+        # A step of NaN says that the times are too coarse: the result is then NaN too,
+        # and not a window at the wrong place.
+        return w if dt is None else jnp.where(jnp.isnan(dt), jnp.nan, w)
 
 
 class AbstractEntrywise(AbstractDisturbance):
@@ -160,41 +201,43 @@ class AbstractEntrywise(AbstractDisturbance):
     `size` entries.
     """
 
-    def _set_entries(self, size: int | None, **values: Any) -> None:
-        """Set the fields of these names, and the size that they share."""
-        values["size"] = _common_size(type(self).__name__, size, values)
-        for name, value in values.items():
-            setattr(self, name, value)
+    def __post_init__(self):
+        self.size = self._common_size()  # pyright: ignore[reportAttributeAccessIssue]
 
     def __check_init__(self):
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        _common_size(type(self).__name__, values.pop("size"), values)
+        self._common_size()
+
+    def _common_size(self) -> int:
+        """The size that arrays share; numbers fit any size."""
+        where, size = type(self).__name__, self.size
+        for name in [f.name for f in dataclasses.fields(self) if f.name != "size"]:
+            array = as_float_array(getattr(self, name))
+            if not eqx.is_inexact_array(array) or array.ndim > 1:
+                got = array.shape if eqx.is_array(array) else shortened(array)
+                raise ValueError(
+                    f"{where}: {name} must be a number or a vector with an entry for "
+                    f"each disturbance, got {got}."
+                )
+            if array.ndim == 1:
+                if size is not None and array.shape[0] != size:
+                    raise ValueError(
+                        f"{where}: {name} has {array.shape[0]} entries where {size} "
+                        "are expected."
+                    )
+                size = array.shape[0]
+        if size is None:
+            raise ValueError(
+                f"{where}: size must be given when every other argument is a number, "
+                f"such as {where}(..., size=2)."
+            )
+        return check_count(size, "size", where)
 
     def _rows(self, w: Array, times: Vector) -> Array:
         """`w`, of one step or of all, for all `times`."""
         return jnp.broadcast_to(w, (len(times), self.size)).astype(times.dtype)
 
 
-def _common_size(where: str, size: int | None, values: dict[str, Any]) -> int:
-    """The size that arrays share; numbers fit any size."""
-    for name, value in values.items():
-        array = as_float_array(value)
-        if not eqx.is_inexact_array(array) or array.ndim > 1:
-            got = array.shape if eqx.is_array(array) else shortened(array)
-            raise ValueError(
-                f"{where}: {name} must be a number or a vector with an entry for each "
-                f"disturbance, got {got}."
-            )
-        if array.ndim == 1:
-            if size is not None and array.shape[0] != size:
-                raise ValueError(
-                    f"{where}: {name} has {array.shape[0]} entries where {size} are "
-                    "expected."
-                )
-            size = array.shape[0]
-    if size is None:
-        raise ValueError(
-            f"{where}: size must be given when every other argument is a number, such "
-            f"as {where}(..., size=2)."
-        )
-    return check_count(size, "size", where)
+def as_size(size: int | None) -> int | None:
+    """The size as given: a converter, so that `None` may stand for what the other
+    fields say."""
+    return size

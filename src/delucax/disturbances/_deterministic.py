@@ -9,16 +9,16 @@ from jaxtyping import Array
 
 from .._check import as_matrix, check_count, check_range
 from .._module import parameter, positive
-from .._typing import PRNGKey, Vector
+from .._typing import PRNGKey, Real, Vector
 from ..math import sin
 from ..math._steps import coarsest, position, step_between
-from ._base import AbstractDisturbance, AbstractEntrywise, Rows
+from ._base import AbstractDisturbance, AbstractEntrywise, as_size, Rows
 
 
 class Zero(AbstractDisturbance):
     """No disturbance.
 
-    **Arguments:** `size`: entries a step.
+    **Arguments:** `size`: entries per step.
 
     !!! example
 
@@ -45,7 +45,7 @@ class Constant(AbstractEntrywise):
     **Arguments:**
 
     - `value`: a number, or a vector of `size` entries.
-    - `size`: entries a step; follows from `value` if that is a vector.
+    - `size`: entries per step; follows from `value` if that is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit.
 
@@ -59,14 +59,41 @@ class Constant(AbstractEntrywise):
         ```
     """
 
-    value: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(self, value: Any, *, size: int | None = None):
-        self._set_entries(size, value=value)
+    value: Real = parameter()
+    size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         return self._rows(self.value, times)
+
+
+def shock(
+    value: Any, start: Any, duration: Any, *, size: int | None = None
+) -> AbstractDisturbance:
+    """A constant push for a while: a `Constant`, `between` two times.
+
+    **Arguments:**
+
+    - `value`: a number, or a vector of `size` entries.
+    - `start`, `duration`: in units of time.
+    - `size`: entries per step; follows from `value` if that is a vector.
+
+    **Returns:** the disturbance.
+
+    **Raises:** `ValueError` if the size is unknown or does not fit, or `duration` is
+    negative.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        push = dlx.disturbances.shock(jnp.array([0.0, 0.5]), start=5.0, duration=0.5)
+        ```
+    """
+    check_range(duration, "duration", "shock")
+    given = {} if size is None else {"size": size}
+    return Constant(value, **given).between(start, start + duration)
 
 
 class Sinusoid(AbstractEntrywise):
@@ -78,7 +105,7 @@ class Sinusoid(AbstractEntrywise):
     - `frequency`: in hertz if time is in seconds.
     - `phase`: in radians, 0 by default.
     - `offset`: 0 by default.
-    - `size`: entries a step; follows from the others if one is a vector.
+    - `size`: entries per step; follows from the others if one is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit.
 
@@ -93,24 +120,11 @@ class Sinusoid(AbstractEntrywise):
         ```
     """
 
-    amplitude: Array = parameter()
-    frequency: Array = parameter()
-    phase: Array = parameter()
-    offset: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(
-        self,
-        amplitude: Any,
-        frequency: Any,
-        phase: Any = 0.0,
-        offset: Any = 0.0,
-        *,
-        size: int | None = None,
-    ):
-        self._set_entries(
-            size, amplitude=amplitude, frequency=frequency, phase=phase, offset=offset
-        )
+    amplitude: Real = parameter()
+    frequency: Real = parameter()
+    phase: Real = parameter(0.0)
+    offset: Real = parameter(0.0)
+    size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         angle = 2 * np.pi * self.frequency * times[:, None] + self.phase
@@ -125,15 +139,15 @@ class Square(AbstractEntrywise):
     - `amplitude`.
     - `period`: in units of time, positive.
     - `duty`: the part of a period at `+amplitude`, from 0 to 1; 0.5 by default.
-    - `size`: entries a step; follows from the others if one is a vector.
+    - `size`: entries per step; follows from the others if one is a vector.
 
     A period, or a part of one, within rounding of a whole number of steps is that
     number of steps. The gradient with respect to `period` and `duty` is zero almost
     everywhere.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, the period is not
-    positive, or `duty` is not between 0 and 1; in a horizon of more than 2^22 steps in
-    single precision, whose times do not tell the steps apart.
+    positive, or `duty` is not between 0 and 1; or for a horizon of more than 2^22 steps
+    in single precision, whose times are too coarse for the steps.
 
     !!! example
 
@@ -145,28 +159,23 @@ class Square(AbstractEntrywise):
         ```
     """
 
-    amplitude: Array = parameter()
-    period: Array = parameter(constraint=positive)
-    duty: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(
-        self, amplitude: Any, period: Any, duty: Any = 0.5, *, size: int | None = None
-    ):
-        self._set_entries(size, amplitude=amplitude, period=period, duty=duty)
+    amplitude: Real = parameter()
+    period: Real = parameter(constraint=positive)
+    duty: Real = parameter(0.5)
+    size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
     def __check_init__(self):
         check_range(self.duty, "duty", "Square", 0, 1)
 
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         dt = step_between(times, "Square")
-        # Counted from 0 in steps, which late times of a few steps do not tell.
+        # In steps where the grid begins at 0; late times give their step less exactly.
         unit = self.period if dt is None else jnp.where(times[0] == 0, dt, self.period)
         eps = coarsest(times, self.period, self.duty)
         at, period = (
             sum(position(t, unit, 0.0, eps)) for t in (times[:, None], self.period)
         )
-        # Steps are whole numbers, between which rounding by `slack` decides nothing.
+        # `slack` absorbs rounding error: steps are whole numbers.
         slack = jnp.minimum(2 * eps * (jnp.abs(at) + 1), 0.25)
         phase = at - period * jnp.floor((at + slack) / period)
         w = jnp.where(

@@ -11,10 +11,10 @@ from jaxtyping import Array
 from .._check import check_count, check_key, check_range, check_step
 from .._jax import normal
 from .._module import parameter
-from .._typing import PRNGKey, Vector
+from .._typing import PRNGKey, Real, Vector
 from ..math import clip
 from ..math._steps import step_between
-from ._base import AbstractDisturbance, AbstractEntrywise, Rows
+from ._base import AbstractDisturbance, AbstractEntrywise, as_size, Rows
 
 
 class Gaussian(AbstractEntrywise):
@@ -24,7 +24,7 @@ class Gaussian(AbstractEntrywise):
 
     - `std`: standard deviation.
     - `mean`: 0 by default.
-    - `size`: entries a step; follows from the others if one is a vector.
+    - `size`: entries per step; follows from the others if one is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `std` is
     negative.
@@ -41,12 +41,9 @@ class Gaussian(AbstractEntrywise):
         ```
     """
 
-    std: Array = parameter()
-    mean: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(self, std: Any, mean: Any = 0.0, *, size: int | None = None):
-        self._set_entries(size, std=std, mean=mean)
+    std: Real = parameter()
+    mean: Real = parameter(0.0)
+    size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
     def __check_init__(self):
         check_range(self.std, "std", "Gaussian")
@@ -62,7 +59,7 @@ class Uniform(AbstractEntrywise):
     **Arguments:** each a number or a vector of `size` entries.
 
     - `low`, `high`: the ends.
-    - `size`: entries a step; follows from the others if one is a vector.
+    - `size`: entries per step; follows from the others if one is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `high` is
     below `low`.
@@ -79,12 +76,9 @@ class Uniform(AbstractEntrywise):
         ```
     """
 
-    low: Array = parameter()
-    high: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(self, low: Any, high: Any, *, size: int | None = None):
-        self._set_entries(size, low=low, high=high)
+    low: Real = parameter()
+    high: Real = parameter()
+    size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
     def __check_init__(self):
         check_range(self.high, "high", "Uniform", self.low)
@@ -104,7 +98,7 @@ class RandomWalk(AbstractEntrywise):
 
     - `std`: standard deviation of a step, 0.3 by default.
     - `bound`: 1 by default.
-    - `size`: entries a step; follows from the others if one is a vector.
+    - `size`: entries per step; follows from the others if one is a vector.
 
     **Raises:** `ValueError` if the size is unknown or does not fit, or `std` or
     `bound` is negative.
@@ -121,12 +115,9 @@ class RandomWalk(AbstractEntrywise):
         ```
     """
 
-    std: Array = parameter()
-    bound: Array = parameter()
-    size: int = eqx.field(static=True)
-
-    def __init__(self, std: Any = 0.3, bound: Any = 1.0, *, size: int | None = None):
-        self._set_entries(size, std=std, bound=bound)
+    std: Real = parameter(0.3)
+    bound: Real = parameter(1.0)
+    size: int = eqx.field(default=None, converter=as_size, static=True, kw_only=True)
 
     def __check_init__(self):
         check_range(self.std, "std", "RandomWalk")
@@ -135,6 +126,7 @@ class RandomWalk(AbstractEntrywise):
     def sequence(self, key: PRNGKey | None, times: Vector) -> Rows:
         shape = (times.shape[0], self.size)
         e = normal(check_key(key, "RandomWalk"), shape, times.dtype)
+        # In the precision of the times, as the carry of a scan must keep its type.
         std, bound = self.std.astype(e.dtype), self.bound.astype(e.dtype)
 
         def step(w, e):
@@ -158,7 +150,7 @@ class Brownian(AbstractDisturbance):
         follow one another in `w`.
 
     **Raises:** `ValueError` if `dt` is not positive or `substeps` is below 1, or if
-    `dt` is left out and the times are too late for their precision to tell it.
+    `dt` is left out and the precision of late times is too coarse for it.
 
     !!! example
 
@@ -189,8 +181,9 @@ class Brownian(AbstractDisturbance):
         if self.dt is None and times.shape[0] < 2:
             raise ValueError(
                 f"Brownian: dt must be given for {times.shape[0]} times, which do not "
-                "tell it."
+                "define it."
             )
         dt = step_between(times, "Brownian") if self.dt is None else self.dt
         e = normal(check_key(key, "Brownian"), (times.shape[0], self.size), times.dtype)
+        # Increments of each substep: their variance is its length.
         return (jnp.sqrt(dt / self.substeps) * e).astype(times.dtype)

@@ -6,11 +6,11 @@ from ._base import (
     AbstractDiscretization as AbstractDiscretization,
     AbstractDynamics as AbstractDynamics,
     AbstractWrapper as AbstractWrapper,
+    open_loop as open_loop,
 )
+from ._conversion import c2d as c2d, d2c as d2c
 from ._discretized import Discretized as Discretized
 from ._linear import LinearDynamics as LinearDynamics
 from ._linearize import linearize as linearize, OperatingPoint as OperatingPoint
-from ._open_loop import open_loop as open_loop
-from ._sampling import c2d as c2d, d2c as d2c
 from ._trim import trim as trim
 from ._wrappers import Delayed as Delayed, WorstCase as WorstCase

@@ -1,15 +1,21 @@
-"""The discrete-time map that environments and planners step, and wrappers of plants."""
+"""The discrete-time map that environments and planners step.
+
+What it is, the states that it leads to, and base classes of dynamics around a plant.
+"""
 
 import abc
 from typing import Any, ClassVar, TYPE_CHECKING
 
 import equinox as eqx
+import jax
+import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from .._check import as_vector, check_instance, check_step
-from .._module import check_parameters
-from .._results import Result, RESULTS
+from .._check import as_rows, as_vector, check_instance, check_step
+from .._jax import by_components, join_state, split_state, stack_steps
+from .._module import as_float_array, check_parameters
+from .._results import choose, first_failure, first_of, or_none, Result, RESULTS
 from .._typing import RealScalar
 from ..systems import AbstractPlant, AbstractSystem
 
@@ -42,8 +48,8 @@ class AbstractDynamics(AbstractPlant):
     @property
     def increments(self) -> int:
         """How many Brownian increments of equal variance `w` holds one after the other,
-        each of `disturbance_size / increments` entries: 1 if `noise` is `"brownian"`
-        and nothing else is said, and 0 if it is not.
+        each of `disturbance_size / increments` entries; by default 1 if `noise` is
+        `"brownian"`, else 0.
         """
         return 1 if self.noise == "brownian" else 0
 
@@ -51,7 +57,7 @@ class AbstractDynamics(AbstractPlant):
     def advance(
         self, t: RealScalar, x: Array, u: Array, w: Array | None
     ) -> tuple[Array, Result]:
-        """One step, with what became of it.
+        """One step and its status.
 
         `result` is that of the solver alone. The numbers are not checked: from NaN, or
         from a finite state so large that it overflows, `x_next` is not finite although
@@ -85,35 +91,98 @@ class AbstractDynamics(AbstractPlant):
         if w is not None:
             w = as_vector(w, self.disturbance_size, "w (the disturbance)", where)
         x_next, result = self.advance(t, x, u, w)
+        # Explicit steps cannot fail, and their programs carry no check.
         if result is RESULTS.successful:
             return x_next
         return result.error_if(x_next, result != RESULTS.successful)
 
 
-def zeros_if_none(w: Array | None, size: int, like: Array) -> Array:
-    """A zero disturbance where none is given."""
-    return jnp.zeros(size, like.dtype) if w is None else w
+def open_loop(
+    dynamics: AbstractDynamics,
+    x0: Any,
+    controls: Any,
+    w: Any = None,
+    t0: RealScalar = 0.0,
+) -> Array:
+    """The states that given controls lead to, for planning and identification.
+
+    `x_{k+1} = F(t0 + k dt, x_k, u_k, w_k)`.
+
+    **Arguments:**
+
+    - `dynamics`: the discrete-time dynamics.
+    - `x0`: the first state, shape `(n,)`.
+    - `controls`: shape `(T, m)`.
+    - `w`: disturbances, shape `(T, k)`; zero by default.
+    - `t0`: the time of the first state, 0 by default.
+
+    **Returns:** the states, shape `(T + 1, n)`. Already compiled; differentiable
+    with respect to every array.
+
+    **Raises:** `ValueError` on a wrong shape, and an error at run time if the solver
+    fails or a state becomes NaN or infinite.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
+        states = dlx.open_loop(dynamics, jnp.zeros(2), 0.1 * jnp.ones((20, 1)))
+        ```
+    """
+    where = "open_loop"
+    check_instance(dynamics, AbstractDynamics, "dynamics", where)
+    x0 = as_vector(x0, dynamics.state_size, "x0", where)
+    controls = as_rows(controls, dynamics.control_size, "controls", where)
+    if w is not None:
+        w = as_rows(w, dynamics.disturbance_size, "w", where, controls.shape[0])
+    return _open_loop(dynamics, x0, controls, w, as_float_array(t0))
+
+
+@eqx.filter_jit
+def _open_loop(dynamics, x0, controls, w, t0):
+    size = x0.shape[0]
+
+    # The gradient stores the states alone, and computes each step again.
+    @jax.checkpoint
+    @by_components
+    def body(parts, inputs):
+        k, u, w = inputs
+        t = t0 + k * dynamics.dt
+        x_next, result = dynamics.advance(t, join_state(parts, size), u, w)
+        return split_state(x_next.astype(x0.dtype)), (parts, or_none(result))
+
+    steps = jnp.arange(controls.shape[0])
+    last, (parts, results) = lax.scan(body, split_state(x0), (steps, controls, w))
+    states = stack_steps(parts, size, last)
+    # NaN propagates, so the last state tells of all.
+    finite = jnp.all(jnp.isfinite(states[-1]))
+    end = choose(finite, RESULTS.successful, RESULTS.diverged)
+    result = first_failure(first_of(results), end)
+    return result.error_if(states, result != RESULTS.successful)
 
 
 def _forwarded(name: str) -> Any:
-    """A property of the plant inside."""
+    """A property of the wrapped plant."""
     return property(
-        lambda self: getattr(self._inside, name), doc="That of the plant inside."
+        lambda self: getattr(self._inside, name), doc="That of the wrapped plant."
     )
 
 
 def _forwarded_units(what: str) -> Any:
-    """The units of the plant inside, where its names are the wrapper's too."""
+    """The units of the wrapped plant if the names are unchanged, else `()`."""
 
     def units(self):
         same = getattr(self, f"{what}_names") == getattr(self._inside, f"{what}_names")
         return getattr(self._inside, f"{what}_units") if same else ()
 
-    return property(units, doc="Those of the plant inside, where the names are.")
+    return property(units, doc="Those of the wrapped plant if the names are, else ().")
 
 
 class _Forwarding(AbstractDynamics):
-    """Dynamics whose names, sizes and hooks are those of a plant inside by default."""
+    """Dynamics whose names, sizes and hooks are by default those of a wrapped plant."""
 
     @property
     @abc.abstractmethod
@@ -132,6 +201,8 @@ class _Forwarding(AbstractDynamics):
     @property
     def observes_state(self):
         """Whether `observe` returns the state itself."""
+        # A sensor of the wrapper's own is traced; else the wrapped plant is asked,
+        # which may know without tracing.
         own = type(self).observe is not _Forwarding.observe
         if own or self.state_size != self._inside.state_size:
             return super().observes_state
@@ -185,12 +256,11 @@ class AbstractDiscretization(_Forwarding):
 
 
 class AbstractWrapper(_Forwarding):
-    """Dynamics with a field `dynamics`, like which they are in all that a subclass does
-    not say otherwise.
+    """A wrapper around a field `dynamics`, to which everything is forwarded that a
+    subclass does not override.
 
     A subclass writes `advance`. One whose state has more entries also gives
-    `state_names`, `observe`, `difference` and `equilibrium`. Anything else that
-    environments, planners and learners ask of dynamics is asked of the field.
+    `state_names`, `observe`, `difference` and `equilibrium`.
 
     !!! example
 

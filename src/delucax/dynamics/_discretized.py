@@ -1,5 +1,6 @@
 """A continuous system integrated over one control interval."""
 
+import functools
 from typing import Any
 
 import diffrax
@@ -10,23 +11,24 @@ from jaxtyping import Array
 
 from .._check import check_count, check_instance
 from .._integration import (
+    as_fixed_step_solver,
     check_kind,
     check_method,
     check_returned,
     evaluate_field,
-    for_fixed_steps,
-    raise_on_failure,
     RK4,
     runge_kutta_step,
     solve_result,
-    Start,
     tableau_of,
+    throwing_adjoint,
+    TimeOffset,
 )
 from .._jax import by_components, join_state, split_state
 from .._module import parameter
 from .._results import choose, first_of, or_none, promote, RESULTS
+from .._typing import Real
 from ..systems import AbstractSystem
-from ._base import AbstractDiscretization, zeros_if_none
+from ._base import AbstractDiscretization
 
 
 _SDE_SOLVERS = (
@@ -41,7 +43,8 @@ _SDE_SOLVERS = (
 
 
 class Discretized(AbstractDiscretization):
-    r"""The exact-at-the-switch, zero-order-hold discretisation of a system.
+    r"""Zero-order-hold discretisation: a system is integrated over one control interval
+    with the control held.
 
     `x_next = x + integral over [t, t + dt] of f(s, x(s), u, w) ds`, the control (and a
     disturbance that enters the field) held over the interval; then the system's
@@ -53,11 +56,11 @@ class Discretized(AbstractDiscretization):
     `diffrax.diffeqsolve`, whose gradient is taken as `adjoint` says.
 
     The interval is integrated in its own time, from 0, so that an autonomous step is
-    the same at any `t`. A field of time, or a diffusion, is evaluated at `t + s`. Below
-    double precision that sum is rounded (by up to 5e-4 at 1e4 in float32), and the
-    field is then corrected by its first two derivatives with respect to time along the
-    rounding error. One that cannot be differentiated twice forwards (a
-    `jax.custom_vjp` of time) stays as it is at the rounded time.
+    the same at any `t`. A time-dependent field or diffusion is evaluated at `t + s`.
+    Below double precision that sum is rounded (by up to 5e-4 at 1e4 in float32), and
+    the field is then corrected by its first two derivatives with respect to time along
+    the rounding error. One without a second forward-mode derivative (a
+    `jax.custom_vjp` of time) is evaluated at the rounded time.
 
     If the system has a `diffusion`, then `w` holds the Brownian increments of the
     substeps one after the other, each with variance `dt / substeps`, and the solver is
@@ -71,7 +74,7 @@ class Discretized(AbstractDiscretization):
         compile again).
     - `solver`: a Diffrax solver; [`delucax.dynamics.RK4`][] by default, and
         `diffrax.Euler` for a system with a diffusion.
-    - `substeps`: solver steps an interval, 1 by default; fixed-step only.
+    - `substeps`: solver steps per interval, 1 by default; fixed-step only.
     - `stepsize_controller`: such as `diffrax.PIDController(rtol=1e-6, atol=1e-8)`;
         `None` for fixed steps.
     - `adjoint`: any `diffrax.AbstractAdjoint`; `diffrax.RecursiveCheckpointAdjoint()`
@@ -106,37 +109,24 @@ class Discretized(AbstractDiscretization):
     """
 
     system: AbstractSystem
-    dt: Array = parameter()
-    solver: diffrax.AbstractSolver
-    substeps: int = eqx.field(static=True)
-    stepsize_controller: diffrax.AbstractStepSizeController | None
-    adjoint: diffrax.AbstractAdjoint | None
-    max_steps: int | None = eqx.field(static=True)
+    dt: Real = parameter()
+    solver: diffrax.AbstractSolver | None = None
+    substeps: int = eqx.field(default=1, static=True)
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None
+    adjoint: diffrax.AbstractAdjoint | None = None
+    max_steps: int | None = eqx.field(default=None, static=True)
 
-    def __init__(
-        self,
-        system: AbstractSystem,
-        dt: Any,
-        solver: diffrax.AbstractSolver | None = None,
-        substeps: int = 1,
-        stepsize_controller: diffrax.AbstractStepSizeController | None = None,
-        adjoint: diffrax.AbstractAdjoint | None = None,
-        max_steps: int | None = None,
-    ):
-        where = "Discretized"
-        self.system = system
-        self.dt = dt
-        self.substeps = check_count(substeps, "substeps", where)
-        if solver is None:
+    def __post_init__(self):
+        system, where = self.system, "Discretized"
+        self.substeps = check_count(self.substeps, "substeps", where)
+        if self.solver is None:
             noisy = isinstance(system, AbstractSystem) and system.noise == "brownian"
-            solver = diffrax.Euler() if noisy else RK4()
-        if stepsize_controller is not None:
-            if adjoint is None:
-                adjoint = diffrax.RecursiveCheckpointAdjoint()
-            max_steps = 256 if max_steps is None else max_steps
-            max_steps = check_count(max_steps, "max_steps", where)
-        self.solver, self.stepsize_controller = solver, stepsize_controller
-        self.adjoint, self.max_steps = adjoint, max_steps
+            self.solver = diffrax.Euler() if noisy else RK4()
+        if self.stepsize_controller is not None:
+            if self.adjoint is None:
+                self.adjoint = diffrax.RecursiveCheckpointAdjoint()
+            steps = 256 if self.max_steps is None else self.max_steps
+            self.max_steps = check_count(steps, "max_steps", where)
 
     def __check_init__(self):
         where, system, solver = "Discretized", self.system, self.solver
@@ -168,29 +158,28 @@ class Discretized(AbstractDiscretization):
 
     @property
     def disturbance_size(self):
-        """That of the system; of a diffusion, its Brownian motions times the substeps,
-        of each of which `w` holds the increments.
+        """The size of `w`: that of the system; with a diffusion times the substeps, as
+        `w` holds one increment of each Brownian motion per substep.
         """
         return self.system.disturbance_size * (self.increments or 1)
 
     @property
     def increments(self):
-        """One a substep, where the system has a diffusion."""
+        """One increment per substep for a system with a diffusion, else 0."""
         return self.substeps if self.noise == "brownian" else 0
 
     def advance(self, t, x, u, w):
         system, noise = self.system, self.noise
-        added = held = increments = None
-        if noise == "additive":
-            added = w
-        elif noise is None:
-            held = zeros_if_none(w, self.disturbance_size, x)
-        else:
-            increments = zeros_if_none(w, self.disturbance_size, x)
-            increments = increments.reshape(self.substeps, -1)
-        # An interval is integrated from 0 to dt: where t is large, t + dt is rounded.
+        given: Any = w
+        if w is None and noise != "additive":
+            given = jnp.zeros(self.disturbance_size, x.dtype)
+        added = given if noise == "additive" else None
+        held = given if noise is None else None
+        increments = given.reshape(self.substeps, -1) if noise == "brownian" else None
+        # An interval is integrated from 0 to dt: where t is large, t + dt is rounded,
+        # and so would the length of the interval be.
         t = jnp.asarray(t, x.dtype)
-        start = Start(t, lambda t: evaluate_field(system, t, x, u, held))
+        start = TimeOffset(t, lambda t: evaluate_field(system, t, x, u, held))
         args = system, start, u, held
         if self.stepsize_controller is not None:
             x_next, result = self._adaptive(x, args)
@@ -201,6 +190,8 @@ class Discretized(AbstractDiscretization):
                 x_next, result = step(0, x, increments[0] if noisy else None)
             else:
                 x_next, result = self._repeat(step, x, increments)
+        # Once per interval, not per substep: the field is defined off the manifold,
+        # too.
         x_next = system.project(x_next)
         check_returned(x_next, x, system, "project")
         if added is not None:
@@ -208,38 +199,37 @@ class Discretized(AbstractDiscretization):
         return x_next.astype(x.dtype), result
 
     def _fixed_step(self, args):
-        """A step, as a function of the time in the interval and the state."""
+        """A substep, as a function of the time in the interval and the state."""
         system, start, u, held = args
+        assert self.solver is not None
         h, tableau = self.dt / self.substeps, tableau_of(self.solver)
         if tableau is None:
-            solver, term = for_fixed_steps(self.solver), diffrax.ODETerm(_field)
+            solver, term = as_fixed_step_solver(self.solver), diffrax.ODETerm(_field)
             return lambda s, x, _: _solver_step(solver, term, s, x, h, args)
-
-        def at_late_time(s, x):
-            return _field(s, x, args)
 
         def field(s, x):
             dx = system.vector_field(start.t + s, x, u, held)
             check_returned(dx, x, system, "vector_field")
             return dx
 
-        rhs = at_late_time if start.is_corrected else field
-
-        def step(s, x, _):
-            return runge_kutta_step(tableau, rhs, s, x, h), RESULTS.successful
-
-        return step
+        # The field itself is in the loop where nothing is to be corrected: fewer frames
+        # lie between it and an error that it raises.
+        rhs = (lambda s, x: _field(s, x, args)) if start.is_corrected else field
+        step = functools.partial(runge_kutta_step, tableau, rhs)
+        return lambda s, x, _: (step(s, x, h), RESULTS.successful)
 
     def _noisy_step(self, x, args):
-        """The same with an increment of the Brownian motions."""
+        """A substep with an increment of the Brownian motions."""
         system, start, u, _ = args
         h = self.dt / self.substeps
-        start = Start(start.t, lambda t: system.diffusion(t, x, u))
+        start = TimeOffset(start.t, lambda t: system.diffusion(t, x, u))
 
         def g(s, x):
-            return start.after(s, lambda t: system.diffusion(t, x, u))
+            return start.evaluate(s, lambda t: system.diffusion(t, x, u))
 
         def step(s, x, dB):
+            # Euler and Maruyama's method; Diffrax's takes a term with a path of its
+            # own.
             if type(self.solver) is diffrax.Euler:
                 x_next = x + h * _field(s, x, args) + _apply(g(s, x), dB)
                 return x_next, RESULTS.successful
@@ -263,22 +253,27 @@ class Discretized(AbstractDiscretization):
         return join_state(parts, x.shape[0]), first_of(results)
 
     def _adaptive(self, x, args):
-        assert self.stepsize_controller is not None and self.adjoint is not None
+        solver, controller, adjoint = (
+            self.solver,
+            self.stepsize_controller,
+            self.adjoint,
+        )
+        assert solver is not None and controller is not None and adjoint is not None
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(_field),
-            self.solver,
+            solver,
             jnp.zeros((), x.dtype),
             self.dt,
             dt0=None,
             y0=x,
             args=args,
-            stepsize_controller=self.stepsize_controller,
-            adjoint=raise_on_failure(self.adjoint),
+            stepsize_controller=controller,
+            adjoint=throwing_adjoint(adjoint),
             max_steps=self.max_steps,
             throw=False,
         )
         assert solution.ys is not None
-        result = solve_result(solution, self.stepsize_controller, x.dtype)
+        result = solve_result(solution, controller, x.dtype)
         return solution.ys[0], result
 
 
@@ -305,11 +300,11 @@ class _BrownianTerm(diffrax.AbstractTerm):
 
 
 def _field(s, x, args):
-    """The vector field at `s` after the start of the interval. An adjoint reaches what
-    is in `args`, not what a function closes over.
+    """The vector field at `s` after the start of the interval. Adjoints differentiate
+    `args` only, not closures.
     """
     system, start, u, held = args
-    return start.after(s, lambda t: evaluate_field(system, t, x, u, held))
+    return start.evaluate(s, lambda t: evaluate_field(system, t, x, u, held))
 
 
 def _solver_step(solver, term, s, x, h, args):
@@ -324,6 +319,6 @@ def _solver_step(solver, term, s, x, h, args):
     )
     if result is diffrax.RESULTS.successful:
         return x_next, RESULTS.successful
-    # The words of Diffrax for it speak of the steps of a step-size controller.
+    # Diffrax's message refers to a step-size controller, which there is not.
     solved = promote(result) == RESULTS.successful
     return x_next, choose(solved, RESULTS.successful, RESULTS.stage_not_solved)

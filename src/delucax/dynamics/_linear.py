@@ -73,6 +73,8 @@ class LinearDynamics(AbstractDynamics):
         A, B, *_ = parts = _checked_matrices(self.A, self.B, self.C, self.E)
         self.A, self.B, self.C, self.E = parts
         n, m = B.shape[-2:]
+        # What is constant is repeated along the time axis of A, so that one scan or one
+        # index serves all.
         x_ref = jnp.zeros(n, A.dtype) if self.x_ref is None else self.x_ref
         u_ref = jnp.zeros(m, A.dtype) if self.u_ref is None else self.u_ref
         x_next = x_ref if self.x_next is None else self.x_next
@@ -98,8 +100,6 @@ class LinearDynamics(AbstractDynamics):
                     f"{where}: {name} must have shape {shape}, got {jnp.shape(array)}."
                 )
             check_real(array, name, where)
-        checked_names(self.state_names, "x", n, "state_names", where)
-        checked_names(self.control_names, "u", m, "control_names", where)
 
     @property
     def is_time_varying(self) -> bool:
@@ -128,12 +128,15 @@ class LinearDynamics(AbstractDynamics):
         """
         if not self.is_time_varying:
             return self
+        # Outside the horizon every row is NaN, and so is the next state.
         k = step_at(t, self.dt, len(self.A), "LinearDynamics")
         pick = lambda s: [s.A, s.B, s.E, s.x_ref, s.u_ref, s.x_next]  # noqa: E731
         here = row_at(pick(self), k)
         return eqx.tree_at(pick, self, here, is_leaf=lambda leaf: leaf is None)
 
     def advance(self, t, x, u, w):
+        # Deviations are taken before they are multiplied: about a large operating point
+        # that keeps their precision.
         here = self.at(t)
         x_next = here.x_next + matvec(here.A, x - here.x_ref)
         x_next = x_next + matvec(here.B, u - here.u_ref)

@@ -85,17 +85,17 @@ def linearize(
     - `model`: an [`delucax.AbstractDynamics`][] or [`delucax.AbstractSystem`][].
     - `t`: time, 0 by default.
     - `x`, `u`: the state and control to linearise at; by default the `equilibrium` that
-        the model names. The [`delucax.dynamics.OperatingPoint`][] that
-        [`delucax.trim`][] computes stands as `x` for both. Any point will do: it is the
-        regulators which ask that the plant rests there, as
-        [`delucax.controllers.LQR`][] says.
+        the model defines. The [`delucax.dynamics.OperatingPoint`][] that
+        [`delucax.trim`][] computes may be passed as `x`; it supplies both. Any point is
+        valid here, but regulators such as [`delucax.controllers.LQR`][] need an
+        equilibrium.
 
     **Returns:** [`delucax.LinearDynamics`][] of dynamics, with the same `dt`;
     [`delucax.systems.LinearSystem`][] of a system. `E` is the derivative with respect
     to the disturbance.
 
     **Raises:** `ValueError` on a wrong shape, or if no point is given and the model
-    names none.
+    defines no equilibrium.
 
     !!! example
 
@@ -110,6 +110,7 @@ def linearize(
     hint = "for an environment, its `dynamics`"
     model, x, u = at_point(model, t, x, u, "linearize", hint)
     t = jnp.asarray(t, x.dtype)
+    # The sensor is linearised, too, so that estimators can be designed on the result.
     C = jacobian(lambda x: model.observe(t, x))(x)
     names = dict(state_names=model.state_names, control_names=model.control_names)
     w = jnp.zeros(model.disturbance_size, x.dtype)
@@ -122,6 +123,7 @@ def linearize(
         dx = f(t, x, u, held)
         return LinearSystem(A, B, C, E, x_ref=x, u_ref=u, dx_ref=dx, **names)
     step = functools.partial(model, t)
+    # The public call, whose solver failures raise, and not `advance`.
     A, B, E = jacobian(step, (0, 1, 2))(x, u, w)
     return LinearDynamics(A, B, C, E, model.dt, x, u, step(x, u, w), **names)
 

@@ -12,25 +12,28 @@ from ..math._linear_solve import full_precision, solve
 _MAX_ROOTS = 40
 _MAX_ROOT_STEPS = 60
 _CLOSE = 0.25
-"""How far from the identity the quadrature is exact to rounding."""
+"""The distance from the identity up to which the quadrature is exact to rounding."""
 _SQUARINGS = 12
 _TERMS = 9
-"""Of the exponential's series: exact to rounding for norms up to 300."""
+"""The terms of the exponential's series: exact to rounding for norms up to 300."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
 def logarithm(
     A: Float[Array, "n n"],
 ) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
-    """The principal logarithm, and whether there is none.
+    """The principal logarithm, and whether it failed.
 
     It is differentiated as the inverse of the exponential that it is: the derivative of
     the exponential is linear, and the block logarithm below solves it.
     """
+    # The iterations have no reverse mode, and are not differentiated: they are run on a
+    # constant, and the derivative is put beside their value.
     constant = lax.stop_gradient(A)
     eye = jnp.eye(A.shape[0], dtype=A.dtype)
     value, converged = _by_roots(constant)
     error = jnp.linalg.norm(exponential_less_one(value) + eye - constant)
+    # The proof of the result: its exponential is A.
     close = error <= jnp.finfo(A.dtype).eps ** 0.5 * jnp.linalg.norm(constant)
     failed = ~(converged & close)
     # The identity in the place of what failed, so that its derivatives are finite.
@@ -53,7 +56,10 @@ def _with_derivative_jvp(primals, tangents):
     logarithm = _with_derivative(*primals)
 
     def inverse(M, right):
-        """The tangent of the logarithm: a block of that of a block matrix."""
+        """The tangent of the logarithm: a block of that of a block matrix,
+        `log [[M, E], [0, M]] = [[log M, D], [0, log M]]` with `D` that along `E`."""
+        # D is linear in E, which is scaled so that the matrix stays as near to the
+        # identity as M is.
         n = M.shape[0]
         size = jnp.linalg.norm(right)
         size = jnp.where(size > 0, size, 1)
@@ -96,6 +102,7 @@ def _by_roots(A: Array) -> tuple[Array, Array]:
 
     start = (A, jnp.asarray(0), jnp.asarray(True))
     root, k, converged = lax.while_loop(proceeds, body, start)
+    # log A = 2^k log A^(1/2^k): inverse scaling and squaring.
     X = root - eye
     converged = converged & (jnp.linalg.norm(X) <= _CLOSE)
     X = jnp.where(converged, X, 0)
@@ -113,10 +120,12 @@ def _by_roots(A: Array) -> tuple[Array, Array]:
 def _square_root(A: Array) -> tuple[Array, Array]:
     """The principal square root, by the product form of Denman and Beavers' iteration.
 
-    `M` goes to the identity and `Y` to the root. On the negative half-line there is
-    none, and `M` goes nowhere.
+    `M` converges to the identity and `Y` to the root, and neither does if an eigenvalue
+    is on the closed negative real axis.
     """
     n, eps = A.shape[0], jnp.finfo(A.dtype).eps
+    # Y_{k+1} = Y_k (I + M_k^-1) / 2, M_{k+1} = (I + (M_k + M_k^-1) / 2) / 2, which is
+    # Newton's method for Y^2 = A, in a form that stays stable under rounding.
     eye = jnp.eye(n, dtype=A.dtype)
     small = 10 * n * eps
 
@@ -136,5 +145,5 @@ def _square_root(A: Array) -> tuple[Array, Array]:
     far = jnp.asarray(jnp.inf, A.dtype)
     start = (A, A, jnp.asarray(jnp.finfo(A.dtype).max, A.dtype), far, jnp.asarray(0))
     _, root, error, *_ = lax.while_loop(proceeds, body, start)
-    # A NaN compares false, and is no root.
+    # Written so that NaN counts as no root.
     return root, error < eps**0.5 * n

@@ -15,7 +15,7 @@ from .._integration import evaluate_field
 from .._message import shortened
 from .._results import choose, raise_on_failure, RESULTS
 from .._typing import RealScalar
-from ..math._drift import relative_drift, ULPS, units_of
+from ..math._norms import relative_drift, ULPS, units_of
 from ..systems import AbstractSystem
 from ._base import AbstractDynamics
 from ._discretized import Discretized
@@ -23,7 +23,7 @@ from ._linearize import at_point, OperatingPoint
 
 
 _MAX_STEPS = 256
-"""Of each of the two methods."""
+"""The step limit of each of the two methods."""
 
 
 def trim(
@@ -43,13 +43,13 @@ def trim(
     unknowns than equations it is the least change among its neighbours, to first order.
     The unit of each state is its guess, or where that is zero the largest guess of a
     state, at most 1, and 1 if all are zero; so for controls. A guess counts as zero if
-    it is less than 100 roundings of the largest one, or of 1 if that is less: in
-    float32 that is 1e-5 of it. The other states then rest as far as a whole unit of
-    this one moves them, so measure a state that is so small in a smaller unit, such as
-    nmol. A free state or control that comes out smaller than 4 roundings of its unit is
-    set to zero. Where there is no root it is a point of least residual, each equation
-    in units of the size of its terms, and the result says so. At a multiple root the
-    last digits may be missing, and the result be `no_equilibrium`.
+    it is below 100 eps times the largest one, or times 1 if that is less: in float32,
+    1e-5 of it. Residuals are measured relative to these units, so scale states that are
+    much smaller than the others (use nmol, for instance). A free state or control below
+    4 eps of its unit is set to zero. Where there is no root it is a point of least
+    residual, each equation in units of the size of its terms, and the result says so.
+    At a multiple root the last digits may be missing, and the result be
+    `no_equilibrium`.
 
     Levenberg and Marquardt's method in a trust region, then Newton's on the conditions
     of the nearest point. Differentiable in forward and reverse mode with respect to all
@@ -62,7 +62,7 @@ def trim(
         [`delucax.Discretized`][] dynamics rest where their system does.
     - `t`: time, 0 by default.
     - `x`, `u`: the guess, shapes `(n,)` and `(m,)`; by default the `equilibrium` that
-        the model names. An `OperatingPoint` as `x` stands for both.
+        the model defines. An `OperatingPoint` as `x` supplies both.
     - `fix`: the states and controls that stay at the guess, by name: one, several, or a
         dictionary from name to value, which replaces that of the guess. None by
         default.
@@ -72,7 +72,7 @@ def trim(
     **Returns:** [`delucax.dynamics.OperatingPoint`][].
 
     **Raises:** `ValueError` on a wrong shape, an unknown name, a time or guess that is
-    not finite, if all is fixed, or if no guess is given and the model names no
+    not finite, if all is fixed, or if no guess is given and the model defines no
     equilibrium; an error at run time as `throw` says.
 
     Source: Nocedal and Wright, 2006.
@@ -113,7 +113,7 @@ def trim(
 
 
 def _fixed(model: Any, fix: Any, where: str) -> dict[int, Any]:
-    """From the index of each state and control that is held to its value, if given."""
+    """The index of each state and control that is held, with its value if given."""
     if isinstance(fix, str):
         fix = (fix,)
     names = (*model.state_names, *model.control_names)
@@ -166,6 +166,8 @@ class _Problem(eqx.Module):
         if isinstance(model, AbstractSystem):
             w = jnp.zeros(model.disturbance_size, x.dtype)
             held = w if model.disturbance_names else None
+            # A state is at rest on its manifold: off it, there would be roots that no
+            # trajectory reaches.
             return evaluate_field(model, self.t, model.project(x), u, held)
         return model.difference(model.advance(self.t, x, u, None)[0], x)
 
@@ -179,13 +181,14 @@ class _Problem(eqx.Module):
             (drift, slope), (_, curvature) = jax.jvp(first, (y,), (pair[1],))
             return drift, slope, curvature
 
-        # A pair of directions after the other: a batch of them compiles for longer.
+        # By `lax.map` over pairs of directions, because `jax.vmap` compiles for longer.
         pairs = jnp.repeat(eye, k, 0), jnp.tile(eye[jnp.array(self.free)], (y.size, 1))
         drift, slopes, H = lax.map(along, pairs)
         return drift[0], slopes[::k].T, H.reshape(y.size, k, -1).transpose(2, 0, 1)
 
     def terms(self, J: Array) -> Array:
         """The size of the terms of each equation at the guess, a unit of it."""
+        # Of J dz, entry by entry: a residual is small if it is beside these.
         terms = jnp.abs(J) @ self.units
         return jnp.where(terms > 0, terms, 1)
 
@@ -221,6 +224,7 @@ def _expand(problem: _Problem, z: Array, terms: Array) -> _Point:
     rtol = float(100 * max(J.shape) * jnp.finfo(J.dtype).eps)
     # Not by Lineax, whose solves raise in their derivative where there is NaN.
     P = jnp.linalg.pinv(J, rtol=rtol)
+    # The least solution of the linear model r + J (z' - z) = 0 is z' = P (J z - r).
     linear = J @ z - r
     near = P @ linear
     offset = z - near
@@ -234,11 +238,11 @@ def _expand(problem: _Problem, z: Array, terms: Array) -> _Point:
 
 @eqx.filter_custom_jvp
 def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
-    """The nearest point, the drift there and its Jacobian, and how far from it the last
-    step still was.
+    """The nearest point, the drift there and its Jacobian, and the size of the last
+    step.
 
     Levenberg and Marquardt's method within a trust radius, then Newton's, in one loop
-    with one copy of the model, whose compilation is most of the price. Where Newton's
+    that traces the model once, because compile time dominates. Where Newton's
     does not converge, as where J loses rank, it is the point of least residual.
     """
     dtype, n = problem.guess.dtype, problem.model.state_size
@@ -258,11 +262,16 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
         step, newton, converged, _, z, d, damping, radius, old, best = carry
         new = _expand(problem, z + d, old.terms)
         finite = jnp.isfinite(jnp.sum(new.slope) + jnp.sum(new.gram))
+        # Newton's steps are all taken: towards a saddle of the cost, too.
         better = newton | (finite & (new.cost < old.cost))
         z, new = select(better, (z + d, new), (z, old))
+        # Marquardt's rule. The radius bounds the step in the largest entry, because far
+        # from the guess the model may have other roots.
         damping = jnp.where(better, jnp.maximum(damping / 4, eps), damping * 4)
         radius = jnp.where(better, 2 * radius, jnp.max(jnp.abs(d)) / 4)
         diagonal = jnp.diagonal(new.gram)
+        # Scaled by the diagonal, so that units don't matter; unknowns that no equation
+        # has would make it singular.
         floor = eps * (jnp.max(diagonal) + eps)
         damped = new.gram + jnp.diag(damping * (diagonal + floor))
         matrix = jnp.where(newton, new.slope, damped)
@@ -276,7 +285,7 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
             *select(new.cost < best[0], here, best[:-1]),
             jnp.where(newton, best[-1], gap),
         )
-        # One more step after Newton's method has converged.
+        # One more step after convergence, whose error is the square of the last one.
         converged, done = newton & small, converged
         newton = newton | small | (step >= _MAX_STEPS)
         return step + 1, newton, converged, done, z, d, damping, radius, new, best
@@ -285,13 +294,15 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
     best = inf, zero, blank.drift, blank.jacobian, inf
     start = jnp.array(0), no, no, no, zero, zero, one, one / 2, blank, best
     end = lax.while_loop(proceeds, body, start)
-    _, _, _, _, z, d, _, _, point, (cost, *best) = end
+    *_, z, d, _, _, point, (cost, *best) = end
     gap = jnp.max(jnp.abs(d))
     good = _settled(gap, z) & (point.cost <= 1.01 * cost + eps)
     return select(good, (z, point.drift, point.jacobian, gap), tuple(best))
 
 
 def _settled(gap: Array, z: Array) -> Array:
+    """Whether a step was short: at a multiple root, where Newton's method is slow and
+    the root known to a part of its digits, too."""
     return gap <= jnp.finfo(z.dtype).eps ** (1 / 3) * (1 + jnp.max(jnp.abs(z)))
 
 
@@ -305,6 +316,8 @@ def _nearest_jvp(primals, tangents):
         return _expand(problem, z, problem.terms(jacobian)).offset
 
     _, change = eqx.filter_jvp(lambda problem: offset(problem, z), primals, tangents)
+    # The implicit function theorem for offset(problem, z) = 0: d offset/dz dz =
+    # -change.
     dz = -jnp.linalg.solve(jax.jacfwd(offset, 1)(primals[0], z), change)
     drift_at = lambda problem, z: problem.drift(problem.at(z))
     _, drift = eqx.filter_jvp(drift_at, (*primals, z), (*tangents, dz))
@@ -313,7 +326,7 @@ def _nearest_jvp(primals, tangents):
 
 @eqx.filter_jit
 def _solve(model: Any, t: Array, guess: Array, free: tuple[int, ...]):
-    """The point nearest to the guess, and what became of it."""
+    """The point nearest to the guess, with its status."""
     n = model.state_size
     eps = jnp.finfo(guess.dtype).eps
     problem = _Problem(model, t, guess, free)

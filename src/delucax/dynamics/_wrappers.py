@@ -1,5 +1,6 @@
 """Dynamics around others: dead times, and an adversary that acts on the state."""
 
+from dataclasses import KW_ONLY
 from typing import Any
 
 import equinox as eqx
@@ -8,19 +9,21 @@ from jaxtyping import Array, Float
 
 from .._check import as_matrix, as_vector, check_count, check_instance, check_positive
 from .._module import parameter
+from .._typing import Real
 from ..math import matvec
 from ..math._norms import within_ball
 from ._base import AbstractDynamics, AbstractWrapper
 
 
 class Delayed(AbstractWrapper):
-    """Dynamics whose controls act, or whose sensor reads, some whole steps late,
+    """Dynamics with an input delay, an output delay or both, in whole steps,
 
     `x_next = F(t, x, u[k - controls], w)`, `y = observe(t, x)[k - sensor]`.
 
-    What is under way is part of the state: `(x, u[k - 1], ..., u[k - controls],
-    y[k - 1], ..., y[k - sensor])`. It is a true transport delay, differentiable like
-    any other state; for the delay of a fraction of a step discretise a lag.
+    Pending controls and observations are part of the state: `(x, u[k - 1], ...,
+    u[k - controls], y[k - 1], ..., y[k - sensor])`. It is a true transport delay,
+    differentiable like any other state. For a fraction of a step use a first-order lag
+    or a Padé approximation in the system.
 
     **Arguments:**
 
@@ -45,29 +48,23 @@ class Delayed(AbstractWrapper):
     """
 
     dynamics: AbstractDynamics
-    controls: int = eqx.field(static=True)
-    sensor: int = eqx.field(static=True)
+    controls: int = eqx.field(default=0, static=True)
+    sensor: int = eqx.field(default=0, static=True)
 
-    def __init__(self, dynamics: AbstractDynamics, controls: int = 0, sensor: int = 0):
-        where = "Delayed"
-        self.dynamics = dynamics
-        self.controls = check_count(controls, "controls", where, least=0)
-        self.sensor = check_count(sensor, "sensor", where, least=0)
+    def __check_init__(self):
+        check_count(self.controls, "controls", "Delayed", least=0)
+        check_count(self.sensor, "sensor", "Delayed", least=0)
 
     @property
     def state_names(self):
-        inner = self.dynamics
-        late = [
-            f"{name}[-{k + 1}]"
-            for k in range(self.controls)
-            for name in inner.control_names
-        ]
+        inner, ages = self.dynamics, range(self.controls)
+        late = [f"{name}[-{k + 1}]" for k in ages for name in inner.control_names]
         outputs = range(inner.observation_size if self.sensor else 0)
         late += [f"y{i}[-{k + 1}]" for k in range(self.sensor) for i in outputs]
         return (*inner.state_names, *late)
 
     def _cut(self, x: Array) -> tuple[Array, Array, Array]:
-        """The plant's own state, the controls and the observations under way."""
+        """The plant's own state, the pending controls and the pending observations."""
         n = self.dynamics.state_size
         m = n + self.controls * self.dynamics.control_size
         return x[:n], x[n:m], x[m:]
@@ -87,10 +84,10 @@ class Delayed(AbstractWrapper):
         **Arguments:**
 
         - `x`: the plant's own state.
-        - `u`: the control that is under way, zero by default.
+        - `u`: the pending control, zero by default.
 
-        **Returns:** the state, with the control and what the sensor reads of `x` in
-        every place under way.
+        **Returns:** the state, in which every pending control is `u` and every pending
+        observation that of `x`.
 
         **Raises:** `ValueError` on a wrong shape.
         """
@@ -105,6 +102,8 @@ class Delayed(AbstractWrapper):
     def advance(self, t, x, u, w):
         own, controls, observed = self._cut(x)
         acting, late = u, []
+        # The newest comes first, and the oldest acts, or is read. Slices of no entries
+        # are left out, so that the state stays one of components.
         if self.controls:
             m = u.shape[0]
             acting = controls[-m:]
@@ -126,9 +125,11 @@ class Delayed(AbstractWrapper):
         own, _, observed = self._cut(x)
         if not self.sensor:
             return self.dynamics.observe(t, own)
+        # The oldest observation is the last block.
         return observed[-(observed.shape[0] // self.sensor) :]
 
     def difference(self, x, x_ref):
+        # Angles wrap in the plant's own state alone.
         n = self.dynamics.state_size
         own = self.dynamics.difference(x[:n], x_ref[:n])
         return jnp.concatenate([own, x[n:] - x_ref[n:]])
@@ -143,19 +144,19 @@ class WorstCase(AbstractWrapper):
 
     `x_next = F(t, x, u, w + L difference(x, x_ref))`,
 
-    about the operating point that the dynamics name. With the `L` of
+    about the operating point that the dynamics define. With the `L` of
     [`delucax.controllers.HInfinity`][] or of [`delucax.riccati.hinf_dare`][] it is the
     worst disturbance of the H-infinity game; a `bound` keeps it within what a
     disturbance can be.
 
     **Arguments:**
 
-    - `dynamics`: the plant, which names an equilibrium.
+    - `dynamics`: the plant, which defines an equilibrium.
     - `L`: the adversary's gain, shape `(k, n)`.
     - `bound`: what it adds is scaled back to this Euclidean norm; none by default.
 
-    **Raises:** `ValueError` if `dynamics` are none or name no equilibrium, `L` does not
-    fit them, or `bound` is not positive.
+    **Raises:** `ValueError` if `dynamics` are none or define no equilibrium, `L` does
+    not fit them, or `bound` is not positive.
 
     Source: Basar and Bernhard, 1995.
 
@@ -178,15 +179,13 @@ class WorstCase(AbstractWrapper):
 
     dynamics: AbstractDynamics
     L: Float[Array, "k n"] = parameter()
-    bound: Array | None = parameter()
-
-    def __init__(self, dynamics: AbstractDynamics, L: Any, *, bound: Any = None):
-        self.dynamics, self.L, self.bound = dynamics, L, bound
+    _: KW_ONLY
+    bound: Real | None = parameter(None)
 
     def __check_init__(self):
         where, dynamics = "WorstCase", self.dynamics
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
-        dynamics.equilibrium()
+        dynamics.equilibrium()  # raises where there is none
         as_matrix(self.L, "L", where)
         shape = dynamics.disturbance_size, dynamics.state_size
         if self.L.shape != shape:
@@ -198,7 +197,7 @@ class WorstCase(AbstractWrapper):
             check_positive(self.bound, "bound", where)
 
     def attack(self, x: Array) -> Array:
-        """What the adversary adds to the disturbance.
+        """The adversary's part of the disturbance.
 
         **Arguments:** `x`: the state.
 
@@ -212,4 +211,6 @@ class WorstCase(AbstractWrapper):
 
     def advance(self, t, x, u, w):
         added = self.attack(x)
+        # Beside the environment's own disturbance, which the adversary does not
+        # replace.
         return self.dynamics.advance(t, x, u, added if w is None else w + added)

@@ -6,9 +6,4 @@ from ._kalman import (
     KalmanFilter as KalmanFilter,
     UnscentedKalmanFilter as UnscentedKalmanFilter,
 )
-from ._smoother import (
-    Filtered as Filtered,
-    run_filter as run_filter,
-    smooth as smooth,
-    Smoothed as Smoothed,
-)
+from ._smoother import run_filter as run_filter, smooth as smooth

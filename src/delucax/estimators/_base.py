@@ -13,7 +13,7 @@ from .._typing import BoolScalar, Control, Observation, PRNGKey, RealScalar
 
 
 class Belief(NamedTuple):
-    """What is known of a state: it is taken to be normal, `x ~ N(mean, covariance)`.
+    """A normal distribution of a state, `x ~ N(mean, covariance)`.
 
     **Arguments:**
 
@@ -47,15 +47,16 @@ class AbstractEstimator(eqx.Module):
     At each step, in this order: `update` takes in the observation `y_k`; `predict`
     moves on over the step from `t_k`, with the control `u_k` that was really applied.
     Whatever the estimator carries from step to step is its state, a pytree of arrays.
-    `estimate` reads a belief off it, and `status` says what became of the last step.
-    [`delucax.controllers.OutputFeedback`][] makes the calls in a closed loop, and
-    [`delucax.estimators.run_filter`][] on a record.
+    `estimate` computes a belief from it, and `status` the status of the last step.
+    [`delucax.controllers.OutputFeedback`][] makes the calls in a closed loop. On a
+    record [`delucax.estimators.run_filter`][] makes them, of the Kalman filters alone,
+    whose log-likelihood it also computes.
 
     To write an estimator, subclass this and give `init`, `update` and `predict`. The
-    state of a filter is a [`delucax.estimators.Belief`][], and there is no more to
-    write. One that carries something else also gives `estimate`: a moving-horizon
-    estimator, say, carries the observations and controls of its window and the last
-    solution. One that solves a problem gives `status`.
+    state of a filter is a [`delucax.estimators.Belief`][], and needs no other methods.
+    One that carries something else also gives `estimate`: a moving-horizon estimator,
+    say, carries the observations and controls of its window and the last solution. One
+    that solves a problem gives `status`.
 
     !!! example
 
@@ -123,7 +124,7 @@ class AbstractEstimator(eqx.Module):
         """
 
     def estimate(self, state: PyTree) -> Belief:
-        """The belief that a state stands for; by default the state is the belief.
+        """The mean and covariance of a state; by default the state itself, a belief.
 
         **Arguments:** `state`: the estimator's state.
 
@@ -132,7 +133,7 @@ class AbstractEstimator(eqx.Module):
         return state
 
     def status(self, state: PyTree) -> Result:
-        """What became of the last `update` or `predict`.
+        """The status of the last `update` or `predict`.
 
         **Arguments:** `state`: the estimator's state after it.
 

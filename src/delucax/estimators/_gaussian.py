@@ -1,8 +1,7 @@
-"""What all Kalman filters share: second moments, and the steps made of them."""
+"""The conditioning of normal distributions that all Kalman filters share."""
 
 import abc
 import math
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -17,7 +16,7 @@ from .._check import (
     symmetric_matrix,
 )
 from .._controller import wrong_observation
-from .._typing import Control, Observation, RealScalar, Scalar
+from .._typing import Control, Difference, Observation, RealScalar, Scalar
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ..math._linear_solve import (
@@ -31,100 +30,65 @@ from ..math._linear_solve import (
 from ._base import AbstractEstimator, Belief
 
 
-class AbstractJoint(eqx.Module):
-    """A state `x` and an image `z` of it with noise added, as jointly normal."""
+class Joint(eqx.Module):
+    """The joint normal distribution of a state `x` and of `z`, its image plus noise,
 
-    mean: eqx.AbstractVar[Array]
+    `x = E[x] + X e`, `z = mean + Z e + noise`, `e ~ (0, P)`.
 
-    @property
-    @abc.abstractmethod
-    def covariance(self) -> Array:
-        """That of `z`."""
-
-    @property
-    @abc.abstractmethod
-    def cross(self) -> Array:
-        """The covariance of `x` with `z`, shape `(n, p)`."""
-
-    @abc.abstractmethod
-    def gain(self) -> Array:
-        """The `G` of `E[x | z] = E[x] + G (z - E[z])`."""
-
-    @abc.abstractmethod
-    def remainder(self, G: Array) -> Array:
-        """The covariance of `x - G z`: that of `x` given `z`, at the gain.
-
-        A sum of congruences, so that it is symmetric and stays semidefinite in
-        rounding, and an error in `G` counts to second order only.
-        """
-
-
-class LinearJoint(AbstractJoint):
-    """The moments of `z = C x + noise`.
-
-    What is known of a steady state need not be computed again.
+    Of the linear `z = C x + noise`, `Z` is `C`, `P` the covariance of the state and `X`
+    the identity, which is left out. Of weighted points, `X` and `Z` have their
+    deviations as columns, and `P` their weights, the diagonal of a matrix. What is
+    known of a steady state need not be computed again.
     """
 
     mean: Array
+    X: Array | None
+    Z: Array
     P: Array
-    C: Array
     noise: Array
     known_covariance: Array | None = None
     known_gain: Array | None = None
     known_remainder: Array | None = None
 
+    def _form(self, A, B):
+        """`A P B'`."""
+        return (A @ self.P if self.P.ndim == 2 else A * self.P) @ B.T
+
     @property
     @full_precision
     def covariance(self):
+        """The covariance of `z`."""
         if self.known_covariance is not None:
             return self.known_covariance
-        return symmetric(self.C @ self.P @ self.C.T + self.noise)
+        return symmetric(self._form(self.Z, self.Z) + self.noise)
 
     @property
     @full_precision
     def cross(self):
-        return self.P @ self.C.T
+        """The covariance of `x` with `z`, shape `(n, p)`."""
+        return self.P @ self.Z.T if self.X is None else self._form(self.X, self.Z)
 
     def gain(self):
+        """The `G` of `E[x | z] = E[x] + G (z - E[z])`."""
         if self.known_gain is not None:
             return self.known_gain
-        return _gain(self.covariance, self.cross)
+        S, _ = _regular(self.covariance)
+        if S.shape[0] <= SMALL:
+            return solve(S, self.cross.T).T
+        tag = lx.positive_semidefinite_tag
+        return factorised(S, lx.Cholesky(), tag)(self.cross.T).T
 
     @full_precision
     def remainder(self, G):
+        """The covariance of `x - G z`: that of `x` given `z`, at the gain."""
         if self.known_remainder is not None:
             return self.known_remainder
-        # Joseph's form.
-        rest = jnp.eye(self.P.shape[0], dtype=self.P.dtype) - G @ self.C
-        return symmetric(rest @ self.P @ rest.T + G @ self.noise @ G.T)
-
-
-class SampledJoint(AbstractJoint):
-    """The moments of weighted points: deviations `dx` and `dz`, a row a point."""
-
-    mean: Array
-    dx: Array
-    dz: Array
-    weights: Array
-    noise: Array
-
-    @property
-    @full_precision
-    def covariance(self):
-        return symmetric((self.weights * self.dz.T) @ self.dz + self.noise)
-
-    @property
-    @full_precision
-    def cross(self):
-        return (self.weights * self.dx.T) @ self.dz
-
-    def gain(self):
-        return _gain(self.covariance, self.cross)
-
-    @full_precision
-    def remainder(self, G):
-        rest = self.dx - self.dz @ G.T
-        return symmetric((self.weights * rest.T) @ rest + G @ self.noise @ G.T)
+        # Joseph's form, a sum of congruences: it stays semidefinite in rounding, where
+        # the shorter P - G S G' may not, and it is stationary in G, so that an error of
+        # the gain counts to second order only.
+        X = jnp.eye(len(G), dtype=self.P.dtype) if self.X is None else self.X
+        rest = X - G @ self.Z
+        return symmetric(self._form(rest, rest) + G @ self.noise @ G.T)
 
 
 @full_precision
@@ -133,20 +97,12 @@ def congruence(E: Float[Array, "n k"], W: Float[Array, "k k"]) -> Float[Array, "
     return symmetric(E @ W @ E.T)
 
 
-def _gain(S, cross):
-    """`cross S^-1`, and no gain on what does not vary."""
-    S, _ = _regular(S)
-    if S.shape[0] <= SMALL:
-        return solve(S, cross.T).T
-    tag = lx.positive_semidefinite_tag
-    return factorised(S, lx.Cholesky(), tag)(cross.T).T
-
-
 def _regular(S: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, " n"]]:
     """A covariance made definite, and which of its entries vary.
 
     What is added is of the size of rounding, in the units of each entry. An entry that
-    does not vary is given the variance 1: nothing is correlated with it.
+    does not vary is given the variance 1: nothing is correlated with it, so its gain
+    is 0.
     """
     variances = jnp.diagonal(S)
     varies = variances != 0
@@ -158,25 +114,11 @@ def square_root(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The lower triangular `L` of `P = L L'`; NaN if `P` is not semidefinite."""
     regular, varies = _regular(P)
     posed = is_definite(regular)
-    # A matrix that has no root is kept out of the derivative too.
+    # A matrix that has no root is kept out of the derivative too: `where` alone would
+    # multiply a NaN cotangent by 0.
     eye = jnp.eye(P.shape[0], dtype=P.dtype)
     L = jnp.linalg.cholesky(jnp.where(posed, regular, eye))
     return jnp.where(posed, jnp.where(varies[:, None], L, 0), jnp.nan)
-
-
-@full_precision
-def log_density(
-    residual: Float[Array, " p"], S: Float[Array, "p p"]
-) -> Float[Array, ""]:
-    """The logarithm of the normal density `N(0, S)`; NaN if `S` is not definite."""
-    (p,) = residual.shape
-    posed = is_definite(S)
-    L = jnp.linalg.cholesky(jnp.where(posed, S, jnp.eye(p, dtype=S.dtype)))
-    operator = lx.MatrixLinearOperator(L, lx.lower_triangular_tag)
-    whitened = lx.linear_solve(operator, residual, lx.Triangular(), throw=False).value
-    log_scale = jnp.sum(jnp.log(jnp.diagonal(L))) + 0.5 * p * math.log(2 * math.pi)
-    value = -0.5 * jnp.sum(whitened**2) - log_scale
-    return jnp.where(posed, value, jnp.nan)
 
 
 class AbstractGaussianFilter(AbstractEstimator):
@@ -191,21 +133,35 @@ class AbstractGaussianFilter(AbstractEstimator):
     V: eqx.AbstractVar[Float[Array, "p p"]]
     mean: eqx.AbstractVar[Float[Array, " n"]]
     covariance: eqx.AbstractVar[Float[Array, "n n"]]
-    observation_difference: eqx.AbstractVar[Callable[[Array, Array], Array] | None]
+    observation_difference: eqx.AbstractVar[Difference | None]
 
     @abc.abstractmethod
-    def _observation(self, t: RealScalar, belief: Belief) -> AbstractJoint:
+    def _observation(self, t: RealScalar, belief: Belief) -> Joint:
         """The moments of what will be observed at `t`."""
 
     @abc.abstractmethod
-    def _transition(self, t: RealScalar, u: Control, belief: Belief) -> AbstractJoint:
+    def _transition(self, t: RealScalar, u: Control, belief: Belief) -> Joint:
         """The moments of the next state."""
 
     def __check_init__(self):
-        where, n = type(self).__name__, self.dynamics.state_size
-        noise_covariances(self.dynamics, self.W, self.V, where)
-        as_vector(self.mean, n, "mean", where)
-        covariance_matrix(self.covariance, n, "covariance", "the state", where)
+        self._model()
+
+    def _model(self, default: Array | None = None) -> tuple[Array, Array, Array, Array]:
+        """`W`, `V`, and the mean and covariance of the first state, checked, and in the
+        precision of all; where they are not given, `default` or zero and the identity.
+        """
+        where, dynamics, mean = type(self).__name__, self.dynamics, self.mean
+        n, p = dynamics.state_size, dynamics.observation_size
+        k = dynamics.disturbance_size
+        W = _covariance_matrix(self.W, k, "W", "the disturbance", where)
+        V = _covariance_matrix(self.V, p, "V", "the observation", where)
+        default = jnp.zeros(n, W.dtype) if default is None else default
+        mean = default if mean is None else as_vector(mean, n, "mean", where)
+        check_finite(mean, "mean", where)
+        P = jnp.eye(n, dtype=mean.dtype) if self.covariance is None else self.covariance
+        P = _covariance_matrix(P, n, "covariance", "the state", where)
+        dtype = jnp.result_type(mean, P, default, W, V)
+        return W, V, mean.astype(dtype), P.astype(dtype)
 
     def init(self, *, key=None):
         del key
@@ -247,9 +203,19 @@ class AbstractGaussianFilter(AbstractEstimator):
         mean = belief.mean + matvec(G, innovation)
         return _like(Belief(mean, joint.remainder(G)), belief)
 
+    @full_precision
     def _log_density(self, belief, joint, innovation):
+        """The log-density of an innovation, `N(0, S)`; NaN if `S` is not definite."""
         S = joint.covariance
-        return log_density(innovation.astype(S.dtype), S).astype(belief.mean.dtype)
+        posed, p = is_definite(S), len(S)
+        L = jnp.linalg.cholesky(jnp.where(posed, S, jnp.eye(p, dtype=S.dtype)))
+        # `r' S^-1 r = |L^-1 r|^2` and `log det S = 2 sum log L_ii`, from one factor.
+        lower = lx.MatrixLinearOperator(L, lx.lower_triangular_tag)
+        r = innovation.astype(S.dtype)
+        whitened = lx.linear_solve(lower, r, lx.Triangular(), throw=False).value
+        log_scale = jnp.sum(jnp.log(jnp.diagonal(L))) + 0.5 * p * math.log(2 * math.pi)
+        value = -0.5 * jnp.sum(whitened**2) - log_scale
+        return jnp.where(posed, value, jnp.nan).astype(belief.mean.dtype)
 
     def _prediction(self, t, u, belief):
         m = self.dynamics.control_size
@@ -263,6 +229,7 @@ class AbstractGaussianFilter(AbstractEstimator):
     def _smoothed(self, t, u, belief, after):
         """The belief once that of the next state, `after`, is known from all data."""
         joint = self._prediction(t, u, belief)
+        # Backwards, `P_k A' Sigma_{k+1}^-1` is the gain of `x_k` on the next state.
         G = joint.gain()
         shift = self.dynamics.difference(after.mean, joint.mean)
         covariance = joint.remainder(G) + G @ after.covariance @ G.T
@@ -274,16 +241,7 @@ def _like(after: Belief, before: Belief) -> Belief:
     return Belief(*(a.astype(b.dtype) for a, b in zip(after, before, strict=True)))
 
 
-def noise_covariances(
-    dynamics: AbstractDynamics, W: Any, V: Any, where: str
-) -> tuple[Array, Array]:
-    """`W` and `V`, of the sizes that `dynamics` have, or an error."""
-    k, p = dynamics.disturbance_size, dynamics.observation_size
-    W = covariance_matrix(W, k, "W", "the disturbance", where)
-    return W, covariance_matrix(V, p, "V", "the observation", where)
-
-
-def covariance_matrix(value: Any, size: int, name: str, of: str, where: str) -> Array:
+def _covariance_matrix(value: Any, size: int, name: str, of: str, where: str) -> Array:
     """`value` as a covariance matrix of `size`, or an error."""
     matrix = symmetric_matrix(value, name, where)
     if matrix.shape != (size, size):
@@ -293,26 +251,3 @@ def covariance_matrix(value: Any, size: int, name: str, of: str, where: str) -> 
         )
     check_definite(matrix, name, where, False)
     return matrix
-
-
-def gaussian_model(
-    dynamics: AbstractDynamics,
-    W: Any,
-    V: Any,
-    mean: Any,
-    covariance: Any,
-    default: Array | None,
-    where: str,
-) -> tuple[Array, Array, Array, Array]:
-    """The covariances `W` and `V` of the noise, and the mean (`default`, or zero, if
-    there is none) and covariance of the first state, in the precision of all."""
-    W, V = noise_covariances(dynamics, W, V, where)
-    n = dynamics.state_size
-    default = jnp.zeros(n, W.dtype) if default is None else default
-    mean = default if mean is None else as_vector(mean, n, "mean", where)
-    check_finite(mean, "mean", where)
-    if covariance is None:
-        covariance = jnp.eye(n, dtype=mean.dtype)
-    covariance = covariance_matrix(covariance, n, "covariance", "the state", where)
-    dtype = jnp.result_type(mean, covariance, default, W, V)
-    return W, V, mean.astype(dtype), covariance.astype(dtype)

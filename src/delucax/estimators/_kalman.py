@@ -1,6 +1,6 @@
 """Kalman filters: linear, extended and unscented."""
 
-from collections.abc import Callable
+from dataclasses import KW_ONLY
 from typing import Any
 
 import equinox as eqx
@@ -21,15 +21,14 @@ from .._check import (
 from .._jax import jacobian
 from .._module import function_field, parameter, positive, weight
 from .._results import raise_on_failure, RESULTS
+from .._typing import Difference, Real
 from ..dynamics import AbstractDynamics, LinearDynamics
 from ..math._linear_solve import symmetric
 from ..riccati import filter_dare
 from ._gaussian import (
     AbstractGaussianFilter,
     congruence,
-    gaussian_model,
-    LinearJoint,
-    SampledJoint,
+    Joint,
     square_root,
 )
 
@@ -96,7 +95,7 @@ class KalmanFilter(AbstractGaussianFilter):
     y_ref: Float[Array, " p"] | None = parameter()
     L: Float[Array, "n p"] | None = weight()
     updated_covariance: Float[Array, "n n"] | None = parameter()
-    observation_difference: Callable[[Array, Array], Array] | None = function_field()
+    observation_difference: Difference | None = function_field()
 
     def __init__(
         self,
@@ -108,7 +107,7 @@ class KalmanFilter(AbstractGaussianFilter):
         covariance: Any = None,
         steady_state: bool = False,
         y_ref: Any = None,
-        observation_difference: Callable[[Array, Array], Array] | None = None,
+        observation_difference: Difference | None = None,
     ):
         where = "KalmanFilter"
         _check_linear(dynamics)
@@ -116,9 +115,8 @@ class KalmanFilter(AbstractGaussianFilter):
         self.dynamics, self.observation_difference = dynamics, observation_difference
         x_ref = dynamics.at(0.0).x_ref
         x_ref = x_ref.astype(jnp.result_type(x_ref, dynamics.A))
-        self.W, self.V, self.mean, self.covariance = gaussian_model(
-            dynamics, W, V, mean, covariance, x_ref, where
-        )
+        self.W, self.V, self.mean, self.covariance = W, V, mean, covariance
+        self.W, self.V, self.mean, self.covariance = self._model(x_ref)
         self.y_ref = self.L = self.updated_covariance = None
         if y_ref is not None:
             self.y_ref = as_vector(y_ref, self.V.shape[0], "y_ref", where)
@@ -135,7 +133,7 @@ class KalmanFilter(AbstractGaussianFilter):
         what = f"{where}: there is no steady state. Of A', C' in the places of A, B"
         solution = raise_on_failure(solution, what, facts=solution._facts)
         self.covariance = symmetric(solution.X).astype(self.mean.dtype)
-        joint = LinearJoint(C @ self.mean, self.covariance, C, self.V)
+        joint = Joint(C @ self.mean, None, C, self.covariance, self.V)
         self.L = joint.gain()
         self.updated_covariance = joint.remainder(self.L)
 
@@ -165,21 +163,15 @@ class KalmanFilter(AbstractGaussianFilter):
         else:
             deviation = belief.mean - dynamics.at(t).x_ref
             mean = self.y_ref + dynamics.observe(t, deviation)
-        return LinearJoint(
-            mean,
-            belief.covariance,
-            self._C,
-            self.V,
-            known_gain=self.L,
-            known_remainder=self.updated_covariance,
-        )
+        known = dict(known_gain=self.L, known_remainder=self.updated_covariance)
+        return Joint(mean, None, self._C, belief.covariance, self.V, **known)
 
     def _transition(self, t, u, belief):
         here = self.dynamics.at(t)
         mean, _ = here.advance(t, belief.mean, u, None)
         known = None if self.L is None else self.covariance
         P, noise = belief.covariance, self._noise(here)
-        return LinearJoint(mean, P, here.A, noise, known_covariance=known)
+        return Joint(mean, None, here.A, P, noise, known_covariance=known)
 
 
 def _check_linear(dynamics: Any) -> None:
@@ -187,7 +179,42 @@ def _check_linear(dynamics: Any) -> None:
     check_instance(dynamics, LinearDynamics, "dynamics", "KalmanFilter", hint)
 
 
-class ExtendedKalmanFilter(AbstractGaussianFilter):
+class _AbstractNonlinearFilter(AbstractGaussianFilter):
+    """A filter of any dynamics, whose disturbance counts to first order."""
+
+    def __post_init__(self):
+        self._check_dynamics()
+        self.W, self.V, self.mean, self.covariance = self._model()
+
+    def __check_init__(self):
+        self._check_dynamics()
+
+    def _check_dynamics(self) -> None:
+        where, dynamics = type(self).__name__, self.dynamics
+        check_instance(dynamics, AbstractDynamics, "dynamics", where)
+        n = dynamics.state_size
+        x = jnp.zeros(n)
+        shape = eqx.filter_eval_shape(dynamics.difference, x, x).shape
+        if shape != (n,):
+            raise ValueError(
+                f"{where}: dynamics must have a difference of the size of the state, "
+                f"{(n,)}, got shape {shape}."
+            )
+
+    def _advanced(self, t, x, u, w=None):
+        """The next state; NaN if the solver fails, which the loop around it reports."""
+        x_next, result = self.dynamics.advance(t, x, u, w)
+        if result is RESULTS.successful:
+            return x_next
+        return jnp.where(result == RESULTS.successful, x_next, jnp.nan)
+
+    def _noise(self, t, u, x):
+        """`E W E'`, what the disturbance adds to the covariance of the next state."""
+        w = jnp.zeros(len(self.W), x.dtype)
+        return congruence(jacobian(lambda w: self._advanced(t, x, u, w))(w), self.W)
+
+
+class ExtendedKalmanFilter(_AbstractNonlinearFilter):
     r"""The Kalman filter of the dynamics linearised about the estimate, at each step,
     by automatic differentiation:
 
@@ -235,44 +262,24 @@ class ExtendedKalmanFilter(AbstractGaussianFilter):
     dynamics: AbstractDynamics
     W: Float[Array, "k k"] = parameter()
     V: Float[Array, "p p"] = parameter()
-    mean: Float[Array, " n"] = parameter()
-    covariance: Float[Array, "n n"] = parameter()
-    observation_difference: Callable[[Array, Array], Array] | None = function_field()
-
-    def __init__(
-        self,
-        dynamics: AbstractDynamics,
-        W: Any,
-        V: Any,
-        *,
-        mean: Any = None,
-        covariance: Any = None,
-        observation_difference: Callable[[Array, Array], Array] | None = None,
-    ):
-        where = "ExtendedKalmanFilter"
-        _check_dynamics(dynamics, where)
-        self.dynamics = dynamics
-        self.W, self.V, self.mean, self.covariance = gaussian_model(
-            dynamics, W, V, mean, covariance, None, where
-        )
-        self.observation_difference = observation_difference
-
-    def __check_init__(self):
-        _check_dynamics(self.dynamics, "ExtendedKalmanFilter")
+    _: KW_ONLY
+    mean: Float[Array, " n"] = parameter(None)
+    covariance: Float[Array, "n n"] = parameter(None)
+    observation_difference: Difference | None = function_field(None)
 
     def _observation(self, t, belief):
         observe = lambda x: self.dynamics.observe(t, x)
         C = jacobian(observe)(belief.mean)
-        return LinearJoint(observe(belief.mean), belief.covariance, C, self.V)
+        return Joint(observe(belief.mean), None, C, belief.covariance, self.V)
 
     def _transition(self, t, u, belief):
-        A = jacobian(lambda x: _advanced(self.dynamics, t, x, u))(belief.mean)
-        mean = _advanced(self.dynamics, t, belief.mean, u)
-        noise = _added_covariance(self, t, u, belief.mean)
-        return LinearJoint(mean, belief.covariance, A, noise)
+        A = jacobian(lambda x: self._advanced(t, x, u))(belief.mean)
+        mean = self._advanced(t, belief.mean, u)
+        noise = self._noise(t, u, belief.mean)
+        return Joint(mean, None, A, belief.covariance, noise)
 
 
-class UnscentedKalmanFilter(AbstractGaussianFilter):
+class UnscentedKalmanFilter(_AbstractNonlinearFilter):
     r"""The Kalman filter whose moments are those of `2 n + 1` points, each passed
     through the dynamics and the sensor:
 
@@ -280,10 +287,10 @@ class UnscentedKalmanFilter(AbstractGaussianFilter):
 
     The points are the mean, and the mean plus and minus the columns of
     `sqrt(c) chol(covariance)`, with `c = alpha^2 (n + kappa)`; the outer ones weigh
-    `1 / (2 c)`, the middle one `1 - n / c` in the mean and
-    `2 - n / c - alpha^2 + beta` in the covariance. They are drawn anew for each update.
-    The disturbance counts to first order, by `E W E'` with `E = dF/dw` at the mean,
-    which is exact where it is added to the state. On linear dynamics this is the
+    `1 / (2 c)`, the middle one `1 - n / c` in the mean and `2 - n / c - alpha^2 + beta`
+    in the covariance. They are computed anew for each update. The disturbance counts to
+    first order, by `E W E'` with `E = dF/dw` at the mean, which is exact where it is
+    added to the state. On linear dynamics this is the
     [`delucax.estimators.KalmanFilter`][].
 
     With the default weights no weight is negative, so that covariances stay
@@ -293,22 +300,13 @@ class UnscentedKalmanFilter(AbstractGaussianFilter):
 
     **Arguments:**
 
-    - `dynamics`: any dynamics; their `observe` is the sensor h, and their `difference`,
-        which wraps angles, measures the spread of the moved points.
-    - `W`: covariance of the disturbance that the dynamics take, shape `(k, k)`,
-        symmetric, semidefinite. Of a system with a diffusion that of the Brownian
-        increments.
-    - `V`: covariance of the sensor noise, shape `(p, p)`, symmetric, semidefinite.
-    - `mean`: of the first state, shape `(n,)`; zero by default.
-    - `covariance`: of the first state before it is observed, shape `(n, n)`, symmetric,
-        semidefinite; the identity by default.
+    - `dynamics`, `W`, `V`, `mean`, `covariance`, `observation_difference`: as for
+        [`delucax.estimators.ExtendedKalmanFilter`][]. The `difference` of the dynamics
+        measures the spread of the moved points.
     - `alpha`: spread of the points, a positive number; 1 by default.
-    - `beta`: what is added to the weight of the middle point in covariances, a number;
-        2 by default, which suits normal states.
+    - `beta`: prior knowledge of the distribution, a number that is added to the weight
+        of the middle point in covariances; 2 by default, optimal for normal states.
     - `kappa`: more spread, a number above `-n`; 0 by default.
-    - `observation_difference`: `(y, y_predicted) -> deviation`, which wraps angles
-        among the observations: `dynamics.difference` where the state is observed, for
-        example. Subtraction by default.
 
     **Raises:** `ValueError` if `dynamics` is not dynamics, a covariance is not one, a
     number is out of its range, or sizes do not fit.
@@ -321,51 +319,26 @@ class UnscentedKalmanFilter(AbstractGaussianFilter):
         import delucax as dlx
         import jax.numpy as jnp
 
-        pendulum = dlx.Discretized(dlx.systems.Pendulum(), dt=0.05)
-        W, V = 1e-4 * jnp.eye(2), 1e-2 * jnp.eye(2)
-        ukf = dlx.estimators.UnscentedKalmanFilter(
-            pendulum, W, V, observation_difference=pendulum.difference
-        )
-        belief = ukf.update(0.0, jnp.array([0.1, 0.0]), ukf.init())
-        belief = ukf.predict(0.0, jnp.zeros(1), belief)
+        dynamics = dlx.make("pendulum").dynamics
+        noise, tilted = 1e-3 * jnp.eye(2), jnp.array([0.1, 0.0])
+        ukf = dlx.estimators.UnscentedKalmanFilter(dynamics, noise, noise, kappa=1.0)
+        ukf.update(0.0, tilted, ukf.init()).mean
         ```
     """
 
     dynamics: AbstractDynamics
     W: Float[Array, "k k"] = parameter()
     V: Float[Array, "p p"] = parameter()
-    mean: Float[Array, " n"] = parameter()
-    covariance: Float[Array, "n n"] = parameter()
-    alpha: Float[Array, ""] = parameter(constraint=positive)
-    beta: Float[Array, ""] = parameter()
-    kappa: Float[Array, ""] = parameter()
-    observation_difference: Callable[[Array, Array], Array] | None = function_field()
-
-    def __init__(
-        self,
-        dynamics: AbstractDynamics,
-        W: Any,
-        V: Any,
-        *,
-        mean: Any = None,
-        covariance: Any = None,
-        alpha: Any = 1.0,
-        beta: Any = 2.0,
-        kappa: Any = 0.0,
-        observation_difference: Callable[[Array, Array], Array] | None = None,
-    ):
-        where = "UnscentedKalmanFilter"
-        _check_dynamics(dynamics, where)
-        self.dynamics = dynamics
-        self.W, self.V, self.mean, self.covariance = gaussian_model(
-            dynamics, W, V, mean, covariance, None, where
-        )
-        self.alpha, self.beta, self.kappa = alpha, beta, kappa
-        self.observation_difference = observation_difference
+    _: KW_ONLY
+    mean: Float[Array, " n"] = parameter(None)
+    covariance: Float[Array, "n n"] = parameter(None)
+    alpha: Real = parameter(1.0, constraint=positive)
+    beta: Real = parameter(2.0)
+    kappa: Real = parameter(0.0)
+    observation_difference: Difference | None = function_field(None)
 
     def __check_init__(self):
         where = "UnscentedKalmanFilter"
-        _check_dynamics(self.dynamics, where)
         for name in ("alpha", "beta", "kappa"):
             check_number(getattr(self, name), name, where)
         check_positive(self.alpha, "alpha", where)
@@ -381,13 +354,15 @@ class UnscentedKalmanFilter(AbstractGaussianFilter):
         return self._sampled(observe, self.observation_difference, belief, self.V)
 
     def _transition(self, t, u, belief):
-        advance = lambda x: _advanced(self.dynamics, t, x, u)
-        noise = _added_covariance(self, t, u, belief.mean)
+        advance = lambda x: self._advanced(t, x, u)
+        noise = self._noise(t, u, belief.mean)
         return self._sampled(advance, self.dynamics.difference, belief, noise)
 
     def _sampled(self, function, difference, belief, noise):
         mean, (n,) = belief.mean, belief.mean.shape
         spread = self.alpha**2 * (n + self.kappa)
+        # Any root serves; the triangular one needs no eigenvalues, whose derivative is
+        # infinite where two of them meet.
         columns = jnp.sqrt(spread) * square_root(belief.covariance)
         dx = jnp.concatenate([jnp.zeros((1, n)), columns.T, -columns.T])
         dx = dx.astype(mean.dtype)
@@ -399,35 +374,9 @@ class UnscentedKalmanFilter(AbstractGaussianFilter):
         else:
             dz = jax.vmap(difference, in_axes=(0, None))(z, middle)
         outer = jnp.full(2 * n, 1 / (2 * spread), mean.dtype)
+        # The weights of the mean add up to 1, and the middle deviation is 0: its weight
+        # of `1 - n / c`, which is huge where alpha is small, is never used.
         shift = outer @ dz[1:]
         inner = 2 - n / spread - self.alpha**2 + self.beta
         weights = jnp.concatenate([jnp.reshape(inner, 1).astype(mean.dtype), outer])
-        return SampledJoint(middle + shift, dx, dz - shift, weights, noise)
-
-
-def _check_dynamics(dynamics: Any, where: str) -> None:
-    check_instance(dynamics, AbstractDynamics, "dynamics", where)
-    n = dynamics.state_size
-    x = jnp.zeros(n)
-    shape = eqx.filter_eval_shape(dynamics.difference, x, x).shape
-    if shape != (n,):
-        raise ValueError(
-            f"{where}: dynamics must have a difference of the size of the state, "
-            f"{(n,)}, got shape {shape}."
-        )
-
-
-def _advanced(dynamics: AbstractDynamics, t: Any, x: Array, u: Array, w: Any = None):
-    """The next state; NaN if the solver fails, which the loop around it reports."""
-    x_next, result = dynamics.advance(t, x, u, w)
-    if result is RESULTS.successful:
-        return x_next
-    return jnp.where(result == RESULTS.successful, x_next, jnp.nan)
-
-
-def _added_covariance(estimator: Any, t: Any, u: Array, x: Array) -> Array:
-    """`E W E'`, what the disturbance adds to the covariance of the next state."""
-    dynamics, W = estimator.dynamics, estimator.W
-    w = jnp.zeros(W.shape[0], x.dtype)
-    E = jacobian(lambda w: _advanced(dynamics, t, x, u, w))(w)
-    return congruence(E, W)
+        return Joint(middle + shift, dx.T, (dz - shift).T, weights, noise)

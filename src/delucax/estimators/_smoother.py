@@ -18,32 +18,7 @@ from ._gaussian import AbstractGaussianFilter
 
 
 class Filtered(eqx.Module):
-    """What a filter made of a record of `T` observations.
-
-    **Attributes:**
-
-    - `predicted`: the belief of each state before it is observed, and at the end that
-        of the state after the last control: a [`delucax.estimators.Belief`][] with a
-        leading axis of `T + 1`.
-    - `updated`: the belief once it is observed, with a leading axis of `T`.
-    - `log_likelihoods`: the log-density of each observation given those before it,
-        shape `(T,)`.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
-
-    After a step that fails, all is NaN.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        dynamics = dlx.LinearDynamics(0.9 * jnp.eye(1), jnp.ones((1, 1)))
-        kalman = dlx.estimators.KalmanFilter(dynamics, jnp.eye(1), jnp.eye(1))
-        filtered = dlx.estimators.run_filter(kalman, jnp.ones((20, 1)))
-        filtered.updated.mean, filtered.log_likelihood
-        ```
-    """
+    """The result of `run_filter`."""
 
     predicted: Belief
     updated: Belief
@@ -52,32 +27,16 @@ class Filtered(eqx.Module):
 
     @property
     def log_likelihood(self) -> Array:
-        """That of the whole record, a scalar; of a batch, of each of its records."""
+        """The log-likelihood of the whole record, or of each record of a batch."""
         return jnp.sum(self.log_likelihoods, axis=-1)
+
+    def _facts(self) -> str:
+        finite = np.isfinite(self.log_likelihoods)
+        return "" if finite.all() else f"At observation {finite.argmin()}."
 
 
 class Smoothed(eqx.Module):
-    """What a smoother made of a record of `T` observations.
-
-    **Attributes:**
-
-    - `mean`: of each state, given the whole record, shape `(T, n)`.
-    - `covariance`: likewise, shape `(T, n, n)`.
-    - `filtered`: what the filter made of it, a [`delucax.estimators.Filtered`][].
-    - `result`: success, or why not; one of `delucax.RESULTS`.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        dynamics = dlx.LinearDynamics(0.9 * jnp.eye(1), jnp.ones((1, 1)))
-        kalman = dlx.estimators.KalmanFilter(dynamics, jnp.eye(1), jnp.eye(1))
-        smoothed = dlx.estimators.smooth(kalman, jnp.ones((20, 1)))
-        smoothed.mean, smoothed.covariance
-        ```
-    """
+    """The result of `smooth`."""
 
     mean: Array
     covariance: Array
@@ -114,9 +73,17 @@ def run_filter(
     - `throw`: raise if a belief or the likelihood is not finite (default); if false,
         look at `result`.
 
-    **Returns:** a [`delucax.estimators.Filtered`][]. Its result is
-    `RESULTS.diverged` where a belief is not finite, and `RESULTS.ill_posed` where only
-    the likelihood is not, as the covariance of an observation is not definite.
+    **Returns:** an object with
+
+    - `predicted`: the belief of each state before it is observed, and at the end that
+        of the state after the last control: a [`delucax.estimators.Belief`][] with a
+        leading axis of `T + 1`;
+    - `updated`: the belief once it is observed, with a leading axis of `T`;
+    - `log_likelihoods`: the log-density of each observation given those before it,
+        shape `(T,)`, and `log_likelihood`, their sum, that of the record;
+    - `result`: one of `delucax.RESULTS`, `diverged` where a belief is not finite, and
+        `ill_posed` where only the likelihood is not, as the covariance of an
+        observation is not definite. After a step that diverges all is NaN.
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, or that is not
     finite; an error at run time as `throw` says.
@@ -142,10 +109,10 @@ def run_filter(
         ```
     """
     where = "run_filter"
-    record = _record(estimator, observations, controls, t0, where)
-    filtered = _filter(estimator, *record)
-    place = lambda: _first_failure(filtered)
-    return raise_on_failure(filtered, where, throw, "the beliefs", place)
+    filtered = _filter(
+        estimator, *_record(estimator, observations, controls, t0, where)
+    )
+    return raise_on_failure(filtered, where, throw, "the beliefs", filtered._facts)
 
 
 def smooth(
@@ -159,31 +126,29 @@ def smooth(
     r"""The estimate of each state from the whole record, by the smoother of Rauch, Tung
     and Striebel.
 
-    Back from the end, with `G_k = P_k A' Sigma_{k+1}^-1`, the filter's belief being
-    `N(mu_k, Sigma_k)` before `y_k` and `N(m_k, P_k)` after it:
+    The backward recursion is, with `G_k = P_k A' Sigma_{k+1}^-1`, the filter's belief
+    being `N(mu_k, Sigma_k)` before `y_k` and `N(m_k, P_k)` after it:
 
     `mean_k = m_k + G_k (mean_{k+1} - mu_{k+1})`,
     `covariance_k = P_k + G_k (covariance_{k+1} - Sigma_{k+1}) G_k'`,
 
     the latter in a form that stays semidefinite. Of a nonlinear filter, `P_k A'` is the
-    covariance of the state with the next one, as that filter finds it. What does not
-    vary needs no care: a first state that is known, or noise in some states alone.
+    covariance of the state with the next one, as that filter finds it. Covariances may
+    be singular: a first state that is known, or noise in some states alone.
 
     **Arguments:**
 
-    - `estimator`: a [`delucax.estimators.KalmanFilter`][],
-        [`delucax.estimators.ExtendedKalmanFilter`][] or
-        [`delucax.estimators.UnscentedKalmanFilter`][].
-    - `observations`: shape `(T, p)`.
-    - `controls`: those that were applied, shape `(T, m)`; zero by default.
-    - `t0`: the time of the first observation, 0 by default.
-    - `throw`: raise if a belief or the likelihood is not finite (default); if false,
-        look at `result`.
+    - `estimator`, `observations`, `controls`, `t0`, `throw`: as for
+        [`delucax.estimators.run_filter`][].
 
-    **Returns:** a [`delucax.estimators.Smoothed`][].
+    **Returns:** an object with
 
-    **Raises:** `ValueError` on an argument of the wrong kind or shape, or that is not
-    finite; an error at run time as `throw` says.
+    - `mean`: of each state, given the whole record, shape `(T, n)`;
+    - `covariance`: likewise, shape `(T, n, n)`;
+    - `filtered`: what the filter made of it, as from `run_filter`;
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+
+    **Raises:** as `run_filter`.
 
     Source: Rauch, Tung and Striebel, 1965; Sarkka, 2008 (unscented).
 
@@ -204,10 +169,11 @@ def smooth(
         ```
     """
     where = "smooth"
-    record = _record(estimator, observations, controls, t0, where)
-    smoothed = _smooth(estimator, *record)
-    place = lambda: _first_failure(smoothed.filtered)
-    return raise_on_failure(smoothed, where, throw, "the beliefs", place)
+    smoothed = _smooth(
+        estimator, *_record(estimator, observations, controls, t0, where)
+    )
+    facts = smoothed.filtered._facts
+    return raise_on_failure(smoothed, where, throw, "the beliefs", facts)
 
 
 def _record(estimator, observations, controls, t0, where):
@@ -238,24 +204,20 @@ def _filter(estimator, y, u, times) -> Filtered:
         updated = estimator._corrected(belief, *expected)
         after = estimator.predict(t, u, updated)
         ok &= updated.is_finite & after.is_finite
-        # From a failure on, steps are taken from the start again, and then masked: so
-        # no NaN of one member of a batch gets into the derivative of the others.
+        # After a failure go on from the first belief, and mask the steps at the end: no
+        # NaN of one member of a batch may get into the derivative of the others.
         after = jax.tree.map(lambda a, b: jnp.where(ok, a, b), after, first)
         return (after, ok), (updated, after, density, ok)
 
     start = first, first.is_finite
     _, (updated, after, densities, ok) = lax.scan(step, start, (times, y, u))
-    predicted = jax.tree.map(
-        lambda a, b: jnp.concatenate([a[None], _masked(ok, b)]), first, after
-    )
+    joined = lambda a, b: jnp.concatenate([a[None], _masked(ok, b)])
+    predicted = jax.tree.map(joined, first, after)
     definite = jnp.all(jnp.isfinite(densities))
     result = choose(definite, RESULTS.successful, RESULTS.ill_posed)
-    return Filtered(
-        predicted=predicted,
-        updated=jax.tree.map(lambda a: _masked(ok, a), updated),
-        log_likelihoods=_masked(ok, densities),
-        result=choose(jnp.all(ok), result, RESULTS.diverged),
-    )
+    result = choose(jnp.all(ok), result, RESULTS.diverged)
+    updated = jax.tree.map(lambda a: _masked(ok, a), updated)
+    return Filtered(predicted, updated, _masked(ok, densities), result)
 
 
 @eqx.filter_jit
@@ -263,15 +225,16 @@ def _filter(estimator, y, u, times) -> Filtered:
 def _smooth(estimator, y, u, times) -> Smoothed:
     filtered = _filter(estimator, y, u, times)
     ok = jnp.isfinite(filtered.log_likelihoods)
-    updated = jax.tree.map(
-        lambda a, b: _masked(ok, a, b), filtered.updated, estimator.init()
-    )
+    # Steps that failed are run back over the first belief, and masked at the end.
+    kept = lambda a, b: _masked(ok, a, b)
+    updated = jax.tree.map(kept, filtered.updated, estimator.init())
 
     def back(after, inputs):
         t, u, belief = inputs
         belief = estimator._smoothed(t, u, belief, after)
         return belief, belief
 
+    # The last state has no later data: its smoothed belief is the filter's.
     last = jax.tree.map(lambda a: a[-1], updated)
     inputs = jax.tree.map(lambda a: a[:-1], (times, u, updated))
     _, smoothed = lax.scan(back, last, inputs, reverse=True)
@@ -284,8 +247,3 @@ def _smooth(estimator, y, u, times) -> Smoothed:
 
 def _masked(ok: Array, values: Array, otherwise: Any = jnp.nan) -> Array:
     return jnp.where(ok.reshape(-1, *(1,) * (values.ndim - 1)), values, otherwise)
-
-
-def _first_failure(filtered: Filtered) -> str:
-    finite = np.isfinite(filtered.log_likelihoods)
-    return "" if finite.all() else f"At observation {finite.argmin()}."

@@ -1,8 +1,7 @@
 """Experiments, declared as pytest declares tests."""
 
-from ._axes import Mark as Mark
 from ._experiment import Experiment as Experiment, experiment as experiment
-from ._page import Page as Page
+from ._report import report as report
 from ._results import Results as Results
 from ._run import run as run
 from ._statistics import (

@@ -1,10 +1,9 @@
 """One case after another, in the process that it is called in."""
 
 import contextlib
-import functools
+import contextvars
 import inspect
 import os
-import threading
 import time
 import traceback
 import warnings
@@ -18,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
+from .._provenance import device
 from ._experiment import arguments_of, Experiment
-from ._fingerprint import device
 from ._store import RESERVED
 
 
@@ -49,10 +48,8 @@ class Runner:
     def __init__(self, experiment: Experiment):
         self.experiment, self.axes = experiment, experiment.all_axes()
         self.fixtures = experiment.used_fixtures()
-        kinds = [p.kind for p in experiment.arguments.values()]
-        self.takes_any_name = inspect.Parameter.VAR_KEYWORD in kinds
-        self.shared: dict[Any, Any] = {}
-        self.closing = contextlib.ExitStack()
+        # The values of fixtures of the process, and their teardown.
+        self.process: tuple[dict, Any] = {}, contextlib.ExitStack()
         self.is_traceable: dict[Any, bool] = {}
         self.program: Any = jax.jit(self._all_seeds, static_argnums=0)
 
@@ -63,8 +60,8 @@ class Runner:
         values: dict[str, list] = {}
         try:
             with clock, contextlib.ExitStack() as stack:
-                returned = self._call(self._arguments(index, stack), seeds, mesh)
-                values = self._columns(returned)
+                arguments = self._arguments(index, stack)
+                values = self._columns(self._call(arguments, seeds, mesh))
             where = device()
         except KeyboardInterrupt:
             raise
@@ -74,16 +71,17 @@ class Runner:
             trace = "".join(traceback.format_exception(raised))[-_LONGEST:]
             values = {}
         if clock.compiling:
-            release_programs()
+            clear_programs()
         seconds = round(clock.compiling, 6), round(clock.running, 6)
         return Outcome(values, error, trace, *seconds, where, os.getpid())
 
     def close(self) -> None:
-        """End the fixtures of the process. If that fails, it is a warning: the results
-        are there."""
-        self.shared.clear()
+        """Tear down the fixtures of the process. An error is a warning, because the
+        results are there."""
+        made, end = self.process
+        made.clear()
         try:
-            self.closing.close()
+            end.close()
         except KeyboardInterrupt:
             raise
         except BaseException as raised:
@@ -108,25 +106,23 @@ class Runner:
                 arguments["param"] = given[name]
             known = [origins[w] for w in (*wanted, name) if w in origins]
             origins[name] = frozenset().union(*known)
-            if fixture.scope == "case":
-                given[name] = _make(fixture.function, arguments, stack)
-                continue
+            made, end = ({}, stack) if fixture.scope == "case" else self.process
             key = name, origins[name]
-            if key not in self.shared:
-                self.shared[key] = _make(fixture.function, arguments, self.closing)
-            given[name] = self.shared[key]
-        if self.takes_any_name:
-            return given
-        known = self.experiment.arguments
-        return {name: value for name, value in given.items() if name in known}
+            if key not in made:
+                made[key] = _make(fixture.function, arguments, end)
+            given[name] = made[key]
+        takes = self.experiment.arguments
+        takes_any = any(p.kind is p.VAR_KEYWORD for p in takes.values())
+        return {name: v for name, v in given.items() if takes_any or name in takes}
 
     def _call(self, arguments: dict[str, Any], seeds: tuple[int, ...], mesh: Any):
-        """What the function returns: a list by seed, or all seeds at once."""
+        """Call the function: returns a list by seed, or all seeds at once."""
         function, known = self.experiment.function, self.experiment.arguments
         if "seed" in known:
             return [function(**arguments, seed=seed) for seed in seeds]
         if "key" not in known:
             return [function(**arguments)]
+        # Keys are made of the numbers inside, so that another seed compiles nothing.
         numbers = np.asarray(seeds, np.int32)
         if mesh is not None:
             spread = NamedSharding(mesh, PartitionSpec(mesh.axis_names[0]))
@@ -136,16 +132,15 @@ class Runner:
     def _traced(self, arguments: dict[str, Any], numbers: Any) -> Any:
         """Call for all seeds at once, with as much traced as can be.
 
-        First every number is traced, then only those that are no whole numbers, then
-        none. What worked is remembered by what tracing depends on, so that which it is
-        follows from the case alone and not from those that ran before it.
+        Tracing is tried with all numbers, then with floats only, then with none. The
+        choice is cached by the signature, so that it does not depend on the cases that
+        ran before.
         """
         for kinds in _TRACED_KINDS:
             dynamic, rest = _split(arguments, kinds)
             static = _Static(rest)
             leaves, structure = jax.tree.flatten(dynamic)
-            shapes = [(np.shape(x), jax.dtypes.result_type(x), type(x)) for x in leaves]
-            key = static, structure, tuple(shapes), numbers.shape
+            key = static, structure, tuple(map(jax.typeof, leaves)), numbers.shape
             if key not in self.is_traceable:
                 if len(self.is_traceable) >= _PROGRAMS:
                     self.is_traceable.clear()
@@ -171,10 +166,11 @@ class Runner:
         where = self.experiment.name
         if isinstance(returned, list):
             rows = [_as_mapping(row) for row in returned]
-            if any(row.keys() != rows[0].keys() for row in rows):
+            names = {name for row in rows for name in row}
+            if any(row.keys() != names for row in rows):
                 raise ValueError(
                     f"{where}: every seed must return the same names, got "
-                    f"{sorted({name for row in rows for name in row})}."
+                    f"{sorted(names)}."
                 )
             columns = {name: [row[name] for row in rows] for name in rows[0]}
         else:
@@ -248,10 +244,9 @@ def _as_mapping(value: Any) -> Mapping[str, Any]:
 def _simple(value: Any, name: str, where: str) -> Any:
     if value is None or isinstance(value, bool | str):
         return value
-    try:
+    array = np.empty((), object)
+    with contextlib.suppress(Exception):
         array = np.asarray(value)
-    except Exception:
-        array = np.asarray(None, object)
     if jnp.issubdtype(array.dtype, jnp.floating):  # of bfloat16 and its kin as well
         return (array if array.dtype.kind == "f" else array.astype(np.float32)).tolist()
     if array.dtype.kind not in "biu":
@@ -268,48 +263,44 @@ class _Clock:
     compiling = running = 0.0
 
     def __enter__(self) -> "_Clock":
-        _listen()
-        self._outer, _local.spans = getattr(_local, "spans", None), []
-        self._begin = time.perf_counter()
+        self._token, self._begin = _spans.set([]), time.perf_counter()
         return self
 
     def __exit__(self, *_: Any) -> None:
         total = time.perf_counter() - self._begin
-        spans, _local.spans = _local.spans, self._outer
         # One function is traced within another: what is covered counts once.
         covered, last = 0.0, self._begin
-        for begin, end in sorted(spans):
+        for begin, end in sorted(_spans.get() or ()):
             covered += max(end - max(begin, last), 0.0)
             last = max(end, last)
+        _spans.reset(self._token)
         self.compiling = min(covered, total)
         self.running = total - self.compiling
 
 
-_local = threading.local()
+_spans = contextvars.ContextVar[list | None]("spans", default=None)
+"""When programs were traced and compiled, while a clock runs in this thread."""
 
 
-@functools.cache
-def _listen() -> None:
-    """Note the spans of compilations, from now on."""
+def _note(event: str, duration_secs: float, **_: str | int) -> None:
+    spans = _spans.get()
+    if spans is not None and event.startswith("/jax/core/compile/"):
+        now = time.perf_counter()
+        spans.append((now - duration_secs, now))
 
-    def note(event: str, duration_secs: float, **_: str | int) -> None:
-        spans = getattr(_local, "spans", None)
-        if spans is not None and event.startswith("/jax/core/compile/"):
-            now = time.perf_counter()
-            spans.append((now - duration_secs, now))
 
-    jax.monitoring.register_event_duration_secs_listener(note)
+jax.monitoring.register_event_duration_secs_listener(_note)
 
 
 _IN_USE = Path("/proc/self/maps")
 _LIMIT = Path("/proc/sys/vm/max_map_count")
 
 
-def release_programs(limit: int | None = None) -> bool:
+def clear_programs(limit: int | None = None) -> bool:
     """Forget all compiled programs if they hold too many memory maps.
 
     A program that XLA has compiled holds tens of the maps that Linux allows a process,
-    65,530 by default, and a compilation that finds none left ends in a
+    65,530 by default, and a compilation without any left ends in a
     segmentation fault. Programs that are still needed are compiled anew. Elsewhere than
     on Linux nothing is done.
 
@@ -317,12 +308,10 @@ def release_programs(limit: int | None = None) -> bool:
     whether the programs were forgotten.
     """
     try:
-        if limit is None:
-            limit = int(_LIMIT.read_text()) // 2
+        limit = int(_LIMIT.read_text()) // 2 if limit is None else limit
         used = _IN_USE.read_bytes().count(b"\n")
     except (OSError, ValueError):
         return False
-    if used <= limit:
-        return False
-    jax.clear_caches()
-    return True
+    if used > limit:
+        jax.clear_caches()
+    return used > limit

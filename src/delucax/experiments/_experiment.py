@@ -7,69 +7,48 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
-import numpy as np
 
-from .._check import check_choice
+from .._check import check_choice, check_function
 from .._message import did_you_mean
-from ._axes import Axis, axis_of, Mark, Marks, Param, selector, words
-from ._fingerprint import fingerprint, version
+from .._provenance import version
+from ._cases import as_seeds, Axis, axis_of, Case, Mark, Param, selector, words
+from ._fingerprint import fingerprint
 from ._store import RESERVED
+
+
+class _MarkDecorator(Mark):
+    def __call__(self, what: Any) -> Any:
+        """The mark with the reason `what`, or the experiment `what` with the mark."""
+        if isinstance(what, str):
+            return dataclasses.replace(self, reason=what)
+        made = as_experiment(what)
+        return dataclasses.replace(made, marks=(*made.marks, self))
+
+
+class Marks:
+    """`experiment.mark.slow`, and any other name."""
+
+    def __getattr__(self, name: str) -> _MarkDecorator:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return _MarkDecorator(name)
 
 
 @dataclasses.dataclass(frozen=True)
 class Fixture:
-    """What cases need, made by a function; see `experiment.fixture`."""
+    """A resource of cases, made by a function; see `experiment.fixture`."""
 
     function: Callable
     scope: str
     axis: Axis | None
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return self.function(*args, **kwargs)
-
-
-@dataclasses.dataclass(frozen=True)
-class Case:
-    """One call of an experiment: a value of each axis, for all seeds."""
-
-    experiment: str
-    id: str
-    index: tuple[int, ...]
-    shown: Mapping[str, Any]
-    marks: tuple[Mark, ...]
-    hash: str
-
-    @property
-    def key(self) -> tuple[str, str]:
-        """What the store knows it by."""
-        return self.experiment, self.id
-
-    @property
-    def described(self) -> dict[str, Any]:
-        """What a line of the store tells of it."""
-        return {
-            "experiment": self.experiment,
-            "case": self.id,
-            "order": self.index,
-            "hash": self.hash,
-            "parameters": self.shown,
-        }
-
-    def mark(self, name: str) -> Mark | None:
-        """The mark of that name, if it has it."""
-        return next((mark for mark in self.marks if mark.name == name), None)
-
-    def matches(self, word: str) -> bool:
-        """Whether a word is in its name, whatever its case."""
-        return word.lower() in self.id.lower()
-
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """A function and all that it is called with; made by
+    """A function with its parameters, seeds, fixtures and marks; made by
     [`delucax.experiments.experiment`][].
 
-    Called as a function it is the function that it was made of.
+    Calling it calls the function.
 
     **Arguments:**
 
@@ -83,13 +62,13 @@ class Experiment:
     !!! example
 
         ```python
-        from delucax.experiments import experiment
+        from delucax.experiments import experiment, run
 
         @experiment.parametrize("x", [1.0, 2.0, 3.0])
         def square(x):
             return x**2
 
-        results = square.run(progress=False)
+        results = run(square, progress=False)
         assert [row["value"] for row in results.rows] == [1.0, 4.0, 9.0]
         ```
     """
@@ -102,19 +81,15 @@ class Experiment:
     fixtures: Mapping[str, Fixture] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        if not callable(self.function):
-            raise ValueError(
-                f"experiment: function must be a function, got {self.function!r}."
-            )
-        if not self.name:
-            name = getattr(self.function, "__name__", type(self.function).__name__)
-            object.__setattr__(self, "name", name)
-        for name in ("__doc__", "__module__"):
-            object.__setattr__(self, name, getattr(self.function, name, None))
-        object.__setattr__(self, "__wrapped__", self.function)
+        f = self.function
+        check_function(f, "function", "experiment")
+        name = self.name or getattr(f, "__name__", type(f).__name__)
+        own = {n: getattr(f, n, None) for n in ("__doc__", "__module__")}
+        # A frozen dataclass takes no assignment.
+        vars(self).update(own, name=name, __wrapped__=f)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """The function's own answer to `args` and `kwargs`."""
+        """Call the function."""
         return self.function(*args, **kwargs)
 
     @property
@@ -150,12 +125,8 @@ class Experiment:
 
     def all_axes(self) -> tuple[Axis, ...]:
         """The axes, those of its fixtures last."""
-        own = [
-            dataclasses.replace(fixture.axis, names=(name,))
-            for name, fixture in self.used_fixtures().items()
-            if fixture.axis is not None
-        ]
-        return (*self.axes, *own)
+        own = ((f.axis, name) for name, f in self.used_fixtures().items())
+        return (*self.axes, *(Axis((name,), a.params) for a, name in own if a))
 
     def cases(
         self, select: str = "", marks: str = "", slow: bool = False
@@ -175,7 +146,12 @@ class Experiment:
         content.
         """
         self._check()
-        where, code = self.name, self._code()
+        where = self.name
+        functions = [fixture.function for fixture in self.used_fixtures().values()]
+        precise = bool(jax.config.jax_enable_x64)
+        # What all cases share. The experiment's own module counts also in a library.
+        content = [self.function, functions, precise, version("delucax")]
+        code = fingerprint(content, root=getattr(self.function, "__module__", None))
         is_selected = selector(select, "select", where)
         is_marked = selector(marks, "marks", where)
         slow = slow or "slow" in words(marks)
@@ -196,31 +172,10 @@ class Experiment:
                     f"{where}: two cases are called {case.id!r}; give other ids."
                 )
             names.add(case.id)
-            skipped = case.mark("slow") and not slow
-            if not skipped and is_selected(case.matches) and is_marked(case.mark):
+            is_wanted = slow or not case.mark("slow")
+            if is_wanted and is_selected(case.matches) and is_marked(case.mark):
                 cases.append(case)
         return tuple(cases)
-
-    def run(self, **options: Any) -> Any:
-        """Run it: [`delucax.experiments.run`][] of this experiment alone.
-
-        **Arguments:**
-
-        - `**options`: those of [`delucax.experiments.run`][].
-
-        **Returns:** the [`delucax.experiments.Results`][].
-        """
-        from ._run import run
-
-        return run(self, **options)
-
-    def _code(self) -> str:
-        """The hash of the code that all cases share."""
-        module = getattr(self.function, "__module__", None)
-        functions = [fixture.function for fixture in self.used_fixtures().values()]
-        precise = bool(jax.config.jax_enable_x64)
-        content = [self.function, functions, precise, version("delucax")]
-        return fingerprint(content, root=module)
 
     def _check(self) -> None:
         where, arguments, fixtures = self.name, self.arguments, self.used_fixtures()
@@ -232,9 +187,9 @@ class Experiment:
             if name in RESERVED or name == "key":
                 raise ValueError(f"{where}: no parameter can be called {name!r}.")
             if name not in taken and not any_name:
+                hint = did_you_mean(name, sorted(taken))
                 raise ValueError(
-                    f"{where}: the function has no argument {name!r}; "
-                    f"{did_you_mean(name, sorted(taken))}"
+                    f"{where}: the function has no argument {name!r}; {hint}"
                 )
         given = {*names, *fixtures}
         self._check_given(self.function, where, {*given, "key", "seed"})
@@ -292,7 +247,7 @@ class experiment:  # noqa: N801
         ```python
         import delucax as dlx
         import jax.numpy as jnp
-        from delucax.experiments import experiment
+        from delucax.experiments import experiment, run
 
         @experiment.parametrize("length", [0.8, 1.0, 1.2])
         @experiment.parametrize("gain", [10.0, 20.0], ids=["weak", "strong"])
@@ -302,7 +257,7 @@ class experiment:  # noqa: N801
             controller = dlx.controllers.Linear(jnp.stack([jnp.stack([gain, 5.0])]))
             return dlx.rollout(env, controller, key=key, horizon=10).total_cost
 
-        results = cost.run(progress=False)
+        results = run(cost, progress=False)
         assert len(results.rows) == 24
         ```
     """
@@ -426,21 +381,3 @@ def as_experiment(what: Any) -> Experiment:
 def arguments_of(function: Callable) -> Mapping[str, inspect.Parameter]:
     """The arguments of a function by name."""
     return inspect.signature(function).parameters
-
-
-def as_seeds(seeds: Any, where: str) -> tuple[int, ...]:
-    """Seeds from 0 on, or those given."""
-    several = range(seeds) if isinstance(seeds, int) else seeds
-    is_list = isinstance(several, Iterable) and not isinstance(several, str | bytes)
-    chosen = tuple(several) if is_list and not isinstance(seeds, bool) else ()
-    if not chosen or not all(
-        isinstance(s, int | np.integer) and not isinstance(s, bool) and 0 <= s < 2**31
-        for s in chosen
-    ):
-        raise ValueError(
-            f"{where}: seeds must be how many, at least 1, or whole numbers from 0 to "
-            f"2**31 - 1, got {seeds!r}."
-        )
-    if len(set(chosen)) < len(chosen):
-        raise ValueError(f"{where}: seeds must differ, got {seeds!r}.")
-    return tuple(int(s) for s in chosen)

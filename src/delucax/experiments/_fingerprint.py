@@ -1,22 +1,18 @@
-"""What results depend on: the code and values of a case in one hash, and versions."""
+"""Hashes of the code and the values that a case depends on."""
 
 import ast
+import contextlib
 import copyreg
 import dataclasses
-import datetime
 import functools
 import hashlib
-import importlib.metadata
 import inspect
 import os
-import platform
-import subprocess
 import sys
 import sysconfig
 import textwrap
 import types
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -38,21 +34,18 @@ def fingerprint(value: Any, *, root: str | None = None) -> str:
     **Raises:** `TypeError` if something in it has no content to tell it by.
     """
     hasher = _Hasher(root)
-    hasher.feed(value)
+    hasher.add(value)
     return hasher.sha.hexdigest()[:16]
 
 
 def is_library(module: str | None) -> bool:
     """Whether a module belongs to an installed package, or to Python."""
-    if not module or module == "__main__":
+    # One that is not loaded was made by `exec`, as in the tests of the pages.
+    if module == "__main__" or module not in sys.modules:
         return False
-    if module.partition(".")[0] == "delucax":
-        return True
-    loaded = sys.modules.get(module)
-    if loaded is None:  # made by `exec`, in the tests of the pages
-        return False
-    file = getattr(loaded, "__file__", None)
-    return file is None or _is_installed(file)
+    file = getattr(sys.modules[module], "__file__", None)
+    is_ours = module.partition(".")[0] == "delucax"
+    return is_ours or file is None or _is_installed(file)
 
 
 @functools.cache
@@ -65,7 +58,7 @@ class _Hasher:
     def __init__(self, root: str | None):
         self.sha = hashlib.sha256()
         self.root = root
-        # What was visited, with its number; held, so that no other gets its id.
+        # Visited objects with their numbers; kept alive, so that ids are not reused.
         self.visited: dict[int, tuple[int, Any]] = {}
 
     def visit(self, thing: Any) -> bool:
@@ -75,165 +68,161 @@ class _Hasher:
         self.visited[id(thing)] = len(self.visited), thing
         return True
 
-    def own(self, module: str | None) -> bool:
+    def is_own(self, module: str | None) -> bool:
         return module == self.root or not is_library(module)
 
-    def word(self, *words: Any) -> None:
+    def update(self, *words: Any) -> None:
         for word in words:
             word = word if isinstance(word, bytes) else str(word).encode()
             self.sha.update(b"%d:" % len(word) + word)
 
-    def feed(self, value: Any) -> None:
+    def add(self, value: Any) -> None:
         kind = type(value)
-        # One of the user's is more than the list or the mapping that it also is.
-        own = self.own(kind.__module__)
+        # A subclass of list or dict by the user is hashed with its class.
+        own = self.is_own(kind.__module__)
         if value is None or kind in (bool, int, float, complex, str, bytes, range):
-            self.word(kind.__name__, repr(value))
+            self.update(kind.__name__, repr(value))
         elif isinstance(value, jax.Array | np.ndarray | np.generic):
             self.array(value)
         elif isinstance(value, Mapping) and not own:
-            self.word("mapping", len(value))
+            self.update("mapping", len(value))
             for _, key in sorted((repr(key), key) for key in value):
-                self.feed(key)
-                self.feed(value[key])
+                self.add(key)
+                self.add(value[key])
         elif isinstance(value, set | frozenset):
             if own:
                 self.type(kind)
-            self.word("set", *sorted(fingerprint(member) for member in value))
+            self.update("set", *sorted(fingerprint(member) for member in value))
         elif isinstance(value, list | tuple) and not own:
-            self.word(kind.__name__, len(value))
+            self.update(kind.__name__, len(value))
             for member in value:
-                self.feed(member)
+                self.add(member)
         elif isinstance(value, types.FunctionType):
             self.function(value)
         elif isinstance(value, types.BuiltinFunctionType | np.ufunc):
-            self.word("builtin", getattr(value, "__module__", ""), value.__name__)
+            self.update("builtin", getattr(value, "__module__", ""), value.__name__)
         elif isinstance(value, type):
             self.type(value)
         elif isinstance(value, types.ModuleType):
             self.module(value)
         elif not own and hasattr(value, "__wrapped__"):
-            self.feed(value.__wrapped__)  # type: ignore
+            self.add(value.__wrapped__)  # type: ignore
         elif dataclasses.is_dataclass(value):
-            self.feed(kind)
+            self.add(kind)
             for field in dataclasses.fields(value):
-                self.word(field.name)
-                self.feed(getattr(value, field.name, None))
+                self.update(field.name)
+                self.add(getattr(value, field.name, None))
         else:
             self.other(value)
 
     def array(self, value: Any) -> None:
         if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
-            self.word("key", value.dtype)
+            self.update("key", value.dtype)
             value = jax.random.key_data(value)
         content = np.asarray(value)
         if content.dtype == object:
-            self.word("objects", content.shape)
-            self.feed(content.ravel().tolist())
-            return
-        self.word("array", content.dtype, content.shape, content.tobytes())
+            self.update("objects", content.shape)
+            self.add(content.ravel().tolist())
+        else:
+            self.update("array", content.dtype, content.shape, content.tobytes())
 
     def function(self, f: types.FunctionType) -> None:
-        self.word("function", f.__qualname__)
+        self.update("function", f.__qualname__)
         if not self.visit(f):
             return
         names: set[str] = set()
-        if self.own(f.__module__):
-            self.word(source_of(f))
+        if self.is_own(f.__module__):
+            self.update(source_of(f))
             names = _names(f.__code__)
         else:
-            self.word(f.__module__)
-        self.feed([f.__defaults__, f.__kwdefaults__])
+            self.update(f.__module__)
+        self.add([f.__defaults__, f.__kwdefaults__])
         for cell in f.__closure__ or ():
             try:
-                self.feed_named(cell.cell_contents)
+                self.add_named(cell.cell_contents)
             except ValueError:  # not yet set
-                self.word("empty")
+                self.update("empty")
         for name in sorted(names & f.__globals__.keys()):
-            self.word(name)
-            self.feed_named(f.__globals__[name])
+            self.update(name)
+            self.add_named(f.__globals__[name])
 
-    def feed_named(self, value: Any) -> None:
+    def add_named(self, value: Any) -> None:
         """A value that the code names: one without content counts by its type."""
         if id(value) in self.visited:
             return
         before, count = self.sha.copy(), len(self.visited)
         try:
-            self.feed(value)
+            self.add(value)
         except (TypeError, RecursionError):
             self.sha = before
             while len(self.visited) > count:
                 self.visited.popitem()
-            self.word("thing", type(value).__qualname__)
-            if self.own(type(value).__module__):
+            self.update("thing", type(value).__qualname__)
+            if self.is_own(type(value).__module__):
                 self.type(type(value))
 
     def type(self, cls: type) -> None:
-        self.word("type", cls.__module__, cls.__qualname__)
-        if not (self.own(cls.__module__) and self.visit(cls)):
+        self.update("type", cls.__module__, cls.__qualname__)
+        if not (self.is_own(cls.__module__) and self.visit(cls)):
             return
         for name, member in sorted(vars(cls).items()):
-            code = [f for f in _functions(member) if self.own(f.__module__)]
+            code = [f for f in _functions(member) if self.is_own(f.__module__)]
             if code or not name.startswith("__"):
-                self.word(name)
-                self.feed_named(code or member)
+                self.update(name)
+                self.add_named(code or member)
         for base in cls.__bases__:
             self.type(base)
 
     def module(self, module: types.ModuleType) -> None:
-        self.word("module", module.__name__)
-        if self.own(module.__name__) and self.visit(module):
+        self.update("module", module.__name__)
+        if self.is_own(module.__name__) and self.visit(module):
             try:
-                self.word(_plain(inspect.getsource(module)))
+                self.update(_plain(inspect.getsource(module)))
             except (OSError, TypeError, SyntaxError):
-                self.word("no source")
-            # What its code uses of other modules of the user.
+                self.update("no source")
+            # Members from other modules of the user.
             for member in vars(module).values():
                 if isinstance(member, types.ModuleType):
                     self.module(member)
                 elif isinstance(member, types.FunctionType | type):
-                    self.feed_named(member)
+                    self.add_named(member)
 
     def other(self, value: Any) -> None:
         if isinstance(value, Iterator):
             raise TypeError(f"a {type(value).__name__}, which is used up when read")
         kind = type(value)
         if not self.visit(value):
-            self.word("again", self.visited[id(value)][0])
+            self.update("again", self.visited[id(value)][0])
             return
-        # What pickle would write, and the code of whatever is in there.
-        reduce = copyreg.dispatch_table.get(kind)
+        # The parts that pickle would write, and their code.
+        reduce = copyreg.dispatch_table.get(kind, lambda value: value.__reduce_ex__(4))
         try:
-            parts: Any = value.__reduce_ex__(4) if reduce is None else reduce(value)
+            parts: Any = reduce(value)
         except Exception as error:
             raise TypeError(f"a {kind.__name__}, which {error}") from error
         self.type(kind)
         if isinstance(parts, str):
-            self.word(parts)
+            self.update(parts)
             return
         for k, part in enumerate(parts):
             # The fourth and fifth run over members of lists and of dictionaries.
-            self.feed(list(part) if k in (3, 4) and part is not None else part)
+            self.add(list(part) if k in (3, 4) and part is not None else part)
 
 
 def _functions(member: Any) -> list[types.FunctionType]:
     """The functions of a member of a class: a method, a property or the like."""
-    if isinstance(member, property):
-        parts = [member.fget, member.fset, member.fdel]
-    elif isinstance(member, functools.cached_property):
-        parts = [member.func]
-    else:
-        parts = [member]
+    parts: list[Any] = [member]
+    if isinstance(member, property | functools.cached_property):
+        names = ("fget", "fset", "fdel", "func")
+        parts = [getattr(member, name, None) for name in names]
     return [f for f in map(inspect.unwrap, parts) if isinstance(f, types.FunctionType)]
 
 
 def source_of(f: types.FunctionType) -> str:
     """The code of a function, the same whatever its comments and its layout."""
     if f.__name__ != "<lambda>":
-        try:
+        with contextlib.suppress(OSError, TypeError, SyntaxError):
             return _plain(inspect.getsource(f))
-        except (OSError, TypeError, SyntaxError):
-            pass
     return repr(_bytecode(f.__code__))
 
 
@@ -242,11 +231,9 @@ def _plain(source: str) -> str:
     if len(tree.body) == 1 and hasattr(tree.body[0], "decorator_list"):
         tree.body[0].decorator_list = []  # type: ignore
     for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list) and len(body) > 1:
-            first = body[0]
-            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
-                del body[0]
+        match getattr(node, "body", None):
+            case [ast.Expr(ast.Constant()), _, *_]:  # a docstring
+                del node.body[0]  # type: ignore
     return ast.unparse(tree)
 
 
@@ -267,57 +254,3 @@ def _names(code: types.CodeType) -> set[str]:
     """The names that the code uses, those of functions within it too."""
     inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
     return {*code.co_names}.union(*map(_names, inner))
-
-
-_PACKAGES = ("delucax", "jax", "jaxlib", "equinox", "diffrax", "numpy")
-
-
-@functools.cache
-def version(package: str) -> str | None:
-    """The version of an installed package; `None` if it is not."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def provenance(folder: Path) -> dict[str, Any]:
-    """Commit, versions, precision, processor and date of a run of code in `folder`."""
-    versions = {name: version(name) for name in _PACKAGES}
-    versions["python"] = platform.python_version()
-    commit, dirty = _git(folder)
-    return {
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "commit": commit,
-        "dirty": dirty,
-        "dtype": "float64" if jax.config.jax_enable_x64 else "float32",
-        "versions": versions,
-    }
-
-
-def device() -> str:
-    """The kind of device that JAX computes on by default, and how many there are."""
-    devices = jax.devices()
-    kind = devices[0].device_kind
-    return kind if len(devices) == 1 else f"{len(devices)} x {kind}"
-
-
-def _git(folder: Path) -> tuple[str | None, bool | None]:
-    """The commit, and whether files differ from it or Python files are not in it at
-    all; nothing outside a repository. Other new files may be what a run wrote."""
-
-    def ask(*words: str) -> str:
-        how: Any = dict(cwd=folder, timeout=20, check=True)
-        done = subprocess.run(["git", *words], capture_output=True, text=True, **how)
-        return done.stdout.strip()
-
-    try:
-        commit = ask("rev-parse", "HEAD")
-        changed = ask("status", "--porcelain", "--untracked-files=all").splitlines()
-        code = (".py", ".ipynb", '.py"', '.ipynb"')  # a name with blanks is quoted
-        dirty = any(
-            not line.startswith("??") or line.endswith(code) for line in changed
-        )
-        return commit, dirty
-    except (OSError, subprocess.SubprocessError):
-        return None, None

@@ -1,24 +1,49 @@
 """Results as a page, and two of them side by side."""
 
-import dataclasses
 import itertools
 import json
 import math
+import os
 from collections import Counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ._page import escape, Page
+from .._page import escape, Page
 from ._results import Results
-from ._statistics import Bootstrap, interquartile_mean
+from ._statistics import Bootstrap, interquartile_mean, is_number
 
 
 # The panels of a figure, and the cases of a panel, at most.
 _PANELS, _CASES = 30, 60
 
 
-def report(results: Results, title: str) -> Page:
+def report(
+    results: Results, path: str | os.PathLike, *, title: str = "Results"
+) -> None:
+    """Write a self-contained HTML page of sortable tables and figures.
+
+    **Arguments:**
+
+    - `results`: from [`delucax.experiments.run`][].
+    - `path`: the HTML file to write.
+    - `title`: its heading.
+
+    **Raises:** `OSError` if it cannot be written.
+
+    !!! example
+
+        ```python
+        from delucax import experiments
+
+        results = experiments.run(experiments.experiment(lambda: 1.0), progress=False)
+        experiments.report(results, "results.html")
+        ```
+    """
+    page_of(results, title).write(path)
+
+
+def page_of(results: Results, title: str) -> Page:
     """A table of means and a figure for each experiment, what failed, and every row."""
     page = Page(title)
     page.paragraph(_made_with(results), "made")
@@ -54,28 +79,26 @@ def by_experiment(results: Results) -> dict[str, Results]:
 def summary(results: Results) -> tuple[list[str], list[list]]:
     """A row for each case: its parameters, and the interquartile mean of each result
     over the seeds, with the quartiles where there are several."""
-    cases: dict[str, list[dict[str, Any]]] = {}
-    for row in results.rows:
-        cases.setdefault(row["case"], []).append(row)
+    cases = [[*rows.values()] for rows in _by_case(results).values()]
+    firsts = [rows[0] for rows in cases]
     many = any(row["seed"] != results.rows[0]["seed"] for row in results.rows)
     labels = [p for p in results.parameters if any(p in row for row in results.rows)]
-    labels = labels or ["case"]
     columns: list[tuple[str, list]] = [
-        (label, [rows[0].get(label) for rows in cases.values()]) for label in labels
+        (label, [row.get(label) for row in firsts]) for label in labels or ["case"]
     ]
     if many:
-        columns.append(("seeds", [*map(len, cases.values())]))
-    states = [dict.fromkeys(row["status"] for row in rows) for rows in cases.values()]
+        columns.append(("seeds", [*map(len, cases)]))
+    states = [dict.fromkeys(row["status"] for row in rows) for rows in cases]
     columns.append(("status", [*map(", ".join, states)]))
     words = []
     for name in results.metrics:
-        values = [_numbers(rows, name) for rows in cases.values()]
+        values = [_numbers(rows, name) for rows in cases]
         if not any(values):
             if any(isinstance(row.get(name), str) for row in results.rows):
                 words.append((name, name))
             continue
         statistics: dict[str, Any] = {name: interquartile_mean}
-        if many and any(_varies(rows, name) for rows in cases.values()):
+        if many and any(_varies(rows, name) for rows in cases):
             for k in (25, 75):
                 statistics[f"{name} {k}%"] = lambda v, k=k: float(np.percentile(v, k))
         with np.errstate(invalid="ignore"):
@@ -83,14 +106,14 @@ def summary(results: Results) -> tuple[list[str], list[list]]:
                 columns.append((heading, [of(v) if v else None for v in values]))
     times = ("compile s", "compile_seconds"), ("run s", "run_seconds")
     for heading, name in (*words, *times):
-        columns.append((heading, [rows[0].get(name) for rows in cases.values()]))
+        columns.append((heading, [row.get(name) for row in firsts]))
     headings, values = zip(*columns, strict=True)
     return list(headings), [list(row) for row in zip(*values, strict=True)]
 
 
 def _numbers(rows: list[dict[str, Any]], metric: str) -> list[float]:
-    values = (_number(row.get(metric)) for row in rows)
-    return [value for value in values if value is not None]
+    """The values of a result that are numbers."""
+    return [float(v) for v in (row.get(metric) for row in rows) if is_number(v)]
 
 
 def _varies(rows: list[dict[str, Any]], metric: str) -> bool:
@@ -99,9 +122,8 @@ def _varies(rows: list[dict[str, Any]], metric: str) -> bool:
     return any(value != values[0] for value in values)
 
 
-@dataclasses.dataclass(frozen=True)
-class Difference:
-    """What differs from the first results to the second.
+class Difference(NamedTuple):
+    """Differences of two results.
 
     - `changed`: rows of `DIFFERENCES`.
     - `status`: rows of experiment, case, and the status in both.
@@ -115,7 +137,7 @@ class Difference:
     only: tuple[list[tuple[str, str]], list[tuple[str, str]]]
 
     def page(self, names: tuple[str, str]) -> Page:
-        """It as a page, where the results have these names."""
+        """A page of the differences of results with these names."""
         page = Page(f"{names[1]} against {names[0]}")
         page.paragraph(f"{self.same} cases are the same.")
         page.heading(f"{len(self.changed)} results differ")
@@ -136,12 +158,11 @@ DIFFERENCES = [
 ]
 
 
-def diff(first: Results, second: Results, *, resamples: int = 2000) -> Difference:
+def diff(first: Results, second: Results) -> Difference:
     """Interquartile means over the common seeds, and their difference with a paired 95%
     interval, of each result that is not the same in both."""
     a, b = _by_case(first), _by_case(second)
     changed, status, same = [], [], 0
-    bootstrap = Bootstrap(resamples=resamples)
     for key in [key for key in a if key in b]:
         seeds = [seed for seed in a[key] if seed in b[key]]
         states = [{rows[key][s]["status"] for s in seeds} for rows in (a, b)]
@@ -154,13 +175,12 @@ def diff(first: Results, second: Results, *, resamples: int = 2000) -> Differenc
             if all(json.dumps(x) == json.dumps(y) for x, y in pairs):
                 continue
             is_same = False
-            numbers = [(_number(x), _number(y)) for x, y in pairs]
-            kept = [pair for pair in numbers if None not in pair]
+            kept = [pair for pair in pairs if all(map(is_number, pair))]
             line: list[Any] = [*key, metric, *[None] * 5, len(kept)]
             if kept:
                 array = np.array(kept, np.float64)
                 with np.errstate(invalid="ignore"):
-                    difference = bootstrap.paired([array[:, ::-1]])
+                    difference = Bootstrap().paired([array[:, ::-1]])
                 line[3:8] = *interquartile_mean(array, axis=0).tolist(), *difference
             changed.append(line)
         same += is_same
@@ -173,10 +193,6 @@ def _by_case(results: Results) -> dict[tuple[str, str], dict[int, dict[str, Any]
     for row in results.rows:
         cases.setdefault((row["experiment"], row["case"]), {})[row["seed"]] = row
     return cases
-
-
-def _number(value: Any) -> float | None:
-    return float(value) if isinstance(value, bool | int | float) else None
 
 
 def _add_figures(page: Page, results: Results) -> None:
@@ -192,13 +208,13 @@ def _add_figures(page: Page, results: Results) -> None:
     for metric in results.metrics:
         panels: dict[str, dict[str, list[float]]] = {}
         for row in results.rows:
-            value = _number(row.get(metric))
-            if value is None or not math.isfinite(value):
+            value = row.get(metric)
+            if not is_number(value) or not math.isfinite(value):
                 continue
             label = row["case"].partition("[")[2][:-1] or row["case"]
             title = str(row[used[0]]) if len(used) > 1 else ""
             label = label.removeprefix(f"{title}-") if title else label
-            panels.setdefault(title, {}).setdefault(label, []).append(value)
+            panels.setdefault(title, {}).setdefault(label, []).append(float(value))
         panels = dict(itertools.islice(panels.items(), _PANELS))
         most = max(map(len, panels.values()), default=0)
         if most < 2:

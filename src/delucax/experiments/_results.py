@@ -1,4 +1,4 @@
-"""A table of results, and what to make of it."""
+"""Results table with filtering and export."""
 
 import dataclasses
 import json
@@ -10,13 +10,11 @@ from typing import Any
 from .._check import as_path
 from .._extras import extra
 from .._files import replaced
-from ._experiment import Case
-from ._page import as_text, FORMS
-from ._store import CASE_COLUMNS, RUN_COLUMNS, Store
+from .._page import as_text, FORMS
+from ._cases import Case
+from ._store import CASE_COLUMNS, FAILED, RUN_COLUMNS, Store
 
 
-PASSED = ("passed", "passed unexpectedly")
-FAILED = ("failed", "passed unexpectedly")
 # Columns that differ between two runs of the same thing.
 TIMES = ("compile_seconds", "run_seconds", "date")
 
@@ -41,14 +39,14 @@ class Results:
     !!! example
 
         ```python
-        from delucax.experiments import experiment
+        from delucax.experiments import experiment, run
 
         @experiment.parametrize("x", [1.0, 2.0])
         @experiment.seeds(2)
         def noisy(x, seed):
             return x + 0.1 * seed
 
-        results = noisy.run(progress=False)
+        results = run(noisy, progress=False)
         print(results.export("markdown"))
         ```
     """
@@ -101,21 +99,16 @@ class Results:
             metrics |= dict.fromkeys(record["values"])
             parameters |= dict.fromkeys(record["parameters"])
             run = store.runs.get(record.get("run", -1), {})
-            row = {
-                **{name: record[name] for name in ("experiment", "case")},
-                **record["parameters"],
-                **{name: record[name] for name in ("seed", "status")},
-                **record["values"],
-                **{name: record[name] for name in CASE_COLUMNS},
-                **{name: run.get(name) for name in RUN_COLUMNS},
-                "versions": run.get("versions", {}),
-            }
-            rows.append(row)
+            of = lambda *names, record=record: {name: record[name] for name in names}
+            row = of("experiment", "case") | record["parameters"]
+            row |= of("seed", "status") | record["values"] | of(*CASE_COLUMNS)
+            row |= {name: run.get(name) for name in RUN_COLUMNS}
+            rows.append(row | {"versions": run.get("versions", {})})
         return cls(rows, tuple(metrics), tuple(parameters))
 
     @property
     def failed(self) -> list[dict[str, Any]]:
-        """The rows of cases that failed, or passed though they were not to."""
+        """The rows of cases that failed or passed unexpectedly."""
         return [row for row in self.rows if row["status"] in FAILED]
 
     @property
@@ -179,32 +172,17 @@ class Results:
             short = ("experiment", *short) if several else short
             columns = self.all_columns if form in ("csv", "parquet") else short
         self._check_columns(columns, "Results.export")
-        rows = self.flat_rows()
+        body = [[row.get(name) for name in columns] for row in self.flat_rows()]
         if form == "parquet":
             pd, _ = extra("pandas", "experiments"), extra("pyarrow", "experiments")
-            kept = {n: _of_one_type([row.get(n) for row in rows]) for n in columns}
+            kept = {n: _of_one_type([*v]) for n, *v in zip(columns, *body, strict=True)}
             pd.DataFrame(kept).to_parquet(to, index=False)
             return ""
-        body = [[row.get(name) for name in columns] for row in rows]
         text = as_text(form, list(columns), body, digits)
         if ending is not None:
             with replaced(Path(to)) as file:
                 file.write(text.encode())
         return text
-
-    def report(self, path: str | os.PathLike, *, title: str = "Results") -> None:
-        """Write a page of sortable tables and figures that needs nothing beside it.
-
-        **Arguments:**
-
-        - `path`: the HTML file to write.
-        - `title`: its heading.
-
-        **Raises:** `OSError` if it cannot be written.
-        """
-        from ._report import report
-
-        report(self, title).write(path)
 
     def _check_columns(
         self, names: Iterable[str], where: str, more: tuple[str, ...] = ()

@@ -1,21 +1,44 @@
 """Run experiments: here, on all cores, or on a cluster."""
 
+import atexit
 import contextlib
+import dataclasses
 import functools
+import hashlib
 import inspect
 import itertools
 import os
+import tempfile
+import threading
+import traceback
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
 
 from .._check import check_choice, check_count
+from .._extras import extra
+from .._provenance import provenance
+from ._cases import as_seeds, Case
 from ._execute import Outcome, Runner
-from ._experiment import as_experiment, as_seeds, Case, Experiment
-from ._fingerprint import provenance
-from ._results import FAILED, Results
-from ._store import Store
-from ._workers import Job, run_in_workers
+from ._experiment import as_experiment, Experiment
+from ._results import Results
+from ._store import FAILED, Store
+
+
+class Job(NamedTuple):
+    """A case and the seeds to run it with."""
+
+    number: int
+    experiment: Experiment
+    case: Case
+    seeds: tuple[int, ...]
+
+
+Outcomes: TypeAlias = Generator[tuple[Job, Outcome], None, None]
+Packed: TypeAlias = dict[str, tuple[str, bytes]]
+"""Experiments by name, each as a hash and as bytes."""
 
 
 def run(
@@ -85,11 +108,14 @@ def run(
     where = "run"
     chosen = [*map(as_experiment, experiments)]
     if not chosen:
-        raise ValueError(f"{where}: experiments must be one at least.")
+        raise ValueError(f"{where}: at least one experiment must be given.")
     names = [one.name for one in chosen]
     if len(set(names)) < len(names):
         raise ValueError(f"{where}: experiments must have different names: {names}.")
-    workers = _workers(workers, where)
+    if workers == -1:
+        usable = getattr(os, "sched_getaffinity", None)  # not on every system
+        workers = len(usable(0)) if usable else os.cpu_count() or 1
+    workers = check_count(workers, "workers", where)
     check_choice(backend, ("loky", "dask"), "backend", where)
     if mesh is not None and (workers > 1 or backend == "dask"):
         raise ValueError(f"{where}: mesh needs workers=1, got {workers} {backend}.")
@@ -128,36 +154,42 @@ def run(
             opened.append(record)
         if jobs:
             here = workers == 1 and backend == "loky"
-            in_workers = lambda: run_in_workers(jobs, workers, backend)
+            in_workers = lambda: _run_in_workers(jobs, workers, backend)
             outcomes = _run_here(jobs, mesh) if here else in_workers()
             bars = _progress(len(jobs), workers, progress)
             _write_outcomes(jobs, outcomes, opened, bars)
     return Results._of(opened, asked)
 
 
-def _write_outcomes(jobs: list[Job], outcomes: Any, opened: Store, bars: Any) -> None:
+def _write_outcomes(
+    jobs: list[Job], outcomes: Outcomes, opened: Store, bars: Any
+) -> None:
     """Write each outcome down as it arrives."""
-    number = opened.begin(provenance(_folder(jobs[0].experiment)))
+    try:
+        file = inspect.getfile(inspect.unwrap(jobs[0].experiment.function))
+        folder = Path(file).resolve().parent
+    except (TypeError, OSError):  # not in a file
+        folder = Path.cwd()
+    number = opened.write_run(provenance(folder))
     with bars as tick, contextlib.closing(outcomes):
         for job, outcome in outcomes:
             status = _status(job.case, outcome.error)
             fields = outcome._asdict()
             worker = fields.pop("worker")
-            record = {"kind": "case", "run": number, **job.case.described}
-            record |= {"seeds": job.seeds, "status": status, **fields}
-            opened.append(record)
+            made = {"kind": "case", "run": number, "seeds": job.seeds}
+            opened.append({**made, **job.case.described, "status": status, **fields})
             tick(worker, job.case.id, status)
 
 
 def _with_new_status(case: Case, stored: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Lines for what is not run again, where a mark came or went since."""
+    """Status updates of stored cases whose marks changed."""
     again = []
     for record in stored:
         status = _status(case, record["error"])
         if record["status"] != status:
-            line = {name: v for name, v in record.items() if name != "seed"}
-            values = {name: [value] for name, value in record["values"].items()}
-            line |= {"seeds": [record["seed"]], "status": status, "values": values}
+            line = {**record, "status": status}
+            line["seeds"] = [line.pop("seed")]
+            line["values"] = {n: [value] for n, value in record["values"].items()}
             again.append(line)
     return again
 
@@ -168,27 +200,149 @@ def _status(case: Case, error: str | None) -> str:
     return "passed" if error is None else "failed"
 
 
-def _folder(experiment: Experiment) -> Path:
-    try:
-        file = inspect.getfile(inspect.unwrap(experiment.function))
-        return Path(file).resolve().parent
-    except (TypeError, OSError):
-        return Path.cwd()
-
-
-def _workers(workers: Any, where: str) -> int:
-    if workers == -1:
-        usable = getattr(os, "sched_getaffinity", None)
-        return len(usable(0)) if usable else os.cpu_count() or 1
-    return check_count(workers, "workers", where)
-
-
-def _run_here(jobs: list[Job], mesh: Any) -> Generator[tuple[Job, Outcome], None, None]:
+def _run_here(jobs: list[Job], mesh: Any) -> Outcomes:
     for _, group in itertools.groupby(jobs, key=lambda job: job.experiment.name):
         same = list(group)
         with contextlib.closing(Runner(same[0].experiment)) as runner:
             for job in same:
                 yield job, runner.run(job.case.index, job.seeds, mesh)
+
+
+def _run_in_workers(jobs: list[Job], workers: int, backend: str) -> Outcomes:
+    """Run jobs by joblib. If a worker dies, the jobs that were running are repeated one
+    by one, to know which one kills it. Workers end with the run if they hold fixtures
+    that must be ended."""
+    extra("joblib", "experiments")
+    if backend == "dask":
+        extra("distributed", "dask")
+    pending = {job.number: job for job in jobs}
+    packed = {job.experiment.name: _packed(job.experiment) for job in jobs}
+    with tempfile.TemporaryDirectory() as folder, _one_thread():
+        marks = folder if backend == "loky" else None
+        while pending:
+            try:
+                for number, outcome in _parallel(
+                    list(pending.values()), packed, workers, backend, marks
+                ):
+                    yield pending.pop(number), outcome
+            except Exception as error:
+                if type(error).__name__ not in _DEATHS:
+                    raise
+                started = [n for n in pending if Path(folder, str(n)).exists()]
+                for job in [pending.pop(n) for n in (started if marks else [*pending])]:
+                    yield job, _alone(job, packed, backend)
+        if any(
+            fixture.scope == "process" and inspect.isgeneratorfunction(fixture.function)
+            for job in jobs
+            for fixture in job.experiment.used_fixtures().values()
+        ):
+            _end_fixtures(backend)
+
+
+def _end_fixtures(backend: str) -> None:
+    """End the fixtures of idle workers; those of loky end with the process."""
+    if backend == "dask":
+        client = extra("distributed", "dask").default_client()
+        client.run(_close_runners, on_error="ignore")
+    else:
+        loky = extra("joblib.externals.loky", "experiments")
+        loky.get_reusable_executor(reuse=True).shutdown(wait=True)
+
+
+def _parallel(
+    jobs: list[Job], packed: Packed, workers: int, backend: str, marks: str | None
+) -> Iterator[Any]:
+    import joblib
+
+    options = bool(jax.config.jax_enable_x64), marks
+    task, parallel = joblib.delayed(_work), joblib.Parallel
+    with joblib.parallel_config(backend=backend, n_jobs=workers):
+        yield from parallel(return_as="generator_unordered")(
+            task(packed[experiment.name], number, case.index, seeds, *options)
+            for number, experiment, case, seeds in jobs
+        )
+
+
+def _alone(job: Job, packed: Packed, backend: str) -> Outcome:
+    try:
+        # Two workers, for joblib runs a single one in this process.
+        ((_, outcome),) = _parallel([job], packed, 2, backend, None)
+        return outcome
+    except Exception as error:
+        if type(error).__name__ not in _DEATHS:
+            raise
+        message = "WorkerDied: the process that ran the case was killed, or crashed."
+        trace = "".join(traceback.format_exception(error))
+        return Outcome({}, message, trace, 0.0, 0.0, None, 0)
+
+
+# By their names: the classes are in packages that need not be there.
+_DEATHS = ("TerminatedWorkerError", "BrokenProcessPool", "KilledWorker")
+
+
+def _packed(experiment: Experiment) -> tuple[str, bytes]:
+    """The experiment as bytes that any process can read, and their hash."""
+    cloudpickle = extra("cloudpickle", "experiments")
+    # Its fixtures are looked up here: in another process it has no module's globals.
+    experiment = dataclasses.replace(experiment, fixtures=experiment.used_fixtures())
+    try:
+        content = cloudpickle.dumps(experiment)
+    except Exception as error:
+        raise ValueError(
+            f"run: {experiment.name} cannot be sent to another process: {error}. Make "
+            "what cannot be sent in the function or in a fixture."
+        ) from error
+    # As bytes: Dask would keep an array on one worker, and lose it with that worker.
+    return hashlib.sha256(content).hexdigest(), content
+
+
+_local = threading.local()
+# All that this process holds, in whatever thread.
+_held: set[Runner] = set()
+
+
+@atexit.register
+def _close_runners() -> None:
+    while _held:
+        _held.pop().close()
+
+
+def _work(
+    packed: Any, number: int, index: tuple, seeds: tuple, precise: bool, marks: Any
+) -> tuple[int, Outcome]:
+    """Run one case in a worker, which keeps the runner for the next one."""
+    import cloudpickle
+
+    name, content = packed
+    with jax.enable_x64(precise):
+        runners = _local.__dict__.setdefault("runners", {})
+        if (name, precise) not in runners:
+            for old in runners.values():
+                old.close()
+                _held.discard(old)
+            runners.clear()
+            runners[name, precise] = Runner(cloudpickle.loads(content))
+        runner = runners[name, precise]
+        _held.add(runner)
+        if marks is not None:
+            Path(marks, str(number)).touch()
+        return number, runner.run(index, seeds, None)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Processes that are started meanwhile compute with one thread each."""
+    flag, flags = "--xla_cpu_multi_thread_eigen=false", os.environ.get("XLA_FLAGS", "")
+    names = "XLA_FLAGS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
+    before = {name: os.environ[name] for name in names if name in os.environ}
+    os.environ.update(dict.fromkeys(names, "1"))
+    os.environ["XLA_FLAGS"] = flags if flag in flags else f"{flags} {flag}".strip()
+    try:
+        yield
+    finally:
+        for name in names:
+            os.environ.pop(name, None)
+        os.environ.update(before)
 
 
 @contextlib.contextmanager

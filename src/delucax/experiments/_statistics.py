@@ -2,12 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
+from .._check import check_range
 from .._extras import extra
-from ._results import PASSED, Results
+from ._results import Results
+from ._store import PASSED
 
 
 def interquartile_mean(values: Any, axis: int | None = None) -> Any:
@@ -39,17 +41,24 @@ def interquartile_mean(values: Any, axis: int | None = None) -> Any:
     array = array.reshape(-1) if axis is None else np.moveaxis(array, axis, -1)
     count = array.shape[-1] if array.ndim else 0
     if count == 0:
-        raise ValueError("interquartile_mean: values must be one at least, got none.")
+        raise ValueError("interquartile_mean: values must have at least one entry.")
     cut = count / 4
     place = np.arange(count)
-    # How much of each sorted value lies between the quartiles.
+    # The k-th sorted value fills [k, k + 1] of [0, count]; what of it lies between the
+    # quartiles, count / 4 and 3 count / 4, is its weight.
     weight = np.clip(place + 1 - cut, 0, 1) * np.clip(count - cut - place, 0, 1)
     if count == 1:
         weight = np.ones(1)
+    # Not a product with zero, which would make NaN of an infinite value outside.
     inside = weight > 0
     ordered = np.sort(array, axis=-1)[..., inside]
     mean = ordered @ weight[inside] / weight.sum()
     return float(mean) if mean.ndim == 0 else mean
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Whether a result is a number, which statistics can be made of."""
+    return isinstance(value, bool | int | float)
 
 
 def compare(
@@ -84,8 +93,8 @@ def compare(
 
     **Returns:** a `pandas.DataFrame`, a row for each value: `iqm`, `low`, `high` of its
     interquartile mean; `difference` (or `ratio`) to the baseline's over the common
-    pairs, its `difference_low`, `difference_high`; `below`, the part of the pairs that
-    are below the baseline's; and `pairs`.
+    pairs, its `difference_low`, `difference_high`; `below`, the fraction of the pairs
+    that are below the baseline; and `pairs`.
 
     **Raises:** `ValueError` if there is no such parameter, value or metric.
 
@@ -100,7 +109,7 @@ def compare(
         def cost(method, seed):
             return seed + (1.0 if method == "b" else 0.0)
 
-        results = cost.run(progress=False)
+        results = experiments.run(cost, progress=False)
         table = experiments.compare(results, by="method", baseline="a")
         assert table.loc["b", "difference"] == 1.0
         ```
@@ -116,29 +125,25 @@ def compare(
             raise ValueError(
                 f"{where}: {name} must be a {kind} ({names}), got {value!r}."
             )
-    if not 0 < confidence < 1:
-        raise ValueError(
-            f"{where}: confidence must be between 0 and 1, got {confidence}."
-        )
+    check_range(confidence, "confidence", where, 0, 1)
     samples: dict[Any, dict[tuple, dict[int, float]]] = {}
-    for row in results.rows:
+    for row in [row for row in results.rows if row["status"] in PASSED]:
         value = row.get(metric)
-        if row["status"] not in PASSED:
-            continue
-        if not isinstance(value, bool | int | float):
+        if not is_number(value):
             raise ValueError(
                 f"{where}: metric {metric!r} must be a number in every row, got "
                 f"{value!r} in {row['case']}."
             )
-        others = tuple(row.get(n) for n in results.parameters if n != by)
-        groups = samples.setdefault(row[by], {})
-        group = groups.setdefault((row["experiment"], others), {})
+        others = (row.get(n) for n in ("experiment", *results.parameters) if n != by)
+        group = samples.setdefault(row[by], {}).setdefault(tuple(others), {})
         group[row["seed"]] = float(value)
     if baseline not in samples:
         raise ValueError(
             f"{where}: baseline must be a value of {by!r} that passed "
             f"({', '.join(map(repr, samples))}), got {baseline!r}."
         )
+    # The same draws for all values of the parameter: what is shared by two of them does
+    # not widen the interval of their difference.
     bootstrap = Bootstrap(confidence, resamples, seed)
     rows = {}
     for label, groups in samples.items():
@@ -149,15 +154,15 @@ def compare(
             common = [s for s in group if s in against]
             if common:
                 pairs.append(np.array([[group[s], against[s]] for s in common]))
-        name = "ratio" if ratio else "difference"
-        names = ("iqm", "low", "high", name, f"{name}_low", f"{name}_high")
-        both = *bootstrap.interval(own), *bootstrap.paired(pairs, ratio)
-        row: dict[str, Any] = dict(zip(names, both, strict=True))
         flat = np.concatenate(pairs) if pairs else np.zeros((0, 2))
-        row["below"] = float(np.mean(flat[:, 0] < flat[:, 1])) if len(flat) else np.nan
-        row["pairs"] = len(flat)
-        rows[label] = row
-    return pd.DataFrame.from_dict(rows, orient="index").rename_axis(by)
+        below = float(np.mean(flat[:, 0] < flat[:, 1])) if pairs else np.nan
+        both = *bootstrap.interval(own), *bootstrap.paired(pairs, ratio)
+        rows[label] = *both, below, len(flat)
+    name = "ratio" if ratio else "difference"
+    names = ["iqm", "low", "high", name, f"{name}_low", f"{name}_high"]
+    names += ["below", "pairs"]
+    frame = pd.DataFrame.from_dict(rows, orient="index", columns=names)
+    return frame.rename_axis(by)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,6 +222,7 @@ class Bootstrap:
             return np.nan, np.nan, np.nan
         drawn, flat = self._drawn(groups), np.concatenate(groups)
         of = np.divide if ratio else np.subtract
+        # A baseline of zero has no ratio: infinity or NaN, as the division says.
         with np.errstate(divide="ignore", invalid="ignore"):
             value = of(*self.statistic(flat, axis=0))
             resampled = of(*self.statistic(drawn, axis=1).T)
@@ -224,6 +230,7 @@ class Bootstrap:
 
     def _drawn(self, groups: Sequence[np.ndarray]) -> np.ndarray:
         rng = np.random.default_rng(self.seed)
+        # A group of one would be drawn as it is, and the interval have no width.
         if all(len(group) == 1 for group in groups):
             groups = [np.concatenate(groups)]
         parts = [
@@ -233,6 +240,7 @@ class Bootstrap:
         return np.concatenate(parts, axis=1)
 
     def _ends(self, resampled: np.ndarray) -> tuple[float, float]:
+        # Efron's percentile interval.
         tail = (1 - self.confidence) / 2
         low, high = np.quantile(resampled, [tail, 1 - tail])
         return float(low), float(high)

@@ -3,7 +3,7 @@
 The first line names the format; a line `run` says what the cases after it were made
 with; a line `case` holds a case for some of its seeds. A line is written by one call,
 and one that was cut short is dropped when the file is next opened, so that a process
-may be killed at any moment. Of what was run again the last line counts.
+may be killed at any moment. For cases that ran again the last line counts.
 """
 
 import contextlib
@@ -15,19 +15,27 @@ from typing import Any
 from .._check import as_path
 
 
+try:
+    import fcntl
+except ImportError:  # Windows has no such lock, and two runs could write
+    fcntl = None
+
 _FORMAT = "delucax-results"
 _VERSION = 1
 _HEADER = {"format": _FORMAT, "version": _VERSION}
-# What a line `case` and a line `run` tell of each row of the table.
+# The columns of the table that come from a line `case` and from a line `run`.
 CASE_COLUMNS = "error", "traceback", "compile_seconds", "run_seconds", "device", "hash"
 RUN_COLUMNS = ("date", "commit", "dirty", "dtype")
 _KEYS = ("experiment", "case", "seed", "status", "versions")
+_NEEDED = {"run", "parameters", "status", "error", "device"}
+PASSED = ("passed", "passed unexpectedly")
+FAILED = ("failed", "passed unexpectedly")
 RESERVED = (*_KEYS, *CASE_COLUMNS, *RUN_COLUMNS)
 """Names that neither a parameter nor a result can have."""
 
 
 class Store:
-    """The lines of a results file, or of none: then they are kept in memory alone.
+    """The lines of a results file; without a path they are kept in memory alone.
 
     `cases` is by experiment and case; each holds `hash`, `order` and `seeds`: what
     counts of each seed, as a line has it but with its own values.
@@ -43,74 +51,72 @@ class Store:
         if self.path is not None and self.path.exists():
             self._read(self.path)
 
+    def _error(self, why: str) -> ValueError:
+        return ValueError(f"{self.where}: '{self.path}' {why}")
+
     def _read(self, path: Path) -> None:
         if path.is_dir():
-            raise ValueError(f"{self.where}: '{path}' is a folder, not a results file.")
+            raise self._error("is a folder, not a results file.")
         if not path.is_file():  # a device may have no end
-            raise ValueError(f"{self.where}: '{path}' is no regular file.")
+            raise self._error("is no regular file.")
         try:
             content = path.read_bytes()
         except OSError as error:
-            raise type(error)(f"{self.where}: '{path}' cannot be read: {error}") from (
-                error
-            )
+            where = f"{self.where}: '{path}'"
+            raise type(error)(f"{where} cannot be read: {error}") from error
         lines = content.split(b"\n")
         # A line without its end was cut short by the end of its process.
         self._whole = len(content) - len(lines.pop())
         if lines or not _line(_HEADER).startswith(content):
-            self._check_header(lines[0] if lines else content, path)
+            self._check_header(lines[0] if lines else content)
         for number, line in enumerate(lines[1:], 2):
             try:
-                self._take(json.loads(line))
+                self._add(json.loads(line))
             except (ValueError, KeyError, TypeError, AttributeError) as error:
                 raise ValueError(
                     f"{self.where}: line {number} of '{path}' is damaged; remove it "
                     "to run its case again."
                 ) from error
 
-    def _check_header(self, line: bytes, path: Path) -> None:
+    def _check_header(self, line: bytes) -> None:
         try:
             header = json.loads(line)
-            is_ours, version = header["format"] == _FORMAT, header["version"]
+            if header["format"] != _FORMAT:
+                raise KeyError
+            version = header["version"]
         except (ValueError, KeyError, TypeError):
-            is_ours, version = False, None
-        if not is_ours:
-            raise ValueError(
-                f"{self.where}: '{path}' is not a results file of delucax."
-            )
+            raise self._error("is not a results file of delucax.") from None
         if version != _VERSION:
-            raise ValueError(
-                f"{self.where}: '{path}' has format {version}, and this "
-                f"version of delucax reads and writes {_VERSION}; it is left as it is. "
-                "Write to another file, or use the delucax that wrote it."
+            raise self._error(
+                f"has format {version}, and this version of delucax reads and writes "
+                f"{_VERSION}; it is left as it is. Write to another file, or use the "
+                "delucax that wrote it."
             )
 
-    def _take(self, record: dict[str, Any]) -> None:
+    def _add(self, record: dict[str, Any]) -> None:
         if record["kind"] == "run":
             self.runs[record["run"]] = record
             return
         key = record["experiment"], record["case"]
+        values, seeds = record["values"], record["seeds"]
+        is_whole = _NEEDED <= record.keys()
+        if not is_whole or any(len(column) != len(seeds) for column in values.values()):
+            raise ValueError
         entry = self.cases.get(key)
         if entry is None or entry["hash"] != record["hash"]:
             entry = self.cases[key] = {"hash": record["hash"], "seeds": {}}
-        values, seeds = record["values"], record["seeds"]
-        if any(len(column) != len(seeds) for column in values.values()):
-            raise ValueError
         entry["order"] = tuple(record["order"])
-        for name in ("run", "parameters", "status", "error", "device"):
-            if name not in record:
-                raise KeyError(name)
         for place, seed in enumerate(seeds):
             own = {name: column[place] for name, column in values.items()}
             entry["seeds"][seed] = {**record, "seed": seed, "values": own}
 
     def stored(self, key: tuple[str, str], hash: str) -> dict[int, dict[str, Any]]:
-        """What counts of a case by seed: of the code and the values of this hash."""
+        """The results of a case by seed, if its code and values have this hash."""
         entry = self.cases.get(key, {"hash": None})
         return entry["seeds"] if entry["hash"] == hash else {}
 
     def open(self) -> None:
-        """Make ready to write: alone, after what is whole."""
+        """Open for writing: lock the file and cut off a partial last line."""
         if self.path is None or self._file is not None:
             return
         try:
@@ -118,31 +124,29 @@ class Store:
             self._file = os.open(self.path, os.O_CREAT | os.O_RDWR | os.O_APPEND, 0o666)
         except OSError as error:
             raise self._unwritable(error) from error
-        try:
-            _lock(self._file)
-        except OSError as error:
-            self.close()
-            raise ValueError(
-                f"{self.where}: '{self.path}' is being written by another run."
-            ) from error
+        if fcntl is not None:
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                self.close()
+                raise self._error("is being written by another run.") from error
         if os.fstat(self._file).st_size > self._whole:
             os.ftruncate(self._file, self._whole)
         if self._whole == 0:
             self._write(_HEADER)
 
-    def begin(self, provenance: dict[str, Any]) -> int:
-        """Note what the cases that follow are made with; its number."""
+    def write_run(self, provenance: dict[str, Any]) -> int:
+        """Write the provenance of the cases that follow; returns its number."""
         number = max(self.runs, default=-1) + 1
         self.append({"kind": "run", "run": number, **provenance})
         return number
 
     def append(self, record: dict[str, Any]) -> None:
         """Add a line."""
-        # What is read back is what counts, so that a fresh table and one that was read
-        # are the same.
+        # Kept as it is read back, so that a fresh table and one from a file are equal.
         if self.path is not None:
             self._write(record)
-        self._take(record)
+        self._add(record)
 
     def _write(self, record: dict[str, Any]) -> None:
         line = _line(record)
@@ -176,11 +180,3 @@ class Store:
 
 def _line(record: dict[str, Any]) -> bytes:
     return (json.dumps(record, separators=(",", ":")) + "\n").encode()
-
-
-def _lock(file: int) -> None:
-    try:
-        import fcntl
-    except ImportError:  # Windows has no such lock, and two runs could write
-        return
-    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

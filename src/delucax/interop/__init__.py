@@ -1,4 +1,4 @@
-"""Conversions to and from other libraries, each an optional extra."""
+"""Conversions to and from other libraries. gymnax and files need no extra."""
 
 from . import gymnax as gymnax
 from ._linear_models import (

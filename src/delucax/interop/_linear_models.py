@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._check import as_path, is_concrete
+from .._check import as_path, check_time_invariant, is_concrete
 from .._extras import extra
 from .._module import indexed_names
 from ..dynamics import LinearDynamics
@@ -127,41 +127,30 @@ def to_control(
             f"{type(model).__name__}."
         )
     discrete = isinstance(model, LinearDynamics)
-    if discrete and model.is_time_varying:
-        raise ValueError(
-            f"{where}: model must be time-invariant, got matrices at "
-            f"{model.A.shape[0]} times; `dynamics.at(t)` are those at one time."
-        )
+    if discrete:
+        check_time_invariant(model, "model", where)
     if not is_concrete(model.A):
         raise ValueError(
             f"{where}: model must be concrete, got one that is being traced (by "
             "jax.jit, jax.vmap or jax.grad); python-control computes in NumPy."
         )
-    inputs, columns = list(model.control_names), [np.asarray(model.B)]
+    n, names = model.state_size, list(model.state_names)
+    inputs, B = list(model.control_names), np.asarray(model.B)
     if disturbances:
         if model.E is None and not discrete:
             raise ValueError(
                 f"{where}: disturbances=True needs a model with E, which says how they "
                 "enter the vector field, got a LinearSystem whose E is None."
             )
-        E = np.eye(model.state_size) if model.E is None else np.asarray(model.E)
-        columns.append(E)
+        E = np.eye(n) if model.E is None else np.asarray(model.E)
+        B = np.concatenate([B, E], axis=1)
         inputs += indexed_names("w", E.shape[1])
-    eye = np.eye(model.state_size)
-    C = eye if model.C is None else np.asarray(model.C, float)
-    states = list(model.state_names)
-    B = np.concatenate(columns, axis=1).astype(float)
-    return control.StateSpace(
-        np.asarray(model.A, float),
-        B,
-        C,
-        np.zeros((C.shape[0], B.shape[1])),
-        float(model.dt) if isinstance(model, LinearDynamics) else 0,
-        states=states,
-        inputs=inputs,
-        outputs=states if np.array_equal(C, eye) else C.shape[0],
-        remove_useless_states=False,
-    )
+    C = np.eye(n) if model.C is None else np.asarray(model.C, float)
+    outputs = names if np.array_equal(C, np.eye(n)) else len(C)
+    signals: Any = dict(states=names, inputs=inputs, outputs=outputs)
+    dt = float(model.dt) if isinstance(model, LinearDynamics) else 0
+    matrices = np.asarray(model.A, float), B.astype(float), C, 0
+    return control.StateSpace(*matrices, dt, **signals, remove_useless_states=False)
 
 
 def from_control(
@@ -212,7 +201,14 @@ def from_control(
     if system.nstates == 0:
         raise ValueError(f"{where}: system must have states, got none.")
     labels = list(system.input_labels)
-    chosen = [_index(d, labels, where) for d in disturbances]
+    for d in disturbances:
+        known = isinstance(d, str | int) and d in (*labels, *range(len(labels)))
+        if not known:
+            raise ValueError(
+                f"{where}: disturbances must be among the inputs {labels}, by name or "
+                f"index, got {d!r}."
+            )
+    chosen = [labels.index(d) if isinstance(d, str) else d for d in disturbances]
     if len(set(chosen)) != len(chosen):
         raise ValueError(
             f"{where}: disturbances must be different inputs, got {disturbances!r}."
@@ -228,17 +224,6 @@ def from_control(
         float(system.dt),
         state_names=tuple(system.state_labels),
         control_names=tuple(labels[i] for i in rest),
-    )
-
-
-def _index(disturbance: Any, labels: list[str], where: str) -> int:
-    if isinstance(disturbance, str) and disturbance in labels:
-        return labels.index(disturbance)
-    if isinstance(disturbance, int) and disturbance in range(len(labels)):
-        return disturbance
-    raise ValueError(
-        f"{where}: disturbances must be among the inputs {labels}, by name or index, "
-        f"got {disturbance!r}."
     )
 
 

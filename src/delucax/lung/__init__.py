@@ -1,37 +1,13 @@
-"""Lungs, the breath that a ventilator is to make, and controllers that learn to."""
+"""Ventilators: lungs, breath waveforms, learned lung models and controllers."""
 
 from ._breath_controllers import (
     BangBang as BangBang,
     Breathing as Breathing,
     BreathPolicy as BreathPolicy,
-    FeedForward as FeedForward,
-    Summed as Summed,
 )
-from ._breath_file import (
-    read_breaths as read_breaths,
-    write_breaths as write_breaths,
-    write_example as write_example,
-)
-from ._breaths import (
-    Breaths as Breaths,
-    explore as explore,
-    Explorer as Explorer,
-    segment as segment,
-    split as split,
-)
-from ._controller_training import (
-    breath_error as breath_error,
-    pid_grid as pid_grid,
-    PIDGrid as PIDGrid,
-    train_controllers as train_controllers,
-)
+from ._breath_file import read_breaths as read_breaths, write_breaths as write_breaths
+from ._breaths import Breaths as Breaths, explore as explore, Explorer as Explorer
 from ._learned_lung import LearnedLung as LearnedLung
-from ._lung_fitting import (
-    fit_lungs as fit_lungs,
-    open_loop_error as open_loop_error,
-    stack as stack,
-    unstack as unstack,
-)
 from ._lung_models import (
     GreyBoxLung as GreyBoxLung,
     LungModel as LungModel,
@@ -42,8 +18,13 @@ from ._lung_tasks import (
     delay_lung as delay_lung,
     double_compartment as double_compartment,
     learned_lung as learned_lung,
-    lung_environment as lung_environment,
     single_compartment as single_compartment,
+)
+from ._lung_training import (
+    breath_error as breath_error,
+    fit_lungs as fit_lungs,
+    pid_grid as pid_grid,
+    train_controllers as train_controllers,
 )
 from ._lungs import (
     AbstractLung as AbstractLung,
@@ -52,14 +33,7 @@ from ._lungs import (
     DoubleCompartment as DoubleCompartment,
     SingleCompartment as SingleCompartment,
 )
-from ._original_lungs import (
-    original_valve as original_valve,
-    OriginalBalloonLung as OriginalBalloonLung,
-    OriginalDelayLung as OriginalDelayLung,
-    OriginalSingleCompartment as OriginalSingleCompartment,
-)
 from ._runner import (
-    Recording as Recording,
     run_breaths as run_breaths,
     Runner as Runner,
     SimulatedRunner as SimulatedRunner,
@@ -71,4 +45,4 @@ from ._ventilation import (
     Valves as Valves,
     ventilation as ventilation,
 )
-from ._waveform import at_pip as at_pip, BreathWaveform as BreathWaveform
+from ._waveform import BreathWaveform as BreathWaveform

@@ -11,7 +11,7 @@ from jaxtyping import Array, PyTree
 from .._check import check_choice, check_count, check_key, check_step
 from .._controller import AbstractController, check_controller
 from .._module import parameter, positive, weight
-from .._typing import PRNGKey
+from .._typing import PRNGKey, Real
 from ..math import clip
 from ._learned_lung import tanh_network
 from ._waveform import BreathWaveform, check_waveform
@@ -24,20 +24,21 @@ class _Phases(NamedTuple):
 
 
 class Breathing(AbstractController):
-    r"""A controller of the inspiratory valve, made one of whole breaths.
+    r"""A controller of whole breaths, made of one of the inspiratory valve.
 
     In the inspiratory phase `u = (clip(inspiratory(y), 0, 100), valve(y))`. In the
-    expiratory phase the inspiratory valve is closed; or, with a `hold`, once half a
-    period has gone by it is opened to `hold (1 - exp(-5 s))`, `s` being the time since,
-    which keeps the airway open against a leak. The inspiratory controller begins each
-    breath as it began the first one, and observes none of the expiratory phase.
+    expiratory phase the inspiratory valve is closed; or, with an `expiratory_opening`
+    `u_e`, in the second half of a period it is opened to `u_e (1 - exp(-5 s))`, where
+    `s` is the time since the middle: this keeps the airway open against a leak. The
+    inspiratory controller is reset at the start of each breath, and is not called in
+    the expiratory phase.
 
     **Arguments:**
 
     - `inspiratory`: any controller of one control, such as a
         [`delucax.controllers.PID`][] whose reference is the waveform.
     - `waveform`: a [`delucax.lung.BreathWaveform`][].
-    - `hold`: [%], 0 by default; that of the original is 5.
+    - `expiratory_opening`: [%], 0 by default; that of the original is 5.
     - `valve`: a controller of the expiratory valve; by default it is 0 in the
         inspiratory phase and 1 in the expiratory phase.
 
@@ -63,7 +64,7 @@ class Breathing(AbstractController):
 
     inspiratory: AbstractController
     waveform: BreathWaveform
-    hold: Array = parameter(0.0)
+    expiratory_opening: Array = parameter(0.0)
     valve: AbstractController | None = None
 
     def __check_init__(self):
@@ -84,8 +85,9 @@ class Breathing(AbstractController):
         begins = inhale & ~state.inhaling
         inner = _where(begins, self.inspiratory.init(key=None), state.inner)
         u_in, after = self.inspiratory(t, y, inner)
+        # Opened with a time constant of 0.2 s.
         late = jnp.maximum(self.waveform.share(t) - 0.5, 0) * self.waveform.period
-        held = self.hold * (1 - jnp.exp(-5 * late))
+        held = self.expiratory_opening * (1 - jnp.exp(-5 * late))
         u_in = jnp.where(inhale, clip(u_in[0], 0, 100), held)
         u_out, valve = jnp.where(inhale, 0.0, 1.0), None
         if self.valve is not None:
@@ -102,7 +104,7 @@ class Breathing(AbstractController):
 
 
 def _where(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
-    """One of two states. Random keys are those of `no`: none is drawn from twice."""
+    """Select one of two states. Random keys are those of `no`: none is used twice."""
 
     def where(yes, no):
         if not eqx.is_array(no) or jnp.issubdtype(no.dtype, jax.dtypes.prng_key):
@@ -143,19 +145,14 @@ class BangBang(AbstractController):
         return jnp.where(y > self.waveform(t), 0, self.high).astype(y.dtype), state
 
 
-class _Window(NamedTuple):
-    errors: Array
-    controls: Array
-
-
 class BreathPolicy(AbstractController):
     r"""A network of the last errors, the targets to come, and the last controls,
 
     `u = 100 sigmoid(network(e[k], ..., e[k + 1 - errors], r[k + 1], r[k + 2], r[k],
     u[k - 1], ..., u[k - controls]) + shift)`,
 
-    all scaled; before the breath there are zeros. The sigmoid keeps the control within
-    the bounds of the valve and its gradient alive.
+    all scaled; before the breath there are zeros. The sigmoid enforces the bounds of
+    the valve without a zero gradient.
 
     The kind `"mlp"` is a fully connected network. The kind `"cnn"` first takes the
     means of the last 1, 2, ..., `errors` errors, and convolves them.
@@ -198,8 +195,8 @@ class BreathPolicy(AbstractController):
     network: eqx.nn.MLP = weight()
     convolution: Array | None = weight()
     waveform: BreathWaveform
-    dt: Array = parameter(constraint=positive)
-    shift: Array = parameter()
+    dt: Real = parameter(constraint=positive)
+    shift: Real = parameter()
     kind: Literal["mlp", "cnn"] = eqx.field(static=True)
     errors: int = eqx.field(static=True)
     controls: int = eqx.field(static=True)
@@ -231,120 +228,39 @@ class BreathPolicy(AbstractController):
             depth = 0
         check_count(depth, "depth", where, least=0)
         self.network = tanh_network(size, "scalar", width, depth, key=key)
-        self.shift = -2.0  # pyright: ignore[reportAttributeAccessIssue]
+        self.shift = -2.0
 
     def __check_init__(self):
         check_waveform(self.waveform, "BreathPolicy")
         check_step(self.dt, "BreathPolicy")
 
     def init(self, *, key=None):
-        zeros = lambda size: jnp.zeros(size, jnp.result_type(self.dt))  # noqa: E731
-        return _Window(zeros(self.errors), zeros(self.controls))
+        dtype = jnp.result_type(self.dt)
+        return jnp.zeros(self.errors, dtype), jnp.zeros(self.controls, dtype)
 
     def __call__(self, t, y, state):
+        errors, controls = state
         now = self.waveform.pressure(t)
-        error = ((now - y) / 10).astype(state.errors.dtype)
-        errors = jnp.concatenate([error, state.errors[:-1]])
+        # Scaled, so that what enters the network is about 1: errors by 10 cmH2O,
+        # targets by 15, controls by 50 %.
+        error = ((now - y) / 10).astype(errors.dtype)
+        errors = jnp.concatenate([error, errors[:-1]])
         ahead = [self.waveform.pressure(t + k * self.dt) for k in (1, 2)]
         targets = (jnp.stack([*ahead, now]) - self.waveform.peep) / 15
         features = errors
         if self.convolution is not None:
+            # Means over the last 1, 2, ... errors, convolved with filters of width 5.
             means = jnp.cumsum(errors) / jnp.arange(1, self.errors + 1)
             windows = [means[i : self.errors - 4 + i] for i in range(5)]
             convolved = jnp.stack(windows, 1) @ self.convolution
             features = jnp.ravel(jnp.maximum(0, convolved))
-        z = jnp.concatenate([features, targets, state.controls]).astype(y.dtype)
+        z = jnp.concatenate([features, targets, controls]).astype(y.dtype)
         u = 100 * jax.nn.sigmoid(self.network(z) + self.shift)
-        after = state._replace(errors=errors.astype(state.errors.dtype))
-        return jnp.reshape(u, (1,)).astype(y.dtype), after
+        return jnp.reshape(u, (1,)).astype(y.dtype), (errors, controls)
 
     def applied(self, u, cost, state):
         if not self.controls:
             return state
-        last = (u[:1] / 50).astype(state.controls.dtype)
-        return state._replace(controls=jnp.concatenate([last, state.controls[:-1]]))
-
-
-class Summed(AbstractController):
-    """The sum of two controllers, such as a PID and a network trained on top of it,
-
-    `u = first(y) + second(y) - offset`.
-
-    **Arguments:**
-
-    - `first`: any controller.
-    - `second`: another one of as many controls.
-    - `offset`: 0 by default.
-
-    **Raises:** `ValueError` if what is given is no controller.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-        from delucax import lung
-
-        waveform = lung.BreathWaveform()
-        pid = dlx.controllers.LeakyPID(dt=0.03, reference=waveform)
-        policy = lung.BreathPolicy(waveform, 0.03, key=jax.random.key(0))
-        controller = lung.Summed(pid, policy, offset=50.0)
-        ```
-    """
-
-    first: AbstractController
-    second: AbstractController
-    offset: Array = parameter(0.0)
-
-    def __check_init__(self):
-        check_controller(self.first, "first", "Summed")
-        check_controller(self.second, "second", "Summed")
-
-    def init(self, *, key=None):
-        keys = (None, None) if key is None else jr.split(key)
-        return self.first.init(key=keys[0]), self.second.init(key=keys[1])
-
-    def __call__(self, t, y, state):
-        u, first = self.first(t, y, state[0])
-        v, second = self.second(t, y, state[1])
-        return (u + (v - self.offset)).astype(y.dtype), (first, second)
-
-    def applied(self, u, cost, state):
-        first = self.first.applied(u, cost, state[0])
-        return first, self.second.applied(u, cost, state[1])
-
-
-class FeedForward(AbstractController):
-    """A control that goes with the target, `u = gain (r(t) - peep) + offset`.
-
-    Add it to a PID with [`delucax.lung.Summed`][].
-
-    **Arguments:**
-
-    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
-    - `gain`: [%/cmH2O], 1 by default. Trainable.
-    - `offset`: [%], 0 by default. Trainable.
-
-    **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`.
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax.lung import BreathWaveform, FeedForward
-
-        forward = FeedForward(BreathWaveform(), gain=0.5)
-        forward(0.1, jnp.array([5.0]), forward.init())
-        ```
-    """
-
-    waveform: BreathWaveform
-    gain: Array = weight(1.0)
-    offset: Array = weight(0.0)
-
-    def __check_init__(self):
-        check_waveform(self.waveform, "FeedForward")
-
-    def __call__(self, t, y, state):
-        u = self.gain * (self.waveform(t) - self.waveform.peep) + self.offset
-        return u.astype(y.dtype), state
+        errors, controls = state
+        last = (u[:1] / 50).astype(controls.dtype)
+        return errors, jnp.concatenate([last, controls[:-1]])

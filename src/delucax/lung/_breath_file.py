@@ -2,22 +2,17 @@
 
 import array
 import csv
-import itertools
 import math
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
-import jax.random as jr
 import numpy as np
 
-from .._check import as_path, check_count, check_key, check_positive
-from .._typing import PRNGKey
-from ._breaths import Breaths, explore
-from ._lung_tasks import double_compartment
+from .._check import as_path, check_count, check_positive
+from ._breaths import Breaths
 from ._waveform import LENGTH
 
 
@@ -49,7 +44,7 @@ def read_breaths(
     **Arguments:**
 
     - `path`: the file.
-    - `length`: samples an inspiration, 29 by default.
+    - `length`: samples per inspiration, 29 by default.
     - `dt`: the time between samples [s]; the median of the file's by default.
     - `resistances`, `compliances`: the values that `R` and `C` may have; 5, 20, 50 and
         10, 20, 50 by default.
@@ -100,22 +95,19 @@ def read_breaths(
     grid = dt * np.arange(length)
     for start, end in zip(starts, ends, strict=True):
         open_at = np.flatnonzero(table["u_out"][start:end] > 0)
-        stop = start + (int(open_at[0]) if len(open_at) else end - start)
+        stop = start + int(np.append(open_at, end - start)[0])
         t = time[start:stop] - time[start]
         # The last sample may be up to half a step after the last row.
         if stop == start or t[-1] + 0.5 * dt < grid[-1]:
-            raise _wrong(
-                path,
-                table["line"][start],
-                "u_out",
+            words = (
                 f"breath {table['breath_id'][start]:g} has an inspiration of "
                 f"{stop - start} rows and {t[-1] if len(t) else 0:.3g} s, too short "
-                f"for length = {length} samples of {dt:.3g} s",
+                f"for length = {length} samples of {dt:.3g} s"
             )
-        rows = slice(start, stop)
+            raise _wrong(path, table["line"][start], "u_out", words)
         held = np.clip(np.searchsorted(t, grid + 1e-9) - 1, 0, None)
-        pressure = np.interp(grid, t, table["pressure"][rows])
-        samples.append((table["u_in"][rows][held], pressure))
+        pressure = np.interp(grid, t, table["pressure"][start:stop])
+        samples.append((table["u_in"][start:stop][held], pressure))
     u_in, pressure = jnp.asarray(np.array(samples)).swapaxes(0, 1)
     lungs = jnp.asarray(table["R"][starts]), jnp.asarray(table["C"][starts])
     return Breaths(u_in, jnp.zeros_like(u_in), pressure, dt, *lungs)
@@ -128,7 +120,9 @@ def _wrong(path: Path, line: Any, column: str, words: str) -> ValueError:
 def _breaths(
     path: Path, table: dict[str, np.ndarray], allowed: dict[str, Sequence[float]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where each breath begins and ends, if each is one breath of one lung.
+    """The first row of each breath and the row after its last.
+
+    Raises unless each breath is of one lung.
 
     `allowed` holds the values that a column may have.
     """
@@ -139,39 +133,22 @@ def _breaths(
     first = starts[np.unique(number[starts], return_index=True)[1]]
     again = begins & ~np.isin(np.arange(len(number)), first)
     single = begins & np.append(begins[1:], True)
-    step = {name: np.diff(column, prepend=0.0) for name, column in table.items()}
-    one_of = lambda values: f"must be one of {', '.join(f'{v:g}' for v in values)}"
-    constant = (
-        "must be the same for all of breath {breath:g}, got {now:g} after {last:g}"
-    )
-    checks = [
-        (
-            name,
-            ~np.isin(table[name], np.asarray(values, float)),
-            f"{one_of(values)}, got {{now:g}}",
-        )
-        for name, values in allowed.items()
-    ]
+    rise = {n: np.diff(table[n], prepend=0.0) for n in ("time_step", "R", "C")}
+    apart = "the rows of a breath must follow each other, but breath {now:g} was before"
+    short = "a breath must have at least 2 rows, got 1 of breath {now:g}"
+    later = "must increase within a breath, got {now:g} after {last:g}"
+    same = "must be the same for all of breath {breath:g}, got {now:g} after {last:g}"
+    checks = []
+    for name, values in allowed.items():
+        one_of = f"must be one of {', '.join(f'{v:g}' for v in values)}, got {{now:g}}"
+        checks.append((name, ~np.isin(table[name], np.asarray(values, float)), one_of))
     checks += [
         ("u_in", (u_in < 0) | (u_in > 100), "must be between 0 and 100, got {now:g}"),
-        (
-            "breath_id",
-            again,
-            "the rows of a breath must follow each other, but breath {now:g} was "
-            "before",
-        ),
-        (
-            "breath_id",
-            single,
-            "a breath must have at least 2 rows, got 1 of breath {now:g}",
-        ),
-        (
-            "time_step",
-            ~begins & (step["time_step"] <= 0),
-            "must increase within a breath, got {now:g} after {last:g}",
-        ),
-        ("R", ~begins & (step["R"] != 0), constant),
-        ("C", ~begins & (step["C"] != 0), constant),
+        ("breath_id", again, apart),
+        ("breath_id", single, short),
+        ("time_step", ~begins & (rise["time_step"] <= 0), later),
+        ("R", ~begins & (rise["R"] != 0), same),
+        ("C", ~begins & (rise["C"] != 0), same),
     ]
     for name, bad, words in checks:
         if bad.any():
@@ -183,7 +160,7 @@ def _breaths(
 
 
 def _table(path: Path) -> dict[str, np.ndarray]:
-    """The columns by name, as numbers, and of each row its `line` in the file."""
+    """The columns by name, as numbers, and the `line` of each row in the file."""
     # Bytes that are not text are rejected later, as values that are not numbers.
     with open(path, newline="", encoding="utf-8-sig", errors="replace") as file:
         reader = csv.reader(file)
@@ -262,63 +239,14 @@ def write_breaths(path: str | os.PathLike, breaths: Breaths) -> None:
             "write_breaths: breaths must have resistance and compliance, got None."
         )
     count, length = breaths.pressure.shape
-    whole = lambda values: np.repeat(np.asarray(values), length)  # noqa: E731
+    whole = lambda values: np.repeat(np.asarray(values), length)
+    of_each = np.arange(1, count + 1), breaths.resistance, breaths.compliance
     columns = [
         np.arange(1, count * length + 1),
-        whole(np.arange(1, count + 1)),
-        whole(breaths.resistance),
-        whole(breaths.compliance),
+        *map(whole, of_each),
         np.tile(float(breaths.dt) * np.arange(length), count),
         *(np.ravel(a) for a in (breaths.u_in, breaths.u_out, breaths.pressure)),
     ]
     form = "%d,%d,%g,%g,%.6f,%.6f,%d,%.6f"
     header = ",".join(COLUMNS)
     np.savetxt(path, np.stack(columns, 1), form, header=header, comments="")
-
-
-def write_example(
-    path: str | os.PathLike,
-    breaths: int = 20,
-    *,
-    key: PRNGKey,
-) -> None:
-    """Write a file of that kind, made by exploring the nine lungs of the task
-    `lung/double_compartment`; 80 rows a breath, with the expiratory phase.
-
-    **Arguments:**
-
-    - `path`: the file to write.
-    - `breaths`: of each lung, 20 by default.
-    - `key`: a random key.
-
-    **Raises:** `OSError` if the file cannot be written.
-
-    !!! example
-
-        ```python
-        import tempfile
-        from pathlib import Path
-        import jax
-        from delucax import lung
-
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "train.csv"
-            lung.write_example(path, 1, key=jax.random.key(0))
-        ```
-    """
-    check_key(key, "write_example")
-    lungs = list(itertools.product(RESISTANCES, COMPLIANCES))
-    parts = [
-        explore(
-            double_compartment(resistance=R, compliance=C),
-            breaths,
-            key=own,
-            length=80,
-            scale=0.5,
-            resistance=R,
-            compliance=C,
-        )
-        for (R, C), own in zip(lungs, jr.split(key, len(lungs)), strict=True)
-    ]
-    join = lambda *columns: jnp.concatenate(columns) if columns[0].ndim else columns[0]
-    write_breaths(path, jax.tree.map(join, *parts))

@@ -25,7 +25,7 @@ from ..environments import Environment
 from ..math import clip
 from ..simulation import rollout
 from ._ventilation import waveform_of
-from ._waveform import as_pips, at_pip, BreathWaveform, check_waveform, LENGTH, PIPS
+from ._waveform import as_pips, BreathWaveform, check_waveform, LENGTH, PIPS
 
 
 GAINS = (*(i / 10 for i in range(10)), *(float(i) for i in range(1, 11)))
@@ -57,11 +57,13 @@ class Breaths(eqx.Module):
     !!! example
 
         ```python
+        import jax
         import jax.numpy as jnp
         from delucax.lung import Breaths
 
         zeros = jnp.zeros((4, 29))
-        len(Breaths(zeros, zeros, zeros + 5.0, dt=0.03))
+        breaths = Breaths(zeros, zeros, zeros + 5.0, dt=0.03)
+        train, test = breaths.split(0.25, key=jax.random.key(0))
         ```
     """
 
@@ -80,17 +82,17 @@ class Breaths(eqx.Module):
             raise ValueError(
                 f"Breaths: pressure must have shape (breaths, samples), got {shape}."
             )
-        per_sample = shape, " like pressure"
-        per_breath = shape[:-1], ", an entry for each breath"
-        expected = dict.fromkeys(("u_in", "u_out", "truth"), per_sample)
-        expected |= dict.fromkeys(("resistance", "compliance"), per_breath)
-        for name, (fits, which) in expected.items():
-            given = getattr(self, name)
-            if given is not None and jnp.shape(given) != fits:
-                raise ValueError(
-                    f"Breaths: {name} must have shape {fits}{which}, got "
-                    f"{jnp.shape(given)}."
-                )
+        for names, fits, which in (
+            (("u_in", "u_out", "truth"), shape, " like pressure"),
+            (("resistance", "compliance"), shape[:-1], ", an entry for each breath"),
+        ):
+            for name in names:
+                value = getattr(self, name)
+                if value is not None and jnp.shape(value) != fits:
+                    raise ValueError(
+                        f"Breaths: {name} must have shape {fits}{which}, got "
+                        f"{jnp.shape(value)}."
+                    )
 
     def __len__(self) -> int:
         return self.pressure.shape[0]
@@ -99,101 +101,98 @@ class Breaths(eqx.Module):
         """The breaths of an index, a slice or booleans."""
         return jax.tree.map(lambda a: a[index] if a.ndim else a, self)
 
+    @classmethod
+    def from_recording(
+        cls, u_in: Any, u_out: Any, pressure: Any, *, dt: Any, length: int = LENGTH
+    ) -> "Breaths":
+        """The inspirations of a recording, cut out of it.
 
-def segment(
-    u_in: Any, u_out: Any, pressure: Any, *, dt: Any, length: int = LENGTH
-) -> Breaths:
-    """The inspirations of a recording, cut out of it.
+        An inspiration is a longest stretch with the expiratory valve closed. Those
+        shorter than `length` are left out, and the others cut to it.
 
-    An inspiration is a longest stretch with the expiratory valve closed. Those shorter
-    than `length` are left out, and the others cut to it.
+        **Arguments:**
 
-    **Arguments:**
+        - `u_in`, `u_out`, `pressure`: the recording, vectors of one size.
+        - `dt`: the time between samples [s].
+        - `length`: samples per inspiration, 29 by default.
 
-    - `u_in`, `u_out`, `pressure`: the recording, vectors of one size.
-    - `dt`: the time between samples [s].
-    - `length`: samples an inspiration, 29 by default.
+        **Returns:** a [`delucax.lung.Breaths`][].
 
-    **Returns:** a [`delucax.lung.Breaths`][].
+        **Raises:** `ValueError` if sizes differ, a value is not finite, or there is no
+        inspiration as long.
 
-    **Raises:** `ValueError` if sizes differ, a value is not finite, or there is no
-    inspiration as long.
+        !!! example
 
-    !!! example
+            ```python
+            import jax.numpy as jnp
+            from delucax.lung import Breaths
 
-        ```python
-        import jax.numpy as jnp
-        from delucax.lung import segment
+            u_out = jnp.tile(jnp.repeat(jnp.array([0.0, 1.0]), 30), 3)
+            Breaths.from_recording(0 * u_out, u_out, 0 * u_out, dt=0.03)
+            ```
+        """
+        where = "from_recording"
+        length = check_count(length, "length", where)
+        columns = [np.asarray(column, float) for column in (u_in, u_out, pressure)]
+        if columns[0].ndim != 1 or len({column.shape for column in columns}) != 1:
+            raise ValueError(
+                f"{where}: u_in, u_out and pressure must be vectors of one size, got "
+                f"shapes {[column.shape for column in columns]}."
+            )
+        for name, column in zip(("u_in", "u_out", "pressure"), columns, strict=True):
+            check_finite(column, name, where)
+        edges = np.diff((columns[1] < 0.5).astype(int), prepend=0, append=0)
+        starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+        fits = starts[ends - starts >= length]
+        if not len(fits):
+            longest = int(np.max(ends - starts, initial=0))
+            raise ValueError(
+                f"{where}: u_out must be 0 for at least length = {length} samples in a "
+                f"row, but the longest inspiration of {len(starts)} has {longest}."
+            )
+        rows = fits[:, None] + np.arange(length)
+        return cls(*(jnp.asarray(column[rows]) for column in columns), dt=dt)
 
-        u_out = jnp.tile(jnp.repeat(jnp.array([0.0, 1.0]), 30), 3)
-        segment(0 * u_out, u_out, 0 * u_out, dt=0.03).pressure.shape
-        ```
-    """
-    where = "segment"
-    length = check_count(length, "length", where)
-    columns = [np.asarray(column, float) for column in (u_in, u_out, pressure)]
-    if columns[0].ndim != 1 or len({column.shape for column in columns}) != 1:
-        raise ValueError(
-            f"{where}: u_in, u_out and pressure must be vectors of one size, got "
-            f"shapes {[column.shape for column in columns]}."
-        )
-    for name, column in zip(("u_in", "u_out", "pressure"), columns, strict=True):
-        check_finite(column, name, where)
-    closed = np.concatenate([[False], columns[1] < 0.5, [False]]).astype(int)
-    edges = np.diff(closed)
-    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    fits = starts[ends - starts >= length]
-    if not len(fits):
-        longest = int(np.max(ends - starts, initial=0))
-        raise ValueError(
-            f"{where}: u_out must be 0 for at least length = {length} samples in a "
-            f"row, but the longest inspiration of {len(starts)} has {longest}."
-        )
-    rows = fits[:, None] + np.arange(length)
-    return Breaths(*(jnp.asarray(column[rows]) for column in columns), dt=dt)
+    def split(self, test: float = 0.1, *, key: PRNGKey) -> tuple["Breaths", "Breaths"]:
+        """Breaths to train on and breaths to test on, drawn at random.
 
+        **Arguments:**
 
-def split(
-    breaths: Breaths, test: float = 0.1, *, key: PRNGKey
-) -> tuple[Breaths, Breaths]:
-    """Breaths to train on and breaths to test on, drawn at random.
+        - `test`: the share to test on, between 0 and 1; 0.1 by default.
+        - `key`: a random key.
 
-    **Arguments:**
+        **Returns:** `(train, test)`.
 
-    - `breaths`: to divide.
-    - `test`: the share to test on, between 0 and 1; 0.1 by default.
-    - `key`: a random key.
+        **Raises:** `ValueError` if either would be empty.
+        """
+        check_key(key, "split")
+        check_range(test, "test", "split", 0, 1)
+        cut = round(test * len(self))
+        if not 0 < cut < len(self):
+            raise ValueError(
+                f"split: test must leave breaths on both sides, got {test} of "
+                f"{len(self)} breaths."
+            )
+        order = jr.permutation(key, len(self))
+        return self[order[cut:]], self[order[:cut]]
 
-    **Returns:** `(train, test)`.
+    def open_loop_error(self, model: Any) -> Array:
+        """The mean absolute error of a lung that is given the recorded controls alone.
 
-    **Raises:** `ValueError` if either would be empty.
+        Against the truth of the breaths where it is known, else against what the sensor
+        read.
 
-    !!! example
+        **Arguments:** `model`: a [`delucax.lung.LearnedLung`][] or
+            [`delucax.lung.LungModel`][].
 
-        ```python
-        import jax
-        import jax.numpy as jnp
-        from delucax import lung
-
-        zeros = jnp.zeros((10, 29))
-        breaths = lung.Breaths(zeros, zeros, zeros, dt=0.03)
-        train, test = lung.split(breaths, 0.2, key=jax.random.key(0))
-        ```
-    """
-    check_key(key, "split")
-    check_range(test, "test", "split", 0, 1)
-    cut = round(test * len(breaths))
-    if not 0 < cut < len(breaths):
-        raise ValueError(
-            f"split: test must leave breaths on both sides, got {test} of "
-            f"{len(breaths)} breaths."
-        )
-    order = jr.permutation(key, len(breaths))
-    return breaths[order[cut:]], breaths[order[:cut]]
+        **Returns:** a scalar [cmH2O].
+        """
+        truth = self.pressure if self.truth is None else self.truth
+        return jnp.mean(jnp.abs(jax.vmap(model.predict)(self.u_in) - truth))
 
 
 class Explorer(AbstractController):
-    r"""A PID whose inspiratory control is disturbed, to learn a lung from.
+    r"""A PID with random gains and a random disturbance, to collect data of a lung.
 
     Its control is `(clip(pid + bump(t), 0, 100), 0)`, and `(0, 1)` in the expiratory
     phase. The gains `kp` and `ki` of the [`delucax.controllers.LeakyPID`][] are drawn
@@ -240,8 +239,7 @@ class Explorer(AbstractController):
         return LeakyPID(gains[0], gains[1], dt=self.dt, reference=self.waveform)
 
     def init(self, *, key=None):
-        key = jr.key(0) if key is None else key
-        keys = jr.split(key, 4)
+        keys = jr.split(jr.key(0) if key is None else key, 4)
         gains = self.scale * jr.choice(keys[0], jnp.array(GAINS), (2,))
         low = jnp.array([-30.0, 0.1, 0.0, 0.0, 0.05])
         high = jnp.array([30.0, 0.5, 1.0, 100.0, 0.3])
@@ -251,14 +249,15 @@ class Explorer(AbstractController):
 
     def __call__(self, t, y, state):
         gains, bump, is_ramp, memory = state
-        u, memory = self._pid(gains)(t, y, memory)
-        waveform = self.waveform
+        waveform, pid = self.waveform, self._pid(gains)
+        u, memory = pid(t, y, memory)
         since = waveform.share(t) * waveform.period
         inspiration = waveform.inspiration * waveform.period
-        half = bump[1] / 2
-        middle = half + bump[2] * (inspiration - bump[1])
-        triangle = bump[0] * jnp.maximum(0, 1 - jnp.abs(since - middle) / half)
-        ramp = bump[3] * jnp.maximum(0, 1 - since / bump[4])
+        height, width, place, top, duration = (bump[i] for i in range(5))
+        # The triangle lies within the inspiration, its middle at a place from 0 to 1.
+        middle = width / 2 + place * (inspiration - width)
+        triangle = height * jnp.maximum(0, 1 - jnp.abs(since - middle) / (width / 2))
+        ramp = top * jnp.maximum(0, 1 - since / duration)
         u = clip(u[0] + jnp.where(is_ramp, ramp, triangle), 0, 100)
         inhale = waveform.is_inspiration(t)
         u = jnp.stack([jnp.where(inhale, u, 0), jnp.where(inhale, 0.0, 1.0)])
@@ -267,13 +266,11 @@ class Explorer(AbstractController):
 
 @eqx.filter_jit
 def _explored(env, explorer, pips, keys, length):
-    index = env.cost.index
-
     def one(pip, key):
-        world, controller = at_pip((env, explorer), pip)
+        world, controller = BreathWaveform.at_pip((env, explorer), pip)
         run: Any = rollout(world, controller, key=key, horizon=length, throw=False)
         truth = jax.vmap(lambda x: env.dynamics.observe(0.0, x))(run.states[:-1])
-        highest = jnp.max(run.states[:, index])
+        highest = jnp.max(run.states[:, env.cost.index])
         u, y = run.controls, run.observations
         return u[:, 0], u[:, 1], y[:, 0], truth[:, 0], highest
 
@@ -302,7 +299,7 @@ def explore(
     - `env`: a task of a lung, such as `delucax.make("lung/double_compartment")`.
     - `breaths`: how many.
     - `key`: a random key.
-    - `length`: samples a breath, 29 by default.
+    - `length`: samples per breath, 29 by default.
     - `pips`: the peak pressures to draw from, 10, 15, ..., 35 cmH2O by default.
     - `scale`: of the PID gains that are drawn, 1 by default.
     - `abort`: the abort limit [cmH2O], 70 by default.
@@ -310,7 +307,7 @@ def explore(
 
     **Returns:** a [`delucax.lung.Breaths`][], with `truth`.
 
-    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
     say), or hardly a breath stays below the limit.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
@@ -338,6 +335,7 @@ def explore(
     explorer = Explorer(dt=env.dt, waveform=waveform, scale=scale)
     kept, count = [], 0
     for attempt in range(50):
+        # Four times as many as asked for, so that one batch mostly does.
         draw_key, run_key = jr.split(jr.fold_in(key, attempt))
         drawn = jr.choice(draw_key, pips, (4 * breaths,))
         keys = jr.split(run_key, 4 * breaths)
@@ -352,10 +350,8 @@ def explore(
             f"{where}: abort must be a limit that some breaths stay below, but of "
             f"{200 * breaths} breaths only {count} stayed below {abort}: lower scale."
         )
-    u_in, u_out, pressure, truth = (
-        jnp.asarray(np.concatenate(column)[:breaths])
-        for column in zip(*kept, strict=True)
-    )
+    whole = [np.concatenate(column)[:breaths] for column in zip(*kept, strict=True)]
+    u_in, u_out, pressure, truth = map(jnp.asarray, whole)
     each = lambda value: None if value is None else jnp.full(breaths, float(value))
     lungs = each(resistance), each(compliance)
     return Breaths(u_in, u_out, pressure, env.dt, *lungs, truth)

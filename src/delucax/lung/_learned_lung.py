@@ -1,6 +1,6 @@
 """A lung learned from breaths."""
 
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
 import jax
@@ -26,12 +26,14 @@ class LearnedLung(AbstractDynamics):
     `p[k + 1] = p[k] + line . z + network(z) + output_k . tanh(hidden_k z_all)`,
     `z = (v(u[k]), ..., v(u[k + 1 - u_window]), p[k], ..., p[k + 1 - p_window])`,
 
-    where `v`, a small network of one control, straightens the curve of the valve, and
-    `z_all` is the whole history; its term is there for `k < boundary`. Before an
-    inspiration the valve is closed and the pressure is that at which they start.
+    where `v`, a small network of one control, linearises the curve of the valve, and
+    `z_all` is the whole history. The last term is included for `k < boundary` only.
+    Before an inspiration the valve is closed and the pressure is the start pressure of
+    the breaths.
 
-    As published: `p[k + 1] = network(z)` of the controls as they are, for
-    `k < boundary` its last term instead, and the history is 0 before an inspiration.
+    With `published`, the model of the paper: `p[k + 1] = network(z)` of the raw
+    controls, for `k < boundary` the last term alone, and a history of zeros before an
+    inspiration.
 
     The `boundary` networks have 16 hidden units each, and are one stacked array,
     of which a step takes its slice.
@@ -109,20 +111,20 @@ class LearnedLung(AbstractDynamics):
         for name, value in sizes.items():
             check_count(value, name, where)
         hidden_key, output_key, valve_key, key = jr.split(key, 4)
-        size = 2 * max(u_window, p_window, boundary)
+        inputs, size = u_window + p_window, 2 * max(u_window, p_window, boundary)
         shape = boundary, 16
+        # Variances of one over the inputs keep what enters a tanh about 1.
         self.hidden = jr.normal(hidden_key, (*shape, size)) / size**0.5
         self.output = 0.1 * jr.normal(output_key, shape) / 16**0.5
-        self.line = jnp.zeros(u_window + p_window)
+        self.line = jnp.zeros(inputs)
         self.valve = tanh_network("scalar", "scalar", 8, 1, key=valve_key)
-        inputs = u_window + p_window
         self.network = tanh_network(inputs, "scalar", width, depth, key=key)
-        closed = breaths.u_out < 0.5
-        count = jnp.sum(closed)
-        mean = lambda a: jnp.sum(jnp.where(closed, a, 0)) / count  # noqa: E731
-        self.u_mean, self.p_mean = mean(breaths.u_in), mean(breaths.pressure)
-        self.u_std = jnp.sqrt(mean((breaths.u_in - self.u_mean) ** 2)) + 1e-3
-        self.p_std = jnp.sqrt(mean((breaths.pressure - self.p_mean) ** 2)) + 1e-3
+        inhaling = breaths.u_out < 0.5
+        moments = lambda a: (jnp.mean(a, where=inhaling), jnp.std(a, where=inhaling))
+        self.u_mean, u_std = moments(breaths.u_in)
+        self.p_mean, p_std = moments(breaths.pressure)
+        # It is divided by, and 0 where all are the same.
+        self.u_std, self.p_std = u_std + 1e-3, p_std + 1e-3
         self.start = jnp.mean(breaths.pressure[..., 0])
         self.dt = breaths.dt
         self.u_window, self.p_window = u_window, p_window
@@ -130,7 +132,7 @@ class LearnedLung(AbstractDynamics):
 
     @property
     def window(self) -> int:
-        """How many controls, and how many pressures, the state holds."""
+        """The number of controls, and of pressures, in the state."""
         return self.hidden.shape[-1] // 2
 
     @property
@@ -172,22 +174,21 @@ class LearnedLung(AbstractDynamics):
     def observe(self, t, x):
         return jnp.reshape(self.pressure(x), (1,)).astype(x.dtype)
 
-    def _straight(self, controls: Array) -> Array:
-        """Controls as the network of the later steps is given them."""
-        if self.published:
-            return controls
-        return controls + jax.vmap(self.valve)(controls)
+    def _linearised(self, controls: Array) -> Array:
+        """The controls, with the curve of the valve linearised."""
+        return controls if self.published else controls + jax.vmap(self.valve)(controls)
 
-    def _late(self, straight: Array, pressures: Array) -> Array:
+    def _later_step(self, linearised: Array, pressures: Array) -> Array:
         """The next pressure, after the first steps."""
-        z = jnp.concatenate([straight, pressures[: self.p_window]])
+        z = jnp.concatenate([linearised, pressures[: self.p_window]])
         predicted = self.network(z)
-        if self.published:
-            return predicted
-        return pressures[0] + self.line @ z + predicted
+        # The networks learn the change: for a short step it is small and near linear.
+        return predicted if self.published else pressures[0] + self.line @ z + predicted
 
-    def _early(self, history: Array, late: Any, hidden: Array, output: Array) -> Array:
-        """The next pressure in one of the first steps; `late` is that afterwards."""
+    def _first_step(
+        self, history: Array, late: Any, hidden: Array, output: Array
+    ) -> Array:
+        """The next pressure in a first step; `late` is that of `_later_step`."""
         own = output @ jnp.tanh(hidden @ history)
         return own if self.published else own + late
 
@@ -201,12 +202,15 @@ class LearnedLung(AbstractDynamics):
         control = jnp.reshape((u[0] - self.u_mean) / self.u_std, (1,)).astype(x.dtype)
         controls, pressures = jnp.concatenate([control, x[: n - 1]]), x[n : 2 * n]
         step, first = x[2 * n], self.hidden.shape[0]
+        # The count of steps is a float in the state; past `boundary` a slice is still
+        # taken, and not used, because a scan has no branches of other shapes.
         i = jnp.clip(jnp.round(step), 0, first - 1).astype(int)
-        late = self._late(self._straight(controls[: self.u_window]), pressures)
+        late = self._later_step(self._linearised(controls[: self.u_window]), pressures)
         history = jnp.concatenate([controls, pressures])
-        early = self._early(history, late, self.hidden[i], self.output[i])
+        early = self._first_step(history, late, self.hidden[i], self.output[i])
         predicted = self._bound(jnp.where(step < first - 0.5, early, late))
         after = jnp.hstack([controls, predicted, pressures[: n - 1], step + 1])
+        # Nothing is learned of expirations: an open valve resets the state.
         after = jnp.where(u[1] > 0.5, self.resting(), after)
         return after.astype(x.dtype), RESULTS.successful
 
@@ -229,8 +233,8 @@ class LearnedLung(AbstractDynamics):
         return self._predicted(u_in, (pressure - self.p_mean) / self.p_std)
 
     def _predicted(self, u_in: Array, recorded: Array | None) -> Array:
-        """As `advance` would, but all that is known before is computed at once: the
-        windows of controls, which network a step takes, and with records every step."""
+        """The same as by `advance`, but what needs no prediction is computed for all
+        steps at once: the windows of controls, and with records the whole."""
         n, last = self.window, u_in.shape[0] - 1
         first = min(self.hidden.shape[0], last)
         x0 = self.resting().astype(u_in.dtype)
@@ -238,20 +242,21 @@ class LearnedLung(AbstractDynamics):
         before = jnp.zeros(n - 1) if self.published else x0[: n - 1]
         u = jnp.concatenate([before.astype(u.dtype), u])
         controls = _windows(u, n)[:-1]
-        straight = _windows(self._straight(u), n)[:-1, : self.u_window]
+        linearised = _windows(self._linearised(u), n)[:-1, : self.u_window]
         weights = self.hidden[:first], self.output[:first]
 
         def begin(pressures, inputs):
-            controls, straight, hidden, output = inputs
-            late = 0.0 if self.published else self._late(straight, pressures)
+            controls, linearised, hidden, output = inputs
+            late = 0.0 if self.published else self._later_step(linearised, pressures)
             history = jnp.concatenate([controls, pressures])
-            return self._bound(self._early(history, late, hidden, output))
+            return self._bound(self._first_step(history, late, hidden, output))
 
-        def go_on(pressures, straight):
-            return self._bound(self._late(straight, pressures))
+        def go_on(pressures, linearised):
+            return self._bound(self._later_step(linearised, pressures))
 
-        inputs = controls[:first], straight[:first], *weights
+        inputs = controls[:first], linearised[:first], *weights
         start = x0[n : 2 * n]
+        # Open loop each step needs the pressure before it; with records none does.
         if recorded is None:
 
             def scan(step, pressures, inputs):
@@ -262,21 +267,19 @@ class LearnedLung(AbstractDynamics):
                 return jax.lax.scan(body, pressures, inputs)
 
             pressures, early = scan(begin, start, inputs)
-            _, late = scan(go_on, pressures, straight[first:])
+            _, late = scan(go_on, pressures, linearised[first:])
         else:
             known = _windows(jnp.append(start[:0:-1], recorded), n)[:-1]
             early = jax.vmap(begin)(known[:first], inputs)
-            late = jax.vmap(go_on)(known[first:], straight[first:])
+            late = jax.vmap(go_on)(known[first:], linearised[first:])
         return self.p_mean + self.p_std * jnp.concatenate([start[:1], early, late])
 
 
+_Size: TypeAlias = int | Literal["scalar"]
+
+
 def tanh_network(
-    inputs: int | Literal["scalar"],
-    outputs: int | Literal["scalar"],
-    width: int,
-    depth: int,
-    *,
-    key: PRNGKey,
+    inputs: _Size, outputs: _Size, width: int, depth: int, *, key: PRNGKey
 ) -> eqx.nn.MLP:
     """A fully connected network whose hidden layers are tanh."""
     tanh, identity = as_module(jnp.tanh), as_module(jax.nn.identity)
@@ -284,8 +287,7 @@ def tanh_network(
 
 
 def _windows(values: Array, size: int) -> Array:
-    """The last so many values at each of the times that have as many before them,
-    newest first."""
+    """The last `size` values at each time that has as many, newest first."""
     count = values.shape[0] - size + 1
     shifts = [values[size - 1 - i : size - 1 - i + count] for i in range(size)]
     return jnp.stack(shifts, axis=1)

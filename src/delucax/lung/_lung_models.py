@@ -1,4 +1,4 @@
-"""Lungs of physics, of networks, and of both, as models to be fitted to breaths."""
+"""Physical, neural and grey-box models of a lung, to be fitted to breaths."""
 
 from typing import Any, ClassVar
 
@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from .._check import check_count, check_instance, check_key, check_step
 from .._module import parameter, positive, weight
-from .._typing import PRNGKey, RealScalar, Scalar, State
+from .._typing import PRNGKey, Real, RealScalar, Scalar, State
 from ..dynamics import Delayed, Discretized
 from ._learned_lung import tanh_network
 from ._lungs import AbstractLung, SingleCompartment
@@ -78,11 +78,11 @@ class LungModel(eqx.Module):
         **Returns:** shape `(T,)` [cmH2O], the first before any control acted.
         """
 
+        # Recomputed for the gradient, of which only the states are kept.
         @jax.checkpoint
         def body(x, u):
-            after, _ = self.dynamics.advance(
-                0.0, x, jnp.stack([u, jnp.zeros_like(u)]), None
-            )
+            both = jnp.stack([u, jnp.zeros_like(u)])
+            after, _ = self.dynamics.advance(0.0, x, both, None)
             return after, self.dynamics.observe(0.0, x)[0]
 
         x0 = self.resting().astype(u_in.dtype)
@@ -123,9 +123,9 @@ class NeuralLung(AbstractLung):
     """
 
     network: eqx.nn.MLP = weight()
-    p_mean: Array = parameter()
-    p_std: Array = parameter(constraint=positive)
-    rate: Array = parameter(constraint=positive)
+    p_mean: Real = parameter()
+    p_std: Real = parameter(constraint=positive)
+    rate: Real = parameter(constraint=positive)
     valves: Valves
     hidden: int = eqx.field(static=True)
 
@@ -145,8 +145,7 @@ class NeuralLung(AbstractLung):
         check_key(key, where)
         sizes = self.hidden + 3, self.hidden + 1, width, depth
         self.network = tanh_network(*sizes, key=key)
-        scales: Any = 20.0, 10.0, 10.0
-        self.p_mean, self.p_std, self.rate = scales
+        self.p_mean, self.p_std, self.rate = 20.0, 10.0, 10.0
         self.valves = Valves() if valves is None else valves
 
     @property
@@ -161,6 +160,7 @@ class NeuralLung(AbstractLung):
         return jnp.hstack([first, jnp.zeros(self.hidden)])
 
     def vector_field(self, t, x, u, w):
+        # Scaled to be about 1; the valve itself is known and not learned.
         flow = self.valves.flow(u[0]) / self.valves.max_flow
         z = jnp.concatenate([x, jnp.stack([flow, u[1]]).astype(x.dtype)])
         return (self.rate * self.network(z)).astype(x.dtype)
@@ -172,8 +172,9 @@ class GreyBoxLung(AbstractLung):
     `p = p_single(x) + p_std network(inflow, V / C, h)`,
     `dh/dt = rate memory(inflow, V / C, h)`,
 
-    with the state (inflow [L/s], opening, volume [L], memory h). The networks begin so
-    small that it begins as the physics. Smooth but for an opening of 0.
+    with the state (inflow [L/s], opening, volume [L], memory h). The first network
+    starts with a small output, so that the model starts near the physical one. Not
+    smooth at an opening of 0.
 
     **Arguments:**
 
@@ -201,18 +202,14 @@ class GreyBoxLung(AbstractLung):
     single: SingleCompartment
     network: eqx.nn.MLP = weight()
     memory: eqx.nn.MLP = weight()
-    p_std: Array = parameter(constraint=positive)
-    rate: Array = parameter(constraint=positive)
+    p_std: Real = parameter(constraint=positive)
+    rate: Real = parameter(constraint=positive)
 
     state_names: ClassVar = ("inflow", "opening", "volume", "memory")
     state_units: ClassVar = ("L/s", "", "L", "")
 
     def __init__(
-        self,
-        single: SingleCompartment | None = None,
-        width: int = 16,
-        *,
-        key: PRNGKey,
+        self, single: SingleCompartment | None = None, width: int = 16, *, key: PRNGKey
     ):
         where = "GreyBoxLung"
         check_key(key, where)
@@ -221,14 +218,13 @@ class GreyBoxLung(AbstractLung):
         network, self.memory = (
             tanh_network(3, "scalar", width, 1, key=k) for k in jr.split(key)
         )
-        last = lambda mlp: mlp.layers[-1].weight  # noqa: E731
+        last = lambda mlp: mlp.layers[-1].weight
         self.network = eqx.tree_at(last, network, 0.1 * last(network))
-        scales: Any = 10.0, 5.0
-        self.p_std, self.rate = scales
+        self.p_std, self.rate = 10.0, 5.0
 
     @property
     def valves(self) -> Valves:
-        """Those of the single compartment."""
+        """The valves of the single compartment."""
         return self.single.valves
 
     def _inputs(self, x: Array) -> Array:

@@ -1,12 +1,19 @@
-"""The lungs by name."""
+"""Tasks in which a lung is ventilated."""
 
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import diffrax
+import numpy as np
 
-from .._check import check_count, check_instance, check_keywords, keywords_of
+from .._check import (
+    check_count,
+    check_instance,
+    check_keywords,
+    is_concrete,
+    keywords_of,
+)
 from .._module import load
 from ..dynamics import Delayed, Discretized
 from ..environments import Environment
@@ -20,7 +27,7 @@ from ._lungs import (
     SingleCompartment,
 )
 from ._ventilation import ventilation
-from ._waveform import BreathWaveform, check_peep, LENGTH
+from ._waveform import BreathWaveform
 
 
 def _task(
@@ -58,16 +65,23 @@ def _task(
     if delay:
         dynamics = Delayed(dynamics, controls=delay)
         rest = dynamics.filled(rest)
-    options.setdefault("rest", rest)
+    options.setdefault("resting_state", rest)
     env = ventilation(dynamics, waveform, **options)
-    check_peep(waveform, valves, where)
+    asked, least = waveform.peep, valves.peep
+    # Checked where both are known. Numbers of another precision may differ by rounding.
+    if is_concrete(asked) and is_concrete(least):
+        if np.any(np.asarray(asked) < np.asarray(least) - 1e-3):
+            raise ValueError(
+                f"{where}: the peep of waveform must be at least that of valves, "
+                f"{least}, below which no lung empties, got {asked}. Give both."
+            )
     return env
 
 
 def balloon_lung(
     system: BalloonLung | None = None, *, horizon: int = 100, **options: Any
 ) -> Environment:
-    """Make a balloon breathe as a waveform says.
+    """Ventilate a balloon, so that the pressure tracks a waveform.
 
     The controls, the observation, the state and the cost are those of
     [`delucax.lung.ventilation`][]. Starts at rest at PEEP. Never terminates.
@@ -75,7 +89,7 @@ def balloon_lung(
     **Arguments:**
 
     - `system`: a [`delucax.lung.BalloonLung`][]; made of `options` by default.
-    - `horizon`: steps an episode, 100 by default.
+    - `horizon`: steps per episode, 100 by default.
     - `**options`: arguments of the lung; the control interval `dt` (0.03 by default),
         `solver` and `substeps` of [`delucax.Discretized`][]; `waveform`,
         `sensor_delay`, `noise` and others of [`delucax.lung.ventilation`][]; those of
@@ -83,7 +97,7 @@ def balloon_lung(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
+    **Raises:** `ValueError` on invalid numbers, or if the PEEP of `waveform` is below
     that of its valves.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
@@ -107,7 +121,7 @@ def delay_lung(
     horizon: int = 100,
     **options: Any,
 ) -> Environment:
-    """Make a balloon breathe through a long pipe, which what is done must first pass.
+    """Ventilate a balloon through a long pipe, with a transport delay.
 
     As `lung/balloon_lung`, but that the controls act some steps late, and that the pipe
     is elastic.
@@ -116,13 +130,13 @@ def delay_lung(
 
     - `system`: a [`delucax.lung.DelayLung`][]; made of `options` by default.
     - `delay`: steps until a control acts, 5 by default.
-    - `horizon`: steps an episode, 100 by default.
+    - `horizon`: steps per episode, 100 by default.
     - `**options`: as of `lung/balloon_lung`; `substeps` is 4 by default, because air
         rushes out of the pipe in some 25 ms.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
+    **Raises:** `ValueError` on invalid numbers, or if the PEEP of `waveform` is below
     that of its valves.
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
@@ -144,19 +158,19 @@ def delay_lung(
 def single_compartment(
     system: SingleCompartment | None = None, *, horizon: int = 100, **options: Any
 ) -> Environment:
-    """Make a lung of one compartment breathe as a waveform says.
+    """Ventilate a lung of one compartment, so that the pressure tracks a waveform.
 
     As `lung/balloon_lung`, with another lung.
 
     **Arguments:**
 
     - `system`: a [`delucax.lung.SingleCompartment`][]; made of `options` by default.
-    - `horizon`: steps an episode, 100 by default.
+    - `horizon`: steps per episode, 100 by default.
     - `**options`: as of `lung/balloon_lung`.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
+    **Raises:** `ValueError` on invalid numbers, or if the PEEP of `waveform` is below
     that of its valves.
 
     !!! example
@@ -174,7 +188,7 @@ def single_compartment(
 def double_compartment(
     system: DoubleCompartment | None = None, *, horizon: int = 100, **options: Any
 ) -> Environment:
-    """Make a lung of a fast and a slow compartment breathe, with delay and noise.
+    """Ventilate a lung of a fast and a slow compartment, with a late, noisy sensor.
 
     The plant of the ventilator study: as `lung/single_compartment`, with another lung
     and a real sensor.
@@ -182,14 +196,14 @@ def double_compartment(
     **Arguments:**
 
     - `system`: a [`delucax.lung.DoubleCompartment`][]; made of `options` by default.
-    - `horizon`: steps an episode, 100 by default.
+    - `horizon`: steps per episode, 100 by default.
     - `**options`: as of `lung/balloon_lung`; `sensor_delay` is 2 steps and `noise`
         0.2 cmH2O by default, and `substeps` is 2, because with the expiratory valve
         open the fast compartment of a narrow lung is empty within some 10 ms.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or if the PEEP of `waveform` is below
+    **Raises:** `ValueError` on invalid numbers, or if the PEEP of `waveform` is below
     that of its valves.
 
     !!! example
@@ -206,26 +220,27 @@ def double_compartment(
 
 
 def learned_lung(
-    model: LearnedLung | None = None, *, horizon: int = 100, **options: Any
+    model: LearnedLung | LungModel | None = None, *, horizon: int = 100, **options: Any
 ) -> Environment:
-    """Make a lung breathe that was learned from breaths.
+    """Ventilate a lung that was learned from breaths: controllers are trained in it.
 
-    As `lung/balloon_lung`; its time step is that of the breaths, and what it is let out
-    to is the pressure that they start at, whatever the PEEP of `waveform`.
+    As `lung/balloon_lung`; its time step is that of the breaths, and it exhales to
+    their start pressure regardless of the PEEP of `waveform`. The sensor of a
+    [`delucax.lung.LungModel`][] has the delay of the model.
 
     **Arguments:**
 
-    - `model`: a [`delucax.lung.LearnedLung`][]. By default the one that comes with the
-        library, learned from breaths of the task `lung/double_compartment`; its sensor
-        is two samples late, and so is its pressure. In the repository,
-        `python -m benchmarks.learned_lung` makes it.
-    - `horizon`: steps an episode, 100 by default.
-    - `**options`: `waveform`, `noise` and others of [`delucax.lung.ventilation`][] and
-        [`delucax.Environment`][].
+    - `model`: a [`delucax.lung.LearnedLung`][] or a [`delucax.lung.LungModel`][]. By
+        default the learned lung that comes with the library, from breaths of the task
+        `lung/double_compartment`; its sensor is two samples late, and so is its
+        pressure. In the repository, `python -m benchmarks.learned_lung` makes it.
+    - `horizon`: steps per episode, 100 by default.
+    - `**options`: `waveform`, `noise`, `limit` and others of
+        [`delucax.lung.ventilation`][] and [`delucax.Environment`][].
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if `model` is another one, or on illegal numbers.
+    **Raises:** `ValueError` if `model` is another one, or on invalid numbers.
 
     Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
     Zajdel, Schottdorf, Cohen and Hazan, 2021.
@@ -234,54 +249,19 @@ def learned_lung(
 
         ```python
         import delucax as dlx
-
-        env = dlx.make("lung/learned_lung")
-        ```
-    """
-    lung: Any = model
-    if model is None:
-        lung = load(Path(__file__).with_name("learned_lung.dlx"))
-    check_instance(lung, LearnedLung, "model", "learned_lung")
-    check_keywords(options, "learned_lung", learned_lung, ventilation, Environment)
-    options.setdefault("rest", lung.resting())
-    return ventilation(lung, horizon=horizon, **options)
-
-
-def lung_environment(
-    model: LearnedLung | LungModel,
-    waveform: BreathWaveform | None = None,
-    *,
-    noise: Any = 0.2,
-    horizon: int = LENGTH,
-    **options: Any,
-) -> Environment:
-    """A task in a fitted lung: where controllers are trained.
-
-    **Arguments:**
-
-    - `model`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][].
-    - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]; the default one by
-        default.
-    - `noise`: the standard deviation of what the sensor adds [cmH2O], 0.2 by default.
-    - `horizon`: steps an episode, 29 by default.
-    - `**options`: other arguments of [`delucax.lung.ventilation`][], such as `limit`.
-
-    **Returns:** an [`delucax.Environment`][].
-
-    **Raises:** `ValueError` if it is no such model, or `waveform` is not a
-    `BreathWaveform`.
-
-    !!! example
-
-        ```python
         from delucax import lung
 
-        env = lung.lung_environment(lung.LungModel(lung.SingleCompartment()))
+        env = dlx.make("lung/learned_lung")
+        fitted = lung.LungModel(lung.SingleCompartment())
+        env = lung.learned_lung(fitted, noise=0.2, horizon=29)
         ```
     """
-    where = "lung_environment"
-    check_keywords(options, where, lung_environment, ventilation, Environment)
+    where = "learned_lung"
+    check_keywords(options, where, learned_lung, ventilation, Environment)
+    if model is None:
+        model = load(Path(__file__).with_name("learned_lung.dlx"))
     if isinstance(model, LungModel):
+        # The task senses before it delays; so it takes what the model delays.
         options |= dict(sensor_delay=model.dynamics.sensor)
         dynamics, rest = model.dynamics.dynamics, model.system.resting(model.peep)
     elif isinstance(model, LearnedLung):
@@ -291,5 +271,5 @@ def lung_environment(
             f"{where}: model must be a LearnedLung or a LungModel, got "
             f"{type(model).__name__}."
         )
-    options.setdefault("rest", rest)
-    return ventilation(dynamics, waveform, noise=noise, horizon=horizon, **options)
+    options.setdefault("resting_state", rest)
+    return ventilation(dynamics, horizon=horizon, **options)

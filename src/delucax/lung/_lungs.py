@@ -72,8 +72,9 @@ class AbstractLung(AbstractSystem):
         return jnp.reshape(self.pressure(x), (1,))
 
 
-class _AbstractCompartment(AbstractLung):
-    """One elastic volume at the end of one resistance, `dV/dt = (p - P(V)) / R`."""
+class _AbstractRigidPipe(AbstractLung):
+    """A lung behind a rigid airway, whose pressure balances the flows of the valves and
+    of the lung. The state begins with the inflow and the opening."""
 
     if TYPE_CHECKING:  # pyright takes an AbstractVar for the first argument
         resistance: ClassVar[Any]
@@ -81,6 +82,18 @@ class _AbstractCompartment(AbstractLung):
     else:
         resistance: eqx.AbstractVar[Array]
         valves: eqx.AbstractVar[Valves]
+
+    @abc.abstractmethod
+    def _inside(self, x: State) -> Array:
+        """The pressure behind the resistance [cmH2O]."""
+
+    def pressure(self, x: State) -> Scalar:
+        inside = self._inside(x)
+        return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
+
+
+class _AbstractCompartment(_AbstractRigidPipe):
+    """One elastic volume at the end of one resistance, `dV/dt = (p - P(V)) / R`."""
 
     state_names: ClassVar = ("inflow", "opening", "volume")
     state_units: ClassVar = ("L/s", "", "L")
@@ -98,17 +111,16 @@ class _AbstractCompartment(AbstractLung):
     def _volume(self, pressure: RealScalar) -> Scalar:
         """The volume at which the elastic pressure is `pressure`."""
 
-    def pressure(self, x: State) -> Scalar:
-        inside = self.elastic_pressure(x[2])
-        return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
+    def _inside(self, x: State) -> Array:
+        return self.elastic_pressure(x[2])
 
     def resting(self, pressure: RealScalar) -> State:
         volume = self._volume(pressure)
         return jnp.stack([0 * volume, 0 * volume, volume])
 
     def vector_field(self, t, x, u, w):
-        inflow, opening = self.valves.slopes(x[0], x[1], u)
-        filling = (self.pressure(x) - self.elastic_pressure(x[2])) / self.resistance
+        inflow, opening = self.valves.derivatives(x[0], x[1], u)
+        filling = (self.pressure(x) - self._inside(x)) / self.resistance
         return jnp.stack([inflow, opening, filling])
 
 
@@ -119,7 +131,7 @@ class SingleCompartment(_AbstractCompartment):
 
     where the pressure `p` of the airway balances the flows of the valves,
     [`delucax.lung.Valves.airway_pressure`][]. The state is (inflow [L/s], opening,
-    volume [L]). Smooth but for an opening of 0.
+    volume [L]). Not smooth at an opening of 0.
 
     With the inspiratory valve held and no way out but a leak `G`, the pressure settles
     at `flow(u_in) / G`; with the expiratory valve open and no leak, at
@@ -159,7 +171,7 @@ class SingleCompartment(_AbstractCompartment):
         return PER_ML * self.compliance * pressure
 
 
-class DoubleCompartment(AbstractLung):
+class DoubleCompartment(_AbstractRigidPipe):
     r"""Two elastic compartments side by side, a fast and a slow one,
 
     `dV_i/dt = (p_c - V_i / C_i) / R_i`, `p_c = p - R_0 (dV_1/dt + dV_2/dt)`.
@@ -167,9 +179,9 @@ class DoubleCompartment(AbstractLung):
     A share of the resistance is central, `R_0 = central R`; the rest is that of both
     ways in parallel, `1 / (1 / R_1 + 1 / R_2) = (1 - central) R`, with
     `R_2 = imbalance R_1`. The compliance is divided as `C_1 = share C` and
-    `C_2 = (1 - share) C`. So a flow that begins meets `R`, and slow breathing `C`. The
-    state is (inflow [L/s], opening, fast [L], slow [L]), the latter two volumes. Smooth
-    but for an opening of 0.
+    `C_2 = (1 - share) C`. So `R` is the resistance at high frequencies, and `C` the
+    static compliance. The state is (inflow [L/s], opening, fast [L], slow [L]), the
+    latter two volumes. Not smooth at an opening of 0.
 
     **Arguments:**
 
@@ -210,8 +222,9 @@ class DoubleCompartment(AbstractLung):
     state_units: ClassVar = ("L/s", "", "L", "L")
 
     def _parts(self, x: State) -> tuple[Array, Array, Array, Array, Array]:
-        """The conductances of both ways, the pressures at their ends, and the pressure
-        of the one compartment that they are to the airway."""
+        """The conductances of both ways, the pressures in both compartments, and the
+        pressure in the equivalent single compartment."""
+        # R_1 and R_2 of `1 / (1 / R_1 + 1 / R_2) = parallel` and `R_2 = imbalance R_1`.
         parallel = (1 - self.central) * self.resistance
         fast = self.imbalance / ((1 + self.imbalance) * parallel)
         slow = 1 / ((1 + self.imbalance) * parallel)
@@ -219,27 +232,26 @@ class DoubleCompartment(AbstractLung):
         p1, p2 = x[2] / (self.share * whole), x[3] / ((1 - self.share) * whole)
         return fast, slow, p1, p2, (fast * p1 + slow * p2) / (fast + slow)
 
-    def pressure(self, x: State) -> Scalar:
-        inside = self._parts(x)[-1]
-        return self.valves.airway_pressure(x[0], x[1], self.resistance, inside)
+    def _inside(self, x: State) -> Array:
+        return self._parts(x)[-1]
 
     def resting(self, pressure: RealScalar) -> State:
         volume = PER_ML * self.compliance * pressure
-        return jnp.stack(
-            [0 * volume, 0 * volume, self.share * volume, (1 - self.share) * volume]
-        )
+        fast, slow = self.share * volume, (1 - self.share) * volume
+        return jnp.stack([0 * volume, 0 * volume, fast, slow])
 
     def vector_field(self, t, x, u, w):
-        inflow, opening = self.valves.slopes(x[0], x[1], u)
+        inflow, opening = self.valves.derivatives(x[0], x[1], u)
         fast, slow, p1, p2, inside = self._parts(x)
         total = (self.pressure(x) - inside) / self.resistance
+        # p_c, where the central resistance ends and both ways begin.
         centre = inside + (1 - self.central) * self.resistance * total
         return jnp.stack([inflow, opening, fast * (centre - p1), slow * (centre - p2)])
 
 
 def balloon_pressure(volume: Array, rest: Array, stiffness: Array) -> Array:
-    """The pressure in a balloon, `stiffness (1 - (r0 / r)^6) / (r0^2 r)`, its radius
-    being that of a sphere of its volume; held below a tenth of the volume at rest."""
+    """The pressure in a balloon, `stiffness (1 - (r0 / r)^6) / (r0^2 r)`, with the
+    radius of a sphere of its volume; constant below a tenth of the volume at rest."""
     # Towards an empty balloon the pressure and its slope go to minus infinity.
     volume = jnp.maximum(volume, 0.1 * rest)
     radius = (3 * volume / (4 * jnp.pi)) ** (1 / 3)
@@ -252,13 +264,10 @@ class BalloonLung(_AbstractCompartment):
 
     `dV/dt = (p - P(V)) / R`, `P(V) = stiffness (1 - (r0 / r)^6) / (r0^2 r)`,
 
-    with `r` and `r0` the radii of spheres of the volumes `V` and `rest`. It is stiff at
-    first, gives way, and past `V = 2.65 rest` the pressure falls as it grows. The state
-    is (inflow [L/s], opening, volume [L]). Smooth where the volume is above a tenth of
-    `rest`, below which the pressure is held, but for an opening of 0.
-
-    For the map of the original Deluca, with its constants, see
-    [`delucax.lung.OriginalBalloonLung`][].
+    with `r` and `r0` the radii of spheres of the volumes `V` and `rest`. The pressure
+    rises, is greatest at `V = 2.65 rest`, and then falls. The state is (inflow [L/s],
+    opening, volume [L]). Not smooth at an opening of 0 and at a tenth of `rest`, below
+    which the pressure is constant.
 
     **Arguments:**
 
@@ -345,12 +354,14 @@ class DelayLung(AbstractLung):
 
     def resting(self, pressure: RealScalar) -> State:
         volume = _stretched(self.rest, self.stiffness, pressure)
+        # `0 * volume` is a zero of its dtype and shape, whatever `pressure` is.
         return jnp.stack([0 * volume, 0 * volume, pressure + 0 * volume, volume])
 
     def vector_field(self, t, x, u, w):
-        inflow, opening = self.valves.slopes(x[0], x[1], u)
+        inflow, opening = self.valves.derivatives(x[0], x[1], u)
         inside = balloon_pressure(x[3], self.rest, self.stiffness)
         filling = (x[2] - inside) / self.resistance
+        # The pipe stores air, so its pressure is a state, and no balance is solved.
         outflow = self.valves.outflow(x[1], x[2])
         rise = (x[0] - filling - outflow) / (PER_ML * self.pipe)
         return jnp.stack([inflow, opening, rise, filling])

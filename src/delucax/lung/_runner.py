@@ -1,4 +1,4 @@
-"""A controller at a ventilator, simulated or real, one step after the other."""
+"""The real-time loop of a controller and a ventilator, simulated or physical."""
 
 import abc
 import time
@@ -17,7 +17,7 @@ from ..environments import Environment
 
 
 ABORT = 60.0
-"""The pressure at which a run is given up [cmH2O]."""
+"""The pressure at which a run is aborted [cmH2O]."""
 
 
 _step = eqx.filter_jit(Environment.step)
@@ -29,7 +29,7 @@ _applied = eqx.filter_jit(
 
 @runtime_checkable
 class Runner(Protocol):
-    """What [`delucax.lung.run_breaths`][] needs of a ventilator.
+    """The interface of a ventilator for [`delucax.lung.run_breaths`][].
 
     Write one for a machine: none of it needs JAX, and any of it may block or raise.
 
@@ -67,7 +67,7 @@ class Runner(Protocol):
 
     @abc.abstractmethod
     def should_abort(self, pressure: float) -> bool:
-        """Whether to give the run up.
+        """Whether to abort the run.
 
         **Arguments:** `pressure`: what was read last [cmH2O].
         """
@@ -84,7 +84,7 @@ class SimulatedRunner:
 
     - `environment`: a task of a lung.
     - `key`: a random key, for the noise of the sensor.
-    - `abort`: the pressure at which the run is given up [cmH2O], 60 by default.
+    - `abort`: the pressure at which the run is aborted [cmH2O], 60 by default.
     - `real_time`: whether `wait` waits, as at a machine; false by default.
 
     **Raises:** `ValueError` if it is no task of a lung, or `abort` is not positive.
@@ -152,7 +152,7 @@ class SimulatedRunner:
     def wait(self) -> None:
         """Let one step go by."""
         if self.real_time:
-            # What was missed is not caught up with: no step is shorter than it should.
+            # A missed deadline is not made up for: no step is shorter than `dt`.
             self._due = max(self._due + self.dt, time.perf_counter())
             time.sleep(max(0.0, self._due - time.perf_counter()))
         self.state = self._advanced()
@@ -182,23 +182,13 @@ class SimulatedRunner:
 
 
 class Recording(NamedTuple):
-    """What a run at a ventilator leaves behind, in NumPy arrays.
+    """The record of a run at a ventilator, in NumPy arrays.
 
     **Attributes:**
 
-    - `times` [s], `pressure` [cmH2O], `u_in` [%], `u_out`: an entry a step.
-    - `aborted`: whether the run was given up; the last entry is then the reading that
+    - `times` [s], `pressure` [cmH2O], `u_in` [%], `u_out`: an entry per step.
+    - `aborted`: whether the run was aborted; the last entry is then the reading that
         was too high, and the controls of the clean-up.
-
-    !!! example
-
-        ```python
-        import numpy as np
-        from delucax.lung import Recording
-
-        empty = np.zeros(0)
-        recording = Recording(empty, empty, empty, empty, aborted=False)
-        ```
     """
 
     times: np.ndarray
@@ -219,7 +209,7 @@ def run_breaths(
 
     Each step: read the pressure; stop if `runner.should_abort` is true; ask the
     controller; set the valves; wait. At the end, and also after an error in any of it
-    or an interruption, `runner.cleanup()` is called, and the error goes on.
+    or an interruption, `runner.cleanup()` is called, and the error is raised again.
 
     **Arguments:**
 
@@ -228,7 +218,10 @@ def run_breaths(
     - `steps`: 100 by default.
     - `key`: a random key for the controller; none by default.
 
-    **Returns:** a [`delucax.lung.Recording`][].
+    **Returns:** a named tuple of NumPy arrays with an entry per step, `times` [s],
+        `pressure` [cmH2O], `u_in` [%] and `u_out`; and `aborted`: whether the run
+        was aborted. The last entry is then the reading that was too high, and the
+        controls of the clean-up.
 
     **Raises:** `ValueError` if what is given is no runner or no controller, or a
         control is not finite.

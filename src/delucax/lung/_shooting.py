@@ -1,7 +1,7 @@
 """Controls of a breath by gradient descent through a lung."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,21 +15,16 @@ from .._module import parameter, positive
 from ..environments import Environment
 from ._learned_lung import LearnedLung
 from ._ventilation import waveform_of
-from ._waveform import as_pips, at_pip, BreathWaveform, check_waveform, LENGTH, PIPS
-
-
-class _Shooting(NamedTuple):
-    lung: Array
-    plan: Array
+from ._waveform import as_pips, BreathWaveform, check_waveform, LENGTH, PIPS
 
 
 class ShootingMPC(AbstractController):
     r"""Plans the next controls in a learned lung, at every step anew.
 
-    The learned lung runs beside the true one under the same controls, and is drawn to
-    what the sensor reads. The plan is improved by some steps of Adam on the error to
-    the target, and its first control is used. With `u = 100 sigmoid(z)` it keeps the
-    bounds of the valve.
+    The learned lung runs beside the true one under the same controls, and its pressure
+    is corrected towards the measured one by a fixed gain. The plan is improved by some
+    steps of Adam on the error to the target, and its first control is applied. With
+    `u = 100 sigmoid(z)` it keeps the bounds of the valve.
 
     **Arguments:**
 
@@ -76,11 +71,12 @@ class ShootingMPC(AbstractController):
 
     def init(self, *, key=None):
         lung = self.model.resting()
-        return _Shooting(lung, jnp.full(self.horizon, -2.0, lung.dtype))
+        return lung, jnp.full(self.horizon, -2.0, lung.dtype)
 
     def __call__(self, t, y, state):
-        model = self.model
-        lung = model.corrected(state.lung, y[0], 1 - self.memory)
+        model, (predicted, plan) = self.model, state
+        # An observer with a fixed gain.
+        lung = model.corrected(predicted, y[0], 1 - self.memory)
         ahead = t + model.dt * jnp.arange(1, self.horizon + 1)
         target = self.waveform.pressure(ahead)
 
@@ -91,36 +87,37 @@ class ShootingMPC(AbstractController):
 
             return jnp.mean(jnp.abs(jax.lax.scan(body, lung, plan)[1] - target))
 
-        start = jnp.append(state.plan[1:], state.plan[-1])
+        # Begins at the plan of the step before, whose first control has been used.
+        start = jnp.append(plan[1:], plan[-1])
         optimiser = optax.adam(self.learning_rate)
         plan, _ = _descended(error, start, optimiser, self.iterations)
-        return _controls(plan[0])[:1].astype(y.dtype), _Shooting(lung, plan)
+        return _controls(plan[0])[:1].astype(y.dtype), (lung, plan)
 
     def applied(self, u, cost, state):
+        lung, plan = state
         u = jnp.stack([u[0], jnp.zeros_like(u[0])])
-        lung, _ = self.model.advance(0.0, state.lung, u, None)
-        return state._replace(lung=lung)
+        return self.model.advance(0.0, lung, u, None)[0], plan
 
 
 def least_error(
     env: Environment, *, pips: Any = PIPS, steps: int = 600, horizon: int = LENGTH
 ) -> Array:
-    """About the least error that any control of the inspiratory valve could have.
+    """Estimate the least error that any control of the inspiratory valve can reach.
 
-    The controls of each breath are chosen by gradient descent with the true lung at
-    hand, nothing to measure and no noise: what a controller that is right from the
-    start would reach, to the accuracy of the descent.
+    The controls of each breath are found by gradient descent with full knowledge of the
+    true lung and without noise: a bound on all controllers, to the accuracy of the
+    descent.
 
     **Arguments:**
 
     - `env`: a task of a lung.
     - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
     - `steps`: of the descent, 600 by default.
-    - `horizon`: steps an episode, 29 by default.
+    - `horizon`: steps per episode, 29 by default.
 
     **Returns:** the mean error at each of the pressures, shape `(pips,)` [cmH2O].
 
-    **Raises:** `ValueError` if the arguments are illegal (a peak pressure below PEEP,
+    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
     say).
 
     !!! example
@@ -140,10 +137,11 @@ def least_error(
     optimiser = optax.adam(optax.cosine_decay_schedule(0.3, steps))
 
     def of(pip):
-        world = at_pip(env, pip)
+        world = BreathWaveform.at_pip(env, pip)
         x0: Any = world.initial_state
 
         def error(z):
+            # Kept for the gradient are the states alone, not what a step computes.
             @jax.checkpoint
             def body(x, inputs):
                 k, z = inputs
@@ -153,8 +151,8 @@ def least_error(
             _, costs = jax.lax.scan(body, x0, (jnp.arange(horizon), z))
             return jnp.mean(costs)
 
-        z = jnp.full(horizon, -1.0)
-        _, errors = _descended(error, z, optimiser, steps)
+        _, errors = _descended(error, jnp.full(horizon, -1.0), optimiser, steps)
+        # The best visited, because Adam does not descend at every step.
         return jnp.min(errors, initial=jnp.inf)
 
     return eqx.filter_jit(jax.vmap(of))(pips)
@@ -171,7 +169,7 @@ def _descended(
     optimiser: optax.GradientTransformation,
     steps: int,
 ) -> tuple[Array, Array]:
-    """Where gradient descent ends, and the error before each of its steps."""
+    """The end of a gradient descent, and the error before each of its steps."""
 
     def descend(carry, _):
         z, memory = carry

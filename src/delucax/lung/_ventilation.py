@@ -33,7 +33,7 @@ class Valves(eqx.Module):
     `expiratory_lag d(opening)/dt = u_out - opening`.
 
     Out goes `max(opening, 0) (p - peep) / expiratory_resistance`, and through a leak
-    `leak p`. Smooth but for an opening of 0, which the lag approaches and does not
+    `leak p`. Not smooth at an opening of 0, which the lag approaches and does not
     cross.
 
     **Arguments:**
@@ -74,18 +74,21 @@ class Valves(eqx.Module):
         check_range(self.leak, "leak", "Valves")
 
     def flow(self, u_in: Any) -> Array:
-        """What the inspiratory valve settles at.
+        """The steady flow of the inspiratory valve.
 
         **Arguments:** `u_in`: its opening [%].
 
         **Returns:** the flow [L/s], of the shape of `u_in`.
         """
         curve = lambda u: jax.nn.sigmoid(self.steepness * (u - self.midpoint))  # noqa: E731
+        # A sigmoid is neither 0 when closed nor 1 when open: shifted and scaled.
         closed = curve(0.0)
         return self.max_flow * (curve(u_in) - closed) / (curve(100.0) - closed)
 
-    def slopes(self, inflow: Array, opening: Array, u: Array) -> tuple[Array, Array]:
-        """How fast both valves move.
+    def derivatives(
+        self, inflow: Array, opening: Array, u: Array
+    ) -> tuple[Array, Array]:
+        """The time derivatives of the inflow and of the expiratory opening.
 
         **Arguments:**
 
@@ -115,12 +118,13 @@ class Valves(eqx.Module):
 
         **Returns:** `p` [cmH2O].
         """
+        # Linear in p, so that no iteration is needed within a step of the solver.
         out = self._conductance(opening)
         flows = inflow + pressure / resistance + out * self.peep
         return flows / (1 / resistance + out + self.leak)
 
     def outflow(self, opening: Array, pressure: Array) -> Array:
-        """What goes out by the expiratory valve and the leak.
+        """The flow out through the expiratory valve and the leak.
 
         **Arguments:**
 
@@ -133,8 +137,10 @@ class Valves(eqx.Module):
         return jnp.asarray(out + self.leak * pressure)
 
     def _conductance(self, opening: Array) -> Array:
-        """Of the expiratory valve. A solver may look at an opening below 0, where the
-        balance of the flows would be singular; the slope at 0 is that to the right."""
+        """The conductance of the expiratory valve."""
+        # A stage of a solver may evaluate an opening below 0, where the balance of the
+        # flows would be singular. `where`, unlike `maximum`, has the right-hand
+        # derivative at 0 itself.
         return jnp.where(opening < 0, 0, opening) / self.expiratory_resistance
 
 
@@ -208,17 +214,17 @@ class PressureSensor(AbstractWrapper):
 
 
 class BreathCost(AbstractCost):
-    r"""How far the pressure is from the target, `weight |p - r(t)|`.
+    r"""The weighted absolute error of the pressure, `weight |p - r(t)|`.
 
-    The weight is 1 in the inspiratory phase and `expiration` in the other. With a limit
-    each cmH2O above it costs ten more, as an alarm is worse than an error. Not smooth
-    on the target, and at the limit.
+    The weight is 1 in the inspiratory phase and `expiration_weight` in the other. With
+    a limit each cmH2O above it costs ten more, as an alarm is worse than an error. Not
+    smooth on the target, and at the limit.
 
     **Arguments:**
 
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][].
     - `index`: the place of the pressure in the state.
-    - `expiration`: 0 by default.
+    - `expiration_weight`: 0 by default.
     - `limit`: a pressure [cmH2O]; none by default.
 
     **Raises:** `ValueError` if `waveform` is not a `BreathWaveform`, or the limit is
@@ -237,7 +243,7 @@ class BreathCost(AbstractCost):
 
     waveform: BreathWaveform
     index: int = eqx.field(static=True)
-    expiration: Array = parameter(0.0)
+    expiration_weight: Array = parameter(0.0)
     limit: Array | None = parameter(None)
 
     def __check_init__(self):
@@ -248,7 +254,7 @@ class BreathCost(AbstractCost):
     def __call__(self, t: RealScalar, x: State, u: Control) -> Scalar:
         pressure = x[self.index]
         error = jnp.abs(pressure - self.waveform.pressure(t))
-        weight = jnp.where(self.waveform.is_inspiration(t), 1, self.expiration)
+        weight = jnp.where(self.waveform.is_inspiration(t), 1, self.expiration_weight)
         cost = weight * error
         if self.limit is not None:
             cost = cost + 10 * jnp.maximum(pressure - self.limit, 0)
@@ -260,10 +266,10 @@ def ventilation(
     /,
     waveform: BreathWaveform | None = None,
     *,
-    rest: ArrayLike | None = None,
+    resting_state: ArrayLike | None = None,
     sensor_delay: int = 0,
     noise: Any = 0.0,
-    expiration: Any = 0.0,
+    expiration_weight: Any = 0.0,
     limit: Any = None,
     horizon: int = 100,
     **options: Any,
@@ -281,17 +287,17 @@ def ventilation(
         controls (u_in, u_out).
     - `waveform`: the target, a [`delucax.lung.BreathWaveform`][]; up to 35 cmH2O, 20
         times a minute, by default.
-    - `rest`: the first state of the dynamics; zero by default.
+    - `resting_state`: the first state of the dynamics; zero by default.
     - `sensor_delay`: steps until a pressure is observed, 0 by default.
     - `noise`: the standard deviation of what the sensor adds [cmH2O], 0 by default.
-    - `expiration`, `limit`: of the cost; 0 and none by default.
-    - `horizon`: steps an episode, 100 by default.
+    - `expiration_weight`, `limit`: of the cost; 0 and none by default.
+    - `horizon`: steps per episode, 100 by default.
     - `**options`: other arguments of [`delucax.Environment`][], which hold instead of
         those of the task.
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` on illegal numbers, or if `waveform` is not a
+    **Raises:** `ValueError` on invalid numbers, or if `waveform` is not a
     `BreathWaveform`.
 
     !!! example
@@ -302,25 +308,26 @@ def ventilation(
 
         plant = lung.SingleCompartment(resistance=5.0)
         dynamics = dlx.Discretized(plant, dt=0.03)
-        env = lung.ventilation(dynamics, rest=plant.resting(5.0), noise=0.2)
+        env = lung.ventilation(dynamics, resting_state=plant.resting(5.0), noise=0.2)
         ```
     """
     where = "ventilation"
     check_keywords(options, where, ventilation, Environment)
     check_range(noise, "noise", where)
-    check_range(expiration, "expiration", where)
+    check_range(expiration_weight, "expiration_weight", where)
     delay = check_count(sensor_delay, "sensor_delay", where, least=0)
     waveform = BreathWaveform() if waveform is None else waveform
-    rest = jnp.zeros(dynamics.state_size) if rest is None else rest
+    rest = jnp.zeros(dynamics.state_size) if resting_state is None else resting_state
     sensor = sensed = PressureSensor(dynamics)
     initial_state = sensor.filled(rest)
     if delay:
         sensed = Delayed(sensor, sensor=delay)
         initial_state = sensed.filled(initial_state)
+    # The value of a traced or batched noise cannot be inspected: it is kept.
     silent = isinstance(noise, int | float) and noise == 0
     fields: dict[str, Any] = dict(
         dynamics=sensed,
-        cost=BreathCost(waveform, dynamics.state_size, expiration, limit),
+        cost=BreathCost(waveform, dynamics.state_size, expiration_weight, limit),
         sensor_noise=None if silent else Gaussian(noise, size=1),
         initial_state=initial_state,
         control_bounds=(jnp.zeros(2), jnp.array([100.0, 1.0])),

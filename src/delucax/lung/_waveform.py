@@ -1,4 +1,4 @@
-"""The pressure that a clinician asks for, breath by breath."""
+"""The target waveform of the airway pressure."""
 
 from typing import Any, TypeVar
 
@@ -40,9 +40,9 @@ class BreathWaveform(eqx.Module):
     **Arguments:**
 
     - `pip`: the peak inspiratory pressure [cmH2O], 35 by default.
-    - `peep`: the positive end-expiratory pressure [cmH2O], 5 by default. It is what is
-        asked for; what a lung is let out to is the `peep` of its
-        [`delucax.lung.Valves`][], so that whoever changes one changes both.
+    - `peep`: the positive end-expiratory pressure [cmH2O], 5 by default. This is the
+        target; the pressure that a lung exhales to is the `peep` of its
+        [`delucax.lung.Valves`][]. Change both together.
     - `rate`: breaths a minute, 20 by default.
     - `keypoints`: shares of a period, increasing, from 0 to 1; `(0, 1/3, 1/2, 1)` by
         default. The pressure may jump from the end of a breath to the next one.
@@ -108,7 +108,7 @@ class BreathWaveform(eqx.Module):
         return 60 / self.rate
 
     def share(self, t: Any) -> Array:
-        """How much of its breath has gone by at time `t`, from 0 to 1.
+        """The elapsed share of the breath at time `t`, from 0 to 1.
 
         **Arguments:** `t`: time [s].
 
@@ -116,6 +116,7 @@ class BreathWaveform(eqx.Module):
         counts as its beginning.
         """
         breaths = as_float_array(t) / self.period
+        # `mod` would give almost 1 where rounding puts `k dt` just before a breath.
         return jnp.maximum(breaths - jnp.floor(breaths + _slack(breaths)), 0)
 
     def is_inspiration(self, t: Any) -> Array:
@@ -142,9 +143,47 @@ class BreathWaveform(eqx.Module):
         """The target pressure at time `t`, shape `(1,)`."""
         return jnp.atleast_1d(self.pressure(t))
 
+    @staticmethod
+    def at_pip(tree: _T, pip: Any) -> _T:
+        """A copy of a pytree in which every breath waveform has that peak pressure.
+
+        An environment and its controller each hold the waveform; under `jax.vmap` this
+        makes a batch of both over several pressures, which compiles once.
+
+        **Arguments:**
+
+        - `tree`: a waveform, an environment, a controller, or a tuple of them.
+        - `pip`: the peak inspiratory pressure [cmH2O].
+
+        **Returns:** the copy.
+
+        **Raises:** `ValueError` if there is no waveform in it, or `pip` is below PEEP.
+
+        !!! example
+
+            ```python
+            import delucax as dlx
+            from delucax.lung import BreathWaveform
+
+            env = BreathWaveform.at_pip(dlx.make("lung/single_compartment"), 20.0)
+            ```
+        """
+        pip = as_float_array(pip)
+        if not eqx.is_inexact_array(pip):
+            raise ValueError(f"at_pip: pip must be a number, got {pip!r}.")
+        waveforms = lambda tree: parts_of((tree,), BreathWaveform)
+        every = waveforms(tree)
+        if not every:
+            name = type(tree).__name__
+            raise ValueError(f"at_pip: there is no BreathWaveform in the {name}.")
+        for waveform in every:
+            _check_pip(pip, waveform.peep, "pip", "at_pip")
+        pips = lambda tree: [waveform.pip for waveform in waveforms(tree)]
+        return eqx.tree_at(pips, tree, [pip] * len(every))
+
 
 def _slack(breaths: Array) -> Array:
-    """Of a period: by how much rounding of `k dt` may be off after so many breaths."""
+    """A bound on the rounding error of `k dt` after so many breaths, in periods."""
     eps = jnp.finfo(breaths.dtype).eps
     return jnp.clip(2 * eps * jnp.abs(breaths), 1e-6, 1e-3)
 
@@ -154,39 +193,21 @@ def check_waveform(waveform: Any, where: str) -> None:
     check_instance(waveform, BreathWaveform, "waveform", where)
 
 
-def check_peep(waveform: BreathWaveform, valves: Any, where: str) -> None:
-    """Raise if the PEEP of a waveform is below what the valves let a lung out to, if
-    their values are known."""
-    asked, least = waveform.peep, valves.peep
-    if is_concrete(asked) and is_concrete(least):
-        # Numbers of another precision may differ by their rounding.
-        if np.any(np.asarray(asked) < np.asarray(least) - 1e-3):
-            raise ValueError(
-                f"{where}: the peep of waveform must be at least that of valves, "
-                f"{least}, below which no lung empties, got {asked}. Give both."
-            )
-
-
 def as_pips(pips: Any, tree: Any, where: str) -> Array:
-    """`pips` as a vector of peak pressures, or an error: none may be below the PEEP of
-    a waveform in a pytree.
+    """`pips` as a vector of peak pressures, none of them below the PEEP of a waveform
+    in a pytree.
 
-    Under `jax.vmap` over them, which is what they are for, they could not be looked at.
+    They are mapped over with `jax.vmap`, inside which their values cannot be checked.
     """
     array = as_float_array(pips)
     if not eqx.is_inexact_array(array) or array.ndim != 1 or not array.size:
         got = f"shape {array.shape}" if eqx.is_array(array) else shortened(pips)
         raise ValueError(f"{where}: pips must be a vector of pressures, got {got}.")
     check_real(array, "pips", where)
-    for waveform in _waveforms(tree):
+    for waveform in parts_of((tree,), BreathWaveform):
         if is_concrete(waveform.peep):
             _check_pip(array, np.max(np.asarray(waveform.peep)), "pips", where)
     return jnp.asarray(array, float)
-
-
-def _waveforms(tree: Any) -> list[BreathWaveform]:
-    """The breath waveforms in a pytree."""
-    return parts_of((tree,), BreathWaveform)
 
 
 def _check_pip(pip: Array, peep: Any, name: str, where: str) -> None:
@@ -197,42 +218,3 @@ def _check_pip(pip: Array, peep: Any, name: str, where: str) -> None:
             raise ValueError(
                 f"{where}: {name} must be at least peep = {peep}, got {pip}."
             )
-
-
-def at_pip(tree: _T, pip: Any) -> _T:
-    """A copy in which every breath waveform has that peak pressure.
-
-    An environment and its controller each hold the waveform; under `jax.vmap` this
-    makes a batch of both over several pressures, which compiles once.
-
-    **Arguments:**
-
-    - `tree`: any pytree: an environment, a controller, or both.
-    - `pip`: the peak inspiratory pressure [cmH2O].
-
-    **Returns:** the copy.
-
-    **Raises:** `ValueError` if there is no [`delucax.lung.BreathWaveform`][] in it, or
-    `pip` is below PEEP.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        from delucax import lung
-
-        env = lung.at_pip(dlx.make("lung/single_compartment"), 20.0)
-        ```
-    """
-    pip = as_float_array(pip)
-    if not eqx.is_inexact_array(pip):
-        raise ValueError(f"at_pip: pip must be a number, got {pip!r}.")
-    waveforms = _waveforms(tree)
-    if not waveforms:
-        raise ValueError(
-            f"at_pip: there is no BreathWaveform in the {type(tree).__name__}."
-        )
-    for waveform in waveforms:
-        _check_pip(pip, waveform.peep, "pip", "at_pip")
-    pips = [pip] * len(waveforms)
-    return eqx.tree_at(lambda tree: [w.pip for w in _waveforms(tree)], tree, pips)

@@ -1,7 +1,5 @@
-"""Numerics that users' own systems need too."""
+"""Numerical helpers for vector fields and costs: fast, with safe derivatives."""
 
-from ._angles import wrap as wrap
-from ._clip import clip as clip
-from ._norms import safe_norm as safe_norm
+from ._angles import cos as cos, sin as sin, wrap as wrap
+from ._norms import clip as clip, safe_norm as safe_norm
 from ._small import matvec as matvec, quadratic_form as quadratic_form
-from ._trig import cos as cos, sin as sin

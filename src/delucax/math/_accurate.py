@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._size import power_of_two
+from ._norms import power_of_two
 
 
 _SMALL = 2**15
-"""Of products of numbers. Up to here one loop over the sums, which XLA compiles in half
-the time, is as fast as many products of matrices."""
+"""Up to so many scalar products one loop over the sums, which XLA compiles in half the
+time, is as fast as several matrix products."""
 _PARTS = 8
 _LONG = 64
 
@@ -21,19 +21,19 @@ _LONG = 64
 def product(
     left: Float[Array, "n k"], right: Float[Array, "k m"], *added: Float[Array, "n m"]
 ) -> tuple[Float[Array, "n m"], Float[Array, "n m"]]:
-    """The product of two matrices and what is added to it, and by how much its entries
-    may be wrong.
+    """The product of two matrices plus the `added` ones, and entrywise error bounds.
 
-    Where terms cancel, what is left has digits too. The bound counts all rounding, but
-    no underflow.
+    It is accurate even under cancellation. The bounds count all rounding, but no
+    underflow.
     """
+    # Static sizes decide: one of the two is compiled.
     if left.size * right.shape[1] > _SMALL:
         return _by_slices(left, right, *added)
     return _term_by_term(left, right, *added)
 
 
 def _term_by_term(left, right, *added):
-    """Each product in parts that have no rounding, and each sum with its error.
+    """By exact parts of each product, and the rounding error of each sum.
 
     Source: Ogita, Rump and Oishi, 2005.
     """
@@ -62,9 +62,9 @@ def _term_by_term(left, right, *added):
 
 
 def _by_slices(left, right, *added):
-    """From each factor slices are cut, of so few bits that their products are exact, in
-    any order of summation and with fused operations; what remains of the factors is
-    small, and so is the rounding of its products. These are added last.
+    """By slices of the factors of so few bits that their products are exact, in any
+    order of summation and with fused operations. The remainders of the factors are
+    small, and so is the rounding of their products, which are added last.
 
     Source: Ozaki, Ogita, Oishi and Rump, 2012.
     """
@@ -72,15 +72,16 @@ def _by_slices(left, right, *added):
     eps, digits = jnp.finfo(dtype).eps, jnp.finfo(dtype).nmant + 1
     count = 1 if digits > 50 else 2
     bits = int((digits - math.log2(count * k)) / 2)
+    # k products of two slices of so many bits sum up without rounding.
     both = jnp.concatenate([left, right.T])
-    # In units in which the k-th column and the k-th row are alike.
+    # Scaled so that the k-th column and the k-th row have like size.
     across, down = (jnp.max(jnp.abs(M), axis=0) for M in (both[:n], both[n:]))
     unit = power_of_two(jnp.sqrt(down) / jnp.sqrt(jnp.where(across > 0, across, 1)))
     unit = jnp.where(unit > 0, unit, 1)
     both *= jnp.where(np.arange(n + m)[:, None] < n, unit, 1 / unit)
     power = power_of_two(jnp.max(jnp.abs(both), axis=1, keepdims=True))
     power = lax.max(power, jnp.finfo(dtype).tiny)
-    # Entries as multiples of ever smaller steps, what each adds, and what is left.
+    # Entries rounded to ever smaller steps, the slices between, and the remainders.
     step = 2.0 ** (bits * np.arange(1, count + 1)[:, None, None] - 2)
     step = step.astype(dtype)
     whole = power * (jnp.round(both / power * step) / step)
@@ -104,14 +105,14 @@ def _by_slices(left, right, *added):
     return total, lost + eps * jnp.abs(total)
 
 
-def in_parts(
+def product_in_parts(
     left: Float[Array, "n k"], right: Float[Array, "k m"]
 ) -> tuple[Float[Array, "n m"], int]:
-    """The product of two matrices, and by how many units of rounding of the product of
-    their absolute values it may be wrong.
+    """The product of two matrices, and its error bound, in units of rounding of the
+    product of their absolute values.
 
-    A sum of k products is wrong by at most k units, in any order; a long one less in
-    parts.
+    The error of a sum of k products is at most k units, in any order; summation in
+    parts reduces it for a long sum.
 
     Source: Higham, 2002, sections 3.1 and 4.2; Jeannerod and Rump, 2013.
     """
@@ -131,14 +132,14 @@ def in_parts(
 
 
 def _sum(a: Array, b: Array) -> tuple[Array, Array]:
-    """`a + b`, and what rounding left out of it."""
+    """`a + b`, and its rounding error (Knuth's two-sum)."""
     total = a + b
     part = total - a
     return total, (a - (total - part)) + (b - part)
 
 
 def _halves(x: Array) -> tuple[Array, Array]:
-    """Two numbers of half the digits, whose sum it is."""
+    """`x` as the sum of two numbers of half the digits (Dekker's splitting)."""
     info = jnp.finfo(x.dtype)
     high = lax.reduce_precision(x, info.nexp, (info.nmant + 1) // 2 - 1)
     return high, x - high

@@ -1,8 +1,30 @@
-"""Angles on the circle."""
+"""Angles: wrapping, and a sine and a cosine that XLA vectorises on CPU.
 
+In float32, XLA calls a scalar routine for every sine on CPU, which costs more than the
+rest of a simulation step. These are a Cody-Waite range reduction and an odd polynomial
+in plain `jax.numpy`, so that a batch runs in vector registers. In other precisions, and
+for complex or integer input, they are `jnp.sin` and `jnp.cos`.
+
+Cody and Waite, "Software Manual for the Elementary Functions", 1980.
+"""
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
+
+
+# pi in four parts, each with so few bits that its product with a whole number up to
+# about 12,000 is exact in float32.
+_PI = (3.140625, 0.0009670257568359375, 6.2771141529083251953e-07, 1.21542e-10)
+# Minimax polynomial of sin(r) on |r| <= pi/2, odd powers from 3; largest error 6e-9
+# before rounding.
+_SIN = (
+    -0.166666597127914428710938,
+    0.00833307858556509017944336,
+    -0.0001981069071916863322258,
+    2.6083159809786593541503e-06,
+)
 
 
 def wrap(angle: ArrayLike) -> Array:
@@ -29,3 +51,87 @@ def wrap(angle: ArrayLike) -> Array:
     """
     angle = jnp.asarray(angle)
     return angle - (2 * np.pi) * jnp.round(angle * (1 / (2 * np.pi)))
+
+
+def _sine(x: Array, halves: Array, odd: Array) -> Array:
+    """`sin(x - halves pi / 2)` to float32 accuracy, negated where `odd`."""
+    # Part by part: no digit of x cancels before the small parts are subtracted.
+    r = x
+    for part in _PI:
+        r = r - halves * np.float32(part / 2)
+    s = r * r
+    p = np.float32(_SIN[3])
+    for c in (_SIN[2], _SIN[1], _SIN[0]):
+        p = p * s + np.float32(c)
+    # The leading term last: it is exact, and what is added to it is small.
+    p = r + r * (s * p)
+    return jnp.where(odd != 0, -p, p)
+
+
+@jax.custom_jvp
+def _sin32(x: Array) -> Array:
+    # The nearest multiple of pi: sin(x) = +/- sin(x - quotient pi).
+    quotient = jnp.round(x * np.float32(1 / np.pi))
+    return _sine(x, 2 * quotient, quotient.astype(jnp.int32) & 1)
+
+
+@jax.custom_jvp
+def _cos32(x: Array) -> Array:
+    # The nearest odd multiple of pi / 2: cos(x) = -/+ sin(x - halves pi / 2).
+    quotient = jnp.floor(x * np.float32(1 / np.pi))
+    return _sine(x, 2 * quotient + 1, 1 - (quotient.astype(jnp.int32) & 1))
+
+
+# By hand: the derivative of the range reduction would be that of a rounding, zero.
+_sin32.defjvp(lambda p, t: (_sin32(*p), _cos32(*p) * t[0]))
+_cos32.defjvp(lambda p, t: (_cos32(*p), -_sin32(*p) * t[0]))
+
+
+def sin(x: ArrayLike) -> Array:
+    """The sine, vectorised on CPU in float32.
+
+    **Arguments:**
+
+    - `x`: angles in radians, any shape. In float32 the absolute error is at most 1.5e-7
+        for `|x|` up to 1e4, and grows with `|x|` beyond; other precisions use
+        `jnp.sin`.
+
+    **Returns:** the sine, of the shape and dtype of `x`. Differentiable to any order.
+
+    Source: Cody and Waite, 1980.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.math.sin(jnp.linspace(0.0, 3.0, 4))
+        ```
+    """
+    x = jnp.asarray(x)
+    return _sin32(x) if x.dtype == jnp.float32 else jnp.sin(x)
+
+
+def cos(x: ArrayLike) -> Array:
+    """The cosine, vectorised on CPU in float32.
+
+    **Arguments:**
+
+    - `x`: angles in radians, any shape; accuracy as [`delucax.math.sin`][].
+
+    **Returns:** the cosine, of the shape and dtype of `x`. Differentiable to any order.
+
+    Source: Cody and Waite, 1980.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.math.cos(jnp.linspace(0.0, 3.0, 4))
+        ```
+    """
+    x = jnp.asarray(x)
+    return _cos32(x) if x.dtype == jnp.float32 else jnp.cos(x)

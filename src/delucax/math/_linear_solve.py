@@ -1,4 +1,4 @@
-"""Linear solves: one door, with eliminations written out for small matrices."""
+"""Linear solves, with unrolled elimination for small matrices."""
 
 import functools
 from collections.abc import Callable
@@ -8,7 +8,9 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float, Inexact
+from jaxtyping import Array, Float, Inexact
+
+from .._typing import BoolScalar, Square
 
 
 SMALL = 5
@@ -33,9 +35,7 @@ def full_precision(function: Callable) -> Callable:
     return wrapped
 
 
-def solve(
-    matrix: Float[Array, "n n"], right: Float[Array, "n k"]
-) -> Float[Array, "n k"]:
+def solve(matrix: Square, right: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """`matrix^-1 right`; not finite where `matrix` is singular."""
     return factorised(matrix)(right)
 
@@ -53,6 +53,7 @@ def factorised(
     """
     if solver is None:
         solver = _Elimination() if matrix.shape[0] <= SMALL else lx.LU()
+    # The state is computed once. Lineax differentiates the solve, not the elimination.
     operator = lx.MatrixLinearOperator(matrix, tags)
     state = solver.init(operator, {})
 
@@ -65,8 +66,8 @@ def factorised(
 class _Elimination(lx.AbstractLinearSolver):
     """Gaussian elimination with partial pivoting, unrolled, for a matrix and a vector.
 
-    Rows are exchanged by selects, not by indexing, so that each member of a batch has
-    its own pivots at no cost in gathers.
+    Rows are exchanged by selects instead of gathers, which vectorise under `jax.vmap`
+    although each member of a batch has its own pivots.
     """
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
@@ -79,6 +80,7 @@ class _Elimination(lx.AbstractLinearSolver):
         _, (rows, pivots) = state
         n = len(rows)
         x = [vector[i] for i in range(n)]
+        # The row exchanges, then forward and backward substitution.
         for k in range(n):
             chosen = x[k]
             for i in range(k + 1, n):
@@ -89,7 +91,7 @@ class _Elimination(lx.AbstractLinearSolver):
         for k in range(n):
             for i in range(k + 1, n):
                 x[i] = x[i] - rows[i][k] * x[k]
-        x = _apart(x)
+        x = _materialised(x)
         for i in reversed(range(n)):
             for j in range(i + 1, n):
                 x[i] = x[i] - rows[i][j] * x[j]
@@ -109,9 +111,9 @@ class _Elimination(lx.AbstractLinearSolver):
         return True
 
 
-def _apart(tree):
-    """The same values, made before they are used: compilers that fuse all that follows
-    into one loop make them again for each use, and their number doubles with each
+def _materialised(tree):
+    """The same values, materialised before use: a compiler that fuses the whole
+    elimination recomputes them for each use, and their number doubles with each
     pivot."""
     return lax.optimization_barrier(tree)
 
@@ -122,13 +124,14 @@ def _factor(matrix):
     rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
     pivots = []
     for k in range(n):
+        # The pivot is the largest entry of the column: a comparison for each row.
         best, pivot = jnp.abs(rows[k][k]), jnp.asarray(k)
         for i in range(k + 1, n):
             size = jnp.abs(rows[i][k])
             larger = size > best
             best = lax.select(larger, size, best)
             pivot = lax.select(larger, jnp.asarray(i), pivot)
-        rows, pivot = _apart((rows, pivot))
+        rows, pivot = _materialised((rows, pivot))
         pivots.append(pivot)
         chosen = list(rows[k])
         for i in range(k + 1, n):
@@ -136,20 +139,21 @@ def _factor(matrix):
             for j in range(n):
                 chosen[j] = lax.select(is_pivot, rows[i][j], chosen[j])
                 rows[i][j] = lax.select(is_pivot, rows[k][j], rows[i][j])
-        rows[k] = _apart(chosen)
+        rows[k] = _materialised(chosen)
         for i in range(k + 1, n):
             multiplier = rows[i][k] / rows[k][k]
             rows[i][k] = multiplier
             for j in range(k + 1, n):
                 rows[i][j] = rows[i][j] - multiplier * rows[k][j]
-    return _apart(rows), pivots
+    return _materialised(rows), pivots
 
 
-def is_definite(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
+def is_definite(matrix: Square) -> BoolScalar:
     """Whether all pivots of a symmetric matrix are positive."""
     n = matrix.shape[0]
     if n > SMALL:
         return jnp.all(jnp.isfinite(jnp.linalg.cholesky(matrix)))
+    # Elimination without pivoting, whose pivots are the squares of Cholesky's diagonal.
     rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
     definite = jnp.asarray(True)
     for k in range(n):
@@ -167,7 +171,7 @@ def symmetric(X: Float[Array, "*T n n"]) -> Float[Array, "*T n n"]:
 
 
 def no_tangent(tree: Any) -> Any:
-    """The zero tangent of measurements: of whole numbers and flags too."""
+    """The zero tangent of a tree, integers and flags included."""
 
     def zero(x):
         if jnp.issubdtype(x.dtype, jnp.inexact):

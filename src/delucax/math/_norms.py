@@ -1,7 +1,14 @@
-"""Norms whose gradient is finite at zero."""
+"""Norms, projections onto balls and boxes, and the residual of an equilibrium."""
 
+from typing import Any
+
+import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
+
+
+ULPS = 4
+"""The rounding error of a residual `F(x) - x`, in units of the last place of `x`."""
 
 
 def safe_norm(x: ArrayLike, axis: int | None = -1, keepdims: bool = False) -> Array:
@@ -27,6 +34,7 @@ def safe_norm(x: ArrayLike, axis: int | None = -1, keepdims: bool = False) -> Ar
     """
     x = jnp.asarray(x)
     squared = jnp.sum(x * x, axis=axis, keepdims=keepdims)
+    # The square root of a masked one: its gradient is finite where it is not taken.
     at_zero = squared == 0
     return jnp.where(at_zero, 0.0, jnp.sqrt(jnp.where(at_zero, 1.0, squared)))
 
@@ -35,5 +43,104 @@ def within_ball(x: Array, radius: ArrayLike) -> Array:
     """The nearest point of a ball in the Euclidean (Frobenius) norm, with a finite
     gradient everywhere."""
     norm = safe_norm(x, axis=None)
+    # Inside, the factor is exactly 1, and so is its derivative of `x`.
     over = norm > radius
     return jnp.where(over, radius / jnp.where(over, norm, 1), 1).astype(x.dtype) * x
+
+
+def clip(x: ArrayLike, low: Any, high: Any) -> Array:
+    """`x` kept between `low` and `high`, either of which may be infinite.
+
+    `jnp.clip` by comparisons: its own minimum and maximum must pass on a NaN of the
+    limits, which costs a batch on CPU as much as all the rest of a pendulum's step. A
+    NaN in `x` is kept; NaN limits are ignored. The gradient goes to `x` within the
+    limits and on them, and to the limit outside.
+
+    **Arguments:**
+
+    - `x`: any array.
+    - `low`, `high`: the limits, numbers or arrays that broadcast against `x`.
+
+    **Returns:** the clipped array, of the dtype that the three promote to.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        dlx.math.clip(jnp.array([-3.0, 0.5, 3.0]), -2.0, 2.0)
+        ```
+    """
+    x = jnp.where(x > high, high, x)
+    return jnp.where(x < low, low, x)
+
+
+def size(matrix: Array) -> Array:
+    """The Frobenius norm."""
+    # Scaled by the largest entry, whose square may overflow or underflow.
+    scale = _divisor(jnp.max(jnp.abs(matrix)))
+    return scale * _norm(matrix / scale)
+
+
+def relative_size(error: Array, *terms: Array) -> Array:
+    """The norm of an equation's residual over the sum of the norms of its terms."""
+    return relative_and_total_size(error, jnp.stack(terms))[0]
+
+
+def relative_and_total_size(error: Array, terms: Array) -> tuple[Array, Array]:
+    """The norm of an equation's residual, or of a stack of residuals, over the sum of
+    the norms of its stacked terms; and this sum."""
+    scale = _divisor(jnp.max(jnp.abs(terms)))
+    total = jnp.sum(_norm(terms / scale))
+    return _norm(error / scale) / _divisor(total), scale * total
+
+
+def one_if_zero(x: Array) -> Array:
+    """Numbers, with 1 for each that is zero."""
+    return x + (x == 0)
+
+
+def _divisor(x):
+    # `lax.max` propagates NaN, as a comparison would not.
+    return lax.max(x, jnp.finfo(x.dtype).tiny)
+
+
+def _norm(matrix):
+    return jnp.sqrt(jnp.sum(matrix * matrix, axis=(-2, -1)))
+
+
+def power_of_two(x: Array) -> Array:
+    """A power of two near each number, to the last bit, which `jnp.exp2` is not."""
+    # Rounded to no digit of the mantissa.
+    return lax.reduce_precision(x, jnp.finfo(x.dtype).nexp, 0)
+
+
+def relative_drift(
+    drift: Array, jacobian: Array, x: Array, u: Array, *, is_map: bool
+) -> Array:
+    """The scaled residual of an equilibrium, the largest entry of
+
+    `|drift_i| / (|drift_i| + sum_j |jacobian_ij| unit_j)`. The drift of a map is
+    `F(x) - x`, less the rounding of `x_i`. Leading axes are times, along which the unit
+    is that of the largest value.
+    """
+    largest = lambda z: jnp.max(jnp.abs(z).reshape(-1, z.shape[-1]), axis=0)
+    terms = jnp.abs(jacobian) @ jnp.concatenate(
+        [units_of(largest(x)), units_of(largest(u))]
+    )
+    left = jnp.abs(drift)
+    if is_map:
+        rounding = ULPS * jnp.finfo(x.dtype).eps * largest(x)
+        left = jnp.maximum(left - rounding, 0)
+    return jnp.max(jnp.where(left == 0, 0, left / (left + terms)))
+
+
+def units_of(z: Array) -> Array:
+    """The size of each entry; for one that is zero up to rounding that of the largest
+    entry, at most 1, and 1 if all are zero."""
+    size = jnp.abs(z)
+    largest = jnp.max(size, initial=0)
+    # A state at rest at zero still needs a unit in which its drift is judged.
+    floor = jnp.where(largest > 0, jnp.minimum(largest, 1), 1)
+    return jnp.where(size > 100 * jnp.finfo(z.dtype).eps * floor, size, floor)

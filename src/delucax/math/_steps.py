@@ -1,7 +1,8 @@
 """Times as steps of a grid.
 
-A time `k dt` is rounded, and so are the times that are compared with it. What decides
-is therefore the number of steps, which is whole where the two are meant to be equal.
+A time `k dt` is rounded, and so are the times that are compared with it. Comparisons
+are therefore of the numbers of steps, which are whole where the times are meant to be
+equal.
 """
 
 from typing import Any, NamedTuple, TypeVar
@@ -19,17 +20,17 @@ _T = TypeVar("_T")
 
 
 def most_steps(dtype: Any) -> int:
-    """How many steps times of this precision tell apart: 2^22 in single precision."""
+    """The number of steps that times of this precision resolve: 2^22 in float32."""
     return 2 ** (jnp.finfo(dtype).nmant - 1)
 
 
 def check_steps(count: int, dtype: Any, what: str, where: str) -> None:
-    """Raise if times of this precision do not tell `count` steps apart."""
+    """Raise if times of this precision do not resolve `count` steps."""
     most = most_steps(dtype)
     if count > most:
         raise ValueError(
             f"{where}: {what} has {count} steps, but times in {jnp.dtype(dtype).name} "
-            f"tell only {most} apart; use double precision (JAX_ENABLE_X64=1) or "
+            f"resolve only {most}; use double precision (JAX_ENABLE_X64=1) or "
             "shorter pieces."
         )
 
@@ -37,7 +38,7 @@ def check_steps(count: int, dtype: Any, what: str, where: str) -> None:
 def step_at(t: Any, dt: Any, count: int, where: str) -> Array:
     """The step of `count` that time `t` belongs to, `round(t / dt)`.
 
-    A time that is NaN belongs to none: it is before the first step.
+    A NaN time maps to step -1, which is before the first.
     """
     steps = t / dt
     check_steps(count, jnp.result_type(steps), "the horizon", where)
@@ -88,20 +89,22 @@ def step_between(times: Array, where: str) -> Any:
     """The step of a grid of times; `None` for a single time.
 
     It is the first one, or the average one where the grid does not start at 0, because
-    the difference of two late times is rounded. It is NaN, or an error where the times
-    are known, if the times are too late for their precision to tell steps apart.
+    the difference of two late times is rounded. If the precision of the times is too
+    coarse for the steps, it is NaN, or an error where the times are concrete.
     """
     check_steps(times.shape[0], times.dtype, "the horizon", where)
     if times.shape[0] == 1:
         return None
+    # The rounding of late times is spread over all steps by the average.
     average = (times[-1] - times[0]) / (times.shape[0] - 1)
     dt = jnp.where(times[0] == 0, times[1], average)
     last = jnp.maximum(jnp.abs(times[0]), jnp.abs(times[-1]))
     apart = last <= most_steps(times.dtype) * dt
     if is_concrete(apart) and not np.all(apart):
         raise ValueError(
-            f"{where}: times in {times.dtype.name} do not tell steps of {dt:.3g} apart "
-            f"at {last:.6g}; use double precision (JAX_ENABLE_X64=1) or times from 0."
+            f"{where}: times in {times.dtype.name} are too coarse for steps of "
+            f"{dt:.3g} at {last:.6g}; use double precision (JAX_ENABLE_X64=1) or times "
+            "from 0."
         )
     return jnp.where(apart, dt, jnp.nan)
 

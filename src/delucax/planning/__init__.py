@@ -1,9 +1,10 @@
 """Trajectory optimisation over dynamics and a cost."""
 
-from ._constraints import Constraints as Constraints
-from ._count import count_evaluations as count_evaluations, Evaluations as Evaluations
+from ._count import count_evaluations as count_evaluations
 from ._ilqr import ILQR as ILQR, ilqr as ilqr
 from ._iterative_learning import igpc as igpc, ilc as ilc
-from ._planner import AbstractPlanner as AbstractPlanner, Plan as Plan
+from ._plan import Plan as Plan
+from ._planner import AbstractPlanner as AbstractPlanner
+from ._problem import Constraints as Constraints, Problem as Problem
 from ._sampling import CEM as CEM, MPPI as MPPI
-from ._start import default_start as default_start, Start as Start
+from ._start import Start as Start

@@ -1,8 +1,7 @@
-"""How often the dynamics are evaluated, counted as it happens."""
+"""A run-time counter of evaluations of the dynamics, by host callbacks."""
 
-import threading
-from collections import Counter
 from collections.abc import Callable
+from queue import SimpleQueue
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,24 +17,7 @@ from ..dynamics import AbstractDynamics, AbstractWrapper
 
 
 class Evaluations(NamedTuple):
-    """How often dynamics were evaluated, from [`delucax.planning.count_evaluations`][].
-
-    **Attributes:** `primal`, calls, of which the first pass of each derivative is one;
-    `tangent`, products of their Jacobian with a vector; `cotangent`, products of its
-    transpose with one.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        spring = dlx.LinearDynamics(jnp.eye(2), jnp.ones((2, 1)))
-        step = lambda dynamics: dynamics(0.0, jnp.ones(2), jnp.ones(1))
-        _, evaluations = dlx.planning.count_evaluations(step, spring)
-        evaluations.primal, evaluations.tangent, evaluations.cotangent
-        ```
-    """
+    """The numbers of calls of dynamics, and of products with their Jacobian."""
 
     primal: int
     tangent: int
@@ -47,9 +29,9 @@ def count_evaluations(
 ) -> tuple[Any, Evaluations]:
     """Run a function of dynamics, and count how often it evaluates them.
 
-    The dynamics that it is given report each evaluation to the host as it happens, in
-    compiled loops whose length only the data decide, too. Under `jax.vmap` each lane
-    counts. What XLA finds that nothing depends on is not evaluated, and not counted. It
+    The dynamics that it is given report each evaluation to the host as it happens, also
+    in compiled loops whose length depends on the data. Under `jax.vmap` each lane
+    counts. Dead code that XLA removes is not counted. It
     is for counting, not for timing: each report takes microseconds, and each call
     compiles anew.
 
@@ -58,8 +40,10 @@ def count_evaluations(
     - `function`: of the dynamics, such as a call of a planner.
     - `dynamics`: the dynamics.
 
-    **Returns:** `(what the function returns, evaluations)`, the latter
-    [`delucax.planning.Evaluations`][].
+    **Returns:** `(what the function returns, evaluations)`, the latter a named tuple
+    of whole numbers: `primal`, calls, of which the first pass of each derivative is
+    one; `tangent`, products of their Jacobian with a vector; `cotangent`, products of
+    its transpose with one.
 
     **Raises:** `ValueError` if `dynamics` are none, or `function` is no function.
 
@@ -82,37 +66,28 @@ def count_evaluations(
     check_instance(dynamics, AbstractDynamics, "dynamics", where)
     if not callable(function):
         raise ValueError(f"{where}: function must be a function, got {function!r}.")
-    tally = _Tally()
-    out = function(_Counted(dynamics, tally))
+    reports: SimpleQueue[tuple[str, int]] = SimpleQueue()
+    out = function(_Counted(dynamics, reports))
     jax.block_until_ready(eqx.filter(out, eqx.is_array))
+    # Callbacks may still be under way when the arrays are ready.
     jax.effects_barrier()
-    return out, Evaluations(*(tally.counts[kind] for kind in KINDS))
-
-
-KINDS = PRIMAL, TANGENT, COTANGENT = "primal", "tangent", "cotangent"
-
-
-class _Tally:
-    """A count on the host. Compiled code calls it, from any thread."""
-
-    def __init__(self):
-        self.counts: Counter[str] = Counter()
-        self.lock = threading.Lock()
-
-    def add(self, kind: str, lanes: int) -> None:
-        with self.lock:
-            self.counts[kind] += lanes
+    counts = dict.fromkeys(Evaluations._fields, 0)
+    while not reports.empty():
+        kind, lanes = reports.get()
+        counts[kind] += lanes
+    return out, Evaluations(**counts)
 
 
 class _Counted(AbstractWrapper):
     """Dynamics that report each evaluation."""
 
     dynamics: AbstractDynamics
-    tally: _Tally = eqx.field(static=True)
+    # Compiled code puts reports here, from any thread.
+    reports: SimpleQueue[tuple[str, int]] = eqx.field(static=True)
 
     def advance(self, t, x, u, w):
         x_next, result = self.dynamics.advance(t, x, u, w)
-        here = dict(tally=self.tally, kind=PRIMAL, lanes=1)
+        here = dict(reports=self.reports, kind="primal", lanes=1)
         return _report.bind(x_next, jax.lax.stop_gradient(x_next), **here), result
 
 
@@ -124,10 +99,10 @@ Each transformation reports for itself: so an evaluation is counted where it is 
 only if it is."""
 
 
-def _called(x: Any, where: Any, *, tally: _Tally, kind: str, lanes: int) -> Array:
+def _called(x: Any, where: Any, *, reports: Any, kind: str, lanes: int) -> Array:
     def count(flag):
         del flag
-        tally.add(kind, lanes)
+        reports.put((kind, lanes))
         return np.zeros((), bool)
 
     # Truth values alone go to the host and back, for its thread need not have the
@@ -137,18 +112,18 @@ def _called(x: Any, where: Any, *, tally: _Tally, kind: str, lanes: int) -> Arra
     return jnp.where(wrong, jnp.nan, x)
 
 
-def _batch(values, dims, *, tally, kind, lanes):
+def _batch(values, dims, *, lanes, **params):
+    # Under `jax.vmap` one report stands for all members of the batch.
     size = next(v.shape[d] for v, d in zip(values, dims, strict=True) if d is not None)
     x = batching.bdim_at_front(values[0], dims[0], size)
-    params = dict(tally=tally, kind=kind, lanes=lanes * size)
-    return _report.bind(x, values[1], **params), 0
+    return _report.bind(x, values[1], lanes=lanes * size, **params), 0
 
 
 def _jvp(primals, tangents, **params):
     out = _report.bind(*primals, **params)
     if type(tangents[0]) is ad.Zero:
         return out, tangents[0]
-    tangent = _report.bind(tangents[0], out, **(params | {"kind": TANGENT}))
+    tangent = _report.bind(tangents[0], out, **(params | {"kind": "tangent"}))
     return out, tangent
 
 
@@ -156,7 +131,7 @@ def _transpose(cotangent, x, where, **params):
     del x
     if type(cotangent) is ad.Zero:
         return cotangent, None
-    return _report.bind(cotangent, where, **(params | {"kind": COTANGENT})), None
+    return _report.bind(cotangent, where, **(params | {"kind": "cotangent"})), None
 
 
 _report.def_impl(_called)

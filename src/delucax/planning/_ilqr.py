@@ -12,16 +12,17 @@ from .._check import (
     check_count,
     check_positive,
     check_range,
+    finite_rows,
 )
-from .._module import as_float_array, parameter
+from .._module import parameter
 from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ._constraints import Constraints
 from ._descent import Options, SEARCHES
 from ._implicit import solution
-from ._planner import AbstractPlanner, finite_rows, Plan, plan_of
-from ._problem import Problem
+from ._plan import Plan
+from ._planner import AbstractPlanner
+from ._problem import Constraints, Problem
 from ._start import Start
 
 
@@ -34,14 +35,14 @@ class ILQR(AbstractPlanner):
     dynamics and quadratic in the cost about the present trajectory, cross terms
     included, and follows `u - a k - K (x - x_present)` through the true dynamics.
 
-    A step `a = 1, 1/2, ..., 1/2048` is accepted if it brings 1e-4 of the improvement
-    that the model promises. A candidate that diverges is rejected. When none is
+    A step `a = 1, 1/2, ..., 1/2048` is accepted if the cost falls by at least 1e-4 of
+    the predicted decrease. A candidate that diverges is rejected. When none is
     accepted, or the control Hessian is not positive definite, the regularisation `mu`
     rises, and it falls after a success, by the schedule of Tassa, Erez and Todorov.
-    Converged is: the (projected) gradient with respect to each control is at most
-    `tolerance` times one plus the size of the terms that cancel in it, or what a step
-    promises is below the rounding of the cost, and of the states and controls that go
-    into it.
+    It has converged if the (projected) gradient with respect to each control is at most
+    `tolerance` times one plus the size of the terms that cancel in it, or if the
+    predicted decrease is below the rounding of the cost, and of the states and controls
+    that go into it.
 
     It is called as every [`delucax.planning.AbstractPlanner`][], and takes constraints,
     by the method of multipliers.
@@ -49,10 +50,9 @@ class ILQR(AbstractPlanner):
     The plan is differentiable, in either mode and to any order, with respect to every
     array in `dynamics`, `cost`, `x0`, `w`, `t0` and `bounds`, by the implicit function
     theorem: one linear-quadratic problem at the solution, with exact second
-    derivatives, whatever the iteration used. Where the iteration did not converge or
-    the solution is no strict minimum, each derivative of the plan is NaN (a derivative
-    of nothing, such as that of a lane that a batch masks, stays zero). It does not
-    depend on `controls` and `states`, from which the iteration only starts.
+    derivatives, whatever the iteration used. Derivatives are NaN unless the solution is
+    a converged strict minimum. They are zero with respect to `controls` and `states`,
+    from which the iteration only starts.
 
     The minimum is a local one, and which one it is depends on the start. On an unstable
     plant controls alone lead far away, and the iteration may end in a stationary point
@@ -73,7 +73,7 @@ class ILQR(AbstractPlanner):
         to the power 0.4 by default (5.5e-7 in float64).
     - `second_order`: if true, with the second derivatives of dynamics and constraints
         (differential dynamic programming), except in iterations in which they would
-        make the problem concave: fewer iterations, each dearer. If false, without
+        make the problem concave: fewer but more expensive iterations. If false, without
         them (Gauss-Newton), which is slow where multipliers are large. By default true
         if there are constraints.
     - `regularise`: `"control"` (default), which adds `mu` to the control Hessian, or
@@ -138,7 +138,7 @@ class ILQR(AbstractPlanner):
             check_positive(self.finite_difference, "finite_difference", where)
             if self.second_order:
                 raise ValueError(
-                    f"{where}: finite_difference goes without second_order, got both."
+                    f"{where}: finite_difference is incompatible with second_order."
                 )
 
     @property
@@ -155,32 +155,31 @@ class ILQR(AbstractPlanner):
             n, points = problem.dynamics.state_size, start.horizon + 1
             states = finite_rows(states, n, "states", where, points).astype(dtype)
         eps, spacing = float(jnp.finfo(dtype).eps), self.finite_difference
-        tolerance, feasible = self.tolerance, self.constraint_tolerance
-        if tolerance is None:
-            # What differences leave over is no descent direction of the true cost.
-            tolerance = max(eps**0.5, (spacing or 0.0) ** 2)
-        if feasible is None:
-            feasible = eps**0.4
+        # The error of central differences is of the order of the spacing squared. Below
+        # it the gradient is not a descent direction of the true cost.
+        defaults = max(eps**0.5, (spacing or 0.0) ** 2), eps**0.4
+        given = self.tolerance, self.constraint_tolerance
+        tolerance, feasible = (
+            jnp.asarray(default if value is None else value, dtype)
+            for default, value in zip(defaults, given, strict=True)
+        )
+        # Gauss-Newton drops the curvature of the constraints times their multipliers,
+        # which may be large: it converges slowly there.
         second_order = self.second_order
         if second_order is None:
             second_order = problem.constraints is not None and spacing is None
-        options = Options(
-            tolerance=as_float_array(tolerance).astype(dtype),
-            constraint_tolerance=as_float_array(feasible).astype(dtype),
-            states=states,
+        filled: dict[str, Any] = dict(
+            tolerance=tolerance,
+            constraint_tolerance=feasible,
             second_order=bool(second_order),
-            on_state=self.regularise == "state",
-            line_search=self.line_search,
-            parallel=self.parallel,
-            max_iterations=self.max_iterations,
-            spacing=None if spacing is None else float(spacing),
+            finite_difference=spacing and float(spacing),
+            states=states,
         )
-        return _solve(problem, start, options)
+        return _solve(problem, start, Options(**(vars(self) | filled)))
 
 
 _IN_SEQUENCE = (
-    "parallel=True goes without bounds and with regularise='control'; solve in "
-    "sequence otherwise."
+    "parallel=True is incompatible with bounds and requires regularise='control'."
 )
 
 
@@ -208,7 +207,7 @@ def ilqr(
     - `cost`: the stage and final cost.
     - `x0`: the first state, shape `(n,)`.
     - `controls`: what to start from: controls, shape `(T, m)`; the number of steps `T`,
-        for [`delucax.planning.default_start`][]; feedback, or several starts of which
+        for [`delucax.planning.Start.default`][]; feedback, or several starts of which
         the cheapest is taken, as [`delucax.planning.Start`][]; or an earlier plan, with
         its gains.
     - `t0`: the time of the first state, 0 by default.
@@ -225,9 +224,9 @@ def ilqr(
         constraints hold, or `diverged` if every start diverges: the plan is then
         the best iterate.
 
-    **Returns:** a [`delucax.planning.Plan`][]. Converged is stationary: where the
-        control Hessian is not positive definite, `plan.regularisation` says what was
-        added to it, and its derivatives are NaN.
+    **Returns:** a [`delucax.planning.Plan`][]. It is stationary if it has converged.
+        Where the control Hessian is not positive definite, `plan.regularisation` says
+        what was added to it, and the derivatives are NaN.
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, or not finite, a
     horizon of 0, or a lower bound above an upper one; an error at run time as `throw`
@@ -263,4 +262,4 @@ def ilqr(
 def _solve(problem: Problem, start: Start, options: Options) -> Plan:
     fields = solution(problem, start, options)._asdict()
     del fields["multipliers"]
-    return plan_of(problem, **fields)
+    return problem.plan(**fields)

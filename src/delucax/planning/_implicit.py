@@ -1,7 +1,10 @@
 """Derivatives of a plan, by the implicit function theorem.
 
 At a solution the gradient of the Lagrangian is zero. So the change of the solution with
-the problem solves one linear-quadratic problem, with the exact second derivatives.
+the problem solves one linear-quadratic problem, with the exact second derivatives: with
+the conditions `g(z, p) = 0`, `dz = -(dg/dz)^-1 dg/dp dp`, and `dg/dz` is the matrix of
+that problem. No iteration is differentiated, so neither the number of iterations nor
+the start has a part in the derivative.
 """
 
 from typing import Any, NamedTuple
@@ -17,22 +20,30 @@ from .._results import RESULTS
 from ..math import matvec
 from ..math._linear_solve import full_precision
 from ._augmented import with_constraints
-from ._constraints import Multipliers
 from ._descent import Options, Outcome
-from ._lq import apply, in_parallel, in_sequence, product, solve_free, Stages
-from ._problem import costates_of, model, Problem
+from ._lq import (
+    apply,
+    costates_of,
+    in_parallel,
+    in_sequence,
+    model,
+    product,
+    solve_free,
+    Stages,
+)
+from ._problem import Multipliers, Problem
 from ._start import controls_of, Start
 
 
 REFINEMENTS = 20
-"""Of the linear problem with constraints, each of which gains more than a digit."""
+"""The refinements of the constrained linear solve, each worth more than a digit."""
 STIFFER = 10.0
-"""The weight of constraints there, times that at which the planner converged."""
+"""The weight of the constraints in it, relative to the planner's last one."""
 
 
 @eqx.filter_custom_jvp
 def solution(problem: Problem, start: Start, options: Options) -> Outcome:
-    """What the iteration ends with; differentiable with respect to the problem."""
+    """The outcome of the iteration, differentiable with respect to the problem."""
     return by_lanes(with_constraints, problem, start, options)
 
 
@@ -41,36 +52,35 @@ def solution(problem: Problem, start: Start, options: Options) -> Outcome:
 def _solution_jvp(primals: Any, tangents: Any) -> Any:
     out = solution(*primals)
     (problem, start, options), change = primals, tangents[0]
+    # None is a tangent of zero that is known to be one.
     nothing = jax.tree.map(lambda _: None, out)
     if not jax.tree.leaves(change):
         return out, nothing
-    is_none = lambda leaf: leaf is None
-    choose = lambda f: jax.tree.map(f, change, problem, is_leaf=is_none)
-    varied = choose(lambda t, p: None if t is None else p)
-    rest = choose(lambda t, p: p if t is None else None)
+    # Only what has a tangent is varied below, so that nothing else is differentiated.
+    has_tangent = jax.tree.map(
+        lambda t, p: t is not None, change, problem, is_leaf=lambda leaf: leaf is None
+    )
+    varied, rest = eqx.partition(problem, has_tangent)
     solved = out.result == RESULTS.successful
-    # What failed is not used, but must be finite for what is to have a derivative: so
-    # the problem is looked at where it began.
+    # A failed outcome is not used, but derivatives at it must be finite for those of
+    # other members of a batch: so they are taken at the start.
     x0 = jnp.where(jnp.isfinite(problem.x0), problem.x0, 0)
     X = jnp.where(solved, out.states, x0)
     U = jnp.where(solved, out.controls, controls_of(start))
     y = out.multipliers
-
-    def given(varied) -> Problem:
-        return eqx.combine(varied, rest)
-
+    given = lambda varied: eqx.combine(varied, rest)
     dX, dU, dy, free, definite = _change(X, U, y, problem, given, varied, change)
-
-    def cost(varied, X, U):
-        return given(varied).total(X, U)
+    cost = lambda varied, X, U: given(varied).total(X, U)
 
     def gains(varied, X, U, y):
         problem = given(varied).with_multipliers(y)
         stages = model(problem, X, U, None, options.second_order)
         if options.parallel:
             return in_parallel(stages, out.regularisation).K
-        return in_sequence(stages, out.regularisation, options.on_state, None, free).K
+        on_state = options.regularise == "state"
+        return in_sequence(stages, out.regularisation, on_state, None, free).K
 
+    # The gains of the last pass back are a function of the problem and the solution.
     _, dJ = jax.jvp(cost, (varied, X, U), (change, dX, dU))
     _, dK = jax.jvp(gains, (varied, X, U, y), (change, dX, dU, dy))
     ok = solved & definite
@@ -81,16 +91,19 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
 def _change(
     X: Array, U: Array, y: Multipliers | None, problem: Problem, given, varied, change
 ):
-    """Of states, controls and multipliers with the problem; which controls are free;
-    and whether the solution is a strict minimum."""
+    """The tangents of states, controls and multipliers; which controls are free; and
+    whether the solution is a strict minimum."""
     n, T = X.shape[1], U.shape[0]
     # Without the squares the augmented Lagrangian is the Lagrangian.
     plain = None if y is None else y._replace(rho=jnp.zeros_like(y.rho))
+    # The exact second derivatives: those of the Lagrangian, costates included.
     stages = model(problem.with_multipliers(plain), X, U, None, True)
     costates = costates_of(stages.F, stages.h, stages.v)
     z = jnp.concatenate([X[:-1], U], axis=1)
 
     def conditions(varied):
+        """The optimality conditions at the fixed solution. Their tangents with respect
+        to the problem are the right side of the linear problem."""
         problem = given(varied).with_multipliers(plain)
         times = problem.times(T)
 
@@ -107,10 +120,13 @@ def _change(
             c = [c for c, _ in problem.constraints_along(X, U)]
         return (h, after, v), problem.x0, problem.bounds, c
 
+    # Only products with the tangent are needed, whatever number of parameters varies.
     at, linear = jax.jvp(conditions, (varied,), (change,))
     ((slope, *_), *_), ((h, d, v), dx0, ends, dc) = at, linear
     free, fixed = jnp.ones_like(U, bool), jnp.zeros_like(U)
     if problem.bounds is not None:
+        # A control that a bound holds moves with the bound. One that is on it with a
+        # slope of zero is about to leave it, and counts as free.
         low, high = problem.bounds
         at_low = (U <= low) & (slope[:, n:] > 0)
         at_high = (U >= high) & (slope[:, n:] < 0)
@@ -121,26 +137,24 @@ def _change(
         factors = factorise(stages, free)
         dX, dU = substitute(stages, factors, dx0, fixed, free)
         return dX, dU, None, free, jnp.all(factors.ok)
-    active = _active(problem, X, U, z, y)
+    # The slopes of the constraints that hold with equality; zero for the others.
+    times = problem.times(T)
+    stage = lambda z, t: problem.stage_constraints(t, z[:n], z[n:])
+    final = lambda x: problem.final_constraints(times[-1], x)
+    G, equal = jax.vmap(jax.jacfwd(stage, has_aux=True))(z, times[:-1])
+    end, equal_at_end = jax.jacfwd(final, has_aux=True)(X[-1])
+    on, at_end = equal | (y.stage > 0), equal_at_end | (y.final > 0)
+    G, end = jnp.where(on[..., None], G, 0), jnp.where(at_end[:, None], end, 0)
+    active = (G, on), (end, at_end)
     dX, dU, dy, ok = _with_constraints(stages, active, dc, y, dx0, fixed, free)
     return dX, dU, dy, free, ok
 
 
-def _active(problem: Problem, X: Array, U: Array, z: Array, y: Multipliers):
-    """The slopes of the constraints that hold with equality; zero for the others."""
-    n, times = X.shape[1], problem.times(U.shape[0])
-    stage = lambda z, t: problem.stage_constraints(t, z[:n], z[n:])
-    final = lambda x: problem.final_constraints(times[-1], x)
-    slope, equal = jax.vmap(jax.jacfwd(stage, has_aux=True))(z, times[:-1])
-    last, equal_at_end = jax.jacfwd(final, has_aux=True)(X[-1])
-    on, at_end = equal | (y.stage > 0), equal_at_end | (y.final > 0)
-    slope = jnp.where(on[..., None], slope, 0)
-    return (slope, on), (jnp.where(at_end[:, None], last, 0), at_end)
-
-
 def _with_constraints(stages, active, dc, y, dx0, fixed, free):
-    """The linear problem with equality constraints, by the method of multipliers."""
+    """The linear problem with equality constraints `G dz + dc = 0`, by the method of
+    multipliers."""
     (G, on), (end, at_end) = active
+    # The quadratic part is the same in each refinement, so it is factorised once.
     rho = STIFFER * y.rho
     dc = jnp.where(on, dc[0], 0), jnp.where(at_end, dc[1], 0)
     H = stages.H + rho * jnp.einsum("tpi,tpj->tij", G, G)
@@ -156,8 +170,8 @@ def _with_constraints(stages, active, dc, y, dx0, fixed, free):
         moved = jnp.einsum("tpi,ti->tp", G, dz) + dc[0], end @ dX[-1] + dc[1]
         return dX, dU, (dy[0] + rho * moved[0], dy[1] + rho * moved[1])
 
-    def refine(dy, _):
-        return minimum(dy)[2], None
+    # Each pass contracts the error of the multipliers by about 1 / rho.
+    refine = lambda dy, _: (minimum(dy)[2], None)
 
     nothing = jnp.zeros_like(y.stage), jnp.zeros_like(y.final)
     dy, _ = lax.scan(refine, nothing, None, length=REFINEMENTS)
@@ -167,7 +181,7 @@ def _with_constraints(stages, active, dc, y, dx0, fixed, free):
 
 
 class Factors(NamedTuple):
-    """What a linear problem with other linear terms has in common."""
+    """The factorised quadratic part of a linear-quadratic problem."""
 
     K: Array
     V: Array  # of the next state
@@ -179,6 +193,8 @@ def factorise(stages: Stages, free: Array) -> Factors:
     """The quadratic part of the recursion, controls that are not free held."""
     n = stages.V.shape[0]
 
+    # As `in_sequence`, without regularisation: where the problem is not convex there is
+    # no strict minimum, and no derivative.
     def back(V, here):
         F, H, free = here
         M = H + product(F.T, product(V, F))
@@ -198,6 +214,8 @@ def substitute(
     n = dx0.shape[0]
 
     def back(v, here):
+        # As in `factorise`, for the linear terms: change = -Quu^-1 (Qu + Quu fixed)
+        # where free, and `fixed` elsewhere.
         F, h, d, V, M, free, fixed = here
         g = h + apply(F.T, v + apply(V, d))
         push = (g[n:] + apply(M[:, n:], fixed))[:, None]

@@ -1,13 +1,12 @@
 """Iterative learning control, and its variant that learns within each run, too."""
 
-from collections.abc import Callable
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jax.tree_util import Partial
 from jaxtyping import Array
 
 from .._check import (
@@ -17,6 +16,7 @@ from .._check import (
     check_instance,
     check_number,
     check_positive,
+    finite_rows,
 )
 from .._module import as_float_array
 from .._results import choose, RESULTS
@@ -24,25 +24,24 @@ from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ._descent import first_accepted, LEAST_MU, MOST_MU
-from ._lq import in_sequence, Policy
-from ._planner import checked_plan, finite_rows, Plan, plan_of
-from ._problem import model as local_model, Problem, roll_out
+from ._lq import in_sequence, model as local_model, Policy
+from ._plan import Plan
+from ._planner import checked_plan
+from ._problem import Problem, roll_out
 
 
 GROWTH = 10.0
-"""Of the regularisation, from pass to pass, until the problem is convex."""
+"""The growth of the regularisation per pass, until the problem is convex."""
 SLOWER = 0.01
-"""What a failed search of `igpc` multiplies the learning rate by."""
+"""The factor of the learning rate after a failed search of `igpc`."""
 
 
-class Trials(NamedTuple):
-    """What is fixed when an iterative learner is compiled."""
+class _Online(NamedTuple):
+    """The options of the online learning within a run of `igpc`."""
 
-    iterations: int
-    candidates: int = 10  # of a search
-    strict: bool = False  # whether a trial must be better, not only as good
-    slower: float | None = None
-    """What a failed search multiplies the learning rate by. If none, it is the end."""
+    memory: int
+    horizon: int
+    aligned: bool
 
 
 def ilc(
@@ -57,7 +56,7 @@ def ilc(
     throw: bool = True,
 ) -> Plan:
     """Iterative learning control: improve a plan by running it on the plant, and
-    learning from a model that is not the plant how to change it.
+    changing it by the derivatives of a model that is not the plant.
 
     Each iteration linearises the model along the last run of the plant, solves the
     linear-quadratic problem, and runs `u - a k - K (x - x_last)` on the plant, for
@@ -110,165 +109,8 @@ def ilc(
         learned.trace
         ```
     """
-    where = "ilc"
-    problems = as_problems(plant, model, cost, plan, w, where)
-    check_number(step, "step", where)
-    check_positive(step, "step", where)
-    trials = Trials(check_count(iterations, "iterations", where))
-    rates = as_float_array(step), jnp.zeros(())
-    out = learn(*problems, plan, _run_feedback, *rates, trials)
-    return raise_if_diverged(out, where) if throw else out
-
-
-def _run_feedback(
-    plant: Problem,
-    model: Problem,
-    states: Array,
-    controls: Array,
-    policy: Policy,
-    length: Array,
-    rate: Array,
-) -> tuple[Array, Array, Array]:
-    """A run of the plant under the policy alone."""
-    del model, rate
-    return roll_out(plant, states, controls, policy.K, policy.k, length)
-
-
-class _Progress(NamedTuple):
-    last: tuple[Array, Array, Array]
-    """States, controls and cost of the run to improve."""
-    step: Array
-    rate: Array
-    runs: Array
-    trace: Array
-    iteration: Array
-    done: Array
-
-
-@eqx.filter_jit
-def learn(
-    plant: Problem,
-    model: Problem,
-    plan: Plan,
-    run: Callable[..., tuple[Array, Array, Array]],
-    step: Array,
-    rate: Array,
-    trials: Trials,
-) -> Plan:
-    """Iterate from the first run. `run(plant, model, states, controls, policy, length,
-    rate)` runs the plant about the last run, and gives states, controls and cost."""
-    dtype = plan.controls.dtype
-    zero = jnp.zeros((), dtype)
-    about = plan.states.astype(dtype), plan.controls, plan.gains.astype(dtype)
-    first = roll_out(plant, *about, jnp.zeros_like(plan.controls), zero)
-    lost = ~jnp.isfinite(first[2])
-
-    def policy_of(states, controls) -> tuple[Array, Policy]:
-        stages = local_model(model, states, controls, None, False)
-        box = model.room(controls)
-
-        def regularised(mu):
-            return mu, in_sequence(stages, mu, False, box)
-
-        def more(tried):
-            return regularised(jnp.maximum(LEAST_MU, GROWTH * tried[0]))
-
-        def concave(tried):
-            return ~tried[1].ok & (tried[0] < MOST_MU)
-
-        return lax.while_loop(concave, more, regularised(zero))
-
-    def body(now):
-        states, controls, cost = now.last
-        _, policy = policy_of(states, controls)
-
-        def trial(tried):
-            length = now.step * jnp.asarray(1.1, dtype) ** (
-                1.0 - tried.astype(dtype) ** 2
-            )
-            after = run(plant, model, states, controls, policy, length, now.rate)
-            good = after[2] < cost if trials.strict else after[2] <= cost
-            return (length, after), good
-
-        given = trial, trials.candidates, (now.step, now.last)
-        tried, (length, after), good = first_accepted(*given)
-        keep = lambda new, old: jnp.where(good, new, old)
-        after = jax.tree.map(keep, after, now.last)
-        iteration = now.iteration + 1
-        rate, ended = now.rate, iteration >= trials.iterations
-        if trials.slower is None:
-            ended = ended | ~good
-        else:
-            rate = keep(rate, trials.slower * rate)
-        trace = now.trace.at[iteration].set(after[2])
-        step, runs = keep(length, now.step), now.runs + tried
-        return _Progress(after, step, rate, runs, trace, iteration, ended)
-
-    start = _Progress(
-        last=first,
-        step=jnp.asarray(step, dtype),
-        rate=jnp.asarray(rate, dtype),
-        runs=jnp.asarray(1),
-        trace=jnp.full((trials.iterations + 1,), first[2]),
-        iteration=jnp.asarray(0),
-        done=lost,
-    )
-    end = lax.while_loop(lambda now: ~now.done, body, start)
-    states, controls, cost = end.last
-    mu, policy = policy_of(states, controls)
-    reached = jnp.arange(trials.iterations + 1) <= end.iteration
-    result = choose(
-        end.iteration < trials.iterations, RESULTS.no_descent, RESULTS.successful
-    )
-    return plan_of(
-        plant,
-        states,
-        controls,
-        cost,
-        gains=policy.K,
-        trace=jnp.where(reached, end.trace, cost),
-        residual=jnp.max(jnp.abs(policy.gradient)),
-        result=choose(lost, RESULTS.diverged, result),
-        iterations=end.iteration,
-        rollouts=end.runs,
-        regularisation=mu,
-    )
-
-
-def raise_if_diverged(plan: Plan, where: str) -> Plan:
-    """Raise if the first run diverged. That a search failed is no failure here."""
-    fine = choose(plan.result == RESULTS.diverged, RESULTS.diverged, RESULTS.successful)
-    checked = checked_plan(eqx.tree_at(lambda p: p.result, plan, fine), where)
-    return eqx.tree_at(lambda p: p.result, checked, plan.result)
-
-
-def as_problems(
-    plant: Any, model: Any, cost: Any, plan: Any, w: Any, where: str
-) -> tuple[Problem, Problem]:
-    """The problems of the plant and of its model, or an error."""
-    for name, dynamics in (("plant", plant), ("model", model)):
-        check_instance(dynamics, AbstractDynamics, name, where)
-    check_instance(cost, AbstractCost, "cost", where)
-    check_instance(plan, Plan, "plan", where, ", such as ilqr makes")
-    T, m = plan.controls.shape
-    sizes = plan.states.shape[1], m
-    for name, dynamics in (("plant", plant), ("model", model)):
-        got = dynamics.state_size, dynamics.control_size
-        if got != sizes:
-            raise ValueError(
-                f"{where}: {name} must have the states and controls of plan, {sizes}, "
-                f"got {got}."
-            )
-    if w is not None:
-        w = finite_rows(w, plant.disturbance_size, "w", where, T)
-    x0 = plan.states[0].astype(plan.controls.dtype)
-    t0, bounds = plan.t0.astype(x0.dtype), None
-    if plan.low is not None and plan.high is not None:
-        bounds = plan.low, plan.high
-    problem = lambda dynamics, w: Problem(
-        dynamics, cost, x0, t0, w, bounds, plan.difference
-    )
-    return problem(plant, w), problem(model, None)
+    given = plant, model, cost, plan, w, iterations, step
+    return _learned("ilc", *given, 0.0, None, False, throw)
 
 
 def igpc(
@@ -288,38 +130,29 @@ def igpc(
     throw: bool = True,
 ) -> Plan:
     """Iterative gradient perturbation control: iterative learning control in which each
-    run learns online, too, from how the plant leaves the model:
+    run learns online, too, from the model mismatch:
 
     `u_t = u_last - a k - K (x_t - x_last) + sum_{i=1..memory} E_i w_{t-i} + o`, with
     `w_t = x_{t+1} - F(t, x_t, u_t)`, F being the model.
 
-    E and o start at zero in each run, and follow at step t, by `learning_rate / t`, the
-    gradient of the last cost of a roll-out of `horizon` steps, from a state that was
-    met to the present one, through the model and what it left over. The next iteration
-    linearises along the run, so what was learned within it stays. For the rest it is
-    [`delucax.planning.ilc`][]. On the paper's quadrotor it needs fewer runs than
-    that; over many winds, with the steps of both well chosen, it does not.
+    E and o start at zero in each run. At step t they descend, with rate
+    `learning_rate / t`, along the gradient of a counterfactual cost: the last one of
+    `horizon` steps through the model, with the observed mismatch added. The next
+    iteration linearises along the run, so what was learned within it stays. Otherwise
+    it is identical to [`delucax.planning.ilc`][].
 
     **Arguments:**
 
-    - `plant`: the true dynamics, which are only run.
-    - `model`: the dynamics that are differentiated, of the same sizes.
-    - `cost`: the stage and final cost.
-    - `plan`: where to start, as in [`delucax.planning.ilc`][].
-    - `w`: disturbances of the plant, the same in each run, of which the model does not
-        know, shape `(T, k)`; zero by default.
-    - `iterations`: 40 by default.
-    - `step`: the first `a`, 1 by default.
+    - `plant`, `model`, `cost`, `plan`, `w`, `iterations`, `step`, `throw`: as in
+        [`delucax.planning.ilc`][].
     - `learning_rate`: 0.001 by default.
     - `memory`: the number of past disturbances, 3 by default.
-    - `horizon`: of the roll-out, 3 by default.
+    - `horizon`: the steps of the counterfactual cost, 3 by default.
     - `indices`: `"aligned"` (default), each disturbance at the step that it was met;
         or `"deluca"`, for comparison: one step early, as in the original library.
-    - `anneal`: if true (default), a search tries six steps, of which one must lower the
-        cost, or else the learning rate is divided by 100; if false, it tries ten, of
-        which one must not raise it, or else it ends.
-    - `throw`: raise if the first run diverges (default); if false, look at the
-        `result`.
+    - `anneal`: if true (default), a search tries up to 6 steps until one lowers the
+        cost, and divides the learning rate by 100 if none does. If false, it tries up
+        to 10 steps until one does not raise the cost, and stops if all do.
 
     **Returns:** a [`delucax.planning.Plan`][], as from [`delucax.planning.ilc`][]:
     the best run of the plant, what was learned within it included, and feedback about
@@ -336,55 +169,163 @@ def igpc(
         import delucax as dlx
         import jax.numpy as jnp
 
-        model = dlx.make("planar_quadrotor")
-        plant = dlx.make("planar_quadrotor", wind="dissipative", wind_strength=0.1)
-        start = jnp.tile(model.dynamics.equilibrium()[1], (30, 1))
-        x0 = model.initial_state
-        plan = dlx.planning.ilqr(model.dynamics, model.cost, x0, start)
+        env = dlx.make("pendulum")
+        heavier = dlx.replace(env.dynamics, {"system.mass": 1.2})
+        plan = dlx.planning.ilqr(env.dynamics, env.cost, jnp.array([0.5, 0.0]), 20)
         learned = dlx.planning.igpc(
-            plant.dynamics, model.dynamics, model.cost, plan, iterations=5
+            heavier, env.dynamics, env.cost, plan, iterations=5
         )
         learned.trace
         ```
     """
     where = "igpc"
-    problems = as_problems(plant, model, cost, plan, w, where)
-    for name, value in (("step", step), ("learning_rate", learning_rate)):
-        check_number(value, name, where)
-        no_learning = name == "learning_rate" and isinstance(value, int | float)
-        if not (no_learning and value == 0):
-            check_positive(value, name, where)
+    check_number(learning_rate, "learning_rate", where)
+    # A rate of zero is valid: only the feedback acts then.
+    if not (isinstance(learning_rate, int | float) and learning_rate == 0):
+        check_positive(learning_rate, "learning_rate", where)
     check_choice(indices, ("aligned", "deluca"), "indices", where)
-    run = Partial(
-        perturbed,
-        memory=check_count(memory, "memory", where),
-        horizon=check_count(horizon, "horizon", where),
+    online = _Online(
+        check_count(memory, "memory", where),
+        check_count(horizon, "horizon", where),
         aligned=indices == "aligned",
     )
+    check_bool(anneal, "anneal", where)
+    given = plant, model, cost, plan, w, iterations, step
+    return _learned(where, *given, learning_rate, online, anneal, throw)
+
+
+def _learned(
+    where, plant, model, cost, plan, w, iterations, step, rate, online, anneal, throw
+) -> Plan:
+    """Check what both kinds take, and iterate."""
+    models = ("plant", plant), ("model", model)
+    for name, dynamics in models:
+        check_instance(dynamics, AbstractDynamics, name, where)
+    check_instance(cost, AbstractCost, "cost", where)
+    check_instance(plan, Plan, "plan", where, ", such as ilqr makes")
+    T, m = plan.controls.shape
+    sizes = plan.states.shape[1], m
+    for name, dynamics in models:
+        got = dynamics.state_size, dynamics.control_size
+        if got != sizes:
+            raise ValueError(
+                f"{where}: {name} must have the states and controls of plan, {sizes}, "
+                f"got {got}."
+            )
+    if w is not None:
+        w = finite_rows(w, plant.disturbance_size, "w", where, T)
     iterations = check_count(iterations, "iterations", where)
-    trials = Trials(iterations)
-    if check_bool(anneal, "anneal", where):
-        trials = Trials(iterations, candidates=6, strict=True, slower=SLOWER)
-    rates = as_float_array(step), as_float_array(learning_rate)
-    out = learn(*problems, plan, run, *rates, trials)
-    return raise_if_diverged(out, where) if throw else out
+    check_number(step, "step", where)
+    check_positive(step, "step", where)
+    x0 = plan.states[0].astype(plan.controls.dtype)
+    t0, bounds = plan.t0.astype(x0.dtype), None
+    if plan.low is not None and plan.high is not None:
+        bounds = plan.low, plan.high
+    # The model has no disturbance: `w` is part of the model mismatch.
+    true = Problem(plant, cost, x0, t0, w, bounds, plan.difference)
+    known = dataclasses.replace(true, dynamics=model, w=None)
+    rates = as_float_array(step), as_float_array(rate)
+    out = _iterate(true, known, plan, *rates, iterations, online, bool(anneal))
+    if not throw:
+        return out
+    # That a search failed is no failure here, but how learning usually ends.
+    fine = choose(out.result == RESULTS.diverged, out.result, RESULTS.successful)
+    checked = checked_plan(eqx.tree_at(lambda p: p.result, out, fine), where)
+    return eqx.tree_at(lambda p: p.result, checked, out.result)
 
 
-def perturbed(
-    plant: Problem,
-    model: Problem,
-    states: Array,
-    controls: Array,
-    policy: Policy,
-    length: Array,
-    rate: Array,
-    *,
-    memory: int,
-    horizon: int,
-    aligned: bool,
-) -> tuple[Array, Array, Array]:
+class _Progress(NamedTuple):
+    last: tuple[Array, Array, Array]
+    """States, controls and cost of the run to improve."""
+    step: Array
+    rate: Array
+    runs: Array
+    trace: Array
+    iteration: Array
+    done: Array
+
+
+@eqx.filter_jit
+def _iterate(plant, model, plan, step, rate, iterations, online, anneal) -> Plan:
+    """Iterate from the first run, which follows the feedback of `plan`."""
+    dtype = plan.controls.dtype
+    zero = jnp.zeros((), dtype)
+    about = plan.states.astype(dtype), plan.controls, plan.gains.astype(dtype)
+    first = roll_out(plant, *about, jnp.zeros_like(plan.controls), zero)
+    lost = ~jnp.isfinite(first[2])
+
+    def policy_of(states, controls) -> tuple[Array, Policy]:
+        """The policy by the model's derivatives along a run of the plant, with the
+        least regularisation tried that makes the problem convex."""
+        stages = local_model(model, states, controls, None, False)
+        box = model.room(controls)
+        solved = lambda mu: (mu, in_sequence(stages, mu, False, box))
+        more = lambda now: solved(jnp.maximum(LEAST_MU, GROWTH * now[0]))
+        concave = lambda now: ~now[1].ok & (now[0] < MOST_MU)
+        return lax.while_loop(concave, more, solved(zero))
+
+    def body(now):
+        states, controls, cost = now.last
+        _, policy = policy_of(states, controls)
+
+        def trial(tried):
+            # One try above the last step, then ever shorter ones: 1.1^(1 - j^2) for
+            # j = 0, 1, ... is 1.1, 1, 0.75, 0.47, ..., as in the original library.
+            power = 1.0 - tried.astype(dtype) ** 2
+            length = now.step * jnp.asarray(1.1, dtype) ** power
+            if online is None:
+                after = roll_out(plant, states, controls, policy.K, policy.k, length)
+            else:
+                rest = states, controls, policy, length, now.rate, online
+                after = _perturbed(plant, model, *rest)
+            good = after[2] < cost if anneal else after[2] <= cost
+            return (length, after), good
+
+        last = now.step, now.last
+        tried, (length, after), good = first_accepted(trial, 6 if anneal else 10, last)
+        keep = lambda new, old: jnp.where(good, new, old)
+        after = jax.tree.map(keep, after, now.last)
+        iteration = now.iteration + 1
+        ended = iteration >= iterations
+        # Without a rate to lower, a failed search would only fail again.
+        ended = ended if anneal else ended | ~good
+        return _Progress(
+            last=after,
+            step=keep(length, now.step),
+            rate=keep(now.rate, SLOWER * now.rate) if anneal else now.rate,
+            runs=now.runs + tried,
+            trace=now.trace.at[iteration].set(after[2]),
+            iteration=iteration,
+            done=ended,
+        )
+
+    step, rate = (jnp.asarray(number, dtype) for number in (step, rate))
+    trace, count = jnp.full((iterations + 1,), first[2]), jnp.asarray(0)
+    start = _Progress(first, step, rate, count + 1, trace, count, done=lost)
+    end = lax.while_loop(lambda now: ~now.done, body, start)
+    states, controls, cost = end.last
+    mu, policy = policy_of(states, controls)
+    reached = jnp.arange(iterations + 1) <= end.iteration
+    early = end.iteration < iterations
+    result = choose(early, RESULTS.no_descent, RESULTS.successful)
+    return plant.plan(
+        states,
+        controls,
+        cost,
+        gains=policy.K,
+        trace=jnp.where(reached, end.trace, cost),
+        residual=jnp.max(jnp.abs(policy.gradient)),
+        result=choose(lost, RESULTS.diverged, result),
+        iterations=end.iteration,
+        rollouts=end.runs,
+        regularisation=mu,
+    )
+
+
+def _perturbed(plant, model, states, controls, policy, length, rate, online):
     """A run of the plant under the policy and what is learned online; its states,
     controls and cost, infinite if it diverged."""
+    memory, horizon, aligned = online
     controls, K = controls - length * policy.k, policy.K
     T, m = controls.shape
     n, dtype = plant.x0.shape[0], controls.dtype
@@ -397,7 +338,9 @@ def perturbed(
         return plant.clip(u + jnp.einsum("imn,in->m", E, w) + o)
 
     def last_cost(learned, x, first, w):
-        """Of a roll-out through the model, from step `first`."""
+        """The counterfactual cost: the last one of a rollout through the model, from
+        step `first`, as if `learned` had acted in it, with the observed disturbances.
+        """
         cost = jnp.zeros((), dtype)
         for j in range(horizon):
             k = first + j
@@ -411,6 +354,7 @@ def perturbed(
         k, w_k = inputs
         u = act(k, x, learned, disturbances[horizon:])
         after = plant.step(times[k], x, u, w_k)
+        # w_t = x_{t+1} - F(t, x_t, u_t): all that the model did not foresee.
         left = plant.deviation(after, model.step(times[k], x, u, None))
         disturbances = jnp.concatenate([disturbances[1:], left[None]])
         visited = jnp.concatenate([visited[1:], x[None]])
@@ -418,6 +362,7 @@ def perturbed(
         late = int(aligned)
         first = jnp.maximum(k - horizon + late, 0)
         slope = jax.grad(last_cost)(learned, visited[late], first, disturbances)
+        # Online gradient descent with steps of 1/t, from the first full history on.
         size = jnp.where(k >= horizon, rate / jnp.maximum(k, 1), 0)
         learned = jax.tree.map(lambda p, g: p - size * g, learned, slope)
         return (after, learned, visited, disturbances), (x, u)

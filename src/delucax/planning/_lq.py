@@ -1,9 +1,10 @@
-"""The linear-quadratic problem that each iteration of a planner solves.
+"""The linear-quadratic model of a problem about a trajectory, and its solution.
 
-`minimise sum_k 1/2 z'H z + h'z + 1/2 x_T'V x_T + v'x_T` along `x_next = F z + d`, with
-`z = (x, u)`: in sequence, or in parallel over time.
+Each iteration of a planner minimises `sum_k 1/2 z'H z + h'z + 1/2 x_T'V x_T + v'x_T`
+along `x_next = F z + d`, with `z = (x, u)`, in sequence or in parallel over time.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -11,9 +12,11 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._jax import first_possible
 from ..math import matvec
-from ..math._linear_solve import full_precision, is_definite, SMALL, solve
-from ..riccati._recursion import gain, linear_recursion, values
+from ..math._linear_solve import full_precision, is_definite, SMALL, solve, symmetric
+from ..riccati import dre
+from ._problem import Problem, Values
 
 
 _UNROLL = 16
@@ -32,10 +35,8 @@ class Stages(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """The changes `-k - K dx` of the controls, and what they promise.
-
-    A step of length `alpha` is promised to change the cost by
-    `alpha slope + alpha^2 curvature / 2`.
+    """The changes `-k - K dx` of the controls, and the predicted change of the cost:
+    `alpha slope + alpha^2 curvature / 2` for a step of length `alpha`.
     """
 
     K: Array
@@ -45,6 +46,114 @@ class Policy(NamedTuple):
     slope: Array
     curvature: Array
     ok: Array
+
+
+def model(
+    problem: Problem,
+    states: Array,
+    controls: Array,
+    defects: Array | None,
+    second_order: bool,
+    use_exact: Array | None = None,
+    spacing: float | None = None,
+) -> Stages:
+    """The linear-quadratic model of the problem about a trajectory.
+
+    The second derivatives of dynamics and constraints are left out where `use_exact` is
+    false. With a `spacing` the dynamics are linearised by central differences.
+    """
+    size, times = states.shape[1], problem.times(controls.shape[0])
+    t, end = times[:-1], times[-1]
+    # State and control are one vector, so that each derivative is taken once, with its
+    # cross terms.
+    z = jnp.concatenate([states[:-1], controls], axis=1)
+    step = lambda z, t, w: problem.step(t, z[:size], z[size:], w)
+    stage_cost = lambda z, t, y: problem.stage_cost(t, z[:size], z[size:], y)
+    final_cost = lambda x: problem.final_cost(end, x)
+
+    def stage_hessian(z, t, y):
+        """The Hessian of the cost and of the constraints' squared linear parts."""
+        if problem.multipliers is None:
+            return jax.hessian(stage_cost)(z, t, y)
+        c = lambda z: problem.stage_constraints(t, z[:size], z[size:])
+        cost = jax.hessian(lambda z: problem.cost(t, z[:size], z[size:]))(z)
+        return cost + squared(c, z, y, problem.multipliers.rho)
+
+    y = problem.stage_multipliers
+    v = jax.grad(final_cost)(states[-1])
+    if spacing is None:
+        # In reverse mode if possible, because a step has fewer outputs than inputs.
+        slopes = first_possible(jax.jacrev(step), jax.jacfwd(step))
+    else:
+        slopes = central(step, spacing, problem.deviation)
+    F = jax.vmap(slopes)(z, t, problem.w)
+    h = jax.vmap(jax.grad(stage_cost))(z, t, y)
+    H = jax.vmap(stage_hessian)(z, t, y)
+    V = jax.hessian(lambda x: problem.cost.final(end, x))(states[-1])
+    # By default Gauss-Newton: exact Hessians of the cost, linear dynamics and
+    # constraints.
+    if problem.multipliers is not None:
+        c = lambda x: problem.final_constraints(end, x)
+        V = V + squared(c, states[-1], *problem.multipliers[1:])
+    if second_order:
+        # The Hessian of the Hamiltonian, cost + costate' F: the curvature of the
+        # dynamics is weighted by the costates.
+        def hamiltonian(z, t, w, y, costate):
+            return stage_cost(z, t, y) + costate @ step(z, t, w)
+
+        # Forward over reverse is cheapest. Implicit solvers inside may have one mode
+        # only.
+        slope = jax.grad(hamiltonian)
+        ways = jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(hamiltonian))
+        each = z, t, problem.w, y, costates_of(F, h, v)
+        exact = jax.vmap(first_possible(*ways))(*each)
+        at_end = jax.hessian(final_cost)(states[-1])
+        # Both are computed where a flag of the loop decides, because the flag is
+        # traced.
+        if use_exact is None:
+            H, V = exact, at_end
+        else:
+            H, V = jnp.where(use_exact, exact, H), jnp.where(use_exact, at_end, V)
+    # Rounding leaves Hessians not quite symmetric, which the pass back relies on.
+    stages = Stages(F, symmetric(H), h, defects, symmetric(V), v)
+    return jax.tree.map(lambda a: a.astype(states.dtype), stages)
+
+
+def squared(c: Callable[[Array], Values], z: Array, y: Array, rho: Array) -> Array:
+    """The Hessian of the active constraints' squares, without second derivatives: that
+    of `rho c'c / 2` by Gauss and Newton, `rho J'J`."""
+    slope = jax.jacfwd(lambda z: c(z)[0])(z)
+    value, equal = c(z)
+    active = equal | (y + rho * value > 0)
+    return rho * slope.T @ jnp.where(active[:, None], slope, 0)
+
+
+def costates_of(F: Array, h: Array, v: Array) -> Array:
+    """The gradient of the cost with respect to each next state, shape `(T, n)`, by the
+    adjoint equation `p_k = h_x + A'p_{k+1}` with the last one `v`."""
+    size = v.shape[0]
+
+    def back(costate, here):
+        F, h = here
+        return h[:size] + matvec(F[:, :size].T, costate), costate
+
+    return lax.scan(back, v.astype(h.dtype), (F, h), reverse=True)[1]
+
+
+def central(f: Any, spacing: float, deviation: Any) -> Any:
+    """The Jacobian in the first argument by central differences: two calls for each
+    of its entries."""
+
+    def evaluate(z, *args):
+        # By the deviation, because a wrapped angle may jump between the two sides.
+        def along(way):
+            change = spacing * way
+            return deviation(f(z + change, *args), f(z - change, *args))
+
+        ways = jnp.eye(z.shape[0], dtype=z.dtype)
+        return jax.vmap(along)(ways).T / (2 * spacing)
+
+    return evaluate
 
 
 def product(a: Array, b: Array) -> Array:
@@ -82,6 +191,7 @@ def solve_definite(matrix: Array, right: Array) -> tuple[Array, Array]:
     # from the right sides, in which the solution is linear.
     rows = [matrix[i, i:] for i in range(m)]
     sides = [right[i] for i in range(m)]
+    # A pivot below this share of its diagonal entry may be rounding alone.
     least = m * jnp.finfo(matrix.dtype).eps
     pivots, ok = [], jnp.asarray(True)
     for i in range(m):
@@ -107,6 +217,11 @@ def in_sequence(
 ) -> Policy:
     """The regularised recursion, back in time.
 
+    With the cost-to-go `1/2 x'V x + v'x` of the next state, that of a stage is
+    `1/2 z'M z + g'z` with `M = H + F'V F`, `g = h + F'(v + V d)`. Its minimum over the
+    control, of the blocks `Quu`, `Qux`, `Qu`, is `-k - K dx`, `k = Quu^-1 Qu`,
+    `K = Quu^-1 Qux`.
+
     `box` is `(low, high)` of each change of a control, shapes `(T, m)`, if there are
     bounds. `free`, boolean, shape `(T, m)`, says which controls may change at all.
 
@@ -118,11 +233,12 @@ def in_sequence(
     def back(carry, here):
         V, v = carry
         F, H, h, d, box, free = here
-        VF = product(V, F)
-        M = H + product(F.T, VF)
+        M = H + product(F.T, product(V, F))
         pushed = apply(F.T, v if d is None else v + apply(V, d))
         g = h + pushed
         Quu, Qux, Qu = M[n:, n:], M[n:, :n], g[n:]
+        # Either mu |dx_next|^2 / 2 or mu |du|^2 / 2 is added to what is minimised, but
+        # not to the cost-to-go, which stays that of the policy.
         if on_state:
             extra = mu * product(F[:, n:].T, F)
         else:
@@ -130,22 +246,24 @@ def in_sequence(
         pivot, cross = Quu + extra[:, n:], Qux + extra[:, :n]
         change = None
         if box is not None:
-            change, free = box_minimum(pivot, Qu, *box)
+            change, free = solve_box_qp(pivot, Qu, *box)
         S, ok = solve_free(pivot, jnp.concatenate([cross, Qu[:, None]], 1), free)
         K, k = S[:, :n], S[:, n] if change is None else -change
         ok = ok & jnp.all(jnp.isfinite(k))
         K, k = jnp.where(ok, K, 0), jnp.where(ok, k, 0)
-        # In this form nothing is assumed of K and k.
+        # The cost-to-go under any K and k: the shorter forms hold at the minimum alone,
+        # and bounds and the regularisation lead away from it.
         Quu_k = apply(Quu, k)
         D = product(K.T, product(Quu, K) - Qux)
         V = M[:n, :n] + D - product(Qux.T, K)
         v = g[:n] + apply(K.T, Quu_k - Qu) - apply(Qux.T, k)
-        kept = K, k, Qu, pushed[n:], Quu_k, ok
-        return ((V + V.T) / 2, v), kept
+        # Rounding would let V drift away from symmetry over a long horizon.
+        return ((V + V.T) / 2, v), (K, k, Qu, pushed[n:], Quu_k, ok)
 
     xs = (stages.F, stages.H, stages.h, stages.d, box, free)
     _, kept = lax.scan(back, (stages.V, stages.v), xs, reverse=True)
     K, k, Qu, pushed, Quu_k, ok = kept
+    # Along -a k the cost changes by -a k'Qu + a^2 k'Quu k / 2, summed over the stages.
     slope, curvature = -jnp.sum(k * Qu), jnp.sum(k * Quu_k)
     scale = jnp.max(jnp.abs(pushed))
     return Policy(K, k, Qu, scale, slope, curvature, jnp.all(ok))
@@ -155,12 +273,13 @@ def solve_free(matrix: Array, right: Array, free: Array | None) -> tuple[Array, 
     """As `solve_definite`, over the entries that are free; zero in the others."""
     if free is None:
         return solve_definite(matrix, right)
+    # Rows and columns of the others become those of the identity: the sizes stay fixed.
     both = free[:, None] & free[None]
     matrix = jnp.where(both, matrix, jnp.eye(free.shape[0], dtype=matrix.dtype))
     return solve_definite(matrix, jnp.where(free[:, None], right, 0))
 
 
-def box_minimum(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Array]:
+def solve_box_qp(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Array]:
     """The minimum of `1/2 u'H u + g'u` between bounds, and which entries are free.
 
     By projected Newton steps, which find the active bounds in a few.
@@ -169,6 +288,7 @@ def box_minimum(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Arr
     """
     m = g.shape[0]
     if m == 1:
+        # Of one control it is the free minimum, clipped.
         ok = H[0] > 0
         u = jnp.clip(-g / jnp.where(ok, H[0], 1), low, high)
         return u, (u > low) & (u < high)
@@ -176,27 +296,24 @@ def box_minimum(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Arr
     lengths = 0.5 ** jnp.arange(16.0, dtype=g.dtype)
     steep = jnp.diagonal(H)
     steep = jnp.where(steep > 0, steep, 1)
-
-    def gradient(u):
-        return g + matvec(H, u)
+    gradient = lambda u: g + matvec(H, u)
+    value = lambda u: jnp.sum(u * (g + gradient(u))) / 2
 
     def is_free(u, slope, near):
         held = (u <= low + near) & (slope > 0) | (u >= high - near) & (slope < 0)
         return ~held
 
-    def value(u):
-        return jnp.sum(u * (g + gradient(u))) / 2
-
     def body(state):
         u, _, count = state
         slope = gradient(u)
-        # Entries that are near a bound and go to it are kept out of the Newton step,
+        # Entries near a bound and on the way to it are kept out of the Newton step,
         # or they would shorten it.
         plain = -slope / steep
         left = jnp.max(jnp.abs(jnp.clip(u + plain, low, high) - u))
         free = is_free(u, slope, jnp.minimum(left, 0.01 * (high - low)))
         newton, _ = solve_free(H, -slope[:, None], free)
         step = jnp.where(free, newton[:, 0], plain)
+        # The projected line search, for all lengths at once: they are few and cheap.
         tried = jnp.clip(u + lengths[:, None] * step, low, high)
         values = jax.vmap(value)(tried)
         best = tried[jnp.argmin(values)]
@@ -205,9 +322,7 @@ def box_minimum(H: Array, g: Array, low: Array, high: Array) -> tuple[Array, Arr
         going = lower & (left > slack * (1 + jnp.max(jnp.abs(u))))
         return after, going, count + 1
 
-    def going(state):
-        return state[1] & (state[2] < 10 * m)
-
+    going = lambda state: state[1] & (state[2] < 10 * m)
     zero = jnp.clip(jnp.zeros_like(g), low, high)
     u, _, _ = lax.while_loop(going, body, (zero, jnp.asarray(True), 0))
     return u, is_free(u, gradient(u), 0.0)
@@ -223,42 +338,34 @@ def in_parallel(stages: Stages, mu: Array) -> Policy:
     """
     F, H, h, d, V, v = stages
     n = V.shape[0]
-    m = F.shape[2] - n
-    A, B = F[..., :n], F[..., n:]
+    A, B, q, r = F[..., :n], F[..., n:], h[:, :n], h[:, n:]
     Q, S, R = H[:, :n, :n], H[:, :n, n:], H[:, n:, n:]
-    damped = R + mu * jnp.eye(m, dtype=F.dtype)
-    X = values(A, B, Q, damped, S, V, 0, True)
-    ok = jnp.all(jnp.isfinite(X))
-    after = jnp.where(ok, X[1:], 0)
-    safe = jnp.where(ok, damped, jnp.eye(m, dtype=F.dtype))
-    K, loop = jax.vmap(gain)(A, B, safe, S, after)
-    q, r = h[:, :n], h[:, n:]
-    shift = 0 if d is None else jnp.einsum("tij,tj->ti", after, d)
-    added = jnp.einsum("tji,tj->ti", loop, shift + jnp.zeros_like(q)) + q
-    added = added - jnp.einsum("tji,tj->ti", K, r)
-    p = linear_recursion(loop, added, v, True, lambda loop, p: loop.T @ p)
-    pushed = jnp.einsum("tji,tj->ti", B, p[1:] + shift)
-    gradient = r + pushed
-    curved = jnp.swapaxes(B, 1, 2) @ after @ B
-    k = jax.vmap(solve)(safe + curved, gradient[..., None])[..., 0]
-    ok = ok & jnp.all(jnp.isfinite(k))
-    K, k = jnp.where(ok, K, 0), jnp.where(ok, k, 0)
-    slope, curvature = promised(stages, K, k)
-    return Policy(K, k, gradient, jnp.max(jnp.abs(pushed)), slope, curvature, ok)
+    damped = R + mu * jnp.eye(B.shape[2], dtype=F.dtype)
+    linear = dict(d=d, q=q, r=r, final_q=v)
+    solution = dre(A, B, Q, damped, S, final=V, **linear, parallel=True, throw=False)
+    ok = jnp.all(jnp.isfinite(solution.K)) & jnp.all(jnp.isfinite(solution.k))
+    parts = solution.X[1:], solution.p[1:], solution.K, solution.k
+    X, p, K, k = (jnp.where(ok, part, 0) for part in parts)
+    # The gradient of stage cost and cost-to-go, 1/2 x'X x + p'x of the next state, with
+    # respect to the control.
+    shift = 0 if d is None else jnp.einsum("tij,tj->ti", X, d)
+    pushed = jnp.einsum("tji,tj->ti", B, p + shift)
+    slope, curvature = predicted_change(stages, K, k)
+    return Policy(K, k, r + pushed, jnp.max(jnp.abs(pushed)), slope, curvature, ok)
 
 
-def promised(stages: Stages, K: Array, k: Array) -> tuple[Array, Array]:
+def predicted_change(stages: Stages, K: Array, k: Array) -> tuple[Array, Array]:
     """Slope and curvature of the cost along the step, by following the linear model."""
     F, H, h, d, V, v = stages
 
     def forward(dx, here):
         F, K, k, d = here
+        # The linear model under du = -k - K dx, from dx = 0.
         z = jnp.concatenate([dx, -k - matvec(K, dx)])
         after = matvec(F, z)
         return after if d is None else after + d, z
 
-    start = jnp.zeros_like(v)
-    last, z = lax.scan(forward, start, (F, K, k, d))
+    last, z = lax.scan(forward, jnp.zeros_like(v), (F, K, k, d))
     slope = jnp.sum(h * z) + v @ last
     curvature = jnp.einsum("ti,tij,tj->", z, H, z) + last @ V @ last
     return slope, curvature

@@ -1,4 +1,4 @@
-"""What a planner is, and the plan that it returns."""
+"""The protocol of planners."""
 
 import abc
 import numbers
@@ -8,170 +8,54 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from .._check import (
-    as_bounds,
-    as_rows,
-    as_vector,
     check_control_bounds,
     check_count,
-    check_finite,
     check_instance,
     check_key,
     check_number,
-    check_step,
+    finite_rows,
+    finite_vector,
 )
-from .._controller import AbstractController, wrong_observation
-from .._module import as_float_array, as_module, function_field, parameter, weight
-from .._results import choose, raise_on_failure, Result, RESULTS
+from .._module import as_float_array, as_module
+from .._results import choose, raise_on_failure, RESULTS
 from .._typing import PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
-from ..math import matvec
-from ..math._steps import row_at, step_at
-from ._constraints import Constraints
-from ._problem import Problem
-from ._start import control_at_rest, default_start, Start
-
-
-class Plan(AbstractController):
-    """A locally optimal trajectory, and a controller that follows it,
-
-    `u = controls[k] - gains[k] (y - states[k])` with `k = round((t - t0) / dt)`,
-
-    between the bounds that it was planned with. Outside the horizon the control is NaN,
-    which a rollout reports. [`delucax.planning.ilqr`][] makes it, and so do
-    [`delucax.planning.MPPI`][] and [`delucax.planning.CEM`][], without gains, and
-    [`delucax.planning.ilc`][] and [`delucax.planning.igpc`][].
-
-    **Arguments:**
-
-    - `states`: shape `(T+1, n)`.
-    - `controls`: shape `(T, m)`, trainable.
-    - `gains`: shape `(T, m, n)`, trainable. The rows of controls that a bound holds are
-        zero.
-    - `cost`: the cost of the trajectory, with its final cost.
-    - `trace`: the cost at the start and after each iteration, shape
-        `(max_iterations + 1,)`; the last one repeated where there were fewer. With
-        constraints, of the augmented Lagrangian.
-    - `residual`: the largest entry of the gradient of the cost with respect to the
-        controls, of its projection where a bound holds; of a planner that samples, the
-        largest change of a control in the last iteration.
-    - `violation`: by how much a constraint is violated, or is inactive although its
-        multiplier is not zero; 0 without constraints.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
-    - `iterations`: the iterations taken.
-    - `rollouts`: the trajectories computed, each candidate of a line search being one.
-    - `regularisation`: that of the last iteration. Above zero, the problem has no
-        positive definite control Hessian at the solution, or the search was hard.
-    - `t0`: the time of the first state.
-    - `dt`: the control interval.
-    - `low`, `high`: the bounds of the controls, shape `(m,)`; `None` if there are none.
-    - `difference`: `(x, x_ref) -> deviation`; subtraction by default.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-        import jax.numpy as jnp
-
-        env = dlx.make("planar_quadrotor", horizon=40)
-        _, hover = env.dynamics.equilibrium()
-        start = jnp.tile(hover, (40, 1))
-        plan = dlx.planning.ilqr(env.dynamics, env.cost, env.initial_state, start)
-        dlx.rollout(env, plan, key=jax.random.key(0)).total_cost
-        ```
-    """
-
-    states: Float[Array, "*batch T+1 n"] = parameter()
-    controls: Float[Array, "*batch T m"] = weight()
-    gains: Float[Array, "*batch T m n"] = weight()
-    cost: Array
-    trace: Array
-    residual: Array
-    violation: Array
-    result: Result
-    iterations: Array
-    rollouts: Array
-    regularisation: Array
-    t0: Array = parameter()
-    dt: Array = parameter()
-    low: Array | None = parameter()
-    high: Array | None = parameter()
-    difference: Callable[[Any, Any], Any] | None = function_field()
-
-    def __check_init__(self):
-        check_step(self.dt, "Plan")
-        if self.low is not None or self.high is not None:
-            bounds, size = (self.low, self.high), self.controls.shape[-1]
-            as_bounds(bounds, "Plan", "low and high", size)
-
-    @property
-    def is_usable(self) -> Array:
-        """Whether the planner has a plan to use: it did not diverge, and the
-        constraints can hold.
-
-        A plan of too few iterations, or whose search failed, is the best so far.
-        """
-        finite = jnp.all(jnp.isfinite(self.controls), axis=(-2, -1))
-        lost = (self.result == RESULTS.diverged) | (self.result == RESULTS.infeasible)
-        return finite & ~lost
-
-    def __call__(self, t, y, state):
-        size = self.states.shape[1]
-        if y.shape != (size,):
-            raise wrong_observation(self, size, y)
-        step = step_at(t - self.t0, self.dt, len(self.controls), "Plan")
-        rows = row_at((self.states[:-1], self.controls, self.gains), step)
-        x_ref, u_ref, K = rows
-        e = y - x_ref if self.difference is None else self.difference(y, x_ref)
-        u = u_ref - matvec(K, e)
-        if self.low is not None and self.high is not None:
-            u = jnp.minimum(jnp.maximum(u, self.low), self.high)
-        return u.astype(y.dtype), state
-
-
-def plan_of(
-    problem: Problem, states: Array, controls: Array, cost: Array, **rest: Any
-) -> Plan:
-    """A plan for a problem."""
-    zero = jnp.zeros((), cost.dtype)
-    defaults = dict(violation=zero, regularisation=zero)
-    low, high = problem.bounds or (None, None)
-    return Plan(
-        states=states,
-        controls=controls,
-        cost=cost,
-        t0=problem.t0,
-        dt=problem.dynamics.dt,
-        low=low,
-        high=high,
-        difference=problem.difference,
-        **(defaults | rest),
-    )
+from ._plan import Plan
+from ._problem import Constraints, Problem
+from ._start import operating_point, Start
 
 
 def checked_plan(plan: Plan, where: str, throw: bool = True) -> Plan:
-    """Raise if asked to, unless the plan is a solution."""
-
-    def facts():
-        return (
-            f"After {int(plan.iterations)} iterations the cost is "
-            f"{float(plan.cost):.6g} and the residual {float(plan.residual):.2g}."
-        )
-
+    """The plan; if `throw`, raise unless it is a solution."""
+    facts = lambda: (
+        f"After {int(plan.iterations)} iterations the cost is {float(plan.cost):.6g} "
+        f"and the residual {float(plan.residual):.2g}."
+    )
     return raise_on_failure(plan, where, throw, "the plan", facts)
 
 
 class AbstractPlanner(eqx.Module):
-    """A way to find a plan. Its fields are its options; a call gives it a problem:
+    """Base class of trajectory optimisers. The fields of one are its options, and a
+    call gives it a problem:
 
     `plan = planner(dynamics, cost, x0, controls, t0, w, bounds)`.
 
-    A planner of your own has the method `solve`, which gets a problem whose arguments
-    are checked. It works in [`delucax.controllers.MPC`][] then.
+    To write a planner, subclass it and write `solve(problem, start, key)`, where
+    `problem` is a [`delucax.planning.Problem`][] whose arguments are checked:
+
+    - `start` may hold several starts. `start.cheapest(problem)` picks one.
+    - Controls must respect the bounds: `problem.roll_out` and `problem.clip` do.
+    - Raise an error on `problem.constraints` if the planner takes none.
+    - Return `problem.plan(states, controls, cost)`. A call raises unless its `result`
+        is `successful`.
+    - Set `is_stochastic` if the planner draws random numbers.
+
+    It then works in [`delucax.controllers.MPC`][], too. Derivatives of the plan are
+    those of `solve`.
 
     !!! example
 
@@ -180,12 +64,18 @@ class AbstractPlanner(eqx.Module):
         import jax
         import jax.numpy as jnp
 
+        class Shooting(dlx.planning.AbstractPlanner):
+            def solve(self, problem, start, key):
+                _, _, controls, _ = start.cheapest(problem)
+                cost = lambda controls: problem.roll_out(controls)[2]
+                slope = jax.jit(jax.grad(cost))
+                for _ in range(20):
+                    controls = controls - 0.05 * slope(controls)
+                return problem.plan(*problem.roll_out(controls))
+
         env = dlx.make("pendulum")
-        given = env.dynamics, env.cost, jnp.array([0.5, 0.0]), 10
-        for planner in (dlx.planning.ILQR(), dlx.planning.CEM(samples=64)):
-            key = jax.random.key(0) if planner.is_stochastic else None
-            plan = planner(*given, bounds=(-2.0, 2.0), key=key)
-            plan.cost, plan.result
+        x0 = jnp.array([0.5, 0.0])
+        Shooting()(env.dynamics, env.cost, x0, 10, bounds=(-2.0, 2.0)).cost
         ```
     """
 
@@ -199,12 +89,11 @@ class AbstractPlanner(eqx.Module):
 
     @abc.abstractmethod
     def solve(self, problem: Problem, start: Start, key: PRNGKey | None) -> Plan:
-        """The plan, whatever became of it.
+        """The plan, with its `result` set; a failure does not raise here.
 
         **Arguments:**
 
-        - `problem`: dynamics, cost, first state and time, known disturbances, bounds
-            and constraints; with the cost of a trajectory and so on as methods.
+        - `problem`: a [`delucax.planning.Problem`][].
         - `start`: one start, or several along a first axis.
         - `key`: a random key if the planner draws, else `None`.
         """
@@ -233,7 +122,7 @@ class AbstractPlanner(eqx.Module):
         - `cost`: the stage and final cost.
         - `x0`: the first state, shape `(n,)`.
         - `controls`: what to start from: controls, shape `(T, m)`; the number of steps
-            `T`, for [`delucax.planning.default_start`][]; feedback, or several starts
+            `T`, for [`delucax.planning.Start.default`][]; feedback, or several starts
             of which the cheapest is taken, as [`delucax.planning.Start`][]; or an
             earlier plan, with its gains.
         - `t0`: the time of the first state, 0 by default.
@@ -244,10 +133,9 @@ class AbstractPlanner(eqx.Module):
             planners that take them; none by default.
         - `difference`: `(x, x_ref) -> deviation`, such as `system.difference`, which
             wraps angles, for dynamics that wrap them; subtraction by default.
-        - `fallback`: feedback of the same horizon, with states and gains, which the
-            plan holds in place of its own where that is of no use: every start
-            diverges, or the constraints cannot hold. Its `result` says so. None by
-            default.
+        - `fallback`: feedback of the same horizon, with states and gains, used in place
+            of the plan's own if planning fails: every start diverges, or the
+            constraints cannot hold. The `result` says so. None by default.
         - `key`: a random key, for planners that draw.
         - `throw`: raise unless the plan is a solution (default); if false, look at
             `plan.result`.
@@ -261,16 +149,28 @@ class AbstractPlanner(eqx.Module):
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         check_instance(cost, AbstractCost, "cost", where)
         n, m = dynamics.state_size, dynamics.control_size
-        x0 = as_vector(x0, n, "x0", where)
-        check_finite(x0, "x0", where)
+        x0 = finite_vector(x0, n, "x0", where)
         check_number(t0, "t0", where)
         t0 = as_float_array(t0)
-        if self.starts_from_states:
-            controls = _at_rest(dynamics, cost, controls, where)
-        start = _as_start(dynamics, cost, controls, t0, where)
+        is_count = isinstance(controls, numbers.Integral)
+        if isinstance(controls, Start | Plan):
+            if self.starts_from_states:
+                raise ValueError(
+                    f"{where}: states go with an array of controls or a number of "
+                    f"steps, got {type(controls).__name__}."
+                )
+            start = Start(controls.controls, controls.states, controls.gains)
+            start = start.checked(n, m, "controls", where)
+        elif not is_count:
+            start = Start(finite_rows(controls, m, "controls", where))
+        else:
+            T = check_count(controls, "controls (the horizon)", where)
+            if self.starts_from_states:
+                start = Start(jnp.tile(operating_point(dynamics, cost)[1], (T, 1)))
+            else:
+                start = Start.default(dynamics, cost, T, t0)
         # A default start has no precision of its own.
-        known = () if isinstance(controls, numbers.Integral) else (start.controls,)
-        dtype = jnp.result_type(x0, *known)
+        dtype = jnp.result_type(x0, *(() if is_count else (start.controls,)))
         if w is not None:
             size = dynamics.disturbance_size
             w = finite_rows(w, size, "w", where, start.horizon)
@@ -281,10 +181,10 @@ class AbstractPlanner(eqx.Module):
         if constraints is not None:
             hint = " (`delucax.planning.Constraints`)"
             check_instance(constraints, Constraints, "constraints", where, hint)
-        ends = check_control_bounds(bounds, m, where)
+        ends: Any = check_control_bounds(bounds, m, where)
         if ends is not None:
-            low, high = (jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
-            ends = low, high
+            ends = tuple(jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
+        # One precision for all: the loops of the planners carry it unchanged.
         x0, t0, distance = x0.astype(dtype), t0.astype(dtype), as_module(difference)
         problem = Problem(dynamics, cost, x0, t0, w, ends, distance, constraints)
         start = jax.tree.map(lambda a: a.astype(dtype), start)
@@ -300,46 +200,10 @@ class AbstractPlanner(eqx.Module):
 def _with_fallback(plan: Plan, fallback: Start | Plan) -> Plan:
     trajectory = lambda p: (p.states, p.controls, p.gains)
     usable = plan.is_usable
+    # By `where`, not `cond`: under `jax.vmap` each member of a batch has its own.
     keep = lambda new, old: jnp.where(usable, new, old).astype(new.dtype)
-    # Controls that are not finite are of no use either, whatever the planner says.
+    # Controls that are not finite are a failure, whatever the planner's status.
     result = choose(plan.result == RESULTS.successful, RESULTS.diverged, plan.result)
     result = choose(usable, plan.result, result)
     kept = jax.tree.map(keep, trajectory(plan), trajectory(fallback))
     return eqx.tree_at(lambda p: (*trajectory(p), p.result), plan, (*kept, result))
-
-
-def _as_start(
-    dynamics: AbstractDynamics, cost: AbstractCost, controls: Any, t0: Array, where: str
-) -> Start:
-    """What to start from, or an error."""
-    m = dynamics.control_size
-    if isinstance(controls, Plan):
-        controls = Start(controls.controls, controls.states, controls.gains)
-    if isinstance(controls, Start):
-        return controls.checked(dynamics.state_size, m, "controls", where)
-    if isinstance(controls, numbers.Integral):
-        T = check_count(controls, "controls (the horizon)", where)
-        return default_start(dynamics, cost, T, t0)
-    return Start(finite_rows(controls, m, "controls", where))
-
-
-def _at_rest(dynamics: Any, cost: Any, controls: Any, where: str) -> Any:
-    """The controls for states that are given: those at rest for a number of steps."""
-    if isinstance(controls, Start | Plan):
-        raise ValueError(
-            f"{where}: states go with an array of controls or a number of steps, got "
-            f"{type(controls).__name__}."
-        )
-    if not isinstance(controls, numbers.Integral):
-        return controls
-    T = check_count(controls, "controls (the horizon)", where)
-    return jnp.tile(control_at_rest(dynamics, cost), (T, 1))
-
-
-def finite_rows(
-    value: Any, size: int, name: str, where: str, steps: int | None = None
-) -> Array:
-    """`value` as finite rows of `size` entries, one for each step, or an error."""
-    rows = as_rows(value, size, name, where, steps)
-    check_finite(rows, name, where)
-    return rows

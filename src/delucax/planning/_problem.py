@@ -1,28 +1,152 @@
-"""What is planned: dynamics, a cost, a start; its trajectories and its local model."""
+"""The planning problem: dynamics, a cost, constraints; its trajectories."""
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
-from .._jax import by_components, first_possible, join_state, split_state, stack_steps
-from .._results import first_of, or_none, RESULTS
+from .._jax import by_components, join_state, split_state, stack_steps
+from .._module import check_parameters, function_field
+from .._results import choose, first_of, or_none, RESULTS
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
-from ._constraints import augmented, Constraints, Multipliers, Values, values_of
-from ._lq import Stages
+from ._plan import Plan
+
+
+class Constraints(eqx.Module):
+    """Constraints along a plan: `inequality(t, x, u) <= 0` and
+    `equality(t, x, u) = 0` at each step, `final_inequality(t, x) <= 0` and
+    `final_equality(t, x) = 0` at the end.
+
+    Each returns a number or a vector. The constraints of a step hold at the first one
+    too, where the state is given: one on the state alone must hold there anyway. Bounds
+    on the controls alone are cheaper as `bounds` of the planner.
+
+    **Arguments:**
+
+    - `inequality`: a function of time, state and control; none by default.
+    - `equality`: likewise; none by default.
+    - `final_inequality`: a function of time and the last state; none by default.
+    - `final_equality`: likewise; none by default.
+
+    A function that is a module with [`delucax.parameter`][] fields can be
+    differentiated with respect to them.
+
+    **Raises:** `ValueError` if one is no function, or if there is none.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        slow = lambda t, x, u: jnp.abs(x[1]) - 3.0
+        upright = lambda t, x: x
+        constraints = dlx.planning.Constraints(slow, final_equality=upright)
+        dynamics = dlx.Discretized(dlx.systems.Pendulum(), dt=0.1)
+        cost = dlx.costs.Quadratic([0.0, 0.0], [1.0])
+        plan = dlx.planning.ilqr(
+            dynamics,
+            cost,
+            jnp.array([1.0, 0.0]),
+            jnp.zeros((20, 1)),
+            constraints=constraints,
+        )
+        plan.states[-1], plan.violation
+        ```
+    """
+
+    inequality: Callable[[Array, Array, Array], Any] | None = function_field(None)
+    equality: Callable[[Array, Array, Array], Any] | None = function_field(None)
+    final_inequality: Callable[[Array, Array], Any] | None = function_field(None)
+    final_equality: Callable[[Array, Array], Any] | None = function_field(None)
+
+    def __check_init__(self):
+        check_parameters(self)
+        if all(function is None for function in vars(self).values()):
+            raise ValueError("Constraints: at least one function must be given.")
+
+
+Values: TypeAlias = tuple[Float[Array, "*steps p"], Bool[Array, "*steps p"]]
+"""The values of constraints, inequalities first, and which are of equalities."""
+
+
+class Multipliers(NamedTuple):
+    """The Lagrange multipliers at each step and at the end, and the penalty weight."""
+
+    stage: Array  # (T, p)
+    final: Array  # (q,)
+    rho: Array
+
+
+def values_of(functions: tuple[Any, Any], arguments: tuple, dtype: Any) -> Values:
+    """The values of an inequality and an equality, either of which may be `None`."""
+    given = (jnp.zeros(0) if f is None else f(*arguments) for f in functions)
+    inequality, equality = (jnp.ravel(jnp.asarray(c, dtype)) for c in given)
+    c = jnp.concatenate([inequality, equality])
+    return c, jnp.arange(c.size) >= inequality.size
+
+
+def augmented(c: Array, y: Array, rho: Array, equal: Array) -> Array:
+    """The penalty of constraints with values `c` and multipliers `y`:
+    `y c + rho c^2 / 2`, or `(max(0, y + rho c)^2 - y^2) / (2 rho)` of an inequality.
+
+    Source: Hestenes, 1969; Powell, 1969; Rockafellar, 1973 (inequalities).
+    """
+    # The two agree where an inequality is active, and so do their first derivatives at
+    # the switch; the second one jumps there. A weight of zero leaves the Lagrangian.
+    active = equal | (y + rho * c > 0)
+    safe = jnp.where(rho > 0, rho, 1)
+    return jnp.sum(jnp.where(active, c * (y + rho * c / 2), -(y**2) / (2 * safe)))
+
+
+def updated(c: Array, y: Array, rho: Array, equal: Array) -> Array:
+    """The multipliers after a minimisation."""
+    return jnp.where(equal, y + rho * c, jnp.maximum(y + rho * c, 0))
+
+
+def violated(c: Array, y: Array, rho: Array, equal: Array) -> Array:
+    """How far each constraint is from holding, or its multiplier from being needed."""
+    # max(c, -y / rho) is zero just where c <= 0, y >= 0 and y c = 0: both feasibility
+    # and complementarity, in the unit of the constraint.
+    slack = jnp.maximum(c, -y / rho)
+    return jnp.where(equal, jnp.abs(c), jnp.abs(slack))
 
 
 class Problem(eqx.Module):
-    """A planning problem. Everything in it can be differentiated.
+    """A planning problem, as [`delucax.planning.AbstractPlanner`][] gives it to the
+    `solve` of a planner: with arguments that are checked, of one precision.
 
-    With multipliers its cost is the augmented Lagrangian.
+    It can be differentiated with respect to every array.
+
+    **Attributes:**
+
+    - `dynamics`, `cost`: as given.
+    - `x0`, `t0`: the first state, shape `(n,)`, and its time.
+    - `w`: known disturbances, shape `(T, k)`; `None` for zero.
+    - `bounds`: `(low, high)`, each of shape `(m,)`; `None` without.
+    - `difference`: `(x, x_ref) -> deviation`; `None` for subtraction.
+    - `constraints`: [`delucax.planning.Constraints`][]; `None` without.
+    - `multipliers`: those of the augmented Lagrangian, which is then the cost; `None`
+        without.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        env, x0 = dlx.make("pendulum"), jnp.array([0.5, 0.0])
+        problem = dlx.planning.Problem(env.dynamics, env.cost, x0, jnp.zeros(()))
+        states, controls, cost = problem.roll_out(jnp.zeros((10, 1)))
+        problem.plan(states, controls, cost).result
+        ```
     """
 
     dynamics: AbstractDynamics
@@ -36,58 +160,69 @@ class Problem(eqx.Module):
     multipliers: Multipliers | None = None
 
     def deviation(self, x: Array, x_ref: Array) -> Array:
-        """`x` from `x_ref`, as the caller measures it."""
+        """The deviation of `x` from `x_ref`, by `difference`.
+
+        **Arguments:** `x`, `x_ref`: states.
+        """
         return x - x_ref if self.difference is None else self.difference(x, x_ref)
 
     def times(self, horizon: int) -> Array:
-        """The times of the states, shape `(T + 1,)`."""
+        """The times of the states, shape `(T+1,)`.
+
+        **Arguments:** `horizon`: T.
+        """
+        # By products, not by a sum, so that rounding does not accumulate.
         steps = jnp.arange(horizon + 1)
         return (self.t0 + steps * self.dynamics.dt).astype(self.x0.dtype)
 
     def clip(self, u: Array) -> Array:
-        """The control between the bounds."""
+        """The control, clipped to the bounds.
+
+        **Arguments:** `u`: shape `(m,)`.
+        """
         if self.bounds is None:
             return u
         low, high = self.bounds
         return jnp.minimum(jnp.maximum(u, low), high)
 
     def room(self, controls: Array) -> tuple[Array, Array] | None:
-        """The bounds of a change of each control, if there are any."""
+        """The bounds of a change of each of `controls`, if there are any."""
         if self.bounds is None:
             return None
         low, high = self.bounds
         return low - controls, high - controls
 
     def step(self, t: Array, x: Array, u: Array, w: Array | None) -> Array:
-        """The next state."""
+        """The next state.
+
+        **Arguments:** `t`, `x`, `u`, `w`: as for the dynamics.
+        """
         return self.dynamics.advance(t, x, u, w)[0].astype(x.dtype)
 
     def stage_constraints(self, t: Array, x: Array, u: Array) -> Values:
-        """The values of the constraints of a step."""
+        """The values of the constraints of a step, at `t`, `x`, `u`."""
         assert self.constraints is not None
         functions = self.constraints.inequality, self.constraints.equality
         return values_of(functions, (t, x, u), x.dtype)
 
     def final_constraints(self, t: Array, x: Array) -> Values:
-        """The values of the constraints at the end."""
+        """The values of the constraints at the end, at `t`, `x`."""
         assert self.constraints is not None
         functions = self.constraints.final_inequality, self.constraints.final_equality
         return values_of(functions, (t, x), x.dtype)
 
     def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
-        """The values of the constraints of all steps, and at the end."""
+        """Their values at all steps of `states` and `controls`, and at the end."""
         times = self.times(controls.shape[0])
         stage = jax.vmap(self.stage_constraints)(times[:-1], states[:-1], controls)
         return stage, self.final_constraints(times[-1], states[-1])
 
     def with_multipliers(self, multipliers: Multipliers | None) -> "Problem":
-        """The problem whose cost is the augmented Lagrangian with these, if any."""
-        if multipliers is None:
-            return self
+        """The problem whose cost is the augmented Lagrangian with `multipliers`."""
         return dataclasses.replace(self, multipliers=multipliers)
 
     def stage_cost(self, t: Array, x: Array, u: Array, y: Array | None) -> Array:
-        """The cost of a step, and what the constraints add to it."""
+        """The cost of a step at `t`, `x`, `u`, with the penalty by multipliers `y`."""
         cost = self.cost(t, x, u)
         if self.multipliers is None or y is None:
             return cost + 0.0  # an integer cost has a gradient then
@@ -95,7 +230,7 @@ class Problem(eqx.Module):
         return cost + augmented(c, y, self.multipliers.rho, equal)
 
     def final_cost(self, t: Array, x: Array) -> Array:
-        """The cost at the end, and what the constraints add to it."""
+        """The cost at the end, at `t`, `x`, with the penalty of the constraints."""
         cost = self.cost.final(t, x)
         if self.multipliers is None:
             return cost
@@ -105,15 +240,68 @@ class Problem(eqx.Module):
 
     @property
     def stage_multipliers(self) -> Array | None:
-        """Those of the steps."""
+        """The multipliers of the steps."""
         return None if self.multipliers is None else self.multipliers.stage
 
     def total(self, states: Array, controls: Array) -> Array:
-        """The cost of a trajectory."""
+        """The cost of a trajectory.
+
+        **Arguments:** `states`: shape `(T+1, n)`. `controls`: shape `(T, m)`.
+        """
         times = self.times(controls.shape[0])
         each = (times[:-1], states[:-1], controls, self.stage_multipliers)
         final = self.final_cost(times[-1], states[-1])
         return (jnp.sum(jax.vmap(self.stage_cost)(*each)) + final).astype(states.dtype)
+
+    def roll_out(
+        self, controls: Array, states: Array | None = None, gains: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        """The trajectory under `controls - gains (x - states)`, between the bounds.
+
+        **Arguments:**
+
+        - `controls`: shape `(T, m)`.
+        - `states`: shape `(T+1, n)`, with `gains`; none by default.
+        - `gains`: shape `(T, m, n)`; zero by default.
+
+        **Returns:** `(states, controls, cost)`: shapes `(T+1, n)` and `(T, m)`, and a
+        scalar, infinite if a step failed or a number is not finite.
+        """
+        if states is None:
+            points = controls.shape[0] + 1
+            states = jnp.broadcast_to(self.x0, (points, *self.x0.shape))
+        return roll_out(self, states, controls, gains)
+
+    def plan(self, states: Array, controls: Array, cost: Array, **fields: Any) -> Plan:
+        """The plan of a trajectory, such as `roll_out` returns.
+
+        **Arguments:**
+
+        - `states`, `controls`, `cost`: the trajectory and its cost.
+        - `fields`: others of [`delucax.planning.Plan`][]. By default there are no
+            gains, the trace is the cost, the residual is NaN, and the result is
+            `successful`, or `diverged` if the cost is not finite.
+
+        **Returns:** a [`delucax.planning.Plan`][].
+        """
+        zero, finite = jnp.zeros_like(cost), jnp.isfinite(cost)
+        low, high = self.bounds or (None, None)
+        defaults: dict[str, Any] = dict(
+            gains=jnp.zeros((*controls.shape, states.shape[1]), controls.dtype),
+            trace=cost[None],
+            residual=jnp.full_like(cost, jnp.nan),
+            violation=zero,
+            result=choose(finite, RESULTS.successful, RESULTS.diverged),
+            iterations=jnp.asarray(0),
+            rollouts=jnp.asarray(1),
+            regularisation=zero,
+            t0=self.t0,
+            dt=self.dynamics.dt,
+            low=low,
+            high=high,
+            difference=self.difference,
+        )
+        return Plan(states, controls, cost=cost, **(defaults | fields))
 
 
 def roll_out(
@@ -123,18 +311,20 @@ def roll_out(
     K: Array | None = None,
     k: Array | None = None,
     length: Array | float = 0.0,
-    gaps: Array | None = None,
+    defects: Array | None = None,
 ) -> tuple[Array, Array, Array]:
     """The trajectory under `u - length k - K (x - x_planned)`, and its cost.
 
-    Each of `K` and `k` may be left out. `1 - length` of each gap is left.
-    The cost is infinite if anything goes wrong.
+    Each of `K` and `k` may be left out. `1 - length` of each defect is left.
+    The cost is infinite if a step fails or a number is not finite.
     """
     size = problem.x0.shape[0]
 
+    # The state is carried by its components, as in `delucax.rollout`: most of the time
+    # of a planner is spent here.
     @by_components
     def body(parts, inputs):
-        t, planned, u, K, k, gap, w = inputs
+        t, planned, u, K, k, defect, w = inputs
         x = join_state(parts, size)
         if k is not None:
             u = u - length * k
@@ -143,133 +333,19 @@ def roll_out(
         u = problem.clip(u)
         x_next, result = problem.dynamics.advance(t, x, u, w)
         x_next = x_next.astype(x.dtype)
-        if gap is not None:
-            x_next = x_next - (1 - length) * gap
+        # Multiple shooting: a step of this length closes that share of the defects, so
+        # the trajectory stays near the guess of the states.
+        if defect is not None:
+            x_next = x_next - (1 - length) * defect
         return split_state(x_next), (parts, u, or_none(result))
 
     times = problem.times(controls.shape[0])[:-1]
-    inputs = (times, states[:-1], controls, K, k, gaps, problem.w)
+    inputs = (times, states[:-1], controls, K, k, defects, problem.w)
     last, (parts, controls, results) = lax.scan(body, split_state(problem.x0), inputs)
     states = stack_steps(parts, size, last)
+    # All states are checked, because a cost may ignore some of them, or clip them.
     cost = problem.total(states, controls)
     good = jnp.isfinite(cost) & jnp.all(jnp.isfinite(states))
+    # A step whose solver failed may still give finite numbers.
     good = good & (first_of(results) == RESULTS.successful)
     return states, controls, jnp.where(good, cost, jnp.inf)
-
-
-def gaps_of(problem: Problem, states: Array, controls: Array) -> Array:
-    """How far each step misses the next state of the guess, shape `(T, n)`."""
-    times = problem.times(controls.shape[0])[:-1]
-    inputs = (times, states[:-1], controls, problem.w)
-    reached = jax.vmap(problem.step)(*inputs)
-    return jax.vmap(problem.deviation)(reached, states[1:])
-
-
-def model(
-    problem: Problem,
-    states: Array,
-    controls: Array,
-    gaps: Array | None,
-    second_order: bool,
-    use_exact: Array | None = None,
-    spacing: float | None = None,
-) -> Stages:
-    """The linear-quadratic model of the problem about a trajectory.
-
-    The second derivatives of dynamics and constraints are left out where `use_exact` is
-    false. With a `spacing` the dynamics are linearised by central differences.
-    """
-    horizon, size = controls.shape[0], states.shape[1]
-    times = problem.times(horizon)
-    z = jnp.concatenate([states[:-1], controls], axis=1)
-
-    def step(z, t, w):
-        return problem.step(t, z[:size], z[size:], w)
-
-    def stage_cost(z, t, y):
-        return problem.stage_cost(t, z[:size], z[size:], y)
-
-    def stage_hessian(z, t, y):
-        """That of the cost, with the constraints as their linear parts squared."""
-        if problem.multipliers is None:
-            return jax.hessian(stage_cost)(z, t, y)
-        c = lambda z: problem.stage_constraints(t, z[:size], z[size:])
-        cost = jax.hessian(lambda z: problem.cost(t, z[:size], z[size:]))(z)
-        return cost + squared(c, z, y, problem.multipliers.rho)
-
-    y = problem.stage_multipliers
-    v = jax.grad(lambda x: problem.final_cost(times[-1], x))(states[-1])
-    if spacing is None:
-        slopes = jacobian(step)
-    else:
-        slopes = central(step, spacing, problem.deviation)
-    F = jax.vmap(slopes)(z, times[:-1], problem.w)
-    h = jax.vmap(jax.grad(stage_cost))(z, times[:-1], y)
-    H = jax.vmap(stage_hessian)(z, times[:-1], y)
-    V = jax.hessian(lambda x: problem.cost.final(times[-1], x))(states[-1])
-    if problem.multipliers is not None:
-        c = lambda x: problem.final_constraints(times[-1], x)
-        V = V + squared(c, states[-1], *problem.multipliers[1:])
-    if second_order:
-        costates = costates_of(F, h, v)
-
-        def lagrangian(z, t, w, y, costate):
-            return stage_cost(z, t, y) + costate @ step(z, t, w)
-
-        each = (z, times[:-1], problem.w, y, costates)
-        exact = jax.vmap(curvature(lagrangian))(*each)
-        at_end = jax.hessian(lambda x: problem.final_cost(times[-1], x))(states[-1])
-        if use_exact is None:
-            H, V = exact, at_end
-        else:
-            H, V = jnp.where(use_exact, exact, H), jnp.where(use_exact, at_end, V)
-    H, V = (H + jnp.swapaxes(H, 1, 2)) / 2, (V + V.T) / 2
-    stages = Stages(F, H, h, gaps, V, v)
-    return jax.tree.map(lambda a: a.astype(states.dtype), stages)
-
-
-def squared(c: Callable[[Array], Values], z: Array, y: Array, rho: Array) -> Array:
-    """The Hessian of the active constraints' squares, without second derivatives."""
-    slope = jax.jacfwd(lambda z: c(z)[0])(z)
-    value, equal = c(z)
-    active = equal | (y + rho * value > 0)
-    return rho * slope.T @ jnp.where(active[:, None], slope, 0)
-
-
-def costates_of(F: Array, h: Array, v: Array) -> Array:
-    """The gradient of the cost with respect to each next state, shape `(T, n)`."""
-    size = v.shape[0]
-
-    def back(costate, here):
-        F, h = here
-        return h[:size] + matvec(F[:, :size].T, costate), costate
-
-    return lax.scan(back, v.astype(h.dtype), (F, h), reverse=True)[1]
-
-
-def jacobian(f: Callable[..., Array]) -> Callable[..., Array]:
-    """Of the first argument, in reverse: a step has fewer outputs than inputs."""
-    return first_possible(jax.jacrev(f), jax.jacfwd(f))
-
-
-def central(f: Any, spacing: float, deviation: Any) -> Any:
-    """The Jacobian in the first argument by central differences: two calls for each
-    of its entries."""
-
-    def evaluate(z, *args):
-        def along(way):
-            change = spacing * way
-            return deviation(f(z + change, *args), f(z - change, *args))
-
-        ways = jnp.eye(z.shape[0], dtype=z.dtype)
-        return jax.vmap(along)(ways).T / (2 * spacing)
-
-    return evaluate
-
-
-def curvature(f: Callable[..., Array]) -> Callable[..., Array]:
-    """The Hessian in the first argument."""
-    slope = jax.grad(f)
-    return first_possible(
-        jax.jacfwd(slope), jax.jacrev(slope), jax.jacfwd(jax.jacfwd(f))
-    )

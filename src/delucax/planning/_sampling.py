@@ -1,4 +1,4 @@
-"""Planners that draw sequences of controls: MPPI and the cross-entropy method."""
+"""Sampling-based planners: MPPI and the cross-entropy method."""
 
 import abc
 from typing import ClassVar
@@ -19,22 +19,34 @@ from .._check import (
 )
 from .._message import shortened
 from .._module import parameter
-from .._results import choose, RESULTS
 from .._typing import PRNGKey
-from ._planner import AbstractPlanner, Plan, plan_of
-from ._problem import Problem, roll_out
-from ._start import begin, controls_of, Start
+from ._plan import Plan
+from ._planner import AbstractPlanner
+from ._problem import Problem
+from ._start import controls_of, Start
 
 
 class AbstractSampler(AbstractPlanner):
-    """A planner that draws sequences of controls about a mean, moves the mean, and so
-    on. The cheapest of the means is the plan."""
+    """A sampling-based planner: sequences of controls are drawn about a mean, which
+    `update` moves, in each iteration. The cheapest of the means is the plan."""
 
     samples: eqx.AbstractVar[int]
     iterations: eqx.AbstractVar[int]
     scale: eqx.AbstractVar[Array]
     correlation: eqx.AbstractVar[Array]
     is_stochastic: ClassVar[bool] = True
+
+    def __check_init__(self):
+        where, scale = type(self).__name__, self.scale
+        check_count(self.samples, "samples", where, least=2)
+        check_count(self.iterations, "iterations", where)
+        if not eqx.is_inexact_array(scale) or scale.ndim > 1:
+            raise ValueError(
+                f"{where}: scale must be a number or a vector with an entry for each "
+                f"control, got {shortened(scale)}."
+            )
+        check_positive(scale, "scale", where)
+        check_range(self.correlation, "correlation", where, 0, 1)
 
     @abc.abstractmethod
     def update(
@@ -69,25 +81,12 @@ class AbstractSampler(AbstractPlanner):
         return _search(self, problem, start, key)
 
 
-def check_sampler(planner: AbstractSampler) -> None:
-    """Raise unless the options that all of them have are legal."""
-    where, scale = type(planner).__name__, planner.scale
-    check_count(planner.samples, "samples", where, least=2)
-    check_count(planner.iterations, "iterations", where)
-    if not eqx.is_inexact_array(scale) or scale.ndim > 1:
-        raise ValueError(
-            f"{where}: scale must be a number or a vector with an entry for each "
-            f"control, got {shortened(scale)}."
-        )
-    check_positive(scale, "scale", where)
-    check_range(planner.correlation, "correlation", where, 0, 1)
-
-
-def draw(key: PRNGKey, correlation: Array, count: int, like: Array) -> Array:
+def _draw(key: PRNGKey, correlation: Array, count: int, like: Array) -> Array:
     """Standard normal sequences, shape `(count, T, m)`; the first one is zero."""
     T, m = like.shape
     fresh = jr.normal(key, (T, count - 1, m), like.dtype)
-    # 1 - rho^2 has no slope at rho = 1 that a square root could bear.
+    # An autoregression of order one, v_k = rho v_{k-1} + sqrt(1 - rho^2) e_k, whose
+    # variance stays 1. sqrt(1 - rho^2) is not differentiable at rho = 1.
     rest = jnp.maximum(1 - correlation**2, jnp.finfo(like.dtype).eps)
 
     def follow(before, now):
@@ -105,23 +104,20 @@ def _search(
 ) -> Plan:
     controls = controls_of(start)
     if start.gains is not None or start.count > 1:
-        controls = begin(problem, start)[2]
+        controls = start.cheapest(problem)[2]
     T, m = controls.shape
-    held = jnp.broadcast_to(problem.x0, (T + 1, *problem.x0.shape))
+    cost_of = lambda controls: problem.roll_out(controls)[2]
 
-    def cost_of(controls):
-        return roll_out(problem, held, controls)[2]
-
-    def better(best, mean, cost):
-        lower = cost < best[1]
-        keep = lambda new, old: jnp.where(lower, new, old)
-        return keep(mean, best[0]), keep(cost, best[1])
+    def better(best, *now):
+        return jax.tree.map(lambda a, b: jnp.where(now[1] < best[1], a, b), now, best)
 
     def body(carry, key):
         mean, width, best, _ = carry
-        noise = draw(key, correlation, planner.samples, mean)
+        noise = _draw(key, correlation, planner.samples, mean)
+        # Clipped before they are weighed, so that the mean is of controls that act.
         drawn = jax.vmap(jax.vmap(problem.clip))(mean + width * noise)
         costs = jax.vmap(cost_of)(drawn)
+        # The first sequence is the mean itself: its cost comes with the others.
         best = better(best, drawn[0], costs[0])
         after, width = planner.update(drawn, costs, mean, width)
         moved = jnp.max(jnp.abs(after - mean))
@@ -135,16 +131,13 @@ def _search(
     keys = jr.split(key, planner.iterations)
     (mean, _, best, moved), trace = lax.scan(body, first, keys)
     best = better(best, mean, cost_of(mean))
-    states, planned, cost = roll_out(problem, held, best[0])
-    return plan_of(
-        problem,
+    states, planned, cost = problem.roll_out(best[0])
+    return problem.plan(
         states,
         planned,
         cost,
-        gains=jnp.zeros((T, m, problem.x0.shape[0]), mean.dtype),
         trace=jnp.concatenate([trace, cost[None]]),
         residual=moved,
-        result=choose(jnp.isfinite(cost), RESULTS.successful, RESULTS.diverged),
         iterations=jnp.asarray(planner.iterations),
         rollouts=jnp.asarray(planner.samples * planner.iterations + 1),
     )
@@ -153,6 +146,8 @@ def _search(
 def average(weights: Array, drawn: Array, otherwise: Array) -> Array:
     """The weighted mean of what was drawn; `otherwise` if all weights are zero."""
     total = jnp.sum(weights)
+    # Of a `where` both branches are differentiated: 0/0 in the one that is not taken
+    # would make the gradient NaN.
     safe = jnp.where(total > 0, total, 1)
     mean = jnp.einsum("s,s...->...", weights / safe, drawn)
     return jnp.where(total > 0, mean, otherwise)
@@ -211,11 +206,12 @@ class MPPI(AbstractSampler):
     temperature: Array = parameter(1.0)
 
     def __check_init__(self):
-        check_sampler(self)
         check_number(self.temperature, "temperature", "MPPI")
         check_positive(self.temperature, "temperature", "MPPI")
 
     def update(self, drawn, costs, mean, width):
+        # The softmax of -cost / temperature. The least cost is taken off first, so that
+        # the exponentials do not underflow all together.
         finite, least = jnp.isfinite(costs), jnp.min(costs)
         least = jnp.where(jnp.isfinite(least), least, 0)
         above = jnp.where(finite, costs, least) - least
@@ -234,22 +230,16 @@ class CEM(AbstractSampler):
     `mean <- momentum mean + (1 - momentum) mean of the elites`, and likewise the
     standard deviation.
 
-    A sequence that diverges is no elite. The plan is the best of the means, the start
-    among them, so it costs no more than the start. It has no gains. Its derivatives are
-    those of the elites that were drawn; which ones those are is held.
-
-    It is called as every [`delucax.planning.AbstractPlanner`][], with a `key`, and
-    without constraints. Its result is `diverged` if the start and all means diverge.
+    A sequence that diverges is no elite. The plan, its result and the call are as with
+    [`delucax.planning.MPPI`][]. The derivatives are those of the elites that were
+    drawn; which ones those are is held.
 
     **Arguments:**
 
-    - `samples`: sequences drawn in an iteration, 256 by default.
-    - `iterations`: 10 by default.
+    - `samples`, `iterations`, `correlation`: as in [`delucax.planning.MPPI`][].
     - `elites`: how many of the sequences count, 32 by default.
     - `scale`: the standard deviation to start with, a number or of shape `(m,)`; 1 by
         default.
-    - `correlation`: of a control drawn with the one before it, from 0, white noise, by
-        default, to 1.
     - `momentum`: how much stays of mean and standard deviation, 0.1 by default.
 
     **Raises:** `ValueError` on an option out of its range, or more elites than samples.
@@ -263,12 +253,9 @@ class CEM(AbstractSampler):
         import jax
         import jax.numpy as jnp
 
-        env = dlx.make("pendulum")
+        env, key = dlx.make("pendulum"), jax.random.key(0)
         planner = dlx.planning.CEM(samples=64, elites=8)
-        plan = planner(
-            env.dynamics, env.cost, jnp.array([0.5, 0.0]), 20, key=jax.random.key(0)
-        )
-        plan.cost
+        planner(env.dynamics, env.cost, jnp.array([0.5, 0.0]), 20, key=key).cost
         ```
     """
 
@@ -281,19 +268,19 @@ class CEM(AbstractSampler):
 
     def __check_init__(self):
         where = "CEM"
-        check_sampler(self)
         check_count(self.elites, "elites", where)
         check_at_most(self.elites, self.samples, "elites", where, "samples")
         check_number(self.momentum, "momentum", where)
         check_range(self.momentum, "momentum", where, 0, 1)
 
     def update(self, drawn, costs, mean, width):
-        # Neither infinities nor what is compared need a derivative.
+        # Which sequences are the elites is piecewise constant in the costs, and a
+        # derivative through infinite ones would be NaN.
         _, best = lax.top_k(-lax.stop_gradient(costs), self.elites)
         weights = jnp.isfinite(costs[best]).astype(mean.dtype)
         centre = average(weights, drawn[best], mean)
         variance = average(weights, (drawn[best] - centre) ** 2, width**2)
-        # The square root has no slope at zero.
+        # The square root has an infinite slope at zero, where all elites agree.
         spreads = variance > 0
         after = jnp.where(spreads, jnp.sqrt(jnp.where(spreads, variance, 1)), 0)
         momentum = self.momentum.astype(mean.dtype)

@@ -1,4 +1,4 @@
-"""Where planners start: trajectories under feedback, of which the cheapest is taken."""
+"""The starts of planners: trajectories under feedback."""
 
 from typing import Any
 
@@ -16,11 +16,12 @@ from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math._linear_solve import is_definite
 from ..riccati import dare
-from ._problem import model, Problem, roll_out
+from ._lq import model
+from ._problem import Problem
 
 
 class Start(eqx.Module):
-    """Where a planner starts: the trajectory that the model takes under
+    """A start of a planner: the trajectory of the model under
 
     `u_k = controls[k] - gains[k] (x_k - states[k])`,
 
@@ -113,85 +114,108 @@ class Start(eqx.Module):
             )
         return Start(*arrays)
 
+    def cheapest(self, problem: Problem) -> tuple["Start", Array, Array, Array]:
+        """The start with the cheapest trajectory.
 
-def default_start(
-    dynamics: AbstractDynamics,
-    cost: AbstractCost,
-    horizon: int,
-    t0: RealScalar = 0.0,
-    *,
-    controls: Any = None,
-) -> Start:
-    """The start that planners take by default, of which they use the cheaper one:
+        **Arguments:** `problem`: a [`delucax.planning.Problem`][].
 
-    1. under the LQR about an operating point,
-    2. with its control held.
+        **Returns:** `(start, states, controls, cost)`: the start alone, and what
+        `problem.roll_out` returns for it; the cost is infinite if all diverge.
+        """
 
-    The operating point is the `targets` of the cost where they name both a state and a
-    control. Otherwise it is the equilibrium that the dynamics name. Where they name
-    none, zeros stand in for the target that is missing, or for both. Such a point need
-    not be an equilibrium, and an LQR about it may be a poor start: name the state to
-    regulate to and the control that holds it, which [`delucax.trim`][] finds. A
-    [`delucax.costs.Quadratic`][] has targets, and so has what is made of it by `+`, `*`
-    or [`delucax.costs.Rate`][].
+        def roll(start):
+            states, gains = start.states, start.gains
+            states, controls, cost = problem.roll_out(start.controls, states, gains)
+            # The controls of a start that diverges are finite at least as given.
+            given = jax.vmap(problem.clip)(start.controls)
+            return states, jnp.where(jnp.isfinite(cost), controls, given), cost
 
-    The weights of the LQR are the second derivatives of the stage cost at that point.
+        if self.controls.ndim == 2:
+            return self, *roll(self)
+        # A loop over scalars is faster on CPU than one over vectors of a few entries.
+        rolled = lax.map(roll, self)
+        best = jnp.argmin(lax.stop_gradient(rolled[2]))
+        return jax.tree.map(lambda a: a[best], (self, *rolled))
 
-    There is no such LQR where the derivatives at that point are not finite, the second
-    derivative of the cost with respect to the control is not positive definite, no gain
-    stabilises the plant, or the dynamics cannot be differentiated. The gain of the
-    first start is then zero, and no LQR is tried.
+    @staticmethod
+    def default(
+        dynamics: AbstractDynamics,
+        cost: AbstractCost,
+        horizon: int,
+        t0: RealScalar = 0.0,
+        *,
+        controls: Any = None,
+    ) -> "Start":
+        """The start that planners take by default, of which they use the cheaper one:
 
-    A trajectory that rests at the operating point is not among the starts, for it does
-    not begin at the first state. The LQR leads there.
+        1. under the LQR about an operating point,
+        2. with its control held.
 
-    **Arguments:**
+        The operating point is the `targets` of the cost where they name both a state
+        and a control; otherwise the equilibrium that the dynamics define; otherwise
+        zeros stand in for a target that is missing. A [`delucax.costs.Quadratic`][] has
+        targets, and so has what is made of it by `+`, `*` or [`delucax.costs.Rate`][].
 
-    - `dynamics`: the discrete-time dynamics.
-    - `cost`: the stage and final cost.
-    - `horizon`: the steps `T`.
-    - `t0`: the time at which both are looked at, 0 by default.
-    - `controls`: in place of those of the second one, shape `(T, m)`.
+        If that point is not an equilibrium, an LQR about it may be a poor start: give
+        the cost both targets, which [`delucax.trim`][] finds.
 
-    **Returns:** a [`delucax.planning.Start`][]. No derivative goes through it.
+        The weights of the LQR are the second derivatives of the stage cost at that
+        point.
 
-    **Raises:** `ValueError` if `dynamics` or `cost` is not one, or the horizon is not a
-    whole number of at least 1.
+        There is no such LQR where the derivatives at that point are not finite, the
+        second derivative of the cost with respect to the control is not positive
+        definite, no gain stabilises the plant, or the dynamics cannot be
+        differentiated. The gain of the first start is then zero, and no LQR is tried.
 
-    Source: Rawlings, Mayne and Diehl, 2017 (the regulator as a warm start).
+        A trajectory that rests at the operating point is not among the starts, for it
+        does not begin at the first state. The LQR leads there.
 
-    !!! example
+        **Arguments:**
 
-        ```python
-        import delucax as dlx
+        - `dynamics`: the discrete-time dynamics.
+        - `cost`: the stage and final cost.
+        - `horizon`: the steps `T`.
+        - `t0`: the time at which both are evaluated, 0 by default.
+        - `controls`: in place of those of the second one, shape `(T, m)`.
 
-        env = dlx.make("pendulum")
-        start = dlx.planning.default_start(env.dynamics, env.cost, 20)
-        start.gains[0, 0]
-        ```
-    """
-    check_instance(dynamics, AbstractDynamics, "dynamics", "default_start")
-    check_instance(cost, AbstractCost, "cost", "default_start")
-    T = check_count(horizon, "horizon", "default_start")
-    dynamics, cost = (_constant(tree) for tree in (dynamics, cost))
-    point = _point(dynamics, cost)
-    try:
-        t0 = jnp.asarray(t0, point[0].dtype)
-        *matrices, posed = _expanded(dynamics, cost, *point, t0)
-    except (NotImplementedError, RuntimeError, TypeError, ValueError):
-        # Not differentiable. A planner that needs derivatives says so itself.
-        regulator = None
-    else:
-        regulator = dare(*matrices, throw=False), posed
-    return _both(point, regulator, controls, T)
+        **Returns:** a [`delucax.planning.Start`][]. No derivative goes through it.
+
+        **Raises:** `ValueError` if `dynamics` or `cost` is not one, or the horizon is
+        not a whole number of at least 1.
+
+        Source: Rawlings, Mayne and Diehl, 2017 (the regulator as a warm start).
+
+        !!! example
+
+            ```python
+            import delucax as dlx
+
+            env = dlx.make("pendulum")
+            start = dlx.planning.Start.default(env.dynamics, env.cost, 20)
+            start.gains[0, 0]
+            ```
+        """
+        where = "Start.default"
+        check_instance(dynamics, AbstractDynamics, "dynamics", where)
+        check_instance(cost, AbstractCost, "cost", where)
+        T = check_count(horizon, "horizon", where)
+        constant = lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf
+        dynamics, cost = jax.tree.map(constant, (dynamics, cost))
+        point = operating_point(dynamics, cost)
+        try:
+            t0 = jnp.asarray(t0, point[0].dtype)
+            *matrices, posed = _expanded(dynamics, cost, *point, t0)
+        except (NotImplementedError, RuntimeError, TypeError, ValueError):
+            # Not differentiable. A planner that needs derivatives says so itself.
+            regulator = None
+        else:
+            regulator = dare(*matrices, throw=False), posed
+        return _both(point, regulator, controls, T)
 
 
-def control_at_rest(dynamics: AbstractDynamics, cost: AbstractCost) -> Array:
-    """That of the operating point."""
-    return _point(dynamics, cost)[1]
-
-
-def _point(dynamics: AbstractDynamics, cost: AbstractCost) -> tuple[Array, Array]:
+def operating_point(
+    dynamics: AbstractDynamics, cost: AbstractCost
+) -> tuple[Array, Array]:
     """The operating point, or zeros where neither names one."""
     n, m = dynamics.state_size, dynamics.control_size
     return cost.set_point(dynamics) or (jnp.zeros(n), jnp.zeros(m))
@@ -200,11 +224,13 @@ def _point(dynamics: AbstractDynamics, cost: AbstractCost) -> tuple[Array, Array
 @eqx.filter_jit
 def _expanded(dynamics, cost, x, u, t0):
     """The linear-quadratic problem about a point, and whether it is one."""
+    # The local model of a horizon of one step at the point.
     problem = Problem(dynamics, cost, x, t0)
     stages = model(problem, jnp.stack([x, x]), u[None], None, False)
     n, F, H = x.shape[0], stages.F[0], stages.H[0]
     A, B, Q, R, S = F[:, :n], F[:, n:], H[:n, :n], H[n:, n:], H[:n, n:]
     posed = jnp.all(jnp.isfinite(F)) & jnp.all(jnp.isfinite(H)) & is_definite(R)
+    # Identities in place of what is not finite, so that the solver ends at once.
     safe = (jnp.where(posed, M, jnp.eye(*M.shape, dtype=M.dtype)) for M in (A, B, Q, R))
     return *safe, jnp.where(posed, S, 0), posed
 
@@ -216,10 +242,11 @@ def _both(point, regulator, controls, T):
     K = jnp.zeros((u.shape[0], x.shape[0]), x.dtype)
     if regulator is not None:
         solution, posed = regulator
-        # A gain that stabilises will do, whatever its residual.
+        # Any stabilising gain is a valid start, also one of large residual.
         stable = posed & (solution.spectral_radius < 1)
         stable = stable & jnp.all(jnp.isfinite(solution.K))
         K = jnp.where(stable, solution.K, K)
+    # Both starts are feedback, the second with a gain of zero, so that they stack.
     held = jnp.tile(u, (T, 1))
     return Start(
         jnp.stack([held, held if controls is None else controls]),
@@ -228,34 +255,6 @@ def _both(point, regulator, controls, T):
     )
 
 
-def _constant(tree: Any) -> Any:
-    """A module through which no derivative goes."""
-    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(jax.tree.map(lax.stop_gradient, arrays), rest)
-
-
 def controls_of(start: Start) -> Array:
     """The controls of the first start, shape `(T, m)`."""
     return start.controls[0] if start.controls.ndim == 3 else start.controls
-
-
-def begin(problem: Problem, start: Start) -> tuple[Start, Array, Array, Array]:
-    """The cheapest start, and its states, controls and cost, infinite if all of them
-    diverge."""
-
-    def roll(start):
-        states, gains = start.states, start.gains
-        if states is None:
-            T, n = start.controls.shape[0], problem.x0.shape[0]
-            states = jnp.broadcast_to(problem.x0, (T + 1, n))
-        states, controls, cost = roll_out(problem, states, start.controls, gains)
-        # Of a start that diverges at least the controls are as they were given.
-        given = jax.vmap(problem.clip)(start.controls)
-        return states, jnp.where(jnp.isfinite(cost), controls, given), cost
-
-    if start.controls.ndim == 2:
-        return start, *roll(start)
-    # A loop over scalars is faster on CPU than one over vectors of a few entries.
-    rolled = lax.map(roll, start)
-    best = jnp.argmin(lax.stop_gradient(rolled[2]))
-    return jax.tree.map(lambda a: a[best], (start, *rolled))

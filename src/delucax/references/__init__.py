@@ -1,4 +1,4 @@
-"""Signals `r(t)` to follow. Any function of time will do; these are the common ones."""
+"""Reference signals `r(t)`: a few examples, as any function of time will do."""
 
 from ._signals import (
     Constant as Constant,

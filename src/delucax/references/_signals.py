@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._check import as_matrix, check_step
+from .._check import as_matrix, check_step, check_vector
 from .._module import check_parameters, parameter, positive
-from .._typing import RealScalar, Vector
+from .._typing import Real, RealScalar, Vector
 from ..math import sin
 from ..math._steps import step_at
 
@@ -32,11 +32,7 @@ class Constant(eqx.Module):
     value: Array = parameter()
 
     def __check_init__(self):
-        if jnp.ndim(self.value) != 1:
-            raise ValueError(
-                f"Constant: value must be a vector, got shape {jnp.shape(self.value)}."
-            )
-        check_parameters(self)
+        check_vector(self.value, "value", "Constant")
 
     def __call__(self, t: RealScalar) -> Vector:
         """The signal at time `t`."""
@@ -68,7 +64,7 @@ class Sequence(eqx.Module):
     """
 
     values: Array = parameter()
-    dt: Array = parameter(constraint=positive)
+    dt: Real = parameter(constraint=positive)
 
     def __check_init__(self):
         check_step(self.dt, "Sequence")
@@ -79,6 +75,7 @@ class Sequence(eqx.Module):
         """The signal at time `t`."""
         count = self.values.shape[0]
         k = step_at(t, self.dt, count, "Sequence")
+        # Indexed, not interpolated: a rollout asks at the steps alone.
         return self.values[jnp.clip(k, 0, count - 1)]
 
 
@@ -88,7 +85,7 @@ class FigureEight(eqx.Module):
 
     **Arguments:**
 
-    - `period`: time for one round.
+    - `period`: the period of the curve.
     - `width`, `height`: half the extent to each side, 1 by default.
     - `centre`: shape `(2,)`, the origin by default.
 
@@ -103,9 +100,9 @@ class FigureEight(eqx.Module):
         ```
     """
 
-    period: Array = parameter(constraint=positive)
-    width: Array = parameter(1.0)
-    height: Array = parameter(1.0)
+    period: Real = parameter(constraint=positive)
+    width: Real = parameter(1.0)
+    height: Real = parameter(1.0)
     centre: Array = parameter((0.0, 0.0))
 
     def __check_init__(self):

@@ -1,4 +1,4 @@
-"""Matrix equations of control, by solves and products alone."""
+"""Riccati, Lyapunov and Sylvester equations, solved without eigenvalues."""
 
 from ._algebraic import (
     care as care,
@@ -7,21 +7,13 @@ from ._algebraic import (
     filter_dare as filter_dare,
 )
 from ._finite_horizon import (
-    ContinuousHorizonSolution as ContinuousHorizonSolution,
     cre as cre,
     dre as dre,
     FiniteHorizonSolution as FiniteHorizonSolution,
 )
-from ._hinfinity import (
-    GameSolution as GameSolution,
-    hinf_care as hinf_care,
-    hinf_dare as hinf_dare,
-)
-from ._hinfinity_horizon import (
-    hinf_cre as hinf_cre,
-    hinf_dre as hinf_dre,
-    HorizonGameSolution as HorizonGameSolution,
-)
+from ._hinfinity import hinf_care as hinf_care, hinf_dare as hinf_dare
+from ._hinfinity_horizon import hinf_cre as hinf_cre, hinf_dre as hinf_dre
+from ._level import GameSolution as GameSolution
 from ._linear import (
     dlyap as dlyap,
     dsylvester as dsylvester,

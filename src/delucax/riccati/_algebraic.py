@@ -10,14 +10,7 @@ from ._stabilising import RiccatiSolution, stabilising_solution
 
 
 def dare(
-    A: Any,
-    B: Any,
-    Q: Any,
-    R: Any,
-    S: Any = None,
-    E: Any = None,
-    *,
-    throw: bool = True,
+    A: Any, B: Any, Q: Any, R: Any, S: Any = None, E: Any = None, *, throw: bool = True
 ) -> RiccatiSolution:
     r"""The stabilising solution of the discrete-time algebraic Riccati equation,
 
@@ -27,15 +20,14 @@ def dare(
     `x'Qx + 2 x'Su + u'Ru` over all time along `E x_next = A x + B u`, at cost
     `(Ex)' X (Ex)` from `x`.
 
-    Structure-preserving doubling, started at a multiple of the identity: the Riccati
-    recursion from a positive final cost, 2, 4, 8, ... steps back. Then Newton steps on
-    the equation itself, if its residual asks for them. It takes products and solves
+    Structure-preserving doubling of the Riccati recursion from a positive final cost,
+    followed by Newton steps while the residual is large. It takes products and solves
     alone, no eigenvalues, which suits accelerators and `jax.vmap`; in a batch, a member
-    that fails harms no other. It is differentiable to any order, in either mode, by the
-    implicit function theorem.
+    that fails does not affect the others. It is differentiable to any order, in either
+    mode, by the implicit function theorem.
 
-    Where the cost does not see an unstable mode, the stabilising solution is not the
-    cheapest: no control at all would cost less, and the state would grow.
+    If `(A, Q)` is not detectable, the stabilising solution is not the minimal one: no
+    control at all would cost less, and the state would grow.
 
     **Arguments:**
 
@@ -48,16 +40,15 @@ def dare(
     - `S`: cross weight, shape `(n, m)`; zero by default.
     - `E`: descriptor matrix, shape `(n, n)`, invertible; the identity by default.
     - `throw`: raise unless there is a stabilising solution (default); if false,
-        look at `result`.
+        check `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][]. It is successful if the
-    residual, in units of the states that balance the equation, is at most 1e-12 (1e-5
-    in single precision), or up to a hundred times that if rounding of `X` alone may
-    leave it; and if the closed loop is stable: a small residual alone is no
-    certificate. Else `result` is one of `RESULTS.not_stabilisable`, `not_stabilising`
-    (no such solution), `on_boundary` (eigenvalues on the unit circle, or so close that
-    data changed by rounding have no stabilising solution), `not_converged` and
-    `ill_posed`.
+    closed loop is stable, and the residual after diagonal balancing of the states is at
+    most 1e-12 (1e-5 in single precision), or up to a hundred times that if rounding of
+    `X` alone may cause it. Else `result` is one of `RESULTS.not_stabilisable`,
+    `not_stabilising` (no such solution), `on_boundary` (eigenvalues on the unit circle,
+    or so close that rounding of the data removes the stabilising solution),
+    `not_converged` and `ill_posed`.
 
     **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
     symmetric or (`R`) not semidefinite; an error at run time as `throw` says.
@@ -80,14 +71,7 @@ def dare(
 
 
 def care(
-    A: Any,
-    B: Any,
-    Q: Any,
-    R: Any,
-    S: Any = None,
-    E: Any = None,
-    *,
-    throw: bool = True,
+    A: Any, B: Any, Q: Any, R: Any, S: Any = None, E: Any = None, *, throw: bool = True
 ) -> RiccatiSolution:
     r"""The stabilising solution of the continuous-time algebraic Riccati equation,
 
@@ -98,38 +82,19 @@ def care(
     `(Ex)' X (Ex)` from `x`.
 
     The scaled sign iteration of the Hamiltonian matrix; if that fails, doubling of its
-    Cayley transform. Then Newton steps on the equation itself, if its residual asks for
-    them. It takes products and solves alone, no eigenvalues, which suits accelerators
-    and `jax.vmap`; in a batch, a member that fails harms no other. It is differentiable
-    to any order, in either mode, by the implicit function theorem.
+    Cayley transform. Newton steps, accelerators, batches, derivatives and undetectable
+    modes: as of [`delucax.riccati.dare`][].
 
-    Where the cost does not see an unstable mode, the stabilising solution is not the
-    cheapest: no control at all would cost less, and the state would grow.
+    **Arguments:** `A`, `B`, `Q`, `S`, `E` and `throw`: as of
+    [`delucax.riccati.dare`][];
 
-    **Arguments:**
-
-    - `A`: shape `(n, n)`. Real, or complex, as all others; then `'` is the conjugate
-        transpose.
-    - `B`: shape `(n, m)`.
-    - `Q`: state weight, shape `(n, n)`, symmetric. An indefinite one is accepted.
     - `R`: control weight, shape `(m, m)`, symmetric, positive definite: with a singular
         one the control may be an impulse, and there is no such gain.
-    - `S`: cross weight, shape `(n, m)`; zero by default.
-    - `E`: descriptor matrix, shape `(n, n)`, invertible; the identity by default.
-    - `throw`: raise unless there is a stabilising solution (default); if false,
-        look at `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][] with a `spectral_abscissa`. It
-    is successful if the residual, in units of the states that balance the equation, is
-    at most 1e-12 (1e-5 in single precision), or up to a hundred times that if rounding
-    of `X` alone may leave it; and if the closed loop is stable: a small residual alone
-    is no certificate. Else `result` is one of `RESULTS.not_stabilisable`,
-    `not_stabilising` (no such solution), `on_boundary` (eigenvalues on the imaginary
-    axis, or so close that data changed by rounding have no stabilising solution),
-    `not_converged` and `ill_posed`.
+    is judged as there, with the imaginary axis for the unit circle.
 
-    **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
-    symmetric or (`R`) not definite; an error at run time as `throw` says.
+    **Raises:** as there, and `ValueError` on an `R` that is only semidefinite.
 
     Source: Roberts, 1971 (sign); Byers, 1987 (scaling); Chu, Fan and Lin, 2005
     (doubling); Kleinman, 1968 (Newton); Benner, 2001 (balancing).
@@ -147,9 +112,6 @@ def care(
     """
     data = riccati_arguments("care", A, B, Q, R, S, E, definite=True)
     return stabilising_solution(False, data, "care", throw)
-
-
-_NAMES = ("A", "C", "W", "V", "S", "E")
 
 
 def filter_dare(
@@ -170,16 +132,16 @@ def filter_dare(
     **Arguments:**
 
     - `A`: shape `(n, n)`.
-    - `C`: what is measured, shape `(p, n)`.
+    - `C`: output matrix, shape `(p, n)`.
     - `W`: covariance of the process noise, shape `(n, n)`, symmetric.
     - `V`: covariance of the measurement noise, shape `(p, p)`, symmetric, positive
         semidefinite.
     - `S`: their cross-covariance, shape `(n, p)`; zero by default.
     - `throw`: raise unless there is a stabilising solution (default); if false,
-        look at `result`.
+        check `result`.
 
     **Returns:** a [`delucax.riccati.RiccatiSolution`][], with `K` of shape `(n, p)` and
-    `closed_loop = A - K C`, the matrix of the prediction error. Its `result` speaks of
+    `closed_loop = A - K C`, the matrix of the prediction error. Its `result` is that of
     the transposed system: `RESULTS.not_stabilisable` means that `(A, C)` is not
     detectable.
 
@@ -200,9 +162,7 @@ def filter_dare(
         prediction.X, prediction.K
         ```
     """
-    where = "filter_dare"
-    data = _transposed(where, A, C, W, V, S, definite=False)
-    return _dual(stabilising_solution(True, data, where, throw))
+    return _filter(True, "filter_dare", A, C, W, V, S, throw)
 
 
 def filter_care(
@@ -218,24 +178,17 @@ def filter_care(
 
     This is the equation of [`delucax.riccati.care`][] for the transposed system.
 
-    **Arguments:**
+    **Arguments:** `A`, `C`, `S` and `throw`: as of [`delucax.riccati.filter_dare`][],
+    with intensities for covariances;
 
-    - `A`: shape `(n, n)`.
-    - `C`: what is measured, shape `(p, n)`.
     - `W`: intensity of the process noise, shape `(n, n)`, symmetric.
     - `V`: intensity of the measurement noise, shape `(p, p)`, symmetric, positive
         definite.
-    - `S`: their cross-intensity, shape `(n, p)`; zero by default.
-    - `throw`: raise unless there is a stabilising solution (default); if false,
-        look at `result`.
 
-    **Returns:** a [`delucax.riccati.RiccatiSolution`][], with `K` of shape `(n, p)` and
-    `closed_loop = A - K C`, the matrix of the estimation error. Its `result` speaks of
-    the transposed system: `RESULTS.not_stabilisable` means that `(A, C)` is not
-    detectable.
+    **Returns:** as there, with a `spectral_abscissa`; `closed_loop` is the matrix of
+    the estimation error.
 
-    **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite, not
-    symmetric or (`V`) not definite; an error at run time as `throw` says.
+    **Raises:** as there, and `ValueError` on a `V` that is only semidefinite.
 
     Source: Kalman and Bucy, 1961.
 
@@ -251,28 +204,18 @@ def filter_care(
         estimate.X, estimate.K
         ```
     """
-    where = "filter_care"
-    data = _transposed(where, A, C, W, V, S, definite=True)
-    return _dual(stabilising_solution(False, data, where, throw))
+    return _filter(False, "filter_care", A, C, W, V, S, throw)
 
 
-def _transposed(where, A, C, W, V, S, definite):
+def _filter(discrete, where, A, C, W, V, S, throw) -> RiccatiSolution:
+    """The filter's solution, by that of control for the transposed system."""
     A, C = as_matrix(A, "A", where), as_matrix(C, "C", where)
-    return riccati_arguments(
-        where,
-        A.conj().T,
-        C.conj().T,
-        W,
-        V,
-        S,
-        None,
-        definite=definite,
-        names=_NAMES,
-        dual=True,
+    transposed = A.conj().T, C.conj().T, W, V, S, None
+    data = riccati_arguments(
+        where, *transposed, definite=not discrete, names="ACWVSE", dual=True
     )
-
-
-def _dual(solution: RiccatiSolution) -> RiccatiSolution:
     return eqx.tree_at(
-        lambda s: (s.K, s.closed_loop), solution, replace_fn=lambda M: M.conj().T
+        lambda s: (s.K, s.closed_loop),
+        stabilising_solution(discrete, data, where, throw),
+        replace_fn=lambda M: M.conj().T,
     )

@@ -1,4 +1,4 @@
-"""What the Riccati and Lyapunov solvers accept."""
+"""Checks and conversions of the arguments of matrix equations."""
 
 from typing import Any, NamedTuple
 
@@ -9,14 +9,13 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import (
+    as_finite,
     as_matrix,
     check_count,
     check_definite,
-    check_finite,
     is_concrete,
     symmetric_matrix,
 )
-from .._message import shortened
 from .._module import as_float_array
 
 
@@ -47,34 +46,25 @@ def hermitian_matrix(value: Any, name: str, where: str) -> Array:
     """
     matrix = square_matrix(value, name, where)
     transposed = matrix.conj().T
+    # As large as products such as C'WC may leave by rounding.
     slack = 100 * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
     wrong = jnp.max(jnp.abs(matrix - transposed)) > slack
     if is_concrete(wrong) and wrong:
         kind = "Hermitian" if jnp.iscomplexobj(matrix) else "symmetric"
         raise ValueError(f"{where}: {name} must be {kind}, got {matrix}.")
     average = (matrix + transposed) / 2
-    # Of data that cannot be looked at yet, the result will say that they are ill-posed.
+    # Traced data cannot be checked yet: NaN makes the result `ill_posed`.
     return average if is_concrete(wrong) else jnp.where(wrong, jnp.nan, average)
 
 
 def riccati_arguments(
-    where: str,
-    A: Any,
-    B: Any,
-    Q: Any,
-    R: Any,
-    S: Any,
-    E: Any,
-    *,
-    definite: bool,
-    names: tuple[str, ...] = ("A", "B", "Q", "R", "S", "E"),
-    dual: bool = False,
+    where: str, A, B, Q, R, S, E, *, definite: bool, names="ABQRSE", dual=False
 ) -> RiccatiData:
     """The arguments as matrices of one precision that fit each other.
 
-    `R` must be positive `definite`, or else semidefinite. `names` are those that the
-    caller's arguments have. With `dual`, `A`, `B` are the transposes of what the caller
-    gave, and errors speak of what was given.
+    `R` must be positive `definite`, or else semidefinite. `names` are the letters that
+    the caller's arguments have. With `dual`, `A`, `B` are the transposes of what the
+    caller gave, and errors speak of what was given.
     """
     n_A, n_B, n_Q, n_R, n_S, n_E = names
     A, B = square_matrix(A, n_A, where), as_matrix(B, n_B, where)
@@ -90,22 +80,40 @@ def riccati_arguments(
         )
     shapes = {n_Q: (Q, (n, n)), n_R: (R, (m, m)), n_S: (S, (n, m)), n_E: (E, (n, n))}
     for name, (matrix, shape) in shapes.items():
-        if matrix is not None and matrix.shape != shape:
-            raise ValueError(
-                f"{where}: {name} must have shape {shape} to fit {n_A} and {n_B}, got "
-                f"{matrix.shape}."
-            )
+        if matrix is not None:
+            _check_shape(matrix.shape, shape, name, where, f"{n_A} and {n_B}")
     check_definite(R, n_R, where, definite)
-    given = [A, B, Q, R, S, E]
-    dtype = jnp.result_type(*(M for M in given if M is not None))
+    dtype = jnp.result_type(*jax.tree.leaves((A, B, Q, R, S, E)))
     S = jnp.zeros((n, m), dtype) if S is None else S
     given = RiccatiData(A, B, Q, R, S, E)
     return jax.tree.map(lambda M: M.astype(dtype), given)
 
 
+def _check_shape(shape: tuple, wanted: tuple, name: str, where: str, to_fit: str):
+    if shape != wanted:
+        raise ValueError(
+            f"{where}: {name} must have shape {wanted} to fit {to_fit}, got {shape}."
+        )
+
+
+def where_solved(ok: Array, zeroed: Any, units: Any) -> tuple[Any, Any]:
+    """Trees of matrices where `ok`, one flag or one for each step; elsewhere zeros for
+    the first, identities for the second.
+
+    So no derivative of a problem that failed meets a matrix that is not finite, or that
+    cannot be solved with: a NaN would survive being multiplied by zero afterwards.
+    """
+    ok = ok[:, None, None] if ok.ndim else ok
+    eye = lambda M: jnp.eye(M.shape[-1], dtype=M.dtype)
+    return (
+        jax.tree.map(lambda M: jnp.where(ok, M, 0), zeroed),
+        jax.tree.map(lambda M: jnp.where(ok, M, eye(M)), units),
+    )
+
+
 def is_complex(*matrices: Array | None) -> bool:
     """Whether any of the matrices is."""
-    return any(M is not None and jnp.iscomplexobj(M) for M in matrices)
+    return any(map(jnp.iscomplexobj, jax.tree.leaves(matrices)))
 
 
 def real_form(M: Array) -> Array:
@@ -117,6 +125,7 @@ def complex_form(M: Array) -> Array:
     """The matrix whose real form is `M`."""
     n, m = M.shape[0] // 2, M.shape[1] // 2
     upper, lower = M[:n], M[n:]
+    # Rounding has made the two copies of each part differ: their averages.
     return ((upper[:, :m] + lower[:, m:]) + 1j * (lower[:, :m] - upper[:, m:])) / 2
 
 
@@ -124,7 +133,7 @@ _AXES = dict(A="nn", B="nm", D="nk", Q="nn", R="mm", S="nm", d="n", q="n", r="m"
 """The axes of each argument, an axis being named by its size."""
 
 
-def in_time(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
+def stage_arguments(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
     """Each argument with a leading time axis, in one precision. What is `None` is zero.
 
     The sizes are those of the first argument that has them.
@@ -133,23 +142,21 @@ def in_time(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
     for name, value in given.items():
         if value is None:
             continue
-        array, ndim = as_float_array(value), len(_AXES[name])
+        axes = _AXES[name]
+        ndim = len(axes)
         if name in "QR":
-            is_stack = eqx.is_array(array) and array.ndim == 3
-            array = symmetric_matrix(array, name, where, ndim=3 if is_stack else 2)
-        if not eqx.is_inexact_array(array) or array.ndim not in (ndim, ndim + 1):
-            got = f"shape {array.shape}" if eqx.is_array(array) else shortened(value)
-            shape = ", ".join(_AXES[name]) + ("," if ndim == 1 else "")
-            raise ValueError(
-                f"{where}: {name} must have shape ({shape}), or that with a leading "
-                f"time axis, got {got}."
-            )
-        check_finite(array, name, where)
+            value = as_float_array(value)
+            is_stack = eqx.is_array(value) and value.ndim == 3
+            value = symmetric_matrix(value, name, where, ndim=3 if is_stack else 2)
+        shape = ", ".join(axes) + ("," if ndim == 1 else "")
+        rule = f"have shape ({shape}), or that with a leading time axis"
+        fits = lambda shape, ndim=ndim: len(shape) in (ndim, ndim + 1)
+        arrays[name] = array = as_finite(value, name, where, rule, fits)
         _check_sizes(where, name, array.shape[array.ndim - ndim :], sizes)
         if array.ndim > ndim:
             steps[name] = array.shape[0]
-        arrays[name] = array
-    T, dtype = _length(where, horizon, steps), common_dtype(where, arrays)
+    T, dtype = _length(where, horizon, steps), _real_dtype(where, arrays)
+    # Constant arguments are repeated: one scan serves both kinds.
     zero = jnp.zeros((), dtype)
     shape = lambda name: (T, *(sizes[axis] for axis in _AXES[name]))
     return {
@@ -167,11 +174,11 @@ def constant_matrices(where: str, **given: Any) -> dict[str, Array]:
             check = symmetric_matrix if name in "QR" else as_matrix
             arrays[name] = check(value, name, where)
             _check_sizes(where, name, arrays[name].shape, sizes)
-    dtype = common_dtype(where, arrays)
+    dtype = _real_dtype(where, arrays)
     return {name: array.astype(dtype) for name, array in arrays.items()}
 
 
-def common_dtype(where: str, given: dict[str, Array]):
+def _real_dtype(where: str, given: dict[str, Array]):
     """The real precision that all can be held in."""
     dtype = jnp.result_type(*given.values())
     if not jnp.issubdtype(dtype, jnp.floating):
@@ -183,11 +190,7 @@ def _check_sizes(where, name, shape, sizes):
     for axis, size in zip(_AXES[name], shape, strict=True):
         sizes.setdefault(axis, size)
     wanted = tuple(sizes[axis] for axis in _AXES[name])
-    if shape != wanted:
-        raise ValueError(
-            f"{where}: {name} must have shape {wanted} to fit the other arguments, "
-            f"got {shape}."
-        )
+    _check_shape(shape, wanted, name, where, "the other arguments")
     if 0 in shape:
         raise ValueError(f"{where}: {name} must not be empty, got shape {shape}.")
 
@@ -201,13 +204,11 @@ def _length(where, horizon, steps):
             f"{where}: leading time axes must have one length of at least 1, got "
             f"{steps}."
         )
-    if not steps:
-        if horizon is None:
-            raise ValueError(
-                f"{where}: horizon must be given where no argument has a time axis."
-            )
-        return horizon
-    name, T = next(iter(steps.items()))
+    name, T = next(iter(steps.items()), (None, horizon))
+    if T is None:
+        raise ValueError(
+            f"{where}: horizon must be given where no argument has a time axis."
+        )
     if horizon not in (None, T):
         raise ValueError(
             f"{where}: horizon must be the length of the time axis of {name} ({T}), "
@@ -222,20 +223,14 @@ def final_weight(value: Any, A: Array, where: str) -> Array:
     if value is None:
         return jnp.zeros(shape, A.dtype)
     final = symmetric_matrix(value, "final", where)
-    if final.shape != shape:
-        raise ValueError(
-            f"{where}: final must have shape {shape} to fit A, got {final.shape}."
-        )
+    _check_shape(final.shape, shape, "final", where, "A")
     return final.astype(A.dtype)
 
 
 def increasing_times(times: Any, where: str) -> Array:
     """`times` as an increasing vector of at least two, or an error."""
-    array = as_float_array(times)
-    if not eqx.is_inexact_array(array) or array.ndim != 1 or array.shape[0] < 2:
-        got = f"shape {array.shape}" if eqx.is_array(array) else shortened(times)
-        raise ValueError(f"{where}: times must be at least two numbers, got {got}.")
-    check_finite(array, "times", where)
+    fits = lambda shape: len(shape) == 1 and shape[0] >= 2
+    array = as_finite(times, "times", where, "be at least two numbers", fits)
     if is_concrete(array) and not np.all(np.diff(np.asarray(array)) > 0):
         raise ValueError(f"{where}: times must increase, got {array}.")
     return array

@@ -9,21 +9,22 @@ from jaxtyping import Array
 
 from .._check import as_vector
 from .._results import choose, raise_on_failure, Result, RESULTS
-from ..math._linear_solve import full_precision, solve, symmetric
+from ..math._linear_solve import full_precision, solve
 from ._arguments import (
     constant_matrices,
     final_weight,
-    in_time,
     increasing_times,
+    stage_arguments,
+    where_solved,
 )
-from ._flow import flow_values
 from ._recursion import (
     failed_step,
+    flow_values,
     gain,
     is_clearly_definite,
     linear_recursion,
-    sanitised,
     values,
+    without_cross_weight,
 )
 
 
@@ -31,18 +32,21 @@ class FiniteHorizonSolution(eqx.Module):
     """The optimal control over a finite horizon.
 
     The least cost from state `x` at step `t` is `x'X[t]x + 2 p[t]'x + s[t]`, and the
-    control that attains it is `u = -K[t] x - k[t]`.
+    control that attains it is `u = -K[t] x - k[t]`. In continuous time the least cost
+    from `x` at `times[i]` is `x'X[i]x`, attained by `u = -K[i] x`.
 
     **Attributes:**
 
-    - `X`: at each step and at the end, shape `(T+1, n, n)`, symmetric.
-    - `K`: the gains, shape `(T, m, n)`.
+    - `X`: at each step and at the end, shape `(T+1, n, n)`, symmetric; in continuous
+        time at each point of the grid, shape `(N, n, n)`.
+    - `K`: the gains, shape `(T, m, n)`, or `(N, m, n)`.
+    - `closed_loop`: the matrices `A - B K`, shape `(T, n, n)`, or `(N, n, n)`.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
     - `p`: the linear part of the cost-to-go, shape `(T+1, n)`; zero if the problem has
-        no linear terms, as are `s` and `k`.
+        no linear terms, as are `s` and `k`. `None` in continuous time, as are they.
     - `s`: its constant part, shape `(T+1,)`.
     - `k`: the feed-forward controls, shape `(T, m)`.
-    - `closed_loop`: the matrices `A - B K`, shape `(T, n, n)`.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
+    - `times`: in continuous time the grid, shape `(N,)`; `None` in discrete time.
 
     !!! example
 
@@ -59,11 +63,12 @@ class FiniteHorizonSolution(eqx.Module):
 
     X: Array
     K: Array
-    p: Array
-    s: Array
-    k: Array
     closed_loop: Array
     result: Result
+    p: Array | None = None
+    s: Array | None = None
+    k: Array | None = None
+    times: Array | None = None
 
 
 def dre(
@@ -109,7 +114,7 @@ def dre(
     - `final_q`: linear cost of the final state, shape `(n,)`; zero by default.
     - `parallel`: if true, in parallel over time, by associative scans of logarithmic
         depth, which pays on accelerators; in sequence by default.
-    - `throw`: raise if a step has no minimum (default); if false, look at `result`.
+    - `throw`: raise if a step has no minimum (default); if false, check `result`.
 
     **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. It is NaN at a step
     where `R + B'XB` is not positive definite, and at all before it, as there is no
@@ -135,10 +140,11 @@ def dre(
         ```
     """
     where = "dre"
-    stage = in_time(where, horizon, A=A, B=B, Q=Q, R=R, S=S, d=d, q=q, r=r)
+    stage = stage_arguments(where, horizon, A=A, B=B, Q=Q, R=R, S=S, d=d, q=q, r=r)
     A = stage["A"]
     final, n = final_weight(final, A, where), A.shape[-1]
     is_affine = any(v is not None for v in (d, q, r, final_q))
+    # Without linear terms p, s and k are zero, and are not computed.
     final_q = jnp.zeros(n) if final_q is None else final_q
     final_q = as_vector(final_q, n, "final_q", where).astype(A.dtype)
     solution = _discrete_solution(
@@ -155,7 +161,7 @@ def dre(
 def _discrete_solution(A, B, Q, R, S, d, q, r, final, final_q, is_affine, parallel):
     X = values(A, B, Q, R, S, final, 0, parallel)
     good = jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
-    A, B, Q, R, S, after = sanitised(good, A, B, Q, R, S, X[1:])
+    (A, B, Q, S, after), R = where_solved(good, (A, B, Q, S, X[1:]), R)
     K, loop = jax.vmap(gain)(A, B, R, S, after)
     (T, _, m), n = B.shape, A.shape[-1]
     if is_affine:
@@ -165,11 +171,13 @@ def _discrete_solution(A, B, Q, R, S, d, q, r, final, final_q, is_affine, parall
     masked = lambda M: jnp.where(good.reshape(-1, *(1,) * (M.ndim - 1)), M, jnp.nan)
     p, s = p.at[:-1].set(masked(p[:-1])), s.at[:-1].set(masked(s[:-1]))
     result = choose(jnp.all(good), RESULTS.successful, RESULTS.infeasible)
-    return FiniteHorizonSolution(X, masked(K), p, s, masked(k), masked(loop), result)
+    return FiniteHorizonSolution(X, masked(K), masked(loop), result, p, s, masked(k))
 
 
 def _affine(loop, K, B, R, after, d, q, r, final_q, parallel):
     """The linear and constant parts of the cost-to-go, and the feed-forward."""
+    # With V(x) = x'Xx + 2 p'x + s at the next step, the control of x meets
+    # X (A x + B u + d) + p: the derivative in u is zero at u = -K x - k.
     pushed = jnp.einsum("tij,tj->ti", after, d)
     added = jnp.einsum("tji,tj->ti", loop, pushed) + q
     added = added - jnp.einsum("tji,tj->ti", K, r)
@@ -178,44 +186,10 @@ def _affine(loop, K, B, R, after, d, q, r, final_q, parallel):
     push = r + jnp.einsum("tji,tj->ti", B, ahead)
     pivot = R + jnp.swapaxes(B, 1, 2) @ after @ B
     k = jax.vmap(solve)(pivot, push[..., None])[..., 0]
+    # What d adds to the cost-to-go, less what the feed-forward saves of it.
     gained = jnp.sum(d * (p[1:] + ahead), axis=1) - jnp.sum(k * push, axis=1)
     s = jnp.cumsum(gained[::-1])[::-1]
     return p, jnp.concatenate([s, jnp.zeros(1, s.dtype)]), k
-
-
-class ContinuousHorizonSolution(eqx.Module):
-    """The optimal control over a finite horizon of continuous time.
-
-    The least cost from state `x` at time `times[i]` is `x'X[i]x`, and the control there
-    is `u = -K[i] x`.
-
-    **Attributes:**
-
-    - `times`: the grid, shape `(N,)`.
-    - `X`: shape `(N, n, n)`, symmetric.
-    - `K`: the gains, shape `(N, m, n)`.
-    - `closed_loop`: the matrices `A - B K`, shape `(N, n, n)`.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
-        B = jnp.array([[0.0], [1.0]])
-        times = jnp.linspace(0.0, 2.0, 21)
-        solution = dlx.riccati.cre(A, B, jnp.eye(2), jnp.eye(1), times=times)
-        solution.X[0], solution.K[0]
-        ```
-    """
-
-    times: Array
-    X: Array
-    K: Array
-    closed_loop: Array
-    result: Result
 
 
 def cre(
@@ -228,7 +202,7 @@ def cre(
     times: Any,
     final: Any = None,
     throw: bool = True,
-) -> ContinuousHorizonSolution:
+) -> FiniteHorizonSolution:
     r"""The Riccati differential equation, back from `X(t_1) = final`:
 
     `-dX/dt = A'X + XA - (XB + S) R^-1 (B'X + S') + Q`.
@@ -239,7 +213,7 @@ def cre(
 
     It is exact but for rounding, however stiff the equation and coarse the grid: the
     flow is linear in `[I; X]`, so that it is known over a short time, and intervals are
-    joined, doubling their length each time, in a form that does not grow. It is
+    composed, doubling their length each time, in a form that does not grow. It is
     differentiable to any order, in either mode.
 
     **Arguments:**
@@ -251,9 +225,9 @@ def cre(
     - `S`: cross weight, shape `(n, m)`; zero by default.
     - `times`: where `X` is wanted, increasing, at least two, shape `(N,)`.
     - `final`: final weight, shape `(n, n)`, symmetric; zero by default.
-    - `throw`: raise if there is no minimum (default); if false, look at `result`.
+    - `throw`: raise if there is no minimum (default); if false, check `result`.
 
-    **Returns:** a [`delucax.riccati.ContinuousHorizonSolution`][]. It is NaN at the
+    **Returns:** a [`delucax.riccati.FiniteHorizonSolution`][]. It is NaN at the
     times from which there is no minimum.
 
     **Raises:** `ValueError` on an argument of the wrong shape, that is not finite or
@@ -290,18 +264,15 @@ def cre(
 @eqx.filter_jit
 @full_precision
 def _continuous_solution(A, B, Q, R, S, final, times):
+    # Without a definite R the Hamiltonian has no minimum, whatever X is.
     definite = is_clearly_definite(R)
     safe = jnp.where(definite, R, jnp.eye(R.shape[0], dtype=R.dtype))
-    removed = solve(safe, jnp.concatenate([S.T, B.T], axis=1))
-    n = A.shape[0]
-    plain_A, G = A - B @ removed[:, :n], symmetric(B @ removed[:, n:])
-    plain_Q = symmetric(Q - S @ removed[:, :n])
-    X = flow_values(plain_A, G, plain_Q, final, times, False)
+    X = flow_values(*without_cross_weight(A, B, Q, safe, S), final, times, False)
     good = definite & jnp.all(jnp.isfinite(X), axis=(1, 2))
     known = jnp.where(good[:, None, None], X, 0)
     K = jax.vmap(lambda X: solve(safe, B.T @ X + S.T))(known)
     masked = lambda M: jnp.where(good[:, None, None], M, jnp.nan)
     result = choose(jnp.all(good), RESULTS.successful, RESULTS.infeasible)
-    return ContinuousHorizonSolution(
-        times, masked(known), masked(K), masked(A - B @ K), result
+    return FiniteHorizonSolution(
+        masked(known), masked(K), masked(A - B @ K), result, times=times
     )

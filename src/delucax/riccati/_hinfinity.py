@@ -1,78 +1,47 @@
-"""The stationary H-infinity games."""
+"""The stationary H-infinity games.
+
+A game is the Riccati equation of the joint control `[u; w]`, with an indefinite weight:
+`R` for the control, `-gamma^2 I` for the disturbance, which maximises.
+"""
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_definite, check_step
-from .._results import choose, raise_on_failure, Result, RESULTS
-from ..math._linear_solve import full_precision
-from ._arguments import constant_matrices
-from ._game import (
-    attached,
-    barrier,
-    game_start,
+from .._check import check_definite
+from .._results import choose, RESULTS
+from .._typing import Scalar, Square
+from ..math._linear_solve import full_precision, solve, symmetric
+from ..math._lyapunov import lyapunov
+from ..math._norms import one_if_zero, size
+from ._arguments import constant_matrices, where_solved
+from ._doubling import double
+from ._level import (
+    at_level,
+    bisect_level,
+    Game,
+    game_at_level,
+    GameSolution,
+    inverse_margins,
     joint,
     joint_gain,
-    rounding,
-    sanitised_game,
-    solve_game,
 )
-from ._level import Bisection, game_at_level
+from ._recursion import (
+    hamiltonian,
+    is_clearly_definite,
+    is_saddle,
+    scale_of,
+    short_element,
+    without_cross_weight,
+)
+from ._residual import newton_refine, riccati_residual, stationary
 from ._spectrum import spectral_abscissa, spectral_radius
-
-
-class GameSolution(eqx.Module):
-    """The saddle point of a stationary game.
-
-    **Attributes:**
-
-    - `X`: the solution of the game equation, shape `(n, n)`, symmetric.
-    - `K`: the gain of the control `u = -K x`, shape `(m, n)`.
-    - `L`: the gain of the worst disturbance `w = L x`, shape `(k, n)`.
-    - `gamma`: the level that is attained.
-    - `residual`: the norm of the equation's residual over the sum of the norms of its
-        terms: an upper bound, with rounding of its own evaluation counted.
-    - `closed_loop`: the matrix `A - B K`, shape `(n, n)`.
-    - `spectral_radius`: in discrete time, an upper bound on that of `closed_loop`,
-        close to it. `None` in continuous time.
-    - `iterations`: doublings taken at `gamma`.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
-    - `spectral_abscissa`: in continuous time, the largest real part of an eigenvalue of
-        `closed_loop`, up to rounding. `None` in discrete time.
-
-    `residual`, `spectral_radius` and `spectral_abscissa` are measurements and have no
-    gradient.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
-        B = jnp.array([[0.0], [1.0]])
-        Q, R = jnp.eye(2), jnp.eye(1)
-        solution = dlx.riccati.hinf_dare(A, B, None, Q, R, gamma=5.0)
-        solution.K, solution.L, solution.spectral_radius
-        ```
-    """
-
-    X: Array
-    K: Array
-    L: Array
-    gamma: Array
-    residual: Array
-    closed_loop: Array
-    spectral_radius: Array | None
-    iterations: Array
-    result: Result
-    spectral_abscissa: Array | None = None
+from ._stabilising import is_semidefinite, left_side, shifted
 
 
 def hinf_dare(
@@ -118,7 +87,7 @@ def hinf_dare(
     - `gamma`: the level, a positive number; by default the least that is attainable.
     - `tolerance`: how close to the least level, relatively; by default 16 rounding
         units.
-    - `throw`: raise unless the game is solved (default); if false, look at `result`.
+    - `throw`: raise unless the game is solved (default); if false, check `result`.
 
     **Returns:** a [`delucax.riccati.GameSolution`][]. Its matrices are NaN if there is
     no solution, as when `gamma` is below the least attainable level.
@@ -156,7 +125,7 @@ def hinf_care(
     tolerance: Any = None,
     throw: bool = True,
 ) -> GameSolution:
-    r"""The stationary H-infinity game in continuous time,
+    """The stationary H-infinity game in continuous time,
 
     `A'X + XA - X (B R^-1 B' - gamma^-2 D D') X + Q = 0`,
 
@@ -171,24 +140,17 @@ def hinf_care(
     level, held fixed. As `gamma` falls to the least level `X` may grow without bound:
     take a few percent more for a controller.
 
-    **Arguments:**
+    **Arguments:** `A`, `B`, `D`, `Q`, `gamma` and `throw`: as of
+    [`delucax.riccati.hinf_dare`][];
 
-    - `A`: shape `(n, n)`.
-    - `B`: shape `(n, m)`.
-    - `D`: how the disturbance enters, shape `(n, k)`; `None` for the identity.
-    - `Q`: state weight, shape `(n, n)`, symmetric, positive semidefinite.
     - `R`: control weight, shape `(m, m)`, symmetric, positive definite.
-    - `gamma`: the level, a positive number; by default the least that is attainable.
     - `tolerance`: how close to the least level, relatively; by default 1e-6, and 1e-3
         in float32. Where `X` grows without bound, the least level is the least at which
         its digits suffice to tell that it is a solution, some 1e-5 above.
-    - `throw`: raise unless the game is solved (default); if false, look at `result`.
 
-    **Returns:** a [`delucax.riccati.GameSolution`][]. Its matrices are NaN if
-    there is no solution, as when `gamma` is below the least attainable level.
+    **Returns:** a [`delucax.riccati.GameSolution`][], NaN as there.
 
-    **Raises:** `ValueError` on a matrix of the wrong shape, that is not finite or not
-    symmetric, or a level that is not positive; an error at run time as `throw` says.
+    **Raises:** as there.
 
     Source: Basar and Bernhard, 1995; Doyle, Glover, Khargonekar and Francis, 1989.
 
@@ -210,10 +172,6 @@ def hinf_care(
     return at_level(_solution, where, False, problem, gamma, tolerance, throw)
 
 
-_LOOSE = {4: 1e-3, 8: 1e-6}
-"""Default tolerance of a level by the bytes of a number, where `X` has a pole at it."""
-
-
 def checked_game(where: str, A: Any, B: Any, D: Any, Q: Any, R: Any) -> tuple:
     """The matrices of a stationary game, in one precision, that fit each other."""
     given = constant_matrices(where, A=A, B=B, D=D, Q=Q, R=R)
@@ -222,65 +180,173 @@ def checked_game(where: str, A: Any, B: Any, D: Any, Q: Any, R: Any) -> tuple:
     return tuple(given[name] for name in "ABDQR")
 
 
-def at_level(
-    solution_of: Callable[..., Any],
-    where: str,
-    discrete: bool,
-    problem: tuple,
-    gamma: Any,
-    tolerance: Any,
-    throw: bool,
-) -> Any:
-    """A game at the level that is given, or at the least one to within a tolerance."""
-    dtype = problem[0].dtype
-    if tolerance is None:
-        tolerance = 16 * jnp.finfo(dtype).eps if discrete else _LOOSE[dtype.itemsize]
-    check_step(tolerance, where, "tolerance")
-    if gamma is not None:
-        check_step(gamma, where, "gamma")
-        gamma = jnp.asarray(gamma, dtype)
-    solution = solution_of(discrete, problem, gamma, jnp.asarray(tolerance, dtype))
-    facts = lambda: f"Level gamma {float(solution.gamma):.6g}."
-    return raise_on_failure(solution, where, throw, facts=facts)
-
-
 @eqx.filter_jit
 @full_precision
 def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
-    solve = functools.partial(solve_game, discrete)
-    steep = functools.partial(barrier, discrete)
-    start = game_start(discrete, problem)
-    end, level, gamma = game_at_level(solve, steep, problem, start, gamma, tolerance)
+    end, level, gamma = game_at_level(
+        functools.partial(_solve_game, discrete),
+        functools.partial(_barrier, discrete),
+        problem,
+        _game_start(discrete, problem),
+        gamma,
+        tolerance,
+    )
     game = end.game
-    X = attached(discrete, problem, level, game)
-    safe, X = sanitised_game(game.good, problem, X)
-    A, B, *_ = safe
-    K = joint_gain(discrete, joint(safe, level), X)
+    X = _with_implicit_derivative(discrete, problem, level, game)
+    # An unsolved game is replaced by a trivial one, which keeps NaN out of derivatives.
+    (A, B, D, Q, X), R = where_solved(game.good, (*problem[:4], X), problem[4])
+    K = joint_gain(discrete, joint((A, B, D, Q, R), level), X)
     m = B.shape[1]
     loop = A - B @ K[:m]
-    bound = (spectral_radius if discrete else spectral_abscissa)(
-        lax.stop_gradient(loop)
-    )
+    bound = spectral_radius if discrete else spectral_abscissa
     masked = lambda M: jnp.where(game.good, M, jnp.nan)
-    bound = masked(bound)
+    # A little below the least level the equation nearly has a solution.
+    near = game.residual < 100 * _rounding(len(X), X.dtype)
+    failure = choose(game.holds & near, RESULTS.not_converged, RESULTS.infeasible)
+    # Without a disturbance it is the control problem: no level is to blame.
+    failure = choose(end.solvable, failure, RESULTS.not_stabilising)
+    bound = masked(bound(lax.stop_gradient(loop)))
     return GameSolution(
         X=masked(X),
         K=masked(K[:m]),
         L=masked(-K[m:]),
         gamma=gamma,
-        residual=game.residual,
         closed_loop=masked(loop),
-        spectral_radius=bound if discrete else None,
+        result=choose(game.good, RESULTS.successful, failure),
+        residual=game.residual,
         iterations=game.iterations,
-        result=_outcome(end),
-        spectral_abscissa=None if discrete else bound,
+        **{"spectral_radius" if discrete else "spectral_abscissa": bound},
     )
 
 
-def _outcome(end: Bisection) -> Result:
-    game = end.game
-    # A little below the least level the equation nearly has a solution.
-    near = game.residual < 100 * rounding(game.X.shape[0], game.X.dtype)
-    failure = choose(game.holds & near, RESULTS.not_converged, RESULTS.infeasible)
-    failure = choose(end.solvable, failure, RESULTS.not_stabilising)
-    return choose(game.good, RESULTS.successful, failure)
+def _rounding(n: int, dtype) -> float:
+    """The relative residual that counts as solved."""
+    return 1000 * n * float(jnp.finfo(dtype).eps)
+
+
+def _game_start(discrete: bool, problem: tuple) -> Square:
+    """The starting point without a disturbance: not 0, which is a fixed point if
+    `(A, Q)` is not detectable."""
+    A, B, _, Q, R = problem
+    if discrete:
+        scale = jnp.linalg.norm(Q)
+        scale = one_if_zero(jnp.where(scale > 0, scale, jnp.linalg.norm(R)))
+    else:
+        control = symmetric(B @ solve(R, B.T))
+        # With Q = 0 the unstable modes alone set the size of X, |A|^2 / |B R^-1 B'|.
+        tiny = jnp.finfo(A.dtype).tiny ** 0.5
+        unseen = jnp.linalg.norm(A) ** 2 / jnp.maximum(jnp.linalg.norm(control), tiny)
+        Q = jnp.where(jnp.linalg.norm(Q) > 0, Q, shifted(unseen, Q))
+        scale = scale_of(control, Q)
+    return shifted(scale, A)
+
+
+def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Game:
+    """The stabilising solution of the game equation, with the conditions under which it
+    is a saddle point."""
+    A, B, D, _, R = problem
+    (n, m), eps = B.shape, jnp.finfo(A.dtype).eps
+    data = joint(problem, gamma)
+    # Doubling of the equation of X - X0, from below the solution, to which it rises.
+    element, unit = _element(discrete, data, problem, gamma, X0)
+    J, iterations = double(element, X0 / unit)
+    X, left = newton_refine(
+        lambda X, _: riccati_residual(discrete, data, X, False, maximisers=D.shape[1]),
+        functools.partial(_correction, discrete),
+        X0 + unit * J,
+        units=1,
+        to_working_precision=True,
+    )
+    # Both loops must be stable: against the worst disturbance, and without any.
+    _, _, weight = stationary(discrete, data, X)
+    alone = A - B @ joint_gain(discrete, data, X)[:m]
+    loops = jnp.stack([left.closed_loop, alone])
+    if discrete:
+        stable = jax.vmap(spectral_radius)(loops) < 1 - n * eps
+        decided = is_saddle(symmetric(weight), D.shape[1])
+    else:
+        slack = n * eps * jnp.linalg.norm(A)
+        stable = jax.vmap(spectral_abscissa)(loops) < -slack
+        decided = is_clearly_definite(R)
+    # The equation alone also has solutions above the level of any controller, at which
+    # X is not semidefinite or a loop not stable (Doyle et al., 1989).
+    holds = is_semidefinite(X, 1000) & decided & jnp.all(stable)
+    solved = left.relative < _rounding(n, A.dtype)
+    return Game(X, left.bounds[0], holds, solved, iterations)
+
+
+def _element(discrete, data, problem, gamma, X0):
+    """The element of a step of the equation of `X - X0`, and the unit of `X`."""
+    A, B, D, Q, R = problem
+    if discrete:
+        moved, cross, weight = stationary(True, data, X0)
+        linear = moved @ A - X0
+        return without_cross_weight(A, data.B, linear, weight, cross, Q), 1.0
+    # In continuous time a step is the flow over a short interval.
+    G = symmetric(B @ solve(R, B.T) - D @ D.T / gamma**2)
+    # The flow of the correction, in the unit that makes its parts alike.
+    moved = X0 @ A
+    constant = Q + moved + moved.T - X0 @ G @ X0
+    unit = scale_of(G, constant)
+    H = hamiltonian(A - G @ X0, unit * G, constant / unit)
+    return short_element(H, 0.5 / one_if_zero(jnp.linalg.norm(H))), unit
+
+
+def _correction(discrete, X, loop, error):
+    """The Newton step for an `error` of the equation.
+
+    In continuous time it is solved in coordinates in which `X` is the identity: near
+    the least level `X` is large in some directions, and the loop far from normal.
+    """
+    if discrete:
+        return lyapunov(True, loop, error)
+    eye = shifted(1, X)
+    # With X = root root', loop and error become root' loop root'^-1, root^-1 error
+    # root'^-1; a singular X is shifted by its rounding.
+    slack = jnp.finfo(X.dtype).eps * one_if_zero(size(X))
+    root = lax.stop_gradient(jnp.linalg.cholesky(X + slack * eye))
+    root = jnp.where(jnp.all(jnp.isfinite(root)), root, eye)
+    loop = solve(root, (root.T @ loop).T).T
+    error = solve(root, solve(root, error).T)
+    return symmetric(root @ lyapunov(False, loop, symmetric(error)) @ root.T)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _with_implicit_derivative(
+    discrete: bool, problem: tuple, gamma: Scalar, game: Game
+) -> Square:
+    """`X` of a solved game with its implicit derivatives; zero of an unsolved one."""
+    del discrete, problem, gamma
+    return jnp.where(game.good, game.X, 0)
+
+
+@_with_implicit_derivative.defjvp
+@full_precision
+def _implicit_derivative_jvp(discrete, primals, tangents):
+    X = _with_implicit_derivative(discrete, *primals)
+    problem, gamma, game = primals
+    (A, *others), R = where_solved(game.good, problem[:4], problem[4])
+    if not discrete:
+        # The trivial game has A = 0, which is not stable: it is given A = -I.
+        A = A - shifted(jnp.where(game.good, 0, 1), A)
+    gamma = jnp.where(game.good, gamma, 1)
+    # By the implicit function theorem, as for the equation of control.
+    _, error, loop = jax.jvp(
+        lambda *at: left_side(discrete, X, joint(*at)),
+        ((A, *others, R), gamma),
+        tangents[:2],
+        has_aux=True,
+    )
+    return X, _correction(discrete, X, loop, jnp.where(game.good, error, 0))
+
+
+def _barrier(discrete: bool, problem: tuple, gamma: Scalar) -> Array:
+    """A barrier function, whose slope diverges at the least level."""
+    start = _game_start(discrete, problem)
+    solve_game = functools.partial(_solve_game, discrete)
+    end, _ = bisect_level(solve_game, problem, start, gamma)
+    X = _with_implicit_derivative(discrete, problem, gamma, end.game)
+    total = jnp.trace(X)
+    if discrete:
+        total += inverse_margins(problem[2][None], X[None], gamma)
+    return total

@@ -1,6 +1,5 @@
 """The H-infinity games over a finite horizon."""
 
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -8,54 +7,37 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._results import choose, Result, RESULTS
+from .._results import choose, RESULTS
 from ..math._linear_solve import full_precision, solve, symmetric
-from ._arguments import final_weight, in_time, increasing_times
-from ._flow import flow_values
-from ._game import inverse_margins, joint, joint_gain, players
-from ._hinfinity import at_level, checked_game
-from ._level import Game, game_at_level
-from ._recursion import gain, is_clearly_definite, sanitised, values
+from ._arguments import final_weight, increasing_times, stage_arguments, where_solved
+from ._hinfinity import checked_game
+from ._level import (
+    at_level,
+    Game,
+    game_at_level,
+    GameSolution,
+    inverse_margins,
+    joint,
+    joint_gain,
+    joint_inputs,
+)
+from ._recursion import flow_values, gain, is_clearly_definite, values
 from ._stabilising import shifted
 
 
-class HorizonGameSolution(eqx.Module):
-    """The saddle point of a game over a finite horizon.
-
-    From state `x` at step (or time) `t` the worst cost is `x'X[t]x`, less `gamma^2`
-    times that of the disturbance.
-
-    **Attributes:**
-
-    - `X`: at each step and at the end, shape `(T+1, n, n)`, symmetric; in continuous
-        time at each point of the grid, shape `(N, n, n)`.
-    - `K`: the gains of the control `u = -K[t] x`, shape `(T, m, n)`, or `(N, m, n)`.
-    - `L`: the gains of the worst disturbance `w = L[t] x`, shape `(T, k, n)`, or
-        `(N, k, n)`.
-    - `gamma`: the level that is attained.
-    - `closed_loop`: the matrices `A - B K`, shape `(T, n, n)`, or `(N, n, n)`.
-    - `result`: success, or why not; one of `delucax.RESULTS`.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax.numpy as jnp
-
-        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
-        B = jnp.array([[0.0], [1.0]])
-        Q, R = jnp.eye(2), jnp.eye(1)
-        solution = dlx.riccati.hinf_dre(A, B, None, Q, R, horizon=20, gamma=4.0)
-        solution.K[0], solution.L[0]
-        ```
-    """
-
-    X: Array
-    K: Array
-    L: Array
-    gamma: Array
-    closed_loop: Array
-    result: Result
+def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
+    """`X` at the steps or times of the game `(A, B, D, Q, R, final, *times)`."""
+    A, B, D, Q, R, final, *times = problem
+    if discrete:
+        both, weight = joint_inputs(B, D, R, gamma)
+        S = jnp.zeros_like(both)
+        return values(A, both, Q, weight, S, final, D.shape[-1], False)
+    definite = is_clearly_definite(R)
+    safe = jnp.where(definite, R, shifted(1, R))
+    # The quadratic term of both players, which flows like that of control alone.
+    G = symmetric(B @ solve(safe, B.T) - D @ D.T / gamma**2)
+    X = flow_values(A, G, Q, final, *times, True)
+    return jnp.where(definite, X, jnp.nan)
 
 
 def hinf_dre(
@@ -70,7 +52,7 @@ def hinf_dre(
     gamma: Any = None,
     tolerance: Any = None,
     throw: bool = True,
-) -> HorizonGameSolution:
+) -> GameSolution:
     r"""The H-infinity game over a finite horizon, back from `X_T = final`:
 
     `X_t = Q + A' X (I + (B R^-1 B' - gamma^-2 D D') X)^-1 A`, with `X = X_{t+1}`.
@@ -97,9 +79,9 @@ def hinf_dre(
     - `gamma`: the level, a positive number; by default the least that is attainable.
     - `tolerance`: how close to the least level, relatively; by default 16 rounding
         units.
-    - `throw`: raise unless the game is solved (default); if false, look at `result`.
+    - `throw`: raise unless the game is solved (default); if false, check `result`.
 
-    **Returns:** a [`delucax.riccati.HorizonGameSolution`][]. It is NaN at a step that
+    **Returns:** a [`delucax.riccati.GameSolution`][]. It is NaN at a step that
     has no saddle point, as where `gamma` is too low, and at all before it.
 
     **Raises:** `ValueError` on an argument of the wrong shape, that is not finite or
@@ -124,7 +106,7 @@ def hinf_dre(
     A = jnp.asarray(A) if isinstance(A, list | tuple) else A
     if D is None and eqx.is_array_like(A) and jnp.ndim(A) in (2, 3):
         D = jnp.eye(jnp.shape(A)[-1], dtype=jnp.result_type(A, jnp.float32))
-    stage = in_time(where, horizon, A=A, B=B, D=D, Q=Q, R=R)
+    stage = stage_arguments(where, horizon, A=A, B=B, D=D, Q=Q, R=R)
     final = final_weight(final, stage["A"], where)
     problem = (*stage.values(), final)
     return at_level(_solution, where, True, problem, gamma, tolerance, throw)
@@ -142,7 +124,7 @@ def hinf_cre(
     gamma: Any = None,
     tolerance: Any = None,
     throw: bool = True,
-) -> HorizonGameSolution:
+) -> GameSolution:
     r"""The H-infinity game over a finite horizon of continuous time, back from
     `X(t_1) = final`:
 
@@ -158,27 +140,17 @@ def hinf_cre(
     the least level, `X` grows without bound at the first time: take a few percent more
     for a controller.
 
-    **Arguments:**
+    **Arguments:** `A`, `B`, `D`, `Q`, `R`, `gamma`, `tolerance` and `throw`: as of
+    [`delucax.riccati.hinf_care`][];
 
-    - `A`: shape `(n, n)`.
-    - `B`: shape `(n, m)`.
-    - `D`: how the disturbance enters, shape `(n, k)`; `None` for the identity.
-    - `Q`: state weight, shape `(n, n)`, symmetric, positive semidefinite.
-    - `R`: control weight, shape `(m, m)`, symmetric, positive definite.
     - `times`: where `X` is wanted, increasing, at least two, shape `(N,)`.
     - `final`: final weight, shape `(n, n)`, symmetric, positive semidefinite; zero by
         default.
-    - `gamma`: the level, a positive number; by default the least that is attainable.
-    - `tolerance`: how close to the least level, relatively; by default 1e-6, and 1e-3
-        in float32.
-    - `throw`: raise unless the game is solved (default); if false, look at `result`.
 
-    **Returns:** a [`delucax.riccati.HorizonGameSolution`][]. It is NaN at the times
-    from which there is no solution, as where `gamma` is too low.
+    **Returns:** a [`delucax.riccati.GameSolution`][]. It is NaN at the times from which
+    there is no solution, as where `gamma` is too low.
 
-    **Raises:** `ValueError` on an argument of the wrong shape, that is not finite or
-    not symmetric, times that do not increase, or a level that is not positive; an error
-    at run time as `throw` says.
+    **Raises:** as there, and on times that do not increase.
 
     Source: Basar and Bernhard, 1995; Davison and Maki, 1973.
 
@@ -202,65 +174,48 @@ def hinf_cre(
     return at_level(_solution, where, False, problem, gamma, tolerance, throw)
 
 
-def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
-    """`X` at the steps or times of the game `(A, B, D, Q, R, final, *times)`."""
-    A, B, D, Q, R, final, *times = problem
-    if discrete:
-        both, weight = players(B, D, R, gamma)
-        S = jnp.zeros_like(both)
-        return values(A, both, Q, weight, S, final, D.shape[-1], False)
-    definite = is_clearly_definite(R)
-    safe = jnp.where(definite, R, shifted(1, R))
-    G = symmetric(B @ solve(safe, B.T) - D @ D.T / gamma**2)
-    X = flow_values(A, G, Q, final, *times, True)
-    return jnp.where(definite, X, jnp.nan)
-
-
-def _game(discrete: bool, problem: tuple, gamma: Array, X0: Array) -> Game:
-    """What the search for a level calls: there is no equation left to be solved."""
-    del X0
-    X = _values(discrete, problem, gamma)
-    good = jnp.all(jnp.isfinite(X))
-    nothing = jnp.zeros((), X.dtype)
-    return Game(X, nothing, good, jnp.ones((), bool), jnp.asarray(0))
-
-
-def _barrier(discrete: bool, problem: tuple, gamma: Array) -> Array:
-    """What becomes steep at the least level."""
-    X = _values(discrete, problem, gamma)
-    total = jnp.trace(X[0])
-    if discrete:
-        total += inverse_margins(problem[2], X[1:], gamma)
-    return total
-
-
 @eqx.filter_jit
 @full_precision
-def _solution(discrete: bool, problem, gamma, tolerance) -> HorizonGameSolution:
+def _solution(discrete: bool, problem, gamma, tolerance) -> GameSolution:
     A, B, D, Q, R, _, *times = problem
     points = times[0].shape[0] if times else A.shape[0] + 1
-    solve = functools.partial(_game, discrete)
-    steep = functools.partial(_barrier, discrete)
+
+    def solve_game(problem, gamma, _) -> Game:
+        # There is no equation to be solved: all that can fail is that X is not finite.
+        X = _values(discrete, problem, gamma)
+        zero, yes = jnp.zeros((), X.dtype), jnp.ones((), bool)
+        return Game(X, zero, jnp.all(jnp.isfinite(X)), yes, jnp.asarray(0))
+
+    def barrier(problem, gamma):
+        X = _values(discrete, problem, gamma)
+        total = jnp.trace(X[0])
+        return total + inverse_margins(problem[2], X[1:], gamma) if discrete else total
+
     start = jnp.zeros((points, *A.shape[-2:]), A.dtype)
-    end, level, gamma = game_at_level(solve, steep, problem, start, gamma, tolerance)
+    end, level, gamma = game_at_level(
+        solve_game, barrier, problem, start, gamma, tolerance
+    )
     X = _values(discrete, problem, level)
     good = jnp.all(jnp.isfinite(X), axis=(1, 2))
     masked = lambda M: jnp.where(good[:, None, None], M, jnp.nan)
     m = B.shape[-1]
     if discrete:
+        # X[t+1] decides the gains of step t, which exist where X[t] does.
         good = good[:-1]
-        both, weight = players(B, D, R, level)
-        S = jnp.zeros_like(both)
-        A, both, Q, weight, S, after = sanitised(good, A, both, Q, weight, S, X[1:])
-        K, _ = jax.vmap(gain)(A, both, weight, S, after)
+        both, weight = joint_inputs(B, D, R, level)
+        (A, both, after), weight = where_solved(good, (A, both, X[1:]), weight)
+        K, _ = jax.vmap(gain)(A, both, weight, jnp.zeros_like(both), after)
         B = both[..., :m]
     else:
         known, X = jnp.where(good[:, None, None], X, 0), masked(X)
         R = jnp.where(jnp.any(good), R, shifted(1, R))
         data = joint((A, B, D, Q, R), level)
         K = jax.vmap(lambda X: joint_gain(False, data, X))(known)
-    loop = masked(A - B @ K[:, :m])
-    result = choose(end.game.good, RESULTS.successful, RESULTS.infeasible)
-    return HorizonGameSolution(
-        X, masked(K[:, :m]), masked(-K[:, m:]), gamma, loop, result
+    return GameSolution(
+        X=X,
+        K=masked(K[:, :m]),
+        L=masked(-K[:, m:]),
+        gamma=gamma,
+        closed_loop=masked(A - B @ K[:, :m]),
+        result=choose(end.game.good, RESULTS.successful, RESULTS.infeasible),
     )

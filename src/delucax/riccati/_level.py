@@ -1,17 +1,25 @@
-"""A game at its least level, by bisection, and the derivative of the level."""
+"""A game at a level, or at its least one by bisection, and the level's derivative."""
 
 import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from ..math._linear_solve import full_precision
+from .._check import check_step
+from .._results import raise_on_failure, Result
+from .._typing import Scalar, Square
+from ..math._linear_solve import full_precision, solve
+from ._arguments import RiccatiData
+from ._residual import stationary
 
 
+_LOOSE = {4: 1e-3, 8: 1e-6}
+"""Default tolerance of a level by the bytes of a number, where `X` has a pole at it."""
 _WIDEST = 1e18
 """The search gives up this factor away from where it starts."""
 _FACTOR = 4.0
@@ -21,13 +29,109 @@ _WEIGHTS = (64 / 21, -8 / 3, 2 / 3, -1 / 21)
 """Of the polynomial through values at the roots of the above, at 0."""
 
 
+class GameSolution(eqx.Module):
+    """The saddle point of a game, stationary or over a finite horizon.
+
+    Over a horizon the matrices have a leading axis for the steps `t` (or the points of
+    the grid), and from state `x` at step `t` the worst cost is `x'X[t]x`, less
+    `gamma^2` times that of the disturbance.
+
+    **Attributes:**
+
+    - `X`: the solution of the game equation, shape `(n, n)`, symmetric; over a horizon
+        at each step and at the end, shape `(T+1, n, n)`, or in continuous time at each
+        point of the grid, shape `(N, n, n)`.
+    - `K`: the gain of the control `u = -K x`, shape `(m, n)`; over a horizon
+        `(T, m, n)`, or `(N, m, n)`.
+    - `L`: the gain of the worst disturbance `w = L x`, shape `(k, n)`; over a horizon
+        `(T, k, n)`, or `(N, k, n)`.
+    - `gamma`: the level that is attained.
+    - `closed_loop`: the matrix `A - B K`, shape `(n, n)`; over a horizon `(T, n, n)`,
+        or `(N, n, n)`.
+    - `result`: success, or why not; one of `delucax.RESULTS`.
+    - `residual`: the norm of the equation's residual over the sum of the norms of its
+        terms: an upper bound, with rounding of its own evaluation counted. `None` over
+        a horizon, as are those below.
+    - `iterations`: doublings taken at `gamma`.
+    - `spectral_radius`: in discrete time, an upper bound on that of `closed_loop`,
+        close to it. `None` in continuous time.
+    - `spectral_abscissa`: in continuous time, the largest real part of an eigenvalue of
+        `closed_loop`, up to rounding. `None` in discrete time.
+
+    `residual`, `spectral_radius` and `spectral_abscissa` are measurements and have no
+    gradient.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+        B = jnp.array([[0.0], [1.0]])
+        Q, R = jnp.eye(2), jnp.eye(1)
+        solution = dlx.riccati.hinf_dare(A, B, None, Q, R, gamma=5.0)
+        solution.K, solution.L, solution.spectral_radius
+        ```
+    """
+
+    X: Array
+    K: Array
+    L: Array
+    gamma: Array
+    closed_loop: Array
+    result: Result
+    residual: Array | None = None
+    iterations: Array | None = None
+    spectral_radius: Array | None = None
+    spectral_abscissa: Array | None = None
+
+
+def joint_inputs(B, D, R, gamma) -> tuple[Array, Array]:
+    """`[B D]`, and the weight of the joint control `[u; w]`."""
+    m, k = B.shape[-1], D.shape[-1]
+    weight = jnp.zeros((*R.shape[:-2], m + k, m + k), R.dtype)
+    # gamma^2 w'w is subtracted from the cost.
+    worth = -(gamma**2) * jnp.eye(k, dtype=R.dtype)
+    weight = weight.at[..., :m, :m].set(R).at[..., m:, m:].set(worth)
+    return jnp.concatenate([B, D], axis=-1), weight
+
+
+def joint(problem: tuple, gamma: Scalar) -> RiccatiData:
+    """The equation of the game `(A, B, D, Q, R)`."""
+    A, B, D, Q, R = problem
+    both, weight = joint_inputs(B, D, R, gamma)
+    return RiccatiData(A, both, Q, weight, jnp.zeros_like(both), None)
+
+
+def joint_gain(discrete: bool, data: RiccatiData, X: Square) -> Array:
+    """The gains `K` of the joint control `[u; w] = -K x`."""
+    _, cross, weight = stationary(discrete, data, X)
+    return solve(weight, cross.T)
+
+
+def at_level(solver, where, discrete, problem, gamma, tolerance, throw) -> GameSolution:
+    """The checked call of `solver(discrete, problem, gamma, tolerance)`: the game at a
+    given level, or at the least one to within a tolerance."""
+    dtype = problem[0].dtype
+    if tolerance is None:
+        tolerance = 16 * jnp.finfo(dtype).eps if discrete else _LOOSE[dtype.itemsize]
+    check_step(tolerance, where, "tolerance")
+    if gamma is not None:
+        check_step(gamma, where, "gamma")
+        gamma = jnp.asarray(gamma, dtype)
+    solution = solver(discrete, problem, gamma, jnp.asarray(tolerance, dtype))
+    facts = lambda: f"Level gamma {float(solution.gamma):.6g}."
+    return raise_on_failure(solution, where, throw, facts=facts)
+
+
 class Game(NamedTuple):
-    """A solution of the equation of a game, and what it is worth."""
+    """A solution of the equation of a game, and the conditions of a saddle point."""
 
     X: Array
     residual: Array
-    holds: Array  # whether all conditions of a solution but the equation are met
-    solved: Array  # whether the equation is
+    holds: Array  # whether all conditions but the equation hold
+    solved: Array  # whether the equation is solved
     iterations: Array
 
     @property
@@ -36,7 +140,7 @@ class Game(NamedTuple):
 
 
 class Bisection(NamedTuple):
-    """Where a search for the least level has come to."""
+    """The state of the bisection of the least level."""
 
     low: Array
     high: Array
@@ -48,13 +152,14 @@ class Bisection(NamedTuple):
     trials: Array
 
 
+Barrier = Callable[[tuple, Array], Array]
 Solve = Callable[[tuple, Array, Array], Game]
 """`(A, B, D, Q, R, *others)`, `gamma` and `X0` to the game's solution. `X0` is a point
 below the solution, from which the iteration rises to it."""
 
 
 def bisect_level(
-    solve: Solve,
+    solve_game: Solve,
     problem: tuple,
     start: Array,
     gamma: Array | None = None,
@@ -62,10 +167,10 @@ def bisect_level(
 ) -> tuple[Bisection, Array]:
     """The game at `gamma`, or at the least level; and the level. No derivatives.
 
-    The first trial is without a disturbance, from `start`. It tells whether there is
-    any level, and about where; and the others start at its solution. The level is the
-    upper, feasible end of a bracket that is narrower than `tolerance`, relatively. It
-    is 0 where no disturbance has any effect.
+    The first trial is without a disturbance, from `start`. It tells whether any level
+    is feasible and gives the scale of the bracket; the other trials start at its
+    solution. The level is the upper, feasible end of a bracket of relative width
+    `tolerance`, and 0 where no disturbance has any effect.
     """
     problem, start, gamma = lax.stop_gradient((problem, start, gamma))
     A, B, D, *others = problem
@@ -74,6 +179,7 @@ def bisect_level(
     def more(now):
         if gamma is not None:
             return (now.trials == 0) | (now.solvable & (now.trials < 2))
+        # Until both ends are known the bracket grows, within limits; then it shrinks.
         open_end = jnp.isinf(now.high) | (now.low == 0)
         wide = now.high > now.low * (1 + tolerance)
         near = (now.low < _WIDEST * now.start) & (now.high > now.start / _WIDEST)
@@ -82,29 +188,36 @@ def bisect_level(
 
     def body(now):
         first = now.trials == 0
-        trial = _next(now) if gamma is None else gamma
+        if gamma is None:
+            # Up by factors until feasible, down until not, and then into the middle, of
+            # the logarithms: the level may have any size.
+            known = jnp.where(jnp.isinf(now.high), 1, now.high)
+            up = jnp.where(now.low == 0, now.start, _FACTOR * now.low)
+            down = jnp.where(now.low == 0, known / _FACTOR, jnp.sqrt(now.low * known))
+            trial = jnp.where(jnp.isinf(now.high), up, down)
+        else:
+            trial = gamma
         trial = jnp.where(first, one, trial)
         tried = (A, B, jnp.where(first, 0, D), *others)
-        game = solve(tried, trial, now.base)
+        game = solve_game(tried, trial, now.base)
         good = game.good
-        # What a disturbance does to the cost when it is not resisted at all.
+        # The cost of a unit disturbance, trace D'XD: the square of a typical level, at
+        # which the bracket starts.
         X = game.X[1:] if D.ndim == 3 else game.X
         effect = jnp.einsum("...ik,...ij,...jk->", D, X, D)
         size = jnp.linalg.norm(X) * jnp.sum(D**2)
         slack = 10 * A.shape[-1] * jnp.finfo(A.dtype).eps * size
-        at_first = Bisection(
-            low=now.low,
-            high=now.high,
+        at_first = now._replace(
             start=jnp.sqrt(jnp.maximum(effect, jnp.finfo(A.dtype).tiny)),
             solvable=good,
             affected=effect > slack,
             base=game.X,
             game=game,
-            trials=now.trials,
         )
-        # Between neighbouring numbers there is nothing left to try.
+        # Between neighbouring floating-point numbers the bracket closes.
         stuck = (trial <= now.low) | (trial >= now.high)
         better = good & ~stuck
+        # Of a search the best game is kept, at a given level the one that was solved.
         keep = better if gamma is None else jnp.ones((), bool)
         later = now._replace(
             low=jnp.where(stuck, now.high, jnp.where(good, now.low, trial)),
@@ -113,7 +226,7 @@ def bisect_level(
         )
         return _where(first, at_first, later)._replace(trials=now.trials + 1)
 
-    unknown = jax.eval_shape(solve, problem, one, start)
+    unknown = jax.eval_shape(solve_game, problem, one, start)
     begin = Bisection(
         low=0 * one,
         high=jnp.inf * one,
@@ -132,29 +245,16 @@ def bisect_level(
 
 
 def game_at_level(
-    solve: Solve,
-    barrier: Callable[[tuple, Array], Array],
-    problem: tuple,
-    start: Array,
-    gamma: Array | None,
-    tolerance: Array,
+    solve_game: Solve, barrier: Barrier, problem, start, gamma, tolerance
 ) -> tuple[Bisection, Array, Array]:
     """The game at `gamma`, or at the least level; that level, or 1 if it is 0; and the
     level as it is, with its derivatives."""
-    end, level = bisect_level(solve, problem, start, gamma, tolerance)
+    end, level = bisect_level(solve_game, problem, start, gamma, tolerance)
     if gamma is None:
-        attained = followed(barrier, problem, level)
+        attained = with_derivative(barrier, problem, level)
     else:
         attained = level = gamma
     return end, jnp.where(level > 0, level, 1), attained
-
-
-def _next(now: Bisection) -> Array:
-    """Up by factors until feasible, down until not, and then into the middle."""
-    known = jnp.where(jnp.isinf(now.high), 1, now.high)
-    up = jnp.where(now.low == 0, now.start, _FACTOR * now.low)
-    down = jnp.where(now.low == 0, known / _FACTOR, jnp.sqrt(now.low * known))
-    return jnp.where(jnp.isinf(now.high), up, down)
 
 
 def _where(condition, first, second):
@@ -162,52 +262,66 @@ def _where(condition, first, second):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def followed(barrier: Callable[[tuple, Array], Array], problem: tuple, level: Array):
-    """The least level, differentiated as the problem changes.
+def with_derivative(barrier: Barrier, problem: tuple, level: Array):
+    """The least level, with its derivative in the problem.
 
-    `barrier(problem, gamma)` is any function whose value or slope becomes infinite at
-    the least level: where it is constant, `gamma` moves as the level does.
+    `barrier(problem, gamma)` is any function whose value or slope diverges at the least
+    level: its level sets move with the problem as the least level does.
     """
     del barrier, problem
     return level
 
 
-@followed.defjvp
+@with_derivative.defjvp
 @full_precision
-def _followed_jvp(barrier, primals, tangents):
+def _with_derivative_jvp(barrier, primals, tangents):
+    # By implicit differentiation of barrier(problem, gamma) = constant a little above
+    # the level: at it both slopes are infinite, and their quotient has a limit.
     problem, level = primals
-    level = once(level)
-    problem = jax.tree.map(once, problem)
+    level = once_differentiable(level)
+    problem = jax.tree.map(once_differentiable, problem)
+    # d gamma = -(d barrier / d problem) / (d barrier / d gamma), at some distances.
     still = jax.tree.map(jnp.zeros_like, problem)
     attained = level > 0
     safe = jnp.where(attained, level, 1)
 
-    def following(away):
+    def at_distance(away):
         along = functools.partial(jax.jvp, barrier, (problem, safe * (1 + away)))
         _, slope = along((still, jnp.ones_like(safe)))
         _, change = along((tangents[0], jnp.zeros_like(safe)))
         return -change / jnp.where(slope != 0, slope, 1)
 
-    # Its error is a series in the root of the distance: two eigenvalues may meet on the
-    # boundary. From four distances follows the limit without the first terms.
+    # The error is a series in the root of the distance, as two eigenvalues may meet on
+    # the boundary. Extrapolation from four distances removes its first terms.
     away = jnp.finfo(level.dtype).eps ** (3 / 8) * jnp.asarray(_AWAY, level.dtype)
-    tangent = jax.vmap(following)(away) @ jnp.asarray(_WEIGHTS, level.dtype)
+    tangent = jax.vmap(at_distance)(away) @ jnp.asarray(_WEIGHTS, level.dtype)
     return primals[1], jnp.where(attained, tangent, 0)
 
 
 @jax.custom_jvp
-def once(x: Array) -> Array:
-    """`x`, which can not be differentiated again.
+def once_differentiable(x: Array) -> Array:
+    """`x`, which cannot be differentiated twice.
 
-    The slope of the barrier is infinite in the limit: its own derivative would be
-    rounding alone.
+    The slope of the barrier diverges in the limit: its own derivative would be rounding
+    alone.
     """
     return x
 
 
-@once.defjvp
-def _once_jvp(primals, tangents):
+@once_differentiable.defjvp
+def _once_differentiable_jvp(primals, tangents):
     raise NotImplementedError(
         "The least attainable gamma has first derivatives only. Give gamma as an "
         "argument for higher ones."
     )
+
+
+def inverse_margins(
+    D: Float[Array, "T n k"], X: Float[Array, "T n n"], gamma: Scalar
+) -> Scalar:
+    """The traces of `(gamma^2 I - D'XD)^-1`, summed, in a unit that fits."""
+    eye = jnp.eye(D.shape[-1], dtype=D.dtype)
+    margins = gamma**2 * eye - jnp.swapaxes(D, 1, 2) @ X @ D
+    inverses = jax.vmap(lambda M: jnp.trace(solve(M, eye)))(margins)
+    # In the unit of X, so that the sum may be added to its trace.
+    return lax.stop_gradient(gamma**2 * jnp.linalg.norm(X)) * jnp.sum(inverses)

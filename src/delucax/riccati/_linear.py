@@ -12,10 +12,9 @@ from jaxtyping import Array
 from .._check import as_matrix
 from .._results import choose, raise_on_failure, Result, RESULTS
 from ..math._linear_solve import full_precision, no_tangent, solve
+from ..math._lyapunov import smith, stable_sylvester
 from ._arguments import complex_form, is_complex, real_form, square_matrix
-from ._lyapunov import smith, stable_sylvester
-from ._residual import linear_residual
-from ._search import tolerance
+from ._residual import if_needed, linear_residual, tolerance
 from ._spectrum import spectral_abscissa
 
 
@@ -56,7 +55,7 @@ class MatrixSolution(eqx.Module):
     result: Result
 
     def _facts(self) -> str:
-        """What an error says of a failure."""
+        """The diagnostics of an error."""
         return f"Relative residual {float(self.residual):.1e}."
 
 
@@ -77,7 +76,7 @@ def lyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
     - `A`: shape `(n, n)`. Real, or complex, as `Q`; then `'` is the conjugate
         transpose.
     - `Q`: shape `(n, n)`, not necessarily symmetric.
-    - `throw`: raise unless the solution is found (default); if false, look at `result`.
+    - `throw`: raise unless the solution is found (default); if false, check `result`.
 
     **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
     `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
@@ -114,20 +113,12 @@ def dlyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
     Otherwise a unique solution is still found, in one dense solve, up to `n = 16`;
     beyond it `result` is `RESULTS.not_separated`.
 
-    **Arguments:**
+    **Arguments:** `A`, `Q` and `throw`: as of [`delucax.riccati.lyap`][].
 
-    - `A`: shape `(n, n)`. Real, or complex, as `Q`; then `'` is the conjugate
-        transpose.
-    - `Q`: shape `(n, n)`, not necessarily symmetric.
-    - `throw`: raise unless the solution is found (default); if false, look at `result`.
+    **Returns:** as there; `RESULTS.ill_posed` where two eigenvalues of `A` have the
+    product one.
 
-    **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
-    `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
-    `RESULTS.not_separated`, or `RESULTS.ill_posed` where two eigenvalues of `A` have
-    the product one.
-
-    **Raises:** `ValueError` on a matrix of the wrong shape or that is not finite; an
-    error at run time as `throw` says.
+    **Raises:** as there.
 
     Source: Smith, 1968.
 
@@ -159,7 +150,7 @@ def sylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
     - `A`: shape `(n, n)`. Real, or complex, as `B` and `C`.
     - `B`: shape `(m, m)`.
     - `C`: shape `(n, m)`.
-    - `throw`: raise unless the solution is found (default); if false, look at `result`.
+    - `throw`: raise unless the solution is found (default); if false, check `result`.
 
     **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
     `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
@@ -190,24 +181,16 @@ def dsylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
     `A X B - X + C = 0`.
 
     Solved by doubling if the spectral radii of `A` and `B` have a product below one; by
-    a Cayley transform if the circle about 0 is crossed outwards by both spectra.
+    a Cayley transform if both spectra lie outside the unit circle.
     Otherwise a unique solution is still found, in one dense solve, up to 256 unknowns;
     beyond it `result` is `RESULTS.not_separated`.
 
-    **Arguments:**
+    **Arguments:** `A`, `B`, `C` and `throw`: as of [`delucax.riccati.sylvester`][].
 
-    - `A`: shape `(n, n)`. Real, or complex, as `B` and `C`.
-    - `B`: shape `(m, m)`.
-    - `C`: shape `(n, m)`.
-    - `throw`: raise unless the solution is found (default); if false, look at `result`.
+    **Returns:** as there; `RESULTS.ill_posed` where an eigenvalue of `A` and one of `B`
+    have the product one.
 
-    **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
-    `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
-    `RESULTS.not_separated`, or `RESULTS.ill_posed` where an eigenvalue of `A` and one
-    of `B` have the product one.
-
-    **Raises:** `ValueError` on a matrix of the wrong shape or that is not finite; an
-    error at run time as `throw` says.
+    **Raises:** as there.
 
     Source: Smith, 1968.
 
@@ -225,8 +208,7 @@ def dsylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
 
 
 def _equation(where, discrete, A, B, C, throw) -> MatrixSolution:
-    """The solution for arguments as a user gives them; without `B` they are those of
-    the Lyapunov equation."""
+    """The checked and solved equation; without `B` the Lyapunov equation."""
     name = "Q" if B is None else "C"
     A, C = square_matrix(A, "A", where), as_matrix(C, name, where)
     B = None if B is None else square_matrix(B, "B", where)
@@ -235,9 +217,9 @@ def _equation(where, discrete, A, B, C, throw) -> MatrixSolution:
         raise ValueError(
             f"{where}: {name} must have shape {shape}, got shape {C.shape}."
         )
-    dtype = jnp.result_type(*(M for M in (A, B, C) if M is not None))
-    A, C = A.astype(dtype), C.astype(dtype)
-    B = None if B is None else B.astype(dtype)
+    dtype = jnp.result_type(*jax.tree.leaves((A, B, C)))
+    A, B, C = jax.tree.map(lambda M: M.astype(dtype), (A, B, C))
+    # In continuous time a Lyapunov equation is A X + X A' = -Q.
     C = -C if B is None and not discrete else C
     solution = _solution(discrete, A, B, C)
     return raise_on_failure(solution, where, throw, facts=solution._facts)
@@ -249,6 +231,7 @@ def _solution(discrete, A, B, C) -> MatrixSolution:
     if complex_data:
         A, B, C = jax.tree.map(real_form, (A, B, C))
     solution = _solved(discrete, A, B, C)
+    # A dense solve fails only if the equation is singular.
     failure = RESULTS.ill_posed if C.size <= _DENSE else RESULTS.not_separated
     result = choose(solution.solved, RESULTS.successful, failure)
     return MatrixSolution(
@@ -270,31 +253,22 @@ class _Candidate(NamedTuple):
         return self.residual <= tolerance(self.X.dtype)
 
 
-def _left_side(discrete, A, B, X):
-    """`A X + X B`, or `X - A X B`."""
-    B = A.T if B is None else B
-    return X - A @ X @ B if discrete else A @ X + X @ B
-
-
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 @full_precision
 def _solved(discrete, A, B, C) -> _Candidate:
     """The solution of `A X + X B = C` or `X - A X B = C`; `B` is `A'` by default."""
-    given = [M for M in (A, B, C) if M is not None]
+    given = jax.tree.leaves((A, B, C))
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in given]))
     last = _DENSELY if C.size <= _DENSE else _SHIFTED
-
-    def more(carry):
-        return carry[0] != _DONE
 
     def body(carry):
         kind, before = carry
         plain, shifted = kind == _PLAIN, kind == _SHIFTED
         X, iterations = _separated(discrete, A, B, C, plain, shifted)
         if last == _DENSELY:
-            X = _densely(discrete, A, B, C, X, kind == _DENSELY)
+            X = _dense_solution(discrete, A, B, C, X, kind == _DENSELY)
         residual = linear_residual(discrete, A, A.T if B is None else B, C, X)
-        # The equation is linear: if its residual is small, it is solved.
+        # For a linear equation a small residual is a small backward error: enough.
         better = (residual < before.residual) | plain
         after = before._replace(
             X=jnp.where(better, X, before.X),
@@ -304,21 +278,17 @@ def _solved(discrete, A, B, C) -> _Candidate:
         over = after.solved | (kind == last)
         return jnp.where(over, _DONE, kind + 1), after
 
-    nothing = _Candidate(
-        jnp.full_like(C, jnp.nan),
-        jnp.asarray(jnp.inf, C.dtype),
-        jnp.asarray(0),
-        finite,
-    )
-    start = jnp.where(finite, _PLAIN, _DONE)
-    return lax.while_loop(more, body, (start, nothing))[1]
+    unknown, zero = jnp.asarray(jnp.inf, C.dtype), jnp.asarray(0)
+    nothing = _Candidate(jnp.full_like(C, jnp.nan), unknown, zero, finite)
+    start = jnp.where(finite, _PLAIN, _DONE), nothing
+    return lax.while_loop(lambda carry: carry[0] != _DONE, body, start)[1]
 
 
 def _separated(discrete, A, B, C, plain, shifted):
     """The solution if the spectra are separated, as they are or by a shift."""
     if discrete:
-        # What is not wanted is given a problem that takes one step.
-        X, steps = smith(*_wanted(plain, A, B, C))
+        # An inactive kind gets a trivial problem, which takes one step.
+        X, steps = smith(*_or_trivial(plain, A, B, C))
         # Where both spectra are outside the circle, the Cayley transform puts them to
         # the right of the axis.
         eye_A, eye_B = (jnp.eye(size, dtype=C.dtype) for size in C.shape)
@@ -331,20 +301,18 @@ def _separated(discrete, A, B, C, plain, shifted):
         Y, more_steps = _one_side(A, B, C, sign, jnp.zeros(()), shifted)
         return jnp.where(plain, X, Y), steps + more_steps
     n, m = C.shape
+    # Where the sum of the eigenvalues of A and B is positive, those of -A and -B may be
+    # stable: -(A X + X B) = -C.
     mean = jnp.trace(A) / n + (jnp.trace(A) / n if B is None else jnp.trace(B) / m)
     sign = jnp.where(mean > 0, -1.0, 1.0)
     if B is None:
         # There is no other line for an equation that is its own transpose.
         return _one_side(A, None, C, sign, jnp.zeros(()), plain)
-    shift = _shift(sign * A, sign * B, shifted)
-    return _one_side(A, B, C, sign, sign * shift, plain | shifted)
-
-
-def _shift(A, B, wanted):
-    """Where the line is: between the spectra of `A` and `-B`."""
-    safe_A, safe_B = (jnp.where(wanted, M, 0) for M in (A, B))
+    # A shift by where the line is, between the spectra of A and -B.
+    safe_A, safe_B = (jnp.where(shifted, sign * M, 0) for M in (A, B))
     middle = (spectral_abscissa(safe_A) - spectral_abscissa(safe_B)) / 2
-    return jnp.where(wanted, middle, 0)
+    shift = sign * jnp.where(shifted, middle, 0)
+    return _one_side(A, B, C, sign, shift, plain | shifted)
 
 
 def _one_side(A, B, C, sign, shift, wanted):
@@ -353,44 +321,45 @@ def _one_side(A, B, C, sign, shift, wanted):
     A = sign * (A - shift * jnp.eye(A.shape[0], dtype=A.dtype))
     if B is not None:
         B = sign * (B + shift * jnp.eye(B.shape[0], dtype=B.dtype))
-    A, B, C = _wanted(wanted, A, B, sign * C, -1)
+    A, B, C = _or_trivial(wanted, A, B, sign * C, -1)
     return stable_sylvester(A, B, C)
 
 
-def _wanted(wanted, A, B, C, scale=0):
-    """The problem if it is wanted; else one that is done at once."""
+def _or_trivial(wanted, A, B, C, scale=0):
+    """The problem if it is wanted; else a trivial one."""
     A = jnp.where(wanted, A, scale * jnp.eye(A.shape[0], dtype=A.dtype))
     if B is not None:
         B = jnp.where(wanted, B, scale * jnp.eye(B.shape[0], dtype=B.dtype))
     return A, B, jnp.where(wanted, C, 0)
 
 
-def _densely(discrete, A, B, C, X, wanted):
+def _dense_solution(discrete, A, B, C, X, wanted):
     """The solution as that of one linear system, if it is wanted, else `X`."""
 
-    def body(carry):
-        _, going = carry
+    def dense(_):
+        # vec(A X + X B), row by row, is this matrix times vec(X).
         other = A.T if B is None else B
-        eye_A = jnp.eye(A.shape[0], dtype=A.dtype)
-        eye_B = jnp.eye(other.shape[0], dtype=A.dtype)
+        eye_A, eye_B = (jnp.eye(size, dtype=A.dtype) for size in C.shape)
         if discrete:
             system = jnp.kron(eye_A, eye_B) - jnp.kron(A, other.T)
         else:
             system = jnp.kron(A, eye_B) + jnp.kron(eye_A, other.T)
-        return solve(system, C.reshape(-1, 1)).reshape(C.shape), ~going
+        return solve(system, C.reshape(-1, 1)).reshape(C.shape)
 
-    return lax.while_loop(lambda carry: carry[1], body, (X, wanted))[0]
+    return if_needed(wanted, dense, X, ())
 
 
 @_solved.defjvp
 @full_precision
 def _solved_jvp(discrete, primals, tangents):
+    # The equation is linear in X: dX solves the same one, with another right side.
     A, B, _ = primals
     solution = _solved(discrete, *primals)
     ok = solution.solved
-    # Guarded at both ends: what is not finite in a failed member stays in it.
+    # Masked at input and output, so that a failed member's NaN does not spread.
     dA, dB, dC = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents)
     X = jnp.where(ok, solution.X, 0)
+    # -I/2 for what was not solved: a trivial problem in both times.
     half = functools.partial(jnp.where, ok)
     A, B = jax.tree.map(lambda M: half(M, -jnp.eye(len(M), dtype=M.dtype) / 2), (A, B))
     other, d_other = (A.T, dA.T) if B is None else (B, dB)
@@ -398,9 +367,10 @@ def _solved_jvp(discrete, primals, tangents):
         right = dC + dA @ X @ other + A @ X @ d_other
     else:
         right = dC - dA @ X - X @ d_other
+    # The transposed equation is that of A' and B'.
     across = None if B is None else B.T
     dX = lax.custom_linear_solve(
-        lambda X: _left_side(discrete, A, B, X),
+        lambda X: X - A @ X @ other if discrete else A @ X + X @ other,
         jnp.where(ok, right, 0),
         solve=lambda _, C: _solved(discrete, A, B, C).X,
         transpose_solve=lambda _, C: _solved(discrete, A.T, across, C).X,

@@ -1,39 +1,50 @@
-"""The Riccati recursion over a finite horizon, in sequence or in parallel."""
+"""The Riccati equation over a finite horizon: the recursion of discrete time, in
+sequence or in parallel, and the flow of continuous time."""
 
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from .._typing import BoolScalar, Square
 from ..math._linear_solve import full_precision, solve, symmetric
+from ._arguments import where_solved
 
+
+_MAX_HALVINGS = 40
+_PADE = (1.0, 1 / 2, 5 / 44, 1 / 66, 1 / 792, 1 / 15840, 1 / 665280)
+"""Numerator of the [6/6] approximant of exp; its error is 2e-17 at norm 1/2."""
 
 Element = tuple[Array, Array, Array]
 """`A, C, J` of an interval: from `X` at its end follows `J + A' X (I + C X)^-1 A` at
 its start."""
 
 
-def is_clearly_definite(M: Float[Array, "n n"]) -> Bool[Array, ""]:
+def is_clearly_definite(M: Square) -> BoolScalar:
     """Whether a symmetric matrix is positive definite, by more than rounding."""
     L = jnp.linalg.cholesky(lax.stop_gradient(M))
-    # Relative to the diagonal, so that units do not matter. NaN compares false.
+    # The pivot L_ii^2 is the Schur complement of M_ii, and is compared with it, so that
+    # units do not matter. NaN fails the comparison.
     least = M.shape[0] * jnp.finfo(M.dtype).eps * jnp.abs(jnp.diagonal(M))
     return jnp.all(jnp.diagonal(L) ** 2 > least)
 
 
-def is_saddle(M: Float[Array, "k k"], players: int) -> Bool[Array, ""]:
+def is_saddle(M: Float[Array, "k k"], maximisers: int) -> BoolScalar:
     """Whether `[u; w]' M [u; w]` has a minimum over `u` of its maximum over `w`.
 
-    `w` is the last `players` entries, and may be empty.
+    `w` is the last `maximisers` entries, and may be empty.
     """
-    m = M.shape[0] - players
-    if players == 0:
+    m = M.shape[0] - maximisers
+    if maximisers == 0:
         return is_clearly_definite(M)
+    # Concave in w, and then convex in u once w is at its best: the Schur complement.
     U, C, W = M[:m, :m], M[:m, m:], -M[m:, m:]
     concave = is_clearly_definite(W)
-    safe = jnp.where(concave, W, jnp.eye(players, dtype=M.dtype))
+    safe = jnp.where(concave, W, jnp.eye(maximisers, dtype=M.dtype))
     return concave & is_clearly_definite(symmetric(U + C @ solve(safe, C.T)))
 
 
@@ -44,6 +55,7 @@ def failed_step(X: Float[Array, "T n n"]) -> int:
 
 def gain(A, B, R, S, X):
     """The stationary `K = (R + B'XB)^-1 (B'XA + S')`, and the loop `A - B K`."""
+    # By LU, not Cholesky: in a game the weight is indefinite.
     K = solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
     return K, A - B @ K
 
@@ -58,47 +70,45 @@ def one_step(A, B, Q, R, S, K, X):
     return symmetric(loop.T @ X @ loop + Q + K.T @ R @ K - cross - cross.T)
 
 
-def sanitised(ok, A, B, Q, R, S, X):
-    """The arguments where all is well; elsewhere a step with no difficulty.
-
-    So no NaN of a step that failed is in a derivative.
-    """
-    eye = jnp.broadcast_to(jnp.eye(R.shape[-1], dtype=R.dtype), R.shape)
-    here = ok[..., None, None]
-    A, B, Q, S, X = (jnp.where(here, M, 0) for M in (A, B, Q, S, X))
-    return A, B, Q, jnp.where(here, R, eye), S, X
-
-
 @functools.partial(jax.custom_jvp, nondiff_argnums=(6, 7))
-def values(A, B, Q, R, S, final, players: int, parallel: bool):
+def values(A, B, Q, R, S, final, maximisers: int, parallel: bool):
     """`X` at steps 0 to T of the recursion from `final`, shape `(T+1, n, n)`.
 
-    The last `players` controls maximise. NaN at a step, and at all before it, that has
-    no saddle point.
+    The last `maximisers` controls maximise. It is NaN at a step without a saddle point,
+    and at all before it.
     """
-    run = _in_parallel if parallel else _in_sequence
-    X = run(A, B, Q, R, S, final)
+    if parallel:
+        X = _in_parallel(A, B, Q, R, S, final)
+    else:
+
+        def back(X, here):
+            A, B, Q, R, S = here
+            return one_step(A, B, Q, R, S, gain(A, B, R, S, X)[0], X)
+
+        X = backwards(back, final, (A, B, Q, R, S))
+        X = jnp.concatenate([X, final[None]])
     pivot = R + jnp.swapaxes(B, 1, 2) @ X[1:] @ B
-    good = jax.vmap(lambda M: is_saddle(M, players))(symmetric(pivot))
+    good = jax.vmap(lambda M: is_saddle(M, maximisers))(symmetric(pivot))
     good &= jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
+    # A step without a minimum leaves none to all the steps before it.
     good = lax.cummin(good.astype(jnp.int32), reverse=True).astype(bool)
     return X.at[:-1].set(jnp.where(good[:, None, None], X[:-1], jnp.nan))
 
 
-def _in_sequence(A, B, Q, R, S, final):
+def backwards(step: Callable[[Array, Any], Array], final: Array, steps: Any) -> Array:
+    """The values of the recursion `X = step(X, here)` from `final`, back through
+    `steps`."""
+
     def back(X, here):
-        A, B, Q, R, S = here
-        K, _ = gain(A, B, R, S, X)
-        X = one_step(A, B, Q, R, S, K, X)
+        X = step(X, here)
         return X, X
 
-    _, X = lax.scan(back, final, (A, B, Q, R, S), reverse=True)
-    return jnp.concatenate([X, final[None]])
+    return lax.scan(back, final, steps, reverse=True)[1]
 
 
 def _in_parallel(A, B, Q, R, S, final):
-    # Adding x_next' P x_next - x' P x to each step changes no decision, and makes the
-    # control weight definite even where R is not.
+    # Adding x_next' P x_next - x' P x to each step, a telescoping sum, does not change
+    # the optimal control, and makes the control weight definite even where R is not.
     n = A.shape[-1]
     size = jnp.linalg.norm(Q, axis=(1, 2)).mean() + jnp.linalg.norm(final)
     size = jnp.where(size > 0, size, jnp.linalg.norm(R, axis=(1, 2)).mean())
@@ -106,11 +116,12 @@ def _in_parallel(A, B, Q, R, S, final):
 
     def element(A, B, Q, R, S):
         cross = A.T @ P @ B + S
-        return step_element(A, B, R + B.T @ P @ B, cross, A.T @ P @ A - P, Q)
+        linear, weight = A.T @ P @ A - P, R + B.T @ P @ B
+        return without_cross_weight(A, B, linear, weight, cross, Q)
 
     def combine(later, earlier):
         # The scan runs backwards, so that the later of two comes first.
-        return jax.vmap(joined)(earlier, later)
+        return jax.vmap(composed)(earlier, later)
 
     steps = jax.vmap(element)(A, B, Q, R, S)
     nothing = jnp.zeros((1, n, n), A.dtype)
@@ -118,30 +129,35 @@ def _in_parallel(A, B, Q, R, S, final):
     elements = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), steps, last)
     _, _, J = lax.associative_scan(combine, elements, reverse=True)
     X = (J + P).at[-1].set(final)
-    # One step from each X to the one before takes the scan's rounding away.
+    # One exact step from each X to the one before removes the scan's rounding.
     K, _ = jax.vmap(gain)(A, B, R, S, X[1:])
     return X.at[:-1].set(jax.vmap(one_step)(A, B, Q, R, S, K, X[1:]))
 
 
-def step_element(A, B, weight, cross, linear, Q) -> Element:
-    """The element of a step, about some `X0`.
+def without_cross_weight(A, B, Q, R, S, added=None) -> Element:
+    """`A - B R^-1 S'`, `B R^-1 B'` and `Q - S R^-1 S'` of the equation in the control
+    `u + R^-1 S'x`, which has no cross weight. `added` is a part of `Q` to come last.
 
-    There `weight` is `R + B'X0 B`, `cross` is `A'X0 B + S`, and `linear` is
-    `A'X0 A - X0`.
+    In discrete time it is the element of a step, about some `X0`: for which `Q` is
+    `A'X0 A - X0`, `R` is `R + B'X0 B`, `S` is `A'X0 B + S`, and `added` is `Q`.
     """
     n = A.shape[0]
-    solved = solve(weight, jnp.concatenate([cross.T, B.T], axis=1))
-    K, G = solved[:, :n], symmetric(B @ solved[:, n:])
-    return A - B @ K, G, symmetric(linear - cross @ K + Q)
+    solved = solve(R, jnp.concatenate([S.T, B.T], axis=1))
+    K = solved[:, :n]
+    closed_loop, G = A - B @ K, symmetric(B @ solved[:, n:])
+    # The difference of like terms first: rounding of `added` would hide it.
+    Q = Q - S @ K
+    return closed_loop, G, symmetric(Q if added is None else Q + added)
 
 
-def joined(first: Element, second: Element) -> Element:
+def composed(first: Element, second: Element) -> Element:
     """The element of two intervals, one after the other.
 
     Source: Sarkka and Garcia-Fernandez, 2023.
     """
     A1, C1, J1 = first
     A2, C2, J2 = second
+    # One inverse serves all: J2 (I + C1 J2)^-1 and (I + C1 J2)^-1 C1 are symmetric.
     n = A1.shape[0]
     eye = jnp.eye(n, dtype=A1.dtype)
     solved = solve(eye + C1 @ J2, jnp.concatenate([A1, C1], axis=1))
@@ -157,14 +173,11 @@ def linear_recursion(loop, added, final, parallel: bool, product):
     composition.
     """
     if not parallel:
-
-        def back(Z, here):
-            Z = product(here[0], Z) + here[1]
-            return Z, Z
-
-        _, Z = lax.scan(back, final, (loop, added), reverse=True)
+        back = lambda Z, here: product(here[0], Z) + here[1]
+        Z = backwards(back, final, (loop, added))
         return jnp.concatenate([Z, final[None]])
 
+    # The pair (loop, added) is an affine map; composition of such maps is associative.
     def combine(later, earlier):
         (later_loop, later_added), (loop, added) = later, earlier
         moved = jax.vmap(product)(loop, later_added)
@@ -177,14 +190,15 @@ def linear_recursion(loop, added, final, parallel: bool, product):
 
 @values.defjvp
 @full_precision
-def _values_jvp(players, parallel, primals, tangents):
+def _values_jvp(maximisers, parallel, primals, tangents):
     *matrices, _ = primals
-    X = values(*primals, players, parallel)  # pyright: ignore[reportCallIssue]
+    X = values(*primals, maximisers, parallel)  # pyright: ignore[reportCallIssue]
     good = jnp.all(jnp.isfinite(X[:-1]), axis=(1, 2))
-    A, B, Q, R, S, after = sanitised(good, *matrices, X[1:])  # pyright: ignore[reportCallIssue]
+    A, B, Q, R, S = matrices
+    (A, B, Q, S, after), R = where_solved(good, (A, B, Q, S, X[1:]), R)
     K, loop = jax.vmap(gain)(A, B, R, S, after)
 
-    # At the best gain the cost-to-go is stationary in it: its change is not needed.
+    # By the envelope theorem a change of the optimal gain does not contribute.
     def cost(A, B, Q, R, S):
         return jax.vmap(one_step)(A, B, Q, R, S, K, after)
 
@@ -193,3 +207,143 @@ def _values_jvp(players, parallel, primals, tangents):
     congruence = lambda loop, Z: loop.T @ Z @ loop
     tangent = linear_recursion(loop, change, tangents[-1], parallel, congruence)
     return X, tangent
+
+
+def scale_of(G: Array, Q: Array) -> Array:
+    """The size of `X` at which `X G X` is as large as `Q`; 1 if that is no size."""
+    # |G| x^2 = |Q|; its derivative cancels from the result, as any unit will do.
+    quadratic, constant = jnp.linalg.norm(G), jnp.linalg.norm(Q)
+    usual = (quadratic > 0) & (constant > 0)
+    ratio = jnp.where(usual, constant, 1) / jnp.where(usual, quadratic, 1)
+    return lax.stop_gradient(jnp.sqrt(ratio))
+
+
+def hamiltonian(A, G, Q) -> Array:
+    """The matrix of the linear flow of `[I; X]`, for `dX/dt = -A'X - XA + XGX - Q`."""
+    return jnp.block([[A, -G], [-Q, -A.T]])
+
+
+def short_element(H: Float[Array, "_ _"], time: Array) -> tuple[Array, Array, Array]:
+    """The element of an interval that is short relative to `1 / |H|`."""
+    n = H.shape[0] // 2
+    Z = -H * time
+    power = jnp.eye(2 * n, dtype=H.dtype)
+    parts = [power * _PADE[0], jnp.zeros_like(Z)]  # of even and of odd degree
+    for k in range(1, 7):
+        power = power @ Z
+        parts[k % 2] = parts[k % 2] + _PADE[k] * power
+    even, odd = parts
+    # The denominator of the approximant is its numerator at -Z.
+    flow = solve(even - odd, even + odd)
+    # Backwards over the time: [U; V] = flow [I; X] and V U^-1 is X before it.
+    # That is J + A' X (I + C X)^-1 A with the three solved for here.
+    first, second = flow[:n, :n], flow[:n, n:]
+    eye = jnp.eye(n, dtype=H.dtype)
+    solved = solve(first, jnp.concatenate([eye, second], axis=1))
+    J = solve(first.T, flow[n:, :n].T).T
+    return solved[:, :n], symmetric(solved[:, n:]), symmetric(J)
+
+
+def _short_elements(A, G, Q, times):
+    """The elements of the intervals between `times`, halved as often as needed; the
+    number of halvings; and the unit of `X`."""
+    # In this unit the quadratic and the constant part of the flow have equal norms.
+    unit, lengths = scale_of(G, Q), jnp.diff(times)
+    H = hamiltonian(A, unit * G, Q / unit)
+    # After that many halvings |H| times the longest interval is at most 1/2.
+    sizes = jnp.maximum(2 * jnp.linalg.norm(H) * lengths, 1)
+    count = jnp.max(lax.stop_gradient(jnp.ceil(jnp.log2(sizes))).astype(jnp.int32))
+    count = jnp.minimum(count, _MAX_HALVINGS)
+    short = lengths * 0.5**count
+    return unit, count, jax.vmap(lambda time: short_element(H, time))(short)
+
+
+def has_solution(C: Array, X: Array, is_game: bool) -> Array:
+    """Whether the equation has a solution over an interval, back from `X`.
+
+    It has while `I + C X` is not singular, `C` being that of the time passed so far. As
+    `C` grows with time where nothing but a control is in it, and the interval that can
+    be passed shrinks with `X` where `X` is not negative, it is enough to see at the end
+    that no eigenvalue of `I + C X` has become negative.
+    """
+    C, X = lax.stop_gradient((C, X))
+    # In a game C is indefinite and X is not; without a disturbance it is the reverse.
+    inner, outer = (X, C) if is_game else (C, X)
+    n = X.shape[0]
+    eye = jnp.eye(n, dtype=X.dtype)
+    size = jnp.linalg.norm(inner)
+    # I + C X has the eigenvalues of I + root' X root, with C = root root'.
+    slack = 100 * n * jnp.finfo(X.dtype).eps * jnp.where(size > 0, size, 1)
+    root = jnp.linalg.cholesky(inner + slack * eye)
+    moved = jnp.linalg.cholesky(eye + symmetric(root.T @ outer @ root))
+    return jnp.all(jnp.isfinite(root)) & jnp.all(jnp.isfinite(moved))
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
+def flow_values(A, G, Q, final, times, is_game: bool):
+    """`X` at `times`, back from `final`, along `dX/dt = -A'X - XA + XGX - Q`.
+
+    NaN at a time, and at all before it, from which there is no solution to the end.
+    """
+    unit, count, short = _short_elements(A, G, Q, times)
+    reach = lambda C, J: has_solution(C, J, is_game)
+
+    def twice(_, carry):
+        element, good = carry
+        # The equation from X = 0 may have a solution over each half and none over both.
+        good &= jax.vmap(reach)(element[1], element[2])
+        return jax.vmap(composed)(element, element), good
+
+    start = (short, jnp.ones(len(times) - 1, bool))
+    parts, possible = lax.fori_loop(0, count, twice, start)
+
+    def back(carry, here):
+        X, good = carry
+        element, possible = here
+        # A finite escape time in the interval: the formula below would step over it.
+        good &= possible & has_solution(element[1], X, is_game)
+        X = passed(element, X)
+        good &= jnp.all(jnp.isfinite(X))
+        return (X, good), jnp.where(good, X, jnp.nan)
+
+    start = (final / unit, jnp.ones((), bool))
+    _, X = lax.scan(back, start, (parts, possible), reverse=True)
+    return jnp.concatenate([unit * X, final[None]])
+
+
+def _to_differentiate(A, G, Q, final, times):
+    """The same `X`, where there is one, by loops of fixed length, which reverse mode
+    needs."""
+    unit, count, short = _short_elements(A, G, Q, times)
+
+    def twice(element, k):
+        # After the last doubling zero elements are composed, which is harmless.
+        going = k < count
+        tried = jax.tree.map(lambda M: jnp.where(going, M, 0), element)
+        after = jax.vmap(composed)(tried, tried)
+        kept = jax.tree.map(lambda a, b: jnp.where(going, a, b), after, element)
+        return kept, None
+
+    parts, _ = lax.scan(twice, short, jnp.arange(_MAX_HALVINGS))
+    X = backwards(lambda X, element: passed(element, X), final / unit, parts)
+    return jnp.concatenate([unit * X, final[None]])
+
+
+@flow_values.defjvp
+@full_precision
+def _flow_values_jvp(is_game, primals, tangents):
+    X = flow_values(*primals, is_game)  # pyright: ignore[reportCallIssue]
+    good = jnp.all(jnp.isfinite(X))
+    *matrices, times = primals
+    # A failed problem is replaced, which keeps its NaN out of the derivatives.
+    safe = (*(jnp.where(good, M, 0) for M in matrices), times)
+    _, tangent = jax.jvp(_to_differentiate, safe, tangents)
+    return X, jnp.where(good, tangent, 0)
+
+
+def passed(element, X):
+    """`X` at the start of an interval from `X` at its end."""
+    A, C, J = element
+    n = A.shape[0]
+    moved = solve(jnp.eye(n, dtype=A.dtype) + C @ X, A)
+    return symmetric(J + A.T @ X @ moved)

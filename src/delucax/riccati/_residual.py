@@ -1,100 +1,102 @@
-"""What is left of a matrix equation, bounded from above with all rounding counted."""
+"""Residuals of matrix equations with rigorous rounding-error bounds, and Newton
+steps."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from ..math._accurate import in_parts, product
+from .._typing import BoolScalar, Scalar, Square
+from ..math._accurate import product, product_in_parts
 from ..math._linear_solve import solve, symmetric
-from ..math._size import relative_and_total_size
+from ..math._norms import relative_and_total_size
 from ._arguments import RiccatiData
 
 
 _MARGIN = 1.01
 """Covers the rounding of the norms that a residual is the quotient of."""
+_NEWTON_STEPS = 8
+_FINE = 64
+"""Units of rounding in the relative residual that need no correction."""
+
+
+def tolerance(dtype: Any) -> float:
+    """The relative residual up to which an equation counts as solved."""
+    return 1e-12 if jnp.finfo(dtype).bits == 64 else 1e-5
 
 
 class Residual(NamedTuple):
-    """What is left of a Riccati equation.
+    """The residual of a Riccati equation.
 
-    - `error`: the left side, with the gain in place of the best one.
-    - `relative`: its norm over the sum of those of the terms.
-    - `bounds`: an upper bound on what this is at the best gain and without rounding, in
-      each of the units that were asked for.
+    - `error`: the left side, evaluated at a rounded gain.
+    - `relative`: its norm over the sum of the norms of the terms.
+    - `bounds`: upper bounds on the exact relative residual, at the exact gain and
+      without rounding, in each of the requested units.
     - `closed_loop`: `A - B K`, or `E^-1 (A - B K)`.
     - `terms`: the sum of the norms of the terms, in each of these units.
     """
 
-    error: Float[Array, "n n"]
-    relative: Float[Array, ""]
+    error: Square
+    relative: Scalar
     bounds: Float[Array, " units"]
-    closed_loop: Float[Array, "n n"]
+    closed_loop: Square
     terms: Float[Array, " units"]
-
-
-def no_residual(X: Float[Array, "n n"], units: int) -> Residual:
-    """A residual of nothing, of the shapes of that at `X`."""
-    matrix, number, vector = (jnp.zeros(s, X.dtype) for s in (X.shape, (), units))
-    return Residual(matrix, number, vector, matrix, vector)
 
 
 def riccati_residual(
     discrete: bool,
     data: RiccatiData,
-    X: Float[Array, "n n"],
-    accurately: Bool[Array, ""] | bool,
+    X: Square,
+    accurately: BoolScalar | bool,
     *others: Float[Array, " n"],
-    players: int = 0,
+    maximisers: int = 0,
 ) -> Residual:
-    r"""What is left of the Riccati equation at `X`.
+    r"""The residual of the Riccati equation at `X`.
 
-    The left side is stationary in the gain, so that one in working precision will do.
+    The left side is stationary in the gain, so that one in working precision is enough.
     With `N = -K`, `L = A + B N` and `T = S' + R N` it is
 
     `L'XE + E'XL + Q + S N + N'T - G'W^-1 G`, `W = R`, `G = B'XE + T`, or
     `L'XL - E'XE + Q + S N + N'T - G'W^-1 G`, `W = R + B'XB`, `G = B'XL + T`,
 
     in continuous and in discrete time. G is rounding alone, and the last term its
-    square. The rounding of each product is bounded by that of the absolute values of
-    its factors. Where that is too wide they are evaluated `accurately`.
+    square. The rounding of each product is bounded by the product of the absolute
+    values of its factors. Where this bound is too wide they are evaluated `accurately`.
 
-    The last `players` controls are a second player's, whose terms count apart. In other
-    units of the states the equation is this one, with rows and columns times those of
-    `others`.
+    The last `maximisers` controls are those of a maximising player, whose terms are
+    counted separately. `others` are other units of the states, in which rows and
+    columns of the equation are multiplied by these.
     """
     A, B, Q, _, _, E = data
     (n, m), dtype = B.shape, A.dtype
     moved, cross, weight = stationary(discrete, data, X)
     weighted = X if E is None else E.T @ X
+    # One factorisation for the gain and for the inverse, whose absolute value bounds
+    # the last term: G is small, so that its own rounding matters little.
     solved = solve(weight, jnp.concatenate([cross.T, jnp.eye(m, dtype=dtype)], axis=1))
     K, inverse = solved[:, :n], jnp.abs(solved[:, n:])
-    first = m - players
+    # The terms of the equation, for their norms. A game's two quadratic terms have
+    # opposite signs: their sum would hide how large they are.
+    first = m - maximisers
     moved = moved @ A
     if discrete and E is not None:
         weighted = weighted @ E
     terms = [moved, weighted if discrete else moved, Q, cross[:, :first] @ K[:first]]
-    if players:
+    if maximisers:
         terms.append(cross[:, first:] @ K[first:])
 
     working, left = _evaluated(discrete, *data, X, K)
     closed_loop = working[1] if E is None else solve(E, working[1])
     needed = jnp.asarray(accurately)
     if accurately is not False:
-
-        def more_accurate(carry):
-            _, working, left = carry
-            left = _sharper(discrete, *data, X, working, left)
-            return jnp.zeros_like(needed), jax.tree.map(jnp.zeros_like, working), left
-
-        # A loop of one round is not run for a batch in which no member needs it. What
-        # it works on is carried and changes: else compilers move work ahead of it.
-        start = needed, working, left
-        *_, left = lax.while_loop(lambda carry: carry[0], more_accurate, start)
+        sharper = lambda left, *working: _sharper(discrete, *data, X, working, left)
+        left = if_needed(needed, sharper, left, working)
     error, lost, gap, gap_lost = left
     gap = jnp.abs(gap) + gap_lost
+    # |G'W^-1 G| <= |G|' |W^-1| |G| entry by entry; 2 covers the rounding of W^-1.
     bound = jnp.abs(error) + lost + 2 * gap.T @ (inverse @ gap)
 
     both, terms = jnp.stack([error, bound]), jnp.stack(terms)
@@ -111,8 +113,25 @@ def riccati_residual(
     return Residual(error, relative, bounds, closed_loop, sizes)
 
 
+def if_needed(needed: BoolScalar, function: Callable, value: Any, operands: tuple):
+    """`function(value, *operands)` where it is needed, else `value`.
+
+    By a loop of at most one round, which is not run for a batch in which no member
+    needs it; `lax.cond` would compute both branches. The operands are carried and
+    changed, or compilers would hoist the work out of the loop.
+    """
+
+    def once(carry):
+        _, operands, value = carry
+        nothing = jax.tree.map(jnp.zeros_like, operands)
+        return jnp.zeros_like(needed), nothing, function(value, *operands)
+
+    start = needed, operands, value
+    return lax.while_loop(lambda carry: carry[0], once, start)[2]
+
+
 def stationary(
-    discrete: bool, data: RiccatiData, X: Float[Array, "n n"]
+    discrete: bool, data: RiccatiData, X: Square
 ) -> tuple[Array, Array, Array]:
     """`E'X`, `E'XB + S` and `R`, or `A'X`, `A'XB + S` and `R + B'XB` in discrete time:
     of the last two follows the best gain."""
@@ -125,7 +144,7 @@ def stationary(
 
 
 class _Left(NamedTuple):
-    """The left side and G, and by how much rounding may have changed each entry."""
+    """The left side and G, with bounds on the rounding error of each entry."""
 
     error: Array
     lost: Array
@@ -134,32 +153,36 @@ class _Left(NamedTuple):
 
 
 def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
-    """N, L, T, Y = XL (XE in continuous time) and Z = XE, and what is left."""
+    """N, L, T, Y = XL (XE in continuous time), Z = XE, and the residual."""
     n, m = B.shape
+    # Higham's model: fl(a op b) = (a op b) (1 + d) with |d| <= unit, and a product of k
+    # terms is off by k units of the product of absolute values. `lost_M` is that bound
+    # for M, `from_L` is what an error of L does to XL.
     unit = jnp.finfo(A.dtype).eps / 2
     size_B, size_S, size_X, size_N = (jnp.abs(M) for M in (B, S, X, K))
+    # From here on the rounded gain -N is taken for exact: any gain gives a valid bound.
     N = -K
-    BN, units_BN = in_parts(B, N)
+    BN, units_BN = product_in_parts(B, N)
     L, T = A + BN, S.T + R @ N
     lost_L = (units_BN + 1) * unit * (jnp.abs(A) + size_B @ size_N)
     lost_T = (m + 1) * unit * (size_S.T + jnp.abs(R) @ size_N)
     most_L, size_T = jnp.abs(L) + lost_L, jnp.abs(T)
     Z, lost_Z = X, jnp.zeros_like(X)
     if E is not None:
-        Z, units = in_parts(X, E)
+        Z, units = product_in_parts(X, E)
         lost_Z = units * unit * (size_X @ jnp.abs(E))
     if discrete:
-        Y, units = in_parts(X, L)
+        Y, units = product_in_parts(X, L)
         lost_Y, from_L = units * unit * (size_X @ most_L), size_X @ lost_L
         subtracted = Z if E is None else E.T @ Z
     else:
         Y, lost_Y, from_L = Z, lost_Z, jnp.zeros_like(X)
         subtracted = jnp.zeros_like(X)
     size_Y = jnp.abs(Y)
-    square, units = in_parts(L.T, Y)
+    square, units = product_in_parts(L.T, Y)
     SN, NT = S @ N, N.T @ T
     lost = most_L.T @ (units * unit * size_Y + lost_Y)
-    # What is wrong with L is in both factors where the second is XL.
+    # In discrete time an error of L is in both factors, as the second one is XL.
     both = lost_L.T @ (size_Y + from_L / 2)
     if discrete:
         lost += _twice(both)
@@ -168,6 +191,7 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
     else:
         square, lost = _twice(square), _twice(lost + both)
     lost += m * unit * (size_S @ size_N) + size_N.T @ (m * unit * size_T + lost_T)
+    # Four additions, each of a sum no larger than that of the sizes, and a margin.
     lost += 5 * unit * sum(jnp.abs(M) for M in (square, subtracted, Q, SN, NT))
     gap_lost = size_B.T @ ((n + 2) * unit * size_Y + lost_Y + from_L)
     gap_lost += lost_T + 2 * unit * size_T
@@ -176,10 +200,10 @@ def _evaluated(discrete, A, B, Q, R, S, E, X, K) -> tuple[tuple, _Left]:
 
 
 def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
-    """What is left in more digits, and entry by entry the sharper bound.
+    """The residual in more digits, and entry by entry the sharper bound.
 
-    The rests are what rounding left out of L, T, Y and Z. They are summed with the rest
-    of the equation, each as often as it is there.
+    The rests are the rounding errors of L, T, Y and Z. They enter the sum once for each
+    place at which their matrix stands in the equation.
     """
     N, L, T, Y, Z = working
     n, m = B.shape
@@ -195,7 +219,8 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
     else:
         terms, added = [(L, Z), (Z, L), (S.T, N), (N, T)], [Q]
         of_X = [] if E is None else [(E, Z, 2 * L)]
-    # Pairs of what is left out and a bound on what this leaves out again.
+    # Pairs of a rest and the bound on its error. With S and R stacked under A and B one
+    # product gives the rests of both L and T.
     pair = product(stacked([B, R]), N, stacked([A, S.T]), -stacked([L, T]))
     rests = list(zip(*(jnp.split(M, [n]) for M in pair), strict=True))
     if of_X:
@@ -210,7 +235,7 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
     error, lost = product(left.T, right, *added)
     error += factor @ rest
     lost += jnp.abs(factor) @ (rest_lost + (4 * n + 2 * m + 8) * eps * sizes)
-    # What is wrong with L, times what is wrong with the factor beside it.
+    # The second-order terms: an error of L times an error of the factor beside it.
     most_L, most_T, around = most[:n], most[n : n + m], (n + 4) * eps * jnp.abs(Y)
     if of_X:
         most_Y = most[n + m : 2 * n + m]
@@ -222,6 +247,7 @@ def _sharper(discrete, A, B, Q, R, S, E, X, working, wide: _Left) -> _Left:
         lost += most_L.T @ from_L
     gap_lost = jnp.abs(B.T) @ around + most_T + (n + 4) * eps * jnp.abs(T)
     lost = symmetric(lost)
+    # Where nothing cancels the first bound may be the sharper one.
     sharper = lost < wide.lost
     return _Left(
         jnp.where(sharper, symmetric(error), wide.error),
@@ -237,10 +263,11 @@ def _twice(M):
 
 
 def linear_residual(discrete, A, B, C, X) -> Array:
-    """What is left of `A X + X B = C`, or of `X - A X B = C`, at `X`, over
+    """The residual of `A X + X B = C`, or of `X - A X B = C`, over
     `(|A| + |B|) |X| + |C|`, or over `(|A| |B| + 1) |X| + |C|`.
 
-    Relative to these norms, rounding counts for little, and its bound is added.
+    It is the backward error: the relative change of the data that makes `X` exact.
+    Relative to these norms rounding is small, and its bound is added.
     """
     eps = jnp.finfo(X.dtype).eps
     size_A, size_B = jnp.linalg.norm(A), jnp.linalg.norm(B)
@@ -254,3 +281,58 @@ def linear_residual(discrete, A, B, C, X) -> Array:
     relative = jnp.linalg.norm(error) / jnp.where(terms == 0, 1, terms)
     relative = _MARGIN * (relative + rounding)
     return jnp.where(jnp.isfinite(relative), relative, jnp.inf)
+
+
+def newton_refine(
+    residual: Callable[[Array, Array], Residual],
+    correction: Callable[[Array, Array, Array], Array],
+    X: Square,
+    *,
+    units: int,
+    to_working_precision: bool = False,
+) -> tuple[Array, Residual]:
+    """Newton refinement while the residual decreases.
+
+    `residual(X, accurately)` evaluates the residual, in so many `units`, and
+    `correction(X, closed_loop, error)` is the Newton step. Where its bound is too wide
+    for a certificate the steps go on with accurate residuals, unless they are to end in
+    working precision. Returns the best `X`, and its residual.
+
+    Source: Kleinman, 1968; each step solves the Lyapunov equation of the last loop.
+    """
+    fine, wide = _FINE * float(jnp.finfo(X.dtype).eps), tolerance(X.dtype)
+
+    def body(carry):
+        X, last, best, accurately, going, patient, k = carry
+        # The first round measures, those after it step: so there is one residual in
+        # the compiled program, which is most of its size.
+        first = k == 0
+        step = if_needed(
+            going & ~first,
+            lambda _, *at: correction(*at),
+            jnp.zeros_like(X),
+            (X, *last),
+        )
+        X = symmetric(X + step)
+        new = residual(X, going & accurately)
+        better = first | (new.relative < best[1].relative)
+        # Steps that gain little are at the level of rounding. But far from the solution
+        # the residual may rise in the first one.
+        helped = first | (new.relative < best[1].relative / 4)
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), (X, new), best)
+        rest = best[1].relative
+        again = helped | patient & (rest > wide)
+        again &= (rest > fine) & (k < _NEWTON_STEPS)
+        # The bound is too wide for a certificate: once more, accurately, from the best.
+        hidden = ~again & ~accurately & (jnp.max(best[1].bounds) > wide)
+        X = jnp.where(hidden, best[0], X)
+        k = jnp.where(hidden, 0, k + 1)
+        last = new.closed_loop, new.error
+        return X, last, best, accurately | hidden, again | hidden, helped, k
+
+    yes = jnp.asarray(True)
+    matrix, number, vector = (jnp.zeros(s, X.dtype) for s in (X.shape, (), units))
+    unknown = Residual(matrix, number, vector, matrix, vector)
+    accurately = jnp.asarray(to_working_precision)
+    start = X, (matrix, matrix), (X, unknown), accurately, yes, yes, jnp.asarray(0)
+    return lax.while_loop(lambda carry: carry[4], body, start)[2]

@@ -1,211 +1,291 @@
-"""The attempts that a Riccati solver makes until it has a certified solution or knows
-why there is none."""
+"""The retry strategy of the algebraic Riccati solver: balancing, restarts, and
+perturbed problems that tell why there is no solution."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from .._results import choose, Result, RESULTS
-from ..math._size import one_if_zero, size
+from .._typing import BoolScalar, Scalar, Square
+from ..math._linear_solve import solve
+from ..math._norms import one_if_zero, power_of_two, size
 from ._arguments import RiccatiData
+from ._residual import tolerance
 
 
 FIRST, BALANCED, SECOND, PERTURBED, UNIT, REGULARISED, DONE = range(7)
 """The kinds of attempt.
 
-- `FIRST`: at the problem.
-- `BALANCED`: in units of the states that balance it, which those after it keep.
-- `SECOND`: from another start.
-- `PERTURBED`: with a state weight less by rounding, of which a solution on the boundary
-    makes another or none.
-- `UNIT`: with unit weights, which has a solution if and only if the pair is
-    stabilisable.
-- `REGULARISED`: with a state weight more by the root of rounding, whose loop tells by
-    being close to the boundary that the problem's is on it.
+- `FIRST`: the problem as given.
+- `BALANCED`: after diagonal balancing of the states, which later attempts keep.
+- `SECOND`: from another starting point.
+- `PERTURBED`: with `Q` less by rounding. If the closed loop is stable by rounding
+    alone, the solution of this problem differs much, or there is none.
+- `UNIT`: with `Q` and `R` multiples of the identity. This problem has a stabilising
+    solution if and only if the pair is stabilisable.
+- `REGULARISED`: with `Q` more by the root of rounding. If its closed loop is near the
+    boundary of stability, that of the problem is on it.
 """
 _NEXT = (
-    # after success, failure in units that do not fit, and other failure of
-    (PERTURBED, BALANCED, SECOND),  # FIRST
-    (PERTURBED, SECOND, SECOND),  # BALANCED
-    (PERTURBED, UNIT, UNIT),  # SECOND
-    (DONE, BALANCED, UNIT),  # PERTURBED
-    (REGULARISED, DONE, DONE),  # UNIT
-    (DONE, DONE, DONE),  # REGULARISED
+    # Following a success, a failure in badly scaled units, and any other failure.
+    #
+    # FIRST: a success near the boundary is to be confirmed. A failure may be due to the
+    # scaling, if that is bad, and otherwise to the starting point.
+    (PERTURBED, BALANCED, SECOND),
+    # BALANCED: likewise, and the scaling is ruled out.
+    (PERTURBED, SECOND, SECOND),
+    # SECOND: the last attempt at a solution. The others find out why there is none.
+    (PERTURBED, UNIT, UNIT),
+    # PERTURBED: the solution is confirmed, or marginal. That may be due to bad scaling;
+    # if not, the question is whether the pair is stabilisable.
+    (DONE, BALANCED, UNIT),
+    # UNIT: of a stabilisable pair the closed loop may be on the boundary. If that is
+    # known already, or the pair is not stabilisable, there is nothing more to find out.
+    (REGULARISED, DONE, DONE),
+    # REGULARISED: the last question.
+    (DONE, DONE, DONE),
 )
-"""What is attempted next. A loop far from the boundary needs no `PERTURBED`."""
+"""The next attempt. Far from the boundary a solution needs no `PERTURBED`."""
 _ALIKE = 0.3
-"""How much of its distance from the boundary a loop may owe to rounding."""
+"""The largest relative change of the gap under `PERTURBED` of a robust solution."""
+_SWEEPS = 100
+_APART = 4
+"""Units within this many powers of two of each other are left as they are."""
 
 
 class Candidate(NamedTuple):
-    """What may be the stabilising solution."""
+    """A candidate for the stabilising solution."""
 
-    X: Float[Array, "n n"]
-    residual: Float[Array, ""]  # in units that balance the problem
-    given: Float[Array, ""]  # the residual in the units that the problem was given in
-    bound: Float[Array, ""]  # spectral radius or abscissa of the closed loop
-    gap: Float[Array, ""]  # the distance from the boundary, positive if it is stable
+    X: Square
+    residual: Scalar  # after balancing
+    unscaled: Scalar  # the residual in the user's units
+    bound: Scalar  # spectral radius or abscissa of the closed loop
+    gap: Scalar  # its distance from the boundary of stability, positive if stable
 
 
 class Attempt(NamedTuple):
-    """A candidate, and what it takes to judge it."""
+    """A candidate, and the quantities that decide on it."""
 
     candidate: Candidate
-    rounding: Float[Array, ""]  # of the gap
-    near: Bool[Array, ""]  # whether the gap is so small that it has to be looked at
-    around: Bool[Array, ""]  # whether it is small
-    least: Float[Array, ""]  # the residual that rounding of X may leave, if balanced
-    modest: Bool[Array, ""]  # whether X is far from what rounding makes of infinity
+    rounding: Scalar  # of the gap
+    near: BoolScalar  # whether the gap is within reach of rounding of the data
+    around: BoolScalar  # the same for the wider margin of `REGULARISED`
+    attainable: Scalar  # the balanced residual that rounding of X alone may cause
+    bounded: BoolScalar  # whether |X| is well below |Q| / sqrt(eps)
     iterations: Int[Array, ""]
 
 
 class SearchResult(NamedTuple):
-    """The best candidate, and what the other attempts told."""
+    """The best candidate, and the diagnosis of the other attempts."""
 
     best: Candidate
-    solved: Bool[Array, ""]
-    stable: Bool[Array, ""]
-    fragile: Bool[Array, ""]  # whether data changed by rounding have no such solution
-    stabilisable: Bool[Array, ""]
-    on_edge: Bool[Array, ""]
-    balanced: Bool[Array, ""]
-    posed: Bool[Array, ""]
+    solved: BoolScalar
+    stable: BoolScalar
+    marginal: BoolScalar  # whether rounding of the data changes or removes the solution
+    stabilisable: BoolScalar
+    on_boundary: BoolScalar
+    balanced: BoolScalar
+    well_posed: BoolScalar
     iterations: Int[Array, ""]
 
     @property
-    def X(self) -> Float[Array, "n n"]:
+    def X(self) -> Square:
         return self.best.X
 
     @property
-    def differentiable(self) -> Bool[Array, ""]:
-        return self.stable & jnp.all(jnp.isfinite(self.X)) & self.posed
+    def differentiable(self) -> BoolScalar:
+        return self.stable & jnp.all(jnp.isfinite(self.X)) & self.well_posed
 
     @property
     def result(self) -> Result:
         """The status."""
-        good = self.solved & ~self.fragile
+        good = self.solved & ~self.marginal
         close = self.stable & (self.best.residual <= tolerance(self.X.dtype) ** 0.5)
         result = choose(close, RESULTS.not_converged, RESULTS.not_stabilising)
-        result = choose(self.fragile | self.on_edge, RESULTS.on_boundary, result)
+        result = choose(self.marginal | self.on_boundary, RESULTS.on_boundary, result)
         result = choose(self.stabilisable, result, RESULTS.not_stabilisable)
         result = choose(good, RESULTS.successful, result)
-        return choose(self.posed, result, RESULTS.ill_posed)
-
-
-def tolerance(dtype: Any) -> float:
-    """The relative residual up to which an equation counts as solved."""
-    return 1e-12 if jnp.finfo(dtype).bits == 64 else 1e-5
+        return choose(self.well_posed, result, RESULTS.ill_posed)
 
 
 def search(
-    attempt: Callable[[Int[Array, ""], Bool[Array, ""]], Attempt],
-    X: Float[Array, "n n"],
-    posed: Bool[Array, ""],
-    apart: Bool[Array, ""],
+    attempt: Callable[[Int[Array, ""], BoolScalar], Attempt],
+    X: Square,
+    well_posed: BoolScalar,
+    badly_scaled: BoolScalar,
 ) -> SearchResult:
     """Make attempts of the kinds above, as few as are needed.
 
-    An attempt is of a kind, in balanced units or in those given, which may be `apart`.
-
-    Most problems are solved by the first. In a batch, the others are made if any member
-    has need of them.
+    `attempt(kind, balanced)` is in balanced or in the user's units, which may be
+    `badly_scaled`. Most problems are solved by the first attempt. In a batch, the
+    others are made if any member needs them.
     """
     dtype = X.dtype
     close = tolerance(dtype)
 
-    def more(carry):
-        return carry[0] != DONE
-
     def body(carry):
         kind, before = carry
+        # One attempt, whose kind is data: a branch for each would be compiled for each,
+        # and under vmap all of them run.
         best = before.best
         balanced = before.balanced | (kind == BALANCED)
         new = attempt(kind, balanced)
         at = new.candidate
         stable = at.gap > new.rounding
-        # No X of this precision may come closer; a hundred times is looked past.
-        enough = jnp.clip(new.least, close, 100 * close)
-        # In units that do not fit, a wrong X may leave little.
-        unfit = apart & ~balanced
-        solved = stable & (at.residual <= enough) & (~unfit | (at.given <= close))
-        given = kind <= SECOND
-        # Of two that are solved the one with the smaller residual is kept, and of two
-        # that are not the first, unless the second alone is stable.
-        take = solved & (~before.solved | (at.given < best.given))
-        take = given & (take | (kind == FIRST) | stable & ~before.stable)
+        # Rounding of X may not allow a smaller residual: up to a hundred times the
+        # tolerance is accepted then.
+        enough = jnp.clip(new.attainable, close, 100 * close)
+        # With bad scaling a wrong X can have a small balanced residual.
+        unfit = badly_scaled & ~balanced
+        solved = stable & (at.residual <= enough) & (~unfit | (at.unscaled <= close))
+        unchanged = kind <= SECOND  # the user's problem, not a perturbed one
+        # Between two solutions the smaller residual decides. Between two failures the
+        # first is kept, unless only the second is stable.
+        take = solved & (~before.solved | (at.unscaled < best.unscaled))
+        take = unchanged & (take | (kind == FIRST) | stable & ~before.stable)
 
+        # For a perturbed problem a rough solution is enough.
         survives = stable & (at.residual <= close**0.5)
-        # Rounding hides on which side of the boundary the loop is.
+        # Stable or not: the gap is smaller than its rounding.
         undecided = ~stable & (at.gap >= -new.rounding)
-        undecided &= (at.residual <= close) & new.modest
+        undecided &= (at.residual <= close) & new.bounded
+        # The gap of a robust solution hardly changes with Q; that of a marginal one
+        # changes by as much as itself.
         same = jnp.abs(at.gap - best.gap) <= _ALIKE * best.gap
-        fragile = jnp.where(
-            kind == PERTURBED, ~(survives & same), before.fragile & ~(given & solved)
-        )
+        marginal = before.marginal & ~(unchanged & solved)
+        marginal = jnp.where(kind == PERTURBED, ~(survives & same), marginal)
         unit = kind == UNIT
-        judged, kept = (
-            jax.tree.map(lambda now, then: jnp.where(take, now, then), *pair)
-            for pair in (((solved, stable), (before.solved, before.stable)), (at, best))
+        solved_now, stable_now, kept = jax.tree.map(
+            lambda now, then: jnp.where(take, now, then),
+            (solved, stable, at),
+            (before.solved, before.stable, best),
         )
-        after = SearchResult(
-            kept,
-            *judged,
-            fragile=fragile,
-            stabilisable=jnp.where(
-                unit, survives | undecided | judged[1], before.stabilisable
-            ),
-            on_edge=jnp.where(
-                unit,
-                undecided,
-                jnp.where(kind == REGULARISED, survives & new.around, before.on_edge),
-            ),
+        stabilisable = survives | undecided | stable_now
+        near_it = survives & new.around
+        on_boundary = jnp.where(kind == REGULARISED, near_it, before.on_boundary)
+        after = before._replace(
+            best=kept,
+            solved=solved_now,
+            stable=stable_now,
+            marginal=marginal,
+            stabilisable=jnp.where(unit, stabilisable, before.stabilisable),
+            on_boundary=jnp.where(unit, undecided, on_boundary),
             balanced=balanced,
-            posed=posed,
-            iterations=before.iterations + jnp.where(given, new.iterations, 0),
+            iterations=before.iterations + jnp.where(unchanged, new.iterations, 0),
         )
-        success = jnp.where(given, solved, ~fragile & (~unit | survives))
+        # The column of the table.
+        success = jnp.where(unchanged, solved, ~marginal & (~unit | survives))
         outcome = jnp.where(success, 0, jnp.where(unfit, 1, 2))
         # No index from outside: nothing is clipped, which compiles sooner.
         following = jnp.asarray(_NEXT).at[kind, outcome].get(mode="promise_in_bounds")
-        over = given & solved & ~new.near
+        over = unchanged & solved & ~new.near
         return jnp.where(over, DONE, following), after
 
-    number = jnp.asarray(jnp.inf, dtype)
-    no, yes = jnp.asarray(False), jnp.asarray(True)
+    most, no = jnp.asarray(jnp.inf, dtype), jnp.asarray(False)
+    flags = "solved", "stable", "marginal", "on_boundary", "balanced"
     nothing = SearchResult(
-        Candidate(X, residual=number, given=number, bound=number, gap=-number),
-        solved=no,
-        stable=no,
-        fragile=no,
-        stabilisable=yes,
-        on_edge=no,
-        balanced=no,
-        posed=posed,
+        Candidate(X, residual=most, unscaled=most, bound=most, gap=-most),
+        **dict.fromkeys(flags, no),
+        stabilisable=jnp.asarray(True),
+        well_posed=well_posed,
         iterations=jnp.asarray(0),
     )
-    start = jnp.where(posed, FIRST, DONE)
-    return lax.while_loop(more, body, (start, nothing))[1]
+    start = jnp.where(well_posed, FIRST, DONE)
+    return lax.while_loop(lambda carry: carry[0] != DONE, body, (start, nothing))[1]
 
 
-def weights(
-    kind: Int[Array, ""], data: RiccatiData
-) -> tuple[RiccatiData, Float[Array, ""]]:
-    """The problem with the weights of an attempt of this kind, and the size of the
-    state weight."""
+def weights(kind: Int[Array, ""], data: RiccatiData) -> tuple[RiccatiData, Scalar]:
+    """The data of an attempt of this kind, and the size of the state weight."""
     Q, R, S = data.Q, data.R, data.S
     n, m, dtype = Q.shape[0], R.shape[0], Q.dtype
     eps = jnp.finfo(dtype).eps
+    # Where `Q` is zero `R` sets the scale.
     eye_Q, eye_R = jnp.eye(n, dtype=dtype), jnp.eye(m, dtype=dtype)
     size_Q, size_R = size(Q), size(R)
     scale_R = one_if_zero(size_R)
     scale_Q = jnp.where(size_Q > 0, size_Q, scale_R)
+    # A change of Q by eps is within the rounding of the data. One by the root of eps
+    # moves eigenvalues off the boundary by about eps^(1/4).
     change = jnp.where(kind == PERTURBED, -10 * n * eps * size_Q, 0)
     change = jnp.where(kind == REGULARISED, eps**0.5 * scale_Q, change)
     unit = kind == UNIT
     Q = jnp.where(unit, scale_Q * eye_Q, Q + change * eye_Q)
     R = jnp.where(unit, scale_R * eye_R, R)
     return data._replace(Q=Q, R=R, S=jnp.where(unit, 0, S)), scale_Q
+
+
+def units(data: RiccatiData) -> Float[Array, "2 n"]:
+    """Diagonal balancing: powers of two that scale states and the rows of A, B and E.
+
+    They make the row and the column norms of the Hamiltonian matrix equal, state by
+    state: a badly scaled state is lost in the rounding of the others. A state with a
+    zero row or column keeps its scale. The rows of a given E then have equal norms.
+
+    Source: Parlett and Reinsch, 1969 (balancing); Benner, 2001 (of a Hamiltonian).
+    """
+    A, B, Q, R, _, E = lax.stop_gradient(data)
+    n, dtype = A.shape[0], A.dtype
+    lowest = jnp.finfo(dtype).minexp
+    plain_A, plain_B = (A, B) if E is None else (solve(E, A), solve(E, B))
+
+    def logarithm(M):
+        exponent = jnp.log2(M)
+        return jnp.where(jnp.isfinite(exponent), exponent, lowest)
+
+    # The quadratic blocks are products: B R^-1/2 and Q^1/2 have the scale of one state
+    # each. All in base-2 logarithms.
+    effort = jnp.sqrt(_diagonal_sizes(R))
+    force = jnp.max(jnp.abs(plain_B) / one_if_zero(effort), axis=1)
+    weight = logarithm(jnp.sqrt(_diagonal_sizes(Q)))
+    other = ~jnp.eye(n, dtype=bool)
+    inside, force = logarithm(jnp.abs(plain_A) * other), logarithm(force)
+
+    def more(carry):
+        k, change, _ = carry
+        return (k < _SWEEPS) & (jnp.max(jnp.abs(change)) > 1 / 4)
+
+    def sweep(carry):
+        k, _, d = carry
+        moved = inside + d[:, None] - d
+        forced, weighed = force + d, weight - d
+        # The scale of the cost is free: it is chosen to make both blocks alike.
+        rows = jnp.maximum(jnp.max(moved, axis=1), forced + jnp.max(weighed))
+        columns = jnp.maximum(jnp.max(moved, axis=0), weighed + jnp.max(forced))
+        # Half of the step that each state would take alone, as all move at once.
+        change = (columns - rows) / 4
+        # A zero row or column, with the logarithm `lowest`, asks for a huge step.
+        change = jnp.where(jnp.abs(change) < -lowest / 8, change, 0)
+        return k + 1, change, d + change
+
+    start = jnp.zeros(n, dtype)
+    *_, d = lax.while_loop(more, sweep, (0, start + 1, start))
+    # A factor common to all states has no effect: it is removed to avoid overflow.
+    d -= jnp.mean(d)
+    f = d
+    if E is not None:
+        f = -jnp.max(logarithm(jnp.abs(E)) - d, axis=1)
+    both = jnp.stack([d, f])
+    badly_scaled = jnp.any(jnp.max(both, axis=1) - jnp.min(both, axis=1) > _APART)
+    both = jnp.where(badly_scaled, both, 0)
+    return power_of_two(jnp.exp2(both))
+
+
+def _diagonal_sizes(M):
+    # `jnp.diagonal` gathers, which is slower to compile.
+    return jnp.max(jnp.where(jnp.eye(len(M), dtype=bool), jnp.abs(M), 0), axis=1)
+
+
+def in_units(by: Float[Array, "2 n"], data: RiccatiData) -> RiccatiData:
+    """The data with states and rows scaled `by` these factors."""
+    # With the new state z = state x, the cost x'Qx is z'Qz / state^2. The rows of A, B
+    # and E have a scale of their own, as each equation may be multiplied by a number.
+    A, B, Q, R, S, E = data
+    state, row = (unit[:, None] for unit in by)
+    across = row / by[0]
+    E = None if E is None else E * across
+    Q = Q / (state * by[0])
+    return RiccatiData(A * across, B * row, Q, R, S / state, E)

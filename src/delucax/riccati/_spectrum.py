@@ -5,9 +5,9 @@ import math
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from ..math._size import power_of_two, size
+from .._typing import Scalar, Square
+from ..math._norms import power_of_two, size
 
 
 _SQUARINGS = 60
@@ -20,13 +20,14 @@ _BLOCK = 4
 _TAYLOR_DEGREE = 12
 
 
-def spectral_radius(A: Float[Array, "n n"]) -> Float[Array, ""]:
+def spectral_radius(A: Square) -> Scalar:
     """The spectral radius, from above up to rounding: `|A^N|^(1/N)` for a large `N`.
 
     The bound holds for every N (Gelfand), and is above the radius by a relative
     `log(cond) / N`, with `cond` the condition of the eigenvectors. Of a large matrix a
     few squarings leave only few directions; the rest is done in their span.
     """
+    # In the span of the remaining directions the products are of small matrices.
     logarithm, is_narrow, span, _ = _growth(A, A.shape[0] > _LARGE)
     if A.shape[0] > _LARGE:
         within, *_ = _growth(span.T @ A @ span, False)
@@ -34,18 +35,18 @@ def spectral_radius(A: Float[Array, "n n"]) -> Float[Array, ""]:
     return jnp.exp(logarithm)
 
 
-def spectral_abscissa(A: Float[Array, "n n"]) -> Float[Array, ""]:
-    """The largest real part of an eigenvalue, up to rounding of the balanced matrix.
-
-    `h^-1 log` of the spectral radius of `exp(h A)`, with `h` small enough for a series.
-    """
+def spectral_abscissa(A: Square) -> Scalar:
+    """The largest real part of an eigenvalue, up to rounding of the balanced matrix."""
     return abscissa_and_size(A)[0]
 
 
 def abscissa_and_size(
-    A: Float[Array, "n n"],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The spectral abscissa, and the norm of the balanced matrix that it came from."""
+    A: Square,
+) -> tuple[Scalar, Scalar]:
+    """The spectral abscissa, and the norm of the balanced matrix that it came from.
+
+    `h^-1 log` of the spectral radius of `exp(h A)`, with `h` small enough for a series.
+    """
     A = balanced(A)
     value, is_narrow, span, kept = _slowest(A, A.shape[0] > _LARGE)
     if A.shape[0] > _LARGE:
@@ -59,6 +60,7 @@ def abscissa_and_size(
 
 def _slowest(A, probing):
     scale = size(A)
+    # |exp(hA)^N|^(1/N) tends to exp(h abscissa), h > 0.
     h = 0.25 / jnp.where(scale > 0, scale, 1)
     logarithm, *rest = _growth(_exponential(h * A), probing)
     return logarithm / h, *rest
@@ -66,6 +68,8 @@ def _slowest(A, probing):
 
 def _exponential(A):
     """`exp(A)` for `|A| <= 1/4`, where the series is exact to rounding."""
+    # By blocks of four terms, in Horner's way: six products for twelve terms
+    # (Paterson and Stockmeyer, 1973).
     powers = [jnp.eye(A.shape[0], dtype=A.dtype), A]
     while len(powers) < _BLOCK:
         powers.append(powers[-1] @ A)
@@ -82,23 +86,33 @@ def _growth(A, probing):
     few directions left, a basis of them, and which of its columns are used."""
     n, dtype = A.shape[0], A.dtype
     eps = float(jnp.finfo(dtype).eps)
+    # Probes with a fixed seed: equal problems have equal results.
     count = max(n // 4 if n <= 64 else n // 16, min(n, _LARGE))
     probes = np.random.default_rng(0).normal(size=(n, count)) if probing else 0.0
     probes = jnp.asarray(probes, dtype)
 
     def more(carry):
         *_, logarithm, weight, finished = carry
+        # N = 1 / weight: for a log cond of up to 64 the bound is this close.
         rough = 64 * weight > _DIGITS * jnp.maximum(jnp.abs(logarithm), eps)
         return ~finished & rough & (weight > 0.5**_SQUARINGS)
 
     def body(carry):
         power, span, kept, logarithm, weight, _ = carry
         grown = size(power)
+        # A nilpotent matrix, whose radius is zero: no power of it is scaled any more.
         finished = ~(grown > 0)
         scaled = power / jnp.where(finished, 1, grown)
+        # log |A^2N| / 2N is this sum, as each square is of a matrix of norm one.
         logarithm = logarithm + weight * jnp.log(grown)
         if probing:
-            span, kept, left = _range(scaled, probes)
+            # A basis of the range of the power, as the probes see it. What is as small
+            # as the rounding of the rest is no direction of it.
+            basis, triangle = jnp.linalg.qr(scaled @ probes)
+            pivots = jnp.abs(jnp.diagonal(triangle))
+            kept = pivots > math.sqrt(eps) * jnp.max(pivots)
+            span = jnp.where(kept, basis, 0)
+            left = size(scaled - span @ (span.T @ scaled))
             finished = finished | (left < 4 * math.sqrt(n) * eps)
         return scaled @ scaled, span, kept, logarithm, weight / 2, finished
 
@@ -108,18 +122,7 @@ def _growth(A, probing):
     return logarithm, finished & jnp.isfinite(logarithm), span, kept
 
 
-def _range(power, probes):
-    """A basis of the range of `power`, as the probes see it, which of its columns are
-    used, and how much it misses."""
-    basis, triangle = jnp.linalg.qr(power @ probes)
-    weight = jnp.abs(jnp.diagonal(triangle))
-    # What is as small as the rounding of the rest is no direction of the range.
-    kept = weight > math.sqrt(jnp.finfo(power.dtype).eps) * jnp.max(weight)
-    basis = jnp.where(kept, basis, 0)
-    return basis, kept, size(power - basis @ (basis.T @ power))
-
-
-def balanced(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def balanced(A: Square) -> Square:
     """`D^-1 A D` with `D` diagonal, its rows and columns of like size.
 
     Powers of two, so that no digit is lost. Source: Osborne, 1960.
@@ -130,11 +133,13 @@ def balanced(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
         off = scaled - jnp.diag(jnp.diagonal(scaled))
         rows, columns = jnp.sum(off, axis=1), jnp.sum(off, axis=0)
         usable = (rows > 0) & (columns > 0)
+        # The square root of this ratio makes a row as large as its column.
         ratio = jnp.where(usable, rows, 1) / jnp.where(usable, columns, 1)
         # All at once: half of the step that each would take alone.
         scale = scale * ratio**0.25
         return scale / jnp.exp2(jnp.round(jnp.mean(jnp.log2(scale))))
 
+    # A fixed number of sweeps: balancing need not be exact.
     scale = lax.fori_loop(0, 24, sweep, jnp.ones(A.shape[0], A.dtype))
     usable = jnp.isfinite(scale) & (scale > 0)
     scale = power_of_two(jnp.where(usable, scale, 1))

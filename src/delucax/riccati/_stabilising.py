@@ -6,9 +6,10 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from .._results import raise_on_failure, Result
+from .._typing import BoolScalar
 from ..math._linear_solve import (
     factorised,
     full_precision,
@@ -17,23 +18,37 @@ from ..math._linear_solve import (
     solve,
     symmetric,
 )
-from ..math._size import one_if_zero, size
-from ._arguments import complex_form, is_complex, real_form, RiccatiData
-from ._lyapunov import lyapunov, stein
-from ._newton import polish
-from ._residual import riccati_residual, stationary
-from ._search import Attempt, Candidate, search, SearchResult, SECOND, weights
+from ..math._lyapunov import lyapunov
+from ..math._norms import one_if_zero, size
+from ._arguments import (
+    complex_form,
+    is_complex,
+    real_form,
+    RiccatiData,
+    where_solved,
+)
+from ._doubling import continuous_start, discrete_start
+from ._residual import newton_refine, riccati_residual, stationary
+from ._search import (
+    Attempt,
+    Candidate,
+    in_units,
+    search,
+    SearchResult,
+    SECOND,
+    units,
+    weights,
+)
 from ._spectrum import abscissa_and_size, spectral_radius
-from ._start import continuous_start, discrete_start
-from ._units import in_units, units
 
 
 _SECOND_START = 1e4
-"""How much higher the second start of doubling is than the first."""
+"""How much higher the second start of doubling is than the first: `X` may be far larger
+than `Q`, as where a control is weak."""
 
 
 class RiccatiSolution(eqx.Module):
-    """The solution of a Riccati equation, with the facts to judge it by.
+    """The solution of a Riccati equation, with diagnostics.
 
     **Attributes:**
 
@@ -54,8 +69,8 @@ class RiccatiSolution(eqx.Module):
 
     `X`, `K` and `closed_loop` are differentiable. `residual`, `spectral_radius` and
     `spectral_abscissa` are measurements and have no gradient. Where the solve failed
-    and the loop is not stable there is nothing to differentiate, and the derivatives
-    are zero, so that they do not spoil a batch.
+    and the loop is not stable the derivatives are zero, so that a failed member does
+    not affect the gradient of a batch.
 
     !!! example
 
@@ -74,13 +89,13 @@ class RiccatiSolution(eqx.Module):
     K: Array
     residual: Array
     closed_loop: Array
-    spectral_radius: Array | None
     iterations: Array
     result: Result
+    spectral_radius: Array | None = None
     spectral_abscissa: Array | None = None
 
     def _facts(self) -> str:
-        """What an error says of a failure."""
+        """The diagnostics of an error."""
         radius, abscissa = self.spectral_radius, self.spectral_abscissa
         name, bound = ("abscissa", abscissa) if radius is None else ("radius", radius)
         return (
@@ -104,8 +119,10 @@ def stabilising_solution(
 @eqx.filter_jit
 @full_precision
 def _as_complex(solution: RiccatiSolution, discrete: bool, data: RiccatiData):
-    """A solution in complex form, for which the residual is bounded once more: rounding
-    may have left an X that is no real form."""
+    """The solution in complex form, with a new residual bound: rounding may have left
+    an `X` that is not exactly a real form."""
+    # The real form solves the real equation of twice the size, whose solution has the
+    # same structure, gain and closed loop included.
     solution = eqx.tree_at(
         lambda s: (s.X, s.K, s.closed_loop), solution, replace_fn=complex_form
     )
@@ -122,55 +139,60 @@ def _solution(discrete: bool, data: RiccatiData) -> RiccatiSolution:
     by = d, f = units(data)
     data = in_units(by, data)
     solution = _certified(discrete, data, by)
+    # The gain is a formula in X and the data, whose derivatives are then its own.
     K, closed_loop = _feedback(discrete, solution.differentiable, data, solution.X)
-    residual, bound = lax.stop_gradient((solution.best.given, solution.best.bound))
+    residual, bound = lax.stop_gradient((solution.best.unscaled, solution.best.bound))
+    # Back to the user's units, by powers of two: without rounding.
     return RiccatiSolution(
         X=solution.X * (f[:, None] * f),
         K=K * d,
         residual=residual,
         closed_loop=closed_loop / (d[:, None] / d),
-        spectral_radius=bound if discrete else None,
         iterations=solution.iterations,
         result=solution.result,
-        spectral_abscissa=None if discrete else bound,
+        **{"spectral_radius" if discrete else "spectral_abscissa": bound},
     )
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
-    """The stabilising `X` in balanced units, `by` times those given, and what is known
-    about it."""
+    """The certified search for the stabilising `X`, for data in balanced units, `by`
+    times the user's."""
     A, B, Q, R, S, E = data
     n, eps = A.shape[0], float(jnp.finfo(A.dtype).eps)
-    # The starts are those of E^-1 A and E^-1 B.
+    # The starting points are computed for E^-1 A and E^-1 B.
     explicit = data
     if E is not None:
         solved = factorised(E)
         explicit = RiccatiData(solved(A), solved(B), Q, R, S, None)
-    posed = (
+    # In discrete time R + B'XB is inverted, in continuous time R alone.
+    well_posed = (
         is_semidefinite(R) if discrete else is_definite(R - shifted(eps * size(R), R))
     )
     for M in explicit[:5]:
-        posed = posed & jnp.all(jnp.isfinite(M))
+        well_posed = well_posed & jnp.all(jnp.isfinite(M))
     magnified = 1 if E is None else size(E) ** 2
 
     def attempt(kind: Array, balanced: Array) -> Attempt:
-        # From the units that balance the problem to those of the attempt.
+        # From balanced units to those of the attempt.
         back = state, row = jnp.where(balanced, 1, 1 / by)
         here, size_Q = weights(kind, in_units(back, data))
         start = here
         if E is not None:
-            # Their rows have the units of the states.
+            # Without E the rows have the units of the states.
             plain = in_units(jnp.stack([state, state]), explicit)
             start = here._replace(A=plain.A, B=plain.B)
+        # Discrete time restarts from a higher point, continuous time by doubling in
+        # place of the sign iteration.
         second = kind == SECOND
         if discrete:
             height = size_Q * jnp.where(second, _SECOND_START, 1)
             X, iterations = discrete_start(start, height)
-            size_G = jnp.zeros_like(size_Q)  # not needed
+            size_G = jnp.zeros_like(size_Q)  # needed in continuous time alone
         else:
             X, size_G, iterations = continuous_start(start, second)
-        X, left = polish(
+        # Residuals in the attempt's, the user's and the balanced units.
+        X, left = newton_refine(
             lambda *at: riccati_residual(discrete, here, *at, by[0] * state, state),
             lambda _, *at: _correction(discrete, here.E, *at),
             _outside(here.E, X),
@@ -179,11 +201,12 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
         loop = left.closed_loop
         if discrete:
             bound = spectral_radius(loop)
-            # A stable loop may belong to a stationary point of a cost without a
-            # minimum.
+            # A stable loop may belong to a saddle point of an indefinite cost.
             weight = here.R + here.B.T @ X @ here.B
             gap = jnp.where(is_semidefinite(weight), 1 - bound, -jnp.inf)
             rounding, scale = jnp.asarray(n * eps, A.dtype), 1.0
+            # Eigenvalues come in pairs z, 1/z. Where two meet on the circle, data that
+            # change by rounding move them apart by its root.
             reach = 10 * eps**0.5
         else:
             bound, scale = abscissa_and_size(loop)
@@ -192,37 +215,40 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             # root.
             reach = jnp.sqrt(10 * n * eps * size_G * size_Q) + 10 * rounding
             scale = size(loop)
-        # The rest is said in balanced units.
+        # All else is expressed in balanced units.
         balanced_X = X * (row[:, None] * row)
         size_loop = size(loop * (state / state[:, None]))
         gain = 1 + size_loop**2 if discrete else 2 * size_loop
-        # The residual that rounding of X may leave.
+        # A change dX by rounding causes a residual L'dX L - E'dX E, or E'dX L + L'dX E.
         terms = jnp.where(left.terms[2] > 0, left.terms[2], jnp.inf)
         return Attempt(
             Candidate(balanced_X, left.bounds[2], left.bounds[1], bound, gap),
             rounding=rounding,
             near=jnp.abs(gap) < reach,
             around=jnp.abs(gap) < 4 * eps**0.125 * scale,
-            least=8 * eps * size(balanced_X) * gain * magnified / terms,
-            modest=size(X) * eps**0.5 < size_Q,
+            attainable=8 * eps * size(balanced_X) * gain * magnified / terms,
+            bounded=size(X) * eps**0.5 < size_Q,
             iterations=iterations,
         )
 
-    return search(attempt, jnp.full_like(Q, jnp.nan), posed, jnp.any(by != 1))
+    return search(attempt, jnp.full_like(Q, jnp.nan), well_posed, jnp.any(by != 1))
 
 
 @_certified.defjvp
 @full_precision
 def _certified_jvp(discrete, primals, tangents):
-    """By the implicit function theorem; zero in members that are not solved."""
+    """By the implicit function theorem; zero in unsolved members."""
     data, _ = primals
     solution = _certified(discrete, *primals)
     ok = solution.differentiable
-    # Guarded at both ends: what is not finite in a failed member stays in it.
-    tangent = _where(ok, tangents[0], 0)
+    # Masked at input and output, so that a failed member's NaN does not spread.
+    tangent = jax.tree.map(lambda t: jnp.where(ok, t, 0), tangents[0])
     safe, X = _harmless(ok, data, solution.X)
+    # The derivative of the equation in X is the Lyapunov operator of the closed loop:
+    # dX solves a Lyapunov equation whose constant is the derivative in the data.
     equation = functools.partial(left_side, discrete, X)
     _, error, loop = jax.jvp(equation, (safe,), (tangent,), has_aux=True)
+    # -I/2 is stable in both times, and its Lyapunov equation converges fast.
     loop = jnp.where(ok, loop, shifted(-0.5, loop))
     change = _correction(discrete, data.E, loop, jnp.where(ok, error, 0))
     still = no_tangent(solution)
@@ -234,6 +260,7 @@ def left_side(discrete: bool, X: Array, data: RiccatiData) -> tuple[Array, Array
     """The left side of the equation at `X`, and the closed loop; for derivatives."""
     A, _, Q, *_, E = data
     moved, cross, K, closed_loop = _terms(discrete, data, X)
+    # With the gain eliminated: its derivative in X is then the Lyapunov operator.
     linear = moved @ A
     if discrete:
         linear = linear - (X if E is None else E.T @ X @ E)
@@ -251,7 +278,7 @@ def _terms(discrete, data, X):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _feedback(discrete: bool, ok: Bool[Array, ""], data: RiccatiData, X: Array):
+def _feedback(discrete: bool, ok: BoolScalar, data: RiccatiData, X: Array):
     """`K` and the closed loop, with derivatives in members that are `ok` alone."""
     *_, K, closed_loop = _terms(discrete, data, X)
     return K, closed_loop
@@ -261,32 +288,22 @@ def _feedback(discrete: bool, ok: Bool[Array, ""], data: RiccatiData, X: Array):
 @full_precision
 def _feedback_jvp(discrete, primals, tangents):
     ok, *at = primals
-    tangent = _where(ok, tangents[1:], 0)
-    _, tangent = jax.jvp(
-        lambda *at: _terms(discrete, *at)[2:], _harmless(ok, *at), tangent
-    )
-    return _feedback(discrete, *primals), _where(ok, tangent, 0)
+    if_ok = lambda tree: jax.tree.map(lambda M: jnp.where(ok, M, 0), tree)
+    terms = lambda *at: _terms(discrete, *at)[2:]
+    _, tangent = jax.jvp(terms, _harmless(ok, *at), if_ok(tangents[1:]))
+    return _feedback(discrete, *primals), if_ok(tangent)
 
 
-def _where(ok, tree, other):
-    return jax.tree.map(lambda M: jnp.where(ok, M, other), tree)
-
-
-def _harmless(ok: Bool[Array, ""], data: RiccatiData, X: Array):
-    """The data and `X`, and in members that are not `ok` others that are finite.
-
-    So that no derivative of them meets a matrix that cannot be solved with.
-    """
+def _harmless(ok: BoolScalar, data: RiccatiData, X: Array):
+    """The data and `X`, with finite placeholders in members that are not `ok`."""
     A, B, Q, R, S, E = data
-    A, B, Q, S, X = (jnp.where(ok, M, 0) for M in (A, B, Q, S, X))
-    R = jnp.where(ok, R, shifted(1, R))
-    E = None if E is None else jnp.where(ok, E, shifted(1, E))
+    (A, B, Q, S, X), (R, E) = where_solved(ok, (A, B, Q, S, X), (R, E))
     return RiccatiData(A, B, Q, R, S, E), X
 
 
 def _correction(discrete: bool, E: Array | None, loop: Array, error: Array) -> Array:
-    """The `X` that takes an error of the equation away, to first order."""
-    return _outside(E, stein(loop, error) if discrete else lyapunov(loop, error))
+    """The Newton step for an `error` of the equation, given its closed loop."""
+    return _outside(E, lyapunov(discrete, loop, error))
 
 
 def _outside(E: Array | None, Y: Array) -> Array:
@@ -294,9 +311,11 @@ def _outside(E: Array | None, Y: Array) -> Array:
     return Y if E is None else symmetric(solve(E.T, solve(E.T, Y).T))
 
 
-def is_semidefinite(weight: Array, units: int = 100) -> Bool[Array, ""]:
+def is_semidefinite(weight: Array, units: int = 100) -> BoolScalar:
     """Whether a symmetric matrix has no negative eigenvalue, up to rounding."""
     rounding = weight.shape[0] * jnp.finfo(weight.dtype).eps
+    # The shift makes a zero eigenvalue positive, as Cholesky's factorisation needs, and
+    # leaves a negative one that is more than rounding.
     slack = units * rounding * one_if_zero(size(weight))
     return is_definite(symmetric(weight) + shifted(slack, weight))
 

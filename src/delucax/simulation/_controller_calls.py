@@ -23,8 +23,8 @@ def call_controller(
         if isinstance(returned, jax.Array):
             got = f"an array of shape {returned.shape}"
         raise ValueError(
-            f"{type(controller).__name__}: must return (u, state), the state as it was "
-            f"given if there is none to keep, got {got}."
+            f"{type(controller).__name__}: must return (u, state), the state unchanged "
+            f"if the controller has none, got {got}."
         )
     u, after = returned
     return u, after
@@ -43,7 +43,7 @@ def check_control(u: Any, source: Any, size: int, taker: str) -> None:
 
 
 def controller_result(counts: dict[str, Array], before: dict[str, Array]) -> Result:
-    """What became of a controller, by its tallies before a run and after it."""
+    """The result by a controller's incident counters before a run and after it."""
     result = RESULTS.successful
     for name, kind in INCIDENTS.items():
         if name in counts:
@@ -53,18 +53,18 @@ def controller_result(counts: dict[str, Array], before: dict[str, Array]) -> Res
 
 
 def check_state(controller: AbstractController, first: PyTree, after: PyTree) -> None:
-    """Raise unless a controller's state is made as the `first` one, that of `init`.
+    """Raise unless a controller's state has the structure of the `first`, of `init`.
 
     A loop carries arrays of fixed shapes and dtypes, and nothing else.
     """
     (old, structure), (new, structure_after) = (
         jax.tree_util.tree_flatten_with_path(state) for state in (first, after)
     )
-    pairs = [((), first, after)]
+    changed = [((), first, after)]
     if structure == structure_after:
         leaves = zip(old, new, strict=True)
-        pairs = [(path, a, b) for (path, a), (_, b) in leaves if not _same_kind(a, b)]
-    for path, before, now in pairs:
+        changed = [(path, a, b) for (path, a), (_, b) in leaves if not _same_kind(a, b)]
+    for path, before, now in changed:
         raise ValueError(
             f"{type(controller).__name__}: state{jax.tree_util.keystr(path)} must keep "
             "the structure, shape and dtype that init gives it, "
@@ -78,6 +78,6 @@ def _same_kind(before: Any, now: Any) -> bool:
         return False
     if not eqx.is_array(before):
         return before is now or bool(eqx.tree_equal(before, now))
-    # The dtype of a weakly typed number follows from what it meets.
+    # The dtype of a weakly typed number follows from what it meets in the first step.
     same_dtype = before.dtype == now.dtype or before.weak_type
     return before.shape == now.shape and same_dtype

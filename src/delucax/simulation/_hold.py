@@ -1,6 +1,5 @@
 """Zero-order hold inside one solve, exact at the switch."""
 
-import operator
 from typing import Any, NamedTuple
 
 import diffrax
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._controller import AbstractController, tallies
-from .._integration import AbstractTransparentSolver, evaluate_field, Start
+from .._integration import AbstractForwardingSolver, evaluate_field, TimeOffset
 from ..systems import AbstractSystem
 from ._controller_calls import call_controller, check_control, check_state
 
@@ -23,7 +22,7 @@ class Inputs(eqx.Module):
     """
 
     system: AbstractSystem
-    start: Start  # the time at which the solve's own begins
+    start: TimeOffset  # the time at which the solve's own begins
     source: Any  # a controller, or a function of time; None for an array
     memory: Any  # the controller's first state
     controls: Array | None
@@ -55,12 +54,13 @@ class Inputs(eqx.Module):
         return evaluate_field(self.system, t, x, u, w).astype(x.dtype)
 
     def act(self, s: Array, x: Array, memory: Any) -> tuple[Array, Any]:
-        """A held controller's answer at a switch, and its state after it."""
+        """The control of a held controller at a switch, and its state after it."""
         t = self.start.t + s
         state = eqx.combine(memory, eqx.filter(self.memory, eqx.is_array, inverse=True))
         u, after = call_controller(self.source, t, self.system.observe(t, x), state)
         check_control(u, self.source, self.system.control_size, "system")
         u = u.astype(x.dtype)
+        # Without bounds the control is applied as it is, and there is no cost here.
         after = self.source.applied(u, jnp.zeros((), x.dtype), after)
         check_state(self.source, self.memory, after)
         return u, eqx.filter(after, eqx.is_array)
@@ -68,13 +68,13 @@ class Inputs(eqx.Module):
 
 def field(s, x, args):
     """The vector field at `s` after the start."""
-    return args.start.after(s, lambda t: args.field(t, x))
+    return args.start.evaluate(s, lambda t: args.field(t, x))
 
 
-_index = operator.attrgetter("index")
+_index = lambda args: args.index
 
 
-class Recorded(NamedTuple):
+class SavedState(NamedTuple):
     """A saved state with the held control of the step that it comes from, and the
     controller's tallies then."""
 
@@ -83,12 +83,14 @@ class Recorded(NamedTuple):
     counts: dict[str, Array]
 
 
-def recorded(t: Any, x: Any, args: Any) -> Recorded:
-    """What is saved of a solve with a held controller."""
+def save_fn(t: Any, x: Any, args: Any) -> SavedState:
+    """The function by which a solve with a held controller saves."""
     del t
-    if isinstance(x, Recorded):
+    # Diffrax saves the state itself at the ends of a solve, and an interpolation, which
+    # `_Ends` has completed, in between.
+    if isinstance(x, SavedState):
         return x
-    return Recorded(x, args.u, _counts(args.memory, x))
+    return SavedState(x, args.u, _counts(args.memory, x))
 
 
 def _counts(memory: Any, like: Array) -> dict[str, Array]:
@@ -108,22 +110,23 @@ class _Ends(diffrax.AbstractLocalInterpolation):
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
             return self.inside.evaluate(t0, t1, left=left)
+        # An interpolation meets the end of its step to rounding alone.
         x = jnp.where(t0 == self.t1, self.end, self.inside.evaluate(t0, left=left))
-        return x if self.held is None else Recorded(x, *self.held)
+        return x if self.held is None else SavedState(x, *self.held)
 
 
-class Hold(AbstractTransparentSolver):
+class Hold(AbstractForwardingSolver):
     """A solver of which each step uses the control of the interval that it lies in.
 
-    The times of a step's stages do not tell the interval: its last stage is at the
-    switch itself, and rounding puts others beyond it. So the interval is found once a
-    step, from the step's two ends, and handed to the vector field as an index. What a
-    solver keeps from its last step (the slope at its end) is dropped at a switch. Steps
-    must not cross one, which is the step-size controller's part.
+    The interval cannot be inferred from the times of the stages: the last stage is at
+    the switch itself, and rounding puts others beyond it. So it is found once per step,
+    from the step's two ends, and handed to the vector field as an index. A slope that a
+    solver reuses from its last step is dropped at a switch. The step-size controller
+    ensures that no step crosses one.
 
-    With `sampled`, a controller is asked at the start of each interval for the control
+    With `sampled`, a controller is called at the start of each interval for the control
     to hold; the control and the controller's memory are carried in the solver's state,
-    so that a rejected step takes them back.
+    so that rejected steps restore them.
     """
 
     solver: diffrax.AbstractSolver
@@ -132,6 +135,7 @@ class Hold(AbstractTransparentSolver):
 
     @property
     def interpolation_cls(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        # Diffrax calls it with the step's `dense_info` as keywords.
         inside = self.solver.interpolation_cls
 
         def ends(*, t0, t1, inner, end, held):
@@ -143,6 +147,7 @@ class Hold(AbstractTransparentSolver):
         args = eqx.tree_at(_index, args, self._interval(terms, t0, t1))
         inner = self.solver.init(terms, t0, t1, y0, args)
         held = (args.u, eqx.filter(args.memory, eqx.is_array)) if self.sampled else None
+        # No interval yet, so that the first step counts as a switch.
         return inner, jnp.full((), -1, jnp.int32), held
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
@@ -158,6 +163,8 @@ class Hold(AbstractTransparentSolver):
 
             held = lax.cond(switched, act, lambda held: held, held)
             args = eqx.tree_at(lambda a: a.u, args, held[0])
+        # A switch makes the field jump, after which a solver that keeps its last slope
+        # (first same as last) evaluates it anew.
         y1, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, made_jump | switched
         )
@@ -168,11 +175,8 @@ class Hold(AbstractTransparentSolver):
     def func(self, terms, t0, y0, args):
         forwards = terms.direction == 1
         t = jnp.where(forwards, t0, -t0)
-        after, before = (
-            interval_from(self.switches, t),
-            interval_before(self.switches, t),
-        )
-        args = eqx.tree_at(_index, args, jnp.where(forwards, after, before))
+        both = interval_from(self.switches, t), interval_before(self.switches, t)
+        args = eqx.tree_at(_index, args, jnp.where(forwards, *both))
         return self.solver.func(terms, t0, y0, args)
 
     def _interval(self, terms, t0, t1):
@@ -185,6 +189,7 @@ class Hold(AbstractTransparentSolver):
         low = jnp.where(forwards, t0, -t1)
         high = jnp.where(forwards, t1, -t0)
         index = interval_from(self.switches, low)
+        # The interval in which the larger part of the step lies.
         switch = self.switches[index + 1]
         later = (high - switch > switch - low).astype(index.dtype)
         return jnp.minimum(index + later, self.switches.shape[0] - 2)
@@ -193,6 +198,7 @@ class Hold(AbstractTransparentSolver):
 def interval_from(switches: Array, t: Array) -> Array:
     """k with `switches[k] <= t < switches[k + 1]`, of equal intervals."""
     count = switches.shape[0] - 1
+    # By division, as the intervals are equal: a search would cost a loop per step.
     share = (t - switches[0]) / (switches[-1] - switches[0])
     k = jnp.clip(jnp.floor(share * count).astype(jnp.int32), 0, count - 1)
     # Rounding can put the quotient on the wrong side of a switch, never beyond it.

@@ -11,14 +11,14 @@ import jax.numpy as jnp
 
 from .._check import (
     as_number,
-    as_rows,
     as_vector,
     check_bool,
     check_choice,
     check_count,
-    check_finite,
     check_instance,
     check_key,
+    finite_rows,
+    finite_vector,
 )
 from .._controller import AbstractController, initial_state, tallies
 from .._jax import by_components, join_state, split_state, stack_steps
@@ -62,13 +62,13 @@ def rollout(
     truncate: int | None = None,
     throw: bool = True,
 ) -> Trajectory:
-    """Run a controller in an environment: the one closed loop of the library.
+    """Simulate a controller in an environment, step by step.
 
     At each step k, with `t_k = k dt`: the controller acts on the observation `y_k`; the
-    environment clips the control, charges `c(t_k, x_k, u_k)` and steps; the controller
-    is told the control that was applied and its cost. The final cost is charged once,
-    at `x_T` or on entering a terminated state, after which the state is held at no
-    cost.
+    environment clips the control, charges `c(t_k, x_k, u_k)` and steps; then
+    `controller.applied(u, cost, state)` is called with the clipped control and its
+    cost. The final cost is charged once, at `x_T` or on entering a terminated state,
+    after which the state is held at no cost.
 
     It is already compiled, as `diffrax.diffeqsolve` is: a second call with other
     numbers, another key or start does not compile again. A batch is `jax.vmap` of it.
@@ -82,17 +82,19 @@ def rollout(
         controller.
     - `horizon`: steps; the environment's own by default.
     - `x0`: the first state, shape `(n,)`; drawn by the environment by default.
-    - `w`: disturbances, shape `(horizon, k)`; drawn by the environment by default.
+    - `w`: disturbances, shape `(horizon, k)`, in place of those that the environment
+        draws, which is the default. For a system with a diffusion they are its Brownian
+        increments: standard normal numbers times `sqrt(dt / substeps)`.
     - `keep`: what the trajectory stores, of `"states"`, `"observations"`, `"controls"`,
         `"disturbances"`, `"costs"`, `"terminated"`, `"incidents"` and
         `"controller_state"`; all by default.
     - `checkpoint`: what the gradient stores. `"step"` (default): the state at each
         step, and the step is computed again; `"sqrt"`: the state at each of about the
-        square root of T steps, for long horizons; `None`: all that is needed, nothing
-        computed again.
+        square root of T steps, for long horizons; `None`: all intermediate values,
+        without recomputation.
     - `gradient_decay`: the gradient passing back through the state is multiplied by it
         at each step. 1, the true gradient, by default; 0.9 damps the exploding
-        gradients of a long unstable horizon. It is a factor a step: `exp(-dt / tau)`
+        gradients of a long unstable horizon. It is a factor per step: `exp(-dt / tau)`
         forgets over the time `tau` at any `dt`.
     - `truncate`: the gradient is cut before every `truncate`-th step, in the state and
         in the memory of the controller: truncated back-propagation. Never by default.
@@ -102,8 +104,8 @@ def rollout(
     **Returns:** a [`delucax.Trajectory`][]. Its `result` is the first failure of a
     step, else `diverged`, else `update_refused` if a learner's update was not finite,
     else `plan_failed` if a plan of the controller did not succeed. `throw` raises on
-    all but the last: what follows a failed plan is for the controller to say (`throw=`
-    of [`delucax.controllers.MPC`][]).
+    all but the last: failed plans are handled by the controller (`throw=` of
+    [`delucax.controllers.MPC`][]).
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape; an error at run
     time as `throw` says.
@@ -130,11 +132,9 @@ def rollout(
     horizon = environment.horizon if horizon is None else horizon
     horizon = check_count(horizon, "horizon", where)
     if x0 is not None:
-        x0 = as_vector(x0, environment.state_size, "x0", where)
-        check_finite(x0, "x0", where)
+        x0 = finite_vector(x0, environment.state_size, "x0", where)
     if w is not None:
-        w = as_rows(w, environment.disturbance_size, "w", where, horizon)
-        check_finite(w, "w", where)
+        w = finite_rows(w, environment.disturbance_size, "w", where, horizon)
     keep = (keep,) if isinstance(keep, str) else keep
     named = isinstance(keep, tuple | list | set | frozenset)
     if not named or not set(keep) <= set(KEEP):
@@ -143,10 +143,9 @@ def rollout(
         )
     keep = tuple(name for name in KEEP if name in keep)
     check_choice(checkpoint, ("step", "sqrt", None), "checkpoint", where)
+    decay = as_float_array(as_number(gradient_decay, "gradient_decay", where))
     if isinstance(gradient_decay, int | float) and gradient_decay == 1:
         decay = None
-    else:
-        decay = as_float_array(as_number(gradient_decay, "gradient_decay", where))
     if truncate is not None:
         truncate = check_count(truncate, "truncate", where)
     trajectory = _rollout(
@@ -158,39 +157,49 @@ def rollout(
 @eqx.filter_jit
 def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, truncate):
     dynamics = env.dynamics
+    # Always in four parts: what is drawn does not depend on what else is given.
     start_key, w_key, noise_key, controller_key = env.split_key(key)
     if x0 is None:
         x0 = env.reset(start_key)
     size, dtype, dt = x0.shape[0], x0.dtype, env.dt
+    # Drawn for the whole horizon at once, outside of the loop. A disturbance that is
+    # known to be zero is left out of it.
     if w is None and not isinstance(env.disturbance, Zero):
         w = env.disturbance.draw(w_key, dt, horizon, dtype)
     noise = None
     if env.sensor_noise is not None:
         noise = env.sensor_noise.draw(noise_key, dt, horizon, dtype)
     can_end = env.terminated is not None
-    # A trajectory reads observations off the states where they are the same.
+    # Observations are not stored if they equal the states.
     keeps_y = not ("states" in keep and noise is None and dynamics.observes_state)
 
     first = initial_state(controller, controller_key)
+    # A loop carries arrays alone. The rest of a controller's state, such as the names
+    # of its tallies, is put back at each step.
     first, static = eqx.partition(first, eqx.is_array)
 
     def body(carry, inputs):
         parts, memory, ended, total = carry
         k, w, noise = inputs
+        # By a product: a sum of steps would be rounded anew at each of them.
         t = (k * dt).astype(dtype)
         x = join_state(parts, size)
+        # The same value, with `decay` times its derivative.
         if decay is not None:
             x = lax.stop_gradient(x) + decay * (x - lax.stop_gradient(x))
         if truncate is not None:
-            x, memory = _cut((k > 0) & (k % truncate == 0), (x, memory))
+            is_cut = (k > 0) & (k % truncate == 0)
+            real, rest = eqx.partition((x, memory), eqx.is_inexact_array)
+            cut = lambda leaf: jnp.where(is_cut, lax.stop_gradient(leaf), leaf)
+            x, memory = eqx.combine(jax.tree.map(cut, real), rest)
         y = dynamics.observe(t, x)
         if not eqx.is_inexact_array(y) or y.ndim != 1:
             y = as_vector(y, env.observation_size, "observe(t, x)", "rollout")
         y = y if noise is None else (y + noise).astype(dtype)
         observed, (done, length) = y, ended or (None, None)
         if done is not None:
-            # What is computed after the end is not used, but its derivatives must be
-            # finite: so it is computed where the episode began.
+            # After termination everything is evaluated at the first state: it is not
+            # used, but its derivatives must be finite, because 0 times infinity is NaN.
             y0 = lax.stop_gradient(dynamics.observe(t, x0)).astype(y.dtype)
             observed = jnp.where(done, y0, y)
             x = jnp.where(done, lax.stop_gradient(x0), x)
@@ -202,6 +211,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         step = env._advance(t, x, env._applied(u), w)
         cost, x_next, result = step.cost.astype(dtype), step.state, step.result
         applied = step.control
+        # Broadcasting would otherwise give the loop's state another shape.
         if x_next.shape != x.shape:
             raise ValueError(
                 f"rollout: a step must give a state of shape {x.shape} and a scalar "
@@ -223,10 +233,12 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
             cost, applied = jnp.where(done, 0, cost), jnp.where(done, 0, applied)
             x_next = jnp.where(done, join_state(parts, size), x_next)
             after = jax.tree.map(lambda a, b: jnp.where(done, a, b), memory, after)
+            # A result that is statically a success stays one, and costs nothing.
             if result is not RESULTS.successful:
                 result = choose(done, RESULTS.successful, result)
             ended = (done | step.terminated, length + ~done)
         after_parts = split_state(x_next.astype(dtype))
+        # The state before the step, not after it: `stack_steps` says why.
         kept = {
             "states": parts,
             "observations": split_state(y) if keeps_y else None,
@@ -236,6 +248,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
             "incidents": incidents,
         }
         kept = {name: value for name, value in kept.items() if name in keep}
+        # Costs that are kept are summed afterwards, in a tree: less rounding.
         total = None if total is None else total + cost
         return (after_parts, after, ended, total), (kept, or_none(result))
 
@@ -259,6 +272,7 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         )
 
     has_ended, length = ended or (jnp.zeros((), bool), jnp.asarray(horizon))
+    # At the time of termination, where there was one: the state is held from then on.
     end = (length * dt).astype(dtype)
     final_cost = jnp.asarray(env.cost.final(end, final_state), dtype)
     if final_cost.shape != ():
@@ -268,8 +282,10 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
         )
     costs = kept.get("costs")
     total_cost = (jnp.sum(costs) if total is None else total) + final_cost
+    # NaN propagates, so the last state tells of all.
     finite = jnp.all(jnp.isfinite(final_state)) & jnp.isfinite(total_cost)
     result = choose(finite, RESULTS.successful, RESULTS.diverged)
+    # In order of cause: a failed step, divergence, then what the controller counted.
     result = first_failure(result, controller_result(tallies(last), tallies(first)))
     return Trajectory(
         states=over_time("states", size, parts),
@@ -294,21 +310,17 @@ def _rollout(env, controller, key, x0, w, horizon, keep, checkpoint, decay, trun
     )
 
 
-def _cut(now, tree):
-    """`tree` without its derivatives where `now` holds."""
-
-    real, rest = eqx.partition(tree, eqx.is_inexact_array)
-    cut = lambda leaf: jnp.where(now, lax.stop_gradient(leaf), leaf)
-    return eqx.combine(jax.tree.map(cut, real), rest)
-
-
 def _scan(body, carry, inputs, horizon, checkpoint):
     """`lax.scan` over the horizon, with what the gradient stores chosen."""
     body = by_components(body)
+    # Without it the gradient would store what each operation of a step needs, many
+    # times the state. To compute a step again costs less than to write that out.
     if checkpoint == "step":
         body = jax.checkpoint(body)
     if checkpoint != "sqrt":
         return lax.scan(body, carry, inputs)
+    # Blocks of sqrt(T) steps: one state is stored for each block, and those of a block
+    # while it is run again (Chen, Xu, Zhang and Guestrin, 2016).
     block = max(1, math.isqrt(horizon))
     blocks, rest = divmod(horizon, block)
     inner = jax.checkpoint(body)

@@ -1,4 +1,4 @@
-"""The whole horizon in one solve."""
+"""Continuous-time simulation of a whole horizon by one solve."""
 
 from typing import Any, Literal
 
@@ -10,29 +10,28 @@ from jaxtyping import Array
 
 from .._check import (
     as_number,
-    as_rows,
-    as_vector,
     check_bool,
     check_choice,
     check_count,
-    check_finite,
     check_key,
+    finite_rows,
+    finite_vector,
     is_concrete,
 )
 from .._controller import AbstractController, tallies
 from .._integration import (
+    as_fixed_step_solver,
     check_method,
-    for_fixed_steps,
-    raise_on_failure,
     solve_result,
-    Start,
+    throwing_adjoint,
+    TimeOffset,
 )
 from .._results import choose, first_failure, RESULTS
 from .._typing import PRNGKey
 from ..math._steps import check_steps
 from ..systems import AbstractSystem
 from ._controller_calls import check_control, controller_result
-from ._hold import field, Hold, Inputs, interval_before, Recorded, recorded
+from ._hold import field, Hold, Inputs, interval_before, save_fn, SavedState
 from ._simulate_checks import (
     as_save_times,
     check_adjoint,
@@ -74,8 +73,8 @@ def simulate(
     The solve counts its time from `t0`, so that a late start costs no precision: its
     switches are rounded to that of `t1 - t0`, about `1e-7 (t1 - t0)` in single
     precision, however large `t0` is. The field, with a control that is not held, is
-    corrected for the rounding of `t0 + s` as in [`delucax.Discretized`][]; what is
-    sampled at a switch is given the rounded time.
+    corrected for the rounding of `t0 + s` as in [`delucax.Discretized`][]; held
+    controllers receive the rounded time.
 
     There is no cost here: `costs` is `None`, and the trajectory's `final_cost` and
     `total_cost` are zero. It is already compiled, as [`delucax.rollout`][] is.
@@ -84,8 +83,9 @@ def simulate(
 
     - `system`: the continuous-time system.
     - `controller_or_controls`: an array of controls, shape `(T, m)`; a function of time
-        to a control; or a controller. A controller that is held samples the sensor at
-        each switch, and is told by `applied` of its own control and a cost of zero.
+        to a control; or a controller. A held controller samples the sensor at each
+        switch, and its `applied` is called at once, with its own control and a cost of
+        zero; controllers that learn from costs are therefore refused.
     - `t0`, `t1`: start and end of the horizon, numbers with `t1 > t0`.
     - `x0`: the state at `t0`, shape `(n,)`.
     - `hold`: `"zero"` (default), the control is held over each interval; `None`, it is
@@ -99,13 +99,13 @@ def simulate(
     - `solver`: a Diffrax solver; `diffrax.Tsit5()` by default.
     - `stepsize_controller`: such as `diffrax.PIDController(rtol=1e-6, atol=1e-8)`;
         `None` (default) for fixed steps.
-    - `substeps`: fixed steps an interval, 1 by default.
+    - `substeps`: fixed steps per interval, 1 by default.
     - `adjoint`: any of `diffrax.RecursiveCheckpointAdjoint()` (default),
         `diffrax.DirectAdjoint()`, `diffrax.ForwardMode()`, or
         `diffrax.BacksolveAdjoint()`, which needs a `stepsize_controller`, takes no
         held controller, whose memory cannot be run backwards, and raises if a gradient
         with respect to `t0` or `t1` is asked for.
-    - `max_steps`: the most adaptive steps over the horizon; by default 4096, or 64 an
+    - `max_steps`: the most adaptive steps over the horizon; by default 4096, or 64 per
         interval if that is more.
     - `ts`: the times to save at, increasing and between `t0` and `t1`; by default the
         T + 1 ends of the intervals, where the saved states are the solver's own, not
@@ -116,16 +116,17 @@ def simulate(
         if false, look at `trajectory.result`.
 
     **Returns:** a [`delucax.Trajectory`][] whose `times` are those saved at. Its
-    `controls` and `disturbances` are those in force just before each time but the first
+    `controls` and `disturbances` are those acting just before each time but the first
     (with `hold=None`, the control just after each time but the last), `observations`
     are what the sensor reads at each time but the last.
 
     **Raises:** `ValueError` on an argument of the wrong kind or shape, on a solver or
-    adjoint that does not fit, on more than 2^22 steps in single precision, whose times
-    do not tell them apart, and on systems that one solve cannot integrate: those
-    that `project` their state after each interval, that have a `diffusion`, or, with
-    `w`, that name no disturbances; discretise these with [`delucax.Discretized`][]. An
-    error at run time as `throw` says.
+    adjoint that does not fit, on a controller that learns from costs, on more than
+    2^22 steps in single precision, which is too coarse for their times, and on systems
+    that one solve cannot integrate: those that `project` their state after each
+    interval, that have a `diffusion`, or, with `w`, that name no disturbances;
+    discretise these with [`delucax.Discretized`][]. An error at run time as `throw`
+    says.
 
     Source: Kidger, 2021 (Diffrax).
 
@@ -163,8 +164,7 @@ def simulate(
     check_system(system, w, where)
     check_choice(hold, ("zero", None), "hold", where)
     check_bool(throw, "throw", where)
-    x0 = as_vector(x0, system.state_size, "x0", where)
-    check_finite(x0, "x0", where)
+    x0 = finite_vector(x0, system.state_size, "x0", where)
     if key is not None:
         check_key(key, where)
     t0, t1 = as_number(t0, "t0", where), as_number(t1, "t1", where)
@@ -172,18 +172,21 @@ def simulate(
     if is_concrete(t0) and is_concrete(t1) and not t1 > t0:
         raise ValueError(f"{where}: t1 must be above t0, got t0 = {t0}, t1 = {t1}.")
     source = controller_or_controls
+    if isinstance(source, AbstractController) and source.learns_from_cost:
+        raise ValueError(
+            f"{where}: {type(source).__name__} learns from the cost of each step, but "
+            "simulate has no cost; use `delucax.rollout`."
+        )
     if not callable(source):
         name = "controller_or_controls"
-        source = as_rows(source, system.control_size, name, where)
-        check_finite(source, name, where)
+        source = finite_rows(source, system.control_size, name, where)
         if hold is None:
             raise ValueError(
                 f"{where}: hold=None needs a controller or a function of time; an "
                 "array of controls is held, hold='zero'."
             )
     if w is not None:
-        w = as_rows(w, system.disturbance_size, "w", where)
-        check_finite(w, "w", where)
+        w = finite_rows(w, system.disturbance_size, "w", where)
     substeps = check_count(substeps, "substeps", where)
     adaptive = stepsize_controller is not None
     sampled = hold == "zero" and isinstance(source, AbstractController)
@@ -215,9 +218,8 @@ def simulate(
     start = jnp.asarray(t0, x0.dtype)
     # The length of the horizon before its ends are rounded, if they are known.
     length = jnp.asarray(t1 - t0, x0.dtype)
-    trajectory = _simulate(
-        system, source, w, x0, start, length, ts, key, hold, steps, substeps, options
-    )
+    given = system, source, w, x0, start, length, ts, key, hold, steps, substeps
+    trajectory = _simulate(*given, options)
     return checked(trajectory, where) if throw else trajectory
 
 
@@ -230,6 +232,7 @@ def _simulate(
     grid: Any = None
     switches: Any = None
     if steps is not None:
+        # By fractions of the length, and the end as it is: no sum of steps is rounded.
         grid = length * (jnp.arange(steps * substeps + 1) / (steps * substeps))
         grid = grid.astype(dtype).at[-1].set(length)
         switches = grid[::substeps]
@@ -240,16 +243,17 @@ def _simulate(
     sampled = hold == "zero" and isinstance(source, AbstractController)
     args = _inputs(system, source, w, x0, t0, switches, key, hold)
     if sampled:
+        # The control at the start. The first step calls the controller again, in the
+        # same state, because it is the first of its interval.
         u, _ = args.act(grid[0], x0, eqx.filter(args.memory, eqx.is_array))
         args = eqx.tree_at(lambda a: a.u, args, u, is_leaf=lambda leaf: leaf is None)
-    start = Start(t0, lambda t: args.field(t, x0))
+    start = TimeOffset(t0, lambda t: args.field(t, x0))
     args = eqx.tree_at(lambda a: a.start, args, start)
 
-    saved: dict[str, Any] = (
-        dict(t0=True, ts=saves[1:]) if ts is None else dict(t1=True, ts=saves)
-    )
+    # Either the ends of the intervals, or the times in `ts` and the end of the horizon.
+    saved: Any = dict(t0=True, ts=saves[1:]) if ts is None else dict(t1=True, ts=saves)
     if sampled:
-        saved["fn"] = recorded
+        saved["fn"] = save_fn
     held = hold == "zero" or w is not None
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
@@ -265,12 +269,12 @@ def _simulate(
     states: Any = solution.ys
     applied: Any = None
     counts: dict[str, Any] = {}
-    if isinstance(states, Recorded):
+    if isinstance(states, SavedState):
         states, applied, counts = states
     final_state, states = states[-1], states[:count]
 
     def before(held):
-        """Of a held sequence, what is in force just before each time but the first."""
+        """The rows of a held sequence just before each save time but the first."""
         if held is None or ts is None:
             return held
         return held[jax.vmap(lambda s: interval_before(switches, s))(saves[1:])]
@@ -282,10 +286,11 @@ def _simulate(
     else:
         controls = jax.vmap(args.control)(times[:-1], states[:-1])
     finite = jnp.all(jnp.isfinite(final_state))
-    diverged = choose(finite, RESULTS.successful, RESULTS.diverged)
     result = solve_result(solution, options["stepsize_controller"], dtype)
-    result = first_failure(result, diverged)
-    last = {name: totals[-1] for name, totals in counts.items()}
+    result = first_failure(result, choose(finite, RESULTS.successful, RESULTS.diverged))
+    # At the last save time. The record at `t1` is made with the first state's counters.
+    last = {name: totals[count - 1] for name, totals in counts.items()}
+    incidents = {n: at[1:count] > at[: count - 1] for n, at in counts.items()}
     result = first_failure(result, controller_result(last, tallies(args.memory)))
     sensor = None
     if not system.observes_state:
@@ -305,19 +310,16 @@ def _simulate(
         recorded_observations=sensor,
         recorded_disturbances=before(w),
         recorded_terminated=None,
-        incidents={
-            n: totals[1:count] > totals[: count - 1] for n, totals in counts.items()
-        },
-        controller_state=None,
+        incidents=incidents,
         steps=count - 1,
-        # There is no cost to keep, which is not to have left it out.
+        # With costs, although there are none, so that they don't count as left out.
         keep=("states", "observations", "controls", "disturbances", "costs"),
         **plant_fields(system),
     )
 
 
 def _inputs(system, source, w, x0, t0, switches, key, hold) -> Inputs:
-    """What the solve's vector field takes, before a controller is first asked."""
+    """The arguments of the solve's vector field before a controller is called."""
     controls: Any = None
     memory: Any = None
     if isinstance(source, AbstractController):
@@ -339,7 +341,7 @@ def _inputs(system, source, w, x0, t0, switches, key, hold) -> Inputs:
     if controls is not None:
         controls, source = controls.astype(x0.dtype), None
     index = jnp.zeros((), jnp.int32)
-    return Inputs(system, Start(t0), source, memory, controls, w, index, None)
+    return Inputs(system, TimeOffset(t0), source, memory, controls, w, index, None)
 
 
 def _with_switches(options, held: bool, sampled: bool, grid, switches):
@@ -350,6 +352,7 @@ def _with_switches(options, held: bool, sampled: bool, grid, switches):
         if held and "solver" in options:
             options["solver"] = Hold(options["solver"], switches, sampled)
         controller = options.get("stepsize_controller")
+        # No adaptive step crosses a switch: its error estimate would be of two fields.
         if held and controller is not None and switches.shape[0] > 2:
             clipped = diffrax.ClipStepSizeController(controller, step_ts=switches[1:-1])
             options["stepsize_controller"] = clipped
@@ -358,10 +361,11 @@ def _with_switches(options, held: bool, sampled: bool, grid, switches):
     solver, adjoint = options["solver"], options["adjoint"]
     fixed = options["stepsize_controller"] is None
     if fixed and isinstance(solver, diffrax.AbstractImplicitSolver):
-        solver = for_fixed_steps(solver)
+        solver = as_fixed_step_solver(solver)
+    # The backward solve has a solver of its own, which must hold the controls, too.
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         adjoint = diffrax.BacksolveAdjoint(**fitted(adjoint.kwargs))
-    adjoint = raise_on_failure(adjoint)
+    adjoint = throwing_adjoint(adjoint)
     options = fitted(options | dict(solver=solver, adjoint=adjoint))
     if fixed:
         options["stepsize_controller"] = diffrax.StepTo(grid)
@@ -371,13 +375,14 @@ def _with_switches(options, held: bool, sampled: bool, grid, switches):
 def _since(t0: Array, ts: Array, grid: Array | None, length: Array) -> Array:
     """The save times `ts`, counted from `t0`.
 
-    A time that rounding puts beside a point of the grid is that point, so that what is
-    in force before it is known.
+    They are snapped to grid points within rounding, so that the interval before each is
+    unambiguous.
     """
     saves = jnp.clip(ts - t0, 0, length)
     if grid is None:
         return saves
     steps = grid.shape[0] - 1
     near = grid[jnp.round(saves / length * steps).astype(int)]
+    # Both times are rounded to their own size, and so is their difference.
     slack = 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(ts))
     return jnp.where(jnp.abs(saves - near) <= slack, near, saves)

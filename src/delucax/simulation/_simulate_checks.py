@@ -17,8 +17,8 @@ from ..systems import AbstractSystem
 def check_system(system: Any, w: Any, where: str) -> None:
     """Raise unless one solve can integrate `system`."""
     check_instance(system, AbstractSystem, "system", where)
-    name, reason = type(system).__name__, None
-    if type(system).project is not AbstractSystem.project:
+    name = type(system).__name__
+    if system.projects_state:
         reason = f"system {name} projects its state after each interval"
     elif system.noise == "brownian":
         reason = f"system {name} has a diffusion, whose increments are of fixed steps"
@@ -27,11 +27,12 @@ def check_system(system: Any, w: Any, where: str) -> None:
             f"w cannot be given, as {name} names no disturbances: w would be added to "
             "the state after each interval"
         )
-    if reason is not None:
-        raise ValueError(
-            f"{where}: {reason}, which one solve cannot do; use `delucax.open_loop` or "
-            "`delucax.rollout` with delucax.Discretized(system, dt)."
-        )
+    else:
+        return
+    raise ValueError(
+        f"{where}: {reason}, which one solve cannot do; use `delucax.open_loop` or "
+        "`delucax.rollout` with delucax.Discretized(system, dt)."
+    )
 
 
 def count_intervals(
@@ -67,7 +68,7 @@ def count_intervals(
 
 
 def as_save_times(ts: Any, t0: Any, t1: Any, where: str) -> Any:
-    """`ts` as an array of increasing times from `t0` to `t1`, or an error."""
+    """`ts` as an array of increasing times from `t0` to `t1`; raise if it is not."""
     ts = as_float_array(ts)
     if not eqx.is_inexact_array(ts) or ts.ndim != 1 or ts.shape[0] < 2:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What a closed loop leaves behind."""
+"""The trajectory of a closed loop."""
 
 import dataclasses
 from typing import Any, TYPE_CHECKING
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 class Trajectory(eqx.Module):
     """The record of a closed loop: `T` steps from `T + 1` states.
 
-    What was not asked for with `keep=` is `None`. Under `jax.vmap` every array has a
+    Arrays that `keep=` leaves out are `None`. Under `jax.vmap` every array has a
     leading batch axis.
 
     **Attributes:**
 
     - `times`: shape `(T + 1,)`.
     - `states`: shape `(T + 1, n)`.
-    - `observations`: what the controller was given, shape `(T, p)`.
+    - `observations`: those given to the controller, shape `(T, p)`.
     - `controls`: what was applied, after the bounds, shape `(T, m)`.
     - `disturbances`: shape `(T, k)`.
     - `costs`: stage costs, shape `(T,)`; 0 after termination.
-    - `terminated`: whether step k ended the episode, or found it ended, shape `(T,)`.
+    - `terminated`: whether the episode had terminated after step k, shape `(T,)`.
     - `final_state`: shape `(n,)`.
     - `final_cost`: a scalar, charged once.
     - `total_cost`: the sum of the stage costs and the final cost.
@@ -43,9 +43,10 @@ class Trajectory(eqx.Module):
     - `incidents`: from the name of something that went wrong in the controller to the
         steps at which it did, booleans of shape `(T,)`. `"clipped_control"`: the
         environment's bounds changed the control. `"failed_plan"`: a plan of
-        [`delucax.controllers.MPC`][] did not succeed. `"refused_update"`: what a
-        learner would have learned was not finite. Others are those that a controller
-        counts with [`delucax.controllers.Tally`][].
+        [`delucax.controllers.MPC`][] did not succeed. `"failed_estimate"`: nor did an
+        estimator. `"refused_update"`: what a learner would have learned was not finite.
+        Others are those that a controller counts with
+        [`delucax.controllers.Tally`][].
     - `controller_state`: the arrays of the controller's state at the end.
     - `steps`: T, an int. `dt`: the control interval. `disturbance_size`: k.
     - `keep`: the names of what was kept.
@@ -78,8 +79,8 @@ class Trajectory(eqx.Module):
     ended: Array
     result: Result
     dt: Array
-    # What follows from the rest is not stored but made on demand: writing it out would
-    # cost a batch more than the simulation does.
+    # Arrays that follow from others are computed lazily: to write them out would cost a
+    # batch more than the simulation does.
     recorded_times: Array | None
     recorded_observations: Array | None
     recorded_disturbances: Array | None
@@ -110,7 +111,7 @@ class Trajectory(eqx.Module):
 
     @property
     def observations(self) -> Array | None:
-        """What the controller was given, shape `(T, p)`."""
+        """The observations given to the controller, shape `(T, p)`."""
         if self.recorded_observations is None and "observations" in self.keep:
             return None if self.states is None else self.states[..., :-1, :]
         return self.recorded_observations
@@ -125,15 +126,15 @@ class Trajectory(eqx.Module):
 
     @property
     def terminated(self) -> Array | None:
-        """Whether step k ended the episode, or found it ended, shape `(T,)`."""
+        """Whether the episode had terminated after step k, shape `(T,)`."""
         if self.recorded_terminated is None and "terminated" in self.keep:
             return jnp.zeros((*self.batch_shape, self.steps), bool)
         return self.recorded_terminated
 
     @property
     def failed(self) -> Array:
-        """Whether a step failed, the run diverged or a learner refused an update. A
-        failed plan, which `result` names too, is no failure of the run."""
+        """Whether `result` is neither `successful` nor `plan_failed`: a step failed,
+        the run diverged, or a learner refused an update."""
         planned = self.result == RESULTS.plan_failed
         return (self.result != RESULTS.successful) & ~planned
 
@@ -192,11 +193,15 @@ class Trajectory(eqx.Module):
                 "Trajectory: states and costs must be kept to slice in time; got "
                 "keep= without them."
             )
-
         ends = lambda tree: jax.tree.map(lambda leaf: leaf[start : stop + 1], tree)
         steps = lambda tree: jax.tree.map(lambda leaf: leaf[start:stop], tree)
         costs, incidents = steps(self.costs), steps(self.incidents)
-        is_end = stop == self.steps
+        # A failure by incidents is dropped if none of them is in the slice.
+        result, is_end = self.result, stop == self.steps
+        for name, kind in INCIDENTS.items():
+            if incidents is not None and name in incidents:
+                elsewhere = (result == kind) & ~jnp.any(incidents[name])
+                result = choose(elsewhere, RESULTS.successful, result)
         final_cost = self.final_cost if is_end else jnp.zeros_like(self.final_cost)
         return dataclasses.replace(
             self,
@@ -208,7 +213,7 @@ class Trajectory(eqx.Module):
             total_cost=final_cost if costs is None else jnp.sum(costs) + final_cost,
             length=jnp.clip(self.length - start, 0, stop - start),
             ended=self.ended & (self.length <= stop),
-            result=_result_of(self.result, incidents),
+            result=result,
             recorded_times=ends(self.times),
             recorded_observations=steps(self.recorded_observations),
             recorded_disturbances=steps(self.recorded_disturbances),
@@ -301,7 +306,7 @@ class Trajectory(eqx.Module):
     def summary(self) -> "pandas.DataFrame":
         """One row for a trajectory, one a member for a batch: cost, length, outcome.
 
-        Columns: `total_cost`, `final_cost`, `mean_cost` (a step), `length`,
+        Columns: `total_cost`, `final_cost`, `mean_cost` (per step), `length`,
         `terminated`, `result`; and for each kind of incident that happened, such as
         `failed_plan`, the number of steps `failed_plan_count` and the time of the
         first, `failed_plan_time`.
@@ -312,16 +317,12 @@ class Trajectory(eqx.Module):
         """
         pd = extra("pandas", "tables")
 
-        total = np.ravel(self.total_cost)
-        length = np.ravel(self.length)
-        final = np.ravel(self.final_cost)
-        ok = np.ravel(np.asarray(self.result == RESULTS.successful))
-        ok = np.broadcast_to(ok, total.shape)
+        given = self.total_cost, self.length, self.final_cost
+        total, length, final = map(np.ravel, given)
+        # A result that is statically a success has no batch axis, but broadcasts.
         codes = np.broadcast_to(np.ravel(jax.tree.leaves(self.result)[0]), total.shape)
-        words = [
-            "successful" if fine else _message(code)
-            for fine, code in zip(ok, codes, strict=True)
-        ]
+        result_of = lambda c: jax.tree.map(lambda _: np.asarray(c), RESULTS.successful)
+        words = [RESULTS[result_of(code)] or "successful" for code in codes]
         columns = {
             "total_cost": total,
             "final_cost": final,
@@ -336,15 +337,6 @@ class Trajectory(eqx.Module):
                 columns[f"{name}_count"] = count
                 columns[f"{name}_time"] = np.ravel(self.incident_times[name])
         return pd.DataFrame(columns)
-
-
-def _result_of(result: Result, incidents: dict[str, Array] | None) -> Result:
-    """The result of a stretch in which the incidents that it speaks of may not be."""
-    for name, kind in INCIDENTS.items():
-        if incidents is not None and name in incidents:
-            elsewhere = (result == kind) & ~jnp.any(incidents[name])
-            result = choose(elsewhere, RESULTS.successful, result)
-    return result
 
 
 def plant_fields(plant: AbstractPlant) -> dict[str, Any]:
@@ -373,7 +365,3 @@ def checked(trajectory: Trajectory, where: str) -> Trajectory:
                 )
         raise RuntimeError(message + " Pass throw=False to look at the trajectory.")
     return trajectory
-
-
-def _message(code: Any) -> str:
-    return RESULTS[jax.tree.map(lambda _: np.asarray(code), RESULTS.successful)]

@@ -1,4 +1,4 @@
-"""Whole pieces of work: the paper, the demo, the scoreboard, the ventilator."""
+"""End-to-end studies: the paper, the demo, the scoreboard, the ventilator."""
 
 from ._demo import demo as demo
 from ._swing_up import holds_upright as holds_upright, train_swing_up as train_swing_up

@@ -1,6 +1,6 @@
-"""The main job in one command: from the pendulum's ODE to a trained controller; and the
-paper, in small."""
+"""The demo: from the pendulum's ODE to a trained controller, and the paper in small."""
 
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,8 +24,8 @@ from ..simulation import rollout, Trajectory
 from ._swing_up import BATCH, holds_upright, HORIZON, STEPS, train_swing_up
 from .paper import reproduce, STUDIES
 from .paper._finding import mean_and_half_width
-from .paper._policy_gradient import train_linear
-from .paper._wall_clock import gymnasium_run
+from .paper._gradients import train_linear
+from .paper._wall_clock import gymnasium_run, take_turns
 
 
 EVALUATION_STEPS = 400
@@ -41,7 +41,7 @@ def demo(
     say: Callable[[str], Any] = print,
 ) -> Any:
     """Design, train, compare and show controllers for Gym's pendulum; then the studies
-    of the Deluca paper, small, with what holds of its claims.
+    of the Deluca paper, small, and whether its claims hold.
 
     Takes the pendulum's ODE; designs an LQR about the upright; trains the linear policy
     of the Deluca paper (Section 4) and an MLP by differentiating the rollout; runs them
@@ -77,19 +77,18 @@ def demo(
     check_count(seeds, "seeds", "demo")
     out = _writable(Path(out))
     env = pendulum()
-    controllers: dict[str, Any] = {"zero": Zero(1)}
+    gains_of = lambda K: f"  K = {np.array2string(np.asarray(K), precision=3)}"
 
     say("LQR about the upright, from the linearised ODE")
-    model = linearize(env.dynamics)
-    Q, R = jnp.diag(jnp.array([1.0, 0.1])), jnp.eye(1) * 0.001
-    lqr = LQR(model, Q, R, difference=env.dynamics.difference)
-    controllers["LQR"] = lqr
-    say(f"  K = {np.array2string(np.asarray(lqr.K), precision=3)}")
+    weights = jnp.diag(jnp.array([1.0, 0.1])), jnp.eye(1) * 0.001
+    difference = env.dynamics.difference
+    lqr = LQR(linearize(env.dynamics), *weights, difference=difference)
+    say(gains_of(lqr.K))
 
     say("\nLinear policy u = -K x by gradient descent on the rollout (torque +-10)")
     linear = train_linear(1000).model
-    controllers["linear policy"] = linear
-    say(f"  K = {np.array2string(np.asarray(linear.K), precision=3)}")
+    say(gains_of(linear.K))
+    controllers = {"zero": Zero(1), "LQR": lqr, "linear policy": linear}
 
     say(f"\nMLP by gradient descent through the ODE, {seeds} seeds")
     starts = jax.vmap(env.reset)(jax.random.split(jax.random.key(2**20), STARTS))
@@ -106,13 +105,16 @@ def demo(
         )
         controllers.setdefault("MLP", fitted.model)
 
-    disturbed = pendulum(disturbance=_SHOCK)
     rows, shown = [], {}
-    for world, name in ((env, "none"), (disturbed, "at 10 s")):
-        for label, controller in controllers.items():
-            runs = _evaluate(world, controller, starts)
-            rows.append(_row(label, name, runs))
-            shown[label, name] = runs
+    for world, when in ((env, "none"), (pendulum(disturbance=_SHOCK), "at 10 s")):
+        for name, controller in controllers.items():
+            shown[name, when] = runs = _evaluate(world, controller, starts)
+            cost = np.asarray(runs.total_cost)
+            row: dict[str, Any] = {"controller": name, "shock": when}
+            row["mean cost"], row["+- 95%"] = mean_and_half_width(cost)
+            row |= {"median": np.median(cost), "worst": cost.max()}
+            row["upright at the end"] = int(jnp.sum(holds_upright(runs)))
+            rows.append(row)
     table = pd.DataFrame(rows)
     say(f"\nCost over 20 s from the same {STARTS} starts, torque +-2:\n")
     say(table.to_string(index=False, float_format=lambda x: f"{x:.1f}"))
@@ -128,7 +130,14 @@ def demo(
     # The start that hangs lowest makes the best picture of a swing-up.
     lowest = int(jnp.argmin(jnp.cos(starts[:, 0])))
     picture = {name: shown[name, "at 10 s"][lowest] for name in controllers}
-    _marked(plotting.plot(picture)).savefig(out / "trajectories.png", dpi=120)
+    figure: Any = plotting.plot(picture)
+    for axes in figure.axes:
+        axes.axvspan(10.0, 10.5, color="0.5", alpha=0.25, lw=0)
+    low, high = np.array(figure.axes[0].get_ylim()) / (2 * np.pi)
+    for upright in 2 * np.pi * np.arange(np.ceil(low), np.floor(high) + 1):
+        figure.axes[0].axhline(upright, color="0.5", lw=0.8, ls=":", zorder=0)
+    figure.text(0.01, 0.005, "Grey: the shock. Dotted: upright.", fontsize=8)
+    figure.savefig(out / "trajectories.png", dpi=120)
     say("  table.csv, mlp.dlx, trajectories.png")
     swing = shown["MLP", "none"][lowest][:160]
     plotting.animate(env, swing, path=out / "swing_up.gif", max_frames=80)
@@ -136,56 +145,37 @@ def demo(
 
     trained = BATCH * HORIZON * steps
     usual = float(np.median(seconds[1:] or seconds))
+    without = f" ({usual:.1f} s without, the median seed)" if seeds > 1 else ""
     say(
         f"\nTrained on {trained / 1e6:.1f} million steps, gradients included, in "
-        f"{seconds[0]:.1f} s with compilation"
-        + (f" ({usual:.1f} s without, the median seed)" if seeds > 1 else "")
-        + f": {trained / usual / 1e6:.2f} million steps a second."
+        f"{seconds[0]:.1f} s with compilation{without}: "
+        f"{trained / usual / 1e6:.2f} million steps a second."
     )
     say(_beside_gymnasium(trained / usual))
     say(_derivative())
     say("\nThe Deluca paper, study by study, with few seeds and steps\n")
     names = [name for name in STUDIES if name != "ventilator"]
-    _say_held(reproduce(names, out / "paper", small=True, say=say), say)
-    return table
-
-
-def _say_held(claims: list[dict[str, Any]], say: Callable[[str], Any]) -> None:
-    """How many claims of each study hold, and which do not."""
-    pd = extra("pandas", "demo")
-    claims_of = pd.DataFrame(claims).astype({"holds": int}).groupby("study", sort=False)
-    table = claims_of["holds"].agg(claims="count", hold="sum").reset_index()
-    say(f"\n{table.to_string(index=False)}\n")
+    claims = reproduce(names, out / "paper", small=True, say=say)
+    holds = pd.DataFrame(claims).astype({"holds": int}).groupby("study", sort=False)
+    held = holds["holds"].agg(claims="count", hold="sum").reset_index()
+    say(f"\n{held.to_string(index=False)}\n")
     for claim in claims:
         if not claim["holds"]:
             say(f"Does not hold: {claim['claim']} ({claim['measured']}).")
     say("\nThe ventilator, in a minute: python -m delucax lung --small")
     say("All of it, with more seeds and steps: python -m delucax reproduce all")
+    return table
 
 
 def _writable(out: Path) -> Path:
     """The folder, made and tried before any work is done."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".writable"
-        probe.touch()
-        probe.unlink()
+        tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
         message = f"demo: out must be a folder to write to, got {out}: {error}"
         raise OSError(message) from error
     return out
-
-
-def _marked(figure: Any) -> Any:
-    """The figure with the shock and, in the angle, the upright positions."""
-    for axes in figure.axes:
-        axes.axvspan(10.0, 10.5, color="0.5", alpha=0.25, lw=0)
-    angle = figure.axes[0]
-    low, high = angle.get_ylim()
-    for turn in range(int(np.ceil(low / (2 * np.pi))), int(high / (2 * np.pi)) + 1):
-        angle.axhline(2 * np.pi * turn, color="0.5", lw=0.8, ls=":", zorder=0)
-    figure.text(0.01, 0.005, "Grey: the shock. Dotted: upright.", fontsize=8)
-    return figure
 
 
 @eqx.filter_jit
@@ -194,31 +184,14 @@ def _evaluate(env: Environment, controller: Any, starts: Any) -> Trajectory:
     return jax.vmap(lambda x0: rollout(env, controller, x0=x0, **options))(starts)
 
 
-def _row(label: str, shock: str, runs: Trajectory) -> dict[str, Any]:
-    cost = np.asarray(runs.total_cost)
-    mean, half = mean_and_half_width(cost)
-    return {
-        "controller": label,
-        "shock": shock,
-        "mean cost": mean,
-        "+- 95%": half,
-        "median": np.median(cost),
-        "worst": cost.max(),
-        "upright at the end": int(jnp.sum(holds_upright(runs))),
-    }
-
-
 def _beside_gymnasium(steps_per_second: float) -> str:
     """Gymnasium's own speed, measured here and now if it is installed."""
     count = 20_000
     try:
-        run = gymnasium_run(count)
+        seconds = take_turns([gymnasium_run(count)], 1)
     except ImportError:
         return "Gymnasium is not installed, so its speed was not measured."
-    run()
-    begin = time.perf_counter()
-    run()
-    rate = count / (time.perf_counter() - begin)
+    rate = count / float(seconds[0, 0])
     return (
         f"Gymnasium simulates {rate / 1e6:.3f} million steps a second on this machine: "
         f"training ran {steps_per_second / rate:.0f} times as fast."
@@ -229,15 +202,13 @@ def _derivative() -> str:
     """The cost's derivative with respect to the length, beside a central difference."""
     with jax.enable_x64(True):
         env = pendulum(solver=diffrax.Tsit5(), dt=0.02)
-        K = jnp.array([[20.0, 5.0]])
-        x0 = jnp.array([0.1, 0.0])
+        policy, key = Linear(jnp.array([[20.0, 5.0]])), jax.random.key(0)
+        options: Any = dict(x0=jnp.array([0.1, 0.0]), horizon=250, throw=False)
 
         @jax.jit
         def cost(length):
             longer = replace(env, {"dynamics.system.length": length})
-            key = jax.random.key(0)
-            run = rollout(longer, Linear(K), key=key, x0=x0, horizon=250, throw=False)
-            return run.total_cost
+            return rollout(longer, policy, key=key, **options).total_cost
 
         length, step = jnp.array(1.0), 1e-5
         exact = float(jax.grad(cost)(length))

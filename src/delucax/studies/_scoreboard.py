@@ -19,16 +19,16 @@ from jaxtyping import Array
 from .. import controllers
 from .._controller import AbstractController
 from ..controllers import mlp_policy, OpenLoop, Zero
-from ..costs import AbstractCost, Function
+from ..costs import Function
 from ..disturbances import Gaussian
 from ..dynamics import linearize
 from ..environments import Environment, make, UniformState
 from ..experiments import experiment
-from ..lung import Breathing
+from ..lung import BreathCost, Breathing
 from ..planning import AbstractPlanner, CEM, ILQR, ilqr, MPPI
 from ..simulation import rollout
 from ..training import actor_critic, expected_cost, fit, PPO, SHAC
-from ._listing import task_names
+from .listing import task_names
 
 
 # Of every training: steps of the optimiser on the gradient, episodes a step, and the
@@ -38,9 +38,9 @@ TRAINING_STEPS, EPISODES, LONGEST = 200, 32, 100
 LOOKAHEAD = 30
 
 
-class Pump(AbstractController):
-    """Push as hard as is allowed the way that it moves, as one does a swing: the least
-    cost by far that is known of the mountain cars before it is refined."""
+class EnergyPumping(AbstractController):
+    """Full force in the direction of motion, which pumps energy into a swing: the best
+    first guess that is known for the mountain cars."""
 
     push: Array
 
@@ -49,22 +49,20 @@ class Pump(AbstractController):
 
 
 class Unsuitable(Exception):
-    """A controller is not made for such a task."""
+    """A method does not apply to a task."""
 
 
 @functools.cache
 def task_of(name: str) -> Environment:
     """The task, with what it needs drawn from a fixed key."""
+    options: dict[str, Any] = {}
     if name == "neural":
-        return make(name, width=8, key=jax.random.key(0))
-    if name != "lds":
-        return make(name)
-    options: dict[str, Any] = {
-        "initial_state": UniformState(-jnp.ones(4), jnp.ones(4)),
-        "disturbance": Gaussian(0.1, size=4),
-        "spectral_radius": 1.05,
-    }
-    return make(name, key=jax.random.key(0), states=4, controls=2, **options)
+        options = dict(width=8, key=jax.random.key(0))
+    elif name == "lds":
+        start, w = UniformState(-jnp.ones(4), jnp.ones(4)), Gaussian(0.1, size=4)
+        options = dict(states=4, controls=2, key=jax.random.key(0))
+        options |= dict(initial_state=start, disturbance=w, spectral_radius=1.05)
+    return make(name, **options)
 
 
 @functools.cache
@@ -75,44 +73,46 @@ def _local(name: str) -> tuple[Any, Any, Any]:
     x, u = env.dynamics.equilibrium()
     model = linearize(env.dynamics, jnp.zeros(()), x, u)
     n = x.shape[0]
-
-    def charged(z: Any) -> Any:
-        return env.cost(jnp.zeros(()), x + z[:n], u + z[n:])
-
-    H = np.asarray(jax.hessian(charged)(jnp.zeros(n + u.shape[0]))) / 2
+    cost = lambda z: env.cost(jnp.zeros(()), x + z[:n], u + z[n:])
+    # A cost `x @ Q @ x + u @ R @ u` has twice those for its Hessian.
+    H = np.asarray(jax.hessian(cost)(jnp.zeros(n + u.shape[0]))) / 2
     if not np.all(np.isfinite(H)):
         raise Unsuitable("the cost has no curvature at the equilibrium")
+    # Designs need R definite: a direction that costs nothing is given a weight that is
+    # a ten-thousandth of the largest.
     values, vectors = np.linalg.eigh(H)
     scale = max(values.max(), 1e-3)
     H = vectors * np.clip(values, 1e-4 * scale, None) @ vectors.T
     return model, jnp.asarray(H[:n, :n]), jnp.asarray(H[n:, n:])
 
 
-def _regulator(name: str, design: Callable[..., Any], **options: Any) -> Any:
+def _regulator(
+    name: str, env: Environment, design: Callable[..., Any], **options: Any
+) -> Any:
     """A design from the linear model and the curvature of the cost."""
-    difference = task_of(name).dynamics.difference
-    return design(*_local(name), difference=difference, **options)
+    return design(*_local(name), difference=env.dynamics.difference, **options)
 
 
-def _following(name: str) -> Any:
-    """A PID on the waveform that a lung is to breathe as."""
-    env = task_of(name)
-    waveform = getattr(env.cost, "waveform", None)
-    if waveform is None:
+def _following(name: str, env: Environment) -> Any:
+    """A PID on the waveform that a ventilator is to follow."""
+    if not isinstance(env.cost, BreathCost):
         raise Unsuitable("the cost follows no waveform")
+    waveform = env.cost.waveform
     return Breathing(controllers.LeakyPID(dt=env.dt, reference=waveform), waveform)
 
 
-def _learning(name: str, learner: Callable[..., Any], **options: Any) -> Any:
+def _learning(
+    name: str, env: Environment, learner: Callable[..., Any], **options: Any
+) -> Any:
     """An online learner on top of the LQR."""
-    env = task_of(name)
     return learner(env.dynamics, env.cost, base=agent_of(name, "LQR"), **options)
 
 
-def _receding(name: str, kind: type[AbstractPlanner], **options: Any) -> Any:
+def _receding(
+    name: str, env: Environment, kind: type[AbstractPlanner], **options: Any
+) -> Any:
     """MPC with the model and the cost of the task and, at the end of a plan, the cost
     to go of the LQR where there is one."""
-    env = task_of(name)
     if env.dynamics.observation_size != env.dynamics.state_size:
         raise Unsuitable("the state is not observed")
     bounds = env.control_bounds
@@ -120,28 +120,20 @@ def _receding(name: str, kind: type[AbstractPlanner], **options: Any) -> Any:
         low, high = (np.asarray(bound, float) for bound in bounds)
         width = high - low
         options["scale"] = np.where(np.isfinite(width), width / 4, 1.0)
+    cost, lqr = env.cost, _suited(name, "LQR")
+    if lqr is not None:
+
+        def to_go(t, x):
+            deviation = env.dynamics.difference(x, lqr.x_ref)
+            return deviation @ lqr.P @ deviation
+
+        cost = Function(env.cost, to_go)
     how: dict[str, Any] = {"planner": kind(**options), "bounds": bounds, "throw": False}
-    return controllers.MPC(env.dynamics, _with_cost_to_go(name), LOOKAHEAD, **how)
+    return controllers.MPC(env.dynamics, cost, LOOKAHEAD, **how)
 
 
-def _with_cost_to_go(name: str) -> AbstractCost:
-    """The cost of the task, with the LQR's cost to go for a final cost."""
-    env = task_of(name)
-    try:
-        lqr = agent_of(name, "LQR")
-    except Unsuitable:
-        return env.cost
-
-    def to_go(t: Any, x: Any) -> Any:
-        deviation = env.dynamics.difference(x, lqr.x_ref)
-        return deviation @ lqr.P @ deviation
-
-    return Function(env.cost, to_go)
-
-
-def _by_gradient(name: str, network: Callable[..., Any], **options: Any) -> Any:
+def _by_gradient(env: Environment, network: Callable[..., Any], **options: Any) -> Any:
     """A network, by gradient descent through the rollout."""
-    env = task_of(name)
     first, key = jax.random.split(jax.random.key(1))
     horizon = min(env.horizon, LONGEST)
     loss = expected_cost(env, batch=EPISODES, horizon=horizon, gradient_decay=0.95)
@@ -156,9 +148,9 @@ def _gru(env: Environment, key: Any) -> Any:
     return controllers.GRU(*sizes, 32, features=env.encode, bounds=bounds, key=key)
 
 
-def _by_actor_critic(name: str, method: type[PPO] | type[SHAC]) -> Any:
+def _by_actor_critic(env: Environment, method: type[PPO] | type[SHAC]) -> Any:
     """The MLP by reinforcement learning."""
-    env, head = task_of(name), "gaussian" if method is PPO else "deterministic"
+    head = "gaussian" if method is PPO else "deterministic"
     first, key = jax.random.split(jax.random.key(1))
     model = actor_critic(env, width=32, depth=1, head=head, key=first)
     loss = method(env, EPISODES, min(env.horizon, LONGEST), discount=0.95)
@@ -171,62 +163,58 @@ def _by_actor_critic(name: str, method: type[PPO] | type[SHAC]) -> Any:
 
 def _fitted(loss: Any, model: Any, steps: int, key: Any) -> Any:
     """The model, trained by Adam."""
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(1.0),
-        optax.adam(optax.cosine_decay_schedule(0.01, steps)),
-    )
-    quiet: dict[str, Any] = {"progress": False, "throw": False}
-    return fit(loss, model, optimiser, steps, key=key, **quiet).model
+    adam = optax.adam(optax.cosine_decay_schedule(0.01, steps))
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), adam)
+    options: Any = dict(key=key, progress=False, throw=False)
+    return fit(loss, model, optimiser, steps, **options).model
 
 
-FAMILIES: dict[str, dict[str, Callable[[str], Any]]] = {
+FAMILIES: dict[str, dict[str, Callable[[str, Environment], Any]]] = {
     "Feedback": {
-        "zero": lambda name: controllers.Zero(task_of(name).control_size),
+        "zero": lambda name, env: controllers.Zero(env.control_size),
         "PID": _following,
-        "LQR": lambda name: _regulator(name, controllers.LQR),
-        "FiniteHorizonLQR": lambda name: _regulator(
-            name, controllers.FiniteHorizonLQR, horizon=task_of(name).horizon
+        "LQR": lambda name, env: _regulator(name, env, controllers.LQR),
+        "FiniteHorizonLQR": lambda name, env: _regulator(
+            name, env, controllers.FiniteHorizonLQR, horizon=env.horizon
         ),
-        "HInfinity": lambda name: _regulator(name, controllers.HInfinity),
+        "HInfinity": lambda name, env: _regulator(name, env, controllers.HInfinity),
     },
     "Online learning": {
-        "GPC": lambda name: _learning(name, controllers.gpc),
-        "Adaptive": lambda name: controllers.Adaptive(agent_of(name, "GPC")),
-        "NeuralGPC": lambda name: _learning(
-            name, controllers.neural_gpc, key=jax.random.key(0)
+        "GPC": lambda name, env: _learning(name, env, controllers.gpc),
+        "Adaptive": lambda name, env: controllers.Adaptive(agent_of(name, "GPC")),
+        "NeuralGPC": lambda name, env: _learning(
+            name, env, controllers.neural_gpc, key=jax.random.key(0)
         ),
-        "DRC": lambda name: _learning(name, controllers.drc),
-        "SFC": lambda name: _learning(name, controllers.sfc),
-        "DSC": lambda name: _learning(name, controllers.dsc),
-        "BPC": lambda name: controllers.BPC(
-            task_of(name).dynamics, agent_of(name, "LQR")
-        ),
+        "DRC": lambda name, env: _learning(name, env, controllers.drc),
+        "SFC": lambda name, env: _learning(name, env, controllers.sfc),
+        "DSC": lambda name, env: _learning(name, env, controllers.sfc, double=True),
+        "BPC": lambda name, env: controllers.BPC(env.dynamics, agent_of(name, "LQR")),
     },
     "Planning": {
-        "MPC": lambda name: _receding(name, ILQR, max_iterations=8),
-        "MPPI": lambda name: _receding(name, MPPI, samples=128, iterations=3),
-        "CEM": lambda name: _receding(name, CEM, samples=128, iterations=3),
+        "MPC": lambda name, env: _receding(name, env, ILQR, max_iterations=8),
+        "MPPI": lambda name, env: _receding(name, env, MPPI, samples=128, iterations=3),
+        "CEM": lambda name, env: _receding(name, env, CEM, samples=128, iterations=3),
     },
     "Training": {
-        "affine": lambda name: _by_gradient(name, mlp_policy, width=1, depth=0),
-        "MLP": lambda name: _by_gradient(name, mlp_policy, width=32, depth=1),
-        "GRU": lambda name: _by_gradient(name, _gru),
-        "SHAC": lambda name: _by_actor_critic(name, SHAC),
-        "PPO": lambda name: _by_actor_critic(name, PPO),
+        "affine": lambda name, env: _by_gradient(env, mlp_policy, width=1, depth=0),
+        "MLP": lambda name, env: _by_gradient(env, mlp_policy, width=32, depth=1),
+        "GRU": lambda name, env: _by_gradient(env, _gru),
+        "SHAC": lambda name, env: _by_actor_critic(env, SHAC),
+        "PPO": lambda name, env: _by_actor_critic(env, PPO),
     },
 }
-"""What is compared: how each controller is made for the task of a name."""
+"""The methods by family: each makes a controller for the task of a name."""
 
 
 @functools.cache
 def agent_of(name: str, method: str) -> Any:
     """The controller, designed at the equilibrium or trained.
 
-    **Raises:** `Unsuitable` if it needs what the task has not got.
+    **Raises:** `Unsuitable` if the task lacks what the method needs.
     """
     (maker,) = (family[method] for family in FAMILIES.values() if method in family)
     try:
-        return maker(name)
+        return maker(name, task_of(name))
     except (ValueError, RuntimeError) as error:
         raise Unsuitable(str(error)) from error
 
@@ -244,17 +232,15 @@ PUMPED = ("mountain_car", "mountain_car_discrete")
 
 
 def _planned(env: Environment, guides: list[Any], key: Any) -> Any:
-    """The controls that iLQR finds for a run whose start and disturbances it knows,
-    from no control and from what each of the guides does, if they cost less than that.
-    """
+    """The best controls of iLQR for a known start and known disturbances, from zero
+    control and from each of the guides; or those of a guide, if they cost less."""
     best, least = None, np.inf
     for agent in (Zero(env.control_size), *guides):
         run: Any = rollout(env, agent, key=key, throw=False)
         guess = jnp.nan_to_num(run.controls)
-        w = run.disturbances if env.disturbance_size else None
-        options: Any = dict(w=w, bounds=env.control_bounds, throw=False)
-        problem = env.dynamics, env.cost, run.states[0], guess
-        plan = ilqr(*problem, max_iterations=100, **options)
+        options: Any = dict(bounds=env.control_bounds, max_iterations=100, throw=False)
+        options["w"] = run.disturbances if env.disturbance_size else None
+        plan = ilqr(env.dynamics, env.cost, run.states[0], guess, **options)
         for controls in (guess, plan.controls):
             cost = float(_cost(env, OpenLoop(controls), key))
             if np.isfinite(cost) and cost < least:
@@ -284,14 +270,14 @@ def _costs(env: Environment, agent: Any, keys: Any) -> Any:
 
 @functools.cache
 def _batch(task: str, method: str, block: int) -> tuple[list[float], float | None]:
-    """The costs of a block of seeds, and microseconds a step of one of them."""
+    """The costs of a block of seeds, and microseconds per step of one of them."""
     env = task_of(task)
     seeds = range(block * BATCH, (block + 1) * BATCH)
     keys = jax.vmap(jax.random.key)(jnp.array(seeds))
     if method == "plan":
         guides = [agent for name in GUIDES if (agent := _suited(task, name))]
         if task in PUMPED:
-            guides.append(Pump(jnp.ones(1)))
+            guides.append(EnergyPumping(jnp.ones(1)))
         plans = [_planned(env, guides, key) for key in keys]
         pairs = zip(plans, keys, strict=True)
         return [float(_cost(env, plan, key)) for plan, key in pairs], None
@@ -309,7 +295,7 @@ def _batch(task: str, method: str, block: int) -> tuple[list[float], float | Non
 @experiment.parametrize("method", METHODS)
 @experiment.seeds(BATCH)
 def scoreboard(task: str, method: str, seed: int) -> dict[str, Any]:
-    """The cost of an episode, and microseconds a step."""
+    """The cost of an episode, and microseconds per step."""
     try:
         costs, speed = _batch(task, method, seed // BATCH)
     except Unsuitable as error:

@@ -72,7 +72,7 @@ def spread_starts(environment: Environment) -> Environment:
 
 @functools.lru_cache
 def _optimiser(steps: int) -> optax.GradientTransformation:
-    """One object for each number of steps, so that a second seed does not compile."""
+    """Adam with cosine decay; cached, because `fit` compiles anew for a new one."""
     return optax.adam(optax.cosine_decay_schedule(0.01, steps))
 
 

@@ -200,6 +200,11 @@ class AbstractSystem(AbstractPlant):
         return own_diffusion or cls.noise is not AbstractSystem.noise
 
     @property
+    def projects_state(self) -> bool:
+        """Whether the class has a `project` of its own."""
+        return type(self).project is not AbstractSystem.project
+
+    @property
     def noise(self) -> Noise:
         """`"brownian"` with a `diffusion`; else `None` with `disturbance_names`, and
         `"additive"` without."""

@@ -5,15 +5,14 @@ from dataclasses import KW_ONLY
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import as_vector, check_count, check_key, check_matrices, checked_names
 from .._module import (
-    as_module,
     function_field,
     indexed_names,
+    mlp,
     names_of,
     parameter,
     weight,
@@ -241,16 +240,10 @@ class NeuralSystem(AbstractSystem):
         check_key(key, where)
         self.state_names = names_of(states, "x", "states", where)
         self.control_names = names_of(controls, "u", "controls", where)
-        n = len(self.state_names)
-        self.network = eqx.nn.MLP(
-            n + len(self.control_names),
-            n,
-            check_count(width, "width", where),
-            check_count(depth, "depth", where, least=0),
-            as_module(activation),
-            as_module(jax.nn.identity),
-            key=key,
-        )
+        n, m = len(self.state_names), len(self.control_names)
+        width = check_count(width, "width", where)
+        depth = check_count(depth, "depth", where, least=0)
+        self.network = mlp(n + m, n, width, depth, activation, key=key)
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         return self.network(jnp.concatenate([x, u])).astype(x.dtype)

@@ -3,7 +3,6 @@
 from . import sysid as sysid
 from ._actor_critic import actor_critic as actor_critic, ActorCritic as ActorCritic
 from ._costs import (
-    Attack as Attack,
     expected_cost as expected_cost,
     scored_cost as scored_cost,
     worst_case as worst_case,
@@ -14,7 +13,7 @@ from ._gradient_estimators import (
     EvolutionStrategies as EvolutionStrategies,
     LikelihoodRatio as LikelihoodRatio,
 )
-from ._loss import AbstractSurrogate as AbstractSurrogate
 from ._ppo import PPO as PPO
 from ._record import History as History
 from ._shac import SHAC as SHAC
+from ._steps import AbstractSurrogate as AbstractSurrogate

@@ -24,7 +24,7 @@ from ..controllers import Categorical, MLP, mlp_policy, Standardise
 from ..environments import Environment
 from ..simulation import rollout
 from ._costs import nan_if_failed
-from ._loss import AbstractSurrogate
+from ._steps import AbstractSurrogate
 
 
 class ActorCritic(eqx.Module):
@@ -109,8 +109,8 @@ def actor_critic(
 
     Both are given `environment.encode(y)`, standardised by what training sees. The last
     layers begin a hundred times smaller than usual: that of the policy near the middle
-    of the bounds, and that of the critic flat, because the slope of an
-    estimate that has learned nothing would lead a policy that follows it astray.
+    of the bounds, and that of the critic flat, because the gradient of an untrained
+    critic is misleading.
 
     **Arguments:**
 
@@ -178,15 +178,15 @@ class Episodes(NamedTuple):
     controls: Float[Array, "*batch steps m"]
     costs: Float[Array, "*batch steps"]
     valid: Bool[Array, "*batch steps"]
-    """Whether each step was before the end of its episode."""
+    """True for the steps before the end of the episode."""
     continues: Any
-    """Whether something follows each step."""
+    """False for the last step of an episode."""
     following: Any
     """The cost to go after each step: V there, or the final cost of its episode."""
     advantages: Float[Array, "*batch steps"]
     total_cost: Any
     targets: Float[Array, "*batch steps"]
-    """What V should be at each observation."""
+    """The regression targets of V."""
     log_prob: Any = None
 
 
@@ -208,10 +208,10 @@ class AbstractActorCriticLoss(AbstractSurrogate):
     def __check_init__(self):
         where = type(self).__name__
         check_instance(self.environment, Environment, "environment", where)
-        check_count(self.batch, "batch", where)
-        check_count(self.horizon, "horizon", where)
-        check_range(self.discount, "discount", where, 0, 1)
-        check_range(self.decay, "decay", where, 0, 1)
+        for name in ("batch", "horizon"):
+            check_count(getattr(self, name), name, where)
+        for name in ("discount", "decay"):
+            check_range(getattr(self, name), name, where, 0, 1)
         check_range(self.value_weight, "value_weight", where)
         check_bool(self.bootstrap, "bootstrap", where)
 
@@ -231,7 +231,9 @@ class AbstractActorCriticLoss(AbstractSurrogate):
     def _value_errors(
         self, model: ActorCritic, runs: Episodes
     ) -> Float[Array, "*batch steps"]:
-        """How far the critic's output is from what it should be, in its own scale."""
+        """The errors of the critic's raw output."""
+        # In the scale of the network's own output, so that the learning rate does not
+        # depend on that of the cost.
         raw = jax.vmap(jax.vmap(model.raw))(runs.times, runs.observations)
         return raw - (runs.targets - model.shift) / model.scale
 
@@ -249,48 +251,29 @@ class AbstractActorCriticLoss(AbstractSurrogate):
         observed = observed + jnp.concatenate([noise, jnp.zeros_like(noise[:1])])
         values = jax.vmap(model.value)(run.times, observed)
         following, values = values[1:], values[:-1]
+        # Nothing follows an end but the final cost; beyond a cut V stands for the rest.
         if not self.bootstrap:
             following = following.at[-1].set(run.final_cost)
         following = jnp.where(run.terminated, run.final_cost, following)
         steps = jnp.arange(horizon)
         continues = ~run.terminated & (self.bootstrap | (steps < horizon - 1))
         valid = steps < run.length
+        # Generalised advantage estimation (Schulman et al., 2016), in cost:
+        # A_k = delta_k + discount decay A_{k+1}, from the temporal-difference errors
+        # delta_k = c_k + discount V_{k+1} - V_k.
         errors = costs + self.discount * following - values
         errors = jnp.where(valid, errors, 0)
-        advantages = _advantages(errors, continues, self.discount, self.decay)
-        return Episodes(
-            times=run.times[:-1],
-            observations=run.observations,
-            controls=run.controls,
-            costs=costs,
-            valid=valid,
-            continues=continues,
-            following=following,
-            advantages=advantages,
-            targets=advantages + values,
-            total_cost=run.total_cost,
-        )
 
+        def backward(later, inputs):
+            error, continues = inputs
+            now = error + self.discount * self.decay * jnp.where(continues, later, 0)
+            return now, now
 
-def _advantages(
-    errors: Float[Array, " steps"],
-    continues: Bool[Array, " steps"],
-    discount: RealScalar,
-    decay: RealScalar,
-) -> Float[Array, " steps"]:
-    """The generalised advantage estimate of each step of one episode,
-
-    `A_k = delta_k + g lambda A_{k+1}` with `delta_k = c_k + g V_{k+1} - V_k`, the
-    temporal-difference errors.
-    """
-
-    def back(later, inputs):
-        error, continues = inputs
-        now = error + discount * decay * jnp.where(continues, later, 0)
-        return now, now
-
-    start = jnp.zeros((), errors.dtype)
-    return lax.scan(back, start, (errors, continues), reverse=True)[1]
+        zero = jnp.zeros((), errors.dtype)
+        _, advantages = lax.scan(backward, zero, (errors, continues), reverse=True)
+        record = run.times[:-1], run.observations, run.controls, costs
+        record = *record, valid, continues, following
+        return Episodes(*record, advantages, run.total_cost, advantages + values)
 
 
 class Moments(NamedTuple):
@@ -302,17 +285,19 @@ class Moments(NamedTuple):
 
     @staticmethod
     def empty(like: Array) -> "Moments":
-        """Of no vectors yet."""
+        """The moments of no vectors."""
         zero = jnp.zeros_like(like)
         return Moments(jnp.zeros((), like.dtype), zero, zero)
 
     def joined(self, values: Array, valid: Array) -> "Moments":
-        """With more rows, of which some count."""
+        """The moments with more rows, those that are `valid`."""
         known = valid.reshape(-1, *(1,) * (values.ndim - 1))
         n = jnp.sum(valid).astype(self.count.dtype)
         mean = jnp.sum(jnp.where(known, values, 0), 0) / jnp.maximum(n, 1)
         squares = jnp.sum(jnp.where(known, (values - mean) ** 2, 0), 0)
         total = jnp.maximum(self.count + n, 1)
+        # Chan, Golub and LeVeque's rule for two samples, 1983: no small difference of
+        # large sums of squares is taken.
         gap = mean - self.mean
         return Moments(
             self.count + n,
@@ -324,6 +309,7 @@ class Moments(NamedTuple):
     def std(self) -> Array:
         """The standard deviation, 1 where it is negligible."""
         variance = self.squares / jnp.maximum(self.count, 1)
+        # A feature that does not move is left as it is, and not blown up.
         some = variance > 1e-8
         return jnp.where(some, jnp.sqrt(jnp.where(some, variance, 1)), 1)
 
@@ -336,12 +322,12 @@ class Statistics(NamedTuple):
 
     @staticmethod
     def empty(model: ActorCritic, dtype: Any) -> "Statistics":
-        """Of no observations yet."""
+        """The statistics of no observations."""
         features = [Moments.empty(one.mean) for one in parts_of(model, Standardise)]
         return Statistics(features, Moments.empty(jnp.zeros((), dtype)))
 
     def updated(self, model: ActorCritic, runs: Episodes) -> "Statistics":
-        """With the valid ones of more observations and targets."""
+        """The statistics with the valid observations and targets of more episodes."""
         rows = runs.observations.reshape(-1, runs.observations.shape[-1])
         valid, targets = runs.valid.reshape(-1), runs.targets.reshape(-1)
         parts = zip(parts_of(model, Standardise), self.features, strict=True)
@@ -352,10 +338,11 @@ class Statistics(NamedTuple):
         """The model, standardised by these moments."""
 
         def places(model):
-            parts = parts_of(model, Standardise)
-            each = [leaf for part in parts for leaf in (part.mean, part.std)]
-            return (*each, model.shift, model.scale)
+            each = [(part.mean, part.std) for part in parts_of(model, Standardise)]
+            return [
+                leaf for pair in (*each, (model.shift, model.scale)) for leaf in pair
+            ]
 
         new = [v for m in (*self.features, self.targets) for v in (m.mean, m.std)]
         new = [n.astype(o.dtype) for n, o in zip(new, places(model), strict=True)]
-        return eqx.tree_at(places, model, tuple(lax.stop_gradient(new)))
+        return eqx.tree_at(places, model, lax.stop_gradient(new))

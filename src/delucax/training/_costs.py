@@ -1,4 +1,4 @@
-"""The cost of closed loops: expected and scored, to train on, and at worst."""
+"""Losses from rollouts: expected cost, score-function cost, worst case."""
 
 from typing import Any, NamedTuple
 
@@ -7,7 +7,7 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._check import (
     as_number,
@@ -45,19 +45,12 @@ class _ExpectedCost(eqx.Module):
 
     def __call__(self, controller, key):
         check_key(key, "expected_cost")
+        options: Any = dict(checkpoint=self.checkpoint, truncate=self.truncate)
+        options |= dict(horizon=self.horizon, gradient_decay=self.gradient_decay)
+        options |= dict(keep=(), throw=False)
 
         def total(key):
-            trajectory = rollout(
-                self.environment,
-                controller,
-                key=key,
-                horizon=self.horizon,
-                keep=(),
-                checkpoint=self.checkpoint,
-                gradient_decay=self.gradient_decay,
-                truncate=self.truncate,
-                throw=False,
-            )
+            trajectory = rollout(self.environment, controller, key=key, **options)
             return nan_if_failed(trajectory, trajectory.total_cost)
 
         if self.batch == 1:
@@ -85,7 +78,7 @@ def expected_cost(
 
     - `environment`: the environment.
     - `batch`: the number B of rollouts, all at once under `jax.vmap`.
-    - `horizon`: steps a rollout; the environment's own by default.
+    - `horizon`: steps per rollout; the environment's own by default.
     - `checkpoint`: what the gradient stores, as in [`delucax.rollout`][]; `"step"` by
         default.
     - `gradient_decay`: damping of the gradient through time, as in
@@ -121,18 +114,16 @@ def expected_cost(
     where = "expected_cost"
     check_instance(environment, Environment, "environment", where)
     check_choice(checkpoint, ("step", "sqrt", None), "checkpoint", where)
-    decay = as_float_array(as_number(gradient_decay, "gradient_decay", where))
-    # A decay of 1 is known to leave the gradient alone, and compiles nothing.
+    decay = as_number(gradient_decay, "gradient_decay", where)
+    # A number 1 is known to leave the gradient alone, and compiles nothing.
     is_one = isinstance(gradient_decay, int | float) and gradient_decay == 1
+    decay = 1.0 if is_one else as_float_array(decay)
     horizon = environment.horizon if horizon is None else horizon
-    return _ExpectedCost(
-        environment=environment,
-        gradient_decay=1.0 if is_one else decay,
-        batch=check_count(batch, "batch", where),
-        horizon=check_count(horizon, "horizon", where),
-        checkpoint=checkpoint,
-        truncate=None if truncate is None else check_count(truncate, "truncate", where),
-    )
+    batch = check_count(batch, "batch", where)
+    horizon = check_count(horizon, "horizon", where)
+    if truncate is not None:
+        truncate = check_count(truncate, "truncate", where)
+    return _ExpectedCost(environment, decay, batch, horizon, checkpoint, truncate)
 
 
 class _ScoredCost(eqx.Module):
@@ -153,7 +144,6 @@ class _ScoredCost(eqx.Module):
         # its memory may depend on the weights, and keeps its gradient; the
         # observations, the controls and the costs do not.
         def act(t, y, state, applied, valid):
-            del applied
             u, after = controller(t, y, state)
             log_prob = controller.log_prob(t, y, state, lax.stop_gradient(u))
             return jnp.where(valid, log_prob, 0), after
@@ -163,8 +153,7 @@ class _ScoredCost(eqx.Module):
         *_, controller_key = self.environment.split_key(key)
         state = initial_state(controller, controller_key)
         scores = replay(controller, state, lax.stop_gradient((*record, valid)), act)
-        cost = nan_if_failed(run, run.total_cost)
-        return cost, {"log_prob": jnp.sum(scores)}
+        return nan_if_failed(run, run.total_cost), {"log_prob": jnp.sum(scores)}
 
 
 def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
@@ -220,38 +209,17 @@ def scored_cost(environment: Environment, *, horizon: int | None = None) -> Any:
 
 def nan_if_failed(trajectory: Trajectory, costs: Array) -> Array:
     """Costs of a run, NaN where it failed: those of a failed solve may look finite."""
+    # Costs that are not finite show it already, and stay as they are.
     kept = ~trajectory.failed | ~jnp.isfinite(trajectory.total_cost)
     return jnp.where(kept, costs, jnp.nan)
 
 
-class Attack(NamedTuple):
-    """The worst disturbances of a search.
+class _Attack(NamedTuple):
+    """The worst disturbances of a search, see `worst_case`."""
 
-    - `w`: shape `(horizon, k)`, for `rollout(..., w=w)`.
-    - `total_cost`: what they cost.
-    - `costs`: the total cost at each iteration from that start, shape
-      `(iterations + 1,)`.
-
-    [`delucax.training.worst_case`][] returns it.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-
-        env = dlx.make("pendulum")
-        feedback = dlx.controllers.Linear([[20.0, 5.0]])
-        options = dict(bound=0.01, x0=[0.1, 0.0], horizon=30, iterations=5)
-        search = dlx.training.worst_case
-        attack = search(env, feedback, key=jax.random.key(0), **options)
-        attack.w.shape, attack.costs
-        ```
-    """
-
-    w: Array
+    w: Float[Array, "horizon disturbances"]
     total_cost: Array
-    costs: Array
+    costs: Float[Array, " iterations"]
 
 
 def worst_case(
@@ -264,8 +232,8 @@ def worst_case(
     horizon: int | None = None,
     iterations: int = 20,
     starts: int = 8,
-) -> Attack:
-    r"""Bounded disturbances that cost a controller as much as a local search can find,
+) -> _Attack:
+    r"""Worst-case bounded disturbances of a closed loop, by local search,
 
     `max over w of the total cost, with |w_t| <= bound for each t`.
 
@@ -279,8 +247,8 @@ def worst_case(
     **Arguments:**
 
     - `environment`: the environment; its own disturbance is not used.
-    - `controller`: the controller under attack. A learner is attacked with all that it
-        would learn.
+    - `controller`: the controller under attack. The attack accounts for the adaptation
+        of a learner.
     - `key`: a random key, for the start of the search, of the rollout and of the
         controller.
     - `bound`: of the Euclidean norm of each `w_t`, a positive number.
@@ -289,7 +257,9 @@ def worst_case(
     - `iterations`: 20 by default.
     - `starts`: 8 by default.
 
-    **Returns:** [`delucax.training.Attack`][].
+    **Returns:** a named tuple: `w`, shape `(horizon, k)`, for `rollout(..., w=w)`;
+    `total_cost`, what they cost; and `costs`, the total cost at each iteration from
+    the start that led to them, shape `(iterations + 1,)`.
 
     **Raises:** `ValueError` on an argument of the wrong kind, shape or range, or if the
     environment takes no disturbance.
@@ -324,9 +294,8 @@ def worst_case(
     starts = check_count(starts, "starts", where)
     if x0 is not None:
         x0 = as_vector(x0, environment.state_size, "x0", where)
-    bound = as_float_array(bound)
-    sizes = horizon, iterations, starts
-    return _attack(environment, controller, key, bound, x0, *sizes)
+    options = as_float_array(bound), x0, horizon, iterations, starts
+    return _attack(environment, controller, key, *options)
 
 
 @eqx.filter_jit
@@ -342,6 +311,8 @@ def _attack(environment, controller, key, bound, x0, horizon, iterations, starts
         moved = (norm > 0) & jnp.isfinite(norm)
         return jnp.where(moved, bound * g / jnp.where(moved, norm, 1), old)
 
+    # One iteration of Frank and Wolfe: the maximum over the balls of the cost's linear
+    # model lies on the spheres, along the gradient.
     def step(carry, _):
         w, best, most = carry
         cost, g = jax.value_and_grad(total)(w)
@@ -354,9 +325,8 @@ def _attack(environment, controller, key, bound, x0, horizon, iterations, starts
         carry = w, w, jnp.asarray(-jnp.inf, like.dtype)
         (w, best, most), costs = lax.scan(step, carry, length=iterations)
         last = total(w)
-        better = last > most
         costs = jnp.append(costs, last)
-        return Attack(jnp.where(better, w, best), jnp.maximum(last, most), costs)
+        return _Attack(jnp.where(last > most, w, best), jnp.maximum(last, most), costs)
 
     shape = horizon, environment.disturbance_size
     like = jax.eval_shape(total, jnp.zeros(shape))

@@ -18,9 +18,8 @@ from .._check import check_at_most, check_count, check_key, is_concrete
 from .._results import choose, Result, RESULTS
 from .._typing import PRNGKey
 from ._gradient_estimators import analytic
-from ._loss import AbstractSurrogate
-from ._record import Checkpoint, checkpoint_path, describe_run, History, history_of
-from ._steps import CAPACITY, FAULTS, State, Steps
+from ._record import Checkpoint, checkpoint_path, COLUMNS, describe_run, History
+from ._steps import AbstractSurrogate, CAPACITY, FAULTS, State, Steps
 from ._trainable import partition_trainable
 
 
@@ -34,7 +33,7 @@ _WHERE = "fit"
 
 
 class Fitted(eqx.Module):
-    """What training leaves behind.
+    """The result of `fit`.
 
     **Attributes:**
 
@@ -88,9 +87,9 @@ def fit(
     """Train a model: one loop for policies, identification and learned simulators.
 
     At step k, with `key_k = fold_in(key, k)`: take the loss and its gradient with
-    respect to the trainable values, update them with the optimiser. What has a
-    constraint is moved in its unconstrained value, `z = unconstrain(value)`, and the
-    model sees `constrain(z)`, so that no step leaves the legal set.
+    respect to the trainable values, update them with the optimiser. Constrained values
+    are optimised in the unconstrained space, `z = unconstrain(value)`, and the model
+    gets `constrain(z)`, so that no step leaves the valid set.
 
     The steps run in compiled blocks, as one loop on the device. The result does not
     depend on the size of the block, and a run that was cut off and resumed from its
@@ -132,14 +131,14 @@ def fit(
     - `progress`: whether to show a bar with the loss; true by default.
     - `callbacks`: functions `(step, metrics)` called after each block, with the number
         of steps done and a dictionary of the last step's numbers (their mean over a
-        batch); none by default. The way to TensorBoard and the like.
+        batch), for example to log them to TensorBoard; none by default.
     - `checkpoint`: the path of a file to write the run to; none by default. If it is
         there, the run goes on from it.
     - `checkpoint_every`: steps between checkpoints, rounded up to whole blocks; 10
         blocks by default. The end of the run is always written.
     - `throw`: raise if the loss, its gradient or an update is NaN or infinite
-        (default); if false, stop there and look at `fitted.result`. One of a batch
-        stays as it was, while the others go on.
+        (default); if false, stop there and set `fitted.result`. In a batch only the
+        seed that failed is frozen.
 
     **Returns:** a [`delucax.training.Fitted`][]; of a batch, every array of the model,
     every column of the history but `step` and `seconds`, and the result have its axis.
@@ -187,8 +186,9 @@ def fit(
     steps = check_count(steps, "steps", _WHERE)
     block = check_count(block, "block", _WHERE)
     check_at_most(block, CAPACITY, "block", _WHERE)
-    seeds = _checked_seeds(key)
-    data, data_size, batch_size = _checked_data(data, batch_size)
+    model, data = _as_jax(model), _as_jax(data)
+    seeds = _checked_seeds(key, model)
+    size, batch_size = _checked_data(data, batch_size)
     if isinstance(loss, AbstractSurrogate) and data is not None:
         raise ValueError(
             f"{_WHERE}: data must be None where the loss is a surrogate, which makes "
@@ -204,22 +204,20 @@ def fit(
             f"{_WHERE}: gradient must be an estimator such as "
             f"delucax.training.analytic, got {gradient!r}."
         )
-    model = _as_jax(model)
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((model, key, data))):
         raise ValueError(
             f"{_WHERE}: model, key and data must hold values; fit cannot be called "
             "under jax.jit, jax.vmap or jax.grad. Train an ensemble with a batch of "
             "keys."
         )
-    _check_batched(model, seeds)
     assembly, values = partition_trainable(model, trainable, _WHERE)
     run = Steps(loss, gradient, optimiser, assembly, key, data, batch_size, seeds)
     state = run.start(model, values)
 
     saved, blocks, seconds = None, [], 0.0
     if checkpoint is not None:
-        options: Any = dict(steps=steps, batch_size=batch_size, data_size=data_size)
-        options |= dict(key=np.asarray(jr.key_data(key)).tolist())
+        options: Any = dict(steps=steps, batch_size=batch_size, data_size=size)
+        options["key"] = np.asarray(jr.key_data(key)).tolist()
         described = describe_run(model, assembly.constraints, *state[:3], **options)
         saved = Checkpoint(checkpoint_path(checkpoint), described)
         if resumed := saved.resume(state[:3]):
@@ -242,11 +240,10 @@ def fit(
             faults = np.asarray(state.fault)
             seconds = time.perf_counter() - began
             count = len(rows["loss"])
-            rows["step"] = np.arange(done, done + count)
-            rows["seconds"] = np.full(count, seconds)
-            blocks.append(rows)
+            times = dict(step=np.arange(count) + done, seconds=np.full(count, seconds))
+            blocks.append(rows | times)
             done += count
-            last = {name: float(np.mean(column[-1])) for name, column in rows.items()}
+            last = {name: float(np.mean(c[-1])) for name, c in blocks[-1].items()}
             bar.update(count)
             bar.set_postfix(loss=f"{last['loss']:.4g}", refresh=False)
             is_due = done == steps or done - written >= every
@@ -261,11 +258,14 @@ def fit(
         raise RuntimeError(_failure(faults, blocks[-1], done))
     outcome = lambda fault: choose(fault > 0, RESULTS.diverged, RESULTS.successful)
     each = outcome if seeds is None else jax.vmap(outcome)
-    return Fitted(run.finished(state), history_of(_joined(blocks)), each(state.fault))
+    metrics = _joined(blocks)
+    columns = {name: metrics.pop(name) for name in COLUMNS}
+    history = History(**columns, metrics=metrics)
+    return Fitted(run.finished(state), history, each(state.fault))
 
 
 def _failure(faults: np.ndarray, rows: dict[str, np.ndarray], done: int) -> str:
-    """What failed, in words."""
+    """The message of a failure."""
     remedy = "Pass throw=False to get the model as it was before that step."
     if faults.ndim:
         seed = int(np.argmax(faults > 0))
@@ -281,40 +281,35 @@ def _failure(faults: np.ndarray, rows: dict[str, np.ndarray], done: int) -> str:
     )
 
 
-def _checked_seeds(key: Any) -> int | None:
-    """The number of seeds in a batch of keys; `None` for one key."""
+def _checked_seeds(key: Any, model: PyTree) -> int | None:
+    """The number of seeds in a batch of keys, which each array of the model must have
+    an axis of in front; `None` for one key."""
     typed = eqx.is_array(key) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     raw = eqx.is_array(key) and key.dtype == jnp.uint32 and key.shape[1:] == (2,)
-    if typed and key.ndim == 1 or raw and key.ndim == 2:
-        return check_count(key.shape[0], "the number of keys", _WHERE)
-    check_key(key, _WHERE)
-    return None
-
-
-def _check_batched(model: PyTree, seeds: int | None) -> None:
-    """Raise unless each array of a model has the axis of a batch of keys in front."""
+    if not (typed and key.ndim == 1 or raw and key.ndim == 2):
+        check_key(key, _WHERE)
+        return None
+    seeds = check_count(key.shape[0], "the number of keys", _WHERE)
     for leaf in jax.tree.leaves(eqx.filter(model, eqx.is_array)):
-        if seeds is not None and leaf.shape[:1] != (seeds,):
+        if leaf.shape[:1] != (seeds,):
             raise ValueError(
                 f"{_WHERE}: each array of model must have the axis of the {seeds} keys "
                 "in front, as equinox.filter_vmap(make)(keys) gives it, got one of "
                 f"shape {leaf.shape}."
             )
+    return seeds
 
 
-def _checked_data(
-    data: PyTree, batch_size: Any
-) -> tuple[PyTree, int | None, int | None]:
-    """`(data as JAX arrays, number of rows, batch size)`."""
+def _checked_data(data: PyTree, batch_size: Any) -> tuple[int | None, int | None]:
+    """`(number of rows, batch size)`."""
     if data is None:
         if batch_size is not None:
             raise ValueError(f"{_WHERE}: batch_size needs data.")
-        return None, None, None
-    data = _as_jax(data)
-    shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(data)]
-    sizes = {shape[0] if shape else None for shape in shapes}
-    arrays = all(eqx.is_array(leaf) for leaf in jax.tree.leaves(data))
-    if not arrays or len(sizes) != 1 or sizes & {None, 0}:
+        return None, None
+    leaves = jax.tree.leaves(data)
+    shapes = [jnp.shape(leaf) for leaf in leaves]
+    sizes = {shape[:1] for shape in shapes}
+    if not all(map(eqx.is_array, leaves)) or len(sizes) != 1 or sizes & {(), (0,)}:
         raise ValueError(
             f"{_WHERE}: data must be arrays with a common leading axis, got shapes "
             f"{shapes}."
@@ -323,14 +318,13 @@ def _checked_data(
     if batch_size is not None:
         batch_size = check_count(batch_size, "batch_size", _WHERE)
         check_at_most(batch_size, size, "batch_size", _WHERE, "rows of data")
-    return data, size, batch_size
+    return size, batch_size
 
 
 def _as_jax(tree: PyTree) -> PyTree:
     """NumPy arrays as JAX ones: they would be static under `jit`."""
-    return jax.tree.map(
-        lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, tree
-    )
+    as_jax = lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf
+    return jax.tree.map(as_jax, tree)
 
 
 def _joined(blocks: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

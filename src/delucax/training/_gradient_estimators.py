@@ -1,4 +1,4 @@
-"""Estimators of the gradient of a loss."""
+"""Estimators of the gradient of a loss, and what a loss returns."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,6 @@ from jaxtyping import Array, PyTree
 from .._check import check_count, check_key
 from .._module import check_parameters, parameter, positive
 from .._typing import PRNGKey, Real
-from ._loss import cost_and_metrics
 from ._trainable import weights_of
 
 
@@ -70,7 +69,7 @@ def analytic(
 def gradient_of_weights(
     loss: Callable[[PyTree], tuple[Array, Any]], model: PyTree
 ) -> tuple[Any, PyTree]:
-    """What `loss(model)` returns beside its scalar, and the gradient of that."""
+    """The auxiliary value of `loss(model)`, and the gradient of its scalar."""
     weights, rest = weights_of(model)
     of = lambda weights: loss(eqx.combine(weights, rest))
     (_, value), gradient = eqx.filter_value_and_grad(of, has_aux=True)(weights)
@@ -149,19 +148,20 @@ class EvolutionStrategies(eqx.Module):
         noise = optax.tree.random_like(noise_key, weights, draw)
         # The unperturbed weights come first, so that the loss is traced once.
         sides = 2 if self.antithetic else 1
+        # theta, theta + sigma e_1, ..., and if antithetic theta - sigma e_1, ...
         ones, every = jnp.ones(n), jnp.arange(n)
         signs = jnp.concatenate([jnp.zeros(1), ones, -ones][: 1 + sides])
         directions = jnp.concatenate([jnp.zeros(1, int), *[every] * sides])
         keys = None
         if self.antithetic:
+            # Both of a pair share a key, so that the noise of the loss cancels.
             pairs = jr.split(pair_key, n)
             keys = jnp.concatenate([loss_key[None], pairs, pairs])
 
         def value_at(sign, direction, own_key):
             scale = self.sigma * sign
-            perturbed = jax.tree.map(
-                lambda w, e: (w + scale * e[direction]).astype(w.dtype), weights, noise
-            )
+            moved = lambda w, e: (w + scale * e[direction]).astype(w.dtype)
+            perturbed = jax.tree.map(moved, weights, noise)
             one_key = loss_key if own_key is None else own_key
             value = loss(eqx.combine(perturbed, rest), one_key)
             return cost_and_metrics(value, "EvolutionStrategies")
@@ -171,9 +171,8 @@ class EvolutionStrategies(eqx.Module):
             slopes = (costs[1 : n + 1] - costs[n + 1 :]) / (2 * n * self.sigma)
         else:
             slopes = (costs[1:] - costs[0]) / (n * self.sigma)
-        gradient = jax.tree.map(
-            lambda w, e: jnp.tensordot(slopes, e, 1).astype(w.dtype), weights, noise
-        )
+        along = lambda w, e: jnp.tensordot(slopes, e, 1).astype(w.dtype)
+        gradient = jax.tree.map(along, weights, noise)
         first = {name: metric[0] for name, metric in metrics.items()}
         return (costs[0], first) if first else costs[0], gradient
 
@@ -242,9 +241,7 @@ class LikelihoodRatio(eqx.Module):
         check_key(key, "LikelihoodRatio")
 
         def surrogate(model):
-            def draw(key):
-                return cost_and_metrics(loss(model, key), "LikelihoodRatio")
-
+            draw = lambda key: cost_and_metrics(loss(model, key), "LikelihoodRatio")
             costs, metrics = jax.vmap(draw)(jr.split(key, self.samples))
             if "log_prob" not in metrics:
                 raise ValueError(
@@ -252,13 +249,46 @@ class LikelihoodRatio(eqx.Module):
                     f"the metrics {sorted(metrics)}; delucax.training.scored_cost "
                     "makes such a loss of an environment."
                 )
-            costs = lax.stop_gradient(costs)
-            excess = costs
+            excess = costs = lax.stop_gradient(costs)
             if self.baseline:
                 # The mean of the others differs from that of all by this factor.
                 excess = (costs - jnp.mean(costs)) * (self.samples / (self.samples - 1))
             means = {name: jnp.mean(metric) for name, metric in metrics.items()}
             value = (jnp.mean(costs), lax.stop_gradient(means))
+            # Its gradient is the estimate; its own value means nothing.
             return jnp.mean(excess * metrics["log_prob"]), value
 
         return gradient_of_weights(surrogate, model)
+
+
+def cost_and_metrics(value: Any, where: str) -> tuple[Array, dict[str, Array]]:
+    """The scalar and the metrics of what a loss returned, checked."""
+    is_pair = isinstance(value, tuple | list) and len(value) == 2
+    cost, metrics = value if is_pair else (value, {})
+    if not isinstance(metrics, dict):
+        got = "an array" if eqx.is_array(metrics) else type(metrics).__name__
+        raise ValueError(
+            f"{where}: loss must return a scalar, or a scalar and a dictionary of "
+            f"metrics, got {got} for the metrics."
+        )
+    metrics = {name: _scalar(metric, where, name) for name, metric in metrics.items()}
+    cost = _scalar(cost, where, None)
+    if not jnp.issubdtype(cost.dtype, jnp.floating):
+        raise ValueError(
+            f"{where}: loss must return a floating-point scalar, got dtype "
+            f"{cost.dtype}."
+        )
+    return cost, metrics
+
+
+def _scalar(value: Any, where: str, name: str | None) -> Array:
+    what = "loss must return" if name is None else f"metric {name!r} must be"
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{where}: {what} a scalar, got {type(value).__name__}."
+        ) from None
+    if array.shape != ():
+        raise ValueError(f"{where}: {what} a scalar, got shape {array.shape}.")
+    return array

@@ -1,7 +1,7 @@
 """Proximal policy optimisation."""
 
 from dataclasses import KW_ONLY
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,12 +17,7 @@ from .._check import (
     check_positive,
     check_range,
 )
-from .._controller import (
-    AbstractStochasticPolicy,
-    check_stochastic,
-    initial_state,
-    replay,
-)
+from .._controller import check_stochastic, initial_state, replay
 from .._module import parameter
 from .._typing import PRNGKey, RealScalar
 from ..controllers import Gaussian
@@ -55,8 +50,8 @@ class PPO(AbstractActorCriticLoss):
     [`delucax.training.ActorCritic`][] whose policy draws, and the trained controller is
     `fitted.model.policy` (or `.policy.base`, without the noise).
 
-    An episode that its horizon cuts off is no end: the estimated cost to go stands for
-    what would follow. On termination nothing follows but the final cost. Each
+    Truncation at the horizon is not termination: the critic's estimate replaces the
+    cost of what would follow. On termination nothing follows but the final cost. Each
     [`delucax.controllers.Standardise`][] of the model, and the scale of the critic, are
     set by the batches before, so that the ratio begins at 1; one batch is
     run before the first step for them. A policy with a memory is trained on whole
@@ -71,7 +66,7 @@ class PPO(AbstractActorCriticLoss):
 
     - `environment`: the environment.
     - `batch`: episodes in a batch.
-    - `horizon`: steps an episode; the environment's own by default.
+    - `horizon`: steps per episode; the environment's own by default.
     - `discount`: of the cost to go, 0.99 by default.
     - `decay`: lambda of the advantage estimate, 0.95 by default.
     - `clip`: 0.2 by default.
@@ -79,8 +74,8 @@ class PPO(AbstractActorCriticLoss):
     - `minibatches`: in one pass, 8 by default; what does not fill the last is left out.
     - `value_weight`: 0.5 by default.
     - `entropy_weight`: 0 by default.
-    - `bootstrap`: whether the horizon is a cut (default); if false it is the end, and
-        the final cost is charged there.
+    - `bootstrap`: whether the horizon truncates (default); if false it terminates the
+        episode, with the final cost.
 
     **Raises:** `ValueError` on an argument of the wrong kind or range; when it is
     trained, if the model is not an `ActorCritic`, its policy does not draw, or a
@@ -128,7 +123,7 @@ class PPO(AbstractActorCriticLoss):
 
     def init(self, model: ActorCritic, key: PRNGKey) -> _Memory:
         check_instance(model, ActorCritic, "model", "PPO")
-        policy = _policy_of(model)
+        policy = check_stochastic(model.policy, "policy", "PPO")
         unbounded = isinstance(policy, Gaussian) and policy.bounds is None
         if unbounded and self.environment.control_bounds is not None:
             raise ValueError(
@@ -139,8 +134,7 @@ class PPO(AbstractActorCriticLoss):
         rows, total_cost = self._rows(model, key)
         count = rows.times.shape[0]
         check_at_most(self.minibatches, count, "minibatches", "PPO", "rows of a batch")
-        none = Statistics.empty(model, rows.costs.dtype)
-        statistics = none.updated(model, rows)
+        statistics = Statistics.empty(model, rows.costs.dtype).updated(model, rows)
         zero = jnp.zeros((), int)
         return _Memory(rows, jnp.arange(count), zero, statistics, total_cost)
 
@@ -159,45 +153,39 @@ class PPO(AbstractActorCriticLoss):
         # of `init` are in the memory already.
         again = (part == 0) & (step > 0)
         old = memory.statistics
-        statistics = lax.cond(
-            again, lambda: old.updated(model, memory.rows), lambda: old
-        )
-        memory = memory._replace(statistics=statistics)
+        updated = lambda: old.updated(model, memory.rows)
+        memory = memory._replace(statistics=lax.cond(again, updated, lambda: old))
         memory = lax.cond(part == 0, fresh, lambda: memory)
-        order = lax.cond(
-            part % self.minibatches == 0,
-            lambda: jr.permutation(order_key, memory.order),
-            lambda: memory.order,
-        )
+        shuffled = lambda: jr.permutation(order_key, memory.order)
+        is_pass = part % self.minibatches == 0
+        order = lax.cond(is_pass, shuffled, lambda: memory.order)
         return memory._replace(order=order, part=part)
 
     def __call__(
         self, model: ActorCritic, memory: _Memory, key: PRNGKey
     ) -> tuple[Array, dict[str, Array]]:
-        del key
         model = memory.statistics.applied_to(model)
         size = memory.order.shape[0] // self.minibatches
         start = memory.part % self.minibatches * size
         chosen = lax.dynamic_slice(memory.order, (start,), (size,))
         rows = jax.tree.map(lambda leaf: leaf[chosen], memory.rows)
-        log_prob, entropy = _scores(model, rows)
+        log_prob, entropy = _scores(model.policy, rows)
         weights = rows.valid / jnp.maximum(jnp.sum(rows.valid), 1)
-
-        def mean(values):
-            return jnp.sum(jnp.where(rows.valid, values, 0) * weights)
-
+        mean = lambda values: jnp.sum(jnp.where(rows.valid, values, 0) * weights)
         change = jnp.where(rows.valid, log_prob - rows.log_prob, 0)
-        ratio = jnp.exp(change)
+        ratio, advantages = jnp.exp(change), rows.advantages
         clipped = jnp.clip(ratio, 1 - self.clip, 1 + self.clip)
-        surrogate = mean(
-            jnp.maximum(ratio * rows.advantages, clipped * rows.advantages)
-        )
+        # The larger of the two, because these are costs: a pessimistic bound, without a
+        # slope where the ratio has gained all that the clip allows.
+        surrogate = mean(jnp.maximum(ratio * advantages, clipped * advantages))
         value_loss = mean(self._value_errors(model, rows) ** 2)
         bonus = mean(entropy)
         loss = surrogate + self.value_weight * value_loss - self.entropy_weight * bonus
         metrics = {
             "total_cost": memory.total_cost,
             "entropy": bonus,
+            # E[r - 1 - log r] is the divergence from the old policy, and no sample of
+            # it is negative (Schulman, 2020).
             "kl": mean(ratio - 1 - change),
             "clipped": mean((jnp.abs(ratio - 1) > self.clip).astype(ratio.dtype)),
             "value_loss": value_loss,
@@ -207,11 +195,14 @@ class PPO(AbstractActorCriticLoss):
     def _rows(self, model: ActorCritic, key: PRNGKey) -> tuple[Episodes, Array]:
         """The rows of a fresh batch, and its mean cost."""
         runs = self._episodes(model, key)
-        log_prob, _ = _scores(model, runs)
+        policy: Any = model.policy
+        log_prob, _ = _scores(policy, runs)
         count = jnp.maximum(jnp.sum(runs.valid), 1)
         mean = jnp.sum(jnp.where(runs.valid, runs.advantages, 0)) / count
         squares = jnp.where(runs.valid, (runs.advantages - mean) ** 2, 0)
         deviation = jnp.sqrt(jnp.sum(squares) / count)
+        # To unit variance, so that the step does not depend on the scale of the cost;
+        # 1e-8 is for batches without variance.
         rows = runs._replace(
             advantages=(runs.advantages - mean) / (deviation + 1e-8),
             log_prob=log_prob,
@@ -219,22 +210,17 @@ class PPO(AbstractActorCriticLoss):
             following=None,
             total_cost=None,
         )
-        if not _policy_of(model).has_memory:
+        # Without a memory each step is a row of its own, `(batch * horizon, 1, ...)`.
+        if not policy.has_memory:
             rows = jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[2:]), rows)
         return jax.tree.map(lax.stop_gradient, rows), jnp.mean(runs.total_cost)
 
 
-def _policy_of(model: ActorCritic) -> AbstractStochasticPolicy:
-    """The policy of a model, which must know the probability of what it draws."""
-    return check_stochastic(model.policy, "policy", "PPO")
-
-
-def _scores(model: ActorCritic, rows: Episodes) -> tuple[Array, Array]:
+def _scores(policy: Any, rows: Episodes) -> tuple[Array, Array]:
     """The log-probability and the entropy at each step of rows.
 
     With a memory, a row is an episode from its beginning.
     """
-    policy = _policy_of(model)
 
     def score(t, y, state, u):
         log_prob, entropy = policy.log_prob(t, y, state, u), policy.entropy(t, y, state)

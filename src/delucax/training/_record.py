@@ -24,7 +24,7 @@ _FORMAT = "delucax.training.fit 2"
 
 
 class History(eqx.Module):
-    """What was measured at each step, in NumPy arrays of one entry a step.
+    """The measurements of a training run, NumPy arrays with an entry per step.
 
     **Attributes:**
 
@@ -69,14 +69,10 @@ class History(eqx.Module):
 
         **Raises:** `KeyError` if there is no such column.
         """
-        if name in COLUMNS:
-            return getattr(self, name)
-        if name in self.metrics:
-            return self.metrics[name]
-        raise KeyError(
-            f"History: no column {name!r}; there are "
-            f"{', '.join((*COLUMNS, *self.metrics))}."
-        )
+        if name not in self._columns:
+            names = ", ".join(self._columns)
+            raise KeyError(f"History: no column {name!r}; there are {names}.")
+        return self._columns[name]
 
     def to_pandas(self) -> "pandas.DataFrame":
         """A table with a row for each step.
@@ -85,20 +81,15 @@ class History(eqx.Module):
 
         **Raises:** `ImportError` without pandas (`pip install "delucax[tables]"`).
         """
-        pd = extra("pandas", "tables")
+        return extra("pandas", "tables").DataFrame(self._columns)
 
-        return pd.DataFrame({name: self[name] for name in (*COLUMNS, *self.metrics)})
-
-
-def history_of(columns: dict[str, Any]) -> History:
-    """A history of its columns by name."""
-    columns = {name: np.asarray(column) for name, column in columns.items()}
-    metrics = {name: c for name, c in columns.items() if name not in COLUMNS}
-    return History(**{name: columns[name] for name in COLUMNS}, metrics=metrics)
+    @property
+    def _columns(self) -> dict[str, np.ndarray]:
+        return {name: getattr(self, name) for name in COLUMNS} | self.metrics
 
 
 class Checkpoint(NamedTuple):
-    """Where a run is saved, and the description that distinguishes it from others."""
+    """The file of a run, and the description that identifies the run."""
 
     path: Path
     run: dict[str, Any]
@@ -124,7 +115,14 @@ class Checkpoint(NamedTuple):
             ) from None
         for what in self.run | saved["run"]:
             old, new = saved["run"].get(what), self.run.get(what)
-            if not _agree(old, new):
+            if isinstance(old, tuple) and isinstance(new, tuple):
+                # To three digits, so that a run may resume on another machine, where
+                # the same model comes out a little different.
+                difference = np.abs(np.subtract(old, new))
+                same = np.all(difference <= 1e-3 * max(old[1], new[1]))
+            else:
+                same = old == new
+            if not same:
                 raise self._other_run(f"{what} is {old} there and {new} here")
         arrays = jax.tree.unflatten(jax.tree.structure(arrays), saved["arrays"])
         return arrays, saved["history"], saved["seconds"]
@@ -140,7 +138,7 @@ class Checkpoint(NamedTuple):
     def check_replay(
         self, saved: dict[str, np.ndarray], rows: dict[str, np.ndarray]
     ) -> None:
-        """Raise unless `rows`, the first steps taken again, are those that were saved.
+        """Raise unless `rows`, the first steps taken again, match those saved.
 
         A loss, a learning rate and the contents of data have no name to compare, but
         another one shows in the first steps.
@@ -152,8 +150,7 @@ class Checkpoint(NamedTuple):
                 f"{', '.join(sorted(columns))}"
             )
         for name in ("loss", "gradient_norm"):
-            new = rows[name]
-            old = saved[name][: len(new)]
+            old, new = saved[name][: len(rows[name])], rows[name]
             if not np.allclose(old, new, rtol=1e-4, atol=0):
                 raise self._other_run(
                     f"the {name} of its first steps is {old} and is {new} here, so "
@@ -195,7 +192,7 @@ def describe_run(
     memory: PyTree,
     **options: Any,
 ) -> dict[str, Any]:
-    """What distinguishes a run from another, by its name in an error message.
+    """The description that identifies a run, by the names used in error messages.
 
     The arrays that the run starts from are compared by their fingerprints.
     """
@@ -206,8 +203,11 @@ def describe_run(
             options[f"{name} {place}"] = _kind(leaf)
     for place, leaf in _placed(model):
         if is_float(leaf):
+            # Bounds may be infinite.
+            flat = np.nan_to_num(np.asarray(leaf, float).ravel(), posinf=1, neginf=-1)
+            projection = float(flat @ np.cos(np.arange(flat.size)))
             what = f"(projection, norm) of model{place} at the start"
-            options[what] = _fingerprint(leaf)
+            options[what] = projection, float(np.linalg.norm(flat))
     return options
 
 
@@ -218,20 +218,3 @@ def _placed(tree: PyTree) -> list[tuple[str, Any]]:
 
 def _kind(leaf: Any) -> str:
     return f"{leaf.dtype}{list(leaf.shape)}"
-
-
-def _fingerprint(leaf: Any) -> tuple[float, float]:
-    """The projection of an array on a fixed pattern, and its norm."""
-    # Bounds may be infinite.
-    values = np.nan_to_num(np.asarray(leaf, float).ravel(), posinf=1, neginf=-1)
-    projection = values @ np.cos(np.arange(values.size))
-    return float(projection), float(np.linalg.norm(values))
-
-
-def _agree(old: Any, new: Any) -> bool:
-    if isinstance(old, tuple) and isinstance(new, tuple):
-        # To three digits, so that a run may resume on another machine, where the same
-        # model comes out a little different.
-        difference = np.abs(np.subtract(old, new))
-        return bool(np.all(difference <= 1e-3 * max(old[1], new[1])))
-    return old == new

@@ -46,23 +46,23 @@ class SHAC(AbstractActorCriticLoss):
     `total_cost` and `value_loss`.
 
     Horizon, termination and `bootstrap` are as in [`delucax.training.PPO`][]. The
-    windows are those of whole episodes of the present policy, rather than one window a
-    step of episodes that an older one began: its clock, its disturbances and its memory
-    are those of the environment.
+    windows are those of whole episodes of the present policy, and not one window per
+    step of episodes that an older policy began, so that time, disturbances and the
+    memory of the policy are consistent within an episode.
 
     **Arguments:**
 
     - `environment`: the environment.
     - `batch`: episodes in a batch.
-    - `horizon`: steps an episode; the environment's own by default.
+    - `horizon`: steps per episode; the environment's own by default.
     - `window`: steps of a window, 16 by default; the last of an episode may be shorter.
     - `discount`: of the cost to go, 0.99 by default.
     - `decay`: lambda of the target, 0.95 by default.
     - `rate`: at which the target network follows, 0.2 by default; 1 for none.
     - `value_weight`: 1 by default.
     - `refresh`: steps between two batches that set the scales, 10 by default.
-    - `bootstrap`: whether the horizon is a cut (default); if false it is the end, and
-        the final cost is charged there.
+    - `bootstrap`: whether the horizon truncates (default); if false it terminates the
+        episode, with the final cost.
 
     **Raises:** `ValueError` on an argument of the wrong kind or range; when it is
     trained, if the model is not an `ActorCritic`.
@@ -106,8 +106,7 @@ class SHAC(AbstractActorCriticLoss):
 
     def init(self, model: ActorCritic, key: PRNGKey) -> _Memory:
         check_instance(model, ActorCritic, "model", "SHAC")
-        none = Statistics.empty(model, self.environment.dt.dtype)
-        statistics = none
+        statistics = none = Statistics.empty(model, self.environment.dt.dtype)
         # Twice: what the targets are depends on the scale of the critic.
         for one in jr.split(key):
             statistics = self._updated(none, statistics.applied_to(model), one)
@@ -117,16 +116,12 @@ class SHAC(AbstractActorCriticLoss):
         self, model: ActorCritic, memory: _Memory, step: Array, key: PRNGKey
     ) -> _Memory:
         new = eqx.filter(model.critic, is_float)
-        critic = jax.tree.map(
-            lambda old, new: (old + self.rate * (new - old)).astype(old.dtype),
-            memory.critic,
-            new,
-        )
+        follow = lambda old, new: (old + self.rate * (new - old)).astype(old.dtype)
+        critic = jax.tree.map(follow, memory.critic, new)
         again = (step > 0) & (step % self.refresh == 0)
         old, target = memory.statistics, _with_target(model, memory)
-        statistics = lax.cond(
-            again, lambda: self._updated(old, target, key), lambda: old
-        )
+        updated = lambda: self._updated(old, target, key)
+        statistics = lax.cond(again, updated, lambda: old)
         return _Memory(lax.stop_gradient(critic), statistics)
 
     def __call__(
@@ -139,12 +134,14 @@ class SHAC(AbstractActorCriticLoss):
         ends = (within == self.window - 1) | (steps == self.horizon - 1)
         bonus = jnp.where(ends | ~runs.continues, runs.following, 0)
         costs = jnp.where(runs.valid, runs.costs + self.discount * bonus, 0)
+        # The targets are data to the critic: it is not trained by moving them.
         error = self._value_errors(model, lax.stop_gradient(runs))
         # Over each episode first.
         actor = jnp.sum(self.discount**within * costs, axis=1)
         critic = jnp.sum(jnp.where(runs.valid, error**2, 0), axis=1)
         count = jnp.sum(runs.valid)
         value_loss = jnp.sum(critic) / count
+        # In the scale of the critic, so that one learning rate does for both.
         actor = jnp.sum(actor) / (count * model.scale)
         metrics = {"total_cost": jnp.mean(runs.total_cost), "value_loss": value_loss}
         return actor + self.value_weight * value_loss, lax.stop_gradient(metrics)
@@ -155,7 +152,6 @@ class SHAC(AbstractActorCriticLoss):
 
 def _with_target(model: ActorCritic, memory: _Memory) -> ActorCritic:
     """The model with the target network for a critic, held fixed."""
-    _, rest = eqx.partition(model.critic, is_float)
-    target = eqx.combine(lax.stop_gradient(memory.critic), rest)
+    target = eqx.combine(lax.stop_gradient(memory.critic), model.critic)
     model = eqx.tree_at(lambda m: m.critic, model, target)
     return memory.statistics.applied_to(model)

@@ -1,5 +1,6 @@
-"""The steps of [`delucax.training.fit`][], compiled in blocks."""
+"""Steps of [`delucax.training.fit`][] in compiled blocks; losses with a memory."""
 
+import abc
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,9 +14,9 @@ import optax
 from jaxtyping import Array, Int, PyTree
 
 from .._typing import PRNGKey
-from ._loss import AbstractSurrogate, cost_and_metrics
+from ._gradient_estimators import cost_and_metrics
 from ._record import COLUMNS
-from ._trainable import Assembly, strong
+from ._trainable import Assembly, strip_weak_type
 
 
 Values = dict[str, Array]
@@ -26,25 +27,106 @@ _ORDER = 2**32 - 1
 _MEMORY = 2**32 - 2
 CAPACITY = 1000
 """The most steps in a block. It is the size of the buffers whatever the block, so that
-the compiled program, and with it every last bit, is the same for all."""
+results are bitwise independent of `block`."""
 FAULTS = ("nothing", "loss", "gradient", "update")
-"""What is not finite, by the number that a block returns."""
+"""The name of the value that is not finite, by the number that a block returns."""
 
 
 class State(NamedTuple):
-    """What a step changes; of each seed, if there are several."""
+    """The state of the training loop; with an axis of seeds, if there are several."""
 
     values: Values
     optimiser: PyTree
     memory: PyTree
-    """That of a surrogate."""
+    """The memory of a surrogate."""
     order: tuple[Array, Array] | None
     """The rows of the data in the order of a pass, and the number of the pass."""
     fault: Int[Array, "*seeds"]
 
 
+class AbstractSurrogate(eqx.Module):
+    """A surrogate loss with a memory, such as that of PPO.
+
+    [`delucax.training.fit`][] makes the calls: `init` once; then at each step `update`,
+    which may run the model, and the loss `surrogate(model, memory, key)` of what is
+    remembered, whose gradient any estimator takes; in the end `finished`. All are pure,
+    so that the whole runs in the one loop, is `vmap`ped over seeds, and goes on from a
+    checkpoint. [`delucax.training.PPO`][] and [`delucax.training.SHAC`][] are two.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        import jax.numpy as jnp
+        import optax
+
+        class Steadied(dlx.training.AbstractSurrogate):
+            "Descend to 1, but never far from a running mean."
+
+            def init(self, model, key):
+                return model.K
+
+            def update(self, model, memory, step, key):
+                return 0.9 * memory + 0.1 * model.K
+
+            def __call__(self, model, memory, key):
+                return jnp.sum((model.K - 1) ** 2 + (model.K - memory) ** 2)
+
+        controller = dlx.controllers.Linear(jnp.zeros((1, 2)))
+        key = jax.random.key(0)
+        fitted = dlx.training.fit(Steadied(), controller, optax.adam(0.1), 10, key=key)
+        ```
+    """
+
+    @abc.abstractmethod
+    def init(self, model: PyTree, key: PRNGKey) -> PyTree:
+        """The memory before the first step.
+
+        **Arguments:** `model`: the model. `key`: a random key.
+
+        **Returns:** a pytree of arrays.
+        """
+
+    @abc.abstractmethod
+    def update(self, model: PyTree, memory: PyTree, step: Any, key: PRNGKey) -> PyTree:
+        """The memory for a step; no gradient is taken through it.
+
+        **Arguments:**
+
+        - `model`: the model before the step.
+        - `memory`: that of the step before.
+        - `step`: the number of the step, from 0.
+        - `key`: a random key.
+
+        **Returns:** a pytree of the same structure, shapes and dtypes.
+        """
+
+    @abc.abstractmethod
+    def __call__(self, model: PyTree, memory: PyTree, key: PRNGKey) -> Any:
+        """The loss.
+
+        **Arguments:**
+
+        - `model`: the model.
+        - `memory`: that of the step.
+        - `key`: a random key.
+
+        **Returns:** a scalar, or a scalar and a dictionary of scalar metrics.
+        """
+
+    def finished(self, model: PyTree, memory: PyTree) -> PyTree:
+        """The model with what was learned beside its weights; as it is by default.
+
+        **Arguments:** `model`: the model. `memory`: that of the last step.
+
+        **Returns:** the model.
+        """
+        return model
+
+
 class Steps(NamedTuple):
-    """What all steps of a run share."""
+    """The constants of a run."""
 
     loss: Callable[..., Any]
     gradient: Callable[..., Any]
@@ -60,20 +142,23 @@ class Steps(NamedTuple):
         state = _over_seeds(self.optimiser.init, self.seeds)(values)
         memory = order = None
         if isinstance(self.loss, AbstractSurrogate):
-            memory = _first_memory(self.loss, model, self.key, self.seeds)
+            begin = jax.tree_util.Partial(_first_memory, self.loss)
+            memory = _compiled_over_seeds(begin, self.seeds, model, self.key)
         shape = () if self.seeds is None else (self.seeds,)
         if self.batch_size is not None:
-            size = jax.tree.leaves(self.data)[0].shape[0]
+            size = len(jax.tree.leaves(self.data)[0])
             no_pass = jnp.full(shape, -1, jnp.int32)
             order = jnp.zeros((*shape, size), jnp.int32), no_pass
         fault = jnp.zeros(shape, jnp.int32)
-        return State(values, jax.tree.map(strong, state), memory, order, fault)
+        return State(values, jax.tree.map(strip_weak_type, state), memory, order, fault)
 
     def block(
         self, state: State, first: int, stop: int
     ) -> tuple[State, dict[str, np.ndarray]]:
-        """The steps from `first` up to `stop`, at most `CAPACITY` of them: the state
-        after them, and of each a row of metrics."""
+        """Take the steps from `first` up to `stop`, at most `CAPACITY`.
+
+        **Returns:** the state after them, and the metrics by name, an entry per step.
+        """
         state, outcome = self._compiled(state, jnp.asarray([first, stop], jnp.int32))
         rows, count = jax.device_get(outcome)
         return state, {name: column[:count] for name, column in rows.items()}
@@ -81,23 +166,24 @@ class Steps(NamedTuple):
     def finished(self, state: State) -> PyTree:
         """The trained model, with what a surrogate learned beside its weights."""
         model = self.assembly(state.values)
-        if isinstance(self.loss, AbstractSurrogate):
-            model = _finished(self.loss, model, state.memory, self.seeds)
-        return model
+        if not isinstance(self.loss, AbstractSurrogate):
+            return model
+        finished: Any = self.loss.finished
+        return _compiled_over_seeds(finished, self.seeds, model, state.memory)
 
     @eqx.filter_jit
     def _compiled(
         self, state: State, span: Int[Array, "2"]
     ) -> tuple[State, tuple[dict[str, Array], Array]]:
         def step_of_all(state, k):
-            stepped = _over_seeds(self._step, self.seeds, last=None)
-            return stepped(self.assembly, self.key, state, k)
+            step = lambda model, key, state: self._step(model, key, state, k)
+            return _over_seeds(step, self.seeds)(self.assembly, self.key, state)
 
         first, stop = span[0], span[1]
         # Traced once, here: the loop needs the shapes of a row before it begins.
         step: Any = eqx.filter_closure_convert(step_of_all, state, first)
-        row = step.out_struct[1]
-        rows = {n: jnp.zeros((CAPACITY, *s.shape), s.dtype) for n, s in row.items()}
+        empty = lambda entry: jnp.zeros((CAPACITY, *entry.shape), entry.dtype)
+        rows = jax.tree.map(empty, step.out_struct[1])
 
         def going(carry):
             state, _, count = carry
@@ -106,11 +192,8 @@ class Steps(NamedTuple):
         def body(carry):
             state, rows, count = carry
             state, row = step(state, first + count)
-            rows = {
-                name: lax.dynamic_update_index_in_dim(rows[name], row[name], count, 0)
-                for name in rows
-            }
-            return state, rows, count + 1
+            put = lambda rows, row: lax.dynamic_update_index_in_dim(rows, row, count, 0)
+            return state, jax.tree.map(put, rows, row), count + 1
 
         start = (state, rows, jnp.zeros((), jnp.int32))
         state, rows, count = lax.while_loop(going, body, start)
@@ -130,7 +213,10 @@ class Steps(NamedTuple):
         if isinstance(self.loss, AbstractSurrogate):
             own_key, memory_key = jr.split(own_key)
             memory = self.loss.update(assembly(values), memory, k, memory_key)
-            _check_memory(self.loss, before.memory, memory)
+            kind = lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf))
+            rule = "a memory of the shapes and dtypes that it was given,"
+            rule = f"{type(self.loss).__name__}.update must return {rule}"
+            _check_kept(kind, before.memory, memory, rule)
             arguments = (memory,)
 
         def of(values, key):
@@ -138,97 +224,63 @@ class Steps(NamedTuple):
 
         value, slope = self.gradient(of, values, own_key)
         cost, metrics = cost_and_metrics(value, _WHERE)
-        _check_gradient(slope, values)
-        slope = jax.tree.map(lambda g, v: g.astype(v.dtype), slope, values)
+        rule = "gradient must return (value, gradient) with a gradient like the values"
+        _check_kept(jnp.shape, values, slope, rule)
+        # A key in the state of an optimiser cannot be cast, and need not be.
+        cast = lambda x, old: x if x.dtype == old.dtype else x.astype(old.dtype)
+        slope = jax.tree.map(cast, slope, values)
         if taken := sorted(set(metrics) & set(COLUMNS)):
             raise ValueError(
                 f"{_WHERE}: metrics must not be called {', '.join(COLUMNS)}; got "
                 f"{taken[0]!r}."
             )
-        updates, after = optax.with_extra_args_support(self.optimiser).update(
-            slope,
-            before.optimiser,
-            values,
-            value=cost,
-            grad=slope,
-            value_fn=lambda v: cost_and_metrics(of(v, own_key), _WHERE)[0],
-        )
-        # Kept in the precision that it began with, or the loop would not close.
-        after = jax.tree.map(
-            lambda new, old: new if new.dtype == old.dtype else new.astype(old.dtype),
-            after,
-            before.optimiser,
-        )
+        # Line searches of Optax take the loss too.
+        value_of = lambda v: cost_and_metrics(of(v, own_key), _WHERE)[0]
+        given: Any = dict(value=cost, grad=slope, value_fn=value_of)
+        update = optax.with_extra_args_support(self.optimiser).update
+        updates, after = update(slope, before.optimiser, values, **given)
+        # The carry of a while loop must keep its dtypes.
+        after = jax.tree.map(cast, after, before.optimiser)
         moved = optax.apply_updates(values, updates)
         norm = _norm(slope)
         faulty = ~jnp.stack([*map(_is_finite, (cost, norm, moved))])
         fault = jnp.where(jnp.any(faulty), 1 + jnp.argmax(faulty), 0).astype(jnp.int32)
-        # A seed that failed stays as it was while the others go on.
+        # A seed that failed is frozen while the others go on.
         if self.seeds is not None:
             fault = jnp.where(before.fault == 0, fault, before.fault)
-        stepped: Any = jax.tree.map(
-            lambda new, old: jnp.where(fault == 0, new, old),
-            (moved, after, memory),
-            before[:3],
-        )
-        row = {"loss": strong(cost), "gradient_norm": norm, **metrics}
+        kept = lambda new, old: jnp.where(fault == 0, new, old)
+        stepped: Any = jax.tree.map(kept, (moved, after, memory), before[:3])
+        row = {"loss": strip_weak_type(cost), "gradient_norm": norm, **metrics}
         return State(*stepped, order=order, fault=fault), row
 
 
-@eqx.filter_jit
-def _first_memory(
-    loss: AbstractSurrogate, model: PyTree, key: PRNGKey, seeds: int | None
-) -> PyTree:
+def _first_memory(loss: AbstractSurrogate, model: PyTree, key: PRNGKey) -> PyTree:
     """The memory of a surrogate before the first step."""
-
-    def begin(model, key):
-        memory = loss.init(model, jr.fold_in(key, _MEMORY))
-        if not all(eqx.is_array(leaf) for leaf in jax.tree.leaves(memory)):
-            raise ValueError(
-                f"{_WHERE}: the memory of {type(loss).__name__} must be a pytree of "
-                f"arrays, got {memory!r}."
-            )
-        return jax.tree.map(strong, memory)
-
-    return _over_seeds(begin, seeds)(model, key)
+    memory = loss.init(model, jr.fold_in(key, _MEMORY))
+    if not all(eqx.is_array(leaf) for leaf in jax.tree.leaves(memory)):
+        raise ValueError(
+            f"{_WHERE}: the memory of {type(loss).__name__} must be a pytree of "
+            f"arrays, got {memory!r}."
+        )
+    return jax.tree.map(strip_weak_type, memory)
 
 
 @eqx.filter_jit
-def _finished(
-    loss: AbstractSurrogate, model: PyTree, memory: PyTree, seeds: int | None
-) -> PyTree:
-    return _over_seeds(loss.finished, seeds)(model, memory)
+def _compiled_over_seeds(function: Any, seeds: int | None, *arguments: PyTree) -> Any:
+    """A call of a pytree that is a function, compiled once for all of its structure."""
+    return _over_seeds(function, seeds)(*arguments)
 
 
-def _over_seeds(
-    function: Callable[..., Any], seeds: int | None, last: int | None = 0
-) -> Callable[..., Any]:
-    """`function` over a leading axis of every argument, or as it is for one seed.
-
-    `last` is `None` if the last argument does not have that axis.
-    """
-    if seeds is None:
-        return function
-    first = eqx.if_array(0)
-
-    def mapped(*arguments):
-        axes = [first] * (len(arguments) - 1) + [None if last is None else first]
-        return eqx.filter_vmap(function, in_axes=tuple(axes))(*arguments)
-
-    return mapped
+def _over_seeds(function: Callable[..., Any], seeds: int | None) -> Callable[..., Any]:
+    """`function` over a leading axis of every argument, or as it is for one seed."""
+    return function if seeds is None else eqx.filter_vmap(function)
 
 
-def _check_memory(loss: AbstractSurrogate, old: PyTree, new: PyTree) -> None:
-    """Raise unless an update keeps the structure, shapes and dtypes of a memory."""
-    shapes = [
-        jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf)), memory)
-        for memory in (old, new)
-    ]
-    if shapes[0] != shapes[1]:
-        raise ValueError(
-            f"{_WHERE}: {type(loss).__name__}.update must return a memory of the "
-            f"shapes and dtypes that it was given, {shapes[0]}, got {shapes[1]}."
-        )
+def _check_kept(kind: Callable[[Any], Any], old: Any, new: Any, rule: str) -> None:
+    """Raise unless `new` has the structure of `old`, and leaves of its kinds."""
+    expected, got = (jax.tree.map(kind, tree) for tree in (old, new))
+    if expected != got:
+        raise ValueError(f"{_WHERE}: {rule} {expected}, got {got}.")
 
 
 def _drawn_rows(
@@ -238,13 +290,12 @@ def _drawn_rows(
     rows, last_pass = order
     batches = rows.shape[0] // batch_size
     this_pass = k // batches
-    rows = lax.cond(
-        this_pass == last_pass,
-        lambda: rows,
-        lambda: jr.permutation(jr.fold_in(key, this_pass), rows.shape[0]).astype(
-            jnp.int32
-        ),
-    )
+
+    def redrawn():
+        own_key = jr.fold_in(key, this_pass)
+        return jr.permutation(own_key, rows.size).astype(rows.dtype)
+
+    rows = lax.cond(this_pass == last_pass, lambda: rows, redrawn)
     start = (k % batches) * batch_size
     return lax.dynamic_slice(rows, (start,), (batch_size,)), (rows, this_pass)
 
@@ -256,16 +307,5 @@ def _norm(tree: PyTree) -> Array:
 
 
 def _is_finite(tree: PyTree) -> Array:
-    return jnp.all(
-        jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)])
-    )
-
-
-def _check_gradient(gradient: PyTree, values: Values) -> None:
-    """Raise unless an estimator's gradient has the structure and shapes of `values`."""
-    expected, got = (jax.tree.map(jnp.shape, tree) for tree in (values, gradient))
-    if expected != got:
-        raise ValueError(
-            f"{_WHERE}: gradient must return (value, gradient) with a gradient like "
-            f"the values {expected}, got {got}."
-        )
+    leaves = jax.tree.leaves(tree)
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))

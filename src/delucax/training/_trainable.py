@@ -1,4 +1,4 @@
-"""Which leaves of a model move, and how the rest and their limits are kept."""
+"""Partition of a model into its trainable, unconstrained values and the rest."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -16,9 +16,9 @@ from .._module import AbstractConstraint, get_path, marked_leaves, path_string
 
 
 class Assembly(eqx.Module):
-    """A model with holes where its trainable leaves go.
+    """A model without its trainable leaves.
 
-    Calling it with the unconstrained values fills the holes with legal ones.
+    A call with the unconstrained values rebuilds the model.
     """
 
     leaves: list[Any]
@@ -27,28 +27,24 @@ class Assembly(eqx.Module):
     constraints: dict[str, AbstractConstraint]
 
     def __call__(self, values: dict[str, Array]) -> Any:
-        legal, leaves = self.constrained(values), list(self.leaves)
+        constrained, leaves = self.constrained(values), list(self.leaves)
         for index, path, is_weak in self.holes:
-            leaves[index] = _weak(legal[path]) if is_weak else legal[path]
+            value = constrained[path]
+            leaves[index] = _with_weak_type(value) if is_weak else value
         return jax.tree.unflatten(self.structure, leaves)
 
     def constrained(self, values: dict[str, Array]) -> dict[str, Array]:
-        """The legal values."""
-        limits = self.constraints
-        return {
-            path: limits[path].constrain(value) if path in limits else value
-            for path, value in values.items()
-        }
+        """The values that the model gets."""
+        limits = self.constraints.items()
+        return values | {path: limit.constrain(values[path]) for path, limit in limits}
 
 
 def partition_trainable(
     model: PyTree, trainable: Any, where: str
 ) -> tuple[Assembly, dict[str, Array]]:
     """`model` as its unconstrained trainable values, by path, and all the rest."""
-    entries = [
-        (path_string(path), leaf, role, constraint)
-        for path, leaf, role, constraint in marked_leaves(model)
-    ]
+    leaves_of = marked_leaves(model)
+    entries: list[Any] = [(path_string(path), *marks) for path, *marks in leaves_of]
     given: Mapping[str, AbstractConstraint | None] = {}
     if trainable is None:
         chosen = [role == "weight" and is_float(leaf) for _, leaf, role, _ in entries]
@@ -58,27 +54,27 @@ def partition_trainable(
     else:
         chosen = _chosen_by_filter(model, entries, trainable, where)
     if not any(chosen):
-        floats = [path for path, leaf, _, _ in entries if is_float(leaf)]
+        floats = [repr(path) for path, leaf, _, _ in entries if is_float(leaf)]
+        named = ", ".join(floats[:8]) or "none"
+        more = f" and {len(floats) - 8} more" if len(floats) > 8 else ""
         reason = "no field is marked weight()"
         if trainable is not None:
             reason = f"trainable={shortened(trainable)} picks no leaf"
         raise ValueError(
             f"{where}: nothing in {type(model).__name__} is trainable: {reason}. The "
-            f"floating-point arrays that could be are {_listed(floats)}."
+            f"floating-point arrays that could be are {named}{more}."
         )
     leaves, holes, constraints, values = [], [], {}, {}
-    for index, ((path, leaf, _, constraint), moves) in enumerate(
-        zip(entries, chosen, strict=True)
-    ):
-        leaves.append(None if moves else leaf)
-        if not moves:
+    for index, (path, leaf, _, constraint) in enumerate(entries):
+        leaves.append(None if chosen[index] else leaf)
+        if not chosen[index]:
             continue
         name = path or "the model"
         check_finite(leaf, name, where)
         for prefix, other in given.items():
             if other is not None and _is_under(path, prefix):
                 constraint = other
-        value = strong(leaf)
+        value = strip_weak_type(leaf)
         if constraint is not None:
             if not np.all(constraint.holds(leaf)):
                 raise ValueError(f"{where}: {name} must be {constraint}, got {leaf}.")
@@ -86,8 +82,8 @@ def partition_trainable(
             value = constraint.unconstrain(value)
         values[path] = value
         holes.append((index, path, leaf.weak_type))
-    structure = jax.tree.structure(model)
-    return Assembly(leaves, structure, tuple(holes), constraints), values
+    assembly = Assembly(leaves, jax.tree.structure(model), tuple(holes), constraints)
+    return assembly, values
 
 
 def weights_of(model: PyTree) -> tuple[PyTree, PyTree]:
@@ -109,16 +105,16 @@ def is_float(leaf: Any) -> bool:
     return eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
-def strong(leaf: Any) -> Any:
+def strip_weak_type(leaf: Any) -> Any:
     """An array without its weak type; anything else as it is.
 
-    An optimiser turns weak types strong after its first step, which would compile the
+    An optimiser returns strong types from its first step on, which would compile the
     loop again.
     """
     return lax.convert_element_type(leaf, leaf.dtype) if is_float(leaf) else leaf
 
 
-def _weak(value: Array) -> Array:
+def _with_weak_type(value: Array) -> Array:
     """`value` with a weak type, so that the model sees the kind of leaf that it had."""
     like = jnp.asarray(0.0)
     if value.dtype != like.dtype:
@@ -135,13 +131,11 @@ def _as_paths(
 ) -> Mapping[str, AbstractConstraint | None] | None:
     """From path to constraint, or `None` if `trainable` does not name paths."""
     if isinstance(trainable, str):
-        trainable = [trainable]
-    listed = isinstance(trainable, tuple | list | set | frozenset)
-    if not (listed or isinstance(trainable, Mapping)):
+        return {trainable: None}
+    several = isinstance(trainable, tuple | list | set | frozenset | Mapping)
+    if not several or not all(isinstance(path, str) for path in trainable):
         return None
-    if not all(isinstance(path, str) for path in trainable):
-        return None
-    if listed:
+    if not isinstance(trainable, Mapping):
         return dict.fromkeys(trainable)
     given = [c for c in trainable.values() if c is not None]
     named = [isinstance(c, AbstractConstraint) for c in given]
@@ -158,24 +152,24 @@ def _is_under(path: str, prefix: str) -> bool:
 
 
 def _chosen_by_path(model, entries, paths, where) -> list[bool]:
+    chosen = set()
     for prefix in paths:
         try:
             node = get_path(model, prefix)
         except ValueError as error:
             raise ValueError(f"{where}: trainable: {error}") from None
-        if not any(
-            _is_under(path, prefix) and is_float(leaf) for path, leaf, _, _ in entries
-        ):
+        under = [
+            p for p, leaf, *_ in entries if _is_under(p, prefix) and is_float(leaf)
+        ]
+        chosen.update(under)
+        if not under:
             got = f"dtype {node.dtype}" if eqx.is_array(node) else shortened(node)
             raise ValueError(
                 f"{where}: trainable: {prefix!r} must be a floating-point array, or "
                 f"hold some, got {got}. A number becomes one where its field is "
                 "declared with delucax.parameter() or delucax.weight()."
             )
-    return [
-        is_float(leaf) and any(_is_under(path, prefix) for prefix in paths)
-        for path, leaf, _, _ in entries
-    ]
+    return [path in chosen for path, *_ in entries]
 
 
 def _chosen_by_filter(model, entries, trainable, where) -> list[bool]:
@@ -203,8 +197,3 @@ def _chosen_by_filter(model, entries, trainable, where) -> list[bool]:
                 f"array: {shortened(leaf)}."
             )
     return [bool(moves) for moves in chosen]
-
-
-def _listed(paths: list[str], most: int = 8) -> str:
-    named = ", ".join(repr(path) for path in paths[:most]) or "none"
-    return named if len(paths) <= most else f"{named} and {len(paths) - most} more"

@@ -1,4 +1,4 @@
-"""Learners that start anew, each followed for as long as it does well."""
+"""A meta-learner over copies of a learner that start at different times."""
 
 from dataclasses import KW_ONLY
 from typing import Literal, NamedTuple
@@ -19,11 +19,11 @@ from ..._check import (
 )
 from ..._controller import AbstractController, AbstractLearner
 from ..._module import parameter
-from ..._typing import PRNGKey
+from ..._typing import PRNGKey, Real
 
 
 class AdaptiveState(NamedTuple):
-    """What is remembered of the experts.
+    """The state of the experts.
 
     - `experts`: their states, with a leading axis of slots.
     - `weights`: of each, 0 in an empty slot; they add up to 1.
@@ -59,9 +59,9 @@ class Adaptive(AbstractController):
     deviation of the losses lately, so that their scale does not matter; then a part
     `share` is dealt out evenly to all that live, so that each can rise quickly.
 
-    What is played is the mixture `u = sum_i p_i u_i`; or the control of one expert,
-    chosen anew only with the probability by which its weight has fallen, so that it is
-    seldom exchanged. With [`delucax.controllers.gpc`][] as base it is AdaGPC.
+    With `play="mix"` the control is `u = sum_i p_i u_i`. With `"switch"` it is that of
+    one expert, drawn again only with the probability by which its weight has fallen, so
+    that it seldom changes. With [`delucax.controllers.gpc`][] as base it is AdaGPC.
 
     **Arguments:**
 
@@ -96,8 +96,8 @@ class Adaptive(AbstractController):
     _: KW_ONLY
     slots: int = eqx.field(default=8, static=True)
     every: int = eqx.field(default=64, static=True)
-    rate: Array = parameter(0.5)
-    share: Array = parameter(0.02)
+    rate: Real = parameter(0.5)
+    share: Real = parameter(0.02)
     play: Literal["mix", "switch"] = eqx.field(default="mix", static=True)
 
     def __check_init__(self):
@@ -115,10 +115,8 @@ class Adaptive(AbstractController):
         if self.play == "switch":
             own, base_key = jr.split(check_key(key, "Adaptive.init"))
             chosen = jnp.zeros((), jnp.int32)
-        experts = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (self.slots, *leaf.shape)),
-            self.base.init(key=base_key),
-        )
+        copies = lambda leaf: jnp.broadcast_to(leaf, (self.slots, *leaf.shape))
+        experts = jax.tree.map(copies, self.base.init(key=base_key))
         first, zero = jnp.arange(self.slots) == 0, jnp.zeros(())
         return AdaptiveState(
             experts,
@@ -151,13 +149,15 @@ class Adaptive(AbstractController):
     ) -> AdaptiveState:
         """New weights, up to a factor, and perhaps another choice, after a step."""
         old, alive = state.weights, state.weights > 0
+        # An empty slot holds a stale state, whose loss may not be finite.
         losses = jnp.where(alive, losses, 0)
         played = old @ losses
+        # The mean of all losses at first, then an exponential one over `every` steps.
         fading = 1 / jnp.minimum(state.step + 1, self.every).astype(old.dtype)
         mean = state.mean + fading * (played - state.mean)
         variance = state.variance + fading * ((played - mean) ** 2 - state.variance)
         spread = jnp.sqrt(jnp.where(variance > 0, variance, 1))
-        # None falls by more than a factor at once, however bad it was.
+        # Clipped, to bound the decrease of a weight in one step.
         excess = jnp.clip((losses - played) / spread, -1, 1)
         new = jnp.where(alive, old * jnp.exp(-self.rate * excess), 0)
         state = state._replace(mean=mean, variance=variance)
@@ -183,13 +183,14 @@ class Adaptive(AbstractController):
         step, ends = state.step, state.ends
         is_birth, births = step % self.every == 0, jnp.maximum(step // self.every, 1)
         slot = jnp.argmin(ends)
+        # `births & -births` is the largest power of two that divides it.
         life = self.every * (4 * (births & -births) + 1)
         newborn = is_birth & (jnp.arange(self.slots) == slot)
         ends = jnp.where(newborn, step + life, ends)
         old = jax.tree.map(lambda leaf: leaf[slot], state.experts)
 
         def renewed(leaf, before, after):
-            # What a birth leaves as it is is not written: most of the state.
+            # Write the leaves that a birth changes alone: most stay as they are.
             if after is before:
                 return leaf
             mask = newborn.reshape((-1,) + (1,) * (leaf.ndim - 1))
@@ -201,10 +202,11 @@ class Adaptive(AbstractController):
         kept = alive & ~newborn
         weights = jnp.where(kept, state.weights, 0)
         weights = weights / jnp.sum(weights)
+        # Herbster and Warmuth's share: no weight falls below share / (number alive), so
+        # an expert that becomes the best leads after some log(1 / share) / rate steps.
         weights = (1 - self.share) * weights + self.share * (alive / jnp.sum(alive))
-        state = state._replace(
-            experts=experts, ends=ends, weights=weights.astype(state.weights.dtype)
-        )
+        weights = weights.astype(state.weights.dtype)
+        state = state._replace(experts=experts, ends=ends, weights=weights)
         if state.chosen is None:
             return state
         return self._rechosen(weights, jnp.where(kept[state.chosen], 1, 0), state)

@@ -1,5 +1,6 @@
 """Learning from the cost alone."""
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from ..._check import check_count, check_instance, check_key, check_step
 from ..._controller import AbstractController, Tally
 from ..._module import parameter
-from ..._typing import PRNGKey
+from ..._typing import PRNGKey, Real
 from ...dynamics import AbstractDynamics
 from ...math._norms import safe_norm
 from ._closed_loop import ClosedLoop, ClosedLoopState, in_first_responses, shift
@@ -21,7 +22,7 @@ from ._policy import LinearPolicy
 
 
 class BPCState(NamedTuple):
-    """What it remembers.
+    """The state of a `BPC`.
 
     - `loop`: of the plant and the base controller.
     - `theta`: what has been learned, and `optimiser`, the state of the optimiser.
@@ -42,8 +43,7 @@ class BPCState(NamedTuple):
 
 
 class BPC(AbstractController):
-    """The bandit perturbation controller, which is told the cost of each step and
-    nothing about how it came about,
+    """The bandit perturbation controller, which observes the scalar cost of each step,
 
     `u_t = base(y_t) + (theta_t + delta e_t) s`, `e_t` uniform on the unit sphere,
 
@@ -63,7 +63,7 @@ class BPC(AbstractController):
         [`delucax.controllers.LQR`][].
     - `memory`: the number of past values of the signal, 5 by default: each adds a
         dimension to search.
-    - `horizon`: how long a direction is held responsible, 5 by default.
+    - `horizon`: the number of steps whose directions enter the gradient, 5 by default.
     - `delta`: the size of the directions tried; by default 0.2 over the size of the
         first response of the observation to a unit of control.
     - `learning_rate`: scales the optimiser's step; by default 0.05 over the same size.
@@ -97,8 +97,8 @@ class BPC(AbstractController):
 
     loop: ClosedLoop
     policy: LinearPolicy
-    delta: Array = parameter()
-    learning_rate: Array = parameter()
+    delta: Real = parameter()
+    learning_rate: Real = parameter()
     optimiser: optax.GradientTransformation = eqx.field(static=True)
     window: int = eqx.field(static=True)
 
@@ -117,11 +117,9 @@ class BPC(AbstractController):
         where = "BPC"
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         memory = check_count(memory, "memory", where)
-        # A roll-out as long as it takes a control to show.
+        # Long enough for the response to a control to reach any state.
         loop = ClosedLoop(dynamics, base, dynamics.state_size, where, memory=memory)
-        scale = lambda given, name, units: in_first_responses(
-            loop, given, name, units, where
-        )
+        scale = functools.partial(in_first_responses, loop, where)
         start = jnp.zeros((dynamics.control_size, loop.feature_size), loop.dtype)
         self.loop = loop
         self.policy = LinearPolicy(start, scale(radius, "radius", RADIUS))
@@ -133,6 +131,11 @@ class BPC(AbstractController):
     def __check_init__(self):
         check_step(self.delta, "BPC", "delta")
         check_step(self.learning_rate, "BPC", "learning_rate")
+
+    @property
+    def learns_from_cost(self) -> bool:
+        """True: the cost is all that it observes."""
+        return True
 
     def init(self, *, key=None):
         own, base_key = jr.split(check_key(key, "BPC.init"))
@@ -165,21 +168,12 @@ class BPC(AbstractController):
         # The first cost has nothing to be compared with.
         off = jnp.where(state.steps > 0, cost - state.level, 0)
         size = state.theta.size
+        # The one-point estimate of Flaxman, Kalai and McMahan (2005): the mean of
+        # (d / delta) c(theta + delta e) e over the sphere is the gradient of c smoothed
+        # over the ball. A cost counts for all directions whose effect may still last.
         gradient = size / self.delta * off * jnp.sum(state.tried, axis=0)
-        theta, optimiser, refused = projected_step(
-            self.optimiser,
-            self.learning_rate,
-            self.policy.project,
-            gradient.astype(state.theta.dtype),
-            state.theta,
-            state.optimiser,
-            state.refused,
-        )
-        return state._replace(
+        return projected_step(self, gradient.astype(state.theta.dtype), state)._replace(
             loop=self.loop.applied(u, cost, state.loop),
-            theta=theta,
-            optimiser=optimiser,
-            refused=refused,
             level=state.level + (cost - state.level) / steps,
             steps=steps,
         )

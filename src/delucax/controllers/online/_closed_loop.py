@@ -28,7 +28,7 @@ _AFFINE = (Zero, Constant, Linear, LQR, LQI, LQG, HInfinity)
 """Controllers whose control and state depend on the observation by an affine map that
 is the same at all times."""
 _LEFT_OF_HORIZON, _HORIZONS = 0.03, (10, 1000)
-"""What is left of an impulse at the end of a roll-out, and the shortest and longest."""
+"""The residual of an impulse at the end of a roll-out, and the shortest and longest."""
 _LEFT_OF_MEMORY, _MEMORIES = 0.1, (10, 50)
 """The same of the default memory. A longer policy gains a little, and costs more to
 learn: under noise it is worse."""
@@ -48,7 +48,7 @@ class Tangents(NamedTuple):
 
 
 class ClosedLoopState(NamedTuple):
-    """What is remembered of the closed loop.
+    """The state of the closed loop.
 
     - `base`: the state of the base controller.
     - `t`, `y`, `u_base`: of the current step.
@@ -86,7 +86,7 @@ class ClosedLoop(eqx.Module):
     - `tangents`: the derivatives of a step, and `response`: that of the observation and
       of the base's control to an impulse; `None` where they change.
     - `first_response`: the size of the first change of the observation that a unit of
-      added control makes; `None` if the dynamics name no equilibrium.
+      added control makes; `None` if the dynamics define no equilibrium.
     - `filters`: shape `(f, memory)`, newest first; `None` for the values themselves.
     - `horizon`: the length of the roll-out.
     - `memory`: how many values of the signal are kept.
@@ -121,10 +121,8 @@ class ClosedLoop(eqx.Module):
         self.dynamics, self.base = dynamics, base
         self.observed = dynamics.observes_state
         self.nature = not self.observed if nature is None else nature
-        is_linear = isinstance(dynamics, LinearDynamics)
-        is_constant = (
-            is_linear and not dynamics.is_time_varying and isinstance(base, _AFFINE)
-        )
+        is_lti = isinstance(dynamics, LinearDynamics) and not dynamics.is_time_varying
+        is_constant = is_lti and isinstance(base, _AFFINE)
         if not is_constant and not self.observed:
             raise ValueError(
                 f"{where}: where the state is not observed, dynamics must be linear "
@@ -148,9 +146,14 @@ class ClosedLoop(eqx.Module):
         self.response = self.first_response = None
         if tangents is not None:
             first = jax.tree.map(lambda a: a if a.ndim == 2 else a[0], tangents)
-            response = _impulse_response(first, self.horizon)
-            self.first_response = _first_size(response[:, : dynamics.observation_size])
+            step = lambda z, _: (first.transition @ z, first.output @ z)
+            response = lax.scan(step, first.input, length=self.horizon)[1]
             self.response = response if is_constant else None
+            moved = response[:, : dynamics.observation_size]
+            sizes = jnp.sqrt(jnp.sum(moved**2, axis=(1, 2)))
+            # A control may take several steps to show: what is below is rounding.
+            slack = jnp.finfo(sizes.dtype).eps ** 0.5 * jnp.max(sizes)
+            self.first_response = sizes[jnp.argmax(sizes > slack)]
 
     def __check_init__(self):
         _check_control(self.dynamics, self.base, "ClosedLoop")
@@ -165,21 +168,20 @@ class ClosedLoop(eqx.Module):
 
     @property
     def dtype(self) -> Any:
-        """Of what is remembered."""
+        """The precision of the state."""
         arrays = jax.tree.leaves(eqx.filter(self.dynamics, eqx.is_inexact_array))
         return jnp.result_type(*arrays) if arrays else jnp.zeros(()).dtype
 
     @property
     def feature_size(self) -> int:
-        """Of the vector of features."""
+        """The size of the vector of features."""
         count = self.memory if self.filters is None else self.filters.shape[0]
         return count * self.dynamics.observation_size
 
     def init(self, key: Any, horizon: int) -> ClosedLoopState:
         """Before the first step; `horizon` is 0 without counterfactuals."""
         dynamics, dtype = self.dynamics, self.dtype
-        n, m = dynamics.state_size, dynamics.control_size
-        p = dynamics.observation_size
+        n, m, p = dynamics.state_size, dynamics.control_size, dynamics.observation_size
         base = self.base.init(key=key)
         q = n + _vector(base)[0].shape[0]
         zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
@@ -225,14 +227,15 @@ class ClosedLoop(eqx.Module):
     def _disturbance(self, state: ClosedLoopState) -> Float[Array, " n"]:
         """The last disturbance: the state less where the model went."""
         assert state.predicted is not None
+        # w_{t-1} = x_t - F(x_{t-1}, u_{t-1}), an angle by the shorter way.
         off = self.dynamics.difference(state.y, state.predicted)
         size = jnp.max(jnp.abs(state.y) + jnp.abs(state.predicted))
-        # Compiled twice, a step may round differently: of that nothing is learned.
+        # The same step compiled twice may differ in rounding, which is no disturbance.
         is_more = jnp.abs(off) > 4 * jnp.finfo(off.dtype).eps * size
         return jnp.where(state.started & is_more, off, 0)
 
     def _nature(self, state: ClosedLoopState) -> Float[Array, " p"]:
-        """The observation, had nothing been added to the base's control."""
+        """Nature's output: the observation under the base controller alone."""
         p = state.y.shape[0]
         assert state.forced is not None
         if self.tangents is None:
@@ -250,8 +253,12 @@ class ClosedLoop(eqx.Module):
         if predicted is not None:
             predicted, _ = self.dynamics.advance(state.t, state.y, u, None)
         if impulses is not None:
+            # The state after an impulse j steps ago is A_t ... A_{t-j+1} B_{t-j}: each
+            # is moved on by one step, so that no product is computed twice.
             impulses = shift(tangents.input, tangents.transition @ impulses)
         if forced is not None:
+            # With what was really applied, so that saturation does not look like a
+            # disturbance.
             forced = matvec(tangents.transition, forced) + matvec(tangents.input, v)
         return state._replace(
             base=self.base.applied(u, cost, state.base),
@@ -270,6 +277,9 @@ class ClosedLoop(eqx.Module):
     ) -> tuple[Float[Array, " p"], Float[Array, " m"]]:
         """The observation and control of this step, had `v` been added at it and
         `v_past` at the steps of the roll-out before, newest first."""
+        # Superposition: of a linear loop exact, else to first order about the true run.
+        # Only the difference from what was added counts, so that saturation and noise
+        # stay in.
         change = jnp.einsum("hom,hm->o", self.past(state), v_past - state.added)
         p = state.y.shape[0]
         return state.y + change[:p], state.u_base + change[p:] + v
@@ -289,7 +299,7 @@ def shift(new: Array, history: Array) -> Array:
 
 
 def in_first_responses(
-    loop: ClosedLoop, given: ArrayLike | None, name: str, units: float, where: str
+    loop: ClosedLoop, where: str, given: ArrayLike | None, name: str, units: float
 ) -> Any:
     """A step size or radius as given, or so many `units / first_response`: in units of
     the control that undoes what was observed."""
@@ -298,12 +308,10 @@ def in_first_responses(
         return given
     if loop.first_response is None:
         raise ValueError(
-            f"{where}: {name} must be given, for dynamics that name no equilibrium."
+            f"{where}: {name} must be given, for dynamics that define no equilibrium."
         )
-    responds = loop.first_response > 0
-    return jnp.where(
-        responds, units / jnp.where(responds, loop.first_response, 1), units
-    )
+    # Where a control never shows there is no unit; 1 keeps the quotient finite.
+    return units / jnp.where(loop.first_response > 0, loop.first_response, 1)
 
 
 def _check_control(
@@ -342,6 +350,7 @@ def _tangents(dynamics, base, t, x, state, v) -> Tangents:
         y = dynamics.observe(t, x)
         u, after = base(t, y, back(z[n:]))
         x_next, _ = dynamics.advance(t, x, u + v, None)
+        # The base learns what was applied, so that its anti-windup is part of the loop.
         after = base.applied(u + v, jnp.zeros((), x.dtype), after)
         z_next = jnp.concatenate([x_next, _vector(after)[0].astype(x.dtype)])
         return z_next, jnp.concatenate([y, u.astype(y.dtype)])
@@ -354,8 +363,8 @@ def _tangents(dynamics, base, t, x, state, v) -> Tangents:
 def _equilibrium_tangents(
     dynamics: AbstractDynamics, base: AbstractController
 ) -> Tangents | None:
-    """The derivatives at the operating point, at each time if they depend on it;
-    `None` if the dynamics name no such point."""
+    """The derivatives at the operating point, at each time if they depend on it; `None`
+    if the dynamics define no such point."""
 
     def at(t, x, u):
         state = base.init(key=None)
@@ -375,25 +384,25 @@ def _equilibrium_tangents(
 def _roll_out_length(radius: float | None, horizon: int | None, where: str) -> int:
     """As given, or until an impulse has faded; raise unless the base stabilises the
     plant."""
-    if horizon is not None:
-        horizon = check_count(horizon, "horizon", where)
+    given = None if horizon is None else check_count(horizon, "horizon", where)
     if radius is not None and not radius < 1:
         raise ValueError(
             f"{where}: base must stabilise dynamics, got a closed loop of spectral "
             f"radius {radius:.6g}."
         )
-    if horizon is not None:
-        return horizon
+    if given is not None:
+        return given
     if radius is None:
         raise ValueError(
-            f"{where}: horizon must be given where the closed loop cannot be seen: "
-            "inside a transformation of JAX, or of dynamics that name no equilibrium."
+            f"{where}: horizon must be given inside a transformation of JAX, or for "
+            "dynamics that define no equilibrium: its default needs the closed loop."
         )
     return _steps(radius, _LEFT_OF_HORIZON, *_HORIZONS)
 
 
 def _steps(radius: float, left: float, least: int, most: int) -> int:
     """After how many steps no more than a part `left` is left, between limits."""
+    # radius^steps = left.
     steps = math.log(left) / math.log(radius) if 0 < radius < 1 else 0
     return min(max(least, math.ceil(steps)), most)
 
@@ -406,22 +415,9 @@ def _spectral_radius(tangents: Tangents) -> float | None:
     q, m = tangents.input.shape[-2:]
     transitions = np.asarray(tangents.transition, float).reshape(-1, q, q)
     reached = np.any(np.asarray(tangents.input).reshape(-1, q, m) != 0, axis=(0, 2))
+    # The states that the added control reaches, as a graph: q sweeps suffice.
     for _ in range(q):
         reached = reached | np.any(transitions[..., reached] != 0, axis=(0, 2))
-    # Numbers that a base only carries along, such as a covariance, do not fade.
+    # States of the base that no control moves, such as a covariance, do not decay.
     parts = transitions[:, reached][:, :, reached]
     return max(np.max(np.abs(np.linalg.eigvals(part)), initial=0) for part in parts)
-
-
-def _first_size(moved: Array) -> Array:
-    """The size of the first response that is not zero."""
-    sizes = jnp.sqrt(jnp.sum(moved**2, axis=(1, 2)))
-    slack = jnp.finfo(sizes.dtype).eps ** 0.5 * jnp.max(sizes)
-    return sizes[jnp.argmax(sizes > slack)]
-
-
-def _impulse_response(tangents: Tangents, horizon: int) -> Array:
-    def step(z, _):
-        return tangents.transition @ z, tangents.output @ z
-
-    return lax.scan(step, tangents.input, length=horizon)[1]

@@ -1,7 +1,8 @@
 """Control of a plant that is not known."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import KW_ONLY
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,17 +11,17 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float, Int, PyTree
 
-from ..._check import as_matrix, check_count, check_instance, check_key, check_step
-from ..._controller import AbstractController, wrong_observation
+from ..._check import as_matrix, check_count, check_key, check_step
+from ..._controller import AbstractController, check_controller, wrong_observation
 from ..._module import function_field, parameter
-from ..._typing import PRNGKey
+from ..._typing import PRNGKey, Real
 from ...dynamics import LinearDynamics
 from ...math._linear_solve import solve
 from ._closed_loop import shift
 
 
 class ExploreState(NamedTuple):
-    """What is remembered.
+    """The state of an exploring controller.
 
     - `step`: how many steps were made.
     - `excitations`: the last random controls, newest first.
@@ -51,7 +52,7 @@ class Explore(AbstractController):
 
     `B = N_0`, and `A - BK` is the least-squares solution of
     `(A - BK) [N_0 ... N_{order-1}] = [N_1 ... N_order]`. From then on the controller
-    that `build` makes for `x_next = A x + B u` is in charge. With
+    that `build` makes for `x_next = A x + B u` is used. With
     [`delucax.controllers.gpc`][] and `steps` near `T^(2/3)`, its regret over T steps
     grows as `T^(2/3)`.
 
@@ -92,27 +93,17 @@ class Explore(AbstractController):
 
     build: Callable[[LinearDynamics], AbstractController] = function_field()
     K: Array = parameter()
-    scale: Array = parameter()
-    dt: Array = parameter()
     steps: int = eqx.field(static=True)
-    order: int = eqx.field(static=True)
+    _: KW_ONLY
+    scale: Real = parameter(1.0)
+    order: int = eqx.field(default=None, static=True)
+    dt: Real = parameter(1.0)
 
-    def __init__(
-        self,
-        build: Callable[[LinearDynamics], AbstractController],
-        K: Any,
-        steps: int,
-        *,
-        scale: Any = 1.0,
-        order: int | None = None,
-        dt: Any = 1.0,
-    ):
-        where = "Explore"
-        self.K = as_matrix(K, "K", where)
-        order = self.K.shape[1] if order is None else order
-        self.order = check_count(order, "order", where)
-        self.steps = check_count(steps, "steps", where, least=self.order + 2)
-        self.build, self.scale, self.dt = build, scale, dt
+    def __post_init__(self):
+        where, order = "Explore", self.order
+        n = as_matrix(self.K, "K", where).shape[1]
+        self.order = check_count(n if order is None else order, "order", where)
+        self.steps = check_count(self.steps, "steps", where, least=self.order + 2)
 
     def __check_init__(self):
         as_matrix(self.K, "K", "Explore")
@@ -122,8 +113,9 @@ class Explore(AbstractController):
     def init(self, *, key=None):
         key = check_key(key, "Explore.init")
         (m, n), dtype = self.K.shape, self.K.dtype
-        # Any plant that every design has an answer for.
-        model = self._model(jnp.eye(n, dtype=dtype) / 2, jnp.eye(n, m, dtype=dtype))
+        # A placeholder, for the structure of the state; stable, so that designs exist.
+        A, B = jnp.eye(n, dtype=dtype) / 2, jnp.eye(n, m, dtype=dtype)
+        model = LinearDynamics(A, B, dt=self.dt)
         arrays, inner = self._designed(model)
         return ExploreState(
             step=jnp.zeros((), jnp.int32),
@@ -140,6 +132,8 @@ class Explore(AbstractController):
             raise wrong_observation(self, self.K.shape[1], y)
         dtype, y = y.dtype, y.astype(self.K.dtype)
         # Row j of the excitations is that of j + 1 steps ago.
+        # Signs e have E[e e'] = I and are independent of the past: x e' has the mean of
+        # the response alone, whatever the disturbances.
         moments = y[:, None] * state.excitations[:, None, :] / self.scale**2
         exploring = state.step < self.steps
         moments = jnp.where(exploring, state.moments + moments, state.moments)
@@ -173,12 +167,9 @@ class Explore(AbstractController):
         least = jnp.finfo(gram.dtype).eps * jnp.trace(gram)
         gram = gram + least * jnp.eye(len(gram), dtype=gram.dtype)
         closed_loop = solve(gram, before @ after.T).T
-        model = self._model(closed_loop + N[0] @ self.K, N[0])
+        model = LinearDynamics(closed_loop + N[0] @ self.K, N[0], dt=self.dt)
         arrays, inner = self._designed(model)
         return state._replace(model=model, arrays=arrays, inner=inner)
-
-    def _model(self, A: Array, B: Array) -> LinearDynamics:
-        return LinearDynamics(A, B, dt=self.dt)
 
     def _designed(self, model: LinearDynamics) -> tuple[PyTree, PyTree]:
         """The arrays of the controller for a model, and its state."""
@@ -186,10 +177,10 @@ class Explore(AbstractController):
         @eqx.filter_jit
         def design(model):
             controller = self.build(model)
-            made = "what build makes"
-            check_instance(controller, AbstractController, made, "Explore")
+            check_controller(controller, "what build makes", "Explore")
             return eqx.filter(controller, eqx.is_array), controller.init(key=None)
 
+        # A weak type would change in the loop, where `cond` wants one type.
         strong = lambda x: lax.convert_element_type(x, x.dtype)  # noqa: E731
         return jax.tree.map(strong, design(model))
 

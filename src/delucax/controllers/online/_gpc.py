@@ -1,17 +1,19 @@
-"""Learners whose features are the last values of the signal."""
+"""Learners by their features: the last values of a signal, or filters of them."""
 
+import functools
+import itertools
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array
 
-from ..._check import check_count, check_key, check_positive
+from ..._check import check_bool, check_count, check_key, check_positive
 from ..._controller import AbstractController
-from ..._module import as_module
+from ..._message import shortened
+from ..._module import mlp
 from ..._typing import PRNGKey
 from ...dynamics import AbstractDynamics
 from ._closed_loop import ClosedLoop
@@ -42,8 +44,8 @@ def gpc(
     disturbances are.
 
     The dynamics are linear, time-varying or not, or any others that observe their
-    state; those are linearised along the way, and the disturbance is what the true map
-    leaves over.
+    state; those are linearised along the way, and the disturbance is the residual of
+    the nonlinear map.
 
     **Arguments:**
 
@@ -60,9 +62,9 @@ def gpc(
     - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
         1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
         loop.
-    - `learning_rate`: scales the optimiser's step, of Newton's the longest; by default
-        `0.15 / |B|_F`, with `|B|` the size of what a unit of control does to the state
-        in a step.
+    - `learning_rate`: scales the optimiser's step; of Newton's method, the longest
+        step. By default `0.15 / |B|_F`, with `|B|` the size of what a unit of control
+        does to the state in a step.
     - `optimiser`: an Optax transformation; by default
         [`delucax.controllers.adagrad_norm`][] where dynamics are linear and
         time-invariant, and otherwise [`delucax.controllers.online_newton`][]. Neither
@@ -100,14 +102,14 @@ def gpc(
         run(learner).total_cost / run(regulator).total_cost
         ```
     """
-    base = base_for(dynamics, cost, base, "gpc")
-    loop = ClosedLoop(dynamics, base, horizon, "gpc", memory=memory, nature=False)
-    if not loop.observed:
+    given = dynamics, cost, base, horizon, learning_rate, optimiser, radius
+    learner = linear_learner("gpc", *given, memory=memory, nature=False)
+    if not learner.loop.observed:
         raise ValueError(
             "gpc: dynamics must observe their state (drc learns from outputs), got "
             f"{dynamics.observation_size} outputs of {dynamics.state_size} states."
         )
-    return linear_learner(loop, cost, learning_rate, optimiser, radius, "gpc")
+    return learner
 
 
 def drc(
@@ -133,8 +135,8 @@ def drc(
     hindsight grows as `sqrt(T)`.
 
     With `base` zero it is the gradient response controller; a base such as
-    [`delucax.controllers.LQG`][] makes it as good as that from the start, and right for
-    plants that are not stable by themselves.
+    [`delucax.controllers.LQG`][] gives its performance at the start, and stabilises
+    plants that are unstable.
 
     **Arguments:**
 
@@ -149,8 +151,9 @@ def drc(
     - `horizon`: the length of the roll-out; by default the least h, of 10 at least and
         1000 at most, with `rho^h <= 0.03`, rho being the spectral radius of the closed
         loop.
-    - `learning_rate`: scales the optimiser's step, of Newton's the longest; by default
-        0.15 over the size of the first response of the output to a unit of control.
+    - `learning_rate`: scales the optimiser's step; of Newton's method, the longest
+        step. By default 0.15 over the size of the first response of the output to a
+        unit of control.
     - `optimiser`: an Optax transformation; [`delucax.controllers.online_newton`][] with
         a prior of 4 steps by default.
     - `radius`: M is kept inside this ball in the Frobenius norm; by default 50 over the
@@ -184,9 +187,102 @@ def drc(
         ```
     """
     memory = check_count(memory, "memory", "drc")
-    base = base_for(dynamics, cost, base, "drc")
-    loop = ClosedLoop(dynamics, base, horizon, "drc", memory=memory, nature=True)
-    return linear_learner(loop, cost, learning_rate, optimiser, radius, "drc")
+    given = dynamics, cost, base, horizon, learning_rate, optimiser, radius
+    return linear_learner("drc", *given, memory=memory, nature=True)
+
+
+def sfc(
+    dynamics: AbstractDynamics,
+    cost: Callable[..., Array],
+    *,
+    base: AbstractController | None = None,
+    filters: int = 5,
+    memory: int = 30,
+    margin: float = 0.2,
+    double: bool = False,
+    horizon: int | None = None,
+    learning_rate: Any = None,
+    optimiser: optax.GradientTransformation | None = None,
+    radius: Any = None,
+) -> OnlineLearner:
+    """The spectral filtering controller,
+
+    `u_t = base(y_t) + M_0 s_t + sum_i M_i f_i(s_{t-1}, ..., s_{t-memory})`,
+
+    where the signal s is the last disturbance if the state is observed, nature's output
+    otherwise, and `f_i(s) = sigma_i^(1/4) sum_k phi_i(k) s_{t-k}` with
+    `(sigma_i, phi_i)` the largest eigenvalues and eigenvectors of the matrix
+    `H_jk = (1 - margin)^(j + k - 1) / (j + k - 1)`.
+
+    A few such filters do for a long memory what [`delucax.controllers.gpc`][] and
+    [`delucax.controllers.drc`][] need a matrix per step for: there is less to learn
+    where the closed loop is slow. They depend on the memory and the margin alone, not
+    on the plant.
+
+    The double spectral controller, for a state that is not observed, also adds
+
+    `sum_i M'_i f_i(s_t, ...) + sum_{i <= j} M''_ij (f_i * f_j)(s_t, ...)`,
+
+    `f_i * f_j` being one filter after the other, which represents what an observer,
+    itself a filter, makes of the past.
+
+    **Arguments:**
+
+    - `dynamics`, `cost`, `base`, `horizon`, `learning_rate`, `optimiser`, `radius`: as
+        for [`delucax.controllers.drc`][].
+    - `filters`: how many, 5 by default.
+    - `memory`: the number of past values that are filtered, 30 by default.
+    - `margin`: the stability margin, between 0 and 1: memories that fade as
+        `(1 - margin)^k` or faster are well represented. 0.2 by default.
+    - `double`: the double spectral controller; false by default.
+
+    **Returns:** a [`delucax.controllers.OnlineLearner`][]. In its state `loop.signal`
+    has the last `memory + 1` values, or `2 memory` with `double`, and `theta` the
+    matrices M side by side.
+
+    **Raises:** `ValueError` as [`delucax.controllers.drc`][]; and if there are more
+    filters than the memory has room for, or the margin is not between 0 and 1.
+
+    Source: Brahmbhatt, Buzaglo, Druchyna and Hazan, 2025 (spectral control).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("lds", key=jax.random.key(0))
+        learner = dlx.controllers.sfc(env.dynamics, env.cost)
+        dlx.rollout(env, learner, key=jax.random.key(0)).total_cost
+        ```
+    """
+    where = "sfc"
+    memory = check_count(memory, "memory", where)
+    filters = check_count(filters, "filters", where)
+    if filters > memory:
+        raise ValueError(
+            f"{where}: filters must be at most memory, {memory}, got {filters}."
+        )
+    number = isinstance(margin, int | float) and not isinstance(margin, bool)
+    if not number or not 0 < margin < 1:
+        raise ValueError(
+            f"{where}: margin must be a number between 0 and 1, "
+            f"got {shortened(margin)}."
+        )
+    bank = spectral_filters(memory, filters, float(margin))
+    length = 2 * memory if check_bool(double, "double", where) else memory + 1
+
+    def padded(rows, first):
+        return np.pad(rows, ((0, 0), (first, length - first - rows.shape[1])))
+
+    rows = [np.eye(1, length), padded(bank, 1)]
+    if double:
+        # f_i * f_j is f_j * f_i: a matrix for each pair.
+        pairs = itertools.combinations_with_replacement(bank, 2)
+        twice = np.stack([np.convolve(first, second) for first, second in pairs])
+        rows += [padded(bank, 0), padded(twice, 0)]
+    given = dynamics, cost, base, horizon, learning_rate, optimiser, radius
+    return linear_learner(where, *given, filters=np.concatenate(rows))
 
 
 def neural_gpc(
@@ -244,17 +340,29 @@ def neural_gpc(
     loop = ClosedLoop(dynamics, base, horizon, where, memory=memory)
     check_key(key, where)
     check_positive(learning_rate, "learning_rate", where)
-    network = eqx.nn.MLP(
-        loop.feature_size,
-        dynamics.control_size,
-        check_count(width, "width", where),
-        check_count(depth, "depth", where),
-        as_module(jnp.tanh),
-        as_module(jax.nn.identity),
-        dtype=loop.dtype,
-        key=key,
-    )
+    width = check_count(width, "width", where)
+    depth = check_count(depth, "depth", where)
+    sizes = loop.feature_size, dynamics.control_size, width, depth
+    network = mlp(*sizes, dtype=loop.dtype, key=key)
     last = lambda net: [net.layers[-1].weight, net.layers[-1].bias]
     network = eqx.tree_at(last, network, [0 * leaf for leaf in last(network)])
     optimiser = adagrad_norm() if optimiser is None else optimiser
     return OnlineLearner(loop, cost, NetworkPolicy(network), learning_rate, optimiser)
+
+
+@functools.lru_cache
+def spectral_filters(memory: int, count: int, margin: float) -> np.ndarray:
+    """The filters, shape `(count, memory)`, newest first.
+
+    Source: Hazan, Singh and Zhang, 2017.
+    """
+    index = np.arange(1, memory + 1)
+    total = index[:, None] + index[None, :] - 1.0
+    # In float64 whatever JAX computes in: the eigenvalues of this Hankel matrix fall
+    # off exponentially (Hazan, Singh and Zhang, 2017), which is why a few filters do,
+    # and float32 would lose the small ones in rounding.
+    values, vectors = np.linalg.eigh((1 - margin) ** total / total)
+    values, vectors = values[::-1][:count], vectors[:, ::-1][:, :count]
+    # Eigenvectors have no sign of their own; that of LAPACK is a matter of its version.
+    sign = np.where(vectors.sum(axis=0) < 0, -1.0, 1.0)
+    return (np.maximum(values, 0.0) ** 0.25 * sign * vectors).T

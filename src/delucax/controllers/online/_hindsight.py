@@ -21,30 +21,7 @@ from ._policy import FixedPolicy
 
 
 class Hindsight(NamedTuple):
-    """The best controller of a class for disturbances that are known.
-
-    - `controller`: it, and `trajectory`, its run.
-    - `decrement`: how much less Newton's method still expected, relative to the cost.
-    - `iterations`: steps tried.
-    - `result`: success, or `delucax.RESULTS.not_converged`.
-
-    [`delucax.controllers.best_in_hindsight`][] returns it.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-        import jax.numpy as jnp
-
-        push = dlx.disturbances.Constant(0.1 * jnp.ones(2))
-        env = dlx.make("lds", key=jax.random.key(0), disturbance=push)
-        gain = dlx.controllers.Linear(jnp.zeros((1, 2)))
-        run = dlx.rollout(env, gain, key=jax.random.key(0))
-        best = dlx.controllers.best_in_hindsight(env, gain, run)
-        best.controller.K, best.decrement, best.result
-        ```
-    """
+    """The result of `best_in_hindsight`."""
 
     controller: AbstractController
     trajectory: Trajectory
@@ -65,8 +42,8 @@ def best_in_hindsight(
 
     `min over theta of sum_t c(t, x_t(theta), u_t(theta)) + final(x_T(theta))`,
 
-    with theta the trainable weights of `controller` (of a
-    [`delucax.controllers.FixedPolicy`][] those of its policy, not of its base), from
+    with theta the trainable weights of `controller` (of `learner.fixed()` those of its
+    policy, not of its base), from
     the start and under the disturbances and sensor noise of `trajectory`. It is found
     by Newton's method with Levenberg's damping through the rollout, and is the global
     minimum where the cost is convex in theta: of a disturbance-action policy on a
@@ -84,10 +61,15 @@ def best_in_hindsight(
     - `trajectory`: a run with its states and disturbances, over the whole of which the
         search goes.
     - `iterations`: Newton steps at most, 30 by default.
-    - `tolerance`: stop when a step promises less than this part of the cost; by default
-        the square root of the rounding error.
+    - `tolerance`: stop when the predicted decrease is below this part of the cost; by
+        default the square root of the rounding error.
 
-    **Returns:** [`delucax.controllers.Hindsight`][].
+    **Returns:** a named tuple of
+
+    - `controller`: the best of the class, and `trajectory`, its run;
+    - `decrement`: the predicted decrease of the last Newton step, relative to the cost;
+    - `iterations`: steps tried;
+    - `result`: success, or `delucax.RESULTS.not_converged`.
 
     **Raises:** `ValueError` if the trajectory has no states or disturbances (or
     observations, where they are noisy), or the controller no trainable weights.
@@ -205,6 +187,8 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
 
     def derivatives(theta):
         total = lambda theta: run(theta, checkpoint="sqrt")[1].total_cost  # noqa: E731
+        # One linearisation, then a batch of products with the Hessian: forward over
+        # reverse.
         (cost, gradient), jvp = jax.linearize(jax.value_and_grad(total), theta)
         _, hessian = jax.vmap(jvp)(eye)
         return cost, gradient, (hessian + hessian.T) / 2
@@ -213,15 +197,18 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
         best, local, damping, _, k = carry
         cost, gradient, hessian = local
         size = jnp.trace(jnp.abs(hessian)) / len(start)
+        # Levenberg's damping, in units of the mean curvature: theta has no scale.
         damped = hessian + damping * jnp.where(size > 0, size, 1) * eye
         change = solve(damped, -gradient[:, None])[:, 0]
         change = jnp.where(k > 0, change, 0)
-        promised = -(gradient @ change + change @ hessian @ change / 2)
+        # The decrease that the quadratic model predicts, of the undamped model.
+        predicted = -(gradient @ change + change @ hessian @ change / 2)
+        # Cost and derivatives in one pass: a trial that succeeds needs them next.
         tried = derivatives(best + change)
         pick = lambda new, old: jnp.where(tried[0] < cost, new, old)  # noqa: E731
-        left = promised / (jnp.abs(cost) + jnp.finfo(start.dtype).tiny)
-        # What is promised below rounding is not to be had.
-        left = jnp.where((k > 0) & (promised >= 0), left, jnp.inf)
+        left = predicted / (jnp.abs(cost) + jnp.finfo(start.dtype).tiny)
+        # A predicted decrease below zero is rounding.
+        left = jnp.where((k > 0) & (predicted >= 0), left, jnp.inf)
         # With less damping, rounding would move what the cost does not depend on.
         damping = pick(jnp.maximum(damping / 10, least), damping * 10)
         local = jax.tree.map(pick, tried, local)

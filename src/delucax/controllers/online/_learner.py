@@ -1,5 +1,6 @@
-"""Online control: learning what to add to a base controller's control."""
+"""Online learners of a policy that is added to a base controller."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,8 +15,9 @@ from ..._check import check_instance, check_step, is_concrete, output_of
 from ..._controller import AbstractController, AbstractLearner, Tally
 from ..._jax import is_constant
 from ..._module import function_field, parameter
+from ..._typing import Real
 from ...dynamics import AbstractDynamics, LinearDynamics, linearize
-from .._basic import Scheduled
+from .._composed import Scheduled
 from .._lqr import LQR
 from .._output_feedback import LQG
 from ._closed_loop import ClosedLoop, ClosedLoopState, in_first_responses, shift
@@ -32,7 +34,7 @@ _PRIOR_OF_OUTPUTS = 4.0
 
 
 class LearnerState(NamedTuple):
-    """What an online learner remembers.
+    """The state of an online learner.
 
     - `loop`: of the plant and the base controller.
     - `features`: of this step and those of the roll-out before it, newest first.
@@ -57,8 +59,9 @@ class OnlineLearner(AbstractLearner):
     `u_t = base(y_t) + policy(theta_t, features_t)`,
 
     where the features are filters of a signal that does not depend on what was added:
-    the past disturbances, or nature's output. Before it acts, theta moves against the
-    gradient of what this step would have cost had it been in use all along a roll-out,
+    the past disturbances, or nature's output. Before it acts, theta takes a step
+    against the gradient of a counterfactual loss, the cost of this step had theta been
+    held during a roll-out,
 
     `loss_t(theta) = c(t, y_t(theta), u_t(theta))`,
     `y_t(theta) = y_t + sum_{j < horizon} G_j (v_{t-1-j}(theta) - v_{t-1-j})`,
@@ -102,7 +105,7 @@ class OnlineLearner(AbstractLearner):
     loop: ClosedLoop
     cost: Callable[..., Array] = function_field()
     policy: AbstractPolicy
-    learning_rate: Array = parameter()
+    learning_rate: Real = parameter()
     optimiser: optax.GradientTransformation = eqx.field(static=True)
 
     def __check_init__(self):
@@ -125,10 +128,8 @@ class OnlineLearner(AbstractLearner):
         loop, theta = self.loop, self.policy.init()
         inner, h = loop.init(key, loop.horizon), loop.horizon
         weighted = None
-        uses_curvature = isinstance(
-            self.optimiser, optax.GradientTransformationExtraArgs
-        )
-        if uses_curvature and loop.response is not None:
+        with_extra = optax.GradientTransformationExtraArgs
+        if isinstance(self.optimiser, with_extra) and loop.response is not None:
             root = self._constant_root()
             weighted = None if root is None else self._weighted(root, inner)
         return LearnerState(
@@ -144,19 +145,11 @@ class OnlineLearner(AbstractLearner):
         before = lambda features: self.policy(state.theta, features)
         features, _, loop = self.loop.act(self, t, y, state.loop, before)
         state = state._replace(loop=loop, features=shift(features, state.features))
-        theta, optimiser, refused = projected_step(
-            self.optimiser,
-            self.learning_rate,
-            self.policy.project,
-            jax.grad(self._loss)(state.theta, state),
-            state.theta,
-            state.optimiser,
-            state.refused,
-            curvature=lambda: self._curvature(state),
-        )
-        v = self.policy(theta, features)
-        state = state._replace(theta=theta, optimiser=optimiser, refused=refused)
-        return (loop.u_base + v).astype(y.dtype), state
+        gradient = jax.grad(self._loss)(state.theta, state)
+        curvature = lambda: self._curvature(state)
+        after = projected_step(self, gradient, state, curvature=curvature)
+        v = self.policy(after.theta, features)
+        return (loop.u_base + v).astype(y.dtype), after
 
     def applied(self, u, cost, state):
         return state._replace(loop=self.loop.applied(u, cost, state.loop))
@@ -176,12 +169,16 @@ class OnlineLearner(AbstractLearner):
         **Arguments:** `theta`: what it has learned, from its state; by default what it
         starts with.
 
-        **Returns:** a controller whose `policy.start` is trainable.
+        **Returns:** a controller, `u_t = base(y_t) + policy(theta, features_t)`. Its
+        `policy.start` is theta, trainable; its `loop` is the learner's.
         """
         policy = self.policy if theta is None else self.policy.at(theta)
         return FixedPolicy(self.loop, policy)
 
     def _outcome(self, theta, state):
+        # One theta for all steps of the roll-out, as if it had been held. As it moves
+        # slowly, regret in these losses bounds that of the run (Anava, Hazan and
+        # Mannor, 2015; Agarwal et al., 2019).
         v = jax.vmap(self.policy, in_axes=(None, 0))(theta, state.features)
         return self.loop.counterfactual(v[0], v[1:], state.loop)
 
@@ -202,6 +199,7 @@ class OnlineLearner(AbstractLearner):
         at each step of the roll-out, newest first, shape (horizon + 1, p + m, m)."""
         past = self.loop.past(loop)
         p, m = loop.y.shape[0], past.shape[2]
+        # What is added now changes the control of this step, and no observation yet.
         direct = jnp.eye(p + m, m, -p, past.dtype)
         response = jnp.concatenate([direct[None], past])
         return jnp.einsum("ok,hom->hkm", root, response)
@@ -209,6 +207,8 @@ class OnlineLearner(AbstractLearner):
     def _root(self, t, z):
         p = self.loop.dynamics.observation_size
         cost = lambda z: self.cost(t, z[:p], z[p:])  # noqa: E731
+        # Gauss and Newton: the curvature by theta is J' H J, as outcomes are linear in
+        # theta.
         return positive_root(jax.hessian(cost)(z))
 
     def _constant_root(self):
@@ -220,17 +220,24 @@ class OnlineLearner(AbstractLearner):
 
 
 def linear_learner(
-    loop: ClosedLoop,
+    where: str,
+    dynamics: AbstractDynamics,
     cost: Callable[..., Array],
+    base: AbstractController | None,
+    horizon: int | None,
     learning_rate: ArrayLike | None,
     optimiser: optax.GradientTransformation | None,
     radius: ArrayLike | None,
-    where: str,
+    **signal: Any,
 ) -> OnlineLearner:
-    """A learner of a linear map from features to control."""
-    start = jnp.zeros((loop.dynamics.control_size, loop.feature_size), loop.dtype)
-    ball = in_first_responses(loop, radius, "radius", RADIUS, where)
-    rate = in_first_responses(loop, learning_rate, "learning_rate", STEP, where)
+    """A learner of a linear map from features to control; `signal` says what the
+    features are, as to a `ClosedLoop`."""
+    base = base_for(dynamics, cost, base, where)
+    loop = ClosedLoop(dynamics, base, horizon, where, **signal)
+    start = jnp.zeros((dynamics.control_size, loop.feature_size), loop.dtype)
+    scale = functools.partial(in_first_responses, loop, where)
+    ball = scale(radius, "radius", RADIUS)
+    rate = scale(learning_rate, "learning_rate", STEP)
     if optimiser is None:
         # Newton's step where gradients alone are slow: nature's outputs are much alike
         # from step to step, and a response that changes points elsewhere each time.
@@ -248,7 +255,12 @@ def base_for(
     where: str,
 ) -> AbstractController:
     """The base of a learner with this model and cost, which are checked: as given, or
-    the default one."""
+    by default the regulator for the curvature of the cost at the operating point.
+
+    For each time of time-varying dynamics it is the one that would be best if they
+    stayed as they are; where not the state but `C x` is observed, it acts on the
+    estimate of a Kalman filter for disturbances and sensor noise of unit covariance.
+    """
     hint = (
         ", the model that it learns with (`delucax.controllers.Explore` identifies one)"
     )
@@ -259,39 +271,13 @@ def base_for(
             f"delucax.costs, got {type(cost).__name__}."
         )
     check_scalar_cost(cost, dynamics, where)
-    return _default_base(dynamics, cost, where) if base is None else base
-
-
-def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None:
-    """Raise unless a cost of what `dynamics` show is a scalar."""
-    y, u = (dynamics.observation_size,), (dynamics.control_size,)
-    try:
-        value = output_of(cost, (), y, u)
-    except ValueError as error:
-        raise ValueError(
-            f"{where}: cost must take the observation, of shape {y}, where a state is "
-            f"asked for, and a control of shape {u}: {error}"
-        ) from error
-    got = getattr(value, "shape", None)
-    if got != ():
-        got = type(value).__name__ if got is None else f"an array of shape {got}"
-        raise ValueError(f"{where}: cost must give a scalar, got {got}.")
-
-
-def _default_base(
-    dynamics: AbstractDynamics, cost: Callable[..., Array], where: str
-) -> AbstractController:
-    """The regulator for the curvature of the cost at the operating point.
-
-    For each time of time-varying dynamics it is the one that would be best if they
-    stayed as they are; where not the state but `C x` is observed, it acts on what a
-    Kalman filter for disturbances and sensor noise of unit covariance makes of it.
-    """
+    if base is not None:
+        return base
     try:
         x, u = dynamics.equilibrium()
     except ValueError as error:
         raise ValueError(
-            f"{where}: base must be given, for dynamics that name no equilibrium to "
+            f"{where}: base must be given, for dynamics that define no equilibrium to "
             "design one at."
         ) from error
     t = jnp.zeros((), x.dtype)
@@ -310,18 +296,38 @@ def _default_base(
     return Scheduled(design(times), dynamics.dt)
 
 
+def check_scalar_cost(cost: Any, dynamics: AbstractDynamics, where: str) -> None:
+    """Raise unless a cost of what `dynamics` show is a scalar."""
+    y, u = (dynamics.observation_size,), (dynamics.control_size,)
+    try:
+        value = output_of(cost, (), y, u)
+    except ValueError as error:
+        raise ValueError(
+            f"{where}: cost must take the observation, of shape {y}, where a state is "
+            f"asked for, and a control of shape {u}: {error}"
+        ) from error
+    got = getattr(value, "shape", None)
+    if got != ():
+        got = type(value).__name__ if got is None else f"an array of shape {got}"
+        raise ValueError(f"{where}: cost must give a scalar, got {got}.")
+
+
 def _curvature(dynamics, cost, t, x, u, where):
     """The second derivatives of the cost, as weights of a regulator."""
     y, n = dynamics.observe(t, x), x.shape[0]
 
     def charged(z):
+        # Gauss and Newton in the observation: the curvature of the sensor, which could
+        # make the cost concave, is left out.
         y_here = y + jax.jvp(lambda x: dynamics.observe(t, x), (x,), (z[:n],))[1]
         return cost(t, y_here, u + z[n:])
 
+    # c = dx'Q dx + ...: half of the second derivatives.
     H = jax.hessian(charged)(jnp.zeros(n + u.shape[0], x.dtype)) / 2
     Q, R, S = H[:n, :n], H[n:, n:], H[:n, n:]
     if is_concrete(H):
         H = np.asarray(H, float)
+        # Above the rounding of a Hessian in float32.
         slack = 1e-6 * np.max(np.abs(H), initial=0)
         curved = np.all(np.linalg.eigvalsh(H) >= -slack)
         if not (curved and np.all(np.linalg.eigvalsh(np.asarray(R)) > slack)):

@@ -11,31 +11,25 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from ..._check import check_positive
-from ..._controller import Tally
 
 
-def projected_step(
-    optimiser: optax.GradientTransformation,
-    learning_rate: Array,
-    project: Callable[[Any], Any],
-    gradient: PyTree,
-    theta: PyTree,
-    state: PyTree,
-    refused: Tally,
-    **extra: Any,
-) -> tuple[PyTree, PyTree, Tally]:
-    """`theta` and the state of the optimiser a step later; where that is not finite,
-    they stay as they are and the step is counted as refused. `extra` is for the
-    optimisers that take more than a gradient."""
-    optimiser = optax.with_extra_args_support(optimiser)
-    extra["learning_rate"] = learning_rate
-    step, after = optimiser.update(gradient, state, theta, **extra)
-    add = lambda old, step: old + (learning_rate * step).astype(old.dtype)
-    new = project(jax.tree.map(add, theta, step)), after
+def projected_step(owner: Any, gradient: PyTree, state: Any, **extra: Any) -> Any:
+    """The state of a learner (`owner`) whose `theta` and `optimiser` have made a step;
+    where that is not finite, they stay as they are and the step is counted as
+    `refused`. `extra` is for the optimisers that take more than a gradient."""
+    optimiser = optax.with_extra_args_support(owner.optimiser)
+    rate = extra["learning_rate"] = owner.learning_rate
+    before = state.theta, state.optimiser
+    step, after = optimiser.update(gradient, state.optimiser, state.theta, **extra)
+    add = lambda old, step: old + (rate * step).astype(old.dtype)
+    # Projected after the step (Zinkevich, 2003): the bound on the regret needs the set.
+    new = owner.policy.project(jax.tree.map(add, state.theta, step)), after
     floats = jax.tree.leaves(eqx.filter(new, eqx.is_inexact_array))
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in floats]))
     keep = lambda new, old: jnp.where(finite, new, old)
-    return *jax.tree.map(keep, new, (theta, state)), refused.add(~finite)
+    theta, after = jax.tree.map(keep, new, before)
+    refused = state.refused.add(~finite)
+    return state._replace(theta=theta, optimiser=after, refused=refused)
 
 
 def _adagrad_norm_init(params: PyTree) -> Array:
@@ -126,24 +120,30 @@ class _OnlineNewtonUpdate(eqx.Module):
         factor = curvature()
         root, total, count = state
         size = jnp.sum(factor**2)
-        # Next to this step all before it is rounding: start anew.
+        # Where this update is larger than all before it by 1 / sqrt(eps), they would be
+        # lost in rounding: start anew.
         first = size > total / jnp.sqrt(jnp.finfo(size.dtype).eps)
         total, count = jnp.where(first, 0, total), jnp.where(first, 0, count)
         new_total, new_count = total + size, count + (size > 0)
         # Until the prior is outweighed it is worth `prior` of the average step so far.
         mean = lambda total, count: total / jnp.where(count > 0, count, 1)  # noqa: E731
         early = (size > 0) & (count > 0) & (count < self.prior)
+        # The prior: a multiple of the identity with the trace of `prior` average
+        # updates.
         fresh = gradient.size / (self.prior * jnp.where(first, size, 1))
         fresh = jnp.sqrt(fresh) * jnp.eye(gradient.size, dtype=gradient.dtype)
         after = jnp.where(early, mean(new_total, new_count), 1)
         scale = jnp.sqrt(jnp.where(early, mean(total, count) / after, 1))
         root = jnp.where(first, fresh, scale * root)
-        # Potter's square-root form stays positive whatever the rounding.
+        # Sherman and Morrison's P - P c c'P / (1 + c'P c) for each column c, on a root
+        # of P: Potter's form stays positive whatever the rounding.
         for column in factor.T:
             along = column @ root
             gain = 1 + along @ along
             root = root - jnp.outer(root @ along, along) / (gain + jnp.sqrt(gain))
         step = root @ (gradient @ root) / learning_rate
+        # A trust region of radius 1 (times the learning rate): early curvature is a
+        # guess.
         squared = jnp.sum(step**2)
         long = squared > 1
         step = step * jnp.where(long, 1 / jnp.sqrt(jnp.where(long, squared, 1)), 1)
@@ -198,6 +198,7 @@ def online_newton(prior: float = 100.0) -> optax.GradientTransformation:
 def positive_root(H: Float[Array, "z z"]) -> Float[Array, "z z"]:
     """The Cholesky factor of the positive part of a symmetric matrix; columns that
     have no positive pivot are zero."""
+    # Pivots below are rounding, and their square roots would be noise.
     slack = len(H) * jnp.finfo(H.dtype).eps * jnp.max(jnp.abs(jnp.diag(H)), initial=0)
 
     columns = []

@@ -1,4 +1,4 @@
-"""What is learned: a map from features to what is added to the base's control."""
+"""The policies that are learned: maps from features to controls."""
 
 import abc
 
@@ -34,7 +34,7 @@ class AbstractPolicy(eqx.Module):
     def __call__(
         self, theta: PyTree, features: Float[Array, " f"]
     ) -> Float[Array, " m"]:
-        """What is added to the base's control."""
+        """The control that is added to that of the base."""
 
     @abc.abstractmethod
     def project(self, theta: PyTree) -> PyTree:
@@ -54,6 +54,7 @@ class AbstractPolicy(eqx.Module):
             v = jax.vmap(self, in_axes=(None, 0))(unravel(flat), features)
             return jnp.einsum("hom,hm->o", response, v)
 
+        # Few outcomes, many weights: reverse mode.
         return jax.jacrev(outcome)(flat)
 
 
@@ -106,26 +107,11 @@ class NetworkPolicy(AbstractPolicy):
 
 
 class FixedPolicy(AbstractController):
-    """What an online learner learns about, without the learning,
+    """The policy of an online learner, held fixed,
 
     `u_t = base(y_t) + policy(theta, features_t)`.
 
-    It is the policy that a learner has come to, or the best one in hindsight
-    ([`delucax.controllers.best_in_hindsight`][]). `learner.fixed(theta)` makes it.
-
-    **Attributes:** `loop`, the model with its base controller and the features of its
-    signal; `policy`, the family of policies, whose `policy.start` is theta, trainable.
-
-    !!! example
-
-        ```python
-        import delucax as dlx
-        import jax
-
-        env = dlx.make("lds", key=jax.random.key(0))
-        policy = dlx.controllers.gpc(env.dynamics, env.cost).fixed()
-        dlx.rollout(env, policy, key=jax.random.key(0)).total_cost
-        ```
+    `learner.fixed(theta)` makes it.
     """
 
     loop: ClosedLoop

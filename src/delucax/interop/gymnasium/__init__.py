@@ -3,18 +3,11 @@
 Importing it tells Gymnasium of them: `gymnasium.make("delucax/Pendulum-v1")`.
 """
 
-from ..._extras import extra
+from ..._extras import extra as _extra
 
 
-extra("gymnasium", "gymnasium")
+_extra("gymnasium", "gymnasium")
 
-from ._registration import (  # noqa: E402
-    make as make,
-    make_vector as make_vector,
-    register_ids as register_ids,
-)
+from ._registration import make as make, make_vector as make_vector  # noqa: E402
 from ._single_env import GymnasiumEnv as GymnasiumEnv  # noqa: E402
 from ._vector_env import GymnasiumVectorEnv as GymnasiumVectorEnv  # noqa: E402
-
-
-register_ids()

@@ -11,6 +11,7 @@ import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -18,62 +19,52 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from jaxtyping import Array
 
-from ..._check import LARGEST
+from ..._check import check_finite, check_real
+from ..._message import shortened
+from ..._module import as_float_array
 from ..._typing import PRNGKey, State
 from ...environments import Environment
-from .. import _adapter as adapter
-from .._adapter import EpisodeState
+from .. import _episode as episodes
+from .._episode import EpisodeState, HashableEnvironment, StepOutcome
+from .._spaces import action_ends, observation_ends
 
 
-def read_options(options: Any, names: tuple[str, ...], where: str) -> list[Any]:
-    """The options of a reset, none for those that are left out."""
+def read_options(
+    options: Any, env: Environment, where: str, count: int | None = None
+) -> tuple[jax.Array | None, Any]:
+    """The options of a reset: the state to begin at, or of each of `count`, and which
+    of these are reset; `None` for what is left out."""
+    names = ("state",) if count is None else ("state", "reset_mask")
     if options is not None and not isinstance(options, Mapping):
         raise ValueError(f"{where}: options must be a dictionary, got {options!r}.")
     options = dict(options or {})
-    values = [options.pop(name, None) for name in names]
-    if options:
+    if unknown := [repr(name) for name in options if name not in names]:
         raise ValueError(
             f"{where}: options takes {' and '.join(map(repr, names))} alone, got "
-            f"{', '.join(map(repr, options))}."
+            f"{', '.join(unknown)}."
         )
-    return values
+    state, mask = options.get("state"), options.get("reset_mask")
+    if state is None:
+        return None, mask
+    shape = (env.state_size,)
+    each = shape if count is None else (count, *shape)
+    state = as_float_array(state)
+    if not eqx.is_inexact_array(state) or state.shape not in (shape, each):
+        shapes = shape if count is None else f"{shape}, or {each} for one each"
+        got = f"shape {state.shape}" if eqx.is_array(state) else shortened(state)
+        raise ValueError(f"{where}: state must have shape {shapes}, got {got}.")
+    check_real(state, "state", where)
+    check_finite(state, "state", where)
+    return jnp.broadcast_to(state.astype(float), each), mask
 
 
-def action_space(env: Environment, discrete: bool) -> Box | Discrete:
-    """Indices into the table of actions, or controls."""
-    if discrete:
-        assert env.actions is not None
-        return Discrete(len(env.actions))
-    return _box(env.control_bounds, env.control_size, adapter.LARGEST_ACTION)
-
-
-def observation_space(env: Environment) -> Box:
-    """What `encode` returns."""
-    bounds = env.observation_bounds
+def spaces(env: Environment, discrete: bool) -> tuple[Box | Discrete, Box]:
+    """The actions, indices into their table or controls, and what `encode` returns."""
+    box = lambda ends: Box(ends[0].astype(np.float32), ends[1].astype(np.float32))
+    actions: Any = env.actions
     # Gymnasium's own spaces are infinite where bounds are.
-    ends = (-LARGEST, LARGEST) if bounds is None else bounds
-    return _box(ends, env.feature_size, np.inf)
-
-
-def _box(bounds: Any, size: int, largest: float) -> Box:
-    ends = adapter.finite_ends(bounds, size, largest)
-    low, high = (np.asarray(end, np.float32) for end in ends)
-    return Box(low, high, dtype=np.float32)
-
-
-class Layout(NamedTuple):
-    """Where things are in the packed array."""
-
-    states: int
-    features: int
-
-    @property
-    def observation(self) -> slice:
-        return slice(self.states, self.states + self.features)
-
-    @property
-    def size(self) -> int:
-        return self.states + self.features + 5
+    observations = box(observation_ends(env, np.inf))
+    return Discrete(len(actions)) if discrete else box(action_ends(env)), observations
 
 
 REWARD, TERMINATED, TRUNCATED, FAILED, STEP = range(-5, 0)
@@ -88,12 +79,14 @@ class Program(NamedTuple):
     step: Any  # (packed and action, signals if there are any) -> packed
     start_batch: Any
     step_batch: Any
-    layout: Layout
+    states: slice  # where they are in the packed array
+    observation: slice
+    size: int
 
 
 def program(env: Environment, discrete: bool, truncate: bool = True) -> Program:
     """The program of an environment; one that is the same compiles no more."""
-    return _compiled(adapter.ByValue(env), discrete, truncate)
+    return _compiled(HashableEnvironment(env), discrete, truncate)
 
 
 def shared(size: int, dtype: Any) -> tuple[np.ndarray, jax.Array]:
@@ -116,58 +109,50 @@ def draw_key(generator: np.random.Generator) -> PRNGKey:
 
 
 @functools.lru_cache(maxsize=64)
-def _compiled(same: adapter.ByValue, discrete: bool, truncate: bool) -> Program:
-    env = same.env
-    layout = Layout(env.state_size, env.feature_size)
+def _compiled(same: HashableEnvironment, discrete: bool, truncate: bool) -> Program:
+    env, n = same.env, same.env.state_size
+    end = n + env.feature_size
+    size = end - REWARD
+
+    def start(key: PRNGKey, state: State | None) -> tuple[Array, episodes.Signals]:
+        if episodes.has_signals(env):
+            episode = episodes.begin(env, key, state)
+        else:
+            # Not splitting the key saves a third of the time of a batched reset.
+            x = env.reset(key) if state is None else state
+            episode = EpisodeState(x, jnp.zeros((), int))
+        no = jnp.zeros((), bool)
+        outcome = StepOutcome(jnp.zeros((), episode.state.dtype), no, no, no)
+        return _packed(env, episode, outcome), episode.signals
 
     def step(packed, action, signals):
         action = action[0].astype(int) if discrete else action
-        x, k = packed[: layout.states], packed[STEP].astype(int)
-        now = EpisodeState(x, k, signals)
-        return _packed(env, *adapter.step(env, now, action, truncate))
+        now = EpisodeState(packed[:n], packed[STEP].astype(int), signals)
+        return _packed(env, *episodes.step(env, now, action, truncate))
 
-    def step_in_place(given, signals=adapter.NO_SIGNALS):
-        return step(given[: layout.size], given[layout.size :], signals)
+    def step_in_place(given, signals=episodes.NO_SIGNALS):
+        return step(given[:size], given[size:], signals)
 
-    start = functools.partial(_start, env)
     start_batch = jax.vmap(start)
     step_batch = functools.partial(_step_batch, step, start_batch)
-    return Program(
-        jax.jit(start),
-        jax.jit(step_in_place),
-        jax.jit(start_batch),
-        jax.jit(step_batch, static_argnums=0),
-        layout,
-    )
+    compiled = jax.jit(start), jax.jit(step_in_place), jax.jit(start_batch)
+    step_batch = jax.jit(step_batch, static_argnums=0)
+    return Program(*compiled, step_batch, slice(n), slice(n, end), size)
 
 
-def _packed(env: Environment, episode: EpisodeState, outcome: adapter.Outcome) -> Array:
-    x, (reward, terminated, truncated, failed) = episode.state, outcome
+def _packed(env: Environment, episode: EpisodeState, outcome: StepOutcome) -> Array:
+    x, (reward, *ends, failed) = episode.state, outcome
     failed = failed | ~jnp.all(jnp.isfinite(x)) | ~jnp.isfinite(reward)
-    rest = (reward, terminated, truncated, failed, episode.time)
-    rest = jnp.stack([jnp.asarray(part, x.dtype) for part in rest])
-    return jnp.concatenate([x, adapter.observe(env, episode).astype(x.dtype), rest])
-
-
-def _start(
-    env: Environment, key: PRNGKey, state: State | None
-) -> tuple[Array, adapter.Signals]:
-    if adapter.has_signals(env):
-        episode = adapter.begin(env, key, state)
-    else:
-        # A key that is not split saves a batch a third of the time of a reset.
-        x = env.reset(key) if state is None else state
-        episode = EpisodeState(x, jnp.zeros((), int))
-    no = jnp.zeros((), bool)
-    outcome = adapter.Outcome(jnp.zeros((), episode.state.dtype), no, no, no)
-    return _packed(env, episode, outcome), episode.signals
+    parts = reward, *ends, failed, episode.time
+    rest = jnp.stack([jnp.asarray(part, x.dtype) for part in parts])
+    return jnp.concatenate([x, episodes.observe(env, episode).astype(x.dtype), rest])
 
 
 def _step_batch(step, start_batch, mode, packed, actions, signals, key):
-    """A step of each; those that have ended begin anew as `mode` says.
+    """A step of each environment; ended episodes are reset as `mode` says.
 
-    **Returns:** the packed arrays, those of the last step of what has ended, the
-    signals and a key.
+    **Returns:** the packed arrays, the packed arrays before the resets, the signals and
+    a key.
     """
     ended = (packed[:, TERMINATED] + packed[:, TRUNCATED]) > 0
     last = jax.vmap(step)(packed, actions.astype(packed.dtype), signals)
@@ -178,7 +163,7 @@ def _step_batch(step, start_batch, mode, packed, actions, signals, key):
     if mode == "SameStep":
         ended = (last[:, TERMINATED] + last[:, TRUNCATED]) > 0
 
-    # A few at a time, for most steps end few episodes.
+    # A few resets at a time, because most steps end few episodes.
     count = len(packed)
     few = min(count, max(16, count // 16))
 
@@ -187,7 +172,7 @@ def _step_batch(step, start_batch, mode, packed, actions, signals, key):
         which = jnp.flatnonzero(ended, size=few, fill_value=count)
         use, key = jr.split(key)
         first, drawn = start_batch(jr.split(use, few), None)
-        if mode == "SameStep":  # the reward and the end are those of the old episode
+        if mode == "SameStep":  # the reward and the flags are those of the old episode
             outcome = slice(REWARD, STEP)
             first = first.at[:, outcome].set(last[which, outcome])
         put = lambda new, old: old.at[which].set(new, mode="drop")

@@ -11,43 +11,34 @@ from gymnasium.envs.registration import EnvSpec
 from ... import environments, lung
 from ..._check import check_count
 from ...environments import Environment, make as make_task
-from .._adapter import has_signals, reads_first_argument
+from .._episode import has_signals, reads_first_argument
 from ._single_env import GymnasiumEnv
 from ._vector_env import GymnasiumVectorEnv
 
 
-_TASKS = vars(lung) | vars(environments)
-# The name of a task, and whether its actions are whole numbers: of tasks with an id of
-# their own, and of the others.
+_FUNCTIONS = vars(lung) | vars(environments)
+# The name of a task, whether its actions are whole numbers, and Gymnasium's threshold
+# of the mean return from which it counts as solved.
 _IDS = {
-    "Acrobot-v1": ("acrobot", True),
+    "Acrobot-v1": ("acrobot", True, -100.0),
     "AcrobotContinuous-v1": ("acrobot", False),
-    "CartPole-v1": ("cartpole", True),
+    "CartPole-v1": ("cartpole", True, 475.0),
     "CartPoleContinuous-v1": ("cartpole", False),
     "CartPoleLinear-v1": ("cartpole_linear", False),
     "CSTR-v1": ("cstr", False),
     "LDS-v1": ("lds", False),
-    "MountainCar-v0": ("mountain_car_discrete", True),
-    "MountainCarContinuous-v0": ("mountain_car", False),
+    "MountainCar-v0": ("mountain_car_discrete", True, -110.0),
+    "MountainCarContinuous-v0": ("mountain_car", False, 90.0),
 }
-_OTHERS = {*environments.registered()} & {*_TASKS} - {name for name, _ in _IDS.values()}
+_OTHERS = {*environments.registered()} & {*_FUNCTIONS} - {n for n, *_ in _IDS.values()}
 _IDS |= {f"{n.title().replace('_', '')}-v1": (n, False) for n in sorted(_OTHERS)}
-
-
-# The mean return at which Gymnasium takes a task to be solved.
-_THRESHOLDS = {
-    "Acrobot-v1": -100.0,
-    "CartPole-v1": 475.0,
-    "MountainCar-v0": -110.0,
-    "MountainCarContinuous-v0": 90.0,
-}
 
 
 # Tasks whose plants are drawn at random, unless one is given.
 _DRAWN = {"lds": ("A", "B", "system", "key"), "neural": ("system", "key")}
 
 
-def _task(task: str, kwargs: dict[str, Any]) -> Environment:
+def _made(task: str, kwargs: dict[str, Any]) -> Environment:
     if task in _DRAWN and not any(name in kwargs for name in _DRAWN[task]):
         kwargs = kwargs | {"key": jax.random.key(0)}
     return make_task(task, **kwargs)
@@ -70,8 +61,9 @@ def make(
 
     - `task`: a name that [`delucax.make`][] knows.
     - `discrete`, `render_mode`: of [`delucax.interop.gymnasium.GymnasiumEnv`][].
-    - `**kwargs`: passed to the task. Plants that are drawn at random are drawn with
-        `jax.random.key(0)` unless a `key` or a plant is given.
+    - `**kwargs`: passed to the task. The random plants of `lds` and `neural` are drawn
+        with the fixed key `jax.random.key(0)` unless a `key` or a plant is given; so
+        does `gymnasium.make`.
 
     **Returns:** a [`delucax.interop.gymnasium.GymnasiumEnv`][].
 
@@ -85,23 +77,23 @@ def make(
         env.reset(seed=0)
         ```
     """
-    env = _task(task, kwargs)
+    env = _made(task, kwargs)
     return GymnasiumEnv(env, discrete=discrete, render_mode=render_mode)
 
 
 def make_registered(task: str, **kwargs: Any) -> GymnasiumEnv:
     """The entry point of all ids, whose episodes Gymnasium's time limit ends.
 
-    What has to know when that is ends at its own horizon: a task with a horizon that is
-    given, with disturbances or noise, which are drawn for all of it, or with a cost
-    that is given and charges a final state.
+    Tasks that need a fixed length end at their own horizon instead: those with an
+    explicit horizon, with disturbances or noise, which are drawn for all of it, or with
+    an explicit cost that has a final cost.
     """
     own = {k: kwargs.pop(k) for k in ("discrete", "render_mode") if k in kwargs}
-    env = _task(task, kwargs)
-    final = lambda x: kwargs["cost"].final(0.0, x)
-    given = kwargs.get("cost") is not None
-    has_final = given and reads_first_argument(final, jnp.zeros(env.state_size))
-    ends = "horizon" in kwargs or has_signals(env) or has_final
+    env = _made(task, kwargs)
+    ends = "horizon" in kwargs or has_signals(env)
+    if kwargs.get("cost") is not None:
+        final = lambda x: env.cost.final(0.0, x)
+        ends = ends or reads_first_argument(final, jnp.zeros(env.state_size))
     return GymnasiumEnv(env, truncate=ends, **own)
 
 
@@ -152,41 +144,21 @@ def make_vector(
     if max_episode_steps not in (None, -1):  # -1 is Gymnasium's word for none
         steps = check_count(max_episode_steps, "max_episode_steps", where)
         kwargs["horizon"] = min(steps, kwargs.get("horizon", steps))
-    env = _task(task, kwargs)
     num_envs = check_count(num_envs, "num_envs", where)
-    return GymnasiumVectorEnv(
-        env, num_envs, discrete=discrete, autoreset_mode=autoreset_mode
+    options: Any = dict(discrete=discrete, autoreset_mode=autoreset_mode)
+    return GymnasiumVectorEnv(_made(task, kwargs), num_envs, **options)
+
+
+for _name, (_task, _discrete, *_threshold) in _IDS.items():
+    _arguments = inspect.signature(_FUNCTIONS[_task]).parameters
+    _spec = EnvSpec(
+        id=f"delucax/{_name}",
+        entry_point=f"{__name__}:make_registered",
+        vector_entry_point=f"{__package__}:make_vector",
+        max_episode_steps=_arguments["horizon"].default,
+        reward_threshold=_threshold[0] if _threshold else None,
+        # Orders are checked by the environment itself.
+        order_enforce=False,
+        kwargs={"task": _task, "discrete": _discrete},
     )
-
-
-def register_ids() -> tuple[str, ...]:
-    """Tell Gymnasium of the tasks, as `delucax/Pendulum-v1` and so on.
-
-    Importing `delucax.interop.gymnasium` does it; to do it again changes nothing.
-
-    **Returns:** the ids.
-
-    !!! example
-
-        ```python
-        from delucax.interop.gymnasium import register_ids
-
-        register_ids()
-        ```
-    """
-    ids = []
-    for name, (task, discrete) in _IDS.items():
-        signature = inspect.signature(_TASKS[task])
-        spec = EnvSpec(
-            id=f"delucax/{name}",
-            entry_point=f"{__name__}:make_registered",
-            vector_entry_point=f"{__package__}:make_vector",
-            max_episode_steps=signature.parameters["horizon"].default,
-            reward_threshold=_THRESHOLDS.get(name),
-            # Orders are checked by the environment itself.
-            order_enforce=False,
-            kwargs={"task": task, "discrete": discrete},
-        )
-        gymnasium.registry.setdefault(spec.id, spec)
-        ids.append(spec.id)
-    return tuple(ids)
+    gymnasium.registry.setdefault(_spec.id, _spec)

@@ -9,10 +9,11 @@ import jax
 import numpy as np
 from gymnasium.error import InvalidAction, ResetNeeded
 
-from ..._check import as_vector, check_bool, check_finite, check_instance
+from ..._check import check_bool, check_choice, check_instance
 from ..._message import shortened
 from ...environments import Environment
-from .._adapter import has_discrete_actions, has_signals
+from .._episode import has_signals
+from .._spaces import has_discrete_actions
 from . import _program as programs
 
 
@@ -69,11 +70,7 @@ class GymnasiumEnv(gymnasium.Env):
     ):
         where = "GymnasiumEnv"
         check_instance(env, Environment, "env", where)
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            raise ValueError(
-                f"{where}: render_mode must be one of {RENDER_MODES} or None, got "
-                f"{render_mode!r}."
-            )
+        check_choice(render_mode, (*RENDER_MODES, None), "render_mode", where)
         if not check_bool(truncate, "truncate", where) and has_signals(env):
             raise ValueError(
                 f"{where}: truncate must be True where there are disturbances or "
@@ -85,12 +82,11 @@ class GymnasiumEnv(gymnasium.Env):
         self.render_mode = render_mode
         fps = int(np.clip(np.round(1 / float(env.dt)), 1, 60))
         self.metadata = type(self).metadata | {"render_fps": fps}
-        self.action_space = programs.action_space(env, self.discrete)
-        self.observation_space = programs.observation_space(env)
+        self.action_space, self.observation_space = programs.spaces(env, self.discrete)
         self._program = programs.program(env, self.discrete, self.truncate)
         self._table = np.asarray(env.actions) if self.discrete else np.zeros((0, 1))
-        self._count = len(self._table)
-        self._shape = (env.control_size,)
+        self._count, self._shape = len(self._table), (env.control_size,)
+        self._read: Any = operator.index if self.discrete else np.asarray
         self._buffer: Any = None
         self._ended = True
         self._picture: Any = None
@@ -100,7 +96,7 @@ class GymnasiumEnv(gymnasium.Env):
         """The state, shape `(state_size,)`."""
         if self._buffer is None:
             raise ResetNeeded("GymnasiumEnv: there is no state before reset().")
-        return self._buffer[: self._program.layout.states].copy()
+        return self._buffer[self._program.states].copy()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -115,12 +111,7 @@ class GymnasiumEnv(gymnasium.Env):
         **Returns:** the observation, and an empty dictionary.
         """
         super().reset(seed=seed)
-        where = "GymnasiumEnv"
-        (state,) = programs.read_options(options, ("state",), where)
-        if state is not None:
-            state = as_vector(state, self.environment.state_size, "state", where)
-            check_finite(state, "state", where)
-            state = state.astype(float)
+        state, _ = programs.read_options(options, self.environment, "GymnasiumEnv")
         packed, signals = self._program.start(programs.draw_key(self.np_random), state)
         packed = np.asarray(packed)
         if self._buffer is None or self._buffer.dtype != packed.dtype:
@@ -131,28 +122,28 @@ class GymnasiumEnv(gymnasium.Env):
         self._ended, self._stepped = False, False
         if self.render_mode == "human":
             self.render()
-        return packed[self._program.layout.observation].astype(np.float32), {}
+        return packed[self._program.observation].astype(np.float32), {}
 
     def _allocate(self, dtype: Any) -> None:
         """Make the arrays that steps are taken in."""
-        layout, actions = self._program.layout, self.action_space.shape or (1,)
+        size, actions = self._program.size, self.action_space.shape or (1,)
         # The packed array with the action after it, and views of its parts.
-        self._buffer, self._shared = programs.shared(layout.size + actions[0], dtype)
-        self._packed, self._action = np.split(self._buffer, [layout.size])
+        self._buffer, self._shared = programs.shared(size + actions[0], dtype)
+        self._packed, self._action = np.split(self._buffer, [size])
         self._outcome = self._packed[programs.REWARD :]
-        view, single = self._packed[layout.observation], np.float32
+        view, single = self._packed[self._program.observation], np.float32
         copy = functools.partial(view.astype, single)
         self._observation = view.copy if view.dtype == single else copy
 
     def _continue_from(self, packed: np.ndarray) -> None:
         """Go on from here."""
-        # Whole, for the case that a step fails.
+        # `_last` is restored if a step fails.
         self._packed[...] = self._last = packed
         drawn = (self._signals,) if has_signals(self.environment) else ()
         self._advance = functools.partial(self._program.step, self._shared, *drawn)
 
     def __getstate__(self):
-        """What a copy is made of: all but compiled functions, and views."""
+        """The attributes to copy: all but compiled functions and views."""
         views = "_program _shared _packed _action _outcome _observation _advance"
         state = {k: v for k, v in self.__dict__.items() if k not in views.split()}
         return state | {"_picture": None}
@@ -174,42 +165,35 @@ class GymnasiumEnv(gymnasium.Env):
         **Returns:** observation, reward, terminated, truncated, and an empty
         dictionary.
         """
-        # Little Python: each line counts for about as much as the arithmetic.
+        # Hot path: the overhead of Python is as large as the arithmetic.
         if self._ended:
+            what = "not begun" if self._buffer is None else "ended"
             raise ResetNeeded(
-                "GymnasiumEnv: call reset() before step(): the episode has "
-                + ("not begun." if self._buffer is None else "ended.")
+                f"GymnasiumEnv: call reset() before step(): the episode has {what}."
             )
+        try:
+            control = self._read(action)
+        except (TypeError, ValueError):  # not an integer; ragged
+            self._invalid_action(action)
         if self.discrete:
-            try:
-                index = operator.index(action)
-            except TypeError:
-                self._invalid_action(action)
-            if not 0 <= index < self._count:
-                self._invalid_action(action)
-            self._action[0] = index
+            is_valid = 0 <= control < self._count
         else:
-            try:
-                control = np.asarray(action)
-            except ValueError:  # ragged
-                self._invalid_action(action)
-            if control.shape != self._shape or control.dtype.kind not in "iuf":
-                self._invalid_action(action)
-            self._action[...] = control
+            is_valid = control.shape == self._shape and control.dtype.kind in "iuf"
+        if not is_valid:
+            self._invalid_action(action)
+        self._action[...] = control
         self._packed[...] = after = self._advance()
         reward, terminated, truncated, failed, _ = self._outcome.tolist()
         if failed:
             self._fail(action)
-        self._last = after
-        if terminated or truncated:
-            self._ended = True
-        self._stepped = True
+        self._last, self._stepped = after, True
+        self._ended = bool(terminated or truncated)
         if self.render_mode == "human":
             self.render()
         return self._observation(), reward, terminated > 0, truncated > 0, {}
 
     def _invalid_action(self, action: Any) -> NoReturn:
-        """Say what an action must be."""
+        """Raise the error for an invalid action."""
         if self.discrete:
             raise InvalidAction(
                 f"GymnasiumEnv: action must be a whole number from 0 to "
@@ -222,7 +206,7 @@ class GymnasiumEnv(gymnasium.Env):
         )
 
     def _fail(self, action: Any) -> NoReturn:
-        """Say why a step failed. An illegal action leaves the episode where it was."""
+        """Raise after a failed step. An invalid action leaves the episode unchanged."""
         self._packed[...] = self._last
         if not np.all(np.isfinite(action)):
             raise InvalidAction(f"GymnasiumEnv: action must be finite, got {action}.")

@@ -4,7 +4,6 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,12 +13,11 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from ..._check import check_count, check_finite, check_instance, check_real
+from ..._check import check_count, check_instance
 from ..._message import shortened
-from ..._module import as_float_array
 from ..._typing import PRNGKey
 from ...environments import Environment
-from .._adapter import has_discrete_actions
+from .._spaces import has_discrete_actions
 from . import _program as programs
 
 
@@ -43,7 +41,7 @@ class GymnasiumVectorEnv(VectorEnv):
 
     `reset(options={"state": x})` starts all at the state `x`, or each at its own if `x`
     has shape `(num_envs, state_size)`; with `options={"reset_mask": mask}` only some
-    are reset. Pictures are of one: [`delucax.interop.gymnasium.GymnasiumEnv`][].
+    are reset. Only [`delucax.interop.gymnasium.GymnasiumEnv`][] renders.
 
     **Raises:** `ValueError` on a wrong argument. `step` raises
     `gymnasium.error.ResetNeeded` before `reset`, `gymnasium.error.InvalidAction` on
@@ -84,21 +82,19 @@ class GymnasiumVectorEnv(VectorEnv):
         self.num_envs = check_count(num_envs, "num_envs", where)
         self.discrete = has_discrete_actions(env, discrete, where)
         self.metadata = {"autoreset_mode": self._mode, "render_modes": []}
-        self.single_action_space = programs.action_space(env, self.discrete)
-        self.single_observation_space = programs.observation_space(env)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        spaces = programs.spaces(env, self.discrete)
+        self.single_action_space, self.single_observation_space = spaces
+        batched = (batch_space(space, num_envs) for space in spaces)
+        self.action_space, self.observation_space = batched
         self._program = programs.program(env, self.discrete)
         self._packed: Any = None
-        self._signals: Any = None
-        self._key: Any = None
 
     @property
     def states(self) -> np.ndarray:
         """The states, shape `(num_envs, state_size)`."""
         if self._packed is None:
             raise ResetNeeded("GymnasiumVectorEnv: there is no state before reset().")
-        return np.array(self._packed)[:, : self._program.layout.states]
+        return np.array(self._packed)[:, self._program.states]
 
     def reset(
         self,
@@ -119,8 +115,8 @@ class GymnasiumVectorEnv(VectorEnv):
         **Returns:** the observations, and an empty dictionary.
         """
         where = "GymnasiumVectorEnv"
-        state, mask = programs.read_options(options, ("state", "reset_mask"), where)
-        state = self._as_states(state)
+        plant, count = self.environment, self.num_envs
+        state, mask = programs.read_options(options, plant, where, count)
         keys = self._start_keys(seed)
         packed, signals = self._program.start_batch(keys, state)
         if mask is not None:
@@ -138,30 +134,13 @@ class GymnasiumVectorEnv(VectorEnv):
         self._packed, self._signals = packed, signals
         return self._observations(np.asarray(packed)), {}
 
-    def _as_states(self, state: Any) -> jax.Array | None:
-        """A state for each, if any is given."""
-        if state is None:
-            return None
-        where, shape = "GymnasiumVectorEnv", (self.environment.state_size,)
-        each = (self.num_envs, *shape)
-        state = as_float_array(state)
-        if not eqx.is_inexact_array(state) or state.shape not in (shape, each):
-            got = f"shape {state.shape}" if eqx.is_array(state) else shortened(state)
-            raise ValueError(
-                f"{where}: state must have shape {shape}, or {each} for one each, got "
-                f"{got}."
-            )
-        check_real(state, "state", where)
-        check_finite(state, "state", where)
-        return jnp.broadcast_to(state.astype(float), each)
-
     def _start_keys(self, seed: Any) -> PRNGKey:
-        """A key for the start of each, and `_key` for what starts later."""
+        """The keys of this reset; sets `_key`, the key of later automatic resets."""
         own: dict[int, int] = {}
         if isinstance(seed, Sequence | np.ndarray):
             integer = lambda one: isinstance(one, int | np.integer) and one >= 0
-            legal = [one is None or integer(one) for one in seed]
-            if len(legal) != self.num_envs or not all(legal):
+            valid = [one is None or integer(one) for one in seed]
+            if len(valid) != self.num_envs or not all(valid):
                 raise ValueError(
                     f"GymnasiumVectorEnv: seed must be {self.num_envs} whole numbers "
                     f"from 0, one for each, or one for all, got {shortened(seed)}."
@@ -198,10 +177,8 @@ class GymnasiumVectorEnv(VectorEnv):
                 "the reward is not finite, or the solver did not converge. Call "
                 "reset()."
             )
-        terminations, truncations = (
-            packed[:, programs.TERMINATED] > 0,
-            packed[:, programs.TRUNCATED] > 0,
-        )
+        terminations = packed[:, programs.TERMINATED] > 0
+        truncations = packed[:, programs.TRUNCATED] > 0
         info: dict[str, Any] = {}
         ended = terminations | truncations
         if self._mode is AutoresetMode.SAME_STEP and ended.any():
@@ -215,10 +192,10 @@ class GymnasiumVectorEnv(VectorEnv):
         return self._observations(packed), rewards, terminations, truncations, info
 
     def _observations(self, packed: np.ndarray) -> np.ndarray:
-        return packed[:, self._program.layout.observation].astype(np.float32)
+        return packed[:, self._program.observation].astype(np.float32)
 
     def _as_actions(self, actions: Any) -> np.ndarray:
-        """Actions as the program takes them, or an error."""
+        """The actions as an array for the compiled step; raises if they are invalid."""
         where, space = "GymnasiumVectorEnv", self.single_action_space
         try:
             actions = np.asarray(actions)

@@ -1,6 +1,5 @@
 """Environments in gymnax's protocol, both ways. Needs no extra: gymnax is not used."""
 
-from .._adapter import EpisodeState as EpisodeState
 from ._from_gymnax import from_gymnax as from_gymnax, GymnaxDynamics as GymnaxDynamics
 from ._to_gymnax import (
     GymnaxEnv as GymnaxEnv,

@@ -1,4 +1,4 @@
-"""An environment in gymnax's protocol as one of ours."""
+"""Conversion of a gymnax environment to an `Environment`."""
 
 import dataclasses
 import inspect
@@ -18,25 +18,16 @@ from jaxtyping import Array
 from ..._check import check_keywords, check_step
 from ..._module import as_float_array, parameter
 from ..._results import Result, RESULTS
-from ..._typing import (
-    BoolScalar,
-    Control,
-    Disturbance,
-    PRNGKey,
-    RealScalar,
-    Scalar,
-    State,
-    Vector,
-)
+from ..._typing import Control, Disturbance, PRNGKey, RealScalar, Scalar, State
 from ...costs import AbstractCost
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
-from .._adapter import reads_first_argument
+from .._episode import reads_first_argument
 
 
 @dataclasses.dataclass(frozen=True)
 class _Layout:
-    """How arrays lie one after the other in a vector of floats.
+    """The layout of several arrays in one vector of floats.
 
     Whole numbers and booleans are floats there (exact up to 2^24 in float32). The 32
     bits of an unsigned number, such as a word of a random key, are two of 16.
@@ -50,23 +41,21 @@ class _Layout:
         """The shape of array `i` in the vector."""
         return self.shapes[i] + (2,) * (self.dtypes[i] == jnp.uint32)
 
-    def ravel(self, arrays: Sequence[Any]) -> Vector:
+    def ravel(self, arrays: Sequence[Any]) -> State:
         """The vector of some arrays."""
-        parts = [
-            lax.bitcast_convert_type(jnp.asarray(array, dtype), jnp.uint16)
-            if dtype == jnp.uint32
-            else array
-            for array, dtype in zip(arrays, self.dtypes, strict=True)
-        ]
-        return jnp.concatenate([jnp.ravel(part).astype(self.dtype) for part in parts])
+        parts = []
+        for array, dtype in zip(arrays, self.dtypes, strict=True):
+            if dtype == jnp.uint32:
+                array = lax.bitcast_convert_type(jnp.asarray(array, dtype), jnp.uint16)
+            parts.append(jnp.ravel(array).astype(self.dtype))
+        return jnp.concatenate(parts)
 
-    def unravel(self, x: Vector) -> list[Array]:
+    def unravel(self, x: State) -> list[Array]:
         """The arrays in a vector."""
         shapes = [self.stored_shape(i) for i in range(len(self.shapes))]
-        ends = np.cumsum([math.prod(shape) for shape in shapes])
+        parts = jnp.split(x, np.cumsum([math.prod(shape) for shape in shapes])[:-1])
         arrays = []
-        parts = zip(jnp.split(x, ends[:-1]), shapes, self.dtypes, strict=True)
-        for part, shape, dtype in parts:
+        for part, shape, dtype in zip(parts, shapes, self.dtypes, strict=True):
             part = part.reshape(shape)
             if dtype == jnp.uint32:
                 halves = jnp.round(part).astype(jnp.uint16)
@@ -81,8 +70,8 @@ def _check_protocol(env: Any, where: str) -> None:
     for name in ("reset_env", "step_env", "action_space"):
         if not callable(getattr(env, name, None)):
             raise ValueError(
-                f"{where}: env must speak gymnax's protocol, but {type(env).__name__} "
-                f"has no {name}."
+                f"{where}: env must implement gymnax's protocol, but "
+                f"{type(env).__name__} has no {name}."
             )
 
 
@@ -103,8 +92,8 @@ class GymnaxDynamics(AbstractDynamics):
     - `params`: its parameters.
     - `dt`: the time of a step, 1 by default.
 
-    **Raises:** `ValueError` if the environment does not speak the protocol, or `dt` is
-    not positive.
+    **Raises:** `ValueError` if the environment does not implement the protocol, or `dt`
+    is not positive.
 
     !!! example
 
@@ -145,12 +134,12 @@ class GymnaxDynamics(AbstractDynamics):
                 f"{where}: the action space must be a Box or Discrete, got {space!r}."
             )
         self.action_shape = () if self.discrete else tuple(space.shape)
-        size = int(np.prod(self.action_shape))
+        size = math.prod(self.action_shape)
         several = tuple(f"action[{i}]" for i in range(size))
         self.control_names = ("action",) if size == 1 else several
         key = jr.key(0)
         reset = jax.eval_shape(lambda key: env.reset_env(key, params)[1], key)
-        leaves, structure = jax.tree_util.tree_flatten_with_path(reset)
+        leaves, self.structure = jax.tree_util.tree_flatten_with_path(reset)
         for path, leaf in leaves:
             if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
                 raise ValueError(
@@ -158,7 +147,6 @@ class GymnaxDynamics(AbstractDynamics):
                     f"{jax.tree_util.keystr(path)}, where a raw one "
                     "(`jax.random.PRNGKey`) is expected."
                 )
-        self.structure = structure
         action = jnp.zeros(self.action_shape, int if self.discrete else float)
         step = lambda key, *args: env.step_env(key, *args, params)
         self.draws = reads_first_argument(step, key, reset, action)
@@ -175,7 +163,7 @@ class GymnaxDynamics(AbstractDynamics):
             for index in np.ndindex(self.layout.stored_shape(i))
         )
 
-    def ravel(self, state: Any, key: PRNGKey | None = None) -> Vector:
+    def ravel(self, state: Any, key: PRNGKey | None = None) -> State:
         """The vector of a state, such as `x0` of `delucax.rollout`.
 
         **Arguments:**
@@ -189,7 +177,7 @@ class GymnaxDynamics(AbstractDynamics):
         words = jr.bits(jr.key(0) if key is None else key, (2,), jnp.uint32)
         return self._ravel(state, words, False)
 
-    def _ravel(self, state: Any, words: Any, done: Any) -> Vector:
+    def _ravel(self, state: Any, words: Any, done: Any) -> State:
         leaves, structure = jax.tree.flatten(state)
         shapes = tuple(jnp.shape(leaf) for leaf in leaves)
         expected = self.layout.shapes[: self.structure.num_leaves]
@@ -255,16 +243,14 @@ class _Start(eqx.Module):
 
 
 class _Observation(eqx.Module):
-    """What gymnax's users observe, as a vector."""
+    """gymnax's own observation as a vector."""
 
     dynamics: GymnaxDynamics
 
-    def __call__(self, x: State) -> Vector:
-        env, state = self.dynamics.env, self.dynamics.unravel(x)
-        known = dict(key=jr.key(0), state=state, action=None)
-        known["params"] = self.dynamics.params
-        function = _observer(env)
-        assert function is not None
+    def __call__(self, x: State) -> Array:
+        state, params = self.dynamics.unravel(x), self.dynamics.params
+        known = dict(key=jr.key(0), state=state, action=None, params=params)
+        function: Any = _observer(self.dynamics.env)
         takes = inspect.signature(function).parameters
         parts = function(**{name: known[name] for name in known if name in takes})
         leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(parts)]
@@ -275,7 +261,7 @@ def _observer(env: Any) -> Callable | None:
     return getattr(env, "observe", None) or getattr(env, "get_obs", None)
 
 
-def _is_done(t: RealScalar, x: State) -> BoolScalar:
+def _is_done(t: RealScalar, x: State) -> Array:
     return x[-1] > 0.5
 
 
@@ -295,8 +281,8 @@ def from_gymnax(
     The random key of `step_env` is drawn at the start of an episode, from the key of
     the rollout, and is carried in the state if a step uses it at all.
 
-    A reward may hang on the next state, so that a step of the environment is computed
-    for the dynamics and for the cost. Both hold the parameters: to change them, or to
+    The reward may depend on the next state, so that `step_env` is evaluated twice, for
+    the dynamics and for the cost. Both hold the parameters: to change them, or to
     differentiate with respect to them, make the environment anew. Gradients pass where
     the environment lets them: of gymnax 1.0, `with_transition_gradients` is used where
     there is one; before, and elsewhere, gymnax's own environments stop them.
@@ -311,7 +297,7 @@ def from_gymnax(
 
     **Returns:** an [`delucax.Environment`][].
 
-    **Raises:** `ValueError` if the environment does not speak the protocol, if its
+    **Raises:** `ValueError` if the environment does not implement the protocol, if its
     action space is neither a box nor discrete, if a state changes its shape in a step,
     or without a horizon or an observation.
 
@@ -346,15 +332,15 @@ def from_gymnax(
             "observe nor get_obs."
         )
     dynamics = GymnaxDynamics(env, params, dt)
-    env = dynamics.env
-    space = env.action_space(params)
+    space = dynamics.env.action_space(params)
     if dynamics.discrete:
         bounds = (0.0, float(space.n - 1))
         actions = jnp.arange(float(space.n))[:, None]
     else:
-        ends = (jnp.asarray(end, float) for end in (space.low, space.high))
-        shape = dynamics.action_shape
-        bounds = tuple(jnp.broadcast_to(end, shape).ravel() for end in ends)
+        bounds = tuple(
+            jnp.broadcast_to(jnp.asarray(end, float), dynamics.action_shape).ravel()
+            for end in (space.low, space.high)
+        )
         actions = None
     defaults: dict[str, Any] = dict(
         dynamics=dynamics,

@@ -1,21 +1,27 @@
-"""One of our environments in gymnax's protocol."""
+"""Conversion of an `Environment` to gymnax's protocol."""
 
 import functools
-from typing import Any
+import sys
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..._check import check_bool, check_instance, check_key, is_concrete, LARGEST
+from ..._check import check_bool, check_instance, check_key, is_concrete
 from ..._message import shortened
 from ..._module import as_float_array
 from ..._typing import PRNGKey
 from ...environments import Environment
-from .. import _adapter as adapter
-from .._adapter import EpisodeState
-from ._spaces import box_space, discrete_space, separates_ends
+from .. import _episode as episodes
+from .._episode import EpisodeState
+from .._spaces import (
+    action_ends,
+    gymnax_space,
+    has_discrete_actions,
+    observation_ends,
+)
 
 
 class GymnaxParams(eqx.Module):
@@ -53,6 +59,10 @@ class GymnaxParams(eqx.Module):
         return self.environment.horizon
 
 
+Params: TypeAlias = GymnaxParams | None
+"""`default_params` by default."""
+
+
 class GymnaxEnv:
     """A [`delucax.Environment`][] in gymnax's protocol; see
     [`delucax.interop.gymnax.to_gymnax`][].
@@ -69,8 +79,8 @@ class GymnaxEnv:
         [`delucax.interop.gymnax.to_gymnax`][] says.
 
     **Raises:** `ValueError` on a wrong argument; in a step, on an action of the wrong
-    size or kind, or one that is not in the table. One that is being traced cannot be
-    looked at: its fraction is cut off, and it is clamped to the table.
+    size or kind, or one that is not in the table. Traced actions are truncated to whole
+    numbers and clamped to the table.
 
     !!! example
 
@@ -100,11 +110,14 @@ class GymnaxEnv:
                 "jax.jit, jax.vmap or jax.grad); give traced numbers as params, "
                 "GymnaxParams(env)."
             )
-        self.discrete = adapter.has_discrete_actions(env, discrete, where)
+        self.discrete = has_discrete_actions(env, discrete, where)
         if separate_ends is None:
-            separate_ends = separates_ends()
+            # rejax, which imports any gymnax, expects `done`.
+            theirs = sys.modules.get("gymnax.environments.environment")
+            since_1 = hasattr(getattr(theirs, "Environment", None), "is_truncated")
+            separate_ends = since_1 and "rejax" not in sys.modules
         self.separate_ends = check_bool(separate_ends, "separate_ends", where)
-        self._made = adapter.ByValue(env)
+        self._made = episodes.HashableEnvironment(env)
         self._identity = (self._made, self.discrete, self.separate_ends)
 
     def __hash__(self):
@@ -127,16 +140,11 @@ class GymnaxEnv:
     @property
     def num_actions(self) -> int:
         """The number of actions; of controls if they are not whole numbers."""
-        env = self._made.env
-        if self.discrete:
-            assert env.actions is not None
-            return len(env.actions)
-        return env.control_size
+        env: Any = self._made.env
+        return len(env.actions) if self.discrete else env.control_size
 
     @functools.partial(jax.jit, static_argnames=("self",))
-    def reset(
-        self, key: PRNGKey, params: GymnaxParams | None = None
-    ) -> tuple[Array, EpisodeState]:
+    def reset(self, key: PRNGKey, params: Params = None) -> tuple[Array, EpisodeState]:
         """Begin an episode, the one of `delucax.rollout` with the same key.
 
         **Arguments:**
@@ -144,16 +152,14 @@ class GymnaxEnv:
         - `key`: a random key.
         - `params`: `default_params` by default.
 
-        **Returns:** the observation, and a [`delucax.interop.gymnax.EpisodeState`][].
+        **Returns:** the observation, and the state of the episode: a module with the
+        state of the environment, `state`, the steps since it began, `time`, and the
+        disturbances and the noise of the whole episode, `signals`.
         """
         return self.reset_env(key, params)
 
     def step(
-        self,
-        key: PRNGKey,
-        state: EpisodeState,
-        action: Any,
-        params: GymnaxParams | None = None,
+        self, key: PRNGKey, state: EpisodeState, action: Any, params: Params = None
     ) -> tuple[Any, ...]:
         """One step; at the end of the episode, the first state of the next.
 
@@ -178,20 +184,18 @@ class GymnaxEnv:
         last, after, reward, _, info = self.step_env(key, state, action, params)
         terminated, truncated = info["terminated"], info["truncated"]
 
+        as_now = lambda new, now: jnp.asarray(new, now.dtype)
+        here = (last, after)
+        reset = lambda: jax.tree.map(as_now, self.reset_env(key, params), here)
         # One of the two where nothing is batched: a reset may draw a whole episode.
-        def reset():
-            fresh = self.reset_env(key, params)
-            as_now = lambda new, now: jnp.asarray(new, now.dtype)
-            return jax.tree.map(as_now, fresh, (last, after))
-
         done = terminated | truncated
-        observation, after = jax.lax.cond(done, reset, lambda: (last, after))
+        observation, after = jax.lax.cond(done, reset, lambda: here)
         info["final_observation"] = last
         ends = (terminated, truncated) if self.separate_ends else (done,)
         return observation, after, reward, *ends, info
 
     def reset_env(
-        self, key: PRNGKey, params: GymnaxParams | None = None
+        self, key: PRNGKey, params: Params = None
     ) -> tuple[Array, EpisodeState]:
         """`reset`, not compiled.
 
@@ -200,15 +204,11 @@ class GymnaxEnv:
         **Returns:** as `reset` does.
         """
         check_key(key, "GymnaxEnv.reset")
-        state = adapter.begin(self._params(params).environment, key)
+        state = episodes.begin(self._environment(params), key)
         return self.get_obs(state, params), state
 
     def step_env(
-        self,
-        key: PRNGKey,
-        state: EpisodeState,
-        action: Any,
-        params: GymnaxParams | None = None,
+        self, key: PRNGKey, state: EpisodeState, action: Any, params: Params = None
     ) -> tuple[Any, ...]:
         """One step, without a reset and not compiled.
 
@@ -217,10 +217,12 @@ class GymnaxEnv:
         **Returns:** observation, state, reward, done (`terminated` alone with
         `separate_ends`) and a dictionary.
         """
-        del key
-        env = self._params(params).environment
-        given = self._check_action(action)
-        after, outcome = adapter.step(env, state, self._action(env, given))
+        env, given = self._environment(params), self._check_action(action)
+        if self.discrete:
+            u = jnp.clip(given.reshape(()).astype(int), 0, self.num_actions - 1)
+        else:
+            u = given.reshape(env.control_size)
+        after, outcome = episodes.step(env, state, u)
         info = {
             "terminated": outcome.terminated,
             "truncated": outcome.truncated,
@@ -229,36 +231,33 @@ class GymnaxEnv:
         }
         ended = outcome.terminated | outcome.truncated
         done = outcome.terminated if self.separate_ends else ended
-        return adapter.observe(env, after), after, outcome.reward, done, info
+        return episodes.observe(env, after), after, outcome.reward, done, info
 
     def get_obs(
-        self, state: EpisodeState, params: GymnaxParams | None = None, key: Any = None
+        self, state: EpisodeState, params: Params = None, key: Any = None
     ) -> Array:
-        """What is observed of a state.
+        """The observation of a state.
 
         **Arguments:** `state`, `params`: of `step`. `key`: not used.
 
         **Returns:** the observation.
         """
-        del key
-        return adapter.observe(self._params(params).environment, state)
+        return episodes.observe(self._environment(params), state)
 
-    def is_terminal(
-        self, state: EpisodeState, params: GymnaxParams | None = None
-    ) -> Array:
+    def is_terminal(self, state: EpisodeState, params: Params = None) -> Array:
         """Whether the episode ends at a state, by itself or at the horizon.
 
         **Arguments:** `state`, `params`: of `step`.
 
         **Returns:** a boolean.
         """
-        env = self._params(params).environment
+        env = self._environment(params)
         truncated = state.time >= env.horizon
         if env.terminated is None:
             return truncated
-        return env.terminated(adapter.time_of(env, state), state.state) | truncated
+        return env.terminated(episodes.time_of(env, state), state.state) | truncated
 
-    def action_space(self, params: GymnaxParams | None = None) -> Any:
+    def action_space(self, params: Params = None) -> Any:
         """The actions.
 
         **Arguments:** `params`: `default_params` by default.
@@ -266,27 +265,24 @@ class GymnaxEnv:
         **Returns:** a space with `shape` and `dtype`, `low` and `high` or `n`, and
         `sample(key)` and `contains(x)`: gymnax's own where gymnax is in use.
         """
-        env = self._params(params).environment
-        if self.discrete:
-            return discrete_space(self.num_actions)
-        return box_space(env.control_bounds, env.control_size, adapter.LARGEST_ACTION)
+        ends = action_ends(self._environment(params))
+        return gymnax_space(self.num_actions if self.discrete else ends)
 
-    def observation_space(self, params: GymnaxParams | None = None) -> Any:
+    def observation_space(self, params: Params = None) -> Any:
         """The observations.
 
         **Arguments:** `params`: `default_params` by default.
 
         **Returns:** a space as of `action_space`.
         """
-        env = self._params(params).environment
-        return box_space(env.observation_bounds, env.feature_size, LARGEST)
+        return gymnax_space(observation_ends(self._environment(params)))
 
-    def _params(self, params: GymnaxParams | None) -> GymnaxParams:
+    def _environment(self, params: Params) -> Environment:
         if params is None:
-            return self.default_params
+            return self._made.env
         hint = ", such as default_params"
         check_instance(params, GymnaxParams, "params", "GymnaxEnv", hint)
-        return params
+        return params.environment
 
     def _check_action(self, action: Any) -> Array:
         given = as_float_array(action)
@@ -302,11 +298,6 @@ class GymnaxEnv:
                     f"{shortened(action)}."
                 )
         return given
-
-    def _action(self, env: Environment, given: Array) -> Array:
-        if not self.discrete:
-            return given.reshape(env.control_size)
-        return jnp.clip(given.reshape(()).astype(int), 0, self.num_actions - 1)
 
 
 def to_gymnax(

@@ -49,14 +49,10 @@ class SB3VecEnv(VecEnv):
     def __init__(
         self, env: Environment, num_envs: int, *, discrete: bool | None = None
     ):
-        self.vector = GymnasiumVectorEnv(
-            env, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, discrete=discrete
-        )
-        super().__init__(
-            self.vector.num_envs,
-            self.vector.single_observation_space,
-            self.vector.single_action_space,
-        )
+        options: Any = dict(autoreset_mode=AutoresetMode.SAME_STEP, discrete=discrete)
+        self.vector = vector = GymnasiumVectorEnv(env, num_envs, **options)
+        spaces = vector.single_observation_space, vector.single_action_space
+        super().__init__(vector.num_envs, *spaces)
 
     def reset(self) -> np.ndarray:
         """Begin an episode in each.
@@ -65,8 +61,7 @@ class SB3VecEnv(VecEnv):
         """
         states = [options["state"] for options in self._options if options]
         options = {"state": np.stack(states)} if states else None
-        seeds = None if all(seed is None for seed in self._seeds) else self._seeds
-        observations, _ = self.vector.reset(seed=seeds, options=options)
+        observations, _ = self.vector.reset(seed=self._seeds, options=options)
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
@@ -99,8 +94,7 @@ class SB3VecEnv(VecEnv):
 
         **Returns:** a list with an entry for each.
         """
-        value = getattr(self.vector, attr_name)
-        return [value for _ in self._get_indices(indices)]
+        return [getattr(self.vector, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Copies have no attributes of their own.

@@ -9,25 +9,21 @@ from typing import Any
 
 from ..._check import check_choice
 from ..._extras import extra
-from ...experiments import Page
-from ._estimator_variance import estimator_variance
+from ..._page import Page
 from ._finding import Claim, Finding
-from ._lq_perturbations import lq_perturbations
+from ._gradients import estimator_variance, policy_gradient
+from ._online_control import lq_perturbations, pendulum_shock
 from ._oracle_complexity import oracle_complexity
-from ._pendulum_shock import pendulum_shock
-from ._policy_gradient import policy_gradient
 from ._ventilator import ventilator
 from ._wall_clock import wall_clock
 
 
 STUDIES: dict[str, Callable[..., Finding]] = {
-    "oracle-complexity": oracle_complexity,
-    "policy-gradient": policy_gradient,
-    "estimator-variance": estimator_variance,
-    "wall-clock": wall_clock,
-    "ventilator": ventilator,
-    "pendulum-shock": pendulum_shock,
-    "lq-perturbations": lq_perturbations,
+    study.__name__.replace("_", "-"): study
+    for study in (
+        *(oracle_complexity, policy_gradient, estimator_variance, wall_clock),
+        *(ventilator, pendulum_shock, lq_perturbations),
+    )
 }
 """In the order of the paper."""
 
@@ -81,8 +77,7 @@ def reproduce(
     chosen = list(STUDIES) if "all" in chosen else chosen
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    sections: list[str] = []
-    rows: list[dict[str, Any]] = []
+    sections, rows = [], []
     start = time.perf_counter()
     for k, name in enumerate(chosen, 1):
         say(f"[{k}/{len(chosen)}] {name}")
@@ -91,8 +86,8 @@ def reproduce(
         for claim in finding.claims:
             say(f"  {'holds' if claim.holds else 'DOES NOT HOLD'}: {claim.statement}")
             say(f"    {claim.measured}")
-            words = {"claim": claim.statement, "measured": claim.measured}
-            rows.append({"study": name, **words, "holds": claim.holds})
+            row = {"study": name, "claim": claim.statement}
+            rows.append(row | {"measured": claim.measured, "holds": claim.holds})
         for title, figure in finding.figures.items():
             if not isinstance(figure, Path):
                 figure.savefig(out / f"{title}.png", dpi=150)
@@ -114,7 +109,7 @@ def _held(rows: list[dict[str, Any]]) -> str:
 
 
 def _run(name: str, out: Path, small: bool, say: Callable[[str], Any]) -> Finding:
-    """What a study finds: if it fails, that."""
+    """The finding of a study; if it raises, a claim that does not hold."""
     options = {}
     if name == "ventilator":
         options = {"out": out / ("lung-small" if small else "lung"), "say": say}

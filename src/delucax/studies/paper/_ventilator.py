@@ -11,7 +11,7 @@ from ._finding import Claim, Finding
 
 
 def ventilator(small: bool, out: Path, say: Callable[[str], Any]) -> Finding:
-    """What `python -m delucax lung` finds, in the folder that it writes to."""
+    """The results of `python -m delucax lung`, from the folder that it writes to."""
     lung_study(out, small=small, say=lambda line: say(f"  {line}"))
     summary = json.loads((out / "summary.json").read_text())
     simulators = summary["simulators"]
@@ -19,6 +19,7 @@ def ventilator(small: bool, out: Path, say: Callable[[str], Any]) -> Finding:
     relative = max(summary["learned_over_wrong_physics"].values())
     gains, shared = summary["network_over_best_pid"], summary["shared_over_best_pid"]
     whole = {name: value for name, value in shared.items() if math.isfinite(value)}
+    highest, limit = summary["highest_pressure"], summary["abort"]
     claims = [
         Claim(
             "A simulator learned from breaths predicts open loop to 0.4 cmH2O on each "
@@ -45,9 +46,9 @@ def ventilator(small: bool, out: Path, say: Callable[[str], Any]) -> Finding:
             bool(max(whole.values()) <= 0.8),
         ),
         Claim(
-            f"No pressure is above {summary['abort']:g} cmH2O",
-            f"{summary['highest_pressure']:.1f} cmH2O",
-            bool(summary["highest_pressure"] <= summary["abort"]),
+            f"No pressure is above {limit:g} cmH2O",
+            f"{highest:.1f} cmH2O",
+            highest <= limit,
         ),
     ]
     rows: list[dict[str, Any]] = [

@@ -24,12 +24,20 @@ def wall_clock(small: bool = False) -> Finding:
     python_steps = 10**4 if small else 10**5
     chain_start_up, chain = _compiled(steps, None)
     batch_start_up, batch = _compiled(1000, LANES)
-    seconds = _take_turns([chain, batch, gymnasium_run(python_steps)], runs)
+    seconds = take_turns([chain, batch, gymnasium_run(python_steps)], runs)
     ours, each, theirs = (seconds / [steps, 1000 * LANES, python_steps]).T
     rows: list[dict[str, Any]] = [
-        _row("delucax, one after the other", chain_start_up, ours),
-        _row(f"delucax, {LANES} at a time", batch_start_up, each),
-        _row("Gymnasium", None, theirs),
+        {
+            "simulator": name,
+            "start-up, ms": None if compiled is None else 1e3 * compiled,
+            "ns a step": 1e9 * seconds.mean(),
+            "standard deviation": 1e9 * seconds.std(ddof=1),
+        }
+        for name, compiled, seconds in (
+            ("delucax, one after the other", chain_start_up, ours),
+            (f"delucax, {LANES} at a time", batch_start_up, each),
+            ("Gymnasium", None, theirs),
+        )
     ]
     ratios = {
         "in one chain": float(np.median(theirs / ours)),
@@ -54,13 +62,9 @@ def wall_clock(small: bool = False) -> Finding:
 
 def _compiled(steps: int, lanes: int | None) -> tuple[float, Callable[[], Any]]:
     """Seconds to compile, and a run."""
-    env = pendulum()
-
-    def final(x0):
-        key, still = jax.random.key(0), Zero(1)
-        run = rollout(env, still, key=key, x0=x0, horizon=steps, keep=(), throw=False)
-        return run.final_state
-
+    env, key = pendulum(), jax.random.key(0)
+    options: Any = dict(key=key, horizon=steps, keep=(), throw=False)
+    final = lambda x0: rollout(env, Zero(1), x0=x0, **options).final_state
     shape = (2,) if lanes is None else (lanes, 2)
     x0 = jnp.full(shape, 0.5)
     start = time.perf_counter()
@@ -85,7 +89,7 @@ def gymnasium_run(steps: int) -> Callable[[], Any]:
     return run
 
 
-def _take_turns(runs: list[Callable[[], Any]], rounds: int) -> np.ndarray:
+def take_turns(runs: list[Callable[[], Any]], rounds: int) -> np.ndarray:
     """Seconds by round and run. A load on the machine that comes or goes meets all of
     them, so that the ratios within a round barely change."""
     for run in runs:
@@ -97,12 +101,3 @@ def _take_turns(runs: list[Callable[[], Any]], rounds: int) -> np.ndarray:
             run()
             turn[k] = time.perf_counter() - start
     return taken
-
-
-def _row(name: str, compiled: float | None, seconds: np.ndarray) -> dict[str, Any]:
-    return {
-        "simulator": name,
-        "start-up, ms": None if compiled is None else 1e3 * compiled,
-        "ns a step": 1e9 * seconds.mean(),
-        "standard deviation": 1e9 * seconds.std(ddof=1),
-    }

@@ -1,8 +1,9 @@
 """The controllers of the study: designed, searched for, or trained in simulators."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,6 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ... import lung
+from ..._controller import AbstractController
+from ..._module import parameter, stack, taken, unstack, weight
 from ..._typing import PRNGKey
 from ...controllers import gpc, LeakyPID, online_newton, OutputFeedback, PID
 from ...costs import Tracking
@@ -19,7 +22,7 @@ from ...dynamics import LinearDynamics
 from ...environments import Environment
 from ...estimators import KalmanFilter
 from ...training.sysid import arx
-from ._stages import ABORT, SEEN, Size
+from ._stages import ABORT, NOISE, SEEN, Size, Stages
 
 
 TRUE_PID = dict(
@@ -28,11 +31,44 @@ TRUE_PID = dict(
     kd=(0.0, 0.01, 0.03),
 )
 """The gains of the true PIDs that are tried."""
-_NOISE = 0.2
 _TUNED_FURTHER = 4
-"""How many of the PIDs that are drawn at random are trained on."""
+"""The number of PIDs drawn at random that are trained further."""
 _CAREFUL = ABORT - 15
-"""One that does not know its lung has to stay well below the limit."""
+"""The alarm of the network for all lungs: well below the limit, as no lung is known."""
+
+
+class Summed(AbstractController):
+    """The sum of two controllers, such as a PID and a network trained on top of it,
+    `u = first(y) + second(y) - offset`."""
+
+    first: AbstractController
+    second: AbstractController
+    offset: Array = parameter(0.0)
+
+    def init(self, *, key=None):
+        keys = (None, None) if key is None else jr.split(key)
+        return self.first.init(key=keys[0]), self.second.init(key=keys[1])
+
+    def __call__(self, t, y, state):
+        u, first = self.first(t, y, state[0])
+        v, second = self.second(t, y, state[1])
+        return (u + (v - self.offset)).astype(y.dtype), (first, second)
+
+    def applied(self, u, cost, state):
+        first = self.first.applied(u, cost, state[0])
+        return first, self.second.applied(u, cost, state[1])
+
+
+class FeedForward(AbstractController):
+    """A control that goes with the target, `u = gain (r(t) - peep) + offset`."""
+
+    waveform: lung.BreathWaveform
+    gain: Array = weight(1.0)
+    offset: Array = weight(0.0)
+
+    def __call__(self, t, y, state):
+        u = self.gain * (self.waveform(t) - self.waveform.peep) + self.offset
+        return u.astype(y.dtype), state
 
 
 class Contender(NamedTuple):
@@ -56,93 +92,93 @@ class Trainer(NamedTuple):
     waveform: lung.BreathWaveform
     size: Size
     key: PRNGKey
+    say: Callable[[str], Any] = print
 
     @property
     def count(self) -> int:
-        """How many lungs there are."""
+        """The number of lungs."""
         return self.simulators.dt.shape[0]
-
-    @property
-    def dt(self) -> Array:
-        """The control interval."""
-        return self.simulators.dt[0]
 
     def __call__(
         self, start: Any, steps: int, fold: int, *, limit: Any = None, **options: Any
     ) -> Any:
         """The trained controllers: see [`delucax.lung.train_controllers`][]."""
-        task = lambda model: lung.lung_environment(model, self.waveform, limit=limit)
+        options |= dict(steps=steps, key=jr.fold_in(self.key, fold))
+        given: Any = dict(waveform=self.waveform, noise=NOISE, limit=limit)
+        task = lambda model: lung.learned_lung(model, **given)
         # Compiled, as the trainings are: then the first states round as they do there.
         envs = eqx.filter_jit(eqx.filter_vmap(task))(self.simulators)
-        options |= dict(steps=steps, key=jr.fold_in(self.key, fold))
         return lung.train_controllers(envs, start, **options).model
 
     def pid(self, kind: type[LeakyPID | PID], gains: Any) -> LeakyPID | PID:
         """A PID that follows the waveform."""
-        return kind(*gains, dt=self.dt, reference=self.waveform)
+        return kind(*gains, dt=self.simulators.dt[0], reference=self.waveform)
 
     def policies(self, shape: tuple[int, ...], fold: int, **options: Any) -> Any:
         """Networks before they are trained, stacked to `shape`."""
-        make = lambda key: lung.BreathPolicy(self.waveform, self.dt, key=key, **options)
-        return _stacked(make, jr.split(jr.fold_in(self.key, fold), shape))
+        given = self.waveform, self.simulators.dt[0]
+        make = lambda key: lung.BreathPolicy(*given, key=key, **options)
+        for _ in shape:
+            make = lambda keys, one=make: stack(map(one, keys))
+        return make(jr.split(jr.fold_in(self.key, fold), shape))
 
-
-def _stacked(make: Callable[[PRNGKey], Any], keys: PRNGKey) -> Any:
-    return lung.stack([_stacked(make, k) for k in keys]) if keys.ndim else make(keys)
+    def networks(
+        self, shape: tuple[int, ...], fold: int, steps: int, **sizes: Any
+    ) -> Callable[..., Any]:
+        """A function that trains networks of some sizes, stacked to `shape`."""
+        start = lambda: self.policies(shape, fold, **sizes)
+        return lambda **options: self(start(), steps, fold + 1, **options)
 
 
 def searched_pids(envs: Environment, trainer: Trainer) -> dict[str, LeakyPID | PID]:
     """The best PID of each kind, for each lung and for all."""
     best: dict[str, Any] = {}
-    true: Any = dict(TRUE_PID, kind="true")
+    key, true = jr.fold_in(trainer.key, 6), dict[str, Any](TRUE_PID, kind="true")
     for name, kind, options in (("leaky PID", LeakyPID, {}), ("PID", PID, true)):
-        grid = lung.pid_grid(envs, key=jr.fold_in(trainer.key, 6), **options)
-        best[name] = lung.stack([trainer.pid(kind, gains) for gains in grid.best()])
-        best[f"{name} for all"] = trainer.pid(kind, grid.best_of_all())
+        grid, errors = lung.pid_grid(envs, key=key, **options)
+        own, of_all = jnp.argmin(errors, axis=1), jnp.argmin(jnp.mean(errors, axis=0))
+        best[name] = stack([trainer.pid(kind, gains) for gains in grid[own]])
+        best[f"{name} for all"] = trainer.pid(kind, grid[of_all])
     return best
 
 
 def trained_pids(
     trainer: Trainer, pids: dict[str, Any], *, checkpoint: Path, progress: bool
 ) -> dict[str, Any]:
-    """Those PIDs trained on, by themselves and with a feed-forward."""
-    forward = lung.FeedForward(trainer.waveform, jnp.asarray(0.3))
+    """The PIDs trained further by the gradient, alone and with a feed-forward."""
+    forward = FeedForward(trainer.waveform, jnp.asarray(0.3))
+    forwards = stack([forward] * trainer.count)
     starts = {f"trained {name}": pid for name, pid in pids.items()}
-    starts["PID + feed-forward"] = eqx.filter_vmap(lung.Summed)(
-        pids["PID"], lung.stack([forward] * trainer.count)
-    )
-    starts["PID + feed-forward for all"] = lung.Summed(pids["PID for all"], forward)
+    starts["PID + feed-forward"] = eqx.filter_vmap(Summed)(pids["PID"], forwards)
+    starts["PID + feed-forward for all"] = Summed(pids["PID for all"], forward)
     trained, options = {}, dict(learning_rate=0.05, progress=progress)
     for name, start in starts.items():
         steps = trainer.size.pid_steps * (2 if "forward" in name else 1)
         file = f"{checkpoint}.{name.replace(' ', '_')}"
         options |= dict(shared=name.endswith("for all"), checkpoint=file)
-        models = trainer(lung.stack([start]), steps, 6, **options)
-        trained[name] = lung.unstack(models)[0]
+        trained[name] = taken(trainer(stack([start]), steps, 6, **options), 0)
     return trained
-
-
-def _log_uniform(key: PRNGKey, low: float, high: float) -> Array:
-    return jnp.exp(jr.uniform(key, minval=jnp.log(low), maxval=jnp.log(high)))
 
 
 @eqx.filter_jit
 def _drawn(
     kind: type[LeakyPID | PID], count: int, dt: Array, waveform: Any, key: PRNGKey
-) -> lung.Summed:
+) -> Summed:
     """PIDs with a feed-forward, gains at random over orders of magnitude."""
 
+    def between(key, low, high):
+        return jnp.exp(jr.uniform(key, minval=jnp.log(low), maxval=jnp.log(high)))
+
     def one(key):
-        keys, between = jr.split(key, 7), _log_uniform
+        keys = jr.split(key, 7)
+        # Half of them without a derivative, a feed-forward gain or an offset.
         some = jr.bernoulli(keys[0], 0.5, (3,))
         kd = between(keys[1], 0.003, 0.2) * (1.0 if kind is PID else 20.0)
         gains = between(keys[2], 0.03, 8.0), between(keys[3], 0.05, 40.0), some[0] * kd
-        forward = lung.FeedForward(
-            waveform,
-            some[1] * jr.uniform(keys[4], maxval=3.0),
-            some[2] * jr.uniform(keys[5], minval=-10.0, maxval=15.0),
-        )
-        return lung.Summed(kind(*gains, dt=dt, reference=waveform), forward)
+        gain = some[1] * jr.uniform(keys[4], maxval=3.0)
+        offset = some[2] * jr.uniform(keys[5], minval=-10.0, maxval=15.0)
+        forward = FeedForward(waveform, gain, offset)
+        return Summed(kind(*gains, dt=dt, reference=waveform), forward)
 
     return eqx.filter_vmap(one)(jr.split(key, count))
 
@@ -161,12 +197,7 @@ def _errors(
     return jnp.where(jnp.isfinite(errors), errors, jnp.inf)
 
 
-def taken(tree: Any, index: Any) -> Any:
-    """What an index takes of each array of stacked modules."""
-    return jax.tree.map(lambda a: a[index] if eqx.is_array(a) else a, tree)
-
-
-def best_of(candidates: Any, errors: Any, shared: bool) -> Any:
+def best_candidates(candidates: Any, errors: Any, shared: bool) -> Any:
     """The candidate with the least error in each lung, or on average over all; errors
     have the shape `(lungs, candidates)`."""
     if shared:
@@ -175,12 +206,7 @@ def best_of(candidates: Any, errors: Any, shared: bool) -> Any:
 
 
 def tuned_pids(
-    envs: Environment,
-    trainer: Trainer,
-    say: Callable[[str], Any],
-    *,
-    checkpoint: Path,
-    progress: bool,
+    envs: Environment, trainer: Trainer, *, checkpoint: Path, progress: bool
 ) -> dict[str, Any]:
     """The best of many at random and of the best few of them trained on, in each lung
     and for all: by their errors in the lungs themselves, which no network is given."""
@@ -194,18 +220,18 @@ def tuned_pids(
         drawn = _drawn(kind, size.tuned, dt, trainer.waveform, draw_key)
         errors = _errors(envs, drawn, search_key, False)
         for shared in (False, True):
+            # The indices of the best: one list for all lungs, or one per lung.
             ranked = jnp.mean(errors, axis=0) if shared else errors.T
             begin = taken(drawn, jnp.argsort(ranked, axis=0)[:_TUNED_FURTHER])
             label = f"tuned {name} + feed-forward" + (" for all" if shared else "")
             file = Path(f"{checkpoint}.{label.replace(' ', '_')}")
             options |= dict(checkpoint=file, shared=shared)
             trained = lung.train_controllers(envs, begin, key=fit_key, **options)
-            both = [*lung.unstack(begin), *lung.unstack(trained.model)]
-            candidates = lung.stack(both)
+            candidates = stack([*unstack(begin), *unstack(trained.model)])
             judged = _errors(envs, candidates, judge_key, not shared)
             if words := divergence_note(trained.history["diverged"], judged):
-                say(f"  {label}: {words}")
-            best[label] = best_of(candidates, judged, shared)
+                trainer.say(f"  {label}: {words}")
+            best[label] = best_candidates(candidates, judged, shared)
     return best
 
 
@@ -225,43 +251,6 @@ def pid_contenders(pids: dict[str, Any]) -> list[Contender]:
     return [Contender(n, 0, pid, n.endswith("for all")) for n, pid in pids.items()]
 
 
-def networks(
-    trainer: Trainer, kind: Literal["mlp", "cnn"], seeds: int, **options: Any
-) -> lung.BreathPolicy:
-    """A network for each lung, of shape `(seeds, lungs)`."""
-    width = 32 if kind == "mlp" else 12
-    start = trainer.policies((seeds, trainer.count), 7, kind=kind, width=width)
-    return trainer(start, trainer.size.controller_steps, 8, **options)
-
-
-def networks_on_pids(
-    trainer: Trainer, pids: dict[str, Any], **options: Any
-) -> lung.Summed:
-    """A PID and a network on top of it for each lung, of shape `(1, lungs)`."""
-    # So that the network adds nothing before it is trained.
-    offset = 100 * jax.nn.sigmoid(jnp.asarray(-2.0))
-    summed = eqx.filter_vmap(lambda a, b: lung.Summed(a, b, offset=offset))
-    policies = trainer.policies((trainer.count,), 9)
-    start = lung.stack([summed(pids["leaky PID"], policies)])
-    return trainer(start, trainer.size.controller_steps, 10, **options)
-
-
-def networks_for_all(trainer: Trainer, **options: Any) -> lung.BreathPolicy:
-    """A network for all lungs, of shape `(seeds,)`."""
-    size = trainer.size
-    width, controls = size.shared_network
-    start = trainer.policies((size.seeds,), 11, width=width, controls=controls)
-    options |= dict(shared=True, limit=_CAREFUL)
-    return trainer(start, size.shared_steps, 12, **options)
-
-
-def planners(trainer: Trainer) -> Contender:
-    """Predictive control in the learned lungs."""
-    waveforms = lung.stack([trainer.waveform] * trainer.count)
-    plan = eqx.filter_vmap(lung.ShootingMPC)(trainer.simulators, waveforms)
-    return Contender("MPC", 0, plan)
-
-
 def online_learners(
     train: lung.Breaths, pids: dict[str, Any], waveform: lung.BreathWaveform, delay: int
 ) -> Any:
@@ -278,21 +267,20 @@ def online_learners(
         # A model to predict with: each of its numbers need not be known.
         lags: Any = dict(outputs_back=2, controls_back=4, delay=delay + 1)
         identified = arx(outputs, controls, dt=dt, throw=False, **lags).model
-        n = identified.state_size
         model = LinearDynamics(identified.A, identified.B, dt=dt)
         gains = pid.kp, pid.ki, pid.kd
         base = LeakyPID(*gains, dt=dt, reference=waveform, output=0)
-        error = jnp.zeros(n).at[0].set(1.0)
-        cost = Tracking(error, jnp.zeros(1), _Target(waveform, n))
+        error = jnp.zeros(identified.state_size).at[0].set(1.0)
+        cost = Tracking(error, jnp.zeros(1), _Target(waveform, len(error)))
         online = gpc(model, cost, base=base, horizon=10, optimiser=newton)
-        # All that the fit leaves over moves the lung; the sensor is taken at its word.
-        process = jnp.diag(_NOISE**2 * error)
+        # All of the residual variance is process noise; the sensor has next to none.
+        process = jnp.diag(NOISE**2 * error)
+        # The outputs among the states start at PEEP.
         mean = error.at[1].set(1.0) * waveform.peep
         kalman = KalmanFilter(identified, process, 1e-4 * jnp.eye(1), mean=mean)
         return OutputFeedback(online, kalman)
 
-    each = lung.unstack(train), lung.unstack(pids["leaky PID"])
-    return lung.stack([*map(learner, *each)])
+    return stack(map(learner, unstack(train), unstack(pids["leaky PID"])))
 
 
 class _Target(eqx.Module):
@@ -303,3 +291,57 @@ class _Target(eqx.Module):
 
     def __call__(self, t):
         return jnp.zeros(self.size).at[0].set(self.waveform.pressure(t))
+
+
+def contenders(
+    stages: Stages, envs: Environment, train: lung.Breaths, trainer: Trainer
+) -> list[Contender]:
+    """All controllers, in the order of the report."""
+    size, waveform, count = trainer.size, trainer.waveform, trainer.count
+    training, steps = stages.training, size.controller_steps
+    pids = stages.stage("pids", "PID grids", lambda: searched_pids(envs, trainer))
+
+    def residuals(**kept):
+        # So that the network adds nothing before it is trained.
+        offset = 100 * jax.nn.sigmoid(jnp.asarray(-2.0))
+        summed = eqx.filter_vmap(lambda a, b: Summed(a, b, offset=offset))
+        start = stack([summed(pids["leaky PID"], trainer.policies((count,), 9))])
+        return trainer(start, steps, 10, **kept)
+
+    # No control is a PID without gains, as which it compiles nothing of its own.
+    none = trainer.pid(LeakyPID, (0.0, 0.0, 0.0))
+    rows = [Contender("zero", 0, none, True), *pid_contenders(pids)]
+    seeds = f"{size.seeds} seeds at once"
+    networks = trainer.networks((size.seeds, count), 7, steps, width=32)
+    own = training("own", f"A network for each lung, {seeds}", networks)
+    sizes = dict(zip(("width", "controls"), size.shared_network, strict=True))
+    networks = trainer.networks((size.seeds,), 11, size.shared_steps, **sizes)
+    networks = functools.partial(networks, shared=True, limit=_CAREFUL)
+    shared = training("shared", f"A network for all lungs, {seeds}", networks)
+    if size.tuned:
+        words = "PIDs with feed-forward tuned on the lungs"
+        tuned = training("tuned_pids", words, tuned_pids, envs, trainer)
+        rows += pid_contenders(tuned)
+    if size.extras:
+        more = training("trained_pids", "PIDs trained on", trained_pids, trainer, pids)
+        networks = trainer.networks((1, count), 7, steps, kind="cnn", width=12)
+        convolved = training(
+            "own_cnn", "A convolutional network for each lung", networks
+        )
+        residual = training("residual", "A PID and a network for each lung", residuals)
+        learn = lambda: online_learners(train, pids, waveform, size.sensor_delay)
+        online = stages.stage("online", "GPC around the best PIDs", learn)
+        given: Any = trainer.simulators, envs.cost.waveform  # pyright: ignore
+        planners = eqx.filter_vmap(lung.ShootingMPC)(*given)
+        rows += [
+            *pid_contenders(more),
+            Contender("bang-bang", 0, lung.BangBang(waveform), True),
+            Contender("GPC", 0, online),
+            Contender("MPC", 0, planners),
+            Contender("CNN", 0, taken(convolved, 0)),
+            Contender("PID + MLP", 0, taken(residual, 0)),
+        ]
+    rows += [Contender("MLP", seed, one) for seed, one in enumerate(unstack(own))]
+    for seed, one in enumerate(unstack(shared)):
+        rows.append(Contender("MLP for all", seed, one, True))
+    return rows

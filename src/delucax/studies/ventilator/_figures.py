@@ -5,9 +5,11 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 
 from ... import lung
+from ..._module import unstack
 from ...environments import Environment
 from ...plotting import animate
 from ...plotting.figures import color_of, NEUTRAL, NotebookFigure, style_axes
@@ -16,9 +18,16 @@ from ._stages import SHOWN
 
 
 _SIZE = 9.0
+_STYLE: Any = {
+    "axes.labelsize": _SIZE,
+    "axes.titlesize": _SIZE + 1,
+    "legend.fontsize": _SIZE - 1,
+    "legend.frameon": False,
+}
 _ORDER = ("best PID", "MLP", "MLP for all", "MPC", "PID + MLP", "CNN")
 
 
+@rc_context(_STYLE)
 def tracking_figure(
     envs: Environment, shown: dict[str, Any], names: list[str], rows: Rows
 ) -> NotebookFigure:
@@ -26,38 +35,37 @@ def tracking_figure(
     count = len(names)
     lungs = sorted({0, count // 2, count - 1})
     figure = NotebookFigure(figsize=(9.5, 6.2), layout="constrained")
-    axes = figure.subplots(2, len(lungs), squeeze=False, height_ratios=(1.15, 1))
-    cost: Any = lung.unstack(envs)[0].cost
-    index = cost.index
-    for ax, i in zip(axes[0], lungs, strict=True):
+    panels: Any = [lungs, ["errors"] * len(lungs)]
+    axes: Any = figure.subplot_mosaic(panels, height_ratios=(1.15, 1))
+    cost: Any = envs.cost
+    waveform = lung.BreathWaveform.at_pip(unstack(cost)[0].waveform, SHOWN)
+    for i in lungs:
+        ax = axes[i]
         for k, (label, runs) in enumerate(shown.items()):
-            pressure = np.asarray(runs.states[i, :, index])
+            pressure = np.asarray(runs.states[i, :, cost.index])
             times = float(envs.dt[i]) * np.arange(len(pressure))
             ax.plot(times, pressure, color=_color(label, k), lw=1.5, label=label)
         times = np.linspace(0, 2.99, 600)
-        target = np.asarray(lung.at_pip(cost.waveform, SHOWN).pressure(times))
+        target = np.asarray(waveform.pressure(times))
         ax.plot(times, target, color="0.2", lw=1, ls=(0, (4, 2)), label="target")
-        ax.set_title(names[i], fontsize=_SIZE + 1)
-        ax.set_xlabel("time [s]", fontsize=_SIZE)
         style_axes(ax, size=_SIZE)
-        ax.set_xlim(0, 1.6)
-    axes[0, 0].set_ylabel("pressure [cmH2O]", fontsize=_SIZE)
-    axes[0, -1].legend(fontsize=_SIZE - 1, frameon=False)
-    grid = axes[1, 0].get_gridspec()
-    for ax in axes[1]:
-        ax.remove()
-    ax = figure.add_subplot(grid[1, :])
-    error = _errors(rows, names)
-    pids = [error[label] for label in PID_ROWS if label in error]
-    bars = {"best PID": np.min(pids, axis=0)}
+        ax.set(title=names[i], xlabel="time [s]", xlim=(0, 1.6))
+    axes[lungs[0]].set_ylabel("pressure [cmH2O]")
+    axes[lungs[-1]].legend()
+    ax = axes["errors"]
+
     chosen = ("MLP for all", "MPC", "CNN", "PID + MLP", "MLP", "least error")
-    bars |= {label: error[label] for label in chosen if label in error}
+    of = lambda label: [mean_error(rows, label, "unseen", name) for name in names]
+    errors = {label: of(label) for label in (*PID_ROWS, *chosen)}
+    # Those of controllers that were not run are NaN.
+    bars = {"best PID": np.nanmin([errors[label] for label in PID_ROWS], axis=0)}
+    bars |= {label: errors[label] for label in chosen if np.isfinite(errors[label][0])}
     colors = {label: _color(label, k) for k, label in enumerate(bars)}
     _draw_bars(ax, bars, colors | {"least error": NEUTRAL})
     ax.set_xticks(np.arange(count), names)
-    ax.set_ylabel("mean |error| [cmH2O]", fontsize=_SIZE)
-    ax.legend(fontsize=_SIZE - 1, frameon=False, ncols=len(bars), loc="upper center")
-    ax.set_ylim(0, 1.25 * float(np.max(list(bars.values()))))
+    ax.legend(ncols=len(bars), loc="upper center")
+    most = 1.25 * float(np.max(list(bars.values())))
+    ax.set(ylabel="mean |error| [cmH2O]", ylim=(0, most))
     return figure
 
 
@@ -71,21 +79,13 @@ def _draw_bars(ax: Axes, bars: dict[str, Any], colors: dict[str, str]) -> None:
 
 
 def _color(label: str, index: int) -> str:
-    """The same for a controller in all parts of the figure."""
+    """The colour of a controller, the same in all parts of the figure."""
     return color_of(_ORDER.index(label) if label in _ORDER else index)
 
 
-def _errors(rows: list[dict[str, Any]], names: list[str]) -> dict[str, np.ndarray]:
-    """The error at unseen peak pressures, of each controller in each lung."""
-    labels = dict.fromkeys(r["controller"] for r in rows if r["split"] == "unseen")
-    return {
-        label: np.array([mean_error(rows, label, "unseen", name) for name in names])
-        for label in labels
-    }
-
-
+@rc_context(_STYLE)
 def simulator_figure(
-    test: Any, models: dict[str, Any], names: list[str], table: list[dict[str, Any]]
+    test: lung.Breaths, models: dict[str, Any], names: list[str], table: Rows
 ) -> NotebookFigure:
     """A breath that was not learned from as simulators see it, and their errors."""
     figure = NotebookFigure(figsize=(9.5, 3.6), layout="constrained")
@@ -93,35 +93,32 @@ def simulator_figure(
     middle = len(names) // 2
     # One that reaches a pressure that is often asked for.
     breath = int(np.argmin(np.abs(np.max(test.pressure[middle], axis=-1) - 30)))
-    u = test.u_in[middle, breath]
-    times = float(np.ravel(test.dt)[0]) * np.arange(u.shape[0])
+    u, read = test.u_in[middle, breath], np.asarray(test.pressure[middle, breath])
+    times = float(np.ravel(test.dt)[0]) * np.arange(len(u))
     truth = test.pressure if test.truth is None else test.truth
-    read = np.asarray(test.pressure[middle, breath])
     left.plot(times, read, ".", color=NEUTRAL, ms=4, label="read")
     left.plot(times, np.asarray(truth[middle, breath]), color="0.2", lw=1, label="true")
     for k, (label, model) in enumerate(models.items()):
-        if label not in ("learned", "single compartment", "balloon"):
-            continue
-        predicted = np.asarray(eqx.filter_jit(lung.unstack(model)[middle].predict)(u))
-        left.plot(times, predicted, color=color_of(k), lw=1.5, label=label)
-    left.set_title(f"{names[middle]}, from its controls alone", fontsize=_SIZE + 1)
-    left.set_xlabel("time [s]", fontsize=_SIZE)
-    left.set_ylabel("pressure [cmH2O]", fontsize=_SIZE)
-    left.legend(fontsize=_SIZE - 1, frameon=False)
+        if label in ("learned", "single compartment", "balloon"):
+            predict = eqx.filter_jit(unstack(model)[middle].predict)
+            pressure = np.asarray(predict(u))
+            left.plot(times, pressure, color=color_of(k), lw=1.5, label=label)
+    left.set(xlabel="time [s]", ylabel="pressure [cmH2O]")
+    left.set_title(f"{names[middle]}, from its controls alone")
+    left.legend()
     style_axes(left, size=_SIZE)
     errors = {(row["simulator"], row["lung"]): row["mae"] for row in table}
     bars = {label: [errors[label, name] for name in names] for label in models}
     _draw_bars(right, bars, {label: color_of(k) for k, label in enumerate(models)})
-    right.set_yscale("log")
+    right.set(yscale="log", ylabel="open-loop mean |error| [cmH2O]")
     right.set_xticks(np.arange(len(names)), names, rotation=30)
-    right.set_ylabel("open-loop mean |error| [cmH2O]", fontsize=_SIZE)
-    right.set_ylim(top=4 * max(row["mae"] for row in table))
-    right.legend(fontsize=_SIZE - 1, frameon=False, ncols=3, loc="upper center")
+    right.set_ylim(top=4 * max(errors.values()))
+    right.legend(ncols=3, loc="upper center")
     return figure
 
 
 def draw_breath(path: Path, envs: Environment, runs: Any) -> None:
     """A breath in the middle one of the lungs, as a moving picture."""
     middle = len(envs.dt) // 2
-    env = lung.at_pip(lung.unstack(envs)[middle], SHOWN)
-    animate(env, lung.unstack(runs)[middle], path=path, max_frames=40)
+    env = lung.BreathWaveform.at_pip(unstack(envs)[middle], SHOWN)
+    animate(env, unstack(runs)[middle], path=path, max_frames=40)

@@ -1,4 +1,4 @@
-"""How the controllers of the study do at the lungs: its rows, figures and words."""
+"""The results of the ventilator study: its rows, saved controllers and summary."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,15 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from ... import lung
-from ..._module import save
+from ..._module import save, stack, unstack
 from ..._typing import PRNGKey
 from ...environments import Environment
-from ...simulation import rollout
 from ._contenders import Contender
-from ._stages import ABORT, BREATH, INSPIRATION, SEEN, SHOWN, UNSEEN
+from ._simulators import closed_loop
+from ._stages import ABORT, BREATH, SEEN, SHOWN, UNSEEN
 
 
 Rows = list[dict[str, Any]]
+Lungs = tuple[Environment, list[str]]
+"""Tasks that are stacked, and their names."""
+Which = tuple[str, int]
+"""The label of a controller, and its seed."""
 WRONG = ("single compartment", "balloon")
 """Physics that the lungs of the study do not have."""
 PID_ROWS = (
@@ -31,33 +35,8 @@ SPLITS = {"seen": slice(len(SEEN)), "unseen": slice(len(SEEN), None)}
 LEARNED = ("MLP", "MLP for all", "CNN", "PID + MLP", "GPC", "MPC")
 
 
-@eqx.filter_jit
-def _evaluated(envs, controllers, pips, keys):
-    """Errors over an inspiration and the highest pressures of a controller in each
-    lung, and the breaths, shape `(lungs, keys, pips)`; controllers stacked."""
-
-    def in_lung(env, controller):
-        index = env.cost.index
-
-        def one(pip, key):
-            world, policy = lung.at_pip((env, controller), pip)
-            run = rollout(world, policy, key=key, horizon=BREATH, throw=False)
-            assert run.costs is not None and run.states is not None
-            highest = jnp.max(run.states[:, index])
-            return jnp.mean(run.costs[:INSPIRATION]), highest, run
-
-        return jax.vmap(lambda key: jax.vmap(one, (0, None))(pips, key))(keys)
-
-    return eqx.filter_vmap(in_lung)(envs, controllers)
-
-
 def error_rows(
-    contenders: list[Contender],
-    envs: Environment,
-    names: list[str],
-    waveform: lung.BreathWaveform,
-    keys: PRNGKey,
-    between: tuple[Environment, list[str]] | None,
+    contenders: list[Contender], lungs: Lungs, between: Lungs | None, keys: PRNGKey
 ) -> tuple[Rows, dict[str, Any]]:
     """The error of each controller in each lung, averaged over noise and pressures; and
     by label a breath of the first seed in each, at the pressure `SHOWN`.
@@ -65,61 +44,49 @@ def error_rows(
     `between` are other lungs, as many as the first, and the names of those that count:
     controllers that are the same for all lungs are run in them too.
     """
-    rows: Rows = []
-    runs: dict[str, Any] = {}
+    (envs, names), rows, runs = lungs, [], {}
     pips, count = jnp.asarray(SEEN + UNSEEN), len(names)
-    waveforms = lung.stack([waveform] * count)
+    waveforms = envs.cost.waveform  # pyright: ignore[reportAttributeAccessIssue]
     place = (SEEN + UNSEEN).index(SHOWN)
     for label, seed, controllers, shared in contenders:
-        each = lung.stack([controllers] * count) if shared else controllers
+        each = stack([controllers] * count) if shared else controllers
         whole = eqx.filter_vmap(lung.Breathing)(each, waveforms)
-        mae, highest, breaths = _evaluated(envs, whole, pips, keys)
-        shown = jax.tree.map(lambda a: a[:, 0, place], breaths)
-        runs.setdefault(label, shown)
-        for split, at in SPLITS.items():
-            rows += _rows(names, label, seed, split, mae[..., at], highest[..., at])
+        *errors, breaths = closed_loop(envs, whole, pips, keys, BREATH)
+        runs.setdefault(label, jax.tree.map(lambda a: a[:, 0, place], breaths))
+        rows += rows_of(names, (label, seed), *errors)
         if shared and between is not None:
             # As many lungs as before, so that nothing compiles again.
             others, other_names = between
-            mae, highest, _ = _evaluated(others, whole, pips, keys)
-            at = slice(len(other_names)), Ellipsis, SPLITS["unseen"]
-            rows += _rows(other_names, label, seed, "between", mae[at], highest[at])
+            *errors, _ = closed_loop(others, whole, pips, keys, BREATH)
+            splits = {"between": SPLITS["unseen"]}
+            rows += rows_of(other_names, (label, seed), *errors, splits)
     return rows, runs
 
 
-def bound_rows(names: list[str], bound: Any) -> Rows:
-    """Rows of the least errors, shape `(lungs, pips)`."""
-    rows: Rows = []
-    for split, at in SPLITS.items():
-        rows += _rows(names, "least error", 0, split, bound[:, at], None)
+def rows_of(
+    names: list[str], run: Which, errors: Any, highest: Any = None, splits: Any = SPLITS
+) -> Rows:
+    """A row for each lung and each split of the peak pressures, the last axis of the
+    errors and the highest pressures."""
+    (label, seed), rows = run, []
+    for split, at in splits.items():
+        of_split = errors[..., at]
+        most = None if highest is None else np.asarray(highest)[..., at]
+        for i, name in enumerate(names):
+            row: Any = dict(lung=name, controller=label, seed=seed, split=split)
+            row["mae"] = float(np.mean(of_split[i]))
+            row["highest"] = "" if most is None else float(np.max(most[i]))
+            rows.append(row)
     return rows
 
 
-def _rows(
-    names: list[str], label: str, seed: int, split: str, mae: Any, highest: Any
-) -> Rows:
-    return [
-        {
-            "lung": name,
-            "controller": label,
-            "seed": seed,
-            "split": split,
-            "mae": float(np.mean(mae[i])),
-            "highest": "" if highest is None else float(np.max(highest[i])),
-        }
-        for i, name in enumerate(names)
-    ]
-
-
 def save_controllers(
-    folder: Path,
-    contenders: list[Contender],
-    names: list[str],
-    waveform: Any,
-    rows: Rows,
+    folder: Path, contenders: list[Contender], names: list[str], rows: Rows
 ) -> list[str]:
-    """Each as a controller of both valves, ready for a task; returned are the names of
-    those that are not saved, for a pressure of theirs passed the abort limit."""
+    """Save each as a controller of both valves, ready for a task.
+
+    Returns the names of those that are not saved, as a pressure passed the abort limit.
+    """
     unsafe = []
     for label, seed, controllers, shared in contenders:
         if label in FLOORS:
@@ -127,13 +94,13 @@ def save_controllers(
         stem = label.lower().replace(" + ", "_").replace(" ", "_").replace("-", "_")
         runs = [r for r in rows if (r["controller"], r["seed"]) == (label, seed)]
         # One that is shared is saved once, and judged by its runs in all lungs.
-        each = [controllers] if shared else lung.unstack(controllers)
+        each = [controllers] if shared else unstack(controllers)
         for name, controller in zip([None] if shared else names, each, strict=True):
             file = folder / f"{stem if name is None else f'{stem}_{name}'}_{seed}.dlx"
             reached = [r["highest"] for r in runs if name in (None, r["lung"])]
             # NaN is not below the limit.
             if np.max(reached) <= ABORT:
-                save(file, lung.Breathing(controller, waveform))
+                save(file, lung.Breathing(controller, lung.BreathWaveform()))
             else:
                 file.unlink(missing_ok=True)
                 unsafe.append(file.stem)
@@ -141,7 +108,8 @@ def save_controllers(
 
 
 def mean_error(rows: Rows, label: str, split: str, lung: str | None = None) -> float:
-    """Of a controller, over its seeds, in one lung or all; NaN if it was not run."""
+    """The mean error of a controller over its seeds, in one lung or in all; NaN if it
+    was not run."""
     of = lambda row: (row["controller"], row["split"]) == (label, split)
     errors = [r["mae"] for r in rows if of(r) and lung in (None, r["lung"])]
     return float(np.mean(errors)) if errors else float("nan")
@@ -150,7 +118,7 @@ def mean_error(rows: Rows, label: str, split: str, lung: str | None = None) -> f
 def best_of(
     rows: Rows, labels: Iterable[str], split: str, lung: str | None = None
 ) -> tuple[float, str]:
-    """The least error of some controllers, and whose it is; NaN if none was run."""
+    """The least error of some controllers, and its label; NaN if none was run."""
     errors = {label: mean_error(rows, label, split, lung) for label in labels}
     known = ((e, label) for label, e in errors.items() if not np.isnan(e))
     return min(known, default=(float("nan"), ""))
@@ -168,7 +136,7 @@ def _by_kind(table: Rows, column: str) -> dict[str, dict[str, float]]:
 def summarise(
     rows: Rows, table: Rows, seconds: dict[str, float], judge: str, unsafe: list[str]
 ) -> dict[str, Any]:
-    """The figures that the study is about, and sentences of them.
+    """The key figures of the study, and sentences about them.
 
     `judge` says what the controllers were run in, and `unsafe` names those that were
     not saved."""
@@ -189,13 +157,14 @@ def summarise(
     }
     reached = [row["highest"] for row in rows if row["controller"] in LEARNED]
     highest = float(np.max(reached))
+    error, gain = np.array([*learned.values()]), np.array([*gains.values()])
     words = [
-        f"Learned lungs: open-loop error {np.mean(list(learned.values())):.3f} cmH2O "
-        f"on average, {max(learned.values()):.3f} at most; relative to the better of "
-        f"single compartment and balloon at most {max(ratios.values()):.2f}.",
+        f"Learned lungs: open-loop error {error.mean():.3f} cmH2O on average, "
+        f"{error.max():.3f} at most; relative to the better of single compartment and "
+        f"balloon at most {max(ratios.values()):.2f}.",
         "A network for each lung: its error over that of the best PID is "
-        f"{np.mean(list(gains.values())):.2f} on average, {max(gains.values()):.2f} at "
-        "most, at peak pressures that are not trained on.",
+        f"{gain.mean():.2f} on average, {gain.max():.2f} at most, at peak pressures "
+        "that are not trained on.",
         f"A network for all lungs, over the best PID for all: {shared['unseen']:.2f} "
         f"on the lungs of the training, {shared['between']:.2f} on lungs between.",
         f"The highest pressure with what was learned: {highest:.1f} cmH2O; the limit "

@@ -1,10 +1,11 @@
-"""A study in stages: its size, and what of it is done."""
+"""The sizes of a study, and the folder that keeps its finished stages."""
 
 import csv
 import io
 import json
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +18,10 @@ SEEN = (10.0, 15.0, 20.0, 25.0, 30.0, 35.0)
 UNSEEN = (12.5, 17.5, 22.5, 27.5, 32.5)
 SHOWN = 27.5
 """The peak pressure of the breaths in the figures, one of those."""
-INSPIRATION, BREATH = 29, 100
-"""Steps of an inspiration that is learned from, and of a whole breath."""
+INSPIRATION = 29
+"""Steps of an inspiration, from which lungs are learned."""
+BREATH = 100
+"""Steps of a whole breath."""
 ABORT = 60.0
 """The pressure that no controller is to reach [cmH2O]."""
 LUNGS = tuple((R, C) for R in (5.0, 20.0, 50.0) for C in (10.0, 20.0, 50.0))
@@ -27,10 +30,12 @@ BETWEEN = ((10.0, 15.0), (10.0, 35.0), (35.0, 15.0), (35.0, 35.0))
 """Lungs between those that are trained on, (R, C)."""
 SENSOR_DELAY = 2
 """Samples that the sensor is late."""
+NOISE = 0.2
+"""The standard deviation of what the sensor adds [cmH2O]."""
 
 
 class Size(NamedTuple):
-    """How much of everything; the full study by default.
+    """The sizes of a study; the full one by default.
 
     `shared_network` are hidden units of the network for all lungs, and how many
     controls it is given; `tuned` is how many PIDs with feed-forward are drawn;
@@ -83,8 +88,9 @@ SMALL = Size(
 )
 
 
+@dataclass(frozen=True)
 class Stages:
-    """A folder that a study is written to, and how far it is.
+    """The folder of a study, which keeps its finished stages.
 
     **Arguments:**
 
@@ -97,21 +103,30 @@ class Stages:
         whose settings are damaged.
     """
 
-    def __init__(
-        self,
-        out: Path,
-        settings: dict[str, Any],
-        say: Callable[[str], Any],
-        progress: bool,
-    ):
-        self.out, self.say, self.progress = out, say, progress
-        self.seconds: dict[str, float] = {}
-        known = out / "settings.json"
-        (out / "controllers").mkdir(parents=True, exist_ok=True)
-        if known.exists():
-            _check_settings(known, settings)
-        else:
-            self.write("settings.json", json.dumps(settings, indent=1) + "\n")
+    out: Path
+    settings: dict[str, Any]
+    say: Callable[[str], Any]
+    progress: bool
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self):
+        known = self.out / "settings.json"
+        text = json.dumps(self.settings, indent=1) + "\n"
+        (self.out / "controllers").mkdir(parents=True, exist_ok=True)
+        if not known.exists():
+            self.write("settings.json", text)
+        instead = "delete the folder, or name another one with out."
+        try:
+            stored, given = json.loads(known.read_text()), json.loads(text)
+        except ValueError as error:
+            words = f"lung: '{known}' is damaged ({error}); {instead}"
+            raise ValueError(words) from None
+        for name in sorted(given.keys() | stored.keys()):
+            if given.get(name) != stored.get(name):
+                raise ValueError(
+                    f"lung: '{self.out}' holds a study with other settings: {name} is "
+                    f"{stored.get(name)} there and {given.get(name)} here; {instead}"
+                )
 
     def training(
         self, name: str, words: str, train: Callable[..., Any], *args: Any
@@ -122,7 +137,7 @@ class Stages:
         return self.stage(name, words, lambda: train(*args, **options))
 
     def stage(self, name: str, words: str, make: Callable[[], Any]) -> Any:
-        """What `make` returns, or what it returned before, from its file."""
+        """The value of `make()`; if it was made before, from its file."""
         path = self.out / f"{name}.dlx"
         if path.exists():
             stored = load(path)
@@ -151,22 +166,3 @@ class Stages:
         writer.writeheader()
         writer.writerows(rows)
         self.write(name, text.getvalue())
-
-
-def _check_settings(known: Path, settings: dict[str, Any]) -> None:
-    """Raise unless a study was begun with the same settings."""
-    try:
-        stored = json.loads(known.read_text())
-    except ValueError as error:
-        raise ValueError(
-            f"lung: '{known}' is damaged ({error}); delete the folder, or name "
-            "another one with out."
-        ) from None
-    given = json.loads(json.dumps(settings))
-    for name in sorted(given.keys() | stored.keys()):
-        if given.get(name) != stored.get(name):
-            raise ValueError(
-                f"lung: '{known.parent}' holds a study with other settings: {name} is "
-                f"{stored.get(name)} there and {given.get(name)} here. Delete the "
-                "folder, or name another one with out."
-            )

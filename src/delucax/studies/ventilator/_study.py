@@ -16,12 +16,9 @@ import numpy as np
 
 from ... import lung
 from ..._check import check_count
-from ..._typing import PRNGKey
-from ...controllers import LeakyPID
-from ...environments import Environment
-from . import _contenders as making, _report as reporting, _simulators as fitting
-from ._contenders import Contender, pid_contenders, Trainer
-from ._stages import BREATH, FULL, SEEN, SENSOR_DELAY, Size, SMALL, Stages, UNSEEN
+from ..._module import stack, unstack
+from . import _contenders, _report, _simulators
+from ._stages import BREATH, FULL, NOISE, SEEN, SENSOR_DELAY, SMALL, Stages, UNSEEN
 
 
 def lung_study(
@@ -34,8 +31,8 @@ def lung_study(
     say: Callable[[str], Any] = print,
     progress: bool = True,
 ) -> list[dict[str, Any]]:
-    """Learn simulators of lungs from breaths, and controllers in the simulators; show
-    how they do at the lungs themselves, beside the best PIDs.
+    """Learn simulators of lungs from breaths, and controllers in the simulators;
+    evaluate them on the lungs themselves, beside the best PIDs.
 
     The lungs are those of the task `lung/double_compartment`, with the nine resistances
     and compliances of the public data set: valves that lag, a sensor that is two
@@ -67,7 +64,7 @@ def lung_study(
 
     **Returns:** the rows of the report, dictionaries.
 
-    **Raises:** `ValueError` if an argument is illegal, the folder holds a study with
+    **Raises:** `ValueError` if an argument is invalid, the folder holds a study with
         other settings, a file in it is damaged, or the data are not what they should
         be; `OSError` if a file cannot be read or written.
 
@@ -78,13 +75,16 @@ def lung_study(
         ```
     """
     began = time.perf_counter()
-    size = SMALL if small else FULL
+    delay = check_count(sensor_delay, "sensor_delay", "lung", least=0)
+    size = (SMALL if small else FULL)._replace(sensor_delay=delay)
     if seeds is not None:
         size = size._replace(seeds=check_count(seeds, "seeds", "lung"))
-    sensor_delay = check_count(sensor_delay, "sensor_delay", "lung", least=0)
-    size = size._replace(sensor_delay=sensor_delay)
     recorded = None if data is None else lung.read_breaths(data)
-    source = None if data is None else _named(Path(data))
+    source = None
+    if data is not None:
+        # By its name and content: with another content it is another study.
+        digest = hashlib.sha256(Path(data).read_bytes()).hexdigest()[:16]
+        source = f"{Path(data)}, SHA-256 {digest}"
     version = importlib.metadata.version("delucax")
     settings = dict(size._asdict(), data=source, version=version)
     stages = Stages(Path(out), settings, say, progress)
@@ -92,137 +92,86 @@ def lung_study(
 
     if recorded is None:
         lungs = size.lungs
-        breaths = stages.stage("breaths", "Breaths", lambda: fitting.explored(size))
+        breaths = stages.stage("breaths", "Breaths", lambda: _simulators.explored(size))
     else:
-        make = lambda: fitting.grouped(recorded)
+        make = lambda: _simulators.grouped(recorded)
         lungs, breaths = stages.stage("breaths", "Breaths", make)
-        if words := fitting.left_out(recorded, breaths):
+        if words := _simulators.left_out(recorded, breaths):
             say(words)
         kinds = dict.fromkeys((*size.physics, "grey box"))
         size = size._replace(physics=tuple(kinds), between=())
     names = [_lung_name(*each) for each in lungs]
-    train, test = fitting.divided(breaths, jr.fold_in(key, 1))
-    models = _simulators(stages, train, size, key)
-    table = fitting.open_loop_rows(names, test, models)
+    train, test = _simulators.divided(breaths, jr.fold_in(key, 1))
+    words, given = f"all {len(lungs)} at once", (train, size, key)
+    learned = "simulators", f"Learned lungs, {words}", _simulators.learned
+    models: dict[str, Any] = {"learned": stages.training(*learned, *given)}
+    for kind in size.physics:
+        stage = kind.replace(" ", "_"), f"Fitted {kind}, {words}", _simulators.fitted
+        models[kind] = stages.training(*stage, kind, *given)
+    error_of = eqx.filter_jit(eqx.filter_vmap(lung.Breaths.open_loop_error))
+    table: list[dict[str, Any]] = [
+        {"lung": name, "simulator": kind, "mae": float(error)}
+        for kind, model in models.items()
+        for name, error in zip(names, error_of(test, model), strict=True)
+    ]
 
     between = None
     if recorded is None:
         around = [size.between[i % len(size.between)] for i in range(len(lungs))]
         envs, others = (
-            lung.stack([fitting.task_of(R, C, sensor_delay) for R, C in each])
+            stack([_simulators.task_of(R, C, delay) for R, C in each])
             for each in (lungs, around)
         )
         between = others, [_lung_name(*each) for each in size.between]
         judge = "the lungs themselves"
     else:
         # What no controller was trained in stands in for the lungs.
-        task = lambda model: lung.lung_environment(model, waveform, horizon=BREATH)
-        envs = lung.stack([*map(task, lung.unstack(models["grey box"]))])
+        options: Any = dict(waveform=waveform, noise=NOISE, horizon=BREATH)
+        boxes = unstack(models["grey box"])
+        envs = stack([lung.learned_lung(box, **options) for box in boxes])
         judge = "grey-box lungs fitted to the same breaths, for want of the lungs"
-    trainer = Trainer(models["learned"], waveform, size, key)
-    contenders = _contenders(stages, envs, train, trainer)
+    trainer = _contenders.Trainer(models["learned"], waveform, size, key, say)
+    contenders = _contenders.contenders(stages, envs, train, trainer)
     if size.extras and recorded is None:
         pids = next(c.controllers for c in contenders if c.label == "PID")
         words = "Simulators and lungs under the same PIDs"
-        make = lambda: fitting.closed_loop_errors(envs, models, pids, waveform)
+        make = lambda: _simulators.closed_loop_errors(envs, models, pids)
         closed = stages.stage("closed_loop", words, make)
         for row in table:
             errors = closed[row["simulator"]]
             row["closed_loop_mae"] = float(errors[names.index(row["lung"])])
     stages.write_table("simulators.csv", table)
     keys = jr.split(jr.fold_in(key, 99), size.noises)
-    rows, runs = reporting.error_rows(contenders, envs, names, waveform, keys, between)
+    rows, runs = _report.error_rows(contenders, (envs, names), between, keys)
     if size.bound_steps:
         pips = jnp.asarray(SEEN + UNSEEN)
         of = lambda env: lung.least_error(env, pips=pips, steps=size.bound_steps)
         words, make = "The least error, with the lung at hand", eqx.filter_vmap(of)
         bound = stages.stage("bound", words, lambda: make(envs))
-        rows += reporting.bound_rows(names, np.asarray(bound))
+        rows += _report.rows_of(names, ("least error", 0), np.asarray(bound))
     stages.write_table("report.csv", rows)
     place = stages.out / "controllers"
-    unsafe = reporting.save_controllers(place, contenders, names, waveform, rows)
-    summary = reporting.summarise(rows, table, stages.seconds, judge, unsafe)
+    unsafe = _report.save_controllers(place, contenders, names, rows)
+    summary = _report.summarise(rows, table, stages.seconds, judge, unsafe)
     stages.write("summary.json", json.dumps(summary, indent=1) + "\n")
     for line in summary["words"]:
         say(line)
-    best = {"best PID": reporting.best_of(rows, reporting.PID_ROWS, "unseen")[1]}
+    best = {"best PID": _report.best_of(rows, _report.PID_ROWS, "unseen")[1]}
     shown = {n: runs[best.get(n, n)] for n in ("best PID", "MLP", "MLP for all")}
     if importlib.util.find_spec("matplotlib") is None:
         say("No figures: they need matplotlib (pip install 'delucax[plot]').")
     else:
-        from . import _figures as figures
+        from . import _figures
 
-        figure = figures.tracking_figure(envs, shown, names, rows)
+        figure = _figures.tracking_figure(envs, shown, names, rows)
         figure.savefig(stages.out / "controllers.png", dpi=130)
-        figure = figures.simulator_figure(test, models, names, table)
+        figure = _figures.simulator_figure(test, models, names, table)
         figure.savefig(stages.out / "simulators.png", dpi=130)
-        figures.draw_breath(stages.out / "breath.gif", envs, shown["MLP"])
+        _figures.draw_breath(stages.out / "breath.gif", envs, shown["MLP"])
     say(f"Written to {stages.out}/ in {time.perf_counter() - began:.0f} s.")
     return rows
 
 
-def _named(path: Path) -> str:
-    """A file by its name and its content: with another content it is another study."""
-    return f"{path}, SHA-256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}"
-
-
 def _lung_name(resistance: float, compliance: float) -> str:
-    """What a lung is called in the report."""
+    """The name of a lung in the report."""
     return f"R{resistance:g}C{compliance:g}"
-
-
-def _simulators(
-    stages: Stages, train: lung.Breaths, size: Size, key: PRNGKey
-) -> dict[str, lung.LearnedLung | lung.LungModel]:
-    """Simulators of each kind, stacked over the lungs, by name."""
-    count, data = f"all {train.pressure.shape[0]} at once", (train, size, key)
-    words = f"Learned lungs, {count}"
-    learned = stages.training("simulators", words, fitting.learned, *data)
-    models: dict[str, Any] = {"learned": learned}
-    for kind in size.physics:
-        name, words = kind.replace(" ", "_"), f"Fitted {kind}, {count}"
-        models[kind] = stages.training(name, words, fitting.fitted, kind, *data)
-    return models
-
-
-def _contenders(
-    stages: Stages, envs: Environment, train: lung.Breaths, trainer: Trainer
-) -> list[Contender]:
-    """All controllers, in the order of the report."""
-    size, waveform, training = trainer.size, trainer.waveform, stages.training
-    search = lambda: making.searched_pids(envs, trainer)
-    pids = stages.stage("pids", "PID grids", search)
-    # No control is a PID without gains, as which it compiles nothing of its own.
-    none = trainer.pid(LeakyPID, (0.0, 0.0, 0.0))
-    contenders = [Contender("zero", 0, none, True), *pid_contenders(pids)]
-    words = f"A network for each lung, {size.seeds} seeds at once"
-    own = training("own", words, making.networks, trainer, "mlp", size.seeds)
-    words = f"A network for all lungs, {size.seeds} seeds at once"
-    shared = training("shared", words, making.networks_for_all, trainer)
-    if size.tuned:
-        words = "PIDs with feed-forward tuned on the lungs"
-        given = envs, trainer, stages.say
-        tuned = training("tuned_pids", words, making.tuned_pids, *given)
-        contenders += pid_contenders(tuned)
-    if size.extras:
-        words = "PIDs trained on"
-        more = training("trained_pids", words, making.trained_pids, trainer, pids)
-        words = "A convolutional network for each lung"
-        convolved = training("own_cnn", words, making.networks, trainer, "cnn", 1)
-        words = "A PID and a network for each lung"
-        residual = training("residual", words, making.networks_on_pids, trainer, pids)
-        learn = lambda: making.online_learners(train, pids, waveform, size.sensor_delay)
-        online = stages.stage("online", "GPC around the best PIDs", learn)
-        contenders += [
-            *pid_contenders(more),
-            Contender("bang-bang", 0, lung.BangBang(waveform), True),
-            Contender("GPC", 0, online),
-            making.planners(trainer),
-            Contender("CNN", 0, lung.unstack(convolved)[0]),
-            Contender("PID + MLP", 0, lung.unstack(residual)[0]),
-        ]
-    for label, trained in (("MLP", own), ("MLP for all", shared)):
-        alike = trained is shared
-        each = enumerate(lung.unstack(trained))
-        contenders += [Contender(label, seed, one, alike) for seed, one in each]
-    return contenders

@@ -1,6 +1,6 @@
-"""What was identified, how well, and what the data do not tell."""
+"""The result of an identification, with its uncertainty and identifiability."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from ..._results import choose, first_failure, promote, Result, RESULTS
 
 
 CORRELATED = 4.0
-"""The standard deviations by which white noise hardly ever seems correlated."""
+"""The threshold of the whiteness test, in standard deviations."""
 
 _LOADS = 0.02
 """The share of an unknown direction in a parameter that makes the parameter unknown."""
@@ -38,16 +38,16 @@ class Identified(eqx.Module):
     - `std`: their standard deviations, of the same shape; infinite for what is not
         identifiable, NaN where the fit did not converge.
     - `low`, `high`: the ends of their confidence intervals, of the same shape; those of
-        all legal values, such as 0 and infinity, for what is not identifiable; NaN
+        all valid values, such as 0 and infinity, for what is not identifiable; NaN
         where the fit did not converge.
     - `directions`: shape `(p, p)`, a unit vector in each row, least known first.
     - `spread`: the standard deviation along each, shape `(p,)`; NaN where the fit did
         not converge.
     - `identifiable`: of each direction, shape `(p,)`; false where the fit did not
         converge.
-    - `noise`: the standard deviation of what remains of each output.
-    - `correlation`: of what remains from one step to the next, `sqrt(N) r`, with r the
-        correlation coefficient over N steps, that of the output where it is largest;
+    - `noise`: the standard deviation of the residuals of each output.
+    - `correlation`: of the residuals at lag one, `sqrt(N) r`, with r the correlation
+        coefficient over N steps, that of the output where it is largest;
         `None` in linear fits. In white noise it is about normal with variance 1. Above
         4 the model misses something or the noise is correlated; either way the
         intervals are too narrow, and the report says so. 0 where what remains is less
@@ -97,40 +97,32 @@ class Identified(eqx.Module):
 
     def report(self) -> str:
         """A table of the parameters, with what is not identifiable in words, and
-        whether what remains is correlated.
+        whether the residuals are correlated.
 
         **Returns:** text of several lines. Where the fit did not converge it says why,
         and gives no intervals.
         """
         lines = [f"{'parameter':<24}{'estimate':>12}{'low':>12}{'high':>12}"]
-        shape = self.estimate.shape
-        for index in np.ndindex(shape):
-            name = self.names[index[-1]]
-            label = name if len(shape) == 1 else f"output {index[0]}: {name}"
-            ends = [float(a[index]) for a in (self.estimate, self.low, self.high)]
+        for *output, index in np.ndindex(self.estimate.shape):
+            label = "".join(f"output {i}: " for i in output) + self.names[index]
+            columns = (self.estimate, self.low, self.high)
+            ends = [float(column[*output, index]) for column in columns]
             lines.append(f"{label:<24}" + "".join(f"{end:>12.5g}" for end in ends))
         failed = self.result != RESULTS.successful
         if failed and self.result != RESULTS.unexciting:
-            lines.append(
-                f"the fit failed, and has no intervals: {RESULTS[self.result]}"
-            )
+            why = RESULTS[self.result]
+            lines.append(f"the fit failed, and has no intervals: {why}")
             return "\n".join(lines)
-        for row, known in zip(
-            np.asarray(self.directions), np.asarray(self.identifiable), strict=True
-        ):
-            if not known:
-                parts = [
-                    f"{share:+.2f} {name}"
-                    for share, name in zip(row, self.names, strict=True)
-                    if abs(share) > _LOADS
-                ]
-                lines.append("not identifiable: " + " ".join(parts))
+        for row in np.asarray(self.directions)[~np.asarray(self.identifiable)]:
+            shares = zip(row, self.names, strict=True)
+            parts = [f"{share:+.2f} {n}" for share, n in shares if abs(share) > _LOADS]
+            lines.append("not identifiable: " + " ".join(parts))
         if np.all(self.identifiable):
             lines.append("all directions are identifiable")
         if self.correlation is not None and self.correlation > CORRELATED:
             lines.append(
-                "what remains is correlated from step to step: the model may be wrong, "
-                "and the intervals are too narrow"
+                "the residuals are correlated from step to step: the model may be "
+                "wrong, and the intervals are too narrow"
             )
         return "\n".join(lines)
 
@@ -151,48 +143,47 @@ def checked(fit: Identified, throw: bool) -> Identified:
     return result.error_if(fit, result != RESULTS.successful) if throw else fit
 
 
-class Certainty(eqx.Module):
-    """How certain an estimate is, from the sensitivity of the data to it."""
+class Certainty(NamedTuple):
+    """The uncertainty of an estimate, from the sensitivity of the data to it."""
 
-    directions: Array
-    spread: Array
-    identifiable: Array
-    std: Array
+    directions: Float[Array, "p p"]
+    spread: Float[Array, " p"]
+    identifiable: Bool[Array, " p"]
+    std: Float[Array, "*outputs p"]
 
     @staticmethod
     def of(sensitivity: Array, sigma: Array, worst: Any) -> "Certainty":
-        """Of scaled residuals with a standard deviation `sigma`.
+        """From scaled residuals with a standard deviation `sigma`.
 
         `worst` is the spread from which on a direction counts as unknown.
         """
         rows, p = sensitivity.shape
+        # With fewer rows than parameters the rest of the directions has no size.
         if rows < p:
             sensitivity = jnp.pad(sensitivity, ((0, p - rows), (0, 0)))
+        # S = U diag(size) V': along v_i the estimate has the standard deviation
+        # sigma / size_i, as its covariance is sigma^2 (S' S)^-1. A size below the
+        # rounding of S is none.
         _, size, directions = jnp.linalg.svd(sensitivity, full_matrices=False)
         eps = jnp.finfo(sensitivity.dtype).eps
         sensitive = size > 10 * max(rows, p) * eps * size[0]
         spread = jnp.where(sensitive, sigma / jnp.where(sensitive, size, 1), jnp.inf)
         known = sensitive & (spread < worst)
         share = jnp.abs(directions)
-        each = jnp.where(
-            known[:, None],
-            (share * jnp.where(known, spread, 0)[:, None]) ** 2,
-            jnp.where(share > _LOADS, jnp.inf, 0),
-        )
-        # A sign for each direction, so that it is the same whatever the solver.
-        largest = jnp.argmax(
-            share > 0.9 * jnp.max(share, axis=1, keepdims=True), axis=1
-        )
-        sign = jnp.sign(jnp.take_along_axis(directions, largest[:, None], axis=1))
-        return Certainty(
-            (directions * sign)[::-1],
-            spread[::-1],
-            known[::-1],
-            jnp.sqrt(jnp.sum(each, axis=0)),
-        )
+        # The variance of a parameter is the sum of what the directions add to it.
+        added = (share * jnp.where(known, spread, 0)[:, None]) ** 2
+        unknown = jnp.where(share > _LOADS, jnp.inf, 0)
+        variance = jnp.sum(jnp.where(known[:, None], added, unknown), axis=0)
+        # A sign for each direction, so that it is the same whatever the solver: the
+        # first of the entries that are about the largest is positive.
+        is_large = share > 0.9 * jnp.max(share, axis=1, keepdims=True)
+        first = jnp.argmax(is_large, axis=1)[:, None]
+        directions = directions * jnp.sign(jnp.take_along_axis(directions, first, 1))
+        least_known_first = (a[::-1] for a in (directions, spread, known))
+        return Certainty(*least_known_first, std=jnp.sqrt(variance))
 
 
 def quantile(level: Any, where: str) -> Array:
-    """How many standard deviations a confidence interval reaches to either side."""
+    """The half-width of a confidence interval in standard deviations."""
     check_range(level, "level", where, 0, 1)
     return ndtri((1 + as_float_array(level)) / 2)

@@ -30,8 +30,8 @@ def linear(
 
     `min over A, B, c of sum_k |x_{k+1} - A x_k - B u_k - c|^2`.
 
-    The estimate is that of an errors-free state: noise in the recorded states biases
-    it. Intervals take what remains for independent noise, equal in all steps.
+    The recorded states are assumed to be free of noise, which would bias the estimate.
+    Intervals assume independent, identically distributed residuals.
 
     **Arguments:**
 
@@ -162,7 +162,7 @@ def arx(
 
 
 def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, Array]:
-    """Both with an axis of runs in front, checked."""
+    """Both as arrays with an axis of runs in front; raises if they do not fit."""
     outputs, controls = as_float_array(outputs), as_float_array(controls)
     for what, array in ((name, outputs), ("controls", controls)):
         if not eqx.is_inexact_array(array) or array.ndim not in (2, 3):
@@ -188,18 +188,18 @@ def runs_of(outputs: Any, controls: Any, name: str, where: str) -> tuple[Array, 
 def _least_squares(
     regressors: Float[Array, "rows p"], targets: Float[Array, "rows outputs"]
 ) -> tuple[Float[Array, "outputs p"], Float[Array, "outputs p"], Array, Certainty]:
-    """The estimate of each output, its standard deviation, that of what remains, and
+    """The estimate of each output, its standard deviation, that of the residuals, and
     what the data tell of the output with the largest relative noise."""
     rows, p = regressors.shape
+    # In units of the regressors' size, so that the rank does not depend on units.
     size = jnp.sqrt(jnp.mean(regressors**2, axis=0))
     scale = jnp.where(size > 0, size, 1)
     scaled = regressors / scale
     operator = lx.MatrixLinearOperator(scaled)
+    # The solution of least norm where the data do not tell all, by the same measure of
+    # rounding as `Certainty.of`.
     solver = lx.SVD(rcond=10 * max(rows, p) * float(jnp.finfo(scaled.dtype).eps))
-
-    def one(target):
-        return lx.linear_solve(operator, target, solver, throw=False).value
-
+    one = lambda target: lx.linear_solve(operator, target, solver, throw=False).value
     estimate = jax.vmap(one, in_axes=1)(targets)
     rest = targets - scaled @ estimate.T
     noise = jnp.sqrt(jnp.sum(rest**2, axis=0) / max(rows - p, 1))
@@ -208,7 +208,8 @@ def _least_squares(
     typical = jnp.where(typical > 0, typical, 1)
     worst = jnp.max(noise / typical)
     certainty = Certainty.of(scaled, worst, 1.0)
-    # All outputs share the regressors, and differ in their noise alone.
+    # The covariance of output i is noise_i^2 (R' R)^-1: all outputs share the
+    # regressors R, and differ in their noise alone.
     unit = certainty.std / jnp.where(worst > 0, worst, 1)
     std = noise[:, None] * unit / scale
     std = jnp.where(jnp.isinf(certainty.std), jnp.inf, jnp.where(worst > 0, std, 0))
@@ -223,21 +224,18 @@ def _fitted(
     reach: Array,
     throw: bool,
 ) -> Identified:
-    """The linear model of `targets` by `regressors`, each with a row a step."""
+    """The linear model of `targets` by `regressors`, each with a row per step."""
     rows = jnp.concatenate(regressors, axis=2).reshape(-1, len(names))
     targets = targets.reshape(-1, targets.shape[2])
     estimate, std, noise, certainty = _least_squares(rows, targets)
-    interval = reach * std
+    enough = certainty.identifiable & (len(rows) >= len(names))
     fit = Identified(
         model=model_of(estimate),
         names=tuple(names),
         estimate=estimate,
-        std=std,
-        low=estimate - interval,
-        high=estimate + interval,
-        directions=certainty.directions,
-        spread=certainty.spread,
-        identifiable=certainty.identifiable & (len(rows) >= len(names)),
+        low=estimate - reach * std,
+        high=estimate + reach * std,
+        **certainty._replace(std=std, identifiable=enough)._asdict(),
         noise=noise,
         correlation=None,
         x0=None,
@@ -248,8 +246,11 @@ def _fitted(
 
 def _realised(estimate, p, m, a, b, delay, dt) -> LinearDynamics:
     """The dynamics whose state is the past that the estimate looks back on."""
+    # u_{k-1}, ..., u_{k-held}; the control itself is the input.
     held = b + delay - 2
     n = a * p + held * m
+    # A is a block companion matrix: the first rows predict, the others move the past on
+    # by a step.
     # The coefficients of u_{k-1}, u_{k-2}, ..., of which the first is not in the state.
     of_controls = jnp.pad(estimate[:, a * p :], ((0, 0), ((delay - 1) * m, 0)))
     rows = [

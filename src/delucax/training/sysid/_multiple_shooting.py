@@ -23,10 +23,10 @@ _NEAR = 0.05
 class Windows(NamedTuple):
     """Recorded data cut into windows, and the scale of each output."""
 
-    begins: Int[Any, " windows"]
+    begins: Int[np.ndarray, " windows"]
     controls: Float[Array, "windows steps m"]
     observations: Float[Array, "windows points y"]
-    counts: Bool[Any, "windows points"]
+    counts: Bool[np.ndarray, "windows points"]
     noise: Float[Array, " y"]
 
 
@@ -42,11 +42,11 @@ class _Point(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """What the least squares came to."""
+    """The least-squares estimate and its uncertainty."""
 
     values: dict[str, Array]
     starts: Float[Array, "windows n"]
-    legal: Float[Array, " p"]
+    estimate: Float[Array, " p"]
     certainty: Certainty
     noise: Float[Array, " y"]
     correlation: Float[Array, ""]
@@ -66,13 +66,13 @@ def cut_into_windows(
     stop = count * window
     starts = guesses[:, :stop:window].reshape(runs * count, n)
     inputs = controls[:, :stop].reshape(runs * count, window, -1)
-    index = np.arange(count)[:, None] * window + np.arange(window + 1)
+    begins = np.arange(count) * window
+    index = begins[:, None] + np.arange(window + 1)
     observed = observations[:, index].reshape(runs * count, window + 1, size)
-    begins = np.tile(np.arange(count) * window, runs)
     # The observation where a window ends and the next begins counts once.
     counts = np.ones((count, window + 1), bool)
     counts[:-1, -1] = False
-    counts = np.tile(counts, (runs, 1))
+    begins, counts = np.tile(begins, runs), np.tile(counts, (runs, 1))
     # An output that never moves has a spread of rounding.
     spread, largest = jnp.std(observed, axis=(0, 1)), jnp.max(jnp.abs(observed), (0, 1))
     moves = spread > 1e3 * float(jnp.finfo(observed.dtype).eps) * largest
@@ -110,6 +110,7 @@ def solve(
         return residuals, residuals
 
     *recorded, noise = data
+    # Forward, for parameters and states are few and residuals many.
     slopes = jax.jacfwd(window, argnums=(0, 1), has_aux=True)
     sensitivity = jax.vmap(slopes, in_axes=(None, 0, 0))
 
@@ -122,6 +123,8 @@ def solve(
     windows, n = starts.shape
     zeros = lambda *shape: jnp.zeros(shape, dtype)
     slopes = zeros(windows, rows, p), zeros(windows, rows, n)
+    # Any point is better than the first, so that it is linearised in the loop too, and
+    # the sensitivities are compiled once.
     start = _Point(flat, starts, *slopes, zeros(windows, rows), zeros() + jnp.inf)
     best, count = _levenberg_marquardt(linearised, start, max_steps)
 
@@ -131,14 +134,15 @@ def solve(
     # What the states at the beginnings could explain as well tells nothing.
     _, on_starts, _, on_theta, by_theta = _projected(by_theta, by_start, eps)
     size = data.observations.shape[2]
+    # Degrees of freedom: what is observed less what is estimated.
     free = jnp.maximum(jnp.sum(data.counts) * size - p - starts.size, 1)
     sigma = jnp.sqrt(jnp.sum(best.residuals**2) / free)
     residuals = best.residuals.reshape(data.observations.shape)
+    # sqrt(N) r, about standard normal if the residuals are white (Ljung, 1999).
     each = jnp.sum(residuals**2, axis=(0, 1))
     paired = jnp.sum(residuals[:, 1:] * residuals[:, :-1], axis=(0, 1))
-    correlation = jnp.sqrt(jnp.sum(data.counts)) * jnp.max(
-        paired / jnp.where(each > 0, each, 1)
-    )
+    largest = jnp.max(paired / jnp.where(each > 0, each, 1))
+    correlation = jnp.sqrt(jnp.sum(data.counts)) * largest
     # The correlation of rounding errors has no meaning.
     correlation = jnp.where(sigma < 0.5, 0, correlation)
     noise = data.noise * jnp.sqrt(each * size / free)
@@ -152,9 +156,9 @@ def solve(
     result = choose(count <= max_steps, RESULTS.no_descent, RESULTS.not_converged)
     result = choose(settled, RESULTS.successful, result)
     result = choose(jnp.isfinite(cost), result, RESULTS.diverged)
-    legal = flat_legal(assembly, values)
+    estimate = flat_constrained(assembly, values)
     noise = jnp.where(jnp.isfinite(cost), noise, jnp.nan).astype(dtype)
-    return Solution(values, starts, legal, certainty, noise, correlation, result)
+    return Solution(values, starts, estimate, certainty, noise, correlation, result)
 
 
 def _levenberg_marquardt(
@@ -170,6 +174,7 @@ def _levenberg_marquardt(
     makes the estimate differ by.
     """
     p, dtype = start.theta.size, start.residuals.dtype
+    # Shares of the cost, a sum of squares: about the rounding of it in float32.
     small = 1e-9 if dtype == jnp.float64 else 1e-7
     rounding = 100 * jnp.finfo(dtype).eps ** 2 * start.residuals.size
 
@@ -178,6 +183,8 @@ def _levenberg_marquardt(
         here = linearised(*candidate)
         better = here.cost < best.cost
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
+        # Less damping after a success than more after a failure: nearer to the steps
+        # of Gauss and Newton. A step at the minimum fails by rounding alone.
         damping = jnp.where(better | at_minimum, damping / 8, damping * 4)
         damping = jnp.clip(damping, 1e-10, 1e10)
         by_theta, by_start, largest, units = _scaled(best, largest)
@@ -191,9 +198,8 @@ def _levenberg_marquardt(
         # predicts none.
         predicted = jnp.sum(on_theta**2) + jnp.sum(on_starts[..., p] ** 2)
         at_minimum = predicted <= small * best.cost
-        done = (
-            at_minimum & (damping <= 1e-5) | (damping >= 1e9) | (best.cost < rounding)
-        )
+        done = at_minimum & (damping <= 1e-5) | (damping >= 1e9)
+        done = done | (best.cost < rounding)
         return candidate, best, largest, damping, at_minimum, done, count + 1
 
     def running(carry):
@@ -213,17 +219,17 @@ def _scaled(point: _Point, largest: Any) -> tuple[Array, Array, Any, Any]:
 
     The residuals are a last column of those by the parameters.
     """
-    norms = jnp.linalg.norm(point.by_theta, axis=(0, 1))
-    norms = norms, jnp.linalg.norm(point.by_start, axis=1)
+    by_theta, by_start = point.by_theta, point.by_start
+    norms = jnp.linalg.norm(by_theta, axis=(0, 1)), jnp.linalg.norm(by_start, axis=1)
     largest = jax.tree.map(jnp.maximum, largest, norms)
     units = jax.tree.map(lambda norm: jnp.where(norm > 0, norm, 1), largest)
-    by_theta = [point.by_theta / units[0], point.residuals[..., None]]
-    by_start = point.by_start / units[1][:, None]
-    return jnp.concatenate(by_theta, axis=2), by_start, largest, units
+    columns = [by_theta / units[0], point.residuals[..., None]]
+    by_start = by_start / units[1][:, None]
+    return jnp.concatenate(columns, axis=2), by_start, largest, units
 
 
 def _projected(by_theta: Array, by_start: Array, damping: Any) -> tuple[Array, ...]:
-    """First on the states at the beginnings of the windows, then on the rest."""
+    """Eliminate the states at the beginnings of the windows, then the parameters."""
     p = by_theta.shape[2] - 1
     eliminate = jax.vmap(_eliminate, in_axes=(0, 0, None))
     R_x, on_starts, left = eliminate(by_start, by_theta, damping)
@@ -235,8 +241,10 @@ def _projected(by_theta: Array, by_start: Array, damping: Any) -> tuple[Array, .
 def _eliminate(A: Array, B: Array, damping: Any) -> tuple[Array, Array, Array]:
     """Least squares `min |A z - b|^2 + damping |z|^2` for the columns b of B.
 
-    `(R, C, left)`: `R z = C`, and what is left of B, with a row more for each z.
+    `(R, C, residual)`: `R z = C`, and the residual of B, one row longer per entry of z.
     """
+    # By QR of [A; sqrt(damping) I], whose condition number is that of A, and not of
+    # the normal equations A' A.
     n = A.shape[1]
     A = jnp.concatenate([A, jnp.sqrt(damping) * jnp.eye(n, dtype=A.dtype)])
     B = jnp.concatenate([B, jnp.zeros((n, B.shape[1]), B.dtype)])
@@ -245,14 +253,16 @@ def _eliminate(A: Array, B: Array, damping: Any) -> tuple[Array, Array, Array]:
     return R, C, B - Q @ C
 
 
-def flat_legal(assembly: Assembly, values: dict[str, Array]) -> Float[Array, " p"]:
-    """The legal values in one vector."""
+def flat_constrained(
+    assembly: Assembly, values: dict[str, Array]
+) -> Float[Array, " p"]:
+    """The constrained values in one vector."""
     return jax.flatten_util.ravel_pytree(assembly.constrained(values))[0]
 
 
-def relative_unit(legal: Float[Array, " p"]) -> Float[Array, " p"]:
-    """What a relative change of 1 of each legal value amounts to."""
-    return jnp.where(legal == 0, 1, legal)
+def relative_unit(estimate: Float[Array, " p"]) -> Float[Array, " p"]:
+    """The unit of a relative change of each constrained value: itself, or 1 for 0."""
+    return jnp.where(estimate == 0, 1, estimate)
 
 
 def per_relative_change(
@@ -260,6 +270,6 @@ def per_relative_change(
 ) -> Float[Array, " p"]:
     """The change of each unconstrained value that makes a relative change of 1."""
     tangent = jax.tree.map(jnp.ones_like, values)
-    flat = lambda values: flat_legal(assembly, values)
-    legal, rate = jax.jvp(flat, (values,), (tangent,))
-    return relative_unit(legal) / rate
+    flat = lambda values: flat_constrained(assembly, values)
+    estimate, rate = jax.jvp(flat, (values,), (tangent,))
+    return relative_unit(estimate) / rate

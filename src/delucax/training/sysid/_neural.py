@@ -18,7 +18,7 @@ from ..._check import (
     check_positive,
     check_step,
 )
-from ..._module import as_module, names_of, parameter, positive, weight
+from ..._module import mlp, names_of, parameter, positive, weight
 from ..._results import Result, RESULTS
 from ..._typing import PRNGKey, RealScalar
 from ...dynamics import AbstractDynamics
@@ -92,15 +92,9 @@ class NeuralDynamics(AbstractDynamics):
         self.state_names = names_of(states, "x", "states", where)
         self.control_names = names_of(controls, "u", "controls", where)
         n, m = len(self.state_names), len(self.control_names)
-        self.network = eqx.nn.MLP(
-            n + m,
-            n,
-            check_count(width, "width", where),
-            check_count(depth, "depth", where, least=0),
-            as_module(activation),
-            as_module(jax.nn.identity),
-            key=key,
-        )
+        width = check_count(width, "width", where)
+        depth = check_count(depth, "depth", where, least=0)
+        self.network = mlp(n + m, n, width, depth, activation, key=key)
         self.dt, self.x_mean, self.x_scale = dt, x_mean, x_scale
         self.u_scale, self.step_scale = u_scale, step_scale
 
@@ -124,10 +118,10 @@ class NeuralDynamics(AbstractDynamics):
         u: Float[Array, " m"],
         w: Float[Array, " n"] | None,
     ) -> tuple[Float[Array, " n"], Result]:
+        # The network learns the step and not the next state, which is nearly x itself.
         z = jnp.concatenate([(x - self.x_mean) / self.x_scale, u / self.u_scale])
         x_next = x + self.step_scale * self.network(z)
-        if w is not None:
-            x_next = x_next + w
+        x_next = x_next if w is None else x_next + w
         return x_next.astype(x.dtype), RESULTS.successful
 
 
@@ -184,8 +178,8 @@ class PredictionError(eqx.Module):
     `1 / (N steps) sum over stretches and steps of |(x_k - xhat_k) / scale|^2`,
 
     with `xhat` what the recorded controls lead to from the first state of a stretch, by
-    the model alone. A stretch of one step is a one-step fit; longer ones make the model
-    answer for its own errors. Angles are compared by `model.difference`.
+    the model alone. A stretch of one step is a one-step fit; longer ones penalise
+    errors that accumulate. Angles are compared by `model.difference`.
 
     **Arguments:** `scale`: of each state, a number or shape `(n,)`; 1 by default.
 
@@ -233,7 +227,6 @@ class PredictionError(eqx.Module):
 
         **Returns:** a scalar.
         """
-        del key
         check_instance(model, AbstractDynamics, "model", "PredictionError")
 
         def stretch(t, states, controls):
@@ -243,6 +236,7 @@ class PredictionError(eqx.Module):
                 error = model.difference(x_next, recorded) / self.scale
                 return x_next.astype(x.dtype), jnp.sum(error**2)
 
+            # Recomputed in the backward pass, so that memory holds the states alone.
             inputs = (jnp.arange(controls.shape[0]), controls, states[1:])
             return jnp.mean(lax.scan(jax.checkpoint(step), states[0], inputs)[1])
 

@@ -24,16 +24,15 @@ from ._identified import checked, CORRELATED, Identified, quantile
 from ._linear import runs_of
 from ._multiple_shooting import (
     cut_into_windows,
-    flat_legal,
+    flat_constrained,
     per_relative_change,
     relative_unit,
-    Solution,
     solve,
 )
 
 
 _SHORT_WINDOW = 2
-"""The steps of a window in which not even a wild model grows much."""
+"""The window of the second attempt, short to keep a bad guess from diverging."""
 
 
 def physical(
@@ -59,12 +58,12 @@ def physical(
     estimated with the parameters, so that noise in what was observed does no harm, and
     a window is short enough that small errors do not grow beyond measure. Steps are
     scaled by the sensitivities, so that parameters of any size can be estimated
-    together. What has a constraint is moved in its unconstrained value, as in
-    [`delucax.training.fit`][], and its interval is within the legal set.
+    together. Constrained parameters are estimated in the unconstrained space, as in
+    [`delucax.training.fit`][], and their intervals are within the valid set.
 
-    Where the states are observed, and the fit does not converge or what remains of the
-    data is correlated from step to step, it starts once more, from a fit on windows of
-    two steps. It has converged where no step of the linear
+    Where the states are observed, and the fit does not converge or its residuals are
+    correlated from step to step, it starts once more, from a fit on windows of two
+    steps. It has converged where no step of the linear
     model is longer than a twentieth of what the noise makes the estimate vary; if it
     has not, `result` says so, and there are no intervals. A better first guess, a
     shorter window or smaller steps of the integrator may help then.
@@ -83,7 +82,7 @@ def physical(
     - `window`: steps of a window, 20 by default; all T if there are fewer. What does
         not fill the last is left out.
     - `noise`: the standard deviation of each observation, a number or shape `(p,)`; by
-        default as in what remains of a first fit.
+        default that of the residuals of a first fit.
     - `level`: of the confidence intervals, 0.95 by default.
     - `max_steps`: 100 by default.
     - `throw`: raise if it does not converge or the data do not tell all parameters
@@ -122,8 +121,8 @@ def physical(
     if observations.shape[2] != size or controls.shape[2] != dynamics.control_size:
         raise ValueError(
             f"{where}: observations and controls must have {size} and "
-            f"{dynamics.control_size} entries a step, got shapes {observations.shape} "
-            f"and {controls.shape}."
+            f"{dynamics.control_size} entries per step, got shapes "
+            f"{observations.shape} and {controls.shape}."
         )
     runs, steps = controls.shape[:2]
     window = min(check_count(window, "window", where), steps)
@@ -167,55 +166,51 @@ def physical(
     unknown = len(names) + runs * count * n
     few = size * runs * (count * window + 1) <= unknown
     solution = fit(values, window)
-    if x0 is None and not few and window > _SHORT_WINDOW and _is_doubtful(solution):
+    # A second attempt, if it is known now that the first did not converge, or that its
+    # residuals are correlated from step to step, as the noise is not.
+    retries = x0 is None and not few and window > _SHORT_WINDOW
+    failed = solution.result != RESULTS.successful
+    is_known = is_concrete(solution.correlation)
+    if retries and is_known and (failed | (solution.correlation > CORRELATED)):
         # On short windows nothing grows, so that a worse guess does, and there are
         # fewer minima that are not the least.
         again = fit(fit(values, _SHORT_WINDOW).values, window)
-        failed = solution.result != RESULTS.successful
         if again.result == RESULTS.successful:
             if failed or jnp.prod(again.noise) < jnp.prod(solution.noise):
                 solution = again
-    values, legal, certainty = solution.values, solution.legal, solution.certainty
+    values, estimate, certainty = solution.values, solution.estimate, solution.certainty
     std = certainty.std
+    known = certainty._replace(
+        std=std * jnp.abs(relative_unit(estimate)),
+        identifiable=certainty.identifiable & (not few),
+    )
     ends = [_ends(assembly, values, sign * reach * std) for sign in (-1, 1)]
     starts = solution.starts.reshape(runs, count, n)[:, 0]
     fitted = Identified(
         model=assembly(values),
         names=tuple(names),
-        estimate=legal,
-        std=std * jnp.abs(relative_unit(legal)),
+        estimate=estimate,
         low=jnp.minimum(*ends),
         high=jnp.maximum(*ends),
-        directions=certainty.directions,
-        spread=certainty.spread,
-        identifiable=certainty.identifiable & (not few),
+        **known._asdict(),
         noise=solution.noise,
         correlation=solution.correlation,
         x0=starts if is_batch else starts[0],
-        # Where many values fit as well the iteration wanders: the data are to be
-        # blamed.
+        # With too few data the iteration need not converge: `checked` then reports that
+        # the parameters are not identifiable.
         result=RESULTS.successful if few else solution.result,
     )
     return checked(fitted, throw)
 
 
-def _is_doubtful(solution: Solution) -> bool:
-    """Whether it is known now that the iteration did not converge, or that it ended
-    where what remains is correlated from step to step, as the noise is not."""
-    if not is_concrete(solution.correlation):
-        return False
-    failed = solution.result != RESULTS.successful
-    return bool(failed | (solution.correlation > CORRELATED))
-
-
 def _ends(
     assembly: Assembly, values: dict[str, Array], reach: Float[Array, " p"]
 ) -> Float[Array, " p"]:
-    """The legal values that far from the estimate, in relative changes."""
+    """The valid values at distance `reach` from the estimate, in relative changes."""
     flat, unravel = jax.flatten_util.ravel_pytree(values)
     step = reach * per_relative_change(assembly, values)
-    legal = flat_legal(assembly, unravel(flat + step))
+    end = flat_constrained(assembly, unravel(flat + step))
     # A constraint keeps numbers off the ends of its set; an interval may reach them.
-    edge, size = jnp.finfo(legal.dtype), jnp.abs(legal)
-    end = jnp.where(size >= edge.max, jnp.sign(legal) * jnp.inf, legal)
+    edge, size = jnp.finfo(end.dtype), jnp.abs(end)
+    end = jnp.where(size >= edge.max, jnp.sign(end) * jnp.inf, end)
     return jnp.where(size <= edge.tiny, 0, end)

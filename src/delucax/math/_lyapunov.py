@@ -1,34 +1,41 @@
-"""The Stein, Lyapunov and Sylvester equations of stable matrices, by doubling."""
+"""Lyapunov, Stein and Sylvester equations of stable matrices, and Gramians over a
+finite time, by doubling."""
 
 import jax.lax as lax
 import jax.numpy as jnp
+import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
-from ..math._linear_solve import factorised
-from ..math._size import relative_size
+from .._typing import Scalar, Square
+from ._linear_solve import factorised, full_precision, symmetric
+from ._norms import relative_size
 
 
 _REFINEMENTS = 3
 MAX_DOUBLINGS = 60
-"""Beyond it the spectral radius cannot be told from 1: 2**60 > 1 / eps in float64."""
+"""2**60 steps: a spectral radius closer to 1 is not resolved in float64."""
 
 
-def stein(A: Float[Array, "n n"], Q: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The solution of `X = A' X A + Q` for a stable `A`, by doubling.
+def lyapunov(discrete: bool, A: Square, Q: Square) -> Square:
+    """The solution of `A'X + XA + Q = 0`, or in discrete time of `X = A'XA + Q`, for a
+    stable `A`.
 
     It is differentiated as the linear solve that it is, to any order and in either
     mode.
     """
+    equation = smith if discrete else stable_sylvester
+    solved = lambda A: lambda _, right: equation(A, None, right)[0]
+    # The transposed equation is that of A'. The doubling is never differentiated.
     return lax.custom_linear_solve(
-        lambda X: X - A.T @ X @ A,
-        Q,
-        solve=lambda _, right: smith(A.T, None, right)[0],
-        transpose_solve=lambda _, right: smith(A, None, right)[0],
+        lambda X: X - A.T @ X @ A if discrete else A.T @ X + X @ A,
+        Q if discrete else -Q,
+        solve=solved(A.T),
+        transpose_solve=solved(A),
     )
 
 
 def smith(
-    A: Float[Array, "n n"], B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
+    A: Square, B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
 ) -> tuple[Float[Array, "n m"], Array]:
     """`X = A X B + C` for stable `A` and `B` (default `A'`), and the doublings taken.
 
@@ -57,34 +64,21 @@ def smith(
     return X, iterations
 
 
-def lyapunov(F: Float[Array, "n n"], Q: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The solution of `F'X + XF + Q = 0` for a stable `F`.
-
-    It is differentiated as the linear solve that it is, to any order and in either
-    mode.
-    """
-    return lax.custom_linear_solve(
-        lambda X: F.T @ X + X @ F,
-        -Q,
-        solve=lambda _, right: stable_sylvester(F.T, None, right)[0],
-        transpose_solve=lambda _, right: stable_sylvester(F, None, right)[0],
-    )
-
-
 def stable_sylvester(
-    A: Float[Array, "n n"], B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
+    A: Square, B: Float[Array, "m m"] | None, C: Float[Array, "n m"]
 ) -> tuple[Float[Array, "n m"], Array]:
     """`A X + X B = C` for stable `A` and `B` (default `A'`), and the doublings taken.
 
     With `P = (A - c)^-1 (A + c)` and likewise of `B` it is the Stein equation
-    `X = P X P_B - 2c (A - c)^-1 C (B - c)^-1`. What the transform rounds away of a wide
-    spectrum is won back by iterative refinement.
+    `X = P X P_B - 2c (A - c)^-1 C (B - c)^-1`. Iterative refinement recovers what
+    the transform loses of a wide spectrum.
     """
     n, m = C.shape
     eps = jnp.finfo(C.dtype).eps
     other = A.T if B is None else B
     # The geometric mean of the eigenvalues' sizes: the transform maps what is far above
-    # it and far below it towards the circle alike.
+    # it and far below it towards the circle alike. The determinant gives it without
+    # eigenvalues.
     logs = jnp.linalg.slogdet(A)[1]
     logs = 2 * logs if B is None else logs + jnp.linalg.slogdet(B)[1]
     c = jnp.exp(logs / (2 * n if B is None else n + m))
@@ -112,8 +106,7 @@ def stable_sylvester(
         going = better & (residual > 10 * eps)
         return X, left_over, residual, iterations + doublings, going, k + 1
 
-    unknown = jnp.asarray(jnp.inf, C.dtype)
-    zero = jnp.asarray(0)
+    unknown, zero = jnp.asarray(jnp.inf, C.dtype), jnp.asarray(0)
     start = jnp.zeros_like(C), C, unknown, zero, jnp.asarray(True), zero
     X, _, _, iterations, *_ = lax.while_loop(more, body, start)
     return X, iterations
@@ -124,3 +117,35 @@ def _cayley(A, c):
     shift = c * jnp.eye(len(A), dtype=A.dtype)
     solved = factorised(A - shift)
     return solved, solved(A + shift)
+
+
+@full_precision
+def gramian_over(A: Square, Q: Square, time: Scalar) -> Square:
+    """The integral of `exp(A s) Q exp(A' s)` over `s` from 0 to `time`.
+
+    Over the whole time the exponential of `-A` would overflow where `A` is stiff. It is
+    taken over a short part, with `|A| t < 1`, which is then doubled.
+
+    Source: Van Loan, 1978.
+    """
+    n = A.shape[0]
+    fastest = lax.stop_gradient(time * jnp.linalg.norm(A))
+    doublings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(fastest, 1))), 0, MAX_DOUBLINGS)
+    short = time * 0.5**doublings
+    block = jnp.block([[-A, Q], [jnp.zeros_like(A), A.T]]) * short
+    # exp([[-A, Q], [0, A']] t) = [[exp(-A t), exp(-A t) W], [0, exp(A' t)]].
+    exponential = jsl.expm(block)
+    power = exponential[n:, n:].T
+    W = power @ exponential[:n, n:]
+
+    # W(2t) = W(t) + exp(A t) W(t) exp(A' t); of fixed length, which reverse mode needs.
+    def double(carry, k):
+        W, power = carry
+        more = k < doublings
+        # Zero where it is not used: what overflows there must not reach a derivative.
+        safe_power = jnp.where(more, power, 0)
+        W_next = W + safe_power @ W @ safe_power.T
+        return (W_next, jnp.where(more, safe_power @ safe_power, power)), None
+
+    (W, _), _ = lax.scan(double, (W, power), jnp.arange(MAX_DOUBLINGS))
+    return symmetric(W)

@@ -1,4 +1,4 @@
-"""Between continuous linear systems and their sampled form."""
+"""Conversion of linear systems to their sampled form and back: c2d and d2c."""
 
 from typing import Any
 
@@ -11,7 +11,13 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from .._check import check_choice, check_instance, check_step, is_concrete
+from .._check import (
+    check_choice,
+    check_instance,
+    check_step,
+    check_time_invariant,
+    is_concrete,
+)
 from .._typing import Matrix, Scalar, Vector
 from ..math._linear_solve import full_precision, solve
 from ..systems import LinearSystem
@@ -58,11 +64,14 @@ def c2d(system: LinearSystem, dt: ArrayLike, method: str = "zoh") -> LinearDynam
     check_choice(method, _METHODS, "method", "c2d")
     n, inputs = system.state_size, _inputs(system, system.dx_ref)
     if method == "zoh":
+        # exp([[A, B], [0, 0]] dt) holds exp(A dt) and the integral times B, however
+        # singular A is.
         k = inputs.shape[1]
         block = jnp.zeros((n + k, n + k), inputs.dtype)
         block = block.at[:n, :n].set(system.A).at[:n, n:].set(inputs)
         sampled = jsl.expm(block * dt)[:n]
     else:
+        # x_next - x = dt (A (x + x_next) / 2 + B u).
         half = system.A * (dt / 2)
         eye = jnp.eye(n, dtype=half.dtype)
         right = jnp.concatenate([eye + half, inputs * dt], axis=1)
@@ -95,8 +104,9 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
 
     **Raises:** `ValueError` if `dynamics` is not `LinearDynamics`, is time-varying, or
     `method` is unknown. If there is no such system, `RuntimeError` (an error at run
-    time under `jax.jit`): `"zoh"` cannot have eigenvalues of `A_d` that are zero or
-    negative, which no sampled real system has but in pairs, `"tustin"` none that is -1.
+    time under `jax.jit`): for `"zoh"` if `A_d` has an eigenvalue that is zero or
+    negative, which sampled real systems have in pairs alone; for `"tustin"` if it has
+    the eigenvalue -1.
 
     Source: Cheng, Higham, Kenney and Laub, 2001 (the logarithm by square roots).
 
@@ -111,15 +121,13 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
     """
     hint = " (see `delucax.linearize`)"
     check_instance(dynamics, LinearDynamics, "dynamics", "d2c", hint)
-    if dynamics.is_time_varying:
-        raise ValueError(
-            "d2c: dynamics must be time-invariant, got matrices at "
-            f"{dynamics.A.shape[0]} times; `dynamics.at(t)` are those at one time."
-        )
+    check_time_invariant(dynamics, "dynamics", "d2c")
     check_choice(method, _METHODS, "method", "d2c")
     convert, distance, rule = _INVERSES[method]
     inputs = _inputs(dynamics, dynamics.x_next - dynamics.x_ref)
+    # Control, constant and disturbance are converted alike, as columns of one matrix.
     A, inputs, failed = convert(dynamics.A, inputs, dynamics.dt)
+    # Of numbers that are known the eigenvalue at fault can be named.
     if not is_concrete(failed):
         A = eqx.error_if(A, failed, f"d2c: {rule}.")
     elif failed:
@@ -133,7 +141,7 @@ def d2c(dynamics: LinearDynamics, method: str = "zoh") -> LinearSystem:
 
 
 def _inputs(model: LinearSystem | LinearDynamics, drift: Vector) -> Matrix:
-    """What enters beside `A`: the control, a constant and the disturbance."""
+    """The input matrices side by side: of the control, a constant, the disturbance."""
     columns = [model.B, drift[:, None], *([] if model.E is None else [model.E])]
     return jnp.concatenate(columns, axis=1)
 
@@ -169,6 +177,7 @@ def _from_hold(A: Array, inputs: Array, dt: Scalar) -> tuple[Array, Array, Array
 def _from_trapezium(A: Array, inputs: Array, dt: Scalar) -> tuple[Array, Array, Array]:
     n = A.shape[0]
     eye = jnp.eye(n, dtype=A.dtype)
+    # The least singular value, because rounding hides how near -1 an eigenvalue is.
     sizes = jnp.linalg.svd(lax.stop_gradient(A + eye), compute_uv=False)
     failed = ~(sizes[-1] > n * jnp.finfo(A.dtype).eps * sizes[0])
     matrix = jnp.where(failed, eye, A + eye)

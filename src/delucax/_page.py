@@ -1,4 +1,4 @@
-"""Tables as text, and a page of HTML that needs nothing beside it."""
+"""Tables as text, and self-contained HTML pages."""
 
 import base64
 import csv
@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from .._files import replaced
-from ._fingerprint import device, provenance
+from ._extras import extra
+from ._files import replaced
+from ._provenance import device, provenance
 
 
 FORMS = {".csv": "csv", ".parquet": "parquet", ".md": "markdown", ".tex": "latex"}
@@ -98,23 +99,12 @@ def escape(text: Any) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Page:
-    """A report of sortable tables and figures, in an HTML file that needs nothing
-    beside it.
+    """A self-contained HTML page of sortable tables and figures.
 
     **Arguments:**
 
     - `title`: its heading.
     - `parts`: pieces of HTML, to which the methods add.
-
-    !!! example
-
-        ```python
-        from delucax.experiments import Page
-
-        page = Page("Costs")
-        page.table(["controller", "cost"], [["LQR", 1.5], ["zero", 20.0]])
-        page.write("costs.html")
-        ```
     """
 
     title: str
@@ -136,7 +126,7 @@ class Page:
         **Arguments:**
 
         - `text`: what it says.
-        - `kind`: `"made"` shows it faint; plain by default.
+        - `kind`: its CSS class; `"made"` is faint.
         """
         attribute = f' class="{kind}"' if kind else ""
         self.parts.append(f"<p{attribute}>{escape(text)}</p>")
@@ -172,7 +162,7 @@ class Page:
 
         **Arguments:**
 
-        - `folder`: where the code lies.
+        - `folder`: of the source, for the commit.
         """
         made = provenance(Path(folder))
         versions = ", ".join(f"{k} {v}" for k, v in made["versions"].items() if v)
@@ -201,9 +191,7 @@ class Page:
 def _svg(figure: Any) -> str:
     """The same text for the same figure: without a date, with names that a fixed salt
     makes."""
-    from matplotlib import rc_context
-
     out = io.StringIO()
-    with rc_context({"svg.hashsalt": "delucax"}):
+    with extra("matplotlib", "plot").rc_context({"svg.hashsalt": "delucax"}):
         figure.savefig(out, format="svg", metadata={"Date": None})
     return "<svg" + out.getvalue().partition("<svg")[2]

@@ -1,4 +1,4 @@
-"""What every adapter of an environment needs: an episode step by step, and spaces."""
+"""Reset and step of an environment, shared by the adapters to other libraries."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,24 +10,25 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import check_bool, is_concrete
 from .._results import RESULTS
 from .._typing import BoolScalar, PRNGKey, Scalar, State
 from ..disturbances import Zero
 from ..environments import Environment
 
 
-class ByValue:
-    """An environment that equals another if all of their numbers do.
+class HashableEnvironment:
+    """A hashable environment, equal to another if all of their numbers are.
 
-    A function that was compiled with the numbers as constants is looked up by it.
+    It is the key of a cache of functions that have the numbers as constants.
     """
 
     def __init__(self, env: Environment):
         self.env = env
         arrays, static = eqx.partition(env, eqx.is_array)
         leaves, treedef = jax.tree.flatten(arrays)
-        values = [(a.shape, str(a.dtype), _bytes(a)) for a in leaves]
+        is_key = lambda a: jnp.issubdtype(a.dtype, jax.dtypes.prng_key)
+        raw = lambda a: np.asarray(jr.key_data(a) if is_key(a) else a)
+        values = [(a.shape, str(a.dtype), raw(a).tobytes()) for a in leaves]
         self.value = (*values, treedef, static)
         self._hash = hash(self.value)
 
@@ -35,13 +36,7 @@ class ByValue:
         return self._hash
 
     def __eq__(self, other):
-        return isinstance(other, ByValue) and self.value == other.value
-
-
-def _bytes(array):
-    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
-        array = jr.key_data(array)
-    return np.asarray(array).tobytes()
+        return isinstance(other, HashableEnvironment) and self.value == other.value
 
 
 class Signals(NamedTuple):
@@ -55,7 +50,7 @@ NO_SIGNALS = Signals()
 
 
 class EpisodeState(eqx.Module):
-    """Where an episode is.
+    """The state of an episode: of the plant, the step count and the drawn signals.
 
     **Arguments:**
 
@@ -63,15 +58,6 @@ class EpisodeState(eqx.Module):
     - `time`: steps since it began.
     - `signals`: the disturbances and the noise of the whole episode, drawn when it
         began; none by default.
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax.interop.gymnax import EpisodeState
-
-        EpisodeState(jnp.array([0.5, 0.0]), jnp.asarray(0))
-        ```
     """
 
     state: Array
@@ -79,8 +65,8 @@ class EpisodeState(eqx.Module):
     signals: Signals = NO_SIGNALS
 
 
-class Outcome(NamedTuple):
-    """What a step says of itself."""
+class StepOutcome(NamedTuple):
+    """The reward and the flags of one step."""
 
     reward: Scalar
     terminated: BoolScalar
@@ -117,7 +103,7 @@ def time_of(env: Environment, episode: EpisodeState) -> Scalar:
 
 
 def observe(env: Environment, episode: EpisodeState) -> Float[Array, " features"]:
-    """What a network is given."""
+    """The encoded observation, with sensor noise."""
     x, noise = episode.state, episode.signals.noise
     y = env.dynamics.observe(time_of(env, episode), x)
     return env.encode(y if noise is None else (y + noise[episode.time]).astype(x.dtype))
@@ -125,9 +111,8 @@ def observe(env: Environment, episode: EpisodeState) -> Float[Array, " features"
 
 def step(
     env: Environment, episode: EpisodeState, action: Array, truncate: bool = True
-) -> tuple[EpisodeState, Outcome]:
-    """One step; the final cost is charged with the last, which is at the horizon if
-    episodes are to be truncated there."""
+) -> tuple[EpisodeState, StepOutcome]:
+    """One step. The last one, at the horizon if `truncate`, adds the final cost."""
     x, w = episode.state, episode.signals.disturbances
     w = None if w is None else w[episode.time]
     transition = env.step(time_of(env, episode), x, action, w)
@@ -138,37 +123,10 @@ def step(
     final = jnp.where(terminated | truncated, final, 0)
     finite = jnp.all(jnp.isfinite(action)) & jnp.all(jnp.isfinite(x_next))
     failed = (transition.result != RESULTS.successful) | ~finite
-    return after, Outcome(-(transition.cost + final), terminated, truncated, failed)
+    return after, StepOutcome(-(transition.cost + final), terminated, truncated, failed)
 
 
 def reads_first_argument(function: Callable[..., Any], *args: Any) -> bool:
     """Whether anything is computed of the first of `args`, an array."""
     jaxpr = jax.make_jaxpr(function)(*args).jaxpr
     return any(jaxpr.invars[0] is v for e in jaxpr.eqns for v in e.invars)
-
-
-# Samples are drawn of an action space.
-LARGEST_ACTION = 1e3
-
-
-def has_discrete_actions(env: Environment, discrete: bool | None, where: str) -> bool:
-    """Whether actions are indices into the table of `actions`: by default if there is
-    one."""
-    if discrete is None:
-        return env.actions is not None
-    if check_bool(discrete, "discrete", where) and env.actions is None:
-        raise ValueError(
-            f"{where}: discrete needs a table of actions in the environment, which has "
-            "none."
-        )
-    return bool(discrete)
-
-
-def finite_ends(bounds: Any, size: int, largest: float) -> tuple[Any, Any]:
-    """`(low, high)` of a box, of NumPy where they are known. A side without a bound
-    ends at the largest number."""
-    low, high = (-np.inf, np.inf) if bounds is None else bounds
-    numpy = np if is_concrete(low) and is_concrete(high) else jnp
-    finite = lambda end: numpy.nan_to_num(end, posinf=largest, neginf=-largest)
-    low, high = (numpy.broadcast_to(finite(end), (size,)) for end in (low, high))
-    return low, high

@@ -1,4 +1,4 @@
-"""What the commands `list`, `run` and `report` do."""
+"""The commands `list`, `run` and `report`."""
 
 import dataclasses
 import importlib
@@ -9,15 +9,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ._axes import selector
+from .._page import as_text, Page
+from ._cases import selector
 from ._experiment import Experiment
-from ._page import as_text, Page
-from ._report import by_experiment, diff, DIFFERENCES, report, summary
+from ._report import by_experiment, diff, DIFFERENCES, page_of, summary
 from ._results import Results
 from ._run import run
 
 
-def list_cases(file: str, suites: Mapping[str, str], select: str, marks: str) -> int:
+def list_cases(file: str, suites: Mapping[str, str], select: str, marks: str) -> None:
     """Show the cases of a file."""
     experiments = load(file, suites)
     cases = [case for one in experiments for case in one.cases(select, marks, True)]
@@ -25,7 +25,6 @@ def list_cases(file: str, suites: Mapping[str, str], select: str, marks: str) ->
         labels = ", ".join(mark.name for mark in case.marks)
         print(f"{case.id}  ({labels})" if labels else case.id)
     print(f"{len(cases)} cases")
-    return 0
 
 
 def run_file(
@@ -50,13 +49,13 @@ def run_file(
         first = str(row["error"] or "passed though it was expected to fail")
         print(f"FAILED {case}: {first.splitlines()[0]}", file=sys.stderr)
     print(f"{len(done)} cases in {place}")
-    _write_page(html, lambda: report(results, Path(file).stem))
-    return 1 if failed else 0
+    _write_page(html, lambda: page_of(results, Path(file).stem))
+    return bool(failed)
 
 
 def report_file(
     paths: list[str], select: str, html: str | None, exports: list[str]
-) -> int:
+) -> None:
     """Show one results file."""
     if len(paths) != 1:
         raise ValueError("report: two results files are compared with --diff.")
@@ -65,13 +64,12 @@ def report_file(
     for path in exports:
         results.export(path)
         print(f"written {path}")
-    _write_page(html, lambda: report(results, Path(paths[0]).stem))
-    return 0
+    _write_page(html, lambda: page_of(results, Path(paths[0]).stem))
 
 
 def report_diff(
     paths: list[str], select: str, html: str | None, exports: list[str]
-) -> int:
+) -> None:
     """Show what differs between two results files."""
     if len(paths) != 2:
         raise ValueError(f"report: --diff needs two results files, got {len(paths)}.")
@@ -88,7 +86,6 @@ def report_diff(
     differ = {tuple(line[:2]) for line in difference.changed}
     print(f"{difference.same} cases are the same, {len(differ)} differ")
     _write_page(html, lambda: difference.page((paths[0], paths[1])))
-    return 0
 
 
 def _show(results: Results) -> None:

@@ -1,4 +1,4 @@
-"""Parameters, with ids and marks, and which cases of them an expression selects."""
+"""Cases: products of parameters with ids and marks; expressions that select them."""
 
 import dataclasses
 import re
@@ -13,43 +13,11 @@ from ._fingerprint import fingerprint
 
 @dataclasses.dataclass(frozen=True)
 class Mark:
-    """A label of a case, such as `slow`; made by `experiment.mark`.
-
-    **Arguments:**
-
-    - `name`: `"slow"`, `"skip"`, `"xfail"`, or a name of your own to select by.
-    - `reason`: why; nothing by default.
-
-    !!! example
-
-        ```python
-        from delucax.experiments import experiment
-
-        tired = experiment.mark.skip("does not converge")
-        hard = experiment.param(3.0, marks=tired)
-        ```
-    """
+    """A label of a case, such as `experiment.mark.skip("does not converge")`: `slow`,
+    `skip` and `xfail` have a meaning, other names are there to select by."""
 
     name: str
     reason: str = ""
-
-    def __call__(self, what: Any) -> Any:
-        """The mark with the reason `what`, or the experiment `what` with the mark."""
-        if isinstance(what, str):
-            return dataclasses.replace(self, reason=what)
-        from ._experiment import as_experiment
-
-        made = as_experiment(what)
-        return dataclasses.replace(made, marks=(*made.marks, self))
-
-
-class Marks:
-    """`experiment.mark.slow`, and any other name."""
-
-    def __getattr__(self, name: str) -> Mark:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        return Mark(name)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,31 +46,63 @@ class Axis:
     params: tuple[Param, ...]
 
     def choices(self, where: str) -> Iterator[Choice]:
-        """What there is to choose from; `where` is named in errors."""
+        """The choices; `where` is named in errors."""
         for index, param in enumerate(self.params):
-            named = dict(zip(self.names, param.values, strict=True))
-            shown = {name: self._shown(v, param) for name, v in named.items()}
-            hashes = [(n, _hash(v, n, param, where)) for n, v in named.items()]
+            shown, hashes = {}, []
+            for name, value in zip(self.names, param.values, strict=True):
+                shown[name] = self._shown(value, param)
+                try:
+                    hashes.append((name, fingerprint(value)))
+                except (TypeError, RecursionError) as error:
+                    raise ValueError(
+                        f"{where}: the parameter {name!r} of case {param.id!r} cannot "
+                        f"be written down: it holds {error}. Give a name instead, and "
+                        "make the thing in the function or in a fixture."
+                    ) from error
             yield Choice(index, param, shown, fingerprint(hashes))
 
     def _shown(self, value: Any, param: Param) -> Any:
-        """What the table shows: a simple value itself, of another its name or id."""
-        value = value.item() if isinstance(value, np.generic) else value
-        if _is_simple(value):
+        """A value as the table shows it: a simple one as it is, else its name or id."""
+        value = _as_python(value)
+        if isinstance(value, _SIMPLE):
             return value
         return (_label(value) if len(self.names) > 1 else None) or param.id
 
 
-def _hash(value: Any, name: str, param: Param, where: str) -> str:
-    """What tells a value from others by its content."""
-    try:
-        return fingerprint(value)
-    except (TypeError, RecursionError) as error:
-        raise ValueError(
-            f"{where}: the parameter {name!r} of case {param.id!r} cannot be "
-            f"written down: it holds {error}. Give a name instead, and make "
-            "the thing in the function or in a fixture."
-        ) from error
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One call of an experiment: a value of each axis, for all seeds."""
+
+    experiment: str
+    id: str
+    index: tuple[int, ...]
+    shown: Mapping[str, Any]
+    marks: tuple[Mark, ...]
+    hash: str
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Its key in the results store."""
+        return self.experiment, self.id
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """Its columns in a line of the store."""
+        return {
+            "experiment": self.experiment,
+            "case": self.id,
+            "order": self.index,
+            "hash": self.hash,
+            "parameters": self.shown,
+        }
+
+    def mark(self, name: str) -> Mark | None:
+        """The mark of that name, if it has it."""
+        return next((mark for mark in self.marks if mark.name == name), None)
+
+    def matches(self, word: str) -> bool:
+        """Whether a word is in its name, whatever its case."""
+        return word.lower() in self.id.lower()
 
 
 def axis_of(names: Any, values: Any, ids: Any) -> Axis:
@@ -154,8 +154,7 @@ def _ids(params: list[Param], names: tuple, ids: Any, where: str) -> list[str]:
     for k, param in enumerate(params):
         pairs = zip(param.values, names, strict=True)
         words = (f"{n}{k}" if (w := _label(v)) is None else w for v, n in pairs)
-        automatic = "-".join(words)
-        labels.append(param.id or (automatic if ids is None else ids[k]))
+        labels.append(param.id or ("-".join(words) if ids is None else ids[k]))
     counts = Counter(labels)
     for label, param in zip(labels, params, strict=True):
         if counts[label] > 1 and (ids is not None or param.id is not None):
@@ -166,19 +165,37 @@ def _ids(params: list[Param], names: tuple, ids: Any, where: str) -> list[str]:
     ]
 
 
-def _is_simple(value: Any) -> bool:
-    """Whether a table can hold it."""
-    return value is None or isinstance(value, bool | int | float | str)
+_SIMPLE = bool | int | float | str | None
+"""Values that a table can hold."""
+
+
+def _as_python(value: Any) -> Any:
+    """A number of NumPy as one of Python."""
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _label(value: Any) -> str | None:
-    """What to call a value that has a name or is one."""
-    if isinstance(value, np.generic):
-        return str(value.item())
-    if _is_simple(value):
+    """The label of a value that is simple or has a name."""
+    value = _as_python(value)
+    if isinstance(value, _SIMPLE):
         return str(value)
     label = getattr(value, "__name__", None)
     return label if isinstance(label, str) and label != "<lambda>" else None
+
+
+def as_seeds(seeds: Any, where: str) -> tuple[int, ...]:
+    """Seeds from 0 on, or those given."""
+    is_whole = lambda s: isinstance(s, int | np.integer) and not isinstance(s, bool)
+    several = range(seeds) if is_whole(seeds) else seeds
+    chosen = tuple(several) if isinstance(several, Iterable) else ()
+    if not chosen or not all(is_whole(seed) and 0 <= seed < 2**31 for seed in chosen):
+        raise ValueError(
+            f"{where}: seeds must be how many, at least 1, or whole numbers from 0 to "
+            f"2**31 - 1, got {seeds!r}."
+        )
+    if len(set(chosen)) < len(chosen):
+        raise ValueError(f"{where}: seeds must differ, got {seeds!r}.")
+    return tuple(int(s) for s in chosen)
 
 
 _OPERATORS = ("and", "or", "not")
@@ -188,7 +205,7 @@ _TOKEN = re.compile(r"[()]|[^\s()]+")
 def selector(
     expression: str, argument: str, where: str
 ) -> Callable[[Callable[[str], Any]], Any]:
-    """A function of a test of single words to whether the whole holds.
+    """Compile an expression of words into a predicate of a test of single words.
 
     Words are joined by `and`, `or`, `not` and parentheses, as in pytest's `-k`. An
     empty expression holds always.
@@ -203,29 +220,29 @@ def selector(
     tokens = [t.lower() if t.lower() in _OPERATORS else t for t in words(expression)]
     if not tokens:
         return lambda holds: True
-    # It becomes an expression of Python, which has the same operators; each word is
-    # quoted, so that nothing else is evaluated.
-    python: list[str | None] = []
+    # Converted to a Python expression, which has the same operators; words are quoted,
+    # so that `eval` is safe.
+    python: list[str] = []
     depth, wants_word = 0, True
-    for token in (*tokens, None):
+    for token in (*tokens, ""):
         python.append(token)
         if wants_word and token in ("not", "("):
             depth += token == "("
-        elif wants_word and token not in ("and", "or", ")", None):
+        elif wants_word and token not in ("and", "or", ")", ""):
             python[-1], wants_word = f"holds({token!r})", False
         elif not wants_word and token in ("and", "or"):
             wants_word = True
         elif not wants_word and token == ")" and depth:
             depth -= 1
-        elif wants_word or token is not None or depth:
+        elif wants_word or token or depth:
             joint = "')'" if depth else "'and' or 'or'"
-            got = "the end" if token is None else repr(token)
             raise ValueError(
                 f"{where}: {argument} must be words joined by and, or, not and "
                 f"parentheses, got {expression!r}: expected "
-                f"{'a word' if wants_word else joint} instead of {got}."
+                f"{'a word' if wants_word else joint} instead of "
+                f"{repr(token) if token else 'the end'}."
             )
-    code = compile(" ".join(filter(None, python)), "<expression>", "eval")
+    code = compile(" ".join(python), "<expression>", "eval")
     return lambda holds: eval(code, {"holds": holds})
 
 

@@ -7,30 +7,21 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_bool, check_count
 from .._module import parameter, positive
 from .._results import RESULTS
 from .._typing import Control, State
 from ..dynamics import AbstractDynamics
-from ._lungs import balloon_pressure
+from ..lung import BalloonLung
 
 
 def original_valve(u_in: Any) -> Array:
     """The flow of the original's valve, `clip(tanh(0.03 (3 u_in - 130)) + 1, 0, 1.72)`.
 
-    It has kinks where it is clipped; [`delucax.lung.Valves`][] is smooth.
+    It has kinks where it is clipped; `delucax.lung.Valves` is smooth.
 
     **Arguments:** `u_in`: its opening [%].
 
     **Returns:** of the shape of `u_in`.
-
-    !!! example
-
-        ```python
-        from delucax.lung import original_valve
-
-        original_valve(50.0)
-        ```
     """
     return jnp.clip(jnp.tanh(0.03 * (3 * u_in - 130)) + 1, 0, 1.72)
 
@@ -61,7 +52,7 @@ class OriginalBalloonLung(_AbstractOriginalLung):
 
     The state is (volume, pressure). Not smooth where the flow is clipped, and at
     `p = peep`. With the gain of 15 the flow is at its limit from `u_in = 28.7` on, so
-    that control is nearly on and off; [`delucax.lung.BalloonLung`][] is retuned.
+    that control is nearly on and off; `delucax.lung.BalloonLung` is retuned.
 
     **Arguments:**
 
@@ -77,15 +68,6 @@ class OriginalBalloonLung(_AbstractOriginalLung):
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca).
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax.lung import OriginalBalloonLung
-
-        OriginalBalloonLung()(0.0, jnp.array([1.5, 0.0]), jnp.array([20.0, 0.0]))
-        ```
     """
 
     gain: Array = parameter(15.0, constraint=positive)
@@ -98,9 +80,6 @@ class OriginalBalloonLung(_AbstractOriginalLung):
 
     state_names = ("volume", "pressure")
 
-    def __check_init__(self):
-        check_bool(self.leak, "leak", "OriginalBalloonLung")
-
     def _step(self, x, u):
         volume, pressure = x[0], x[1]
         flow = jnp.clip(self.gain * original_valve(u[0]), 0, 2)
@@ -109,19 +88,20 @@ class OriginalBalloonLung(_AbstractOriginalLung):
         after = volume + flow * self.dt
         if self.leak:
             after = after + self.dt / (5 + self.dt) * (self.rest - after)
-        pressure = self.offset + balloon_pressure(after, self.rest, self.stiffness)
+        balloon = BalloonLung(stiffness=self.stiffness, rest=self.rest)
+        pressure = self.offset + balloon.elastic_pressure(after)
         return jnp.stack([after, pressure])
 
 
 class OriginalDelayLung(_AbstractOriginalLung):
-    r"""The delay lung of the original, with the delay that it was to have:
+    r"""The delay lung of the original, with the delay that its code left out:
 
     `v_next = max(v + dt p / resistance, rest)`,
     `pipe_next = inertia pipe + gain u_in[k + 1 - delay]`, times 0.995 if
     `u_out[k + 1 - delay] > 0`,
     `p_next = max(0, pipe_next - P(v_next))`,
 
-    with `P` of [`delucax.lung.OriginalBalloonLung`][]. The state is (volume, pressure,
+    with `P` of `OriginalBalloonLung`. The state is (volume, pressure,
     pipe), and the last `delay - 1` controls: the oldest of a ring of `delay`, that of
     now among them, is the one that acts. Not smooth where the maxima change sides.
 
@@ -139,16 +119,6 @@ class OriginalDelayLung(_AbstractOriginalLung):
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca), whose code left the delay out.
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax.lung import OriginalDelayLung
-
-        lung = OriginalDelayLung(delay=2)
-        lung(0.0, jnp.zeros(5).at[0].set(1.5), jnp.array([20.0, 0.0]))
-        ```
     """
 
     resistance: Array = parameter(10.0, constraint=positive)
@@ -159,25 +129,19 @@ class OriginalDelayLung(_AbstractOriginalLung):
     delay: int = eqx.field(static=True, default=25)
     dt: Array = parameter(0.03, constraint=positive)
 
-    def __check_init__(self):
-        check_count(self.delay, "delay", "OriginalDelayLung")
-
     @property
     def state_names(self):
-        late = [
-            f"{name}[-{k + 1}]"
-            for k in range(self.delay - 1)
-            for name in self.control_names
-        ]
-        return ("volume", "pressure", "pipe", *late)
+        late = range(1, self.delay)
+        names = [f"{name}[-{k}]" for k in late for name in self.control_names]
+        return ("volume", "pressure", "pipe", *names)
 
     def _step(self, x, u):
         volume, pressure, pipe, late = x[0], x[1], x[2], x[3:]
         volume = jnp.maximum(volume + pressure / self.resistance * self.dt, self.rest)
         late = jnp.concatenate([u.astype(x.dtype), late])
         pipe = self.inertia * pipe + self.gain * late[-2]
-        inside = balloon_pressure(volume, self.rest, self.stiffness)
-        pressure = jnp.maximum(0, pipe - inside)
+        balloon = BalloonLung(stiffness=self.stiffness, rest=self.rest)
+        pressure = jnp.maximum(0, pipe - balloon.elastic_pressure(volume))
         pipe = jnp.where(late[-1] > 0, 0.995 * pipe, pipe)
         return jnp.concatenate([jnp.stack([volume, pressure, pipe]), late[:-2]])
 
@@ -189,7 +153,7 @@ class OriginalSingleCompartment(_AbstractOriginalLung):
     `v_next = v + flow dt`.
 
     The state is (volume, pressure). There is no expiration: the pressure never falls.
-    [`delucax.lung.SingleCompartment`][] breathes out.
+    `delucax.lung.SingleCompartment` breathes out.
 
     **Arguments:**
 
@@ -202,16 +166,6 @@ class OriginalSingleCompartment(_AbstractOriginalLung):
 
     Source: Gradu, Hallman, Suo, Yu, Agarwal, Ghai, Singh, Zhang, Majumdar and Hazan,
     2021 (Deluca).
-
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from delucax.lung import OriginalSingleCompartment
-
-        lung = OriginalSingleCompartment()
-        lung(0.0, jnp.array([0.2, 10.0]), jnp.array([20.0, 0.0]))
-        ```
     """
 
     resistance: Array = parameter(15.0, constraint=positive)

@@ -1,45 +1,43 @@
-"""Where Newton's iteration on an algebraic Riccati equation starts."""
+"""Riccati equations by doubling, and by the sign of the Hamiltonian matrix."""
 
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
+from .._typing import BoolScalar, Scalar, Square
 from ..math._linear_solve import factorised, solve, symmetric
-from ..math._size import one_if_zero, relative_and_total_size, size
+from ..math._lyapunov import MAX_DOUBLINGS
+from ..math._norms import one_if_zero, relative_and_total_size, size
 from ._arguments import RiccatiData
-from ._lyapunov import MAX_DOUBLINGS
-from ._recursion import Element, joined, step_element
+from ._recursion import composed, Element, without_cross_weight
 
 
 _SIGN_STEPS = 60
 
 
-def discrete_start(data: RiccatiData, height: Float[Array, ""]) -> tuple[Array, Array]:
+def discrete_start(data: RiccatiData, height: Scalar) -> tuple[Array, Array]:
     """A solution by doubling about `X0 = height I`, and the doublings taken."""
-    # There the control weight is invertible even where R is not, and the recursion
-    # cannot rest at a solution that leaves an unstable mode unseen by Q.
+    # X0 > 0 makes R + B'X0 B invertible, and excludes the fixed points that leave an
+    # undetectable unstable mode unstable.
     A, B, Q, R, S, _ = data
     X0 = height * jnp.eye(A.shape[0], dtype=A.dtype)
+    # The data of the equation of H = X - X0.
     cross = height * (A.T @ B) + S
     weight = symmetric(R + height * (B.T @ B))
-    element = step_element(A, B, weight, cross, height * (A.T @ A) - X0, Q)
-    H, doublings = double(element, X0)
+    linear = height * (A.T @ A) - X0
+    H, doublings = double(without_cross_weight(A, B, linear, weight, cross, Q), X0)
     return X0 + H, doublings
 
 
 def continuous_start(
-    data: RiccatiData, doubled: Bool[Array, ""]
+    data: RiccatiData, doubled: BoolScalar
 ) -> tuple[Array, Array, Array]:
     """A solution by the sign iteration, or by doubling if that is wanted; the size of
     `B R^-1 B'`; and the steps taken."""
-    A, B, Q, R, S, _ = data
-    n = A.shape[0]
-    solved = solve(R, jnp.concatenate([B.T, S.T], axis=1))
-    G = symmetric(B @ solved[:, :n])
-    A = A - B @ solved[:, n:]
-    Q = symmetric(Q - S @ solved[:, n:])
+    A, G, Q = without_cross_weight(*data[:5])
+    # Under vmap both run for all members: the unwanted one ends before its first step.
     by_sign, sign_steps = _by_sign(A, G, Q, ~doubled)
     by_doubling, doublings = _by_doubling(A, G, Q, doubled)
     X = jnp.where(doubled, by_doubling, by_sign)
@@ -50,7 +48,9 @@ def _by_sign(A, G, Q, wanted):
     """`X` from the sign of the Hamiltonian matrix `H = [[A, -G], [-Q, -A']]`.
 
     With `J = [[0, I], [-I, 0]]`, the iteration `H <- (H + H^-1) / 2` is one of the
-    symmetric `W = JH`: `W <- (W + J W^-1 J) / 2`.
+    symmetric `W = JH`: `W <- (W + J W^-1 J) / 2`. It keeps the eigenvalues in pairs.
+
+    Source: Roberts, 1971; Byers, 1987 (the symmetric form and the scaling).
     """
     n, dtype = A.shape[0], A.dtype
     eps = jnp.finfo(dtype).eps
@@ -72,6 +72,7 @@ def _by_sign(A, G, Q, wanted):
         scale = jnp.where(before < 1e-2, 1, jnp.sqrt(ratio))
         new = symmetric(scale * W + turned / scale) / 2
         change = size(new - W) / size(new)
+        # Convergence is quadratic: a small change that is not halved is rounding.
         stalled = (change < 1e-6) & (change > before / 2)
         # A NaN compares false, so that a lane that diverges stops.
         going = (change > 10 * eps) & ~stalled
@@ -80,27 +81,35 @@ def _by_sign(A, G, Q, wanted):
     W = jnp.block([[-Q, -A.T], [-A, G]])
     start = (W, jnp.asarray(jnp.inf, dtype), jnp.asarray(wanted), jnp.asarray(0))
     W, *_, iterations = lax.while_loop(more, body, start)
-    # I - sign(H) = [I; X] M projects onto the stable subspace; H = J'W.
+    # I - sign(H) = [I; X] M projects onto the stable subspace; H = J'W. M alone may be
+    # singular, so that X is found by least squares from all 2n columns.
     upper = jnp.concatenate([eye + W[n:, :n], W[n:, n:]], axis=1)
     lower = jnp.concatenate([-W[:n, :n], eye - W[:n, n:]], axis=1)
     return symmetric(factorised(upper.T, lx.QR())(lower.T).T), iterations
 
 
 def _by_doubling(A, G, Q, wanted):
-    """`X` by doubling of the Cayley transform `(H - shift)^-1 (H + shift)`."""
+    """`X` by doubling of the Cayley transform `(H - c)^-1 (H + c)`, which maps the left
+    half-plane into the circle; `c = |A|`.
+
+    Source: Chu, Fan and Lin, 2005.
+    """
     n = A.shape[0]
+    # The formulas take 2c. It is at least twice the size of any eigenvalue of A.
     shift = 2 * one_if_zero(size(A)) * jnp.eye(n, dtype=A.dtype)
     moved = A - shift / 2
     left = solve(moved, G)
     mixed = moved.T + Q @ left
     right = solve(mixed.T, jnp.concatenate([mixed.T + shift, left.T], axis=1))
+    # With A_c = A - cI and W = A_c' + Q A_c^-1 G: A = I + 2c W^-T, G = 2c A_c^-1 G W^-1
+    # and H = 2c W^-1 Q A_c^-1, the element to be doubled.
     H = solve(mixed, solve(moved.T, Q).T)
     H, G = symmetric(shift @ H), symmetric(shift @ right[:, n:])
     return double((right[:, :n], G, H), jnp.zeros_like(H), wanted)
 
 
 def double(
-    element: Element, X0: Float[Array, "n n"], wanted: Bool[Array, ""] | bool = True
+    element: Element, X0: Square, wanted: BoolScalar | bool = True
 ) -> tuple[Array, Array]:
     """The limit of joining an interval's element to itself, as `J`, if it is wanted;
     and the doublings taken.
@@ -115,13 +124,14 @@ def double(
 
     def body(carry):
         before, _, k = carry
-        after = joined(before, before)
+        after = composed(before, before)
         finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in after]))
-        # What overflows is left at the last finite step: it has no stable loop, and
-        # the caller finds that out.
+        # An overflow ends the iteration at the last finite step, whose closed loop is
+        # not stable, which the caller checks.
         A, _, J = after = jax.tree.map(
             lambda new, old: jnp.where(finite, new, old), after, before
         )
+        # In units of X = X0 + J, of which J may be a small part.
         changes = jnp.stack([J - before[2], J])
         (change, whole), _ = relative_and_total_size(changes, (X0 + J)[None])
         # The next change is at most |A|^2 |J|.

@@ -20,7 +20,7 @@ def task_names() -> tuple[str, ...]:
 def list_names() -> None:
     """Print the names of tasks, controllers and suites."""
     members = vars(controllers).items()
-    names = [name for name, member in members if _makes_controller(name, member)]
+    names = [name for name, member in members if _makes_controller(member)]
     print('Tasks, for delucax.make("..."):')
     _print_columns(task_names())
     print("\nControllers, in delucax.controllers:")
@@ -29,16 +29,12 @@ def list_names() -> None:
     _print_columns(tuple(SUITES))
 
 
-def _makes_controller(name: str, member: Any) -> bool:
+def _makes_controller(member: Any) -> bool:
     """Whether it is a controller, or a function that makes one."""
-    if inspect.isclass(member):
-        is_controller = issubclass(member, AbstractController)
-        return is_controller and not inspect.isabstract(member)
-    if not inspect.isfunction(member):
-        return False
-    made = inspect.signature(member).return_annotation
+    is_function = inspect.isfunction(member)
+    made = inspect.signature(member).return_annotation if is_function else member
     is_controller = inspect.isclass(made) and issubclass(made, AbstractController)
-    return is_controller or name != name.lower()
+    return is_controller and not inspect.isabstract(member)
 
 
 def _print_columns(names: list[str] | tuple[str, ...]) -> None:

@@ -1,0 +1,54 @@
+"""Several modules of one structure as one, and apart again."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+
+def stack(trees: Iterable[Any]) -> Any:
+    """Modules of one structure as one, each array with a leading axis over them."""
+    trees = list(trees)
+    if not trees:
+        raise ValueError("stack: trees must not be empty.")
+    structures = {jax.tree.structure(eqx.filter(tree, eqx.is_array)) for tree in trees}
+    if len(structures) > 1:
+        raise ValueError("stack: trees must be of one structure.")
+
+    def together(*leaves):
+        if not eqx.is_array(leaves[0]):
+            return leaves[0]
+        if all(_is_plain(leaf) for leaf in leaves):
+            return jnp.asarray(np.stack(leaves))
+        return jnp.stack(leaves)
+
+    return jax.tree.map(together, *trees)
+
+
+def unstack(tree: Any) -> list[Any]:
+    """The modules that `stack` made one of."""
+    as_numpy = lambda a: np.asarray(a) if eqx.is_array(a) and _is_plain(a) else a
+    tree = jax.tree.map(as_numpy, tree)
+    return [taken(tree, i) for i in range(count_of(tree))]
+
+
+def taken(tree: Any, index: Any) -> Any:
+    """What an index takes of each array of stacked modules."""
+    is_array = lambda a: eqx.is_array(a) or isinstance(a, np.ndarray)
+    at = lambda a: jnp.asarray(a[index]) if is_array(a) else a
+    return jax.tree.map(at, tree)
+
+
+def count_of(tree: Any) -> int:
+    """How many modules are stacked."""
+    return jax.tree.leaves(eqx.filter(tree, eqx.is_array))[0].shape[0]
+
+
+def _is_plain(leaf: Any) -> bool:
+    """Whether NumPy can stack and slice it, which compiles nothing for each shape."""
+    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return not isinstance(leaf, Tracer) and not is_key

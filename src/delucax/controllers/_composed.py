@@ -1,0 +1,165 @@
+"""Controllers made of other controllers."""
+
+from collections.abc import Callable
+from dataclasses import KW_ONLY
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from .._check import check_count, check_instance, check_step
+from .._controller import AbstractController, check_controller
+from .._module import function_field, parameter
+from ..math._steps import row_at, step_at
+from ._network import features_of
+
+
+class Scheduled(AbstractController):
+    """A controller for each time step, `u_k = controllers[k](t_k, y_k)`.
+
+    The last one is used after the end; before the start the control is NaN, which a
+    rollout reports. All share one state, which must have the same structure and meaning
+    for each of them.
+
+    **Arguments:**
+
+    - `controllers`: controllers of one kind, with a leading axis of time in each of
+        their arrays, as `eqx.filter_vmap` makes them.
+    - `dt`: the step between two of them.
+
+    **Raises:** `ValueError` if `controllers` is not a controller, its arrays do not
+    share a leading axis, or `dt` is not positive.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import equinox as eqx
+        import jax
+        import jax.numpy as jnp
+
+        A = jnp.array([[1.0, 1.0], [0.0, 1.0]])
+        B = jnp.array([[0.0], [1.0]]) * jnp.linspace(1.0, 2.0, 50)[:, None, None]
+        dynamics = dlx.LinearDynamics(jnp.tile(A, (50, 1, 1)), B)
+
+        def design(t):
+            return dlx.controllers.LQR(dynamics.at(t), jnp.eye(2), jnp.eye(1))
+
+        times = jnp.arange(50.0)
+        base = dlx.controllers.Scheduled(eqx.filter_vmap(design)(times), dt=1.0)
+        env = dlx.Environment(dynamics, dlx.costs.Quadratic(jnp.eye(2), jnp.eye(1)))
+        x0 = jnp.ones(2)
+        dlx.rollout(env, base, key=jax.random.key(0), horizon=50, x0=x0).total_cost
+        ```
+    """
+
+    controllers: AbstractController
+    dt: Array = parameter()
+
+    def __check_init__(self):
+        where, hint = "Scheduled", " whose arrays have a leading axis"
+        controllers = self.controllers
+        check_instance(controllers, AbstractController, "controllers", where, hint)
+        check_step(self.dt, "Scheduled")
+        arrays = jax.tree.leaves(eqx.filter(controllers, eqx.is_array))
+        lengths = {array.shape[:1] for array in arrays}
+        if len(lengths) != 1 or () in lengths:
+            raise ValueError(
+                "Scheduled: controllers must have arrays with one leading axis in "
+                f"common, got lengths {sorted(lengths)}."
+            )
+
+    def _at(self, t: Any) -> AbstractController:
+        arrays, rest = eqx.partition(self.controllers, eqx.is_array)
+        count = len(jax.tree.leaves(arrays)[0])
+        k = step_at(t, self.dt, count, "Scheduled")
+        # Held after the end; row -1, of times before the start, is NaN.
+        return eqx.combine(row_at(arrays, jnp.minimum(k, count - 1)), rest)
+
+    def init(self, *, key=None):
+        return self._at(0.0).init(key=key)
+
+    def __call__(self, t, y, state):
+        return self._at(t)(t, y, state)
+
+
+class _Past(NamedTuple):
+    base: PyTree
+    observations: Array
+    controls: Array
+    started: Array
+
+
+class History(AbstractController):
+    """A controller whose input is a window of past observations and controls,
+
+    `u_t = base(t, (z_t, z_{t-1}, ..., z_{t-n}, u_{t-1}, ..., u_{t-n}))`
+
+    with `z = features(y)` and u the controls that were applied. Before the beginning
+    the controls are zero and the observations the first one.
+
+    **Arguments:**
+
+    - `base`: the controller of the window, which has `size (n + 1) + controls n`
+        entries.
+    - `size`: the size of the features.
+    - `controls`: the number of controls.
+    - `length`: n, the steps of the past, 1 by default.
+    - `features`: of an observation, a function such as `env.encode`; the observation
+        itself by default.
+
+    **Raises:** `ValueError` if `base` is not a controller or a size is below 1; when it
+    is run, if the features have another size.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+
+        env = dlx.make("pendulum")
+        angle = lambda y: env.encode(y)[:2]
+        size = 2 * (3 + 1) + 3
+        base = dlx.controllers.MLP(size, 1, width=8, depth=1, key=jax.random.key(0))
+        blind = dlx.controllers.History(base, 2, 1, length=3, features=angle)
+        dlx.rollout(env, blind, key=jax.random.key(1), horizon=10).total_cost
+        ```
+    """
+
+    base: AbstractController
+    size: int = eqx.field(static=True)
+    controls: int = eqx.field(static=True)
+    length: int = eqx.field(default=1, static=True)
+    _: KW_ONLY
+    features: Callable[[Array], Array] | None = function_field(None)
+
+    def __check_init__(self):
+        check_controller(self.base, "base", "History")
+        for name in ("size", "controls", "length"):
+            check_count(getattr(self, name), name, "History")
+
+    def init(self, *, key=None):
+        return _Past(
+            self.base.init(key=key),
+            jnp.zeros((self.length, self.size)),
+            jnp.zeros((self.length, self.controls)),
+            jnp.zeros((), bool),
+        )
+
+    def __call__(self, t, y, state):
+        z = features_of(self, y, self.size).astype(state.observations.dtype)
+        # The first observation fills the window: zeros would look like motion.
+        past = jnp.where(state.started, state.observations, z)
+        window = jnp.concatenate([z, past.ravel(), state.controls.ravel()])
+        u, base = self.base(t, window.astype(y.dtype), state.base)
+        observations = jnp.concatenate([z[None], past[:-1]])
+        return u, _Past(base, observations, state.controls, jnp.ones((), bool))
+
+    def applied(self, u, cost, state):
+        u = u.astype(state.controls.dtype)
+        return state._replace(
+            base=self.base.applied(u, cost, state.base),
+            controls=jnp.concatenate([u[None], state.controls[:-1]]),
+        )

@@ -1,0 +1,437 @@
+"""Lungs fitted to breaths, and controllers to lungs."""
+
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float
+
+from .._check import (
+    check_bool,
+    check_choice,
+    check_count,
+    check_finite,
+    check_instance,
+    check_key,
+    check_positive,
+)
+from .._controller import AbstractController, check_controller
+from .._module import as_float_array, count_of, stack, unstack
+from .._typing import PRNGKey
+from ..controllers import LeakyPID, PID
+from ..environments import Environment
+from ..simulation import rollout
+from ..training import analytic, fit, Fitted
+from ._breath_controllers import Breathing
+from ._breaths import Breaths, GAINS
+from ._learned_lung import LearnedLung
+from ._ventilation import waveform_of
+from ._waveform import as_pips, BreathWaveform, LENGTH, PIPS
+
+
+class _Simulation(eqx.Module):
+    """The error of a batch of lungs over breaths, relative to the scale of each."""
+
+    scale: Array
+    teacher: bool = eqx.field(static=True)
+
+    def __call__(self, models, batch, key):
+        del key
+        u_in, pressure = (jnp.swapaxes(column, 0, 1) for column in batch)
+
+        def one(model, u_in, pressure):
+            inputs = (u_in, pressure) if self.teacher else (u_in,)
+            predict = model.one_step if self.teacher else model.predict
+            return jnp.mean(jnp.abs(jax.vmap(predict)(*inputs) - pressure))
+
+        # Relative to each scale: lungs of large pressures do not outweigh the others.
+        errors = eqx.filter_vmap(one)(models, u_in, pressure)
+        return jnp.mean(errors / self.scale)
+
+
+def fit_lungs(
+    models: Any,
+    breaths: Breaths,
+    *,
+    key: PRNGKey,
+    teacher_steps: int = 1000,
+    steps: int = 800,
+    learning_rate: float = 5e-3,
+    optimiser: optax.GradientTransformation | None = None,
+    batch_size: int | None = 64,
+    trainable: Any = None,
+    progress: bool = False,
+    checkpoint: Any = None,
+) -> Fitted:
+    """Fit lungs to breaths, each to its own, all at once.
+
+    First, where the model can (a [`delucax.lung.LearnedLung`][]), each pressure is
+    predicted from the recorded ones before it, as published; then the whole breath from
+    its controls alone, which the noise of the sensor does not bias. The loss is the
+    mean absolute error, relative to the standard deviation of the pressures; Adam with
+    a learning rate that falls to 0 along a cosine.
+
+    **Arguments:**
+
+    - `models`: a [`delucax.lung.LearnedLung`][] or [`delucax.lung.LungModel`][], or
+        several in one module, each array with a leading axis over them, as
+        `equinox.filter_vmap` makes of them.
+    - `breaths`: [`delucax.lung.Breaths`][] of shape `(B, T)`; of `(models, B, T)` for
+        several.
+    - `key`: a random key, for the batches.
+    - `teacher_steps`: of the first part, 1000 by default.
+    - `steps`: of the second part, 800 by default.
+    - `learning_rate`: 5e-3 by default, and twice that in the first part.
+    - `optimiser`: an Optax optimiser of both parts instead of Adam, with a learning
+        rate of its own; none by default.
+    - `batch_size`: breaths of each lung in a step, 64 by default; `None` for all.
+    - `trainable`: what moves, as in [`delucax.training.fit`][]; the weights by default.
+    - `progress`: whether to show a bar, false by default.
+    - `checkpoint`: the path of a file from which a run that was cut off goes on
+        (beside it, with `.first` added, that of the first part); none by default.
+
+    **Returns:** a [`delucax.training.Fitted`][], that of the last part.
+
+    **Raises:** `ValueError` if the arguments are invalid, `RuntimeError` if it
+    diverges.
+
+    Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
+    Zajdel, Schottdorf, Cohen and Hazan, 2021 (the first part).
+
+    !!! example
+
+        ```python
+        import jax
+        import jax.numpy as jnp
+        from delucax import lung
+
+        u = jnp.linspace(0.0, 50.0, 40).reshape(10, 4)
+        breaths = lung.Breaths(u, 0 * u, 5 + u / 2, dt=0.03)
+        model = lung.LearnedLung(breaths, width=2, boundary=1, key=jax.random.key(1))
+        few = dict(teacher_steps=0, steps=5, batch_size=None)
+        fitted = lung.fit_lungs(model, breaths, key=jax.random.key(2), **few)
+        ```
+    """
+    where = "fit_lungs"
+    check_key(key, where)
+    check_instance(breaths, Breaths, "breaths", where)
+    single = breaths.pressure.ndim == 2
+    if single:
+        models, breaths = stack([models]), stack([breaths])
+    # Batches are drawn along the first axis: the same rows of all lungs.
+    data = jnp.swapaxes(breaths.u_in, 0, 1), jnp.swapaxes(breaths.pressure, 0, 1)
+    if batch_size is not None and batch_size >= len(data[0]):
+        batch_size = None
+    scale = jnp.std(breaths.pressure, axis=(1, 2))
+    learned = isinstance(models, LearnedLung)
+    parts = [(True, teacher_steps, "teacher_steps", 2)] if learned else []
+    parts += [(False, steps, "steps", 1)]
+    options: Any = dict(trainable=trainable, progress=progress, data=data)
+    fitted = None
+    for teacher, count, name, times in parts:
+        if check_count(count, name, where, least=0) == 0:
+            continue
+        # Open loop, errors and their gradients can grow along a breath: clipped.
+        schedule = optax.cosine_decay_schedule(times * learning_rate, count)
+        adam = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+        if checkpoint is not None:
+            ending = ".first" if teacher else ""
+            options |= dict(checkpoint=f"{checkpoint}{ending}", checkpoint_every=100)
+        fitted = fit(
+            _Simulation(scale, teacher),
+            models,
+            adam if optimiser is None else optimiser,
+            count,
+            key=jax.random.fold_in(key, int(teacher)),
+            batch_size=batch_size,
+            **options,
+        )
+        models = fitted.model
+    if fitted is None:
+        raise ValueError(f"{where}: steps must not all be 0.")
+    if single:
+        fitted = Fitted(unstack(fitted.model)[0], fitted.history, fitted.result)
+    return fitted
+
+
+_KINDS: dict[str, Any] = {"leaky": LeakyPID, "true": PID}
+
+
+def breath_error(
+    env: Environment,
+    controller: AbstractController,
+    *,
+    key: PRNGKey,
+    pips: Any = PIPS,
+    horizon: int = LENGTH,
+) -> Array:
+    """The mean absolute error of the pressure under a controller.
+
+    **Arguments:**
+
+    - `env`: a task of a lung.
+    - `controller`: of both valves ([`delucax.lung.Breathing`][]), or of the inspiratory
+        one alone.
+    - `key`: a random key, for the noise of the sensor.
+    - `pips`: the peak pressures to follow, each in an episode of its own;
+        10, 15, ..., 35 cmH2O by default.
+    - `horizon`: steps per episode, 29 by default: 0.87 s of an inspiration.
+
+    **Returns:** the mean of `|p - r|` over the steps of each episode, shape `(pips,)`
+        [cmH2O]. NaN where a run failed.
+
+    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
+    say).
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import jax
+        from delucax import lung
+
+        env = dlx.make("lung/single_compartment")
+        waveform = env.cost.waveform
+        pid = dlx.controllers.LeakyPID(dt=env.dt, reference=waveform)
+        lung.breath_error(env, pid, key=jax.random.key(0), pips=[20.0, 30.0])
+        ```
+    """
+    where = "breath_error"
+    waveform = waveform_of(env, where)
+    check_controller(controller, "controller", where)
+    pips = as_pips(pips, (waveform, controller), where)
+    horizon = check_count(horizon, "horizon", where)
+    is_whole = isinstance(controller, Breathing)
+    whole = controller if is_whole else Breathing(controller, waveform)
+    options: Any = dict(horizon=horizon, keep=("costs",), throw=False)
+
+    def one(pip, key):
+        world, policy = BreathWaveform.at_pip((env, whole), pip)
+        run: Any = rollout(world, policy, key=key, **options)
+        return jnp.mean(run.costs)
+
+    keys = jax.random.split(check_key(key, where), pips.shape[0])
+    return jax.vmap(one)(pips, keys)
+
+
+class _TrackingError(eqx.Module):
+    """The mean error of a batch of controllers, each in its own lungs."""
+
+    envs: Environment
+    pips: Array
+    horizon: int = eqx.field(static=True)
+    shared: bool = eqx.field(static=True)
+    throw: bool = eqx.field(static=True)
+
+    def _counted(self, errors: Array) -> Array:
+        """Errors; unless `throw`, 0 for those that are not finite."""
+        return errors if self.throw else jnp.where(jnp.isfinite(errors), errors, 0)
+
+    def __call__(self, controllers: Any, key: PRNGKey) -> Array:
+        given: Any = dict(pips=self.pips, horizon=self.horizon)
+
+        def in_lung(env, controller, key):
+            return jnp.mean(breath_error(env, controller, key=key, **given))
+
+        # One controller for all lungs is not mapped over them.
+        own = None if self.shared else eqx.if_array(0)
+        in_lungs = eqx.filter_vmap(in_lung, in_axes=(eqx.if_array(0), own, 0))
+
+        def of_seed(controllers, key):
+            keys = jax.random.split(key, count_of(self.envs))
+            errors = in_lungs(self.envs, controllers, keys)
+            if not self.shared:
+                errors = self._counted(errors)
+            return self._counted(jnp.mean(errors))
+
+        keys = jax.random.split(key, count_of(controllers))
+        return jnp.mean(eqx.filter_vmap(of_seed)(controllers, keys))
+
+
+class _FiniteGradients(eqx.Module):
+    """The analytic gradient, 0 for a controller for which it is not finite.
+
+    Controllers are stacked along the first `axes` axes of each leaf.
+    """
+
+    axes: int = eqx.field(static=True)
+
+    def __call__(self, loss: Any, values: Any, key: PRNGKey) -> tuple[Any, Any]:
+        cost, slope = analytic(loss, values, key)
+        own = lambda leaf: tuple(range(self.axes, leaf.ndim))
+        is_finite = lambda leaf: jnp.all(jnp.isfinite(leaf), axis=own(leaf))
+        # All of the gradient of a controller is replaced, for a part has no meaning.
+        finite = jnp.all(jnp.stack([*map(is_finite, jax.tree.leaves(slope))]), axis=0)
+        kept = lambda leaf: jnp.where(jnp.expand_dims(finite, own(leaf)), leaf, 0)
+        diverged = jnp.sum(~finite).astype(cost.dtype)
+        return (cost, {"diverged": diverged}), jax.tree.map(kept, slope)
+
+
+def train_controllers(
+    envs: Environment,
+    controllers: Any,
+    *,
+    key: PRNGKey,
+    shared: bool = False,
+    steps: int = 400,
+    learning_rate: float = 1e-2,
+    pips: Any = PIPS,
+    horizon: int = LENGTH,
+    trainable: Any = None,
+    progress: bool = False,
+    checkpoint: Any = None,
+    throw: bool = True,
+) -> Fitted:
+    """Train controllers in lungs, by the gradient of their error.
+
+    The loss is [`delucax.lung.breath_error`][] over all peak pressures, with fresh
+    noise in each step; Adam with a learning rate that falls to 0 along a cosine.
+    Because Adam scales each weight by itself, the gradients of one controller do not
+    affect the others.
+
+    **Arguments:**
+
+    - `envs`: tasks of lungs in one module, each array with a leading axis over them.
+        Of fitted lungs that are stacked so, `equinox.filter_vmap(learned_lung)(models)`
+        makes them, and of resistances a function that makes a task of one.
+    - `controllers`: of the inspiratory valve, stacked over seeds, and within a seed
+        over the lungs: leaves of shape `(seeds, lungs, ...)`. With `shared`, of shape
+        `(seeds, ...)`.
+    - `key`: a random key, for the noise.
+    - `shared`: whether one controller is for all lungs; false by default.
+    - `steps`: 400 by default.
+    - `learning_rate`: 1e-2 by default.
+    - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
+    - `horizon`: steps per episode, 29 by default.
+    - `trainable`, `progress`, `checkpoint`: of [`delucax.training.fit`][]; the weights,
+        no bar and no file by default.
+    - `throw`: raise if an error or its gradient is NaN or infinite (default); if false,
+        a gradient that is not finite is replaced by 0, the other controllers are
+        unaffected, and `history["diverged"]` counts such controllers at each step.
+
+    **Returns:** a [`delucax.training.Fitted`][].
+
+    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
+    say), `RuntimeError` as `throw` says.
+
+    Source: Suo, Agarwal, Xia, Chen, Ghai, Yu, Gradu, Singh, Zhang, Minasyan, LaChance,
+    Zajdel, Schottdorf, Cohen and Hazan, 2021.
+
+    !!! example
+
+        ```python
+        import equinox as eqx
+        import jax
+        import jax.numpy as jnp
+        from delucax import lung
+
+        task = lambda R: lung.single_compartment(resistance=R)
+        envs = eqx.filter_vmap(task)(jnp.array([5.0, 20.0]))
+        keys = jax.random.split(jax.random.key(0), (1, 2))  # one seed, two lungs
+        policy = lambda key: lung.BreathPolicy(lung.BreathWaveform(), 0.03, key=key)
+        policies = eqx.filter_vmap(eqx.filter_vmap(policy))(keys)
+        few = dict(steps=3, horizon=2, pips=[20.0], key=jax.random.key(1))
+        lung.train_controllers(envs, policies, **few).history.loss
+        ```
+    """
+    where = "train_controllers"
+    if not isinstance(envs, Environment) or jnp.ndim(envs.dt) != 1:
+        raise ValueError(
+            f"{where}: envs must be tasks of lungs that are stacked, got one "
+            f"{type(envs).__name__}; equinox.filter_vmap(delucax.lung.learned_lung) "
+            "makes them of stacked models."
+        )
+    waveform = waveform_of(envs, where, stacked=True)
+    steps = check_count(steps, "steps", where)
+    check_positive(learning_rate, "learning_rate", where)
+    loss = _TrackingError(
+        envs,
+        as_pips(pips, (waveform, controllers), where),
+        check_count(horizon, "horizon", where),
+        check_bool(shared, "shared", where),
+        check_bool(throw, "throw", where),
+    )
+    adam = optax.adam(optax.cosine_decay_schedule(learning_rate, steps))
+    gradient: Any = analytic if throw else _FiniteGradients(1 if shared else 2)
+    options: Any = dict(trainable=trainable, progress=progress, checkpoint=checkpoint)
+    options |= dict(checkpoint_every=None if checkpoint is None else 100, throw=throw)
+    check_key(key, where)
+    return fit(loss, controllers, adam, steps, key=key, gradient=gradient, **options)
+
+
+@eqx.filter_jit
+def _searched(envs, lists, pips, key, kind):
+    """All combinations of the lists of gains, and the error of each in each lung."""
+    lists = [jnp.ravel(values).astype(float) for values in lists]
+    gains = jnp.stack(jnp.meshgrid(*lists, indexing="ij"), -1).reshape(-1, 3)
+
+    def in_lung(env):
+        def one(gains):
+            pid = _KINDS[kind](*gains, dt=env.dt, reference=env.cost.waveform)
+            return jnp.mean(breath_error(env, pid, key=key, pips=pips))
+
+        return jax.vmap(one)(gains)
+
+    return gains, eqx.filter_vmap(in_lung)(envs)
+
+
+def pid_grid(
+    envs: Environment,
+    *,
+    key: PRNGKey,
+    kind: Literal["leaky", "true"] = "leaky",
+    kp: Any = GAINS,
+    ki: Any = GAINS,
+    kd: Any = (0.0,),
+    pips: Any = PIPS,
+) -> tuple[Float[Array, "grid 3"], Float[Array, "lungs grid"]]:
+    """The error of every PID of a grid in every lung, all at once.
+
+    **Arguments:**
+
+    - `envs`: tasks of lungs in one module, each array with a leading axis over them, or
+        a single task.
+    - `key`: a random key, for the noise of the sensor, which is the same for all.
+    - `kind`: `"leaky"` for [`delucax.controllers.LeakyPID`][], which is that of the
+        original (default); `"true"` for [`delucax.controllers.PID`][].
+    - `kp`, `ki`, `kd`: the gains, of which all combinations are tried; 0, 0.1, ...,
+        0.9, 1, 2, ..., 10 for the first two and 0 for the last by default.
+    - `pips`: the peak pressures to follow, 10, 15, ..., 35 cmH2O by default.
+
+    **Returns:** the gains (kp, ki, kd) of each, shape `(grid, 3)`, and the mean error
+        of each in each lung, shape `(lungs, grid)` [cmH2O]; that of one lung for a
+        single task.
+
+    **Raises:** `ValueError` if the arguments are invalid (a peak pressure below PEEP,
+    say).
+
+    !!! example
+
+        ```python
+        import equinox as eqx
+        import jax
+        import jax.numpy as jnp
+        from delucax import lung
+
+        task = lambda R: lung.single_compartment(resistance=R)
+        envs = eqx.filter_vmap(task)(jnp.array([5.0, 20.0]))
+        few = dict(kp=[0.5, 1.0], ki=[1.0], pips=[20.0])
+        gains, errors = lung.pid_grid(envs, key=jax.random.key(0), **few)
+        best_in_each_lung = gains[jnp.argmin(errors, axis=1)]
+        ```
+    """
+    where = "pid_grid"
+    pips = as_pips(pips, waveform_of(envs, where, stacked=True), where)
+    check_key(key, where)
+    check_choice(kind, tuple(_KINDS), "kind", where)
+    lists = []
+    for name, values in (("kp", kp), ("ki", ki), ("kd", kd)):
+        array = as_float_array(values)
+        if not eqx.is_inexact_array(array) or not array.size:
+            raise ValueError(f"{where}: {name} must be numbers, got {values!r}.")
+        check_finite(array, name, where)
+        lists.append(array)
+    envs = envs if jnp.ndim(envs.dt) else stack([envs])
+    return _searched(envs, lists, pips, key, kind)

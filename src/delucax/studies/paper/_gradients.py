@@ -1,0 +1,251 @@
+"""Gradients of a policy: descent through the rollout beside evolution strategies (the
+first figure, right), and the variance of the estimators (Section 2)."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+
+from ... import training
+from ...controllers import Gaussian, Linear, MLP, mlp_policy
+from ...environments import pendulum
+from ...simulation import rollout
+from .._swing_up import spread_starts
+from ._finding import Claim, draw_panels, Finding
+
+
+EPISODE, RATE, GOAL = 50, 0.01, 2.0
+TWICE = 2 * RATE
+BUDGET, HORIZON = 128, 20
+"""Rollouts in one estimate, and steps in a rollout."""
+ON_WEIGHTS, ON_CONTROLS = 0.01, 0.1
+"""Standard deviations of the noise."""
+LONGER = (10, 25, 50, 100, 200, 400)
+DRAWN = 8
+"""Rollouts in one estimate where the start is drawn."""
+
+
+def policy_gradient(small: bool = False) -> Finding:
+    """A linear policy of the pendulum, hanging at first, with torque up to 10."""
+    steps, seeds = (400, 3) if small else (1500, 5)
+    scales, pairs = ((0.1,), (1, 16)) if small else ((0.05, 0.1, 0.3), (1, 4, 16, 64))
+
+    def train(estimator, seed, rate=RATE):
+        options: Any = dict(gradient=estimator, progress=False)
+        return np.asarray(train_linear(steps, seed, rate, **options).history.loss)
+
+    exact = train(training.analytic, 0)
+    first, faster = _first(exact), _first(train(training.analytic, 0, TWICE))
+    rows: Any = [("through the rollout", 1, int(first is not None), first, exact[-1])]
+    curves, fewest = {}, []
+    for scale in scales:
+        for count in pairs:
+            estimator = training.EvolutionStrategies(scale, 2 * count)
+            runs = [train(estimator, seed) for seed in range(seeds)]
+            when = [_first(run) for run in runs]
+            # The loss itself, which is one more rollout a step, is not charged.
+            cost = [2 * count * w for w in when if w is not None]
+            curves[scale, count], fewest = runs, fewest + cost
+            name = f"evolution strategies, sigma {scale}, {count} pairs"
+            median = float(np.median(cost)) if cost else None
+            at_end = float(np.median([run[-1] for run in runs]))
+            rows.append((name, seeds, len(cost), median, at_end))
+    least = min(fewest) if fewest else None
+    claims = [
+        descent_claim(first, faster),
+        Claim(
+            "Evolution strategies need more rollouts at every setting and seed",
+            f"{len(fewest)} of {seeds * len(curves)} runs get there"
+            + ("" if least is None else f", the fastest after {least:,} rollouts"),
+            least is None or (first is not None and least > first),
+        ),
+    ]
+    ax = draw_panels(1, (7.5, 3.4))
+    ax.plot(np.arange(1, steps + 1), exact, "k", lw=2, label="through the rollout")
+    for (scale, count), runs in curves.items():
+        x = 2 * count * np.arange(1, steps + 1)
+        label = f"ES, sigma {scale}, {count} pairs"
+        color, alpha = f"C{scales.index(scale)}", 1 - 0.2 * pairs.index(count)
+        median = np.median(runs, axis=0)
+        ax.plot(x, median, lw=1, color=color, alpha=alpha, label=label)
+    ax.axhline(GOAL, color="0.5", lw=0.8, ls=":")
+    ax.set(xscale="log", xlabel="rollouts", ylabel="mean cost of a step")
+    ax.figure.legend(frameon=False, fontsize=7, loc="outside right center")
+    notes = (
+        f"u = -K (angle, velocity), the angle not wrapped; {EPISODE} steps of 0.05 s "
+        f"from hanging at rest, torque at most 10; descent with rate {RATE} on the "
+        "mean cost of Gym (with the sum it sticks at once). Evolution strategies are "
+        f"antithetic, {seeds} seeds a setting, {steps} updates; lines are medians."
+    )
+    medians = "rollouts, median", "cost at the end, median"
+    columns = "gradient", "runs", "reach 2.0", *medians
+    table: Any = [dict(zip(columns, row, strict=True)) for row in rows]
+    tables, figures = {"Rollouts to cost 2.0": table}, {"policy_gradient": ax.figure}
+    return Finding("Policy gradient of the pendulum", claims, tables, figures, notes)
+
+
+@functools.cache
+def _mean_cost() -> Callable[..., Any]:
+    """The mean cost per step from hanging; cached, as a new function would compile."""
+    env = pendulum(max_torque=10.0, initial_state=np.array([np.pi, 0.0]))
+    total = training.expected_cost(env, batch=1, horizon=EPISODE)
+    return lambda controller, key: total(controller, key) / EPISODE
+
+
+def train_linear(
+    steps: int, seed: int = 0, rate: float = RATE, **options: Any
+) -> training.Fitted:
+    """Descend with a linear policy from zero; with the options of `fit`."""
+    options["key"] = jax.random.key(seed)
+    start = Linear(jnp.zeros((1, 2)))
+    return training.fit(_mean_cost(), start, optax.sgd(rate), steps, **options)
+
+
+def descent_claim(first: int | None, faster: int | None) -> Claim:
+    """The claim at the paper's rate, with the result at twice the rate beside it."""
+    return Claim(
+        "Gradient descent through the rollout reaches cost 2.0 within 120 rollouts",
+        f"{first or 'Never, in'} rollouts at the paper's rate {RATE} "
+        f"({faster or 'never'} at {TWICE})",
+        first is not None and first <= 120,
+    )
+
+
+def _first(losses: np.ndarray) -> int | None:
+    """The number of rollouts until the cost is at most the goal."""
+    below = np.flatnonzero(losses <= GOAL)
+    return int(below[0]) + 1 if below.size else None
+
+
+def estimator_variance(small: bool = False) -> Finding:
+    """Networks of growing width, of one pendulum's control."""
+    # Nearly all of the time is compilation, of each estimator at each width.
+    widths = (4, 64) if small else (4, 8, 16, 32, 64, 128, 256)
+    draws = 64 if small else 256
+    env = pendulum(initial_state=np.array([1.0, 0.0]), horizon=HORIZON)
+    score = training.scored_cost(env)
+    evolution, likelihood = training.EvolutionStrategies, training.LikelihoodRatio
+
+    def loss(controller, key):
+        return rollout(env, controller, key=key, keep=(), throw=False).total_cost
+
+    rows: list[dict[str, Any]] = []
+    for width in widths:
+        policy = MLP(2, 1, width, 1, key=jr.key(0))
+        noisy = Gaussian(policy, float(np.log(ON_CONTROLS)))
+        estimators: dict[str, Any] = {
+            "analytic": (training.analytic, loss, policy),
+            "ES, antithetic": (evolution(ON_WEIGHTS, BUDGET), loss, policy),
+            "REINFORCE": (likelihood(BUDGET), score, noisy),
+            "ES, one-sided": (evolution(ON_WEIGHTS, BUDGET, False), loss, policy),
+            "REINFORCE, no baseline": (likelihood(BUDGET, False), score, noisy),
+        }
+        names = list(estimators)[: 3 if small else 5]
+        samples = {name: _estimates(estimators[name], draws) for name in names}
+        exact = samples["analytic"][0]
+        scale = exact @ exact
+        variance = lambda drawn, by: float(jnp.sum(jnp.var(drawn, axis=0)) / by)
+        ratios = {name: variance(drawn, scale) for name, drawn in samples.items()}
+        rows.append({"parameters": len(exact)} | ratios)
+    ratios = {name: [row[name] for row in rows] for name in rows[0]}
+    sizes = ratios.pop("parameters")
+    steep, flat = (
+        float(np.polyfit(np.log(sizes), np.log(ratios[name]), 1)[0])
+        for name in ("ES, antithetic", "REINFORCE")
+    )
+    last = ratios["REINFORCE"][-1]
+    over = [_at_horizon(T, draws) for T in (LONGER[::4] if small else LONGER)]
+    exploding = over[-1]["analytic"] / over[0]["analytic"]
+    lost = [row["horizon"] for row in over if row["analytic"] > row["REINFORCE"]]
+    claims = [
+        Claim(
+            "The analytic gradient has no variance in a deterministic system (below "
+            "1e-9 of its squared norm)",
+            f"{max(ratios['analytic']):.1e}",
+            bool(max(ratios["analytic"]) < 1e-9),
+        ),
+        Claim(
+            "That of evolution strategies grows in proportion to the parameters "
+            "(slope 0.8 to 1.2 on log-log axes)",
+            f"slope {steep:.2f}",
+            0.8 <= steep <= 1.2,
+        ),
+        Claim(
+            "That of REINFORCE does not depend on the number of parameters (slope -0.2 "
+            "to 0.2), but adds to the problem's own",
+            f"slope {flat:.2f}, {last:.3g} times the squared gradient",
+            abs(flat) <= 0.2 and last > 0,
+        ),
+        Claim(
+            "Over a long horizon, with starts at random, the analytic gradient loses: "
+            "its variance grows above that of REINFORCE at as many rollouts",
+            f"{exploding:.1e} times from {over[0]['horizon']} to {over[-1]['horizon']} "
+            f"steps; above from {lost[0]} steps on"
+            if lost
+            else "below everywhere",
+            bool(lost),
+        ),
+    ]
+    ax, long = draw_panels(2, (9, 3.4))
+    for name, values in ratios.items():
+        if min(values) > 0:
+            ax.loglog(sizes, values, "o-", ms=3, label=name)
+    ax.set(xlabel="parameters", ylabel="variance / squared gradient")
+    ax.xaxis.set_minor_formatter("")
+    ax.legend(frameon=False, fontsize=8)
+    for name in ("analytic", "REINFORCE"):
+        each = [row[name] for row in over]
+        long.loglog([row["horizon"] for row in over], each, "o-", ms=3, label=name)
+    long.set(xlabel="horizon, steps", ylabel="variance")
+    long.legend(frameon=False, fontsize=8)
+    notes = (
+        f"Networks of one layer, {widths[0]} to {widths[-1]} wide, for the pendulum, "
+        f"{HORIZON} steps; {BUDGET} rollouts in an estimate, {draws} estimates; noise "
+        f"of {ON_WEIGHTS} on the weights, or {ON_CONTROLS} on the control. The "
+        "variance is the trace of the covariance. Against the horizon: a network of "
+        f"width 32, starts at any angle and speed, {DRAWN} rollouts an estimate; the "
+        "norms are those of single rollouts."
+    )
+    title = "Variance of gradient estimators"
+    tables = {"Variance / squared gradient": rows, "Against the horizon": over}
+    return Finding(title, claims, tables, {"estimator_variance": ax.figure}, notes)
+
+
+def _at_horizon(horizon: int, draws: int) -> dict[str, Any]:
+    """Variances over a horizon, the start drawn, and how large the gradient is."""
+    env = spread_starts(pendulum())
+    policy = mlp_policy(env, width=32, depth=1, key=jr.key(0))
+    noisy = Gaussian(policy, -1.0, bounds=env.control_bounds)
+    one = training.expected_cost(env, batch=1, horizon=horizon)
+    score = training.scored_cost(env, horizon=horizon)
+    # Of single rollouts, so that norms are those of one, and the variance an eighth.
+    each = np.asarray(_estimates((training.analytic, one, policy), draws))
+    drawn = training.LikelihoodRatio(DRAWN)
+    guesses = np.asarray(_estimates((drawn, score, noisy), draws))
+    norms = np.linalg.norm(each, axis=1)
+    return {
+        "horizon": horizon,
+        "analytic": float(np.sum(np.var(each, axis=0))) / DRAWN,
+        "REINFORCE": float(np.sum(np.var(guesses, axis=0))),
+        "norm, median": float(np.median(norms)),
+        "norm, largest": float(np.max(norms)),
+    }
+
+
+def _estimates(given: tuple[Any, Any, Any], draws: int) -> jax.Array:
+    """Estimates of the gradient by the policy's own weights, a row each; of an
+    estimator, a loss and a model."""
+    estimator, loss, model = given
+
+    def estimate(key):
+        _, gradient = estimator(loss, model, key)
+        own = gradient.base if isinstance(gradient, Gaussian) else gradient
+        return ravel_pytree(own)[0]
+
+    return jax.lax.map(jax.jit(estimate), jr.split(jr.key(1), draws))
