@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._check import (
+    as_entries,
     check_at_most,
     check_count,
     check_instance,
@@ -105,11 +106,7 @@ class NeuralDynamics(AbstractDynamics):
             array = getattr(self, name)
             if name != "x_mean":
                 check_positive(array, name, where)
-            if jnp.shape(array) not in ((), (size,)):
-                raise ValueError(
-                    f"{where}: {name} must be a number or have shape ({size},), got "
-                    f"shape {jnp.shape(array)}."
-                )
+            as_entries(array, size, name, where)
 
     def advance(
         self,
