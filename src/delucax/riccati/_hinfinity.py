@@ -62,9 +62,9 @@ def hinf_dare(
     whose control `u = -K x` keeps the sum of `x'Qx + u'Ru` below `gamma^2` times that
     of `w'w`, from rest, for every disturbance `w` along `x_next = A x + B u + D w`:
 
-    `K = R^-1 B' X L^-1 A`, `L = I + (B R^-1 B' - gamma^-2 D D') X`,
+    `K = R^-1 B' X M^-1 A`, `M = I + (B R^-1 B' - gamma^-2 D D') X`,
 
-    while the worst disturbance is `w = gamma^-2 D' X L^-1 A x`. The control does not
+    while the worst disturbance is `w = gamma^-2 D' X M^-1 A x`. The control does not
     know `w`, and `gamma^2 I - D'XD` must be positive definite.
 
     Doubling, then Newton steps on the equation; the conditions of a solution
