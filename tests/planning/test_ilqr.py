@@ -261,7 +261,7 @@ def test_a_bound_that_is_far_is_not_taken_for_met():
 
 @needs_x64
 @thorough
-def test_the_solve_box_qp():
+def test_a_quadratic_program_between_bounds():
     """Of a few controls: the Karush-Kuhn-Tucker conditions."""
     from delucax.planning._lq import solve_box_qp
 
