@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from .._check import (
     as_bounds,
+    as_entries,
     as_matrix,
     bounds_field,
     check_choice,
@@ -108,12 +109,7 @@ class _AbstractPID(AbstractController):
         for name, value in vectors.items():
             if value is None:
                 continue
-            array = as_float_array(value)
-            if not eqx.is_inexact_array(array) or array.ndim > 1:
-                raise ValueError(
-                    f"{where}: {name} must be a number or a vector, got "
-                    f"{shortened(value)}."
-                )
+            array = as_entries(value, None, name, where, "loop")
             if array.ndim == 1:
                 sizes[name] = array.shape[0]
         if isinstance(self.output, _Select):

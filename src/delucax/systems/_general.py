@@ -8,7 +8,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_vector, check_count, check_key, check_matrices, checked_names
+from .._check import (
+    as_vector,
+    check_count,
+    check_function,
+    check_key,
+    check_matrices,
+    checked_names,
+)
 from .._module import (
     function_field,
     indexed_names,
@@ -175,8 +182,7 @@ def system(
         car = dlx.system(double_integrator, states=("position", "speed"), controls=1)
         ```
     """
-    if not callable(f):
-        raise ValueError(f"system: f must be a function of (t, x, u, w), got {f!r}.")
+    check_function(f, "f", "system", " of (t, x, u, w)")
     return FunctionSystem(
         f,
         names_of(states, "x", "states", "system"),

@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import PyTree
 
-from .._check import check_at_most, check_count, check_key, is_concrete
+from .._check import check_at_most, check_count, check_function, check_key, is_concrete
 from .._results import choose, Result, RESULTS
 from .._typing import PRNGKey
 from ._gradient_estimators import analytic
@@ -176,8 +176,7 @@ def fit(
         fitted.model.length
         ```
     """
-    if not callable(loss):
-        raise ValueError(f"{_WHERE}: loss must be a function, got {loss!r}.")
+    check_function(loss, "loss", _WHERE)
     if not isinstance(optimiser, optax.GradientTransformation):
         raise ValueError(
             f"{_WHERE}: optimiser must be an Optax optimiser such as optax.adam(1e-3), "

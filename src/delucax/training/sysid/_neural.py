@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._check import (
+    as_entries,
     check_at_most,
     check_count,
     check_instance,
@@ -102,14 +103,9 @@ class NeuralDynamics(AbstractDynamics):
         where, n, m = "NeuralDynamics", self.state_size, self.control_size
         sizes = dict(x_mean=n, x_scale=n, u_scale=m, step_scale=n)
         for name, size in sizes.items():
-            array = getattr(self, name)
+            array = as_entries(getattr(self, name), size, name, where)
             if name != "x_mean":
                 check_positive(array, name, where)
-            if jnp.shape(array) not in ((), (size,)):
-                raise ValueError(
-                    f"{where}: {name} must be a number or have shape ({size},), got "
-                    f"shape {jnp.shape(array)}."
-                )
 
     def advance(
         self,
