@@ -42,7 +42,7 @@ help: ## list the targets
 		/^[a-z0-9-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 .PHONY: demo
-demo: $(VENV)/.demo ## a pendulum swings up, then the paper in small; into demo/
+demo: $(VENV)/.demo ## train a swing-up, then the paper at reduced size; into demo/
 	$(bin)/python -u -m delucax demo $(ARGS)
 
 .PHONY: bench
@@ -84,7 +84,7 @@ notebooks-full: $(VENV)/.tests ## run every notebook as it is shown
 		--nbmake --nbmake-timeout=1800 notebooks
 
 .PHONY: lint
-lint: $(VENV)/.dev ## style, formatting, the imports between the floors, the ledger of claims
+lint: $(VENV)/.dev ## style, formatting, imports between layers, the ledger of claims
 	$(bin)/ruff check
 	$(bin)/ruff format --check
 	$(bin)/lint-imports --no-cache --no-logo

@@ -27,7 +27,7 @@ ELSEWHERE = {
     ("wall-clock", "in one chain"): (
         "[the wall-clock table](benchmarks.md#the-wall-clock-table-of-the-deluca-paper)"
     ),
-    ("ventilator", ""): "[with 20 seeds](ventilator.md#what-it-was-to-reach)",
+    ("ventilator", ""): "[with 20 seeds](ventilator.md#limits)",
 }
 BEGIN, END = "<!-- table: claims -->\n", "<!-- end: claims -->"
 

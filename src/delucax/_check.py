@@ -22,6 +22,8 @@ from ._module import (
     as_float_array,
     check_function as check_function,
     indexed_names,
+    mlp,
+    names_of,
 )
 from ._typing import Bounds
 
@@ -457,3 +459,23 @@ def finite_rows(
     rows = as_rows(value, size, name, where, steps)
     check_finite(rows, name, where)
     return rows
+
+
+def state_network(
+    states: int | Sequence[str],
+    controls: int | Sequence[str],
+    width: int,
+    depth: int,
+    activation: Callable[[Array], Array],
+    key: Any,
+    where: str,
+) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
+    """The names of states and controls, and a network of both with as many outputs as
+    there are states."""
+    check_key(key, where)
+    names = names_of(states, "x", "states", where)
+    inputs = names_of(controls, "u", "controls", where)
+    width = check_count(width, "width", where)
+    depth = check_count(depth, "depth", where, least=0)
+    size = len(names) + len(inputs)
+    return names, inputs, mlp(size, len(names), width, depth, activation, key=key)

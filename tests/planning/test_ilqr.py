@@ -381,7 +381,10 @@ def test_a_bad_member_of_a_batch_harms_no_other(line_search):
         (dict(regularise="both"), "regularise must be"),
         (dict(parallel=True, bounds=(-1.0, 1.0)), "parallel"),
         (dict(parallel=True, regularise="state"), "parallel"),
-        (dict(finite_difference=0.1, second_order=True), "finite_difference goes"),
+        (
+            dict(finite_difference=0.1, second_order=True),
+            "finite_difference is incompatible",
+        ),
         (dict(max_iterations=0), "max_iterations"),
         (dict(tolerance=-1.0), "tolerance must be at least 0"),
         (dict(constraint_tolerance=-1.0), "constraint_tolerance"),

@@ -78,6 +78,7 @@ def check_adaptive(solver: diffrax.AbstractSolver, where: str) -> None:
     name = type(solver).__name__
     tableau = tableau_of(solver)
     no_error = tableau is not None and not tableau.b_error.any()
+    # Diffrax accepts a tableau whose error weights are all zero.
     if no_error or not isinstance(solver, diffrax.AbstractAdaptiveSolver):
         raise ValueError(
             f"{where}: solver {name} has no error estimate and cannot be used with a "

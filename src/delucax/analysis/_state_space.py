@@ -72,7 +72,7 @@ class StateSpace(NamedTuple):
 
 
 def state_space(model: Any, inputs: str, where: str) -> StateSpace:
-    """The matrices from one kind of input to the outputs, or an error."""
+    """The checked model from one kind of input to the outputs."""
     if not isinstance(model, LinearModel):
         raise ValueError(
             f"{where}: model must be a LinearSystem or LinearDynamics "

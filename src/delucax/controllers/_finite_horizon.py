@@ -129,7 +129,8 @@ class FiniteHorizonLQR(AbstractController):
         A, B = (a if steps is None else a[:T] for a in (dynamics.A, dynamics.B))
         # With the residual d of the reference the cost to go has a linear term, whose
         # share of the control is the feed-forward k.
-        solution = dre(A, B, Q, R, S, final=final, horizon=T, d=d, parallel=parallel)
+        options: dict[str, Any] = dict(final=final, horizon=T, d=d, parallel=parallel)
+        solution: Any = dre(A, B, Q, R, S, **options)
         self.K, self.k, self.P = solution.K, solution.k, solution.X
         self.dt, self.difference = dynamics.dt, difference
 

@@ -231,6 +231,8 @@ class PID(_AbstractPID):
             self.derivative_on, ("measurement", "error"), "derivative_on", "PID"
         )
         lag, windup, dt = self.derivative_time_constant, self.anti_windup_time, self.dt
+        # Before the base's checks, because the other times are compared with it.
+        check_step(dt, "PID")
         check_range(dt if lag is None else lag, "derivative_time_constant", "PID")
         check_range(dt if windup is None else windup, "anti_windup_time", "PID", dt)
 

@@ -75,6 +75,7 @@ def c2d(system: LinearSystem, dt: ArrayLike, method: str = "zoh") -> LinearDynam
         half = system.A * (dt / 2)
         eye = jnp.eye(n, dtype=half.dtype)
         right = jnp.concatenate([eye + half, inputs * dt], axis=1)
+        # It raises where 2/dt is an eigenvalue of A.
         operator = lx.MatrixLinearOperator(eye - half)
         column = lambda b: lx.linear_solve(operator, b, lx.LU()).value
         sampled = jax.vmap(column, in_axes=1, out_axes=1)(right)

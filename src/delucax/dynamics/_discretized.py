@@ -48,7 +48,8 @@ class Discretized(AbstractDiscretization):
 
     `x_next = x + integral over [t, t + dt] of f(s, x(s), u, w) ds`, the control (and a
     disturbance that enters the field) held over the interval; then the system's
-    `project`; then, where the system names no disturbances, `+ w`.
+    `project`; then, where the system names no disturbances, `+ w`, which may take the
+    state off the manifold of `project` until the next step.
 
     With a fixed step (the default) `dt` is cut into `substeps` equal steps of `solver`:
     explicit Runge-Kutta methods are written out stage by stage, diagonally implicit
@@ -249,6 +250,7 @@ class Discretized(AbstractDiscretization):
             return split_state(x_next.astype(x.dtype)), or_none(result)
 
         xs = jnp.arange(self.substeps), increments
+        # The first failure of a substep is that of the interval.
         parts, results = lax.scan(body, split_state(x), xs)
         return join_state(parts, x.shape[0]), first_of(results)
 
@@ -282,7 +284,8 @@ def _apply(g: Array, dB: Array) -> Array:
 
 
 class _BrownianTerm(diffrax.AbstractTerm):
-    """`g dB` with the increment of this step given."""
+    """`g dB` with the increment of this step given, where Diffrax's own term would
+    evaluate a path: increments are data here, to be given, kept and differentiated."""
 
     diffusion: Any
     increment: Array
@@ -311,6 +314,7 @@ def _solver_step(solver, term, s, x, h, args):
     """One Diffrax step of `h` from `s` after the start of the interval. It starts
     afresh, as it must after a switch of the control.
     """
+    # In local time, so that t1 - t0 is h to rounding, however late the interval is.
     t0 = jnp.asarray(s, x.dtype)
     t1 = t0 + h
     state = solver.init(term, t0, t1, x, args)

@@ -296,6 +296,8 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
     end = lax.while_loop(proceeds, body, start)
     *_, z, d, _, _, point, (cost, *best) = end
     gap = jnp.max(jnp.abs(d))
+    # Newton's method may converge to another stationary point, of a larger residual
+    # than the best one visited.
     good = _settled(gap, z) & (point.cost <= 1.01 * cost + eps)
     return select(good, (z, point.drift, point.jacobian, gap), tuple(best))
 
@@ -335,6 +337,7 @@ def _solve(model: Any, t: Array, guess: Array, free: tuple[int, ...]):
     x, u = y[:n], y[n:]
     is_system = isinstance(model, AbstractSystem)
     share = relative_drift(drift, jacobian, x, u, is_map=not is_system)
+    # Relative to the terms that cancel in the drift, which set its rounding.
     rests = lax.stop_gradient(share) <= eps**0.5
     settled = _settled(offset, z)
     failure = choose(settled, RESULTS.no_equilibrium, RESULTS.not_converged)

@@ -309,6 +309,7 @@ def acrobot(
         )
         ```
     """
+    # A disturbance of the user's may drive the features beyond their bounds.
     bounded = disturbance is None
     if torque_noise is not None:
         if not bounded:

@@ -182,6 +182,7 @@ class Environment(eqx.Module):
         if eqx.tree_equal(before.disturbance, _default_disturbance(old)):
             fields["disturbance"] = _default_disturbance(new)
         n = new.state_size
+        # Only zeros can have been the default; another state is the user's.
         if n != old.state_size and not callable(x0) and is_concrete(x0):
             if x0.shape == (old.state_size,) and not np.any(x0):
                 fields["initial_state"] = jnp.zeros(n, x0.dtype)

@@ -55,6 +55,7 @@ class GymPendulum(AbstractGymStep):
         acceleration = self.system.acceleration(angle, velocity, u[0])
         velocity = velocity + acceleration * self.dt
         velocity = clip(velocity, -self.max_speed, self.max_speed)
+        # Semi-implicit: the angle moves with the new velocity.
         return jnp.stack([angle + velocity * self.dt, velocity])
 
 
@@ -72,6 +73,7 @@ class GymCartPole(AbstractGymStep):
     def gym_step(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         dt = self.dt
         position, velocity, angle, spin = x[0], x[1], x[2], x[3]
+        # Batched, XLA would compute both accelerations again for each entry.
         acceleration, turn = fence(*self.system.accelerations(angle, spin, u[0]))
         velocity_next, spin_next = velocity + dt * acceleration, spin + dt * turn
         if self.semi_implicit:
@@ -101,6 +103,7 @@ class GymMountainCar(AbstractGymStep):
         velocity = clip(velocity, -self.max_speed, self.max_speed)
         position = position + velocity * self.dt
         position = clip(position, self.min_position, self.max_position)
+        # Gym's right wall stops no car: the goal is before it.
         stopped = (position <= self.min_position) & (velocity < 0)
         return jnp.stack([position, jnp.where(stopped, 0, velocity)])
 

@@ -224,6 +224,7 @@ def _random(
     check_range(radius, "spectral_radius", "lds")
     a, b, c = jr.split(key, 3)
     A = jr.normal(a, (n, n))
+    # The eigenvalues scale with the matrix.
     A = A * (radius / jnp.max(jnp.abs(jnp.linalg.eigvals(A))))
     B = jr.normal(b, (n, m))
     if observations is None:

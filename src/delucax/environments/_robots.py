@@ -200,6 +200,7 @@ def planar_quadrotor(system: PlanarQuadrotor) -> Fields:
         ```
     """
     windless = PlanarQuadrotor(system.mass, system.length, system.gravity)
+    # The paper's cost is that of the model, which knows of no wind.
     _, hover = windless.equilibrium()
     return dict(
         cost=Quadratic(jnp.ones(6), 0.1 * jnp.ones(2), control_target=hover),

@@ -115,11 +115,11 @@ def task(
     elif solver is not None:
         default_name = f"`diffrax.{type(solver).__name__}()` by default"
 
-    def decorate(added: Callable[..., Fields]) -> Callable[..., Environment]:
-        where = added.__name__
+    def decorate(build: Callable[..., Fields]) -> Callable[..., Environment]:
+        where = build.__name__
         # The first parameter is the system or the dynamics, the others are options,
         # each with the check that its annotation holds (alone, or in a union).
-        _, *options = inspect.signature(added).parameters.values()
+        _, *options = inspect.signature(build).parameters.values()
         checks = [
             (option.name, check, option.default)
             for option in options
@@ -181,7 +181,7 @@ def task(
                 if (value := chosen.get(name, default)) is not default:
                     check(value, name, where)
             fields: Fields = dict(dynamics=dynamics, horizon=horizon)
-            fields |= added(system if gym is None else dynamics, **chosen)
+            fields |= build(system if gym is None else dynamics, **chosen)
             # Bounds of observations are those of the task as it is.
             if not _CHANGES_OBSERVATIONS.isdisjoint(others):
                 fields["observation_bounds"] = None
@@ -197,9 +197,9 @@ def task(
         unit = f" [{kind.time_unit}]" if kind.time_unit else ""
         names = dict(kind=kind.__name__, unit=unit, solver=default_name)
         shared = (inspect.getdoc(make) or "").format(**numbers, **names)
-        functools.update_wrapper(make, added)
+        functools.update_wrapper(make, build)
         # They follow the options, and end where the source is named.
-        own, source, rest = (inspect.getdoc(added) or "").partition("\n\nSource:")
+        own, source, rest = (inspect.getdoc(build) or "").partition("\n\nSource:")
         make.__doc__ = f"{own}\n{shared}{source}{rest}"
         vars(make)["__signature__"] = signature.replace(parameters=parameters)
         register(where, f"{__package__}:{where}")

@@ -10,10 +10,9 @@ from jaxtyping import Array, PyTree
 
 from .._check import check_choice, check_count, check_key, check_step
 from .._controller import AbstractController, check_controller
-from .._module import parameter, positive, weight
+from .._module import mlp, parameter, positive, weight
 from .._typing import PRNGKey, Real
 from ..math import clip
-from ._learned_lung import tanh_network
 from ._waveform import BreathWaveform, check_waveform
 
 
@@ -227,7 +226,7 @@ class BreathPolicy(AbstractController):
             size += (self.errors - 4) * width - self.errors
             depth = 0
         check_count(depth, "depth", where, least=0)
-        self.network = tanh_network(size, "scalar", width, depth, key=key)
+        self.network = mlp(size, "scalar", width, depth, key=key)
         self.shift = -2.0
 
     def __check_init__(self):

@@ -1,6 +1,6 @@
 """A lung learned from breaths."""
 
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ import jax.random as jr
 from jaxtyping import Array, Float
 
 from .._check import check_bool, check_count, check_instance, check_key
-from .._module import as_module, parameter, positive, weight
+from .._module import mlp, parameter, positive, weight
 from .._results import RESULTS
 from .._typing import PRNGKey, RealScalar, Scalar, State
 from ..dynamics import AbstractDynamics
@@ -117,8 +117,8 @@ class LearnedLung(AbstractDynamics):
         self.hidden = jr.normal(hidden_key, (*shape, size)) / size**0.5
         self.output = 0.1 * jr.normal(output_key, shape) / 16**0.5
         self.line = jnp.zeros(inputs)
-        self.valve = tanh_network("scalar", "scalar", 8, 1, key=valve_key)
-        self.network = tanh_network(inputs, "scalar", width, depth, key=key)
+        self.valve = mlp("scalar", "scalar", 8, 1, key=valve_key)
+        self.network = mlp(inputs, "scalar", width, depth, key=key)
         inhaling = breaths.u_out < 0.5
         moments = lambda a: (jnp.mean(a, where=inhaling), jnp.std(a, where=inhaling))
         self.u_mean, u_std = moments(breaths.u_in)
@@ -273,17 +273,6 @@ class LearnedLung(AbstractDynamics):
             early = jax.vmap(begin)(known[:first], inputs)
             late = jax.vmap(go_on)(known[first:], linearised[first:])
         return self.p_mean + self.p_std * jnp.concatenate([start[:1], early, late])
-
-
-_Size: TypeAlias = int | Literal["scalar"]
-
-
-def tanh_network(
-    inputs: _Size, outputs: _Size, width: int, depth: int, *, key: PRNGKey
-) -> eqx.nn.MLP:
-    """A fully connected network whose hidden layers are tanh."""
-    tanh, identity = as_module(jnp.tanh), as_module(jax.nn.identity)
-    return eqx.nn.MLP(inputs, outputs, width, depth, tanh, identity, key=key)
 
 
 def _windows(values: Array, size: int) -> Array:

@@ -10,10 +10,9 @@ import jax.random as jr
 from jaxtyping import Array
 
 from .._check import check_count, check_instance, check_key, check_step
-from .._module import parameter, positive, weight
+from .._module import mlp, parameter, positive, weight
 from .._typing import PRNGKey, Real, RealScalar, Scalar, State
 from ..dynamics import Delayed, Discretized
-from ._learned_lung import tanh_network
 from ._lungs import AbstractLung, SingleCompartment
 from ._ventilation import Valves
 
@@ -144,7 +143,7 @@ class NeuralLung(AbstractLung):
         check_count(depth, "depth", where)
         check_key(key, where)
         sizes = self.hidden + 3, self.hidden + 1, width, depth
-        self.network = tanh_network(*sizes, key=key)
+        self.network = mlp(*sizes, key=key)
         self.p_mean, self.p_std, self.rate = 20.0, 10.0, 10.0
         self.valves = Valves() if valves is None else valves
 
@@ -216,7 +215,7 @@ class GreyBoxLung(AbstractLung):
         width = check_count(width, "width", where)
         self.single = SingleCompartment() if single is None else single
         network, self.memory = (
-            tanh_network(3, "scalar", width, 1, key=k) for k in jr.split(key)
+            mlp(3, "scalar", width, 1, key=k) for k in jr.split(key)
         )
         last = lambda mlp: mlp.layers[-1].weight
         self.network = eqx.tree_at(last, network, 0.1 * last(network))

@@ -38,7 +38,6 @@ class _Simulation(eqx.Module):
     teacher: bool = eqx.field(static=True)
 
     def __call__(self, models, batch, key):
-        del key
         u_in, pressure = (jnp.swapaxes(column, 0, 1) for column in batch)
 
         def one(model, u_in, pressure):

@@ -68,7 +68,6 @@ class AbstractLung(AbstractSystem):
         """
 
     def observe(self, t, x):
-        del t
         return jnp.reshape(self.pressure(x), (1,))
 
 

@@ -132,6 +132,7 @@ def _iterate(problem: Problem, options: Options, before: _Progress) -> _Progress
     mu = now.regularisation
     about = problem, now.states, now.controls, defects, options.second_order
     stages = model(*about, before.exact, options.finite_difference)
+    # One linear-quadratic problem about the present trajectory.
     policy, residual, settled = directions(problem, stages, now.controls, mu, options)
     penalty = _penalty(before.penalty, defects, policy)
     missed = 0.0 if defects is None else jnp.max(jnp.abs(defects))
@@ -221,6 +222,7 @@ def _searched(kind, problem, before: _Progress, policy: Policy, penalty, roundin
         step = lambda i: trial(lengths[i])
         tried, candidate, accepted = first_accepted(step, HALVINGS, last)
         length = lengths[tried - 1]
+    # A step of length a removes that share of the defects.
     keep = lambda new, old: jnp.where(accepted, new, old)
     left = None if defects is None else keep((1 - length) * defects, defects)
     return (*jax.tree.map(keep, candidate, last), left), accepted, tried

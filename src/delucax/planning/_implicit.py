@@ -132,6 +132,7 @@ def _change(
         at_high = (U >= high) & (slope[:, n:] < 0)
         free = ~(at_low | at_high)
         fixed = jnp.where(at_low, ends[0], jnp.where(at_high, ends[1], fixed))
+    # The quadratic terms of the problem, with the tangents as its linear terms.
     stages = stages._replace(h=h, d=d, v=v)
     if y is None:
         factors = factorise(stages, free)
@@ -166,6 +167,7 @@ def _with_constraints(stages, active, dc, y, dx0, fixed, free):
         h = stages.h + jnp.einsum("tpi,tp->ti", G, push[0])
         pushed = stages._replace(H=H, V=V, h=h, v=stages.v + end.T @ push[1])
         dX, dU = substitute(pushed, factors, dx0, fixed, free)
+        # The first-order update of the multipliers, dy + rho (G dz + dc).
         dz = jnp.concatenate([dX[:-1], dU], axis=1)
         moved = jnp.einsum("tpi,ti->tp", G, dz) + dc[0], end @ dX[-1] + dc[1]
         return dX, dU, (dy[0] + rho * moved[0], dy[1] + rho * moved[1])

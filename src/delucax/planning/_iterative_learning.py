@@ -251,6 +251,7 @@ def _iterate(plant, model, plan, step, rate, iterations, online, anneal) -> Plan
     dtype = plan.controls.dtype
     zero = jnp.zeros((), dtype)
     about = plan.states.astype(dtype), plan.controls, plan.gains.astype(dtype)
+    # The first run follows the plan's own feedback, without a change.
     first = roll_out(plant, *about, jnp.zeros_like(plan.controls), zero)
     lost = ~jnp.isfinite(first[2])
 
@@ -303,6 +304,7 @@ def _iterate(plant, model, plan, step, rate, iterations, online, anneal) -> Plan
     trace, count = jnp.full((iterations + 1,), first[2]), jnp.asarray(0)
     start = _Progress(first, step, rate, count + 1, trace, count, done=lost)
     end = lax.while_loop(lambda now: ~now.done, body, start)
+    # Once more about the best run, for the gains and the residual of the plan.
     states, controls, cost = end.last
     mu, policy = policy_of(states, controls)
     reached = jnp.arange(iterations + 1) <= end.iteration
@@ -369,6 +371,7 @@ def _perturbed(plant, model, states, controls, policy, length, rate, online):
 
     learned = jnp.zeros((memory, m, n), dtype), jnp.zeros(m, dtype)
     visited = jnp.broadcast_to(plant.x0, (horizon + 1, n))
+    # The cost looks back `horizon` steps, whose controls look back `memory` more.
     disturbances = jnp.zeros((horizon + memory, n), dtype)
     start = plant.x0, learned, visited, disturbances
     (last, *_), (before, applied) = lax.scan(body, start, (jnp.arange(T), plant.w))

@@ -342,7 +342,9 @@ def in_parallel(stages: Stages, mu: Array) -> Policy:
     Q, S, R = H[:, :n, :n], H[:, :n, n:], H[:, n:, n:]
     damped = R + mu * jnp.eye(B.shape[2], dtype=F.dtype)
     linear = dict(d=d, q=q, r=r, final_q=v)
-    solution = dre(A, B, Q, damped, S, final=V, **linear, parallel=True, throw=False)
+    solution: Any = dre(
+        A, B, Q, damped, S, final=V, **linear, parallel=True, throw=False
+    )
     ok = jnp.all(jnp.isfinite(solution.K)) & jnp.all(jnp.isfinite(solution.k))
     parts = solution.X[1:], solution.p[1:], solution.K, solution.k
     X, p, K, k = (jnp.where(ok, part, 0) for part in parts)

@@ -87,6 +87,7 @@ class Multipliers(NamedTuple):
 
 def values_of(functions: tuple[Any, Any], arguments: tuple, dtype: Any) -> Values:
     """The values of an inequality and an equality, either of which may be `None`."""
+    # Each returns a number or a vector. The sizes are static, so no mask is needed.
     given = (jnp.zeros(0) if f is None else f(*arguments) for f in functions)
     inequality, equality = (jnp.ravel(jnp.asarray(c, dtype)) for c in given)
     c = jnp.concatenate([inequality, equality])
@@ -326,6 +327,7 @@ def roll_out(
     def body(parts, inputs):
         t, planned, u, K, k, defect, w = inputs
         x = join_state(parts, size)
+        # What is left out is not computed, rather than added as zero.
         if k is not None:
             u = u - length * k
         if K is not None:

@@ -134,6 +134,7 @@ class Start(eqx.Module):
             return self, *roll(self)
         # A loop over scalars is faster on CPU than one over vectors of a few entries.
         rolled = lax.map(roll, self)
+        # The choice is piecewise constant in the costs.
         best = jnp.argmin(lax.stop_gradient(rolled[2]))
         return jax.tree.map(lambda a: a[best], (self, *rolled))
 
@@ -199,6 +200,8 @@ class Start(eqx.Module):
         check_instance(dynamics, AbstractDynamics, "dynamics", where)
         check_instance(cost, AbstractCost, "cost", where)
         T = check_count(horizon, "horizon", where)
+        # An implicit derivative does not depend on the start, so none need go through
+        # it.
         constant = lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf
         dynamics, cost = jax.tree.map(constant, (dynamics, cost))
         point = operating_point(dynamics, cost)
@@ -228,6 +231,7 @@ def _expanded(dynamics, cost, x, u, t0):
     problem = Problem(dynamics, cost, x, t0)
     stages = model(problem, jnp.stack([x, x]), u[None], None, False)
     n, F, H = x.shape[0], stages.F[0], stages.H[0]
+    # z'Hz = x'Qx + 2 x'Su + u'Ru.
     A, B, Q, R, S = F[:, :n], F[:, n:], H[:n, :n], H[n:, n:], H[:n, n:]
     posed = jnp.all(jnp.isfinite(F)) & jnp.all(jnp.isfinite(H)) & is_definite(R)
     # Identities in place of what is not finite, so that the solver ends at once.

@@ -31,7 +31,7 @@ class RiccatiData(NamedTuple):
 
 
 def square_matrix(value: Any, name: str, where: str) -> Array:
-    """`value` as a square matrix of finite entries, or an error."""
+    """`value` as a square matrix of finite entries, checked."""
     matrix = as_matrix(value, name, where)
     if matrix.shape[0] != matrix.shape[1] or matrix.shape[0] == 0:
         raise ValueError(f"{where}: {name} must be square, got shape {matrix.shape}.")
@@ -39,7 +39,7 @@ def square_matrix(value: Any, name: str, where: str) -> Array:
 
 
 def hermitian_matrix(value: Any, name: str, where: str) -> Array:
-    """`value` as a matrix that is its own conjugate transpose, or an error.
+    """`value` as a matrix that is its own conjugate transpose, checked.
 
     An asymmetry of the size of rounding is averaged away. While it is being traced, a
     larger one makes it NaN.
@@ -166,8 +166,7 @@ def stage_arguments(where: str, horizon: Any, **given: Any) -> dict[str, Array]:
 
 
 def constant_matrices(where: str, **given: Any) -> dict[str, Array]:
-    """The matrices that are given, in one precision, or an error unless they fit each
-    other."""
+    """The given matrices in one precision, checked to fit each other."""
     arrays, sizes = {}, {}
     for name, value in given.items():
         if value is not None:
@@ -218,7 +217,7 @@ def _length(where, horizon, steps):
 
 
 def final_weight(value: Any, A: Array, where: str) -> Array:
-    """The final weight, zero if none is given, or an error."""
+    """The final weight, checked; zero by default."""
     shape = A.shape[-2:]
     if value is None:
         return jnp.zeros(shape, A.dtype)
@@ -228,7 +227,7 @@ def final_weight(value: Any, A: Array, where: str) -> Array:
 
 
 def increasing_times(times: Any, where: str) -> Array:
-    """`times` as an increasing vector of at least two, or an error."""
+    """`times` as an increasing vector of at least two, checked."""
     fits = lambda shape: len(shape) == 1 and shape[0] >= 2
     array = as_finite(times, "times", where, "be at least two numbers", fits)
     if is_concrete(array) and not np.all(np.diff(np.asarray(array)) > 0):

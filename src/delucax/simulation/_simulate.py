@@ -271,6 +271,7 @@ def _simulate(
     counts: dict[str, Any] = {}
     if isinstance(states, SavedState):
         states, applied, counts = states
+    # With `ts` one more row is saved, at `t1`.
     final_state, states = states[-1], states[:count]
 
     def before(held):
@@ -336,6 +337,7 @@ def _inputs(system, source, w, x0, t0, switches, key, hold) -> Inputs:
     elif not callable(source):
         controls = source
     elif hold == "zero":
+        # A function of time that is held is an array: its values at the switches.
         controls = jax.vmap(source)(t0 + switches[:-1])
         check_control(controls[0], source, system.control_size, "system")
     if controls is not None:

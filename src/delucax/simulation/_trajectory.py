@@ -186,6 +186,7 @@ class Trajectory(eqx.Module):
                 "Trajectory: one trajectory takes a slice such as trajectory[10:20]; "
                 f"got {index!r}."
             )
+        # As of a list, an index beyond the end is clipped.
         start, stop, _ = index.indices(self.steps)
         stop = max(stop, start)
         if self.states is None or (self.costs is None and "costs" not in self.keep):
@@ -295,6 +296,7 @@ class Trajectory(eqx.Module):
         finite = jnp.isfinite(total)
         total = jnp.where(finite, total, jnp.nan)
         levels = (5, 25, 50, 75, 95)
+        # Members that diverged are counted apart: a mean with infinity tells nothing.
         quantiles = jnp.nanquantile(total, jnp.array(levels, total.dtype) / 100)
         return {f"{q}%": value for q, value in zip(levels, quantiles, strict=True)} | {
             "mean": jnp.nanmean(total),

@@ -10,16 +10,14 @@ from jaxtyping import Array
 
 from .._check import (
     as_vector,
-    check_count,
     check_function,
-    check_key,
     check_matrices,
     checked_names,
+    state_network,
 )
 from .._module import (
     function_field,
     indexed_names,
-    mlp,
     names_of,
     parameter,
     weight,
@@ -242,14 +240,9 @@ class NeuralSystem(AbstractSystem):
         activation: Callable[[Array], Array] = jnp.tanh,
         key: PRNGKey,
     ):
-        where = "NeuralSystem"
-        check_key(key, where)
-        self.state_names = names_of(states, "x", "states", where)
-        self.control_names = names_of(controls, "u", "controls", where)
-        n, m = len(self.state_names), len(self.control_names)
-        width = check_count(width, "width", where)
-        depth = check_count(depth, "depth", where, least=0)
-        self.network = mlp(n + m, n, width, depth, activation, key=key)
+        self.state_names, self.control_names, self.network = state_network(
+            states, controls, width, depth, activation, key, "NeuralSystem"
+        )
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         return self.network(jnp.concatenate([x, u])).astype(x.dtype)

@@ -132,7 +132,7 @@ class TwoTank(AbstractSystem):
         import jax.numpy as jnp
 
         tanks = dlx.systems.TwoTank()
-        x, u = tanks.equilibrium(level=12.0)
+        x, u = tanks.equilibrium(level=12.0)  # of the lower tank, in cm
         tanks.vector_field(0.0, x, u, None)
         ```
     """

@@ -121,7 +121,7 @@ class MassSpringDamper(AbstractSystem):
         for i in range(n):
             tension.append(k[i] * (x[i] - q) + c[i] * (x[n + i] - v))
             q, v = x[i], x[n + i]
-        tension.append(u[0])
+        tension.append(u[0])  # the force acts where a further spring would
         # Loops compute the reciprocals once.
         lightness = 1 / m
         pulls = [(tension[i + 1] - tension[i]) * lightness[i] for i in range(n)]

@@ -93,6 +93,7 @@ class PlanarQuadrotor(AbstractSystem):
             return level, jnp.stack([weight / 2, weight / 2])
         force = self.wind(jnp.zeros(()), level)
         up = weight - force[1]
+        # The thrust balances the wind and the weight in size and direction.
         half = (force[0] * force[0] + up * up) ** 0.5 / 2
         return level.at[2].set(jnp.arctan2(force[0], up)), jnp.stack([half, half])
 

@@ -38,7 +38,7 @@ class SHAC(AbstractActorCriticLoss):
     over all steps, with the target that of `TD(lambda)`. V in either is that of a
     target network, which follows the critic by `rate` at each step.
 
-    It is trained as any loss is, one gradient a step for both; the model is a
+    It is trained as any loss is, one gradient per step for both; the model is a
     [`delucax.training.ActorCritic`][] with a policy that draws or not. The trained
     controller is `fitted.model.policy`. Each step of `fit` takes `batch * horizon`
     steps of the environment, and every `refresh`-th as many again, which set the scale

@@ -15,11 +15,11 @@ from ..._check import (
     check_at_most,
     check_count,
     check_instance,
-    check_key,
     check_positive,
     check_step,
+    state_network,
 )
-from ..._module import mlp, names_of, parameter, positive, weight
+from ..._module import parameter, positive, weight
 from ..._results import Result, RESULTS
 from ..._typing import PRNGKey, RealScalar
 from ...dynamics import AbstractDynamics
@@ -88,14 +88,9 @@ class NeuralDynamics(AbstractDynamics):
         activation: Callable[[Array], Array] = jnp.tanh,
         key: PRNGKey,
     ):
-        where = "NeuralDynamics"
-        check_key(key, where)
-        self.state_names = names_of(states, "x", "states", where)
-        self.control_names = names_of(controls, "u", "controls", where)
-        n, m = len(self.state_names), len(self.control_names)
-        width = check_count(width, "width", where)
-        depth = check_count(depth, "depth", where, least=0)
-        self.network = mlp(n + m, n, width, depth, activation, key=key)
+        self.state_names, self.control_names, self.network = state_network(
+            states, controls, width, depth, activation, key, "NeuralDynamics"
+        )
         self.dt, self.x_mean, self.x_scale = dt, x_mean, x_scale
         self.u_scale, self.step_scale = u_scale, step_scale
 
@@ -103,9 +98,10 @@ class NeuralDynamics(AbstractDynamics):
         where, n, m = "NeuralDynamics", self.state_size, self.control_size
         sizes = dict(x_mean=n, x_scale=n, u_scale=m, step_scale=n)
         for name, size in sizes.items():
-            array = as_entries(getattr(self, name), size, name, where)
+            array = getattr(self, name)
             if name != "x_mean":
                 check_positive(array, name, where)
+            as_entries(array, size, name, where)
 
     def advance(
         self,
