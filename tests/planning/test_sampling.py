@@ -117,7 +117,7 @@ def test_bad_arguments_are_named():
         "samples": dict(samples=1),
         "iterations": dict(iterations=0),
         "scale must be positive": dict(scale=0.0),
-        "scale must be a number or a vector of 1": dict(scale=[1.0, 2.0]),
+        "scale must be a number or have shape .1,": dict(scale=[1.0, 2.0]),
         "correlation": dict(correlation=1.5),
         "temperature": dict(temperature=0.0),
         "one random key": dict(key=3),

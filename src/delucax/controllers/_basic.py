@@ -6,6 +6,7 @@ import jax.random as jr
 from jaxtyping import Array
 
 from .._check import (
+    as_entries,
     as_matrix,
     check_count,
     check_key,
@@ -102,11 +103,7 @@ class Random(AbstractController):
     def __check_init__(self):
         check_vector(self.std, "std", "Random")
         check_range(self.std, "std", "Random")
-        if jnp.shape(self.mean) not in ((), self.std.shape):
-            raise ValueError(
-                f"Random: mean must be a number or have shape {self.std.shape}, got "
-                f"{jnp.shape(self.mean)}."
-            )
+        as_entries(self.mean, len(self.std), "mean", "Random")
 
     def init(self, *, key=None):
         return check_key(key, "Random.init")

@@ -14,6 +14,7 @@ from .._check import (
     bounds_field,
     check_choice,
     check_count,
+    check_function,
     check_instance,
     check_key,
     check_positive,
@@ -88,11 +89,7 @@ class MLP(AbstractController):
         key: PRNGKey,
     ):
         where = "MLP"
-        if not callable(activation):
-            raise ValueError(
-                f"{where}: activation must be a function such as jnp.tanh, got "
-                f"{activation!r}."
-            )
+        check_function(activation, "activation", where, " such as jnp.tanh")
         check_key(key, where)
         self.network = mlp(
             check_count(in_size, "in_size", where),

@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from .._check import (
     as_bounds,
+    as_entries,
     as_matrix,
     bounds_field,
     check_choice,
@@ -108,12 +109,7 @@ class _AbstractPID(AbstractController):
         for name, value in vectors.items():
             if value is None:
                 continue
-            array = as_float_array(value)
-            if not eqx.is_inexact_array(array) or array.ndim > 1:
-                raise ValueError(
-                    f"{where}: {name} must be a number or a vector, got "
-                    f"{shortened(value)}."
-                )
+            array = as_entries(value, None, name, where, "loop")
             if array.ndim == 1:
                 sizes[name] = array.shape[0]
         if isinstance(self.output, _Select):
@@ -235,6 +231,8 @@ class PID(_AbstractPID):
             self.derivative_on, ("measurement", "error"), "derivative_on", "PID"
         )
         lag, windup, dt = self.derivative_time_constant, self.anti_windup_time, self.dt
+        # Before the base's checks, because the other times are compared with it.
+        check_step(dt, "PID")
         check_range(dt if lag is None else lag, "derivative_time_constant", "PID")
         check_range(dt if windup is None else windup, "anti_windup_time", "PID", dt)
 

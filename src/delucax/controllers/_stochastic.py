@@ -11,7 +11,14 @@ import jax.random as jr
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, PyTree
 
-from .._check import as_bounds, as_matrix, bounds_field, check_instance, check_key
+from .._check import (
+    as_bounds,
+    as_entries,
+    as_matrix,
+    bounds_field,
+    check_instance,
+    check_key,
+)
 from .._controller import (
     AbstractController,
     AbstractStochasticPolicy,
@@ -19,7 +26,6 @@ from .._controller import (
     initial_state,
     replay,
 )
-from .._message import shortened
 from .._module import parameter, weight
 from .._typing import PRNGKey, Real, RealScalar
 from ..math import clip
@@ -101,11 +107,7 @@ class Gaussian(_AroundBase):
     def __check_init__(self):
         where = "Gaussian"
         check_controller(self.base, "base", where)
-        if not eqx.is_inexact_array(self.log_std) or self.log_std.ndim > 1:
-            raise ValueError(
-                f"{where}: log_std must be a number or a vector with an entry for each "
-                f"control, got {shortened(self.log_std)}."
-            )
+        as_entries(self.log_std, None, "log_std", where, "control")
         as_bounds(self.bounds, where)
 
     def _mean(self, t, y, state):

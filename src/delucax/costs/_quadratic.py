@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import as_vector, check_finite, symmetric_matrix
+from .._check import as_vector, check_finite, check_function, symmetric_matrix
 from .._message import shortened
 from .._module import function_field, parameter
 from .._typing import Control, Difference, Matrix, RealScalar, Scalar, State, Vector
@@ -182,11 +182,7 @@ class Tracking(_AbstractQuadratic):
         self.reference, self.output = reference, output
 
     def __check_init__(self):
-        if not callable(self.reference):
-            raise ValueError(
-                "Tracking: reference must be a function of time, got "
-                f"{shortened(self.reference)}."
-            )
+        check_function(self.reference, "reference", "Tracking", " of time")
 
     def _state_error(self, t: RealScalar, x: State) -> Vector:
         y = x if self.output is None else self.output(x)

@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, ArrayLike, Float
 
-from .._check import check_count, check_instance, check_key, check_range
-from .._message import shortened
-from .._module import as_float_array, check_parameters, parameter, parts_of
+from .._check import as_entries, check_count, check_instance, check_key, check_range
+from .._module import check_parameters, parameter, parts_of
 from .._typing import PRNGKey, Real, RealScalar, Vector
 from ..math._steps import reached, step_between
 
@@ -211,13 +210,8 @@ class AbstractEntrywise(AbstractDisturbance):
         """The size that arrays share; numbers fit any size."""
         where, size = type(self).__name__, self.size
         for name in [f.name for f in dataclasses.fields(self) if f.name != "size"]:
-            array = as_float_array(getattr(self, name))
-            if not eqx.is_inexact_array(array) or array.ndim > 1:
-                got = array.shape if eqx.is_array(array) else shortened(array)
-                raise ValueError(
-                    f"{where}: {name} must be a number or a vector with an entry for "
-                    f"each disturbance, got {got}."
-                )
+            value = getattr(self, name)
+            array = as_entries(value, None, name, where, "disturbance")
             if array.ndim == 1:
                 if size is not None and array.shape[0] != size:
                     raise ValueError(

@@ -12,7 +12,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-from .._check import check_instance
+from .._check import check_function, check_instance
 from ..dynamics import AbstractDynamics, AbstractWrapper
 
 
@@ -64,8 +64,7 @@ def count_evaluations(
     """
     where = "count_evaluations"
     check_instance(dynamics, AbstractDynamics, "dynamics", where)
-    if not callable(function):
-        raise ValueError(f"{where}: function must be a function, got {function!r}.")
+    check_function(function, "function", where)
     reports: SimpleQueue[tuple[str, int]] = SimpleQueue()
     out = function(_Counted(dynamics, reports))
     jax.block_until_ready(eqx.filter(out, eqx.is_array))

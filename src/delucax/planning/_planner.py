@@ -13,6 +13,7 @@ from jaxtyping import Array
 from .._check import (
     check_control_bounds,
     check_count,
+    check_function,
     check_instance,
     check_key,
     check_number,
@@ -174,10 +175,8 @@ class AbstractPlanner(eqx.Module):
         if w is not None:
             size = dynamics.disturbance_size
             w = finite_rows(w, size, "w", where, start.horizon)
-        if difference is not None and not callable(difference):
-            raise ValueError(
-                f"{where}: difference must be a function, got {difference!r}."
-            )
+        if difference is not None:
+            check_function(difference, "difference", where)
         if constraints is not None:
             hint = " (`delucax.planning.Constraints`)"
             check_instance(constraints, Constraints, "constraints", where, hint)

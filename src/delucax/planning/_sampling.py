@@ -11,13 +11,13 @@ import jax.random as jr
 from jaxtyping import Array, Float
 
 from .._check import (
+    as_entries,
     check_at_most,
     check_count,
     check_number,
     check_positive,
     check_range,
 )
-from .._message import shortened
 from .._module import parameter
 from .._typing import PRNGKey
 from ._plan import Plan
@@ -40,11 +40,7 @@ class AbstractSampler(AbstractPlanner):
         where, scale = type(self).__name__, self.scale
         check_count(self.samples, "samples", where, least=2)
         check_count(self.iterations, "iterations", where)
-        if not eqx.is_inexact_array(scale) or scale.ndim > 1:
-            raise ValueError(
-                f"{where}: scale must be a number or a vector with an entry for each "
-                f"control, got {shortened(scale)}."
-            )
+        as_entries(scale, None, "scale", where, "control")
         check_positive(scale, "scale", where)
         check_range(self.correlation, "correlation", where, 0, 1)
 
@@ -72,11 +68,7 @@ class AbstractSampler(AbstractPlanner):
                 f"{where}: constraints must be None for a planner that samples; "
                 "delucax.planning.ILQR takes them."
             )
-        if self.scale.shape not in ((), (m,)):
-            raise ValueError(
-                f"{where}: scale must be a number or a vector of {m} entries, one for "
-                f"each control, got shape {self.scale.shape}."
-            )
+        as_entries(self.scale, m, "scale", where)
         assert key is not None
         return _search(self, problem, start, key)
 

@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from .._check import (
     as_vector,
+    check_function,
     check_matrices,
     checked_names,
     state_network,
@@ -179,8 +180,7 @@ def system(
         car = dlx.system(double_integrator, states=("position", "speed"), controls=1)
         ```
     """
-    if not callable(f):
-        raise ValueError(f"system: f must be a function of (t, x, u, w), got {f!r}.")
+    check_function(f, "f", "system", " of (t, x, u, w)")
     return FunctionSystem(
         f,
         names_of(states, "x", "states", "system"),

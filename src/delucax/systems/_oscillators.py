@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._check import check_count
+from .._check import as_entries, check_count
 from .._module import parameter, positive
 from .._typing import Control, Disturbance, Real, State, Time
 from ._base import AbstractSystem
@@ -96,12 +96,7 @@ class MassSpringDamper(AbstractSystem):
 
     def __check_init__(self):
         for name in ("mass", "stiffness", "damping"):
-            shape = jnp.shape(getattr(self, name))
-            if shape not in ((), (self.masses,)):
-                raise ValueError(
-                    f"MassSpringDamper: {name} must be a number or have shape "
-                    f"({self.masses},), got {shape}."
-                )
+            as_entries(getattr(self, name), self.masses, name, "MassSpringDamper")
 
     @property
     def state_names(self) -> tuple[str, ...]:

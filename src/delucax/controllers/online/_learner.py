@@ -11,7 +11,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from ..._check import check_instance, check_step, is_concrete, output_of
+from ..._check import check_function, check_instance, check_step, is_concrete, output_of
 from ..._controller import AbstractController, AbstractLearner, Tally
 from ..._jax import is_constant
 from ..._module import function_field, parameter
@@ -265,11 +265,8 @@ def base_for(
         ", the model that it learns with (`delucax.controllers.Explore` identifies one)"
     )
     check_instance(dynamics, AbstractDynamics, "dynamics", where, hint)
-    if not callable(cost):
-        raise ValueError(
-            f"{where}: cost must be a function of (t, y, u), such as one of "
-            f"delucax.costs, got {type(cost).__name__}."
-        )
+    of = " of (t, y, u), such as one of delucax.costs"
+    check_function(cost, "cost", where, of)
     check_scalar_cost(cost, dynamics, where)
     if base is not None:
         return base

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ... import systems
+from ..._check import check_function
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
 from ...systems import AbstractSystem
@@ -194,10 +195,8 @@ def register_drawing(
             f"AbstractDynamics, got {system_class!r}."
         )
     for name, given in (("draw", draw), ("setup", setup)):
-        if not (callable(given) or name == "setup" and given is None):
-            raise ValueError(
-                f"register_drawing: {name} must be a function, got {given!r}."
-            )
+        if given is not None or name == "draw":
+            check_function(given, name, "register_drawing")
 
     def set_up(canvas: Canvas, episode: Episode) -> Drawing:
         if setup is None:
