@@ -74,7 +74,8 @@ def motor(canvas: Canvas, episode: Episode) -> Drawing:
     style = {"size": 12, "ha": "center", "va": "center", "color": "0.25"}
     for name, axis in zip("dq", np.eye(2), strict=True):
         canvas.line([-0.5 * axis, 0.5 * axis], color=canvas.NEUTRAL, lw=1, alpha=0.5)
-        ax.text(0.88 * axis[0], 0.88 * axis[1], name, **style)
+        x, y = 0.88 * axis
+        ax.text(x, y, name, **style)
     largest = float(np.linalg.norm(states[:, :2], axis=1).max(initial=0.0)) or 1.0
     fastest = float(np.abs(episode.visited((2,))).max()) or 1.0
     if target is not None:
