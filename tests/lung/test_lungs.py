@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from helpers import assert_close, needs_x64, thorough, user_error
 from hypothesis import given, settings, strategies as st
-
-import delucax as dlx
-from delucax import lung
-from delucax.controllers import LeakyPID
-from delucax.studies._original_lungs import (
+from original_lungs import (
     OriginalBalloonLung,
     OriginalDelayLung,
     OriginalSingleCompartment,
 )
+
+import delucax as dlx
+from delucax import lung
+from delucax.controllers import LeakyPID
 
 
 pytestmark = needs_x64

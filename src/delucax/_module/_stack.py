@@ -11,7 +11,22 @@ from jax.core import Tracer
 
 
 def stack(trees: Iterable[Any]) -> Any:
-    """Modules of one structure as one, each array with a leading axis over them."""
+    """Modules of one structure as one, each array with a leading axis over them.
+
+    **Arguments:** `trees`: the modules.
+
+    **Returns:** the stacked module.
+
+    **Raises:** `ValueError` if `trees` is empty, or their structures differ.
+
+    !!! example
+
+        ```python
+        from delucax.lung import SingleCompartment, stack
+
+        stack([SingleCompartment(r) for r in (5.0, 20.0, 50.0)]).resistance
+        ```
+    """
     trees = list(trees)
     if not trees:
         raise ValueError("stack: trees must not be empty.")
@@ -30,7 +45,20 @@ def stack(trees: Iterable[Any]) -> Any:
 
 
 def unstack(tree: Any) -> list[Any]:
-    """The modules that `stack` made one of."""
+    """The modules that [`delucax.lung.stack`][] made one of.
+
+    **Arguments:** `tree`: the stacked module.
+
+    **Returns:** a list of modules.
+
+    !!! example
+
+        ```python
+        from delucax.lung import SingleCompartment, stack, unstack
+
+        unstack(stack([SingleCompartment(r) for r in (5.0, 20.0)]))[1].resistance
+        ```
+    """
     as_numpy = lambda a: np.asarray(a) if eqx.is_array(a) and _is_plain(a) else a
     tree = jax.tree.map(as_numpy, tree)
     return [taken(tree, i) for i in range(count_of(tree))]

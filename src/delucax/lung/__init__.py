@@ -1,5 +1,6 @@
 """Ventilators: lungs, breath waveforms, learned lung models and controllers."""
 
+from .._module import stack as stack, unstack as unstack
 from ._breath_controllers import (
     BangBang as BangBang,
     Breathing as Breathing,

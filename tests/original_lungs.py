@@ -7,11 +7,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._module import parameter, positive
-from .._results import RESULTS
-from .._typing import Control, State
-from ..dynamics import AbstractDynamics
-from ..lung import BalloonLung
+from delucax._module import parameter, positive
+from delucax._results import RESULTS
+from delucax._typing import Control, State
+from delucax.dynamics import AbstractDynamics
+from delucax.lung import BalloonLung
 
 
 def original_valve(u_in: Any) -> Array:
