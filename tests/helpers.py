@@ -82,7 +82,7 @@ def ilqr(
     dynamics, cost, x0, controls, t0=0.0, w=None, bounds=None, *, throw=True, **options
 ):
     """A plan by `ILQR` with options; constraints and difference are of the problem."""
-    names = "constraints", "difference"
+    names = "constraints", "difference", "fallback"
     rest = {name: options.pop(name) for name in names if name in options}
     given = dynamics, cost, x0, controls, t0, w, bounds
     return dlx.planning.ILQR(**options)(*given, throw=throw, **rest)

@@ -20,6 +20,7 @@ from .._check import (
     finite_rows,
     finite_vector,
 )
+from .._message import shortened
 from .._module import as_float_array, as_module
 from .._results import choose, raise_on_failure, RESULTS
 from .._typing import PRNGKey
@@ -37,6 +38,9 @@ def checked_plan(plan: Plan, where: str, throw: bool = True) -> Plan:
         f"and the residual {float(plan.residual):.2g}."
     )
     return raise_on_failure(plan, where, throw, "the plan", facts)
+
+
+_TRAJECTORY = "states", "controls", "gains"
 
 
 class AbstractPlanner(eqx.Module):
@@ -187,6 +191,15 @@ class AbstractPlanner(eqx.Module):
         x0, t0, distance = x0.astype(dtype), t0.astype(dtype), as_module(difference)
         problem = Problem(dynamics, cost, x0, t0, w, ends, distance, constraints)
         start = jax.tree.map(lambda a: a.astype(dtype), start)
+        if fallback is not None:
+            T = start.horizon
+            spare = [getattr(fallback, name, None) for name in _TRAJECTORY]
+            shapes = [getattr(array, "shape", None) for array in spare]
+            if shapes != [(T + 1, n), (T, m), (T, m, n)]:
+                raise ValueError(
+                    f"{where}: fallback must be a plan of {T} steps, or a start with "
+                    f"states and gains, got {shortened(fallback)}."
+                )
         if self.is_stochastic:
             check_key(key, where)
         plan = self.solve(problem, start, key)
@@ -197,7 +210,7 @@ class AbstractPlanner(eqx.Module):
 
 @eqx.filter_jit
 def _with_fallback(plan: Plan, fallback: Start | Plan) -> Plan:
-    trajectory = lambda p: (p.states, p.controls, p.gains)
+    trajectory = lambda p: [getattr(p, name) for name in _TRAJECTORY]
     usable = plan.is_usable
     # By `where`, not `cond`: under `jax.vmap` each member of a batch has its own.
     keep = lambda new, old: jnp.where(usable, new, old).astype(new.dtype)
