@@ -65,14 +65,14 @@ def unstack(tree: Any) -> list[Any]:
 
 
 def taken(tree: Any, index: Any) -> Any:
-    """What an index takes of each array of stacked modules."""
+    """The stacked modules at an index."""
     is_array = lambda a: eqx.is_array(a) or isinstance(a, np.ndarray)
     at = lambda a: jnp.asarray(a[index]) if is_array(a) else a
     return jax.tree.map(at, tree)
 
 
 def count_of(tree: Any) -> int:
-    """How many modules are stacked."""
+    """The number of stacked modules."""
     return jax.tree.leaves(eqx.filter(tree, eqx.is_array))[0].shape[0]
 
 
