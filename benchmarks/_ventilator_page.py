@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from delucax.plotting.figures import color_of, NotebookFigure, style_axes
+from delucax._figures import color_of, NotebookFigure, style_axes
 from delucax.studies.ventilator._report import PID_ROWS
 
 

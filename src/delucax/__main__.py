@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import importlib.util
+import inspect
 import subprocess
 import sys
 import textwrap
@@ -11,9 +12,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from ._controller import AbstractController
 from ._extras import extra
 
 
+_SUITES = {"scoreboard": "delucax.studies._scoreboard"}
+"""Experiments that come with the library: their modules."""
 _COMMANDS: list[tuple[Callable, str, str, tuple]] = []
 """The commands in display order: function, help, epilog, options."""
 
@@ -145,13 +149,41 @@ def _lung(out: str, **options: Any) -> None:
     *_CASES,
 )
 def _list(file: str | None, select: str, marks: str) -> int | None:
-    from .studies.listing import list_names, SUITES
-
     if file is None:
-        return list_names()
+        return _list_names()
     from .experiments.commands import list_cases
 
-    list_cases(file, SUITES, select, marks)
+    list_cases(file, _SUITES, select, marks)
+
+
+def _list_names() -> None:
+    """Print the names of tasks, controllers and suites."""
+    from . import controllers, environments
+
+    def makes_controller(member: Any) -> bool:
+        is_function = inspect.isfunction(member)
+        made = inspect.signature(member).return_annotation if is_function else member
+        is_controller = inspect.isclass(made) and issubclass(made, AbstractController)
+        return is_controller and not inspect.isabstract(member)
+
+    members = vars(controllers).items()
+    columns = {
+        'Tasks, for delucax.make("...")': [
+            name for name in environments.registered() if "/" not in name
+        ],
+        "Controllers, in delucax.controllers": sorted(
+            (name for name, member in members if makes_controller(member)),
+            key=str.lower,
+        ),
+        "Suites, for python -m delucax run ...": [*_SUITES],
+    }
+    for number, (title, names) in enumerate(columns.items()):
+        print(f"\n{title}:" if number else f"{title}:")
+        width = max(map(len, names)) + 2
+        rows = -(-len(names) // max(1, 78 // width))
+        for k in range(rows):
+            row = "".join(name.ljust(width) for name in names[k::rows])
+            print(f"  {row}".rstrip())
 
 
 @_command(
@@ -181,14 +213,13 @@ def _run(
     file: str, store: str | None, html: str | None, dask: str | None, **options: Any
 ) -> int:
     from .experiments.commands import run_file
-    from .studies.listing import SUITES
 
     with contextlib.ExitStack() as stack:
         if dask is not None:
             distributed = extra("distributed", "dask")
             stack.enter_context(distributed.Client(dask, timeout=20))
             options["backend"] = "dask"
-        return run_file(file, SUITES, store, html, options)
+        return run_file(file, _SUITES, store, html, options)
 
 
 @_command(

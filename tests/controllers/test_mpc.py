@@ -312,6 +312,8 @@ def test_bad_arguments_are_named():
         MPC(env.dynamics, lambda t, x, u: 0.0, 5)
     with user_error(match="horizon must be a whole number"):
         MPC(*given, 0)
+    with user_error(match="constraints must be a Constraints"):
+        MPC(*given, 5, constraints=lambda t, x, u: x)
     with user_error(match="planner must be an AbstractPlanner"):
         MPC(*given, 5, planner=3)
     with user_error(match="bounds must be numbers or vectors of 1"):

@@ -180,6 +180,9 @@ class MPC(AbstractController):
         check_instance(self.cost, AbstractCost, "cost", where)
         check_cost_sizes(self.cost, (n, m), "cost", where)
         check_instance(self.planner, AbstractPlanner, "planner", where)
+        if self.constraints is not None:
+            hint = " (`delucax.planning.Constraints`)"
+            check_instance(self.constraints, Constraints, "constraints", where, hint)
         check_instance(self.start, Start, "start", where)
         start = self.start.checked(n, m, "start", where)
         if start.controls.ndim != 3 or start.states is None or start.gains is None:

@@ -222,8 +222,9 @@ class AbstractDiscretization(_Forwarding):
     """Dynamics that step a continuous-time system, in a field `system`, whose names,
     units, sensor and equilibrium they have.
 
-    A subclass gives `dt` and writes `advance`. [`delucax.Discretized`][] is the one
-    that takes any system and any solver.
+    A subclass gives `dt` and writes `advance`, whose `w` enters as the `noise` of the
+    system says. [`delucax.Discretized`][] is the one that takes any system and any
+    solver.
 
     !!! example
 
@@ -236,10 +237,15 @@ class AbstractDiscretization(_Forwarding):
             system: dlx.AbstractSystem
             dt: Array = dlx.parameter(0.05)
 
+            def __check_init__(self):
+                if self.noise == "brownian":
+                    raise ValueError("Euler: system must have no diffusion.")
+
             def advance(self, t, x, u, w):
-                x_next = x + self.dt * self.system.vector_field(t, x, u, None)
-                x_next = x_next if w is None else x_next + w
-                return x_next, dlx.RESULTS.successful
+                w = jnp.zeros(self.disturbance_size) if w is None else w
+                held, added = (None, w) if self.noise == "additive" else (w, 0.0)
+                slope = self.system.vector_field(t, x, u, held)
+                return x + self.dt * slope + added, dlx.RESULTS.successful
 
         Euler(dlx.systems.Pendulum())(0.0, jnp.array([0.1, 0.0]), jnp.ones(1))
         ```

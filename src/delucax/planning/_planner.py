@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._check import (
+    check_bool,
     check_control_bounds,
     check_count,
     check_function,
@@ -202,7 +203,9 @@ class AbstractPlanner(eqx.Module):
                 )
         if self.is_stochastic:
             check_key(key, where)
+        check_bool(throw, "throw", where)
         plan = self.solve(problem, start, key)
+        check_instance(plan, Plan, "what solve returns", where)
         if fallback is not None:
             plan = _with_fallback(plan, fallback)
         return checked_plan(plan, where, throw)

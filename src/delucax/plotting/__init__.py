@@ -16,3 +16,4 @@ from ._animate import animate as animate
 from ._drawings._registry import register_drawing as register_drawing
 from ._phase import phase_portrait as phase_portrait
 from ._plot import plot as plot
+from ._renderer import Renderer as Renderer

@@ -19,8 +19,8 @@ from ..simulation import Trajectory
 from ._drawings._canvas import Episode
 from ._export import check_path, compressed, html_player, write
 from ._plot import control_bounds, draw_panel
+from ._renderer import PlantArtist
 from ._runs import as_runs, HELD, Panel, panels_of, Run
-from .renderer import PlantArtist
 
 
 SIZE = 11.0

@@ -18,7 +18,7 @@ from jaxtyping import Int, Num, UInt8
 from PIL import Image
 
 from .._check import as_path
-from .figures import quantised
+from .._figures import quantised
 
 
 Pixels: TypeAlias = UInt8[np.ndarray, "... 3"]

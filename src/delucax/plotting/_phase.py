@@ -10,9 +10,9 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from .. import _figures as figures
 from .._check import as_vector, check_instance
 from ..systems import AbstractSystem
-from . import figures
 from ._runs import as_runs, Trajectories
 
 

@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from .. import _figures as figures
 from .._check import check_instance
 from .._results import RESULTS
 from ..environments import Environment
-from . import figures
 from ._runs import as_runs, FEW, HELD, Panel, panels_of, Run, Trajectories
 
 

@@ -22,13 +22,12 @@ from ..controllers import mlp_policy, OpenLoop, Zero
 from ..costs import Function
 from ..disturbances import Gaussian
 from ..dynamics import linearize
-from ..environments import Environment, make, UniformState
+from ..environments import Environment, make, registered, UniformState
 from ..experiments import experiment
 from ..lung import BreathCost, Breathing
 from ..planning import AbstractPlanner, CEM, ILQR, ilqr, MPPI
 from ..simulation import rollout
 from ..training import actor_critic, expected_cost, fit, PPO, SHAC
-from .listing import task_names
 
 
 # Of every training: steps of the optimiser on the gradient, episodes a step, and the
@@ -291,7 +290,7 @@ def _batch(task: str, method: str, block: int) -> tuple[list[float], float | Non
     return costs.tolist(), 1e6 * best / (BATCH * env.horizon)
 
 
-@experiment.parametrize("task", task_names())
+@experiment.parametrize("task", [name for name in registered() if "/" not in name])
 @experiment.parametrize("method", METHODS)
 @experiment.seeds(BATCH)
 def scoreboard(task: str, method: str, seed: int) -> dict[str, Any]:

@@ -231,7 +231,7 @@ class GymnasiumEnv(gymnasium.Env):
         if self._buffer is None:
             raise ResetNeeded("GymnasiumEnv: call reset() before render().")
         if self._picture is None:
-            from ...plotting.renderer import Renderer
+            from ...plotting import Renderer
 
             self._picture = Renderer(self.environment, self.render_mode == "human")
         control = self._action

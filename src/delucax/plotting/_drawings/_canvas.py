@@ -11,11 +11,11 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon, Rectangle
 
+from ..._figures import color_of, NEUTRAL
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
 from ...simulation import Trajectory
 from ...systems import AbstractSystem
-from ..figures import color_of, NEUTRAL
 
 
 Number: TypeAlias = float | int

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from matplotlib.patches import Wedge
 
-from ..figures import color_of
+from ..._figures import color_of
 from ._canvas import Canvas, Drawing, Episode, FULL_TURN, rotation, Vector
 
 

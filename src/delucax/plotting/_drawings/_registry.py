@@ -10,10 +10,10 @@ import numpy as np
 
 from ... import systems
 from ..._check import check_function
+from ..._figures import style_axes, with_unit, wrapped
 from ...dynamics import AbstractDynamics
 from ...environments import Environment
 from ...systems import AbstractSystem
-from ..figures import style_axes, with_unit, wrapped
 from . import _machines, _mechanics, _vehicles
 from ._canvas import Canvas, Drawing, Episode, layers, Setup, Vector, View
 

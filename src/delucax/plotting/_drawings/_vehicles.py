@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.collections import LineCollection
 
-from ..figures import color_of
+from ..._figures import color_of
 from ._canvas import box, Canvas, Drawing, Episode, rotation, Vector, View
 
 

@@ -9,10 +9,10 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 
 from ... import lung
+from ..._figures import color_of, NEUTRAL, NotebookFigure, style_axes
 from ..._module import unstack
 from ...environments import Environment
 from ...plotting import animate
-from ...plotting.figures import color_of, NEUTRAL, NotebookFigure, style_axes
 from ._report import mean_error, PID_ROWS, Rows
 from ._stages import SHOWN
 

@@ -1,4 +1,4 @@
-"""Figures that show themselves in a notebook, and how everything here looks."""
+"""The style of figures, and a figure that a notebook shows. Imports Matplotlib."""
 
 import io
 import re

@@ -10,12 +10,12 @@ from matplotlib.backend_bases import FigureManagerBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from .._figures import PALETTE
 from ..controllers import Zero
 from ..environments import Environment
 from ..simulation import rollout
 from ._drawings._canvas import Canvas, Episode, States, Vector
 from ._drawings._registry import drawing_for
-from .figures import PALETTE
 
 
 Moments: TypeAlias = Iterable[tuple[Vector, Vector]]
@@ -65,7 +65,28 @@ _INCHES, _DPI = (5.0, 5.0), 100
 
 
 class Renderer:
-    """Draws the plant of an environment, state by state; in a `window` too if asked."""
+    """Draws the plant of an environment, one state at a time.
+
+    The limits of the axes are those of a rollout without control.
+
+    **Arguments:**
+
+    - `environment`: a [`delucax.Environment`][].
+    - `window`: show each picture in a window too; `False` by default.
+
+    **Raises:** `RuntimeError` if a window is asked for and there is no display.
+
+    !!! example
+
+        ```python
+        import delucax as dlx
+        import numpy as np
+
+        renderer = dlx.plotting.Renderer(dlx.make("pendulum"))
+        picture = renderer.frame(np.array([0.5, 0.0]), np.zeros(1))
+        renderer.close()
+        ```
+    """
 
     def __init__(self, environment: Environment, window: bool = False):
         self.pyplot: Any = None
@@ -94,7 +115,15 @@ class Renderer:
         self.plant = PlantArtist(ax, Episode(environment, trajectory), moments)
 
     def frame(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """The picture at a state and a control, shape `(height, width, 3)`."""
+        """The picture at a state and a control.
+
+        **Arguments:**
+
+        - `x`: the state, shape `(n,)`.
+        - `u`: the control, shape `(m,)`.
+
+        **Returns:** an array of shape `(height, width, 3)`.
+        """
         self.plant.draw(np.asarray(x, float), np.asarray(u, float))
         canvas: Any = self.figure.canvas
         canvas.draw()
