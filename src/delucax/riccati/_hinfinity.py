@@ -254,12 +254,13 @@ def _solve_game(discrete: bool, problem: tuple, gamma: Scalar, X0: Square) -> Ga
         lambda X, _: riccati_residual(discrete, data, X, False, maximisers=D.shape[1]),
         functools.partial(_correction, discrete),
         X0 + unit * J,
+        controls=data.B.shape[1],
         units=1,
         to_working_precision=True,
     )
     # Both loops must be stable: against the worst disturbance, and without any.
     _, _, weight = stationary(discrete, data, X)
-    alone = A - B @ joint_gain(discrete, data, X)[:m]
+    alone = A - B @ left.K[:m]
     loops = jnp.stack([left.closed_loop, alone])
     if discrete:
         stable = jax.vmap(spectral_radius)(loops) < 1 - n * eps

@@ -35,6 +35,7 @@ class Residual(NamedTuple):
     - `relative`: its norm over the sum of the norms of the terms.
     - `bounds`: upper bounds on the exact relative residual, at the exact gain and
       without rounding, in each of the requested units.
+    - `K`: the best gain at `X`.
     - `closed_loop`: `A - B K`, or `E^-1 (A - B K)`.
     - `terms`: the sum of the norms of the terms, in each of these units.
     """
@@ -42,6 +43,7 @@ class Residual(NamedTuple):
     error: Square
     relative: Scalar
     bounds: Float[Array, " units"]
+    K: Float[Array, "m n"]
     closed_loop: Square
     terms: Float[Array, " units"]
 
@@ -110,7 +112,7 @@ def riccati_residual(
     relative, sizes = jax.vmap(in_units)(units)
     bounds = _MARGIN * relative[:, 1]
     relative = jnp.where(needed, bounds[0], relative[0, 0])
-    return Residual(error, relative, bounds, closed_loop, sizes)
+    return Residual(error, relative, bounds, K, closed_loop, sizes)
 
 
 def if_needed(needed: BoolScalar, function: Callable, value: Any, operands: tuple):
@@ -288,15 +290,16 @@ def newton_refine(
     correction: Callable[[Array, Array, Array], Array],
     X: Square,
     *,
+    controls: int,
     units: int,
     to_working_precision: bool = False,
 ) -> tuple[Array, Residual]:
     """Newton refinement while the residual decreases.
 
-    `residual(X, accurately)` evaluates the residual, in so many `units`, and
-    `correction(X, closed_loop, error)` is the Newton step. Where its bound is too wide
-    for a certificate the steps go on with accurate residuals, unless they are to end in
-    working precision. Returns the best `X`, and its residual.
+    `residual(X, accurately)` evaluates the residual, of so many `controls` and in so
+    many `units`, and `correction(X, closed_loop, error)` is the Newton step. Where its
+    bound is too wide for a certificate the steps go on with accurate residuals, unless
+    they are to end in working precision. Returns the best `X`, and its residual.
 
     Source: Kleinman, 1968; each step solves the Lyapunov equation of the last loop.
     """
@@ -331,8 +334,9 @@ def newton_refine(
         return X, last, best, accurately | hidden, again | hidden, helped, k
 
     yes = jnp.asarray(True)
-    matrix, number, vector = (jnp.zeros(s, X.dtype) for s in (X.shape, (), units))
-    unknown = Residual(matrix, number, vector, matrix, vector)
+    shapes = X.shape, (), units, (controls, len(X))
+    matrix, number, vector, gain = (jnp.zeros(shape, X.dtype) for shape in shapes)
+    unknown = Residual(matrix, number, vector, gain, matrix, vector)
     accurately = jnp.asarray(to_working_precision)
     start = X, (matrix, matrix), (X, unknown), accurately, yes, yes, jnp.asarray(0)
     return lax.while_loop(lambda carry: carry[4], body, start)[2]

@@ -196,6 +196,7 @@ def _certified(discrete: bool, data: RiccatiData, by: Array) -> SearchResult:
             lambda *at: riccati_residual(discrete, here, *at, by[0] * state, state),
             lambda _, *at: _correction(discrete, here.E, *at),
             _outside(here.E, X),
+            controls=here.B.shape[1],
             units=3,
         )
         loop = left.closed_loop
