@@ -64,6 +64,10 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         'A plan of the controller did not succeed. Where "incidents" are in `keep`, '
         "as by default, `trajectory.incident_counts` says how many did not."
     )
+    estimate_failed = (
+        'An estimate of the controller failed. Where "incidents" are in `keep`, as by '
+        "default, `trajectory.incident_counts` says how many did."
+    )
     update_refused = (
         'An update of a learner was not finite and was not made. Where "incidents" '
         "are in `keep`, as by default, `trajectory.incident_counts` says how many were "
@@ -90,6 +94,7 @@ else:
 INCIDENTS = {
     "refused_update": RESULTS.update_refused,
     "failed_plan": RESULTS.plan_failed,
+    "failed_estimate": RESULTS.estimate_failed,
 }
 """The status of a rollout in which a controller counted an incident of this name."""
 

@@ -52,6 +52,7 @@ def test_an_estimate_that_fails_is_an_incident(key):
     run = dlx.rollout(dlx.make("pendulum"), controller, key=key, horizon=4)
     # The prediction of step 1, and the update of step 2.
     assert run.incidents["failed_estimate"].tolist() == [False, True, True, False]
+    assert run.result == dlx.RESULTS.estimate_failed and not run.failed
 
 
 def test_the_default_status(key):

@@ -45,6 +45,17 @@ def test_a_planner_of_ones_own():
         Shooting()(*given, 8, constraints=rest)
 
 
+def test_a_plan_that_diverges_gives_way_to_the_fallback():
+    wild = dlx.system(lambda t, x, u, w: 1e3 * x**3 + u, states=1, controls=1)
+    given = dlx.Discretized(wild, dt=0.1), dlx.costs.Quadratic([1.0], [1.0]), [1.0]
+    plan = Shooting()(*given, jnp.zeros((8, 1)), throw=False)
+    assert plan.result == dlx.RESULTS.diverged and not plan.is_usable
+    spare = dlx.planning.Start(jnp.ones((8, 1)), jnp.ones((9, 1)), jnp.ones((8, 1, 1)))
+    plan = Shooting()(*given, jnp.zeros((8, 1)), fallback=spare, throw=False)
+    assert plan.result == dlx.RESULTS.diverged
+    np.testing.assert_array_equal(plan.controls, spare.controls)
+
+
 def test_it_works_in_receding_horizon_control():
     mpc = dlx.controllers.MPC(PENDULUM, COST, 8, planner=Shooting(), bounds=(-2.0, 2.0))
     env = dlx.Environment(PENDULUM, COST, horizon=5)

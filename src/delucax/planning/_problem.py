@@ -273,6 +273,8 @@ class Problem(eqx.Module):
             states = jnp.broadcast_to(self.x0, (points, *self.x0.shape))
         return roll_out(self, states, controls, gains)
 
+    # Compiled: the numbers of a plan that diverged are not refused while it is traced.
+    @eqx.filter_jit
     def plan(self, states: Array, controls: Array, cost: Array, **fields: Any) -> Plan:
         """The plan of a trajectory, such as `roll_out` returns.
 

@@ -1,6 +1,7 @@
 """The trajectory of a closed loop."""
 
 import dataclasses
+import functools
 from typing import Any, TYPE_CHECKING
 
 import equinox as eqx
@@ -133,10 +134,10 @@ class Trajectory(eqx.Module):
 
     @property
     def failed(self) -> Array:
-        """Whether `result` is neither `successful` nor `plan_failed`: a step failed,
-        the run diverged, or a learner refused an update."""
-        planned = self.result == RESULTS.plan_failed
-        return (self.result != RESULTS.successful) & ~planned
+        """Whether a step failed, the run diverged, or a learner refused an update:
+        `result` is not `successful`, `plan_failed` or `estimate_failed`."""
+        handled = RESULTS.successful, RESULTS.plan_failed, RESULTS.estimate_failed
+        return ~functools.reduce(jnp.logical_or, [self.result == r for r in handled])
 
     @property
     def incident_counts(self) -> dict[str, Array]:
