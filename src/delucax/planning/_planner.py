@@ -141,7 +141,8 @@ class AbstractPlanner(eqx.Module):
             wraps angles, for dynamics that wrap them; subtraction by default.
         - `fallback`: feedback of the same horizon, with states and gains, used in place
             of the plan's own if planning fails: every start diverges, or the
-            constraints cannot hold. The `result` says so. None by default.
+            constraints cannot hold. `result` and `cost` stay those of the failed plan.
+            None by default.
         - `key`: a random key, for planners that draw.
         - `throw`: raise unless the plan is a solution (default); if false, look at
             `plan.result`.
