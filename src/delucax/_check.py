@@ -45,10 +45,8 @@ def output_of(function: Any, *shapes: tuple[int, ...]) -> Any:
     try:
         hash(structure)
         arrays = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
-    except (
-        TypeError,
-        AttributeError,
-    ):  # an unhashable field, or a leaf that is no array
+    except (TypeError, AttributeError):
+        # An unhashable field, or a leaf that is not an array.
         return eqx.filter_eval_shape(function, *inputs)
     return _traced(structure, arrays, tuple(inputs))
 
@@ -101,7 +99,7 @@ def check_key(key: Any, where: str) -> Any:
 
 
 def _error(value: Any, name: str, where: str, rule: str) -> ValueError:
-    """The error that shows a value which is not as it must be."""
+    """The error for an invalid value."""
     return ValueError(f"{where}: {name} must {rule}, got {shortened(value)}.")
 
 
@@ -346,7 +344,7 @@ def check_keywords(
             )
 
 
-LARGEST = float(np.finfo(np.float32).max)
+FLOAT32_MAX = float(np.finfo(np.float32).max)
 """Replaces an infinite bound of a space, as Gymnasium advises."""
 
 

@@ -12,8 +12,8 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from PIL import Image
 
 
-# Okabe and Ito (2008): told apart by colour-blind readers too. Its yellow and black are
-# left out: one vanishes on white paper, the other on a dark page.
+# Okabe and Ito (2008): distinguishable by colour-blind readers too. Its yellow and
+# black are left out: one vanishes on white paper, the other on a dark page.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LINE_STYLES = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 1.5, 1, 1.5)))
 NEUTRAL = "0.5"

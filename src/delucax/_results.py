@@ -52,9 +52,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     not_converged = "The iteration did not converge within its step limit."
     unexciting = (
-        "The data are too few, or excite too little, to identify all parameters: some "
-        "direction among them is not identifiable. With throw=False the fit is "
-        "returned, and names it."
+        "The data are too few, or excite the system too little, to identify all "
+        "parameters: some direction among them is not identifiable. With throw=False "
+        "the fit is returned, and names it."
     )
     no_descent = (
         "No step lowered the cost, although the gradient is not zero: the problem may "

@@ -211,7 +211,7 @@ class MPC(AbstractController):
             key, draw = jr.split(key)
         last, starts = state.last, state.last.controls
         if not self.planner.starts_from_states:
-            # First, as of starts of equal cost the first is taken.
+            # The last plan comes first: of starts of equal cost the first is taken.
             join = lambda a, b: jnp.concatenate([a[None], b])
             # One batch: the planner rolls all of them out together and refines the
             # best.
@@ -234,8 +234,8 @@ class MPC(AbstractController):
         lost, u = ~plan.is_usable, plan.controls[0]
         u = jnp.where(lost, self._followed(y, last), u)
         if self.throw:
-            # Hung on the control, which every caller reads: on the state it would be
-            # removed as dead code where nobody does.
+            # Attached to the control, which every caller uses: attached to the state it
+            # would be removed as dead code where the state is not read.
             u = plan.result.error_if(u, lost)
         # The warm start is the plan a step later, its last step held for the new one. A
         # lost plan is forgotten, or the next one would start from what had failed.
@@ -255,7 +255,7 @@ class MPC(AbstractController):
         """The first control of the last plan, under its gains."""
         assert last.states is not None and last.gains is not None
         x, u = last.states[0], last.controls[0]
-        # Gains of a plan that diverged may not be finite: its controls alone, then.
+        # The gains of a plan that diverged may not be finite: then its controls alone.
         tried = u - matvec(last.gains[0], deviation(y, x, self.difference))
         u = jnp.where(jnp.isfinite(tried), tried, u)
         if self.bounds is None:

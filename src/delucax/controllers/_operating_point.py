@@ -16,7 +16,7 @@ from ..math._norms import relative_drift
 from ..systems import LinearSystem
 
 
-_RESTS = 1e-4
+_EQUILIBRIUM_TOLERANCE = 1e-4
 """The relative residual of an equilibrium, which users may give to few digits."""
 
 
@@ -87,13 +87,13 @@ def operating_state(
         drift = deviation(x_next, x_ref, difference)
     moved = _relative_drift(drift, A, B, x, u_ref)
     # Negated, so that a NaN counts as motion.
-    moves = ~(moved <= _RESTS)
+    moves = ~(moved <= _EQUILIBRIUM_TOLERANCE)
     if not is_concrete(moves):
         return eqx.error_if(x_ref, moves, f"{rule}.")
     if moves:
         raise ValueError(
-            f"{rule}, to {_RESTS:g} of the terms that move them; the residual is "
-            f"{float(moved):.1e}. {hint}got x_ref {x_ref}, x_next {x_next}."
+            f"{rule}, to {_EQUILIBRIUM_TOLERANCE:g} of the terms that move them; the "
+            f"residual is {float(moved):.1e}. {hint}got x_ref {x_ref}, x_next {x_next}."
         )
     return x_ref
 

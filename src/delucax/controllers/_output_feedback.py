@@ -70,7 +70,7 @@ class OutputFeedback(AbstractController):
     def init(self, *, key=None):
         keys = (None, None) if key is None else jax.random.split(key)
         state = self.estimator.init(key=keys[1])
-        # `applied` is told no time, but the prediction needs it.
+        # `applied` is not given the time, but the prediction needs it.
         time = jnp.zeros((), self.estimator.estimate(state).mean.dtype)
         memory = self.controller.init(key=keys[0])
         return _State(memory, state, time, Tally("failed_estimate"))

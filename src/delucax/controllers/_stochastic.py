@@ -174,7 +174,7 @@ class Gaussian(_AroundBase):
         `sum over k < length of log p(u_k | t_k, y_k, s_k)`.
 
         The record is data: it is held fixed when this is differentiated with respect to
-        the weights, while the state of `base` is followed anew and keeps its gradient.
+        the weights, while the state of `base` is recomputed and keeps its gradient.
         A stochastic `base` is not supported: it would draw anew.
 
         **Arguments:** `trajectory`: one run of this controller, with its observations,

@@ -66,12 +66,13 @@ class AbstractCost(eqx.Module):
 
     def set_point(self, plant: AbstractPlant) -> tuple[State, Control] | None:
         """The state and the control to regulate a plant about: the `targets` where
-        there are both, else the equilibrium of the plant, else the one there is and
-        zeros.
+        there are both, else the equilibrium of the plant, else the target that is
+        given, with zeros for the other.
 
         **Arguments:** `plant`: a system or dynamics.
 
-        **Returns:** `(x, u)`; `None` if there is none of them, or they do not fit.
+        **Returns:** `(x, u)`; `None` if none of these is defined, or the sizes do not
+        fit.
         """
         x, u = targets = self.targets or (None, None)
         if x is None or u is None:
@@ -166,7 +167,7 @@ class Sum(AbstractCost):
 
     **Arguments:** `*terms`: the costs, at least one.
 
-    **Raises:** `ValueError` if there are none, or if one is no cost.
+    **Raises:** `ValueError` if no cost is given, or one is not an `AbstractCost`.
 
     !!! example
 

@@ -128,8 +128,8 @@ class Sum(AbstractDisturbance):
 
     **Arguments:** `*terms`: disturbances of one size.
 
-    **Raises:** `ValueError` if there are none, if one is no disturbance, or if sizes
-    differ.
+    **Raises:** `ValueError` if none is given, if one is not an
+    `AbstractDisturbance`, or if sizes differ.
 
     !!! example
 

@@ -191,8 +191,8 @@ class Discretized(AbstractDiscretization):
                 x_next, result = step(0, x, increments[0] if noisy else None)
             else:
                 x_next, result = self._repeat(step, x, increments)
-        # Once per interval, not per substep: the field is defined off the manifold,
-        # too.
+        # Once per interval, not per substep: the field is also defined off the
+        # manifold.
         x_next = system.project(x_next)
         check_returned(x_next, x, system, "project")
         if added is not None:

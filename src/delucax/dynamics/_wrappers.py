@@ -31,8 +31,8 @@ class Delayed(AbstractWrapper):
     - `controls`: steps until a control acts, 0 by default.
     - `sensor`: steps until an observation is read, 0 by default.
 
-    **Raises:** `ValueError` if `dynamics` are none, or a delay is not a whole number of
-    at least 0.
+    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or a delay is
+    not a whole number of at least 0.
 
     !!! example
 
@@ -117,7 +117,7 @@ class Delayed(AbstractWrapper):
 
     @property
     def observes_state(self):
-        """Whether there is no delay, and the plant observes its state."""
+        """True if there is no delay and the plant observes its state."""
         delayed = self.controls or self.sensor
         return not delayed and self.dynamics.observes_state
 
@@ -155,8 +155,8 @@ class WorstCase(AbstractWrapper):
     - `L`: the adversary's gain, shape `(k, n)`.
     - `bound`: what it adds is scaled back to this Euclidean norm; none by default.
 
-    **Raises:** `ValueError` if `dynamics` are none or define no equilibrium, `L` does
-    not fit them, or `bound` is not positive.
+    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics` or defines no
+    equilibrium, `L` does not fit it, or `bound` is not positive.
 
     Source: Basar and Bernhard, 1995.
 
@@ -211,6 +211,6 @@ class WorstCase(AbstractWrapper):
 
     def advance(self, t, x, u, w):
         added = self.attack(x)
-        # Beside the environment's own disturbance, which the adversary does not
+        # Added to the environment's own disturbance, which the adversary does not
         # replace.
         return self.dynamics.advance(t, x, u, added if w is None else w + added)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from .._check import as_vector, check_finite, LARGEST
+from .._check import as_vector, check_finite, FLOAT32_MAX
 from .._module import as_float_array, parameter
 from .._typing import Control, PRNGKey, Real, Scalar, State, Time, Vector
 from ..costs import AbstractCost, Quadratic
@@ -57,7 +57,7 @@ def _lane_keeping(
     target = jnp.zeros(states).at[3].set(speed)
     corner = jnp.array(spread)
     limit = jnp.stack([jnp.asarray(max_acceleration), jnp.asarray(max_steering)])
-    feature_bound = jnp.full(states + 1, LARGEST).at[2:4].set(1.0)
+    feature_bound = jnp.full(states + 1, FLOAT32_MAX).at[2:4].set(1.0)
     # Where the car is along the lane costs nothing.
     weights = [0.0, 1.0, 1.0] + [0.1] * (states - 3)
     cost = Quadratic(
@@ -262,7 +262,7 @@ def quadrotor(system: Quadrotor, *, max_thrust: Limit = 6.0) -> Fields:
         turn, yaw = system.arm * high, 2 * system.moment * high
         high = jnp.stack([4 * high, turn, turn, yaw])
         low = -high.at[0].set(0.0)
-    feature_bound = jnp.full(18, LARGEST).at[3:12].set(_ROTATION)
+    feature_bound = jnp.full(18, FLOAT32_MAX).at[3:12].set(_ROTATION)
     corner = jnp.array([1.0] * 3 + [0.0] + [0.2] * 3 + [0.5] * 6)
     weights = jnp.array([1.0] * 7 + [0.1] * 6), 0.1 * jnp.ones(4)
     target = dict(state_target=x, control_target=hover)
@@ -340,7 +340,7 @@ def reacher(
     cost = ReacherCost(system, goal)
     reach = system.length_1 + system.length_2
     low, high = (
-        jnp.array([sign] * 4 + [sign * LARGEST] * 2 + [*(sign * reach - cost.goal)])
+        jnp.array([sign] * 4 + [sign * FLOAT32_MAX] * 2 + [*(sign * reach - cost.goal)])
         for sign in (-1.0, 1.0)
     )
     return dict(

@@ -114,7 +114,7 @@ def square_root(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The lower triangular `L` of `P = L L'`; NaN if `P` is not semidefinite."""
     regular, varies = _regular(P)
     posed = is_definite(regular)
-    # A matrix that has no root is kept out of the derivative too: `where` alone would
+    # An indefinite matrix is kept out of the derivative too: `where` alone would
     # multiply a NaN cotangent by 0.
     eye = jnp.eye(P.shape[0], dtype=P.dtype)
     L = jnp.linalg.cholesky(jnp.where(posed, regular, eye))

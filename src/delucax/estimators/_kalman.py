@@ -367,7 +367,7 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
         dx = jnp.concatenate([jnp.zeros((1, n)), columns.T, -columns.T])
         dx = dx.astype(mean.dtype)
         z = jax.vmap(function)(mean + dx)
-        # About the middle point, so that angles are averaged as they should be.
+        # About the middle point, so that angles are averaged across the wrap.
         middle = z[0]
         if difference is None:
             dz = z - middle

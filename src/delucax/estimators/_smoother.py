@@ -145,7 +145,7 @@ def smooth(
 
     - `mean`: of each state, given the whole record, shape `(T, n)`;
     - `covariance`: likewise, shape `(T, n, n)`;
-    - `filtered`: what the filter made of it, as from `run_filter`;
+    - `filtered`: the pass of the filter, as `run_filter` returns it;
     - `result`: success, or why not; one of `delucax.RESULTS`.
 
     **Raises:** as `run_filter`.

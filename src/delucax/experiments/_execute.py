@@ -297,7 +297,7 @@ _LIMIT = Path("/proc/sys/vm/max_map_count")
 
 
 def clear_programs(limit: int | None = None) -> bool:
-    """Forget all compiled programs if they hold too many memory maps.
+    """Clear the caches of JAX if its compiled programs hold too many memory maps.
 
     A program that XLA has compiled holds tens of the maps that Linux allows a process,
     65,530 by default, and a compilation without any left ends in a
@@ -305,7 +305,7 @@ def clear_programs(limit: int | None = None) -> bool:
     on Linux nothing is done.
 
     `limit` is how many maps are too many, by default half of what is allowed. Returns
-    whether the programs were forgotten.
+    whether the caches were cleared.
     """
     try:
         limit = int(_LIMIT.read_text()) // 2 if limit is None else limit

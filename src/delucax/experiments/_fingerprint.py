@@ -31,7 +31,7 @@ def fingerprint(value: Any, *, root: str | None = None) -> str:
     user's own: libraries count by their names alone. An object is what it holds and the
     code of its class. `root` is a module whose code counts although it is a library's.
 
-    **Raises:** `TypeError` if something in it has no content to tell it by.
+    **Raises:** `TypeError` if something in it cannot be hashed by its content.
     """
     hasher = _Hasher(root)
     hasher.add(value)
@@ -61,8 +61,8 @@ class _Hasher:
         # Visited objects with their numbers; kept alive, so that ids are not reused.
         self.visited: dict[int, tuple[int, Any]] = {}
 
-    def visit(self, thing: Any) -> bool:
-        """Whether it is visited for the first time."""
+    def mark_visited(self, thing: Any) -> bool:
+        """Give it a number; true if it had none."""
         if id(thing) in self.visited:
             return False
         self.visited[id(thing)] = len(self.visited), thing
@@ -128,7 +128,7 @@ class _Hasher:
 
     def function(self, f: types.FunctionType) -> None:
         self.update("function", f.__qualname__)
-        if not self.visit(f):
+        if not self.mark_visited(f):
             return
         names: set[str] = set()
         if self.is_own(f.__module__):
@@ -163,7 +163,7 @@ class _Hasher:
 
     def type(self, cls: type) -> None:
         self.update("type", cls.__module__, cls.__qualname__)
-        if not (self.is_own(cls.__module__) and self.visit(cls)):
+        if not (self.is_own(cls.__module__) and self.mark_visited(cls)):
             return
         for name, member in sorted(vars(cls).items()):
             code = [f for f in _functions(member) if self.is_own(f.__module__)]
@@ -175,7 +175,7 @@ class _Hasher:
 
     def module(self, module: types.ModuleType) -> None:
         self.update("module", module.__name__)
-        if self.is_own(module.__name__) and self.visit(module):
+        if self.is_own(module.__name__) and self.mark_visited(module):
             try:
                 self.update(_plain(inspect.getsource(module)))
             except (OSError, TypeError, SyntaxError):
@@ -191,7 +191,7 @@ class _Hasher:
         if isinstance(value, Iterator):
             raise TypeError(f"a {type(value).__name__}, which is used up when read")
         kind = type(value)
-        if not self.visit(value):
+        if not self.mark_visited(value):
             self.update("again", self.visited[id(value)][0])
             return
         # The parts that pickle would write, and their code.

@@ -170,7 +170,7 @@ class Store:
         )
 
     def close(self) -> None:
-        """Let others write."""
+        """Release the lock, so that others can write."""
         if self._file is not None:
             with contextlib.suppress(OSError):
                 os.fsync(self._file)

@@ -34,7 +34,7 @@ def run_file(
     html: str | None,
     options: dict[str, Any],
 ) -> int:
-    """Run the experiments of a file and show what came out."""
+    """Run the experiments of a file and print their results."""
     experiments = load(file, suites)
     place = Path("results") / f"{Path(file).stem}.jsonl" if store is None else store
     results = run(*experiments, store=place, **options)

@@ -8,7 +8,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array
 
-from .._check import check_bool, is_concrete, LARGEST
+from .._check import check_bool, FLOAT32_MAX, is_concrete
 from .._typing import PRNGKey
 from ..environments import Environment
 
@@ -32,11 +32,11 @@ def action_ends(env: Environment) -> tuple[Any, Any]:
     return _finite_ends(env.control_bounds, env.control_size, 1e3)
 
 
-def observation_ends(env: Environment, largest: float = LARGEST) -> tuple[Any, Any]:
+def observation_ends(env: Environment, largest: float = FLOAT32_MAX) -> tuple[Any, Any]:
     """`(low, high)` of what `encode` returns; bounds that are infinite end at the
     largest number."""
     bounds = env.observation_bounds
-    bounds = (-LARGEST, LARGEST) if bounds is None else bounds
+    bounds = (-FLOAT32_MAX, FLOAT32_MAX) if bounds is None else bounds
     return _finite_ends(bounds, env.feature_size, largest)
 
 

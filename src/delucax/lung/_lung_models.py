@@ -1,6 +1,6 @@
 """Physical, neural and grey-box models of a lung, to be fitted to breaths."""
 
-from typing import Any, ClassVar
+from typing import Any, cast, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -63,7 +63,7 @@ class LungModel(eqx.Module):
     @property
     def system(self) -> Any:
         """The lung."""
-        return self.dynamics.dynamics.system  # pyright: ignore[reportAttributeAccessIssue]
+        return cast(Any, self.dynamics).dynamics.system
 
     def resting(self) -> State:
         """The state of the dynamics before an inspiration."""

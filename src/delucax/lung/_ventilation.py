@@ -80,7 +80,7 @@ class Valves(eqx.Module):
 
         **Returns:** the flow [L/s], of the shape of `u_in`.
         """
-        curve = lambda u: jax.nn.sigmoid(self.steepness * (u - self.midpoint))  # noqa: E731
+        curve = lambda u: jax.nn.sigmoid(self.steepness * (u - self.midpoint))
         # A sigmoid is neither 0 when closed nor 1 when open: shifted and scaled.
         closed = curve(0.0)
         return self.max_flow * (curve(u_in) - closed) / (curve(100.0) - closed)
@@ -147,8 +147,8 @@ class Valves(eqx.Module):
 class PressureSensor(AbstractWrapper):
     """Dynamics whose observation, a pressure, is kept at the end of the state.
 
-    A cost reads it there, and need not know the lung. A sensor that is late is a
-    [`delucax.dynamics.Delayed`][] around it.
+    A cost reads it there, and need not know the lung. For a sensor delay wrap it in
+    [`delucax.dynamics.Delayed`][].
 
     **Arguments:** `dynamics`: of a lung; it observes one number.
 

@@ -13,7 +13,7 @@ from ._start import controls_of, Start
 
 
 FIRST_RHO = 10.0
-GROWTH = 10.0
+_RHO_GROWTH = 10.0
 ENOUGH = 0.25
 """The weight stays if the violation falls to this share."""
 
@@ -55,7 +55,7 @@ def with_constraints(problem: Problem, start: Start, options: Options) -> Outcom
         # The multipliers converge by themselves, at a rate that grows with the weight:
         # it rises only where they are too slow (Bertsekas, 1982).
         enough = holds | (violation <= ENOUGH * before.violation)
-        raised = jnp.where(enough, rho, GROWTH * rho)
+        raised = jnp.where(enough, rho, _RHO_GROWTH * rho)
         hopeless = (raised > most_rho) & ~settled & ~spent
         lost = after.result == RESULTS.diverged
         result = choose(settled, RESULTS.successful, RESULTS.not_converged)

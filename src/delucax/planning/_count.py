@@ -45,7 +45,8 @@ def count_evaluations(
     one; `tangent`, products of their Jacobian with a vector; `cotangent`, products of
     its transpose with one.
 
-    **Raises:** `ValueError` if `dynamics` are none, or `function` is no function.
+    **Raises:** `ValueError` if `dynamics` is not an `AbstractDynamics`, or `function`
+    is not a function.
 
     !!! example
 

@@ -258,7 +258,7 @@ def directions(
     else:
         policy = in_sequence(stages, mu, options.regularise == "state", box)
     if stages.d is not None:
-        # The pass back reads both off its own terms, which holds without defects alone.
+        # The backward pass reads both off its terms, which holds only without defects.
         slope, curvature = predicted_change(stages, policy.K, policy.k)
         policy = policy._replace(slope=slope, curvature=curvature)
     slope, enough = policy.gradient, tolerance * (1 + policy.scale)

@@ -56,8 +56,8 @@ class ILQR(AbstractPlanner):
 
     The minimum is a local one, and which one it is depends on the start. On an unstable
     plant controls alone lead far away, and the iteration may end in a stationary point
-    out there. With the number of steps as `controls` it starts from the LQR's
-    trajectory, if that is cheaper.
+    far from the region of interest. If `controls` is a number of steps, it starts from
+    the LQR's trajectory if that is cheaper than that of the equilibrium's control.
 
     Under `jax.vmap` on CPU the plans of a batch are made one after the other, which is
     up to six times as fast as together, where each iteration would wait for the longest
@@ -87,9 +87,9 @@ class ILQR(AbstractPlanner):
         default they are differentiated. The derivatives of the plan are exact in both
         cases, those of the cost too.
     - `states`: states to start from, shape `(T+1, n)`, which need not follow from
-        `controls` (multiple shooting), which are an array or the number of steps then,
-        for those of the equilibrium. The steps close the gaps. By default the states
-        follow from `controls`.
+        `controls` (multiple shooting): the steps close the gaps. `controls` must then
+        be an array, or the number of steps for the controls of the equilibrium. By
+        default the states follow from `controls`.
 
     **Raises:** `ValueError` on an option of the wrong kind or out of its range,
     `parallel` with `regularise="state"`, or `finite_difference` with `second_order`;

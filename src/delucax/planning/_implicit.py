@@ -80,7 +80,7 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
         on_state = options.regularise == "state"
         return in_sequence(stages, out.regularisation, on_state, None, free).K
 
-    # The gains of the last pass back are a function of the problem and the solution.
+    # The gains of the last backward pass depend on the problem and the solution alone.
     _, dJ = jax.jvp(cost, (varied, X, U), (change, dX, dU))
     _, dK = jax.jvp(gains, (varied, X, U, y), (change, dX, dU, dy))
     ok = solved & definite

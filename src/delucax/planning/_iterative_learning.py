@@ -30,9 +30,9 @@ from ._planner import checked_plan
 from ._problem import Problem, roll_out
 
 
-GROWTH = 10.0
+_MU_GROWTH = 10.0
 """The growth of the regularisation per pass, until the problem is convex."""
-SLOWER = 0.01
+_RATE_DECAY = 0.01
 """The factor of the learning rate after a failed search of `igpc`."""
 
 
@@ -261,7 +261,7 @@ def _iterate(plant, model, plan, step, rate, iterations, online, anneal) -> Plan
         stages = local_model(model, states, controls, None, False)
         box = model.room(controls)
         solved = lambda mu: (mu, in_sequence(stages, mu, False, box))
-        more = lambda now: solved(jnp.maximum(LEAST_MU, GROWTH * now[0]))
+        more = lambda now: solved(jnp.maximum(LEAST_MU, _MU_GROWTH * now[0]))
         concave = lambda now: ~now[1].ok & (now[0] < MOST_MU)
         return lax.while_loop(concave, more, solved(zero))
 
@@ -293,7 +293,7 @@ def _iterate(plant, model, plan, step, rate, iterations, online, anneal) -> Plan
         return _Progress(
             last=after,
             step=keep(length, now.step),
-            rate=keep(now.rate, SLOWER * now.rate) if anneal else now.rate,
+            rate=keep(now.rate, _RATE_DECAY * now.rate) if anneal else now.rate,
             runs=now.runs + tried,
             trace=now.trace.at[iteration].set(after[2]),
             iteration=iteration,

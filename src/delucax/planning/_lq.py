@@ -114,7 +114,7 @@ def model(
             H, V = exact, at_end
         else:
             H, V = jnp.where(use_exact, exact, H), jnp.where(use_exact, at_end, V)
-    # Rounding leaves Hessians not quite symmetric, which the pass back relies on.
+    # Rounding leaves Hessians not quite symmetric, which the backward pass relies on.
     stages = Stages(F, symmetric(H), h, defects, symmetric(V), v)
     return jax.tree.map(lambda a: a.astype(states.dtype), stages)
 

@@ -38,7 +38,7 @@ class Constraints(eqx.Module):
     A function that is a module with [`delucax.parameter`][] fields can be
     differentiated with respect to them.
 
-    **Raises:** `ValueError` if one is no function, or if there is none.
+    **Raises:** `ValueError` if one is not a function, or none is given.
 
     !!! example
 
@@ -213,7 +213,7 @@ class Problem(eqx.Module):
         return values_of(functions, (t, x), x.dtype)
 
     def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
-        """Their values at all steps of `states` and `controls`, and at the end."""
+        """The values of the constraints at all steps, and at the end."""
         times = self.times(controls.shape[0])
         stage = jax.vmap(self.stage_constraints)(times[:-1], states[:-1], controls)
         return stage, self.final_constraints(times[-1], states[-1])
@@ -241,7 +241,7 @@ class Problem(eqx.Module):
 
     @property
     def stage_multipliers(self) -> Array | None:
-        """The multipliers of the steps."""
+        """The multipliers of the stage constraints; `None` without."""
         return None if self.multipliers is None else self.multipliers.stage
 
     def total(self, states: Array, controls: Array) -> Array:
@@ -329,7 +329,7 @@ def roll_out(
     def body(parts, inputs):
         t, planned, u, K, k, defect, w = inputs
         x = join_state(parts, size)
-        # What is left out is not computed, rather than added as zero.
+        # Omitted terms are not computed, rather than added as zeros.
         if k is not None:
             u = u - length * k
         if K is not None:

@@ -47,7 +47,7 @@ class AbstractSampler(AbstractPlanner):
     @abc.abstractmethod
     def update(
         self,
-        drawn: Float[Array, "samples T m"],
+        samples: Float[Array, "samples T m"],
         costs: Float[Array, " samples"],
         mean: Float[Array, "T m"],
         width: Float[Array, "T m"],
@@ -56,7 +56,7 @@ class AbstractSampler(AbstractPlanner):
 
         **Arguments:**
 
-        - `drawn`: the sequences of controls, the first of which is the mean.
+        - `samples`: the sequences of controls, the first of which is the mean.
         - `costs`: of their trajectories; infinite for those that diverged.
         - `mean`, `width`: those that they were drawn with.
         """
@@ -107,11 +107,11 @@ def _search(
         mean, width, best, _ = carry
         noise = _draw(key, correlation, planner.samples, mean)
         # Clipped before they are weighed, so that the mean is of controls that act.
-        drawn = jax.vmap(jax.vmap(problem.clip))(mean + width * noise)
-        costs = jax.vmap(cost_of)(drawn)
+        samples = jax.vmap(jax.vmap(problem.clip))(mean + width * noise)
+        costs = jax.vmap(cost_of)(samples)
         # The first sequence is the mean itself: its cost comes with the others.
-        best = better(best, drawn[0], costs[0])
-        after, width = planner.update(drawn, costs, mean, width)
+        best = better(best, samples[0], costs[0])
+        after, width = planner.update(samples, costs, mean, width)
         moved = jnp.max(jnp.abs(after - mean))
         return (after, width, best, moved), best[1]
 
@@ -135,13 +135,13 @@ def _search(
     )
 
 
-def average(weights: Array, drawn: Array, otherwise: Array) -> Array:
-    """The weighted mean of what was drawn; `otherwise` if all weights are zero."""
+def average(weights: Array, samples: Array, otherwise: Array) -> Array:
+    """The weighted mean of the samples; `otherwise` if all weights are zero."""
     total = jnp.sum(weights)
     # Of a `where` both branches are differentiated: 0/0 in the one that is not taken
     # would make the gradient NaN.
     safe = jnp.where(total > 0, total, 1)
-    mean = jnp.einsum("s,s...->...", weights / safe, drawn)
+    mean = jnp.einsum("s,s...->...", weights / safe, samples)
     return jnp.where(total > 0, mean, otherwise)
 
 
@@ -201,7 +201,7 @@ class MPPI(AbstractSampler):
         check_number(self.temperature, "temperature", "MPPI")
         check_positive(self.temperature, "temperature", "MPPI")
 
-    def update(self, drawn, costs, mean, width):
+    def update(self, samples, costs, mean, width):
         # The softmax of -cost / temperature. The least cost is taken off first, so that
         # the exponentials do not underflow all together.
         finite, least = jnp.isfinite(costs), jnp.min(costs)
@@ -209,7 +209,7 @@ class MPPI(AbstractSampler):
         above = jnp.where(finite, costs, least) - least
         temperature = self.temperature.astype(mean.dtype)
         weights = jnp.where(finite, jnp.exp(-above / temperature), 0)
-        return average(weights, drawn, mean), width
+        return average(weights, samples, mean), width
 
 
 class CEM(AbstractSampler):
@@ -265,13 +265,13 @@ class CEM(AbstractSampler):
         check_number(self.momentum, "momentum", where)
         check_range(self.momentum, "momentum", where, 0, 1)
 
-    def update(self, drawn, costs, mean, width):
+    def update(self, samples, costs, mean, width):
         # Which sequences are the elites is piecewise constant in the costs, and a
         # derivative through infinite ones would be NaN.
         _, best = lax.top_k(-lax.stop_gradient(costs), self.elites)
         weights = jnp.isfinite(costs[best]).astype(mean.dtype)
-        centre = average(weights, drawn[best], mean)
-        variance = average(weights, (drawn[best] - centre) ** 2, width**2)
+        centre = average(weights, samples[best], mean)
+        variance = average(weights, (samples[best] - centre) ** 2, width**2)
         # The square root has an infinite slope at zero, where all elites agree.
         spreads = variance > 0
         after = jnp.where(spreads, jnp.sqrt(jnp.where(spreads, variance, 1)), 0)

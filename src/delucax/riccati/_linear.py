@@ -20,7 +20,8 @@ from ._spectrum import spectral_abscissa
 
 _DENSE = 256
 """Up to as many unknowns the equation may be solved as one linear system."""
-_PLAIN, _SHIFTED, _DENSELY, _DONE = range(4)
+_DIRECT, _SHIFTED, _DENSE_SOLVE, _DONE = range(4)
+"""The kinds of attempt: with the spectra as they are, shifted, as one linear system."""
 
 
 class MatrixSolution(eqx.Module):
@@ -259,17 +260,17 @@ def _solved(discrete, A, B, C) -> _Candidate:
     """The solution of `A X + X B = C` or `X - A X B = C`; `B` is `A'` by default."""
     given = jax.tree.leaves((A, B, C))
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in given]))
-    last = _DENSELY if C.size <= _DENSE else _SHIFTED
+    last = _DENSE_SOLVE if C.size <= _DENSE else _SHIFTED
 
     def body(carry):
         kind, before = carry
-        plain, shifted = kind == _PLAIN, kind == _SHIFTED
-        X, iterations = _separated(discrete, A, B, C, plain, shifted)
-        if last == _DENSELY:
-            X = _dense_solution(discrete, A, B, C, X, kind == _DENSELY)
+        direct, shifted = kind == _DIRECT, kind == _SHIFTED
+        X, iterations = _separated(discrete, A, B, C, direct, shifted)
+        if last == _DENSE_SOLVE:
+            X = _dense_solution(discrete, A, B, C, X, kind == _DENSE_SOLVE)
         residual = linear_residual(discrete, A, A.T if B is None else B, C, X)
         # For a linear equation a small residual is a small backward error: enough.
-        better = (residual < before.residual) | plain
+        better = (residual < before.residual) | direct
         after = before._replace(
             X=jnp.where(better, X, before.X),
             residual=jnp.where(better, residual, before.residual),
@@ -280,15 +281,15 @@ def _solved(discrete, A, B, C) -> _Candidate:
 
     unknown, zero = jnp.asarray(jnp.inf, C.dtype), jnp.asarray(0)
     nothing = _Candidate(jnp.full_like(C, jnp.nan), unknown, zero, finite)
-    start = jnp.where(finite, _PLAIN, _DONE), nothing
+    start = jnp.where(finite, _DIRECT, _DONE), nothing
     return lax.while_loop(lambda carry: carry[0] != _DONE, body, start)[1]
 
 
-def _separated(discrete, A, B, C, plain, shifted):
+def _separated(discrete, A, B, C, direct, shifted):
     """The solution if the spectra are separated, as they are or by a shift."""
     if discrete:
         # An inactive kind gets a trivial problem, which takes one step.
-        X, steps = smith(*_or_trivial(plain, A, B, C))
+        X, steps = smith(*_or_trivial(direct, A, B, C))
         # Where both spectra are outside the circle, the Cayley transform puts them to
         # the right of the axis.
         eye_A, eye_B = (jnp.eye(size, dtype=C.dtype) for size in C.shape)
@@ -299,7 +300,7 @@ def _separated(discrete, A, B, C, plain, shifted):
         B = None if B is None else solve(other.T, (B - eye_B).T).T
         A, sign = F, jnp.where(shifted, -1.0, 1.0)
         Y, more_steps = _one_side(A, B, C, sign, jnp.zeros(()), shifted)
-        return jnp.where(plain, X, Y), steps + more_steps
+        return jnp.where(direct, X, Y), steps + more_steps
     n, m = C.shape
     # Where the sum of the eigenvalues of A and B is positive, those of -A and -B may be
     # stable: -(A X + X B) = -C.
@@ -307,12 +308,12 @@ def _separated(discrete, A, B, C, plain, shifted):
     sign = jnp.where(mean > 0, -1.0, 1.0)
     if B is None:
         # There is no other line for an equation that is its own transpose.
-        return _one_side(A, None, C, sign, jnp.zeros(()), plain)
+        return _one_side(A, None, C, sign, jnp.zeros(()), direct)
     # A shift by where the line is, between the spectra of A and -B.
     safe_A, safe_B = (jnp.where(shifted, sign * M, 0) for M in (A, B))
     middle = (spectral_abscissa(safe_A) - spectral_abscissa(safe_B)) / 2
     shift = sign * jnp.where(shifted, middle, 0)
-    return _one_side(A, B, C, sign, shift, plain | shifted)
+    return _one_side(A, B, C, sign, shift, direct | shifted)
 
 
 def _one_side(A, B, C, sign, shift, wanted):

@@ -33,8 +33,8 @@ FIRST, BALANCED, SECOND, PERTURBED, UNIT, REGULARISED, DONE = range(7)
 _NEXT = (
     # Following a success, a failure in badly scaled units, and any other failure.
     #
-    # FIRST: a success near the boundary is to be confirmed. A failure may be due to the
-    # scaling, if that is bad, and otherwise to the starting point.
+    # FIRST: a success near the boundary is to be confirmed. A failure is attributed
+    # to the scaling if that is bad, else to the starting point.
     (PERTURBED, BALANCED, SECOND),
     # BALANCED: likewise, and the scaling is ruled out.
     (PERTURBED, SECOND, SECOND),
@@ -50,10 +50,11 @@ _NEXT = (
     (DONE, DONE, DONE),
 )
 """The next attempt. Far from the boundary a solution needs no `PERTURBED`."""
-_ALIKE = 0.3
+_GAP_TOLERANCE = 0.3
 """The largest relative change of the gap under `PERTURBED` of a robust solution."""
 _SWEEPS = 100
-_APART = 4
+"""The most sweeps of the balancing."""
+_BALANCE_THRESHOLD = 4
 """Units within this many powers of two of each other are left as they are."""
 
 
@@ -155,7 +156,7 @@ def search(
         undecided &= (at.residual <= close) & new.bounded
         # The gap of a robust solution hardly changes with Q; that of a marginal one
         # changes by as much as itself.
-        same = jnp.abs(at.gap - best.gap) <= _ALIKE * best.gap
+        same = jnp.abs(at.gap - best.gap) <= _GAP_TOLERANCE * best.gap
         marginal = before.marginal & ~(unchanged & solved)
         marginal = jnp.where(kind == PERTURBED, ~(survives & same), marginal)
         unit = kind == UNIT
@@ -269,7 +270,9 @@ def units(data: RiccatiData) -> Float[Array, "2 n"]:
     if E is not None:
         f = -jnp.max(logarithm(jnp.abs(E)) - d, axis=1)
     both = jnp.stack([d, f])
-    badly_scaled = jnp.any(jnp.max(both, axis=1) - jnp.min(both, axis=1) > _APART)
+    badly_scaled = jnp.any(
+        jnp.max(both, axis=1) - jnp.min(both, axis=1) > _BALANCE_THRESHOLD
+    )
     both = jnp.where(badly_scaled, both, 0)
     return power_of_two(jnp.exp2(both))
 

@@ -38,7 +38,7 @@ class PlanarQuadrotor(AbstractSystem):
         [`delucax.systems.VortexWind`][] or any other; none by default.
 
     **Raises:** `ValueError` if a mass or length is not positive, a number is not finite
-    or the wind is no function.
+    or the wind is not a function.
 
     Source: Gradu et al., 2021 (Deluca).
 
@@ -239,7 +239,7 @@ class Quadrotor(AbstractSystem):
         **Returns:** the projected state.
         """
         square = x[3] * x[3] + x[4] * x[4] + x[5] * x[5] + x[6] * x[6]
-        # A quaternion of zeros has no direction; it is left, not turned into NaN.
+        # A quaternion of zeros has no direction: it is returned unchanged, not NaN.
         scale = jnp.where(square > 0, square, 1.0) ** -0.5
         q = [scale * x[i] for i in range(3, 7)]
         return jnp.stack([x[0], x[1], x[2], *q, *(x[i] for i in range(7, 13))])

@@ -251,7 +251,7 @@ class AbstractActorCriticLoss(AbstractSurrogate):
         observed = observed + jnp.concatenate([noise, jnp.zeros_like(noise[:1])])
         values = jax.vmap(model.value)(run.times, observed)
         following, values = values[1:], values[:-1]
-        # Nothing follows an end but the final cost; beyond a cut V stands for the rest.
+        # After termination only the final cost remains; after truncation V stands in.
         if not self.bootstrap:
             following = following.at[-1].set(run.final_cost)
         following = jnp.where(run.terminated, run.final_cost, following)

@@ -175,8 +175,8 @@ class PPO(AbstractActorCriticLoss):
         change = jnp.where(rows.valid, log_prob - rows.log_prob, 0)
         ratio, advantages = jnp.exp(change), rows.advantages
         clipped = jnp.clip(ratio, 1 - self.clip, 1 + self.clip)
-        # The larger of the two, because these are costs: a pessimistic bound, without a
-        # slope where the ratio has gained all that the clip allows.
+        # The larger of the two, because these are costs: a pessimistic bound, with zero
+        # gradient once the ratio has left the clip range towards a lower cost.
         surrogate = mean(jnp.maximum(ratio * advantages, clipped * advantages))
         value_loss = mean(self._value_errors(model, rows) ** 2)
         bonus = mean(entropy)

@@ -49,15 +49,16 @@ class Adaptive(AbstractController):
     """An online learner made to keep up with a plant or disturbances that change.
 
     Copies of `base`, the experts, run side by side on the same observations. Every
-    `every` steps a new one is born that has learned nothing; the i-th lives for
+    `every` steps a new one begins that has learned nothing; the i-th expires after
     `every (4 2^k + 1)` steps, 2^k being the largest power of two that divides i, so
-    that there is at all times one that began shortly after any change. The first lives
-    for ever. If no slot is free, the one that would die next makes room.
+    that there is at all times one that began shortly after any change. The first never
+    expires. If no slot is free, the one that would expire next is dropped.
 
     The weights follow the counterfactual losses,
     `p_i <- p_i exp(-rate (loss_i - mean loss) / spread)`, `spread` being the standard
-    deviation of the losses lately, so that their scale does not matter; then a part
-    `share` is dealt out evenly to all that live, so that each can rise quickly.
+    deviation of the losses lately, so that their scale does not matter; then a
+    fraction `share` is distributed evenly over all active experts, so that each can
+    rise quickly.
 
     With `play="mix"` the control is `u = sum_i p_i u_i`. With `"switch"` it is that of
     one expert, drawn again only with the probability by which its weight has fallen, so
@@ -67,10 +68,10 @@ class Adaptive(AbstractController):
 
     - `base`: an [`delucax.AbstractLearner`][], such as one of
         [`delucax.controllers.gpc`][].
-    - `slots`: the number of experts alive at once, 8 by default.
-    - `every`: steps between births, 64 by default.
+    - `slots`: the number of experts that are active at once, 8 by default.
+    - `every`: steps until the next expert begins, 64 by default.
     - `rate`: of the weights, 0.5 by default.
-    - `share`: dealt out evenly at each step, above 0 and at most 1; 0.02 by default.
+    - `share`: distributed evenly at each step, above 0 and at most 1; 0.02 by default.
     - `play`: `"mix"` (default) or `"switch"`.
 
     **Raises:** `ValueError` if `base` is not a learner or a number is out of its range;

@@ -16,7 +16,7 @@ from ..._typing import PRNGKey, Real
 from ...dynamics import AbstractDynamics
 from ...math._norms import safe_norm
 from ._closed_loop import ClosedLoop, ClosedLoopState, in_first_responses, shift
-from ._learner import RADIUS
+from ._learner import DEFAULT_RADIUS
 from ._optimisers import adagrad_norm, projected_step
 from ._policy import LinearPolicy
 
@@ -122,7 +122,7 @@ class BPC(AbstractController):
         scale = functools.partial(in_first_responses, loop, where)
         start = jnp.zeros((dynamics.control_size, loop.feature_size), loop.dtype)
         self.loop = loop
-        self.policy = LinearPolicy(start, scale(radius, "radius", RADIUS))
+        self.policy = LinearPolicy(start, scale(radius, "radius", DEFAULT_RADIUS))
         self.delta = scale(delta, "delta", 0.2)
         self.learning_rate = scale(learning_rate, "learning_rate", 0.05)
         self.optimiser = adagrad_norm() if optimiser is None else optimiser

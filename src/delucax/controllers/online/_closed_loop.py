@@ -27,9 +27,9 @@ from .._output_feedback import LQG
 _AFFINE = (Zero, Constant, Linear, LQR, LQI, LQG, HInfinity)
 """Controllers whose control and state depend on the observation by an affine map that
 is the same at all times."""
-_LEFT_OF_HORIZON, _HORIZONS = 0.03, (10, 1000)
-"""The residual of an impulse at the end of a roll-out, and the shortest and longest."""
-_LEFT_OF_MEMORY, _MEMORIES = 0.1, (10, 50)
+_IMPULSE_DECAY, _HORIZON_RANGE = 0.03, (10, 1000)
+"""What is left of an impulse at the end of a roll-out, and the shortest and longest."""
+_MEMORY_DECAY, _MEMORY_RANGE = 0.1, (10, 50)
 """The same of the default memory. A longer policy gains a little, and costs more to
 learn: under noise it is worse."""
 
@@ -141,7 +141,7 @@ class ClosedLoop(eqx.Module):
             # each number that it learns: there the memory is the shortest.
             is_cheap = is_constant and not self.nature
             rate = radius if is_cheap and radius is not None else 0.0
-            memory = _steps(rate, _LEFT_OF_MEMORY, *_MEMORIES)
+            memory = _steps(rate, _MEMORY_DECAY, *_MEMORY_RANGE)
         self.memory = check_count(memory, "memory", where)
         self.response = self.first_response = None
         if tangents is not None:
@@ -151,7 +151,7 @@ class ClosedLoop(eqx.Module):
             self.response = response if is_constant else None
             moved = response[:, : dynamics.observation_size]
             sizes = jnp.sqrt(jnp.sum(moved**2, axis=(1, 2)))
-            # A control may take several steps to show: what is below is rounding.
+            # A control may take several steps to show; smaller responses are rounding.
             slack = jnp.finfo(sizes.dtype).eps ** 0.5 * jnp.max(sizes)
             self.first_response = sizes[jnp.argmax(sizes > slack)]
 
@@ -397,7 +397,7 @@ def _roll_out_length(radius: float | None, horizon: int | None, where: str) -> i
             f"{where}: horizon must be given inside a transformation of JAX, or for "
             "dynamics that define no equilibrium: its default needs the closed loop."
         )
-    return _steps(radius, _LEFT_OF_HORIZON, *_HORIZONS)
+    return _steps(radius, _IMPULSE_DECAY, *_HORIZON_RANGE)
 
 
 def _steps(radius: float, left: float, least: int, most: int) -> int:

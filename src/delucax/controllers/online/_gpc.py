@@ -359,10 +359,10 @@ def spectral_filters(memory: int, count: int, margin: float) -> np.ndarray:
     index = np.arange(1, memory + 1)
     total = index[:, None] + index[None, :] - 1.0
     # In float64 whatever JAX computes in: the eigenvalues of this Hankel matrix fall
-    # off exponentially (Hazan, Singh and Zhang, 2017), which is why a few filters do,
+    # off exponentially (Hazan, Singh and Zhang, 2017), so that a few filters suffice,
     # and float32 would lose the small ones in rounding.
     values, vectors = np.linalg.eigh((1 - margin) ** total / total)
     values, vectors = values[::-1][:count], vectors[:, ::-1][:, :count]
-    # Eigenvectors have no sign of their own; that of LAPACK is a matter of its version.
+    # The sign of an eigenvector is arbitrary: LAPACK's choice depends on its version.
     sign = np.where(vectors.sum(axis=0) < 0, -1.0, 1.0)
     return (np.maximum(values, 0.0) ** 0.25 * sign * vectors).T

@@ -25,9 +25,9 @@ from ._optimisers import adagrad_norm, online_newton, positive_root, projected_s
 from ._policy import AbstractPolicy, FixedPolicy, LinearPolicy
 
 
-STEP = 0.15
+DEFAULT_STEP = 0.15
 """The step of a learner, in units of the control that undoes what it has observed."""
-RADIUS = 50.0
+DEFAULT_RADIUS = 50.0
 """The largest policy, in the same units."""
 _PRIOR_OF_OUTPUTS = 4.0
 """The prior of what is learned from nature's outputs, in steps."""
@@ -72,8 +72,7 @@ class OnlineLearner(AbstractLearner):
     dynamics linearised along the way.
 
     [`delucax.controllers.gpc`][], [`delucax.controllers.drc`][],
-    [`delucax.controllers.sfc`][], [`delucax.controllers.dsc`][] and
-    [`delucax.controllers.neural_gpc`][] make it.
+    [`delucax.controllers.sfc`][] and [`delucax.controllers.neural_gpc`][] make it.
 
     **Attributes:**
 
@@ -176,9 +175,9 @@ class OnlineLearner(AbstractLearner):
         return FixedPolicy(self.loop, policy)
 
     def _outcome(self, theta, state):
-        # One theta for all steps of the roll-out, as if it had been held. As it moves
-        # slowly, regret in these losses bounds that of the run (Anava, Hazan and
-        # Mannor, 2015; Agarwal et al., 2019).
+        # Theta is held constant during the roll-out. As it moves slowly, regret in
+        # these losses bounds that of the run (Anava, Hazan and Mannor, 2015; Agarwal et
+        # al., 2019).
         v = jax.vmap(self.policy, in_axes=(None, 0))(theta, state.features)
         return self.loop.counterfactual(v[0], v[1:], state.loop)
 
@@ -236,11 +235,11 @@ def linear_learner(
     loop = ClosedLoop(dynamics, base, horizon, where, **signal)
     start = jnp.zeros((dynamics.control_size, loop.feature_size), loop.dtype)
     scale = functools.partial(in_first_responses, loop, where)
-    ball = scale(radius, "radius", RADIUS)
-    rate = scale(learning_rate, "learning_rate", STEP)
+    ball = scale(radius, "radius", DEFAULT_RADIUS)
+    rate = scale(learning_rate, "learning_rate", DEFAULT_STEP)
     if optimiser is None:
         # Newton's step where gradients alone are slow: nature's outputs are much alike
-        # from step to step, and a response that changes points elsewhere each time.
+        # from step to step, and gradients by a response that varies change direction.
         if loop.nature:
             optimiser = online_newton(_PRIOR_OF_OUTPUTS)
         else:

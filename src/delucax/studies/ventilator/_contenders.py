@@ -22,7 +22,7 @@ from ...dynamics import LinearDynamics
 from ...environments import Environment
 from ...estimators import KalmanFilter
 from ...training.sysid import arx
-from ._stages import ABORT, NOISE, SEEN, Size, Stages
+from ._stages import ABORT, NOISE, Size, Stages, TRAIN_PIPS
 
 
 TRUE_PID = dict(
@@ -33,7 +33,7 @@ TRUE_PID = dict(
 """The gains of the true PIDs that are tried."""
 _TUNED_FURTHER = 4
 """The number of PIDs drawn at random that are trained further."""
-_CAREFUL = ABORT - 15
+_TRAINING_LIMIT = ABORT - 15
 """The alarm of the network for all lungs: well below the limit, as no lung is known."""
 
 
@@ -189,7 +189,7 @@ def _errors(
 ) -> Float[Array, "lungs controllers"]:
     """The error of each in each lung, shape `(lungs, controllers)`; of controllers of
     shape `(controllers,)`, or `(controllers, lungs)` if each lung has its own."""
-    options: Any = dict(key=key, pips=jnp.asarray(SEEN))
+    options: Any = dict(key=key, pips=jnp.asarray(TRAIN_PIPS))
     of = lambda env, one: jnp.mean(lung.breath_error(env, one, **options))
     across = eqx.filter_vmap(of, in_axes=(None, eqx.if_array(0)))
     over = eqx.if_array(1) if own else None
@@ -316,7 +316,7 @@ def contenders(
     own = training("own", f"A network for each lung, {seeds}", networks)
     sizes = dict(zip(("width", "controls"), size.shared_network, strict=True))
     networks = trainer.networks((size.seeds,), 11, size.shared_steps, **sizes)
-    networks = functools.partial(networks, shared=True, limit=_CAREFUL)
+    networks = functools.partial(networks, shared=True, limit=_TRAINING_LIMIT)
     shared = training("shared", f"A network for all lungs, {seeds}", networks)
     if size.tuned:
         words = "PIDs with feed-forward tuned on the lungs"

@@ -15,7 +15,7 @@ from ..._typing import PRNGKey
 from ...environments import Environment
 from ._contenders import Contender
 from ._simulators import closed_loop
-from ._stages import ABORT, BREATH, SEEN, SHOWN, UNSEEN
+from ._stages import ABORT, BREATH, SHOWN, TEST_PIPS, TRAIN_PIPS
 
 
 Rows = list[dict[str, Any]]
@@ -30,8 +30,8 @@ PID_ROWS = (
     *("tuned PID + feed-forward", "tuned leaky PID + feed-forward"),
 )
 FLOORS = ("zero", "bang-bang")
-SPLITS = {"seen": slice(len(SEEN)), "unseen": slice(len(SEEN), None)}
-"""Which of the peak pressures `SEEN + UNSEEN` a row of the report is of."""
+SPLITS = {"seen": slice(len(TRAIN_PIPS)), "unseen": slice(len(TRAIN_PIPS), None)}
+"""Which of the peak pressures `TRAIN_PIPS + TEST_PIPS` a row of the report is of."""
 LEARNED = ("MLP", "MLP for all", "CNN", "PID + MLP", "GPC", "MPC")
 
 
@@ -45,9 +45,9 @@ def error_rows(
     controllers that are the same for all lungs are run in them too.
     """
     (envs, names), rows, runs = lungs, [], {}
-    pips, count = jnp.asarray(SEEN + UNSEEN), len(names)
+    pips, count = jnp.asarray(TRAIN_PIPS + TEST_PIPS), len(names)
     waveforms = envs.cost.waveform  # pyright: ignore[reportAttributeAccessIssue]
-    place = (SEEN + UNSEEN).index(SHOWN)
+    place = (TRAIN_PIPS + TEST_PIPS).index(SHOWN)
     for label, seed, controllers, shared in contenders:
         each = stack([controllers] * count) if shared else controllers
         whole = eqx.filter_vmap(lung.Breathing)(each, waveforms)

@@ -15,7 +15,7 @@ from ..._module import positive, stack, unstack
 from ..._typing import PRNGKey
 from ...environments import Environment
 from ...simulation import rollout, Trajectory
-from ._stages import INSPIRATION, SEEN, Size
+from ._stages import INSPIRATION, Size, TRAIN_PIPS
 
 
 class Kind(NamedTuple):
@@ -159,7 +159,7 @@ def closed_loop_errors(
     under the same controller and without noise, by kind: shape `(lungs,)`."""
     waveforms = envs.cost.waveform  # pyright: ignore[reportAttributeAccessIssue]
     whole = eqx.filter_vmap(lung.Breathing)(controllers, waveforms)
-    pips, keys = jnp.asarray(SEEN), jr.key(0)[None]
+    pips, keys = jnp.asarray(TRAIN_PIPS), jr.key(0)[None]
 
     def read(envs):
         run: Any = closed_loop(envs, whole, pips, keys, INSPIRATION)[-1]

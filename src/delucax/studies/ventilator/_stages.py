@@ -13,9 +13,9 @@ from ..._files import replaced
 from ..._module import load, save
 
 
-SEEN = (10.0, 15.0, 20.0, 25.0, 30.0, 35.0)
+TRAIN_PIPS = (10.0, 15.0, 20.0, 25.0, 30.0, 35.0)
 """Peak pressures that controllers are trained at."""
-UNSEEN = (12.5, 17.5, 22.5, 27.5, 32.5)
+TEST_PIPS = (12.5, 17.5, 22.5, 27.5, 32.5)
 SHOWN = 27.5
 """The peak pressure of the breaths in the figures, one of those."""
 INSPIRATION = 29

@@ -18,7 +18,16 @@ from ... import lung
 from ..._check import check_count
 from ..._module import stack, unstack
 from . import _contenders, _report, _simulators
-from ._stages import BREATH, FULL, NOISE, SEEN, SENSOR_DELAY, SMALL, Stages, UNSEEN
+from ._stages import (
+    BREATH,
+    FULL,
+    NOISE,
+    SENSOR_DELAY,
+    SMALL,
+    Stages,
+    TEST_PIPS,
+    TRAIN_PIPS,
+)
 
 
 def lung_study(
@@ -144,7 +153,7 @@ def lung_study(
     keys = jr.split(jr.fold_in(key, 99), size.noises)
     rows, runs = _report.error_rows(contenders, (envs, names), between, keys)
     if size.bound_steps:
-        pips = jnp.asarray(SEEN + UNSEEN)
+        pips = jnp.asarray(TRAIN_PIPS + TEST_PIPS)
         of = lambda env: lung.least_error(env, pips=pips, steps=size.bound_steps)
         words, make = "The least error, with the lung at hand", eqx.filter_vmap(of)
         bound = stages.stage("bound", words, lambda: make(envs))

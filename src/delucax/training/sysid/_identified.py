@@ -163,7 +163,7 @@ class Certainty(NamedTuple):
             sensitivity = jnp.pad(sensitivity, ((0, p - rows), (0, 0)))
         # S = U diag(size) V': along v_i the estimate has the standard deviation
         # sigma / size_i, as its covariance is sigma^2 (S' S)^-1. A size below the
-        # rounding of S is none.
+        # rounding of S counts as zero.
         _, size, directions = jnp.linalg.svd(sensitivity, full_matrices=False)
         eps = jnp.finfo(sensitivity.dtype).eps
         sensitive = size > 10 * max(rows, p) * eps * size[0]

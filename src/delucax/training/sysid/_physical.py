@@ -55,8 +55,8 @@ def physical(
     of window j.
 
     Levenberg and Marquardt's method. The states at the beginning of each window are
-    estimated with the parameters, so that noise in what was observed does no harm, and
-    a window is short enough that small errors do not grow beyond measure. Steps are
+    estimated with the parameters, so that measurement noise does not bias the estimate,
+    and windows are short, so that errors stay bounded within each. Steps are
     scaled by the sensitivities, so that parameters of any size can be estimated
     together. Constrained parameters are estimated in the unconstrained space, as in
     [`delucax.training.fit`][], and their intervals are within the valid set.
@@ -79,13 +79,13 @@ def physical(
     - `x0`: a guess of the first state, shape `(n,)`, from which those of the windows
         are simulated; by default the windows begin with what is observed there, which
         must then be the state.
-    - `window`: steps of a window, 20 by default; all T if there are fewer. What does
-        not fill the last is left out.
+    - `window`: steps of a window, 20 by default; all T if there are fewer. An
+        incomplete last window is left out.
     - `noise`: the standard deviation of each observation, a number or shape `(p,)`; by
         default that of the residuals of a first fit.
     - `level`: of the confidence intervals, 0.95 by default.
     - `max_steps`: 100 by default.
-    - `throw`: raise if it does not converge or the data do not tell all parameters
+    - `throw`: raise if it does not converge or some parameters are not identifiable
         (default); if false, look at `result`.
 
     **Returns:** [`delucax.training.sysid.Identified`][]; its `model` is the dynamics
