@@ -44,6 +44,7 @@ class RK4(diffrax.AbstractERK):
     tableau: ClassVar[diffrax.ButcherTableau] = diffrax.ButcherTableau(
         a_lower=(np.array([0.5]), np.array([0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
         b_sol=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
+        # The classical method has no embedded estimate of its error.
         b_error=np.array([0.0, 0.0, 0.0, 0.0]),
         c=np.array([0.5, 0.5, 1.0]),
     )

@@ -113,6 +113,8 @@ def solve_result(solution: diffrax.Solution, controller: Any, dtype: Any) -> Res
     if controller is None:
         return result
     # A tolerance that is a Python number is known now, and most are far from rounding.
+    # An error estimate is itself rounded, to about eps of the state: below that, steps
+    # shrink without end.
     is_fine = controller.rtol < 4 * float(jnp.finfo(dtype).eps)
     if is_fine is False:
         return result

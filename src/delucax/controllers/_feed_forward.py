@@ -107,6 +107,8 @@ class Preview(eqx.Module):
 
     def __call__(self, t: RealScalar) -> Float[Array, " m"]:
         """`v` at time `t`."""
+        # The sum is the linear term of the cost to go, of which v = -M p is the best
+        # control: p[k] = P d[k] + (A - B K)' p[k+1].
         loop = self.closed_loop.T
         times = t + self.signals.dynamics.dt * jnp.arange(self.steps + 1)
         pushes = jax.vmap(lambda t: self.P @ self.signals.offset(t))(times)

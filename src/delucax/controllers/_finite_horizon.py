@@ -125,6 +125,7 @@ class FiniteHorizonLQR(AbstractController):
         else:
             last = dynamics.at(end).x_ref
         targets = jnp.concatenate([self.x_ref[1:], last[None]])
+        # d[k], by which the dynamics miss r[k+1] from r[k]: e_next = A e + B v + d.
         d = jax.vmap(lambda a, b: deviation(a, b, difference))(x_next, targets)
         A, B = (a if steps is None else a[:T] for a in (dynamics.A, dynamics.B))
         # With the residual d of the reference the cost to go has a linear term, whose

@@ -103,6 +103,8 @@ class HInfinity(AbstractController):
         self.x_ref = operating_state(dynamics, difference, where)
         self.u_ref, self.difference = dynamics.u_ref, difference
         matrices = dynamics.A, dynamics.B, dynamics.E, Q, R
+        # As the state is observed, one Riccati equation does; from outputs it would
+        # take a second, of the filter (Doyle, Glover, Khargonekar and Francis, 1989).
         if is_finite:
             steps = dynamics.A.shape[0] if varies else None
             T = steps if horizon is None else check_count(horizon, "horizon", where)

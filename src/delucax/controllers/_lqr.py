@@ -132,6 +132,7 @@ class LQR(AbstractController):
                 f"{where}: preview must be 0 without a reference or disturbance that "
                 f"is looked up ahead, got {preview}."
             )
+        # K = (R + B'PB)^-1 (B'PA + S'), for u = -K x: the minus is in the law.
         solution = dare(linear.A, linear.B, Q, R, S)
         self.K, self.P, self.feed_forward = solution.K, solution.X, None
         if is_known:
@@ -163,6 +164,7 @@ class LQR(AbstractController):
         if self.feed_forward is not None:
             signals = self.feed_forward.signals
             x_ref = signals.state(t)
+            # The feed-forward has its minus inside.
             u_ref = signals.control(t) + self.feed_forward(t)
         u = u_ref - matvec(self.K, deviation(y, x_ref, self.difference))
         return u.astype(y.dtype), state
@@ -269,6 +271,8 @@ class LQI(AbstractController):
         integrals = [-dynamics.dt * C, jnp.eye(p, dtype=C.dtype)]
         A = jnp.block([[dynamics.A, jnp.zeros((n, p), C.dtype)], integrals])
         B = jnp.concatenate([dynamics.B, jnp.zeros((p, m), C.dtype)])
+        # z integrates r - C x. Where a textbook integrates C x - r (Åström and Murray,
+        # 2008), its Ki has the other sign.
         solution = dare(A, B, Q, R, S)
         self.K, self.Ki, self.P = solution.K[:, :n], solution.K[:, n:], solution.X
 
@@ -290,6 +294,7 @@ class LQI(AbstractController):
         if self.reference is not None:
             error = error + self.reference(t) - matvec(self.output, self.x_ref)
         u = self.u_ref - matvec(self.K, dx) - matvec(self.Ki, state.integral)
+        # After u, which is of z[k]: that is the z of the design.
         integral = state.integral + self.dt * error
         dtype = state.integral.dtype
         after = _Memory(integral.astype(dtype), u.astype(dtype))

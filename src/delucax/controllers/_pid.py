@@ -251,6 +251,8 @@ class PID(_AbstractPID):
         # the plain difference `step / dt`.
         slope = (lag * state.slope + step) / (lag + self.dt)
         asked = self.kp * error + state.integral + self.kd * slope
+        # The gain is inside of the sum, so that a change of it makes no jump
+        # (bumpless).
         integral = state.integral + self.dt * self.ki * error
         # The integral of this step acts from the next one on, so that `applied`, which
         # comes in between, corrects what the next control is made of.

@@ -161,6 +161,8 @@ class Gaussian(_AroundBase):
             # `jnp.where` does not choose it.
             near_low = jnp.where(jnp.isinf(low), 0, low)
             near_high = jnp.where(jnp.isinf(high), 0, high)
+            # P(mean + std e >= high) = Phi((mean - high) / std), in logarithms, which
+            # do not underflow far out in the tail.
             below = (near_low - mean) / std
             above = (mean - near_high) / std
             # A clipped draw has an atom at each bound (Fujita and Maeda, 2018).

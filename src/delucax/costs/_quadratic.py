@@ -127,6 +127,7 @@ class Quadratic(_AbstractQuadratic):
             )
         target = self.state_target
         if self.difference is not None:
+            # From zero, and not x itself, because the difference wraps angles.
             return self.difference(x, jnp.zeros_like(x) if target is None else target)
         return x if target is None else x - target
 
@@ -198,6 +199,8 @@ class Tracking(_AbstractQuadratic):
 def _form(weight: Matrix | Vector, d: Vector) -> Scalar:
     """`d' weight d`, the weight a matrix or its diagonal."""
     # Written out for small sizes, which fuses in the loop of a rollout.
+    # Without the factor 1/2 of some textbooks: the Hessian is twice the weight, and the
+    # weights are those of the Riccati equations as they are.
     if weight.ndim == 2:
         return quadratic_form(weight, d)
     return dot(weight * d, d)

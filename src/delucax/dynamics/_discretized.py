@@ -31,6 +31,8 @@ from ..systems import AbstractSystem
 from ._base import AbstractDiscretization
 
 
+# Euler and ItoMilstein converge to the solution in Itô's sense, the others to that in
+# Stratonovich's: where g depends on x these are different processes.
 _SDE_SOLVERS = (
     diffrax.Euler,
     diffrax.EulerHeun,
@@ -171,6 +173,8 @@ class Discretized(AbstractDiscretization):
 
     def advance(self, t, x, u, w):
         system, noise = self.system, self.noise
+        # A system uses w in one of three ways: in its field, held; as increments of
+        # Brownian motions; or, where it names no disturbances, added to the next state.
         given: Any = w
         if w is None and noise != "additive":
             given = jnp.zeros(self.disturbance_size, x.dtype)
@@ -223,6 +227,8 @@ class Discretized(AbstractDiscretization):
         """A substep with an increment of the Brownian motions."""
         system, start, u, _ = args
         h = self.dt / self.substeps
+        # The diffusion may depend on time where the field does not, so it has a check
+        # of its own.
         start = TimeOffset(start.t, lambda t: system.diffusion(t, x, u))
 
         def g(s, x):
@@ -246,6 +252,7 @@ class Discretized(AbstractDiscretization):
         @by_components
         def body(parts, index_and_increment):
             i, increment = index_and_increment
+            # By i h, and no running sum, whose rounding would grow with the substeps.
             x_next, result = step(i * h, join_state(parts, x.shape[0]), increment)
             return split_state(x_next.astype(x.dtype)), or_none(result)
 
@@ -261,6 +268,10 @@ class Discretized(AbstractDiscretization):
             self.adjoint,
         )
         assert solver is not None and controller is not None and adjoint is not None
+        # Without `dt0` Diffrax estimates a first step from the field (Hairer, Nørsett
+        # and Wanner, 1993, II.4): the last step of the interval before was cut off at
+        # its end and tells little. Without `throw`, because one member of a batch that
+        # fails must not stop the others.
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(_field),
             solver,

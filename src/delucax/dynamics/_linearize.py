@@ -115,11 +115,14 @@ def linearize(
     names = dict(state_names=model.state_names, control_names=model.control_names)
     w = jnp.zeros(model.disturbance_size, x.dtype)
     if isinstance(model, AbstractSystem):
+        # Where no disturbances are named the field has no w, and so there is no E.
         held, E = (w if model.disturbance_names else None), None
         f = functools.partial(evaluate_field, model)
         A, B = jacobian(f, (1, 2))(t, x, u, held)
         if model.disturbance_names:
             E = jacobian(f, 3)(t, x, u, w)
+        # Kept, because at a point that is no equilibrium the model is affine,
+        # f(x_ref, u_ref) + A (x - x_ref) + B (u - u_ref).
         dx = f(t, x, u, held)
         return LinearSystem(A, B, C, E, x_ref=x, u_ref=u, dx_ref=dx, **names)
     step = functools.partial(model, t)

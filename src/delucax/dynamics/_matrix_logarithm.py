@@ -66,6 +66,8 @@ def _with_derivative_jvp(primals, tangents):
         block = jnp.block([[M, right / size], [jnp.zeros_like(M), M]])
         return _by_roots(block)[0][:n, n:] * size
 
+    # The derivative of a function of a matrix at M has the derivative at M' for its
+    # transpose, which makes the reverse mode (Higham, 2008).
     tangent = lax.custom_linear_solve(
         lambda tangent: jax.jvp(exponential_less_one, (logarithm,), (tangent,))[1],
         tangents[0],
@@ -80,6 +82,7 @@ def exponential_less_one(L: Array) -> Array:
     programs. `P` becomes `(I + P)^2 - I`: nothing is lost beside the identity."""
     X = L / 2**_SQUARINGS
     eye = jnp.eye(L.shape[0], dtype=L.dtype)
+    # Horner's rule: X + X^2/2! + ... = X (I + X/2 (I + X/3 (I + ...))).
     P = X / _TERMS
     for k in range(_TERMS - 1, 0, -1):
         P = X @ (eye + P) / k
@@ -110,6 +113,7 @@ def _by_roots(A: Array) -> tuple[Array, Array]:
     # Gauss-Legendre for the integral over [0, 1] of X (I + x X)^-1.
     def add(total, rule):
         node, weight = rule
+        # The rule is for [-1, 1]: x = (1 + node) / 2, with half of the weight.
         return total + weight / 2 * solve(eye + (1 + node) / 2 * X, X), None
 
     rules = jnp.asarray(_NODES, A.dtype), jnp.asarray(_WEIGHTS, A.dtype)

@@ -177,6 +177,8 @@ class _Problem(eqx.Module):
         eye, k = jnp.eye(y.size, dtype=y.dtype), len(self.free)
 
         def along(pair):
+            # Forward over forward, along e_i and then e_j: F, dF/dy_i and d2F/dy_i dy_j
+            # in one pass.
             first = lambda y: jax.jvp(self.drift, (y,), (pair[0],))
             (drift, slope), (_, curvature) = jax.jvp(first, (y,), (pair[1],))
             return drift, slope, curvature
@@ -219,6 +221,8 @@ def _expand(problem: _Problem, z: Array, terms: Array) -> _Point:
     drift, jacobian, H = problem.expansion(problem.at(z))
     terms = jnp.where(terms > 0, terms, problem.terms(jacobian))
     unit = units[free]
+    # Rows in units of their terms and columns in those of the unknowns, so that neither
+    # cost nor rank depends on the units of the model.
     r, J = drift / terms, jacobian[:, free] * unit / terms[:, None]
     H = H[:, free] * unit[:, None] * unit / terms[:, None, None]
     rtol = float(100 * max(J.shape) * jnp.finfo(J.dtype).eps)
@@ -292,6 +296,8 @@ def _nearest(problem: _Problem) -> tuple[Array, Array, Array, Array]:
 
     no = jnp.array(False)
     best = inf, zero, blank.drift, blank.jacobian, inf
+    # The first step is zero: it expands the guess inside the loop, and counts as a
+    # success, after which the damping is 1/4 and the radius 1.
     start = jnp.array(0), no, no, no, zero, zero, one, one / 2, blank, best
     end = lax.while_loop(proceeds, body, start)
     *_, z, d, _, _, point, (cost, *best) = end

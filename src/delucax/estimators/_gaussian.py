@@ -52,6 +52,7 @@ class Joint(eqx.Module):
 
     def _form(self, A, B):
         """`A P B'`."""
+        # A vector P is the diagonal of the weights of points, and scales columns.
         return (A @ self.P if self.P.ndim == 2 else A * self.P) @ B.T
 
     @property
@@ -60,18 +61,22 @@ class Joint(eqx.Module):
         """The covariance of `z`."""
         if self.known_covariance is not None:
             return self.known_covariance
+        # S = Z P Z' + noise: C Sigma C' + V of a sensor, A P A' + E W E' of a step.
         return symmetric(self._form(self.Z, self.Z) + self.noise)
 
     @property
     @full_precision
     def cross(self):
         """The covariance of `x` with `z`, shape `(n, p)`."""
+        # X P Z', without the noise, which is independent of x.
         return self.P @ self.Z.T if self.X is None else self._form(self.X, self.Z)
 
     def gain(self):
         """The `G` of `E[x | z] = E[x] + G (z - E[z])`."""
         if self.known_gain is not None:
             return self.known_gain
+        # G = cov(x, z) S^-1, solved as S G' = cov(z, x): S is symmetric, and no inverse
+        # is formed.
         S, _ = _regular(self.covariance)
         if S.shape[0] <= SMALL:
             return solve(S, self.cross.T).T
@@ -118,6 +123,7 @@ def square_root(P: Float[Array, "n n"]) -> Float[Array, "n n"]:
     # multiply a NaN cotangent by 0.
     eye = jnp.eye(P.shape[0], dtype=P.dtype)
     L = jnp.linalg.cholesky(jnp.where(posed, regular, eye))
+    # A known entry was given the variance 1 only to be factored: its row of L is 0.
     return jnp.where(posed, jnp.where(varies[:, None], L, 0), jnp.nan)
 
 
@@ -160,6 +166,7 @@ class AbstractGaussianFilter(AbstractEstimator):
         check_finite(mean, "mean", where)
         P = jnp.eye(n, dtype=mean.dtype) if self.covariance is None else self.covariance
         P = _covariance_matrix(P, n, "covariance", "the state", where)
+        # One precision for all, because loops carry the belief and keep its types.
         dtype = jnp.result_type(mean, P, default, W, V)
         return W, V, mean.astype(dtype), P.astype(dtype)
 
@@ -171,6 +178,8 @@ class AbstractGaussianFilter(AbstractEstimator):
         return self._corrected(state, *self._innovation(t, y, state))
 
     def predict(self, t, u, state):
+        # A filter needs the marginal of the next state alone; the smoother its joint
+        # distribution with this one.
         joint = self._prediction(t, u, state)
         return _like(Belief(joint.mean, joint.covariance), state)
 
@@ -199,6 +208,8 @@ class AbstractGaussianFilter(AbstractEstimator):
         return joint, self.observation_difference(y, joint.mean)
 
     def _corrected(self, belief, joint, innovation):
+        # Of normal x and z: the mean moves by G (z - E[z]), and the covariance becomes
+        # P - G S G'.
         G = joint.gain()
         mean = belief.mean + matvec(G, innovation)
         return _like(Belief(mean, joint.remainder(G)), belief)
@@ -210,6 +221,7 @@ class AbstractGaussianFilter(AbstractEstimator):
         posed, p = is_definite(S), len(S)
         L = jnp.linalg.cholesky(jnp.where(posed, S, jnp.eye(p, dtype=S.dtype)))
         # `r' S^-1 r = |L^-1 r|^2` and `log det S = 2 sum log L_ii`, from one factor.
+        # A triangular solve, because the inverse of S would square the condition of L.
         lower = lx.MatrixLinearOperator(L, lx.lower_triangular_tag)
         r = innovation.astype(S.dtype)
         whitened = lx.linear_solve(lower, r, lx.Triangular(), throw=False).value
@@ -231,7 +243,11 @@ class AbstractGaussianFilter(AbstractEstimator):
         joint = self._prediction(t, u, belief)
         # Backwards, `P_k A' Sigma_{k+1}^-1` is the gain of `x_k` on the next state.
         G = joint.gain()
+        # By the difference of the dynamics, so that angles go the shorter way.
         shift = self.dynamics.difference(after.mean, joint.mean)
+        # P + G (P_after - Sigma) G', of which the remainder is P - G Sigma G': a sum of
+        # two semidefinite terms, where the textbook's difference may lose that in
+        # rounding.
         covariance = joint.remainder(G) + G @ after.covariance @ G.T
         return _like(Belief(belief.mean + matvec(G, shift), covariance), belief)
 

@@ -129,6 +129,9 @@ class KalmanFilter(AbstractGaussianFilter):
                 "follows."
             )
         C, noise = self._C, self._noise(dynamics)
+        # The dual of the regulator's equation. Its X is the covariance before the
+        # observation, P_{k|k-1} in the textbooks, and L is the gain of the update on
+        # it, not the predictor's A L.
         solution = filter_dare(dynamics.A, C, noise, self.V, throw=False)
         what = f"{where}: there is no steady state. Of A', C' in the places of A, B"
         solution = raise_on_failure(solution, what, facts=solution._facts)
@@ -161,6 +164,8 @@ class KalmanFilter(AbstractGaussianFilter):
         if self.y_ref is None:
             mean = dynamics.observe(t, belief.mean)
         else:
+            # y_ref + C (x - x_ref): `observe` is linear, so that it is C on a
+            # deviation, too.
             deviation = belief.mean - dynamics.at(t).x_ref
             mean = self.y_ref + dynamics.observe(t, deviation)
         known = dict(known_gain=self.L, known_remainder=self.updated_covariance)
@@ -168,7 +173,9 @@ class KalmanFilter(AbstractGaussianFilter):
 
     def _transition(self, t, u, belief):
         here = self.dynamics.at(t)
+        # Without w, whose mean is zero; its covariance is the noise.
         mean, _ = here.advance(t, belief.mean, u, None)
+        # In the steady state A P A' + E W E' is Sigma again.
         known = None if self.L is None else self.covariance
         P, noise = belief.covariance, self._noise(here)
         return Joint(mean, None, here.A, P, noise, known_covariance=known)
@@ -210,6 +217,7 @@ class _AbstractNonlinearFilter(AbstractGaussianFilter):
 
     def _noise(self, t, u, x):
         """`E W E'`, what the disturbance adds to the covariance of the next state."""
+        # E at w = 0, where the disturbance has its mean.
         w = jnp.zeros(len(self.W), x.dtype)
         return congruence(jacobian(lambda w: self._advanced(t, x, u, w))(w), self.W)
 
@@ -269,10 +277,14 @@ class ExtendedKalmanFilter(_AbstractNonlinearFilter):
 
     def _observation(self, t, belief):
         observe = lambda x: self.dynamics.observe(t, x)
+        # About the prediction, the best estimate before y; an iterated filter would go
+        # on from the update (Jazwinski, 1970).
         C = jacobian(observe)(belief.mean)
         return Joint(observe(belief.mean), None, C, belief.covariance, self.V)
 
     def _transition(self, t, u, belief):
+        # F(x) is about F(mean) + A (x - mean): A for the covariance only, F itself for
+        # the mean.
         A = jacobian(lambda x: self._advanced(t, x, u))(belief.mean)
         mean = self._advanced(t, belief.mean, u)
         noise = self._noise(t, u, belief.mean)
@@ -360,6 +372,7 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
 
     def _sampled(self, function, difference, belief, noise):
         mean, (n,) = belief.mean, belief.mean.shape
+        # n + lambda in the textbooks, with lambda = alpha^2 (n + kappa) - n.
         spread = self.alpha**2 * (n + self.kappa)
         # Any root serves; the triangular one needs no eigenvalues, whose derivative is
         # infinite where two of them meet.
@@ -373,10 +386,14 @@ class UnscentedKalmanFilter(_AbstractNonlinearFilter):
             dz = z - middle
         else:
             dz = jax.vmap(difference, in_axes=(0, None))(z, middle)
+        # 1 / (2 (n + lambda)): then X W X' = P exactly, as each column of the root
+        # counts twice, and the rules of a linear map hold for points, too.
         outer = jnp.full(2 * n, 1 / (2 * spread), mean.dtype)
         # The weights of the mean add up to 1, and the middle deviation is 0: its weight
         # of `1 - n / c`, which is huge where alpha is small, is never used.
         shift = outer @ dz[1:]
+        # lambda / (n + lambda) + 1 - alpha^2 + beta (Wan and van der Merwe, 2000).
         inner = 2 - n / spread - self.alpha**2 + self.beta
         weights = jnp.concatenate([jnp.reshape(inner, 1).astype(mean.dtype), outer])
+        # About the mean, from which the middle point is `-shift` away: it counts here.
         return Joint(middle + shift, dx.T, (dz - shift).T, weights, noise)

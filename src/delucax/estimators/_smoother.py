@@ -188,6 +188,7 @@ def _record(estimator, observations, controls, t0, where):
         u = as_rows(controls, m, "controls", where, len(y))
     check_finite(u, "controls", where)
     check_number(t0, "t0", where)
+    # A product, and no running sum, whose rounding would grow along the record.
     times = as_float_array(t0) + jnp.arange(len(y)) * estimator.dynamics.dt
     return y, u, times.astype(y.dtype)
 
@@ -199,6 +200,9 @@ def _filter(estimator, y, u, times) -> Filtered:
     def step(carry, inputs):
         belief, ok = carry
         t, y, u = inputs
+        # First y_k, then u_k, which a controller chooses once it has seen y_k. The
+        # density is that of the innovation, given all y before: by the chain rule these
+        # sum up to the likelihood of the record (Schweppe, 1965).
         expected = estimator._innovation(t, y, belief)
         density = estimator._log_density(belief, *expected)
         updated = estimator._corrected(belief, *expected)
@@ -211,6 +215,7 @@ def _filter(estimator, y, u, times) -> Filtered:
 
     start = first, first.is_finite
     _, (updated, after, densities, ok) = lax.scan(step, start, (times, y, u))
+    # The first belief is a prediction, too, before any data: there is one more.
     joined = lambda a, b: jnp.concatenate([a[None], _masked(ok, b)])
     predicted = jax.tree.map(joined, first, after)
     definite = jnp.all(jnp.isfinite(densities))
@@ -231,6 +236,8 @@ def _smooth(estimator, y, u, times) -> Smoothed:
 
     def back(after, inputs):
         t, u, belief = inputs
+        # The prediction from each belief is made again: to keep it would take the
+        # covariance of the state with the next one at all steps.
         belief = estimator._smoothed(t, u, belief, after)
         return belief, belief
 
@@ -239,6 +246,8 @@ def _smooth(estimator, y, u, times) -> Smoothed:
     inputs = jax.tree.map(lambda a: a[:-1], (times, u, updated))
     _, smoothed = lax.scan(back, last, inputs, reverse=True)
     whole = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), smoothed, last)
+    # A smoothed state is of all that the filter made of later steps: where it failed at
+    # one, none is known.
     filter_ok = filtered.result == RESULTS.successful
     result = choose(whole.is_finite | ~filter_ok, filtered.result, RESULTS.diverged)
     whole = jax.tree.map(lambda a: jnp.where(filter_ok, a, jnp.nan), whole)

@@ -111,6 +111,7 @@ def _search(
         costs = jax.vmap(cost_of)(samples)
         # The first sequence is the mean itself: its cost comes with the others.
         best = better(best, samples[0], costs[0])
+        # A mean of clipped controls is within the bounds, because a box is convex.
         after, width = planner.update(samples, costs, mean, width)
         moved = jnp.max(jnp.abs(after - mean))
         return (after, width, best, moved), best[1]

@@ -286,6 +286,8 @@ def _simulate(
         controls = before(args.controls)
     else:
         controls = jax.vmap(args.control)(times[:-1], states[:-1])
+    # At fixed steps Diffrax estimates no error, and does not report a state that is not
+    # finite.
     finite = jnp.all(jnp.isfinite(final_state))
     result = solve_result(solution, options["stepsize_controller"], dtype)
     result = first_failure(result, choose(finite, RESULTS.successful, RESULTS.diverged))

@@ -59,6 +59,8 @@ class Pendulum(AbstractSystem):
 
         **Returns:** d2(angle)/dt2 [rad/s^2].
         """
+        # m l^2 / 3 is the inertia of a rod about its end. Gravity, m g l/2 sin(angle),
+        # drives away from upright: its sign is plus.
         weight = 3 * self.gravity / (2 * self.length) * sin(angle)
         drive = 3 / (self.mass * self.length**2) * torque
         return weight + drive - self.damping * velocity
@@ -131,9 +133,12 @@ class CartPole(AbstractSystem):
         total = self.cart_mass + self.pole_mass
         moment = self.pole_mass * self.half_length
         lean, upright = sin(angle), cos(angle)
+        # The pole pulls the cart outwards as it swings: a centrifugal force, along
+        # lean.
         push = (force + moment * (spin * spin) * lean) / total
         # 4/3: of a uniform rod of half-length l about its end, over m l.
         inertia = 4 / 3 - self.pole_mass * (upright * upright) / total
+        # A cart that is pushed forwards leaves the pole behind: hence the minus.
         turn = (self.gravity * lean - upright * push) / (self.half_length * inertia)
         return push - moment * turn * upright / total, turn
 
@@ -290,6 +295,8 @@ class Acrobot(AbstractSystem):
         d1 = d1 + self.inertia_1 + self.inertia_2
         d2 = m2 * (c2**2 + l1 * c2 * straight) + self.inertia_2
         # Gravity about the second joint; gravity and Coriolis forces about the first.
+        # Gym has cos(angle - pi/2), from angles to the horizontal; from hanging down it
+        # is the sine, and pulls back.
         phi2 = m2 * c2 * g * sin(angle_1 + angle_2)
         swing = velocity_2 * velocity_2 + 2 * velocity_1 * velocity_2
         phi1 = (m1 * c1 + m2 * l1) * g * sin(angle_1) + phi2

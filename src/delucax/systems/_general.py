@@ -106,6 +106,8 @@ class LinearSystem(AbstractSystem):
         return () if self.E is None else indexed_names("w", self.E.shape[1])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        # Deviations first: about a large operating point `A x - A x_ref` would cancel.
+        # dx_ref is not zero where the point is no equilibrium.
         dx = self.dx_ref + matvec(self.A, x - self.x_ref)
         dx = dx + matvec(self.B, u - self.u_ref)
         if self.E is not None and w is not None:

@@ -148,6 +148,8 @@ class TwoTank(AbstractSystem):
     control_names, control_units = ("flow",), ("cm^3/s",)
 
     def _outflow(self, outlet: Scalar, level: Scalar) -> Scalar:
+        # Torricelli's sqrt(level) far above `smoothing`, and linear near zero; a level
+        # below zero, as a stage of a solver may have, flows back.
         root = level * (level * level + self.smoothing**2) ** -0.25
         return outlet * (2 * self.gravity) ** 0.5 * root
 
@@ -230,12 +232,16 @@ class PermanentMagnetMotor(AbstractSystem):
         **Returns:** the torque [N m], a scalar.
         """
         saliency = self.d_inductance - self.q_inductance
+        # 3/2, as d and q are of the transformation that keeps amplitudes (Clarke's):
+        # the power is 3/2 (v_d i_d + v_q i_q).
         return 1.5 * self.pole_pairs * (self.flux * x[1] + saliency * x[0] * x[1])
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         electrical = self.pole_pairs * x[2]  # the speed at which d and q turn
         d_flux = self.d_inductance * x[0] + self.flux
         q_flux = self.q_inductance * x[1]
+        # The axes turn with the rotor, so that each sees the flux along the other as a
+        # voltage, with opposite signs.
         d_voltage = u[0] - self.resistance * x[0] + electrical * q_flux
         q_voltage = u[1] - self.resistance * x[1] - electrical * d_flux
         torque = self.torque(x) - self.friction * x[2]

@@ -124,6 +124,7 @@ class MassSpringDamper(AbstractSystem):
         tension.append(u[0])  # the force acts where a further spring would
         # Loops compute the reciprocals once.
         lightness = 1 / m
+        # T_i pulls mass i back, and the mass before it along.
         pulls = [(tension[i + 1] - tension[i]) * lightness[i] for i in range(n)]
         return jnp.stack([*(x[n + i] for i in range(n)), *pulls])
 
@@ -164,6 +165,8 @@ class VanDerPol(AbstractSystem):
     state_names, control_names, time_unit = ("x", "v"), ("u",), ""
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
+        # With mu > 0 positive inside |x| = 1, where it feeds energy in: the origin is
+        # unstable, and beyond it takes energy out.
         damping = self.mu * (1 - x[0] * x[0])
         return jnp.stack([x[1], damping * x[1] - x[0] + u[0]])
 

@@ -67,6 +67,7 @@ class PlanarQuadrotor(AbstractSystem):
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         thrust, lean = (u[0] + u[1]) / self.mass, x[2]
+        # Angles are counter-clockwise: a positive one leans to the left, towards -x.
         ax, ay = -thrust * sin(lean), thrust * cos(lean) - self.gravity
         wind = None if self.wind is None else self.wind(t, x)
         if wind is not None and jnp.shape(wind) != (2,):
@@ -77,6 +78,7 @@ class PlanarQuadrotor(AbstractSystem):
         for force in (wind, w):
             if force is not None:
                 ax, ay = ax + force[0] / self.mass, ay + force[1] / self.mass
+        # (right - left) l / I with I = m l^2, all mass at the rotors, as in Deluca.
         turn = (u[1] - u[0]) / (self.mass * self.length)
         return jnp.stack([x[3], x[4], x[5], ax, ay, turn])
 
@@ -198,6 +200,8 @@ class Quadrotor(AbstractSystem):
             return u
         front, left, back, right = u[0], u[1], u[2], u[3]
         thrust = front + left + back + right
+        # r x F with x forward, y left and z up: the rotor at (0, l, 0) rolls by +l, and
+        # that at (l, 0, 0) pitches by -l, nose up being negative.
         roll, pitch = self.arm * (left - right), self.arm * (back - front)
         # Left and right turn one way, front and back the other.
         yaw = self.moment * (left + right - front - back)
@@ -217,6 +221,8 @@ class Quadrotor(AbstractSystem):
             ax, ay, az = ax + push * w[0], ay + push * w[1], az + push * w[2]
         jx, jy, jz = self.inertia_x, self.inertia_y, self.inertia_z
         # q (0, omega) / 2, and Euler's equations.
+        # Rates in the body multiply q from the right; those in the world would do so
+        # from the left. In Euler's equations (J omega) x omega couples the axes.
         turning = [
             -0.5 * (qx * a + qy * b + qz * c),
             0.5 * (qw * a + qy * c - qz * b),
@@ -253,6 +259,8 @@ class Quadrotor(AbstractSystem):
 
         **Returns:** the deviation, a vector.
         """
+        # The cosine of half the angle between the two: below zero, -q is the closer
+        # one.
         along = sum(x[i] * x_ref[i] for i in range(3, 7))
         sign = jnp.where(along < 0, -1.0, 1.0).astype(x.dtype)
         q = [sign * x[i] - x_ref[i] for i in range(3, 7)]
@@ -268,6 +276,8 @@ class Quadrotor(AbstractSystem):
         **Returns:** its entries row by row, shape `(9,)`.
         """
         w, a, b, c = x[3], x[4], x[5], x[6]
+        # Hamilton's convention, i j = k, with the real part first; that of JPL gives
+        # the transpose.
         entries = [
             *(1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b)),
             *(2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a)),
@@ -409,6 +419,7 @@ class VortexWind(_AbstractWind):
         across, along = jnp.zeros((), x.dtype), jnp.zeros((), x.dtype)
         for i in range(centres.shape[0]):
             dx, dy = x[0] - centres[i, 0], x[1] - centres[i, 1]
+            # 2 core r / (r^2 + core^2) is 1 at r = core, where it is largest.
             size = 2 * self.core / (dx * dx + dy * dy + self.core**2)
             across, along = across - size * dy, along + size * dx
         return jnp.stack([self.strength * across, self.strength * along])

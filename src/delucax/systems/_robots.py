@@ -50,6 +50,8 @@ class KinematicBicycle(AbstractSystem):
 
     def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         share = self.rear / (self.front + self.rear)
+        # Wheels that roll turn about the point where the axles' lines meet; the slip is
+        # the angle of the velocity at the centre of mass to the heading.
         tangent = share * sin(u[1]) / cos(u[1])
         # Cosine and sine of the slip angle, from its tangent: no arctangent is needed.
         along = (1 + tangent * tangent) ** -0.5
@@ -126,6 +128,7 @@ class DynamicBicycle(AbstractSystem):
         heading, vx, vy, rate = x[2], x[3], x[4], x[5]
         # Never zero, so that neither the slip angles nor their gradients are NaN.
         speed = (vx * vx + self.standstill**2) ** 0.5
+        # The angle from where a tyre points to where it moves; the force is against it.
         slip_front = jnp.arctan2(vy + self.front * rate, speed) - u[1]
         slip_rear = jnp.arctan2(vy - self.rear * rate, speed)
         force_front = -self.front_stiffness * slip_front

@@ -273,6 +273,7 @@ class AbstractActorCriticLoss(AbstractSurrogate):
         _, advantages = lax.scan(backward, zero, (errors, continues), reverse=True)
         record = run.times[:-1], run.observations, run.controls, costs
         record = *record, valid, continues, following
+        # A + V is the return of TD(lambda), the regression target of V.
         return Episodes(*record, advantages, run.total_cost, advantages + values)
 
 

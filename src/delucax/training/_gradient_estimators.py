@@ -152,6 +152,8 @@ class EvolutionStrategies(eqx.Module):
         ones, every = jnp.ones(n), jnp.arange(n)
         signs = jnp.concatenate([jnp.zeros(1), ones, -ones][: 1 + sides])
         directions = jnp.concatenate([jnp.zeros(1, int), *[every] * sides])
+        # One-sided, all share one key: the noise of the loss is common, and cancels in
+        # the difference from the unperturbed one.
         keys = None
         if self.antithetic:
             # Both of a pair share a key, so that the noise of the loss cancels.
@@ -249,6 +251,8 @@ class LikelihoodRatio(eqx.Module):
                     f"the metrics {sorted(metrics)}; delucax.training.scored_cost "
                     "makes such a loss of an environment."
                 )
+            # Only the score carries a gradient: that of the cost by the draw would
+            # count its dependence on the weights twice.
             excess = costs = lax.stop_gradient(costs)
             if self.baseline:
                 # The mean of the others differs from that of all by this factor.

@@ -172,6 +172,8 @@ class PPO(AbstractActorCriticLoss):
         log_prob, entropy = _scores(model.policy, rows)
         weights = rows.valid / jnp.maximum(jnp.sum(rows.valid), 1)
         mean = lambda values: jnp.sum(jnp.where(rows.valid, values, 0) * weights)
+        # log r, and 0 for padding: its exponential could overflow, and a weight of zero
+        # would leave NaN in the gradient.
         change = jnp.where(rows.valid, log_prob - rows.log_prob, 0)
         ratio, advantages = jnp.exp(change), rows.advantages
         clipped = jnp.clip(ratio, 1 - self.clip, 1 + self.clip)
@@ -224,6 +226,7 @@ def _scores(policy: Any, rows: Episodes) -> tuple[Array, Array]:
 
     def score(t, y, state, u):
         log_prob, entropy = policy.log_prob(t, y, state, u), policy.entropy(t, y, state)
+        # E[-log p(u)] is the entropy: where there is no formula its draw stands for it.
         return log_prob, -log_prob if entropy is None else entropy
 
     def act(t, y, state, u):

@@ -132,11 +132,13 @@ class SHAC(AbstractActorCriticLoss):
         steps = jnp.arange(self.horizon)
         within = steps % self.window
         ends = (within == self.window - 1) | (steps == self.horizon - 1)
+        # What follows a window counts once, at its last step or at that of the episode.
         bonus = jnp.where(ends | ~runs.continues, runs.following, 0)
         costs = jnp.where(runs.valid, runs.costs + self.discount * bonus, 0)
         # The targets are data to the critic: it is not trained by moving them.
         error = self._value_errors(model, lax.stop_gradient(runs))
-        # Over each episode first.
+        # Over each episode first. Discounted from the beginning of the window, not of
+        # the episode: late windows count as much as early ones.
         actor = jnp.sum(self.discount**within * costs, axis=1)
         critic = jnp.sum(jnp.where(runs.valid, error**2, 0), axis=1)
         count = jnp.sum(runs.valid)
@@ -152,6 +154,7 @@ class SHAC(AbstractActorCriticLoss):
 
 def _with_target(model: ActorCritic, memory: _Memory) -> ActorCritic:
     """The model with the target network for a critic, held fixed."""
+    # The gradient of the actor goes through V by its observation, not into its weights.
     target = eqx.combine(lax.stop_gradient(memory.critic), model.critic)
     model = eqx.tree_at(lambda m: m.critic, model, target)
     return memory.statistics.applied_to(model)

@@ -204,6 +204,8 @@ class Steps(NamedTuple):
     ) -> tuple[State, dict[str, Array]]:
         """One step of one seed."""
         values, memory, order = before.values, before.memory, before.order
+        # From the number of the step, not from the step before: the draws are the same
+        # however the steps are cut into blocks, and after a checkpoint.
         own_key = jr.fold_in(key, k)
         arguments = () if self.data is None else (self.data,)
         if self.batch_size is not None and order is not None:
@@ -243,11 +245,13 @@ class Steps(NamedTuple):
         after = jax.tree.map(cast, after, before.optimiser)
         moved = optax.apply_updates(values, updates)
         norm = _norm(slope)
+        # In the order in which one leads to the next, so that the first is the cause.
         faulty = ~jnp.stack([*map(_is_finite, (cost, norm, moved))])
         fault = jnp.where(jnp.any(faulty), 1 + jnp.argmax(faulty), 0).astype(jnp.int32)
         # A seed that failed is frozen while the others go on.
         if self.seeds is not None:
             fault = jnp.where(before.fault == 0, fault, before.fault)
+        # The step at fault is not made: what stays is the last good state.
         kept = lambda new, old: jnp.where(fault == 0, new, old)
         stepped: Any = jax.tree.map(kept, (moved, after, memory), before[:3])
         row = {"loss": strip_weak_type(cost), "gradient_norm": norm, **metrics}
@@ -292,6 +296,8 @@ def _drawn_rows(
     this_pass = k // batches
 
     def redrawn():
+        # From the number of the pass, not from the order before: the same after a
+        # checkpoint.
         own_key = jr.fold_in(key, this_pass)
         return jr.permutation(own_key, rows.size).astype(rows.dtype)
 

@@ -176,6 +176,7 @@ class Adaptive(AbstractController):
         assert state.key is not None and state.chosen is not None
         key, toss, draw = jr.split(state.key, 3)
         stays = jr.uniform(toss) < kept
+        # An empty slot has the weight 0, whose logarithm, -inf, is never drawn.
         other = jr.categorical(draw, jnp.log(weights)).astype(state.chosen.dtype)
         return state._replace(chosen=jnp.where(stays, state.chosen, other), key=key)
 
@@ -183,8 +184,11 @@ class Adaptive(AbstractController):
         """After births and deaths."""
         step, ends = state.step, state.ends
         is_birth, births = step % self.every == 0, jnp.maximum(step // self.every, 1)
+        # An empty slot ended before any that lives, so it comes first.
         slot = jnp.argmin(ends)
         # `births & -births` is the largest power of two that divides it.
+        # The lifetimes of Hazan and Seshadhri, 2009: of so many births only about their
+        # logarithm live at a time, some of them young and some old.
         life = self.every * (4 * (births & -births) + 1)
         newborn = is_birth & (jnp.arange(self.slots) == slot)
         ends = jnp.where(newborn, step + life, ends)

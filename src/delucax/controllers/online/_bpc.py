@@ -154,6 +154,7 @@ class BPC(AbstractController):
     def __call__(self, t, y, state):
         key, now = jr.split(state.key)
         direction = jr.normal(now, state.theta.shape, self.loop.dtype)
+        # A normal vector over its length is uniform on the sphere (Muller, 1959).
         direction = direction / safe_norm(direction, axis=None)
         theta = state.theta + self.delta * direction
         policy = lambda features: self.policy(theta, features)

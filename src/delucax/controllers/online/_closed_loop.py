@@ -146,6 +146,7 @@ class ClosedLoop(eqx.Module):
         self.response = self.first_response = None
         if tangents is not None:
             first = jax.tree.map(lambda a: a if a.ndim == 2 else a[0], tangents)
+            # Markov parameters: row j is the response to an impulse j + 1 steps ago.
             step = lambda z, _: (first.transition @ z, first.output @ z)
             response = lax.scan(step, first.input, length=self.horizon)[1]
             self.response = response if is_constant else None

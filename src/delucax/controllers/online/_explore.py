@@ -166,7 +166,9 @@ class Explore(AbstractController):
         # A direction that was not excited is left as it is.
         least = jnp.finfo(gram.dtype).eps * jnp.trace(gram)
         gram = gram + least * jnp.eye(len(gram), dtype=gram.dtype)
+        # F = N_after N' (N N')^-1, the least squares of F N = N_after.
         closed_loop = solve(gram, before @ after.T).T
+        # What was identified is A - B K, the plant under the gain: B K is added back.
         model = LinearDynamics(closed_loop + N[0] @ self.K, N[0], dt=self.dt)
         arrays, inner = self._designed(model)
         return state._replace(model=model, arrays=arrays, inner=inner)

@@ -275,6 +275,7 @@ def sfc(
     def padded(rows, first):
         return np.pad(rows, ((0, 0), (first, length - first - rows.shape[1])))
 
+    # s_t by itself, and the filters on what is before it: phi_i(k) is for s_{t-k}.
     rows = [np.eye(1, length), padded(bank, 1)]
     if double:
         # f_i * f_j is f_j * f_i: a matrix for each pair.
@@ -345,6 +346,8 @@ def neural_gpc(
     sizes = loop.feature_size, dynamics.control_size, width, depth
     network = mlp(*sizes, dtype=loop.dtype, key=key)
     last = lambda net: [net.layers[-1].weight, net.layers[-1].bias]
+    # The last layer alone is zero: the layers before give it features, and so a
+    # gradient.
     network = eqx.tree_at(last, network, [0 * leaf for leaf in last(network)])
     optimiser = adagrad_norm() if optimiser is None else optimiser
     return OnlineLearner(loop, cost, NetworkPolicy(network), learning_rate, optimiser)
@@ -365,4 +368,6 @@ def spectral_filters(memory: int, count: int, margin: float) -> np.ndarray:
     values, vectors = values[::-1][:count], vectors[:, ::-1][:, :count]
     # The sign of an eigenvector is arbitrary: LAPACK's choice depends on its version.
     sign = np.where(vectors.sum(axis=0) < 0, -1.0, 1.0)
+    # sigma^(1/4) lets a filter count by what it explains, as in the bound on the
+    # regret; the least eigenvalues may round to below zero.
     return (np.maximum(values, 0.0) ** 0.25 * sign * vectors).T

@@ -113,6 +113,8 @@ def best_in_hindsight(
             )
         observe = jax.vmap(environment.dynamics.observe)
         exact = observe(trajectory.times[:-1], states[:-1])
+        # The sensor noise that there was, not a new draw: all are compared under the
+        # same.
         noise = FromArray(trajectory.observations - exact)
         environment = eqx.tree_at(lambda e: e.sensor_noise, environment, noise)
     given = states[0], w, trajectory.steps, iterations, tolerance
@@ -205,6 +207,8 @@ def _search(environment, controller, x0, w, horizon, iterations, tolerance):
         predicted = -(gradient @ change + change @ hessian @ change / 2)
         # Cost and derivatives in one pass: a trial that succeeds needs them next.
         tried = derivatives(best + change)
+        # NaN is not below: a trial that diverges is refused, and the next one damped
+        # more.
         pick = lambda new, old: jnp.where(tried[0] < cost, new, old)  # noqa: E731
         left = predicted / (jnp.abs(cost) + jnp.finfo(start.dtype).tiny)
         # A predicted decrease below zero is rounding.

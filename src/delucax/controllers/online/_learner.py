@@ -147,6 +147,8 @@ class OnlineLearner(AbstractLearner):
         gradient = jax.grad(self._loss)(state.theta, state)
         curvature = lambda: self._curvature(state)
         after = projected_step(self, gradient, state, curvature=curvature)
+        # By the new theta: the loss of this step needs y_t alone, which is known before
+        # the control is chosen.
         v = self.policy(after.theta, features)
         return (loop.u_base + v).astype(y.dtype), after
 

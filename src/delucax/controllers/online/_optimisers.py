@@ -41,6 +41,8 @@ def _adagrad_norm_update(
     updates: Any, state: Any, params: Any = None
 ) -> tuple[PyTree, Array]:
     del params
+    # One step size for all weights, from a sum that includes this gradient: so no step
+    # is longer than the learning rate, not even the first.
     total = state + optax.tree.norm(updates, squared=True)
     some = total > 0
     scale = jnp.where(some, 1 / jnp.sqrt(jnp.where(some, total, 1)), 0)
@@ -141,6 +143,8 @@ class _OnlineNewtonUpdate(eqx.Module):
             along = column @ root
             gain = 1 + along @ along
             root = root - jnp.outer(root @ along, along) / (gain + jnp.sqrt(gain))
+        # P g = root root' g. `projected_step` multiplies by the learning rate, but
+        # Newton's step has a length of its own: it is divided out.
         step = root @ (gradient @ root) / learning_rate
         # A trust region of radius 1 (times the learning rate): early curvature is a
         # guess.
@@ -201,6 +205,8 @@ def positive_root(H: Float[Array, "z z"]) -> Float[Array, "z z"]:
     # Pivots below are rounding, and their square roots would be noise.
     slack = len(H) * jnp.finfo(H.dtype).eps * jnp.max(jnp.abs(jnp.diag(H)), initial=0)
 
+    # Cholesky's factorisation column by column, in Python: the sizes are those of y and
+    # u, and a pivot that is not positive is left out instead of making NaN.
     columns = []
     for j in range(len(H)):
         pivot = H[j, j]

@@ -81,6 +81,7 @@ class LinearPolicy(AbstractPolicy):
 
     def pull_back(self, theta, response, features):
         h, o, m = response.shape
+        # The derivative of `a' theta f` by theta is the outer product a f'.
         if h * o * m * features.shape[1] > _FUSED:
             rows = jnp.einsum("hom,hf->omf", response, features)
         else:

@@ -145,6 +145,7 @@ def arx(
     check_step(dt, where)
     reach = quantile(level, where)
     p, m, steps = outputs.shape[2], controls.shape[2], controls.shape[1]
+    # The first k whose whole past is recorded: y_{k-a}, and u_{k-delay-b+1}.
     first = max(a, b + delay - 1)
     if steps < first:
         raise ValueError(
@@ -202,6 +203,7 @@ def _least_squares(
     one = lambda target: lx.linear_solve(operator, target, solver, throw=False).value
     estimate = jax.vmap(one, in_axes=1)(targets)
     rest = targets - scaled @ estimate.T
+    # Over rows - p degrees of freedom, not rows: p of them the fit has used up.
     noise = jnp.sqrt(jnp.sum(rest**2, axis=0) / max(rows - p, 1))
     # Unknown where its spread is the size of the outputs themselves.
     typical = jnp.sqrt(jnp.mean(targets**2, axis=0))

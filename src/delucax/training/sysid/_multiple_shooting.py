@@ -145,6 +145,7 @@ def solve(
     correlation = jnp.sqrt(jnp.sum(data.counts)) * largest
     # The correlation of rounding errors has no meaning.
     correlation = jnp.where(sigma < 0.5, 0, correlation)
+    # Of the degrees of freedom, which all outputs share, each has `free / size`.
     noise = data.noise * jnp.sqrt(each * size / free)
     values = unravel(theta)
     # No more certain than the noise that was given, or than rounding lets it be.
@@ -190,8 +191,11 @@ def _levenberg_marquardt(
         by_theta, by_start, largest, units = _scaled(best, largest)
         R_x, on_starts, R, on_theta, _ = _projected(by_theta, by_start, damping)
         step = jsl.solve_triangular(R, on_theta)
+        # Back substitution: once the step of theta is known, each window has its own.
         right = on_starts[..., p] - on_starts[..., :p] @ step
         steps = jax.vmap(jsl.solve_triangular)(R_x, right)
+        # r + J z = 0, with J the derivative of the residuals themselves: the step is
+        # -z.
         candidate = best.theta - step / units[0], best.starts - steps / units[1]
         # The decrease of the cost that the linear model predicts. A damped step falls
         # short of it, so it is a minimum only where a step that is hardly damped
@@ -208,6 +212,8 @@ def _levenberg_marquardt(
 
     none = jnp.zeros(p, dtype), jnp.zeros(start.starts.shape, dtype)
     no, first = jnp.array(False), (start.theta, start.starts)
+    # The guess counts as a success, of a cost below infinity: from it the first step
+    # goes with 1e-3.
     damping = jnp.zeros((), dtype) + 8e-3
     carry = first, start, none, damping, no, no, jnp.zeros((), int)
     _, best, *_, count = lax.while_loop(running, body, carry)

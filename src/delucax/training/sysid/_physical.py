@@ -154,6 +154,8 @@ def physical(
         starts, data = cut_into_windows(guesses, observations, controls, window)
         spread = data.noise
         data = data._replace(noise=spread if noise is None else noise)
+        # First in units of the spread of each output; then from there in units of the
+        # residuals that are left, which weighs outputs of unlike noise as they deserve.
         solution = solve(assembly, values, starts, data, max_steps)
         if noise is not None:
             return solution
