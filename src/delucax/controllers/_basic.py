@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from .._check import (
     as_entries,
@@ -16,6 +16,7 @@ from .._check import (
 )
 from .._controller import AbstractController, wrong_observation
 from .._module import parameter, weight
+from .._typing import PRNGKey, RealScalar
 from ..math import matvec
 
 
@@ -42,7 +43,7 @@ class Zero(AbstractController):
     def __check_init__(self):
         check_count(self.control_size, "control_size", "Zero", least=0)
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         return jnp.zeros(self.control_size, y.dtype), state
 
 
@@ -70,7 +71,7 @@ class Constant(AbstractController):
     def __check_init__(self):
         check_vector(self.value, "value", "Constant")
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         return self.value.astype(y.dtype), state
 
 
@@ -105,10 +106,10 @@ class Random(AbstractController):
         check_range(self.std, "std", "Random")
         as_entries(self.mean, len(self.std), "mean", "Random")
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         return check_key(key, "Random.init")
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         state, now = jr.split(state)
         u = self.mean + self.std * jr.normal(now, self.std.shape, y.dtype)
         return u.astype(y.dtype), state
@@ -139,7 +140,7 @@ class Linear(AbstractController):
     def __check_init__(self):
         as_matrix(self.K, "K", "Linear")
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         if y.shape != self.K.shape[1:]:
             raise wrong_observation(self, self.K.shape[1], y)
         return -matvec(self.K, y).astype(y.dtype), state
@@ -175,9 +176,9 @@ class OpenLoop(AbstractController):
         if self.values.shape[0] == 0:
             raise ValueError("OpenLoop: values must have at least one row, got none.")
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         return jnp.zeros((), jnp.int32)
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         u = self.values[jnp.minimum(state, self.values.shape[0] - 1)]
         return u.astype(y.dtype), state + 1

@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 from .._check import check_count, check_instance, check_step
 from .._controller import AbstractController, check_controller
 from .._module import function_field, parameter
+from .._typing import PRNGKey, RealScalar
 from ..math._steps import row_at, step_at
 from ._network import features_of
 
@@ -78,10 +79,10 @@ class Scheduled(AbstractController):
         # Held after the end; row -1, of times before the start, is NaN.
         return eqx.combine(row_at(arrays, jnp.minimum(k, count - 1)), rest)
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         return self._at(0.0).init(key=key)
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         return self._at(t)(t, y, state)
 
 
@@ -140,7 +141,7 @@ class History(AbstractController):
         for name in ("size", "controls", "length"):
             check_count(getattr(self, name), name, "History")
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         return _Past(
             self.base.init(key=key),
             jnp.zeros((self.length, self.size)),
@@ -148,7 +149,7 @@ class History(AbstractController):
             jnp.zeros((), bool),
         )
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         z = features_of(self, y, self.size).astype(state.observations.dtype)
         # The first observation fills the window: zeros would look like motion.
         past = jnp.where(state.started, state.observations, z)
@@ -157,7 +158,7 @@ class History(AbstractController):
         observations = jnp.concatenate([z[None], past[:-1]])
         return u, _Past(base, observations, state.controls, jnp.ones((), bool))
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         u = u.astype(state.controls.dtype)
         return state._replace(
             base=self.base.applied(u, cost, state.base),

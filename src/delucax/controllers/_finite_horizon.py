@@ -4,12 +4,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._check import check_at_most, check_count, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
-from .._typing import Difference
+from .._typing import Difference, RealScalar
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..math._steps import row_at, step_at
@@ -138,7 +138,7 @@ class FiniteHorizonLQR(AbstractController):
     def __check_init__(self):
         check_step(self.dt, "FiniteHorizonLQR")
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         check_state(self, y, self.x_ref.shape[1])
         step = step_at(t, self.dt, len(self.K), type(self).__name__)
         x_ref, u_ref, K, k = row_at((self.x_ref, self.u_ref, self.K, self.k), step)

@@ -2,12 +2,12 @@
 
 from typing import Any
 
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._check import check_count, check_positive, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
-from .._typing import Difference
+from .._typing import Difference, RealScalar
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..math._steps import row_at, step_at
@@ -121,7 +121,7 @@ class HInfinity(AbstractController):
         if self.dt is not None:
             check_step(self.dt, "HInfinity")
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         check_state(self, y, self.x_ref.shape[-1])
         K, x_ref, u_ref = self.K, self.x_ref, self.u_ref
         if self.dt is not None:

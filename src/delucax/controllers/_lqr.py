@@ -5,12 +5,12 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._check import as_matrix, check_count, check_instance, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
-from .._typing import Difference
+from .._typing import Difference, PRNGKey, RealScalar
 from ..dynamics import AbstractDynamics, LinearDynamics, OperatingPoint
 from ..math import matvec
 from ..math._linear_solve import solve
@@ -158,7 +158,7 @@ class LQR(AbstractController):
         given = known.reference, known.control_reference, known.disturbance
         as_signals(known.dynamics, given, "LQR")
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         check_state(self, y, self.x_ref.shape[0])
         x_ref, u_ref = self.x_ref, self.u_ref
         if self.feed_forward is not None:
@@ -280,12 +280,12 @@ class LQI(AbstractController):
         check_step(self.dt, "LQI")
         as_signal("LQI", self.reference, self.Ki.shape[1], "reference")
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         dtype = jnp.result_type(self.K, self.Ki)
         m, p = self.Ki.shape
         return _Memory(jnp.zeros(p, dtype), jnp.zeros(m, dtype))
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         check_state(self, y, self.x_ref.shape[0])
         dx = deviation(y, self.x_ref, self.difference)
         # r - C x with x = x_ref + dx; the part of x_ref cancels where no reference is
@@ -300,7 +300,7 @@ class LQI(AbstractController):
         after = _Memory(integral.astype(dtype), u.astype(dtype))
         return u.astype(y.dtype), after
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         # The least change `dz` of the integral with `Ki dz = asked - applied`, so that
         # the law would have given the applied control: back-calculation in one step.
         excess = state.asked - u.astype(state.asked.dtype)

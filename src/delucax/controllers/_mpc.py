@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, PyTree
 
 from .._check import (
     as_rows,
@@ -22,7 +22,7 @@ from .._check import (
 from .._controller import AbstractController, Tally
 from .._module import function_field
 from .._results import Result, RESULTS
-from .._typing import Control, Difference, Observation, PRNGKey
+from .._typing import Control, Difference, Observation, PRNGKey, RealScalar
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ..math import matvec
@@ -192,7 +192,7 @@ class MPC(AbstractController):
             )
         check_control_bounds(self.bounds, m, where)
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         draws = self.planner.is_stochastic
         if draws:
             check_key(key, "MPC.init")
@@ -204,7 +204,7 @@ class MPC(AbstractController):
             key=key if draws else None,
         )
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         check_state(self, y, self.dynamics.state_size)
         key, draw = state.key, None
         if self.planner.is_stochastic:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._check import (
     as_bounds,
@@ -23,7 +23,7 @@ from .._check import (
 )
 from .._controller import AbstractController, wrong_observation
 from .._module import as_float_array, function_field, mlp, parameter, weight
-from .._typing import PRNGKey, Real
+from .._typing import PRNGKey, Real, RealScalar
 from ..environments import Environment
 from ._stochastic import Gaussian
 
@@ -105,7 +105,7 @@ class MLP(AbstractController):
     def __check_init__(self):
         check_squash(self.bounds, int(self.network.out_size), "MLP")
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         z = features_of(self, y, int(self.network.in_size))
         return squash(self.network(z), self.bounds).astype(y.dtype), state
 
@@ -262,11 +262,11 @@ class GRU(AbstractController):
     def __check_init__(self):
         check_squash(self.bounds, int(self.readout.out_features), "GRU")
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         del key
         return jnp.zeros(self.cell.hidden_size, self.readout.weight.dtype)
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         z = features_of(self, y, int(self.cell.input_size))
         after = self.cell(z.astype(state.dtype), state)
         return squash(self.readout(after), self.bounds).astype(y.dtype), after

@@ -11,7 +11,7 @@ from .._check import check_instance
 from .._controller import AbstractController, check_controller, Tally
 from .._module import parameter
 from .._results import RESULTS
-from .._typing import Difference
+from .._typing import Difference, PRNGKey, RealScalar
 from ..dynamics import LinearDynamics
 from ..estimators import AbstractEstimator, KalmanFilter
 from ._lqr import LQR
@@ -67,7 +67,7 @@ class OutputFeedback(AbstractController):
         check_controller(self.controller, "controller", "OutputFeedback")
         check_instance(self.estimator, AbstractEstimator, "estimator", "OutputFeedback")
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         keys = (None, None) if key is None else jax.random.split(key)
         state = self.estimator.init(key=keys[1])
         # `applied` is not given the time, but the prediction needs it.
@@ -75,14 +75,14 @@ class OutputFeedback(AbstractController):
         memory = self.controller.init(key=keys[0])
         return _State(memory, state, time, Tally("failed_estimate"))
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         after = self.estimator.update(t, y, state.estimator)
         mean = self.estimator.estimate(after).mean.astype(y.dtype)
         u, memory = self.controller(t, mean, state.controller)
         time = jnp.asarray(t, state.time.dtype)
         return u, _State(memory, after, time, self._counted(after, state))
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         memory = self.controller.applied(u, cost, state.controller)
         after = self.estimator.predict(state.time, u, state.estimator)
         return _State(memory, after, state.time, self._counted(after, state))
@@ -214,11 +214,11 @@ class LQG(AbstractController):
     def _feedback(self) -> OutputFeedback:
         return OutputFeedback(self.regulator, self.estimator)
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         return self._feedback.init(key=key)
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         return self._feedback(t, y, state)
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         return self._feedback.applied(u, cost, state)

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from .._check import (
     as_bounds,
@@ -24,7 +24,7 @@ from .._check import (
 from .._controller import AbstractController, wrong_observation
 from .._message import shortened
 from .._module import as_float_array, as_module, parameter, positive, weight
-from .._typing import Bounds, Real, RealScalar
+from .._typing import Bounds, PRNGKey, Real, RealScalar
 from ..math import clip, matvec
 
 
@@ -236,11 +236,11 @@ class PID(_AbstractPID):
         check_range(dt if lag is None else lag, "derivative_time_constant", "PID")
         check_range(dt if windup is None else windup, "anti_windup_time", "PID", dt)
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         zeros = self._zeros()
         return _Memory(zeros, zeros, zeros, jnp.zeros((), bool), zeros)
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         error, measured = self._error(t, y)
         moving = -measured if self.derivative_on == "measurement" else error
         # No derivative on the first call, which has nothing before it.
@@ -259,7 +259,7 @@ class PID(_AbstractPID):
         after = _Memory(integral, slope, moving, jnp.ones((), bool), asked)
         return self._clip(asked, y), _as(after, state)
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         # Back-calculation: with the bounds of the environment included in u, because
         # this is told what was applied.
         correction = self.dt * self._windup_rate() * (u - state.asked)
@@ -334,11 +334,11 @@ class LeakyPID(_AbstractPID):
     output: Callable[[Array], Array] | int | Sequence[int] | None = _output_field()
     bounds: tuple[Array, Array] | None = bounds_field("LeakyPID", default=None)
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         zeros = self._zeros()
         return _Averages(zeros, zeros, zeros)
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         error, _ = self._error(t, y)
         # The low-pass filter dI/dt = (e - I) / T by backward Euler.
         share = self.dt / (self.dt + self.time_constant)

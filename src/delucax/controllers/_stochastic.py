@@ -42,11 +42,11 @@ class _AroundBase(AbstractStochasticPolicy):
 
     base: eqx.AbstractVar[AbstractController]
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         key, base_key = jr.split(check_key(key, f"{type(self).__name__}.init"))
         return _State(self.base.init(key=base_key), key)
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         return state._replace(base=self.base.applied(u, cost, state.base))
 
     @property
@@ -119,7 +119,7 @@ class Gaussian(_AroundBase):
             )
         return mean, base
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         mean, base = self._mean(t, y, state)
         key, now = jr.split(state.key)
         u = mean + jnp.exp(self.log_std) * jr.normal(now, mean.shape, mean.dtype)
@@ -265,7 +265,7 @@ class Categorical(_AroundBase):
             )
         return jax.nn.log_softmax(logits), base
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         logits, base = self._logits(t, y, state)
         key, now = jr.split(state.key)
         u = self.actions[jr.categorical(now, logits)]
@@ -304,12 +304,12 @@ class _Greedy(AbstractController):
     def __check_init__(self):
         check_instance(self.policy, Categorical, "policy", "greedy")
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         return self.policy.base.init(key=key)
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         logits, state = self.policy.base(t, y, state)
         return self.policy.actions[jnp.argmax(logits)].astype(y.dtype), state
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         return self.policy.base.applied(u, cost, state)

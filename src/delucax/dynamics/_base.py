@@ -16,7 +16,7 @@ from .._check import as_rows, as_vector, check_instance, check_step
 from .._jax import by_components, join_state, split_state, stack_steps
 from .._module import as_float_array, check_parameters
 from .._results import choose, first_failure, first_of, or_none, Result, RESULTS
-from .._typing import RealScalar
+from .._typing import Control, Observation, RealScalar, State, Time
 from ..systems import AbstractPlant, AbstractSystem
 
 
@@ -199,7 +199,7 @@ class _Forwarding(AbstractDynamics):
     time_unit = _forwarded("time_unit")
 
     @property
-    def observes_state(self):
+    def observes_state(self) -> bool:
         """Whether `observe` returns the state itself."""
         # A sensor of the wrapper's own is traced; else the wrapped plant is asked,
         # which may know without tracing.
@@ -208,13 +208,13 @@ class _Forwarding(AbstractDynamics):
             return super().observes_state
         return self._inside.observes_state
 
-    def observe(self, t, x):
+    def observe(self, t: Time, x: State) -> Observation:
         return self._inside.observe(t, x)
 
-    def difference(self, x, x_ref):
+    def difference(self, x: State, x_ref: State) -> State:
         return self._inside.difference(x, x_ref)
 
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         return self._inside.equilibrium()
 
 

@@ -25,8 +25,8 @@ from .._integration import (
 )
 from .._jax import by_components, join_state, split_state
 from .._module import parameter
-from .._results import choose, first_of, or_none, promote, RESULTS
-from .._typing import Real
+from .._results import choose, first_of, or_none, promote, Result, RESULTS
+from .._typing import Real, RealScalar
 from ..systems import AbstractSystem
 from ._base import AbstractDiscretization
 
@@ -160,18 +160,20 @@ class Discretized(AbstractDiscretization):
             )
 
     @property
-    def disturbance_size(self):
+    def disturbance_size(self) -> int:
         """The size of `w`: that of the system; with a diffusion times the substeps, as
         `w` holds one increment of each Brownian motion per substep.
         """
         return self.system.disturbance_size * (self.increments or 1)
 
     @property
-    def increments(self):
+    def increments(self) -> int:
         """One increment per substep for a system with a diffusion, else 0."""
         return self.substeps if self.noise == "brownian" else 0
 
-    def advance(self, t, x, u, w):
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
         system, noise = self.system, self.noise
         # A system uses w in one of three ways: in its field, held; as increments of
         # Brownian motions; or, where it names no disturbances, added to the next state.

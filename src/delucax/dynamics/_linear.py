@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from .._check import as_matrix, check_matrices, check_real, checked_names, is_concrete
 from .._module import as_float_array, parameter
-from .._results import RESULTS
-from .._typing import Real
+from .._results import Result, RESULTS
+from .._typing import Control, Observation, Real, RealScalar, State, Time
 from ..math import matvec
 from ..math._steps import row_at, step_at
 from ._base import AbstractDynamics
@@ -134,7 +134,9 @@ class LinearDynamics(AbstractDynamics):
         here = row_at(pick(self), k)
         return eqx.tree_at(pick, self, here, is_leaf=lambda leaf: leaf is None)
 
-    def advance(self, t, x, u, w):
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
         # Deviations are taken before they are multiplied: about a large operating point
         # that keeps their precision.
         here = self.at(t)
@@ -144,10 +146,10 @@ class LinearDynamics(AbstractDynamics):
             x_next = x_next + (w if here.E is None else matvec(here.E, w))
         return x_next.astype(x.dtype), RESULTS.successful
 
-    def observe(self, t, x):
+    def observe(self, t: Time, x: State) -> Observation:
         return x if self.C is None else matvec(self.C, x)
 
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         here = self.at(0.0)
         return here.x_ref, here.u_ref
 

@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 
 from .._check import as_matrix, as_vector, check_count, check_instance, check_positive
 from .._module import parameter
-from .._typing import Real
+from .._results import Result
+from .._typing import Control, Observation, Real, RealScalar, State, Time
 from ..math import matvec
 from ..math._norms import within_ball
 from ._base import AbstractDynamics, AbstractWrapper
@@ -56,7 +57,7 @@ class Delayed(AbstractWrapper):
         check_count(self.sensor, "sensor", "Delayed", least=0)
 
     @property
-    def state_names(self):
+    def state_names(self) -> tuple[str, ...]:
         inner, ages = self.dynamics, range(self.controls)
         late = [f"{name}[-{k + 1}]" for k in ages for name in inner.control_names]
         outputs = range(inner.observation_size if self.sensor else 0)
@@ -99,7 +100,9 @@ class Delayed(AbstractWrapper):
         late = [jnp.tile(u, self.controls), jnp.tile(y, self.sensor)]
         return jnp.concatenate([x, *late]).astype(x.dtype)
 
-    def advance(self, t, x, u, w):
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
         own, controls, observed = self._cut(x)
         acting, late = u, []
         # The newest comes first, and the oldest acts, or is read. Slices of no entries
@@ -116,25 +119,25 @@ class Delayed(AbstractWrapper):
         return jnp.concatenate([after, *late]), result
 
     @property
-    def observes_state(self):
+    def observes_state(self) -> bool:
         """True if there is no delay and the plant observes its state."""
         delayed = self.controls or self.sensor
         return not delayed and self.dynamics.observes_state
 
-    def observe(self, t, x):
+    def observe(self, t: Time, x: State) -> Observation:
         own, _, observed = self._cut(x)
         if not self.sensor:
             return self.dynamics.observe(t, own)
         # The oldest observation is the last block.
         return observed[-(observed.shape[0] // self.sensor) :]
 
-    def difference(self, x, x_ref):
+    def difference(self, x: State, x_ref: State) -> State:
         # Angles wrap in the plant's own state alone.
         n = self.dynamics.state_size
         own = self.dynamics.difference(x[:n], x_ref[:n])
         return jnp.concatenate([own, x[n:] - x_ref[n:]])
 
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         x, u = self.dynamics.equilibrium()
         return self.filled(x, u), u
 
@@ -209,7 +212,9 @@ class WorstCase(AbstractWrapper):
             return added
         return within_ball(added, self.bound)
 
-    def advance(self, t, x, u, w):
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
         added = self.attack(x)
         # Added to the environment's own disturbance, which the adversary does not
         # replace.

@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from .._check import (
     as_vector,
@@ -16,7 +16,7 @@ from .._check import (
     symmetric_matrix,
 )
 from .._controller import wrong_observation
-from .._typing import Control, Difference, Observation, RealScalar, Scalar
+from .._typing import Control, Difference, Observation, PRNGKey, RealScalar, Scalar
 from ..dynamics import AbstractDynamics
 from ..math import matvec
 from ..math._linear_solve import (
@@ -170,14 +170,14 @@ class AbstractGaussianFilter(AbstractEstimator):
         dtype = jnp.result_type(mean, P, default, W, V)
         return W, V, mean.astype(dtype), P.astype(dtype)
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         del key
         return Belief(self.mean, self.covariance)
 
-    def update(self, t, y, state):
+    def update(self, t: RealScalar, y: Observation, state: PyTree):
         return self._corrected(state, *self._innovation(t, y, state))
 
-    def predict(self, t, u, state):
+    def predict(self, t: RealScalar, u: Control, state: PyTree):
         # A filter needs the marginal of the next state alone; the smoother its joint
         # distribution with this one.
         joint = self._prediction(t, u, state)

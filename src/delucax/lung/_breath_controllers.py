@@ -11,7 +11,7 @@ from jaxtyping import Array, PyTree
 from .._check import check_choice, check_count, check_key, check_step
 from .._controller import AbstractController, check_controller
 from .._module import mlp, parameter, positive, weight
-from .._typing import PRNGKey, Real
+from .._typing import PRNGKey, Real, RealScalar
 from ..math import clip
 from ._waveform import BreathWaveform, check_waveform
 
@@ -72,14 +72,14 @@ class Breathing(AbstractController):
         if self.valve is not None:
             check_controller(self.valve, "valve", "Breathing")
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         valve, valve_key = None, None
         if self.valve is not None:
             key, valve_key = (None, None) if key is None else jr.split(key)
             valve = self.valve.init(key=valve_key)
         return _Phases(self.inspiratory.init(key=key), valve, jnp.zeros((), bool))
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         inhale = self.waveform.is_inspiration(t)
         begins = inhale & ~state.inhaling
         inner = _where(begins, self.inspiratory.init(key=None), state.inner)
@@ -94,7 +94,7 @@ class Breathing(AbstractController):
         u = jnp.stack([u_in, u_out]).astype(y.dtype)
         return u, _Phases(_where(inhale, after, inner), valve, inhale)
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         inner = self.inspiratory.applied(u[:1], cost, state.inner)
         state = state._replace(inner=_where(state.inhaling, inner, state.inner))
         if self.valve is None:
@@ -140,7 +140,7 @@ class BangBang(AbstractController):
     def __check_init__(self):
         check_waveform(self.waveform, "BangBang")
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         return jnp.where(y > self.waveform(t), 0, self.high).astype(y.dtype), state
 
 
@@ -233,11 +233,11 @@ class BreathPolicy(AbstractController):
         check_waveform(self.waveform, "BreathPolicy")
         check_step(self.dt, "BreathPolicy")
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         dtype = jnp.result_type(self.dt)
         return jnp.zeros(self.errors, dtype), jnp.zeros(self.controls, dtype)
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         errors, controls = state
         now = self.waveform.pressure(t)
         # Scaled, so that what enters the network is about 1: errors by 10 cmH2O,
@@ -257,7 +257,7 @@ class BreathPolicy(AbstractController):
         u = 100 * jax.nn.sigmoid(self.network(z) + self.shift)
         return jnp.reshape(u, (1,)).astype(y.dtype), (errors, controls)
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         if not self.controls:
             return state
         errors, controls = state

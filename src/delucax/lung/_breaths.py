@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from .._check import (
     check_count,
@@ -19,7 +19,7 @@ from .._check import (
 )
 from .._controller import AbstractController
 from .._module import check_parameters, parameter, positive
-from .._typing import PRNGKey
+from .._typing import PRNGKey, RealScalar
 from ..controllers import LeakyPID
 from ..environments import Environment
 from ..math import clip
@@ -238,7 +238,7 @@ class Explorer(AbstractController):
     def _pid(self, gains: Array) -> LeakyPID:
         return LeakyPID(gains[0], gains[1], dt=self.dt, reference=self.waveform)
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         keys = jr.split(jr.key(0) if key is None else key, 4)
         gains = self.scale * jr.choice(keys[0], jnp.array(GAINS), (2,))
         low = jnp.array([-30.0, 0.1, 0.0, 0.0, 0.05])
@@ -247,7 +247,7 @@ class Explorer(AbstractController):
         is_ramp = jr.bernoulli(keys[2], 0.15)
         return gains, bump, is_ramp, self._pid(gains).init()
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         gains, bump, is_ramp, memory = state
         waveform, pid = self.waveform, self._pid(gains)
         u, memory = pid(t, y, memory)

@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from .._check import check_bool, check_count, check_instance, check_key
 from .._module import mlp, parameter, positive, weight
-from .._results import RESULTS
-from .._typing import PRNGKey, RealScalar, Scalar, State
+from .._results import Result, RESULTS
+from .._typing import Observation, PRNGKey, RealScalar, Scalar, State, Time
 from ..dynamics import AbstractDynamics
 from ._breaths import Breaths
 
@@ -136,7 +136,7 @@ class LearnedLung(AbstractDynamics):
         return self.hidden.shape[-1] // 2
 
     @property
-    def state_names(self):
+    def state_names(self) -> tuple[str, ...]:
         n = self.window
         controls = [f"u_in[-{i + 1}]" for i in range(n)]
         pressures = ["pressure", *(f"pressure[-{i}]" for i in range(1, n))]
@@ -171,7 +171,7 @@ class LearnedLung(AbstractDynamics):
         innovation = (pressure - self.pressure(x)) / self.p_std
         return x.at[self.window].add((gain * innovation).astype(x.dtype))
 
-    def observe(self, t, x):
+    def observe(self, t: Time, x: State) -> Observation:
         return jnp.reshape(self.pressure(x), (1,)).astype(x.dtype)
 
     def _linearised(self, controls: Array) -> Array:
@@ -196,7 +196,9 @@ class LearnedLung(AbstractDynamics):
         # A control that makes no sense must not drive the state out of all bounds.
         return 20 * jnp.tanh(pressure / 20)
 
-    def advance(self, t, x, u, w):
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
         n = self.window
         x = x if w is None else x + w
         control = jnp.reshape((u[0] - self.u_mean) / self.u_std, (1,)).astype(x.dtype)

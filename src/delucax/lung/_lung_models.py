@@ -11,7 +11,16 @@ from jaxtyping import Array
 
 from .._check import check_count, check_instance, check_key, check_step
 from .._module import mlp, parameter, positive, weight
-from .._typing import PRNGKey, Real, RealScalar, Scalar, State
+from .._typing import (
+    Control,
+    Disturbance,
+    PRNGKey,
+    Real,
+    RealScalar,
+    Scalar,
+    State,
+    Time,
+)
 from ..dynamics import Delayed, Discretized
 from ._lungs import AbstractLung, SingleCompartment
 from ._ventilation import Valves
@@ -148,7 +157,7 @@ class NeuralLung(AbstractLung):
         self.valves = Valves() if valves is None else valves
 
     @property
-    def state_names(self):
+    def state_names(self) -> tuple[str, ...]:
         return ("pressure", *(f"hidden {i}" for i in range(self.hidden)))
 
     def pressure(self, x: State) -> Scalar:
@@ -158,7 +167,7 @@ class NeuralLung(AbstractLung):
         first = (pressure - self.p_mean) / self.p_std
         return jnp.hstack([first, jnp.zeros(self.hidden)])
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         # Scaled to be about 1; the valve itself is known and not learned.
         flow = self.valves.flow(u[0]) / self.valves.max_flow
         z = jnp.concatenate([x, jnp.stack([flow, u[1]]).astype(x.dtype)])
@@ -237,7 +246,7 @@ class GreyBoxLung(AbstractLung):
     def resting(self, pressure: RealScalar) -> State:
         return jnp.append(self.single.resting(pressure), 0.0)
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         physical = self.single.vector_field(t, x[:3], u, w)
         memory = self.rate * self.memory(self._inputs(x))
         return jnp.append(physical, memory)

@@ -9,7 +9,16 @@ from jaxtyping import Array
 
 from .._check import is_concrete
 from .._module import bounded, parameter, positive
-from .._typing import Real, RealScalar, Scalar, State
+from .._typing import (
+    Control,
+    Disturbance,
+    Observation,
+    Real,
+    RealScalar,
+    Scalar,
+    State,
+    Time,
+)
 from ..systems import AbstractSystem
 from ._ventilation import Valves
 
@@ -67,7 +76,7 @@ class AbstractLung(AbstractSystem):
         **Returns:** the state.
         """
 
-    def observe(self, t, x):
+    def observe(self, t: Time, x: State) -> Observation:
         return jnp.reshape(self.pressure(x), (1,))
 
 
@@ -117,7 +126,7 @@ class _AbstractCompartment(_AbstractRigidPipe):
         volume = self._volume(pressure)
         return jnp.stack([0 * volume, 0 * volume, volume])
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         inflow, opening = self.valves.derivatives(x[0], x[1], u)
         filling = (self.pressure(x) - self._inside(x)) / self.resistance
         return jnp.stack([inflow, opening, filling])
@@ -239,7 +248,7 @@ class DoubleCompartment(_AbstractRigidPipe):
         fast, slow = self.share * volume, (1 - self.share) * volume
         return jnp.stack([0 * volume, 0 * volume, fast, slow])
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         inflow, opening = self.valves.derivatives(x[0], x[1], u)
         fast, slow, p1, p2, inside = self._parts(x)
         total = (self.pressure(x) - inside) / self.resistance
@@ -356,7 +365,7 @@ class DelayLung(AbstractLung):
         # `0 * volume` is a zero of its dtype and shape, whatever `pressure` is.
         return jnp.stack([0 * volume, 0 * volume, pressure + 0 * volume, volume])
 
-    def vector_field(self, t, x, u, w):
+    def vector_field(self, t: Time, x: State, u: Control, w: Disturbance) -> State:
         inflow, opening = self.valves.derivatives(x[0], x[1], u)
         inside = balloon_pressure(x[3], self.rest, self.stiffness)
         filling = (x[2] - inside) / self.resistance

@@ -7,11 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from .._check import check_count, check_instance
 from .._controller import AbstractController
 from .._module import parameter, positive
+from .._typing import PRNGKey, RealScalar
 from ..environments import Environment
 from ._learned_lung import LearnedLung
 from ._ventilation import waveform_of
@@ -69,11 +70,11 @@ class ShootingMPC(AbstractController):
         check_count(self.horizon, "horizon", where)
         check_count(self.iterations, "iterations", where)
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         lung = self.model.resting()
         return lung, jnp.full(self.horizon, -2.0, lung.dtype)
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         model, (predicted, plan) = self.model, state
         # An observer with a fixed gain.
         lung = model.corrected(predicted, y[0], 1 - self.memory)
@@ -93,7 +94,7 @@ class ShootingMPC(AbstractController):
         plan, _ = _descended(error, start, optimiser, self.iterations)
         return _controls(plan[0])[:1].astype(y.dtype), (lung, plan)
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         lung, plan = state
         u = jnp.stack([u[0], jnp.zeros_like(u[0])])
         return self.model.advance(0.0, lung, u, None)[0], plan

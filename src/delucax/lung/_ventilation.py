@@ -9,7 +9,8 @@ from jaxtyping import Array, ArrayLike
 
 from .._check import as_vector, check_count, check_keywords, check_positive, check_range
 from .._module import check_parameters, parameter, positive
-from .._typing import Control, RealScalar, Scalar, State
+from .._results import Result
+from .._typing import Control, Observation, RealScalar, Scalar, State, Time
 from ..costs import AbstractCost
 from ..disturbances import Gaussian
 from ..dynamics import AbstractDynamics, AbstractWrapper, Delayed
@@ -181,7 +182,7 @@ class PressureSensor(AbstractWrapper):
             )
 
     @property
-    def state_names(self):
+    def state_names(self) -> tuple[str, ...]:
         return (*self.dynamics.state_names, "sensed pressure")
 
     def filled(self, x: ArrayLike) -> State:
@@ -196,19 +197,21 @@ class PressureSensor(AbstractWrapper):
         x = as_vector(x, self.dynamics.state_size, "x", "PressureSensor.filled")
         return jnp.append(x, self.dynamics.observe(0.0, x)).astype(x.dtype)
 
-    def advance(self, t, x, u, w):
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
         after, result = self.dynamics.advance(t, x[:-1], u, w)
         now = self.dynamics.observe(t + self.dt, after).astype(x.dtype)
         return jnp.concatenate([after, now]), result
 
-    def observe(self, t, x):
+    def observe(self, t: Time, x: State) -> Observation:
         return x[-1:]
 
-    def difference(self, x, x_ref):
+    def difference(self, x: State, x_ref: State) -> State:
         own = self.dynamics.difference(x[:-1], x_ref[:-1])
         return jnp.concatenate([own, x[-1:] - x_ref[-1:]])
 
-    def equilibrium(self):
+    def equilibrium(self) -> tuple[State, Control]:
         x, u = self.dynamics.equilibrium()
         return self.filled(x), u
 

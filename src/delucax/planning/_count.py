@@ -13,6 +13,8 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 from .._check import check_function, check_instance
+from .._results import Result
+from .._typing import RealScalar
 from ..dynamics import AbstractDynamics, AbstractWrapper
 
 
@@ -85,7 +87,9 @@ class _Counted(AbstractWrapper):
     # Compiled code puts reports here, from any thread.
     reports: SimpleQueue[tuple[str, int]] = eqx.field(static=True)
 
-    def advance(self, t, x, u, w):
+    def advance(
+        self, t: RealScalar, x: Array, u: Array, w: Array | None
+    ) -> tuple[Array, Result]:
         x_next, result = self.dynamics.advance(t, x, u, w)
         here = dict(reports=self.reports, kind="primal", lanes=1)
         return _report.bind(x_next, jax.lax.stop_gradient(x_next), **here), result

@@ -4,12 +4,13 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._check import as_bounds, check_step
 from .._controller import AbstractController, wrong_observation
 from .._module import function_field, parameter, weight
 from .._results import Result, RESULTS
+from .._typing import RealScalar
 from ..math import matvec
 from ..math._steps import row_at, step_at
 
@@ -99,7 +100,7 @@ class Plan(AbstractController):
         lost = (self.result == RESULTS.diverged) | (self.result == RESULTS.infeasible)
         return finite & ~lost
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         size = self.states.shape[1]
         if y.shape != (size,):
             raise wrong_observation(self, size, y)

@@ -202,7 +202,13 @@ class MPPI(AbstractSampler):
         check_number(self.temperature, "temperature", "MPPI")
         check_positive(self.temperature, "temperature", "MPPI")
 
-    def update(self, samples, costs, mean, width):
+    def update(
+        self,
+        samples: Float[Array, "samples T m"],
+        costs: Float[Array, " samples"],
+        mean: Float[Array, "T m"],
+        width: Float[Array, "T m"],
+    ) -> tuple[Float[Array, "T m"], Float[Array, "T m"]]:
         # The softmax of -cost / temperature. The least cost is taken off first, so that
         # the exponentials do not underflow all together.
         finite, least = jnp.isfinite(costs), jnp.min(costs)
@@ -266,7 +272,13 @@ class CEM(AbstractSampler):
         check_number(self.momentum, "momentum", where)
         check_range(self.momentum, "momentum", where, 0, 1)
 
-    def update(self, samples, costs, mean, width):
+    def update(
+        self,
+        samples: Float[Array, "samples T m"],
+        costs: Float[Array, " samples"],
+        mean: Float[Array, "T m"],
+        width: Float[Array, "T m"],
+    ) -> tuple[Float[Array, "T m"], Float[Array, "T m"]]:
         # Which sequences are the elites is piecewise constant in the costs, and a
         # derivative through infinite ones would be NaN.
         _, best = lax.top_k(-lax.stop_gradient(costs), self.elites)

@@ -139,7 +139,9 @@ class EvolutionStrategies(eqx.Module):
                 f"{where}: samples must be even when antithetic, got {self.samples}."
             )
 
-    def __call__(self, loss, model, key: PRNGKey) -> tuple[Any, PyTree]:
+    def __call__(
+        self, loss: Callable[..., Any], model: PyTree, key: PRNGKey
+    ) -> tuple[Any, PyTree]:
         check_key(key, "EvolutionStrategies")
         weights, rest = weights_of(model)
         n = self.samples // 2 if self.antithetic else self.samples
@@ -239,7 +241,9 @@ class LikelihoodRatio(eqx.Module):
                 f"others, got {self.samples}."
             )
 
-    def __call__(self, loss, model, key: PRNGKey) -> tuple[Any, PyTree]:
+    def __call__(
+        self, loss: Callable[..., Any], model: PyTree, key: PRNGKey
+    ) -> tuple[Any, PyTree]:
         check_key(key, "LikelihoodRatio")
 
         def surrogate(model):

@@ -19,7 +19,7 @@ from ..._check import (
 )
 from ..._controller import AbstractController, AbstractLearner
 from ..._module import parameter
-from ..._typing import PRNGKey, Real
+from ..._typing import PRNGKey, Real, RealScalar
 
 
 class AdaptiveState(NamedTuple):
@@ -111,7 +111,7 @@ class Adaptive(AbstractController):
         check_range(self.share, "share", where, 0, 1)
         check_choice(self.play, ("mix", "switch"), "play", where)
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         chosen, own, base_key = None, None, key
         if self.play == "switch":
             own, base_key = jr.split(check_key(key, "Adaptive.init"))
@@ -131,14 +131,14 @@ class Adaptive(AbstractController):
             key=own,
         )
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         act = jax.vmap(self.base, in_axes=(None, None, 0))
         controls, experts = act(t, y, state.experts)
         weights = state.weights.astype(y.dtype)
         u = weights @ controls if state.chosen is None else controls[state.chosen]
         return u, state._replace(experts=experts, t=jnp.asarray(t, state.t.dtype))
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         losses = jax.vmap(self.base.loss, in_axes=(None, 0))(state.t, state.experts)
         state = self._reweighted(losses.astype(state.weights.dtype), state)
         applied = jax.vmap(self.base.applied, in_axes=(None, None, 0))

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from ..._check import check_count, check_instance, check_key, check_step
 from ..._controller import AbstractController, Tally
 from ..._module import parameter
-from ..._typing import PRNGKey, Real
+from ..._typing import PRNGKey, Real, RealScalar
 from ...dynamics import AbstractDynamics
 from ...math._norms import safe_norm
 from ._closed_loop import ClosedLoop, ClosedLoopState, in_first_responses, shift
@@ -137,7 +137,7 @@ class BPC(AbstractController):
         """True: the cost is all that it observes."""
         return True
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         own, base_key = jr.split(check_key(key, "BPC.init"))
         theta, dtype = self.policy.init(), self.loop.dtype
         return BPCState(
@@ -151,7 +151,7 @@ class BPC(AbstractController):
             refused=Tally("refused_update"),
         )
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         key, now = jr.split(state.key)
         direction = jr.normal(now, state.theta.shape, self.loop.dtype)
         # A normal vector over its length is uniform on the sphere (Muller, 1959).
@@ -163,7 +163,7 @@ class BPC(AbstractController):
         state = state._replace(loop=loop, tried=tried, key=key)
         return (loop.u_base + v).astype(y.dtype), state
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         cost = cost.astype(state.level.dtype)
         steps = state.steps + 1
         # The first cost has nothing to be compared with.

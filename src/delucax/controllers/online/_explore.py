@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from ..._check import as_matrix, check_count, check_key, check_step
 from ..._controller import AbstractController, check_controller, wrong_observation
 from ..._module import function_field, parameter
-from ..._typing import PRNGKey, Real
+from ..._typing import PRNGKey, Real, RealScalar
 from ...dynamics import LinearDynamics
 from ...math._linear_solve import solve
 from ._closed_loop import shift
@@ -110,7 +110,7 @@ class Explore(AbstractController):
         check_step(self.scale, "Explore", "scale")
         check_step(self.dt, "Explore")
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         key = check_key(key, "Explore.init")
         (m, n), dtype = self.K.shape, self.K.dtype
         # A placeholder, for the structure of the state; stable, so that designs exist.
@@ -127,7 +127,7 @@ class Explore(AbstractController):
             key=key,
         )
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         if y.shape != self.K.shape[1:]:
             raise wrong_observation(self, self.K.shape[1], y)
         dtype, y = y.dtype, y.astype(self.K.dtype)
@@ -151,7 +151,7 @@ class Explore(AbstractController):
         )
         return u.astype(dtype), state
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         inner = self._controller(state).applied(u, cost, state.inner)
         inner = _where(state.step < self.steps, state.inner, inner)
         return state._replace(inner=inner, step=state.step + 1)

@@ -15,7 +15,7 @@ from ..._check import check_function, check_instance, check_step, is_concrete, o
 from ..._controller import AbstractController, AbstractLearner, Tally
 from ..._jax import is_constant
 from ..._module import function_field, parameter
-from ..._typing import Real
+from ..._typing import PRNGKey, Real, RealScalar
 from ...dynamics import AbstractDynamics, LinearDynamics, linearize
 from .._composed import Scheduled
 from .._lqr import LQR
@@ -123,7 +123,7 @@ class OnlineLearner(AbstractLearner):
                 f"{type(policy).__name__} that does not."
             )
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         loop, theta = self.loop, self.policy.init()
         inner, h = loop.init(key, loop.horizon), loop.horizon
         weighted = None
@@ -140,7 +140,7 @@ class OnlineLearner(AbstractLearner):
             refused=Tally("refused_update"),
         )
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         before = lambda features: self.policy(state.theta, features)
         features, _, loop = self.loop.act(self, t, y, state.loop, before)
         state = state._replace(loop=loop, features=shift(features, state.features))
@@ -152,14 +152,14 @@ class OnlineLearner(AbstractLearner):
         v = self.policy(after.theta, features)
         return (loop.u_base + v).astype(y.dtype), after
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         return state._replace(loop=self.loop.applied(u, cost, state.loop))
 
-    def loss(self, t, state):
+    def loss(self, t: RealScalar, state: PyTree) -> Array:
         del t
         return self._loss(state.theta, state)
 
-    def fresh(self, state, key):
+    def fresh(self, state: PyTree, key: PRNGKey | None) -> PyTree:
         del key
         theta = self.policy.init()
         return state._replace(theta=theta, optimiser=self.optimiser.init(theta))

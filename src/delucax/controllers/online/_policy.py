@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from ..._check import check_step
 from ..._controller import AbstractController
 from ..._module import parameter, weight
+from ..._typing import PRNGKey, RealScalar
 from ...math._norms import within_ball
 from ._closed_loop import ClosedLoop
 
@@ -118,13 +119,13 @@ class FixedPolicy(AbstractController):
     loop: ClosedLoop
     policy: AbstractPolicy
 
-    def init(self, *, key=None):
+    def init(self, *, key: PRNGKey | None = None) -> PyTree:
         return self.loop.init(key, 0)
 
-    def __call__(self, t, y, state):
+    def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
         policy = lambda features: self.policy(self.policy.init(), features)
         _, v, state = self.loop.act(self, t, y, state, policy)
         return (state.u_base + v).astype(y.dtype), state
 
-    def applied(self, u, cost, state):
+    def applied(self, u: Array, cost: Array, state: PyTree) -> PyTree:
         return self.loop.applied(u, cost, state)
