@@ -6,6 +6,8 @@ from typing import Any, Generic, Literal, TYPE_CHECKING, TypeAlias, TypeVar
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, Num, UInt32
 
 
+Numbers: TypeAlias = ArrayLike | list[Any] | tuple[Any, ...]
+"""What becomes an array: an array, a number, or nested lists of numbers."""
 RealScalar: TypeAlias = Num[Array, ""] | int | float
 """A real number: a Python number or a rank-0 array."""
 Time: TypeAlias = RealScalar
@@ -44,9 +46,8 @@ if TYPE_CHECKING:
         def __get__(self, instance: Any, owner: Any = None) -> _Read: ...
         def __set__(self, instance: Any, value: _Given) -> None: ...
 
-    _Numbers: TypeAlias = ArrayLike | list[Any] | tuple[Any, ...]
-    Real: TypeAlias = _Converted[Array, _Numbers]
-    RealOrNone: TypeAlias = _Converted[Array | None, _Numbers | None]
+    Real: TypeAlias = _Converted[Array, Numbers]
+    RealOrNone: TypeAlias = _Converted[Array | None, Numbers | None]
     BoundsOrNone: TypeAlias = _Converted[
         Bounds | None, tuple[ArrayLike, ArrayLike] | None
     ]

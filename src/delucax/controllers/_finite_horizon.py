@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PyTree
 from .._check import check_at_most, check_count, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
-from .._typing import Difference, RealScalar
+from .._typing import Difference, Numbers, RealScalar
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..math._steps import row_at, step_at
@@ -86,11 +86,11 @@ class FiniteHorizonLQR(AbstractController):
     def __init__(
         self,
         dynamics: LinearDynamics,
-        Q: Any,
-        R: Any,
-        S: Any = None,
+        Q: Numbers,
+        R: Numbers,
+        S: Numbers | None = None,
         *,
-        final: Any = None,
+        final: Numbers | None = None,
         horizon: int | None = None,
         reference: Any = None,
         control_reference: Any = None,

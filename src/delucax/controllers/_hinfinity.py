@@ -1,13 +1,11 @@
 """The H-infinity controller."""
 
-from typing import Any
-
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._check import check_count, check_positive, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
-from .._typing import Difference, RealScalar
+from .._typing import Difference, Numbers, RealScalar
 from ..dynamics import LinearDynamics
 from ..math import matvec
 from ..math._steps import row_at, step_at
@@ -86,12 +84,12 @@ class HInfinity(AbstractController):
     def __init__(
         self,
         dynamics: LinearDynamics,
-        Q: Any,
-        R: Any,
+        Q: Numbers,
+        R: Numbers,
         *,
-        gamma: Any = None,
+        gamma: ArrayLike | None = None,
         horizon: int | None = None,
-        final: Any = None,
+        final: Numbers | None = None,
         difference: Difference | None = None,
     ):
         where = "HInfinity"

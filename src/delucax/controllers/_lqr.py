@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PyTree
 from .._check import as_matrix, check_count, check_instance, check_step
 from .._controller import AbstractController
 from .._module import function_field, parameter, weight
-from .._typing import Difference, PRNGKey, RealScalar
+from .._typing import Difference, Numbers, PRNGKey, RealScalar
 from ..dynamics import AbstractDynamics, LinearDynamics, OperatingPoint
 from ..math import matvec
 from ..math._linear_solve import solve
@@ -101,9 +101,9 @@ class LQR(AbstractController):
     def __init__(
         self,
         dynamics: AbstractDynamics,
-        Q: Any,
-        R: Any,
-        S: Any = None,
+        Q: Numbers,
+        R: Numbers,
+        S: Numbers | None = None,
         *,
         reference: Any = None,
         control_reference: Any = None,
@@ -245,11 +245,11 @@ class LQI(AbstractController):
     def __init__(
         self,
         dynamics: LinearDynamics,
-        Q: Any,
-        R: Any,
-        S: Any = None,
+        Q: Numbers,
+        R: Numbers,
+        S: Numbers | None = None,
         *,
-        output: Any,
+        output: Numbers,
         reference: Any = None,
         difference: Difference | None = None,
     ):

@@ -11,7 +11,7 @@ from .._check import check_instance
 from .._controller import AbstractController, check_controller, Tally
 from .._module import parameter
 from .._results import RESULTS
-from .._typing import Difference, PRNGKey, RealScalar
+from .._typing import Difference, Numbers, PRNGKey, RealScalar
 from ..dynamics import LinearDynamics
 from ..estimators import AbstractEstimator, KalmanFilter
 from ._lqr import LQR
@@ -166,16 +166,16 @@ class LQG(AbstractController):
     def __init__(
         self,
         dynamics: LinearDynamics,
-        Q: Any,
-        R: Any,
-        W: Any,
-        V: Any,
-        S: Any = None,
+        Q: Numbers,
+        R: Numbers,
+        W: Numbers,
+        V: Numbers,
+        S: Numbers | None = None,
         *,
         mean: ArrayLike | None = None,
         covariance: ArrayLike | None = None,
         steady_state: bool = True,
-        y_ref: Any = None,
+        y_ref: Numbers | None = None,
         difference: Difference | None = None,
         observation_difference: Difference | None = None,
     ):

@@ -1,12 +1,10 @@
 """The sampled-data regulator, and the discretisation of quadratic costs."""
 
-from typing import Any
-
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from .._check import as_matrix, check_instance, check_positive, symmetric_matrix
-from .._typing import Difference
+from .._typing import Difference, Numbers
 from ..dynamics import c2d, linearize, OperatingPoint
 from ..math._lyapunov import gramian_over
 from ..systems import AbstractSystem, LinearSystem
@@ -15,7 +13,11 @@ from ._operating_point import linear_at
 
 
 def sampled_weights(
-    system: LinearSystem, Q: Any, R: Any, dt: Any, S: Any = None
+    system: LinearSystem,
+    Q: Numbers,
+    R: Numbers,
+    dt: ArrayLike,
+    S: Numbers | None = None,
 ) -> tuple[Array, Array, Array]:
     """The exact discretisation of a continuous quadratic cost under a held control,
 
@@ -75,10 +77,10 @@ def sampled_weights(
 
 def lqrd(
     system: AbstractSystem,
-    Q: Any,
-    R: Any,
-    dt: Any,
-    S: Any = None,
+    Q: Numbers,
+    R: Numbers,
+    dt: ArrayLike,
+    S: Numbers | None = None,
     *,
     difference: Difference | None = None,
     point: OperatingPoint | None = None,

@@ -11,7 +11,16 @@ from jaxtyping import Array
 from .._check import as_vector, check_finite, check_function, symmetric_matrix
 from .._message import shortened
 from .._module import function_field, parameter
-from .._typing import Control, Difference, Matrix, RealScalar, Scalar, State, Vector
+from .._typing import (
+    Control,
+    Difference,
+    Matrix,
+    Numbers,
+    RealScalar,
+    Scalar,
+    State,
+    Vector,
+)
 from ..math import quadratic_form
 from ..math._small import dot
 from ._base import AbstractCost
@@ -96,16 +105,16 @@ class Quadratic(_AbstractQuadratic):
 
     def __init__(
         self,
-        Q: Any,
-        R: Any,
-        final: Any = None,
-        state_target: Any = None,
-        control_target: Any = None,
+        Q: Numbers,
+        R: Numbers,
+        final: Numbers | None = None,
+        state_target: Numbers | None = None,
+        control_target: Numbers | None = None,
         *,
         difference: Difference | None = None,
     ):
-        self.Q, self.R, self.Qf = Q, R, final
-        self.state_target, self.control_target = state_target, control_target
+        given: Any = Q, R, final, state_target, control_target
+        self.Q, self.R, self.Qf, self.state_target, self.control_target = given
         self.difference = difference
 
     def __check_init__(self):
@@ -173,13 +182,14 @@ class Tracking(_AbstractQuadratic):
 
     def __init__(
         self,
-        Q: Any,
-        R: Any,
+        Q: Numbers,
+        R: Numbers,
         reference: Callable[[RealScalar], Array],
-        final: Any = None,
+        final: Numbers | None = None,
         output: Callable[[Array], Array] | None = None,
     ):
-        self.Q, self.R, self.Qf = Q, R, final
+        given: Any = Q, R, final
+        self.Q, self.R, self.Qf = given
         self.reference, self.output = reference, output
 
     def __check_init__(self):

@@ -16,7 +16,7 @@ from .._check import as_rows, as_vector, check_instance, check_step
 from .._jax import by_components, join_state, split_state, stack_steps
 from .._module import as_float_array, check_parameters
 from .._results import choose, first_failure, first_of, or_none, Result, RESULTS
-from .._typing import Control, Observation, RealScalar, State, Time
+from .._typing import Control, Numbers, Observation, RealScalar, State, Time
 from ..systems import AbstractPlant, AbstractSystem
 
 
@@ -99,9 +99,9 @@ class AbstractDynamics(AbstractPlant):
 
 def open_loop(
     dynamics: AbstractDynamics,
-    x0: Any,
-    controls: Any,
-    w: Any = None,
+    x0: Numbers,
+    controls: Numbers,
+    w: Numbers | None = None,
     t0: RealScalar = 0.0,
 ) -> Array:
     """The states that given controls lead to, for planning and identification.

@@ -1,7 +1,6 @@
 """Dynamics around others: dead times, and an adversary that acts on the state."""
 
 from dataclasses import KW_ONLY
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +9,7 @@ from jaxtyping import Array, Float
 from .._check import as_matrix, as_vector, check_count, check_instance, check_positive
 from .._module import parameter
 from .._results import Result
-from .._typing import Control, Observation, Real, RealScalar, State, Time
+from .._typing import Control, Numbers, Observation, Real, RealScalar, State, Time
 from ..math import matvec
 from ..math._norms import within_ball
 from ._base import AbstractDynamics, AbstractWrapper
@@ -79,7 +78,7 @@ class Delayed(AbstractWrapper):
         """
         return self._cut(x)[0]
 
-    def filled(self, x: Any, u: Any = None) -> Array:
+    def filled(self, x: Numbers, u: Numbers | None = None) -> Array:
         """The state of a plant that has rested.
 
         **Arguments:**

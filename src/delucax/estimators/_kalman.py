@@ -21,7 +21,7 @@ from .._check import (
 from .._jax import jacobian
 from .._module import function_field, parameter, positive, weight
 from .._results import raise_on_failure, RESULTS
-from .._typing import Difference, Real
+from .._typing import Difference, Numbers, Real
 from ..dynamics import AbstractDynamics, LinearDynamics
 from ..math._linear_solve import symmetric
 from ..riccati import filter_dare
@@ -100,13 +100,13 @@ class KalmanFilter(AbstractGaussianFilter):
     def __init__(
         self,
         dynamics: LinearDynamics,
-        W: Any,
-        V: Any,
+        W: Numbers,
+        V: Numbers,
         *,
-        mean: Any = None,
-        covariance: Any = None,
+        mean: Numbers | None = None,
+        covariance: Numbers | None = None,
         steady_state: bool = False,
-        y_ref: Any = None,
+        y_ref: Numbers | None = None,
         observation_difference: Difference | None = None,
     ):
         where = "KalmanFilter"
@@ -115,7 +115,8 @@ class KalmanFilter(AbstractGaussianFilter):
         self.dynamics, self.observation_difference = dynamics, observation_difference
         x_ref = dynamics.at(0.0).x_ref
         x_ref = x_ref.astype(jnp.result_type(x_ref, dynamics.A))
-        self.W, self.V, self.mean, self.covariance = W, V, mean, covariance
+        given: Any = W, V, mean, covariance
+        self.W, self.V, self.mean, self.covariance = given
         self.W, self.V, self.mean, self.covariance = self._model(x_ref)
         self.y_ref = self.L = self.updated_covariance = None
         if y_ref is not None:

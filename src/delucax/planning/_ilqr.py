@@ -1,10 +1,11 @@
 """Iterative linear-quadratic regulator, and differential dynamic programming."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from .._check import (
     check_bool,
@@ -15,7 +16,7 @@ from .._check import (
     finite_rows,
 )
 from .._module import parameter
-from .._typing import PRNGKey
+from .._typing import Numbers, PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ._descent import Options, SEARCHES
@@ -186,11 +187,11 @@ _IN_SEQUENCE = (
 def ilqr(
     dynamics: AbstractDynamics,
     cost: AbstractCost,
-    x0: Any,
+    x0: Numbers,
     controls: Any,
-    t0: Any = 0.0,
-    w: Any = None,
-    bounds: Any = None,
+    t0: ArrayLike = 0.0,
+    w: Numbers | None = None,
+    bounds: Sequence[Numbers] | None = None,
     *,
     constraints: Constraints | None = None,
     max_iterations: int = 500,

@@ -2,13 +2,13 @@
 
 import abc
 import numbers
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from .._check import (
     check_bool,
@@ -24,7 +24,7 @@ from .._check import (
 from .._message import shortened
 from .._module import as_float_array, as_module
 from .._results import choose, raise_on_failure, RESULTS
-from .._typing import PRNGKey
+from .._typing import Numbers, PRNGKey
 from ..costs import AbstractCost
 from ..dynamics import AbstractDynamics
 from ._plan import Plan
@@ -108,11 +108,11 @@ class AbstractPlanner(eqx.Module):
         self,
         dynamics: AbstractDynamics,
         cost: AbstractCost,
-        x0: Any,
+        x0: Numbers,
         controls: Any,
-        t0: Any = 0.0,
-        w: Any = None,
-        bounds: Any = None,
+        t0: ArrayLike = 0.0,
+        w: Numbers | None = None,
+        bounds: Sequence[Numbers] | None = None,
         *,
         constraints: Constraints | None = None,
         difference: Callable[[Array, Array], Array] | None = None,
@@ -158,7 +158,7 @@ class AbstractPlanner(eqx.Module):
         n, m = dynamics.state_size, dynamics.control_size
         x0 = finite_vector(x0, n, "x0", where)
         check_number(t0, "t0", where)
-        t0 = as_float_array(t0)
+        begin: Any = as_float_array(t0)
         is_count = isinstance(controls, numbers.Integral)
         if isinstance(controls, Start | Plan):
             if self.starts_from_states:
@@ -175,7 +175,7 @@ class AbstractPlanner(eqx.Module):
             if self.starts_from_states:
                 start = Start(jnp.tile(operating_point(dynamics, cost)[1], (T, 1)))
             else:
-                start = Start.default(dynamics, cost, T, t0)
+                start = Start.default(dynamics, cost, T, begin)
         # A default start has no precision of its own.
         dtype = jnp.result_type(x0, *(() if is_count else (start.controls,)))
         if w is not None:
@@ -190,8 +190,9 @@ class AbstractPlanner(eqx.Module):
         if ends is not None:
             ends = tuple(jnp.broadcast_to(end, (m,)).astype(dtype) for end in ends)
         # One precision for all: the loops of the planners carry it unchanged.
-        x0, t0, distance = x0.astype(dtype), t0.astype(dtype), as_module(difference)
-        problem = Problem(dynamics, cost, x0, t0, w, ends, distance, constraints)
+        x0, begin = x0.astype(dtype), begin.astype(dtype)
+        distance = as_module(difference)
+        problem = Problem(dynamics, cost, x0, begin, w, ends, distance, constraints)
         start = jax.tree.map(lambda a: a.astype(dtype), start)
         if fallback is not None:
             T = start.horizon

@@ -1,16 +1,22 @@
 """The algebraic Riccati equations of control and of the stationary filter."""
 
-from typing import Any
-
 import equinox as eqx
 
 from .._check import as_matrix
+from .._typing import Numbers
 from ._arguments import riccati_arguments
 from ._stabilising import RiccatiSolution, stabilising_solution
 
 
 def dare(
-    A: Any, B: Any, Q: Any, R: Any, S: Any = None, E: Any = None, *, throw: bool = True
+    A: Numbers,
+    B: Numbers,
+    Q: Numbers,
+    R: Numbers,
+    S: Numbers | None = None,
+    E: Numbers | None = None,
+    *,
+    throw: bool = True,
 ) -> RiccatiSolution:
     r"""The stabilising solution of the discrete-time algebraic Riccati equation,
 
@@ -71,7 +77,14 @@ def dare(
 
 
 def care(
-    A: Any, B: Any, Q: Any, R: Any, S: Any = None, E: Any = None, *, throw: bool = True
+    A: Numbers,
+    B: Numbers,
+    Q: Numbers,
+    R: Numbers,
+    S: Numbers | None = None,
+    E: Numbers | None = None,
+    *,
+    throw: bool = True,
 ) -> RiccatiSolution:
     r"""The stabilising solution of the continuous-time algebraic Riccati equation,
 
@@ -115,7 +128,13 @@ def care(
 
 
 def filter_dare(
-    A: Any, C: Any, W: Any, V: Any, S: Any = None, *, throw: bool = True
+    A: Numbers,
+    C: Numbers,
+    W: Numbers,
+    V: Numbers,
+    S: Numbers | None = None,
+    *,
+    throw: bool = True,
 ) -> RiccatiSolution:
     r"""The stationary covariance of a one-step prediction, in discrete time,
 
@@ -166,7 +185,13 @@ def filter_dare(
 
 
 def filter_care(
-    A: Any, C: Any, W: Any, V: Any, S: Any = None, *, throw: bool = True
+    A: Numbers,
+    C: Numbers,
+    W: Numbers,
+    V: Numbers,
+    S: Numbers | None = None,
+    *,
+    throw: bool = True,
 ) -> RiccatiSolution:
     r"""The stationary covariance of the estimate of the Kalman-Bucy filter,
 

@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from .._check import as_vector
 from .._results import choose, raise_on_failure, Result, RESULTS
+from .._typing import Numbers
 from ..math._linear_solve import full_precision, solve
 from ._arguments import (
     constant_matrices,
@@ -72,18 +73,18 @@ class FiniteHorizonSolution(eqx.Module):
 
 
 def dre(
-    A: Any,
-    B: Any,
-    Q: Any,
-    R: Any,
-    S: Any = None,
+    A: Numbers,
+    B: Numbers,
+    Q: Numbers,
+    R: Numbers,
+    S: Numbers | None = None,
     *,
-    final: Any = None,
+    final: Numbers | None = None,
     horizon: Any = None,
-    d: Any = None,
-    q: Any = None,
-    r: Any = None,
-    final_q: Any = None,
+    d: Numbers | None = None,
+    q: Numbers | None = None,
+    r: Numbers | None = None,
+    final_q: Numbers | None = None,
     parallel: bool = False,
     throw: bool = True,
 ) -> FiniteHorizonSolution:
@@ -193,14 +194,14 @@ def _affine(loop, K, B, R, after, d, q, r, final_q, parallel):
 
 
 def cre(
-    A: Any,
-    B: Any,
-    Q: Any,
-    R: Any,
-    S: Any = None,
+    A: Numbers,
+    B: Numbers,
+    Q: Numbers,
+    R: Numbers,
+    S: Numbers | None = None,
     *,
-    times: Any,
-    final: Any = None,
+    times: Numbers,
+    final: Numbers | None = None,
     throw: bool = True,
 ) -> FiniteHorizonSolution:
     r"""The Riccati differential equation, back from `X(t_1) = final`:

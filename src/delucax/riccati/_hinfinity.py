@@ -11,11 +11,11 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from .._check import check_definite
 from .._results import choose, RESULTS
-from .._typing import Scalar, Square
+from .._typing import Numbers, Scalar, Square
 from ..math._linear_solve import full_precision, solve, symmetric
 from ..math._lyapunov import lyapunov
 from ..math._norms import one_if_zero, size
@@ -45,14 +45,14 @@ from ._stabilising import is_semidefinite, left_side, shifted
 
 
 def hinf_dare(
-    A: Any,
-    B: Any,
-    D: Any,
-    Q: Any,
-    R: Any,
+    A: Numbers,
+    B: Numbers,
+    D: Numbers | None,
+    Q: Numbers,
+    R: Numbers,
     *,
-    gamma: Any = None,
-    tolerance: Any = None,
+    gamma: ArrayLike | None = None,
+    tolerance: ArrayLike | None = None,
     throw: bool = True,
 ) -> GameSolution:
     r"""The stationary H-infinity game in discrete time,
@@ -115,14 +115,14 @@ def hinf_dare(
 
 
 def hinf_care(
-    A: Any,
-    B: Any,
-    D: Any,
-    Q: Any,
-    R: Any,
+    A: Numbers,
+    B: Numbers,
+    D: Numbers | None,
+    Q: Numbers,
+    R: Numbers,
     *,
-    gamma: Any = None,
-    tolerance: Any = None,
+    gamma: ArrayLike | None = None,
+    tolerance: ArrayLike | None = None,
     throw: bool = True,
 ) -> GameSolution:
     """The stationary H-infinity game in continuous time,

@@ -5,9 +5,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from .._results import choose, RESULTS
+from .._typing import Numbers
 from ..math._linear_solve import full_precision, solve, symmetric
 from ._arguments import final_weight, increasing_times, stage_arguments, where_solved
 from ._hinfinity import checked_game
@@ -41,16 +42,16 @@ def _values(discrete: bool, problem: tuple, gamma: Array) -> Array:
 
 
 def hinf_dre(
-    A: Any,
-    B: Any,
-    D: Any,
-    Q: Any,
-    R: Any,
+    A: Numbers,
+    B: Numbers,
+    D: Numbers | None,
+    Q: Numbers,
+    R: Numbers,
     *,
-    final: Any = None,
+    final: Numbers | None = None,
     horizon: Any = None,
-    gamma: Any = None,
-    tolerance: Any = None,
+    gamma: ArrayLike | None = None,
+    tolerance: ArrayLike | None = None,
     throw: bool = True,
 ) -> GameSolution:
     r"""The H-infinity game over a finite horizon, back from `X_T = final`:
@@ -113,16 +114,16 @@ def hinf_dre(
 
 
 def hinf_cre(
-    A: Any,
-    B: Any,
-    D: Any,
-    Q: Any,
-    R: Any,
+    A: Numbers,
+    B: Numbers,
+    D: Numbers | None,
+    Q: Numbers,
+    R: Numbers,
     *,
-    times: Any,
-    final: Any = None,
-    gamma: Any = None,
-    tolerance: Any = None,
+    times: Numbers,
+    final: Numbers | None = None,
+    gamma: ArrayLike | None = None,
+    tolerance: ArrayLike | None = None,
     throw: bool = True,
 ) -> GameSolution:
     r"""The H-infinity game over a finite horizon of continuous time, back from
@@ -167,10 +168,10 @@ def hinf_cre(
         ```
     """
     where = "hinf_cre"
-    A, *others = checked_game(where, A, B, D, Q, R)
-    final = final_weight(final, A, where)
-    times = increasing_times(times, where).astype(A.dtype)
-    problem = (A, *others, final, times)
+    game = checked_game(where, A, B, D, Q, R)
+    final = final_weight(final, game[0], where)
+    times = increasing_times(times, where).astype(game[0].dtype)
+    problem = (*game, final, times)
     return at_level(_solution, where, False, problem, gamma, tolerance, throw)
 
 

@@ -1,7 +1,7 @@
 """The Lyapunov, Stein and Sylvester equations, for spectra that need not be stable."""
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from .._check import as_matrix
 from .._results import choose, raise_on_failure, Result, RESULTS
+from .._typing import Numbers
 from ..math._linear_solve import full_precision, no_tangent, solve
 from ..math._lyapunov import smith, stable_sylvester
 from ._arguments import complex_form, is_complex, real_form, square_matrix
@@ -60,7 +61,7 @@ class MatrixSolution(eqx.Module):
         return f"Relative residual {float(self.residual):.1e}."
 
 
-def lyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
+def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     r"""The continuous-time Lyapunov equation
 
     `A X + X A' + Q = 0`,
@@ -102,7 +103,7 @@ def lyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
     return _equation("lyap", False, A, None, Q, throw)
 
 
-def dlyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
+def dlyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     r"""The discrete-time Lyapunov equation
 
     `A X A' - X + Q = 0`,
@@ -136,7 +137,9 @@ def dlyap(A: Any, Q: Any, *, throw: bool = True) -> MatrixSolution:
     return _equation("dlyap", True, A, None, Q, throw)
 
 
-def sylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
+def sylvester(
+    A: Numbers, B: Numbers, C: Numbers, *, throw: bool = True
+) -> MatrixSolution:
     r"""The Sylvester equation
 
     `A X + X B = C`.
@@ -176,7 +179,9 @@ def sylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
     return _equation("sylvester", False, A, B, C, throw)
 
 
-def dsylvester(A: Any, B: Any, C: Any, *, throw: bool = True) -> MatrixSolution:
+def dsylvester(
+    A: Numbers, B: Numbers, C: Numbers, *, throw: bool = True
+) -> MatrixSolution:
     r"""The Stein equation, which is the Sylvester equation of discrete time,
 
     `A X B - X + C = 0`.

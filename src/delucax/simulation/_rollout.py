@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
+from jaxtyping import ArrayLike
 
 from .._check import (
     as_number,
@@ -24,7 +25,7 @@ from .._controller import AbstractController, initial_state, tallies
 from .._jax import by_components, join_state, split_state, stack_steps
 from .._module import as_float_array
 from .._results import choose, first_failure, first_of, or_none, RESULTS
-from .._typing import Checkpoint, PRNGKey
+from .._typing import Checkpoint, Numbers, PRNGKey
 from ..disturbances import Zero
 from ..environments import Environment
 from ._controller_calls import (
@@ -54,11 +55,11 @@ def rollout(
     *,
     key: PRNGKey,
     horizon: int | None = None,
-    x0: Any = None,
-    w: Any = None,
+    x0: Numbers | None = None,
+    w: Numbers | None = None,
     keep: Sequence[str] = KEEP,
     checkpoint: Checkpoint = "step",
-    gradient_decay: Any = 1.0,
+    gradient_decay: ArrayLike = 1.0,
     truncate: int | None = None,
     throw: bool = True,
 ) -> Trajectory:

@@ -6,7 +6,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from .._check import (
     as_number,
@@ -27,7 +27,7 @@ from .._integration import (
     TimeOffset,
 )
 from .._results import choose, first_failure, RESULTS
-from .._typing import PRNGKey
+from .._typing import Numbers, PRNGKey
 from ..math._steps import check_steps
 from ..systems import AbstractSystem
 from ._controller_calls import check_control, controller_result
@@ -46,17 +46,17 @@ def simulate(
     controller_or_controls: Any,
     t0: Any,
     t1: Any,
-    x0: Any,
+    x0: Numbers,
     *,
     hold: Literal["zero"] | None = "zero",
-    dt: Any = None,
-    w: Any = None,
+    dt: ArrayLike | None = None,
+    w: Numbers | None = None,
     solver: diffrax.AbstractSolver | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     substeps: int = 1,
     adjoint: diffrax.AbstractAdjoint | None = None,
     max_steps: int | None = None,
-    ts: Any = None,
+    ts: Numbers | None = None,
     key: PRNGKey | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = True,

@@ -111,7 +111,7 @@ class Explore(AbstractController):
         check_step(self.dt, "Explore")
 
     def init(self, *, key: PRNGKey | None = None) -> PyTree:
-        key = check_key(key, "Explore.init")
+        own = check_key(key, "Explore.init")
         (m, n), dtype = self.K.shape, self.K.dtype
         # A placeholder, for the structure of the state; stable, so that designs exist.
         A, B = jnp.eye(n, dtype=dtype) / 2, jnp.eye(n, m, dtype=dtype)
@@ -124,7 +124,7 @@ class Explore(AbstractController):
             model=model,
             arrays=arrays,
             inner=inner,
-            key=key,
+            key=own,
         )
 
     def __call__(self, t: RealScalar, y: Array, state: PyTree) -> tuple[Array, PyTree]:
