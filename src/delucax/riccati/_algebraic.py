@@ -120,7 +120,8 @@ def care(
 
         A = jnp.array([[0.0, 1.0], [0.0, 0.0]])
         B = jnp.array([[0.0], [1.0]])
-        K = dlx.riccati.care(A, B, jnp.eye(2), jnp.eye(1)).K  # [[1.0, 1.7321]]
+        solution = dlx.riccati.care(A, B, jnp.eye(2), jnp.eye(1))
+        solution.K, solution.spectral_abscissa  # [[1.0, 1.7321]], -0.866
         ```
     """
     data = riccati_arguments("care", A, B, Q, R, S, E, definite=True)
