@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas
 import pytest
-from helpers import once
+from helpers import as_a_user, once
 from hypothesis import given, settings, strategies as st
 
 import delucax as dlx
@@ -33,9 +33,8 @@ DOORS = {
 @pytest.mark.parametrize("table", [TABLE, TABLE["x"]], ids=["table", "column"])
 def test_a_table_is_refused_in_a_line(name, table):
     kind = type(table).__name__
-    with pytest.raises(
-        ValueError, match=rf"{name} must .*got a {kind}; `.to_numpy\(\)`"
-    ) as raised:
+    match = rf"{name} must .*got a {kind}; `.to_numpy\(\)`"
+    with as_a_user(), pytest.raises(ValueError, match=match) as raised:
         DOORS[name](table)
     assert len(str(raised.value)) < 300
 

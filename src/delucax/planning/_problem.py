@@ -213,7 +213,8 @@ class Problem(eqx.Module):
         return values_of(functions, (t, x), x.dtype)
 
     def constraints_along(self, states: Array, controls: Array) -> tuple[Any, Any]:
-        """The values of the constraints at all steps, and at the end."""
+        """The values of the constraints at each step of `states` under `controls`, and
+        at the end."""
         times = self.times(controls.shape[0])
         stage = jax.vmap(self.stage_constraints)(times[:-1], states[:-1], controls)
         return stage, self.final_constraints(times[-1], states[-1])
