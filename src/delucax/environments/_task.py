@@ -144,7 +144,7 @@ def task(
             - `**others`: arguments of [`delucax.systems.{kind}`][] or
                 [`delucax.Environment`][], such as `disturbance`.
 
-            **Returns:** an [`delucax.Environment`][].
+            **Returns:** the [`delucax.Environment`][].
 
             **Raises:** `ValueError` on invalid numbers, on arguments of a system beside
             one, and on Gym's limits beside a solver or `substeps` without one.
@@ -192,12 +192,14 @@ def task(
         signature = inspect.signature(make)
         system, *rest = signature.parameters.values()
         system = system.replace(annotation=accepts | None)
-        parameters = [system, *options, *derived.values(), *rest]
+        parameters = [system, *map(_plain, options), *derived.values(), *rest]
         numbers = dict(dt=dt, horizon=horizon, substeps=substeps)
         unit = f" [{kind.time_unit}]" if kind.time_unit else ""
         names = dict(kind=kind.__name__, unit=unit, solver=default_name)
         shared = (inspect.getdoc(make) or "").format(**numbers, **names)
         functools.update_wrapper(make, build)
+        # Tools that document it would read the arguments of `build` through this.
+        del vars(make)["__wrapped__"]
         # They follow the options, and end where the source is named.
         own, source, rest = (inspect.getdoc(build) or "").partition("\n\nSource:")
         make.__doc__ = f"{own}\n{shared}{source}{rest}"
@@ -206,6 +208,13 @@ def task(
         return make
 
     return decorate
+
+
+def _plain(option: inspect.Parameter) -> inspect.Parameter:
+    """The option, annotated without its check."""
+    if hasattr(option.annotation, "__metadata__"):
+        return option.replace(annotation=option.annotation.__origin__)
+    return option
 
 
 def _taken(arguments: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
