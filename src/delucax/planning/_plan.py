@@ -1,4 +1,4 @@
-"""The plan: a trajectory, feedback about it, and how it was found."""
+"""The plan: a trajectory, feedback about it, and how it was computed."""
 
 from collections.abc import Callable
 from typing import Any

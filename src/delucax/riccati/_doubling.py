@@ -82,7 +82,7 @@ def _by_sign(A, G, Q, wanted):
     start = (W, jnp.asarray(jnp.inf, dtype), jnp.asarray(wanted), jnp.asarray(0))
     W, *_, iterations = lax.while_loop(more, body, start)
     # I - sign(H) = [I; X] M projects onto the stable subspace; H = J'W. M alone may be
-    # singular, so that X is found by least squares from all 2n columns.
+    # singular, so that X is computed by least squares from all 2n columns.
     upper = jnp.concatenate([eye + W[n:, :n], W[n:, n:]], axis=1)
     lower = jnp.concatenate([-W[:n, :n], eye - W[:n, n:]], axis=1)
     return symmetric(factorised(upper.T, lx.QR())(lower.T).T), iterations

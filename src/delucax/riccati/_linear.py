@@ -78,7 +78,7 @@ def lyap(A: Numbers, Q: Numbers, *, throw: bool = True) -> MatrixSolution:
     - `A`: shape `(n, n)`. Real, or complex, as `Q`; then `'` is the conjugate
         transpose.
     - `Q`: shape `(n, n)`, not necessarily symmetric.
-    - `throw`: raise unless the solution is found (default); if false, check `result`.
+    - `throw`: raise unless the equation is solved (default); if false, check `result`.
 
     **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
     `residual` is at most 1e-12 (1e-5 in single precision); else `result` is
@@ -154,7 +154,7 @@ def sylvester(
     - `A`: shape `(n, n)`. Real, or complex, as `B` and `C`.
     - `B`: shape `(m, m)`.
     - `C`: shape `(n, m)`.
-    - `throw`: raise unless the solution is found (default); if false, check `result`.
+    - `throw`: raise unless the equation is solved (default); if false, check `result`.
 
     **Returns:** a [`delucax.riccati.MatrixSolution`][]. It is successful if the
     `residual` is at most 1e-12 (1e-5 in single precision); else `result` is

@@ -119,8 +119,8 @@ class Hold(AbstractForwardingSolver):
     """A solver of which each step uses the control of the interval that it lies in.
 
     The interval cannot be inferred from the times of the stages: the last stage is at
-    the switch itself, and rounding puts others beyond it. So it is found once per step,
-    from the step's two ends, and handed to the vector field as an index. A slope that a
+    the switch itself, and rounding puts others beyond it. So it is determined once per
+    step, from its two ends, and handed to the vector field as an index. A slope that a
     solver reuses from its last step is dropped at a switch. The step-size controller
     ensures that no step crosses one.
 

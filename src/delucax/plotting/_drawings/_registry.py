@@ -123,7 +123,7 @@ _BY_TYPE: dict[type, Setup] = {
     systems.DoubleIntegrator: _mechanics.double_integrator,
     systems.DynamicBicycle: _vehicles.car,
     systems.KinematicBicycle: _vehicles.car,
-    # The plane of x and z, in which the wings are seen.
+    # The plane of x and z, in which the wings are drawn.
     systems.Lorenz: functools.partial(plane, columns=(0, 2)),
     systems.MassSpringDamper: _mechanics.mass_spring_damper,
     systems.MountainCar: _mechanics.mountain_car,
